@@ -1,0 +1,142 @@
+"""Floor 0: which Dr.Jit backend runs, chosen once: CUDA where a device works, else LLVM on the CPU.
+
+`ad` names Dr.Jit's array types of the chosen backend (`ad.Float`, `ad.Array3f`, ...); the first use chooses, if
+`select` has not. Dr.Jit takes the first libLLVM that it finds, and versions before 19 abort the whole process, so
+the library is looked for here and named in DRJIT_LIBLLVM_PATH before Dr.Jit loads.
+"""
+
+import ctypes
+import importlib
+import os
+import re
+import sys
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+NAMES = ("auto", "cuda", "llvm")
+MINIMUM_LLVM = 19
+INSTALL_LLVM = "sudo apt-get install libllvm19"
+
+_LIBRARY_PLACES = (
+    "/usr/lib/*-linux-gnu*/libLLVM*.so*",
+    "/usr/lib/llvm-*/lib/libLLVM*.so*",
+    "/usr/lib64/libLLVM*.so*",
+    "/usr/lib64/llvm*/lib*/libLLVM*.so*",
+    "/usr/lib/libLLVM*.so*",
+    "/usr/local/lib/libLLVM*.so*",
+    "/opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
+    "/usr/local/opt/llvm*/lib/libLLVM*.dylib",
+)
+
+_selected: str | None = None
+
+
+class BackendError(RuntimeError):
+    """No backend can run here; the message says in one sentence what to install."""
+
+
+@cache
+def find_llvm() -> tuple[Path | None, str]:
+    """(library, sentence): the newest libLLVM of version 19 or later, or None and what was found instead."""
+    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if named:
+        version = _library_version(Path(named))
+        if version is None:
+            return None, f"DRJIT_LIBLLVM_PATH names {named}, which cannot be loaded as libLLVM {MINIMUM_LLVM} or newer"
+        if version < MINIMUM_LLVM:
+            return None, f"DRJIT_LIBLLVM_PATH names libLLVM {version}, expected {MINIMUM_LLVM} or newer"
+        return Path(named), f"libLLVM {version} at {named}"
+    candidates: dict[Path, int] = {}
+    for pattern in _LIBRARY_PLACES:
+        for path in Path("/").glob(pattern.lstrip("/")):
+            match = re.search(r"libLLVM(?:-|\.so\.|\.)?(\d+)", path.name)
+            if match and path.exists():
+                candidates.setdefault(path.resolve(), int(match.group(1)))
+    for path, version in sorted(candidates.items(), key=lambda item: (-item[1], str(item[0]))):
+        if version >= MINIMUM_LLVM and (_library_version(path) or 0) >= MINIMUM_LLVM:
+            return path, f"libLLVM {version} at {path}"
+    found = sorted(set(candidates.values()))
+    other = f"only version {', '.join(map(str, found))}" if found else "none"
+    return None, f"libLLVM {MINIMUM_LLVM} or newer is needed, found {other}; type: {INSTALL_LLVM}"
+
+
+def _library_version(path: Path) -> int | None:
+    """Major version that a libLLVM reports of itself; None where it does not load or is older than 16."""
+    try:
+        get_version = ctypes.CDLL(str(path)).LLVMGetVersion
+    except (OSError, AttributeError):
+        return None
+    numbers = (ctypes.c_uint * 3)()
+    get_version(*(ctypes.byref(numbers, 4 * i) for i in range(3)))
+    return int(numbers[0])
+
+
+def available() -> dict[str, str | None]:
+    """{backend: None where it can run, else one sentence that says why not and what to type}."""
+    library, sentence = find_llvm()
+    if library is not None and "drjit" not in sys.modules:
+        os.environ["DRJIT_LIBLLVM_PATH"] = str(library)
+    import drjit as dr
+
+    reasons: dict[str, str | None] = {"cuda": None, "llvm": None}
+    if not dr.has_backend(dr.JitBackend.CUDA):
+        reasons["cuda"] = "no CUDA device answers; an NVIDIA GPU with driver 535 or newer is needed"
+    if library is None:
+        reasons["llvm"] = sentence
+    elif not dr.has_backend(dr.JitBackend.LLVM):
+        reasons["llvm"] = f"Dr.Jit cannot load {sentence}; import spacesim before drjit"
+    return reasons
+
+
+def select(name: str = "auto") -> str:
+    """Choose the backend: "cuda", "llvm" or "auto" (CUDA if it can run, else LLVM). Returns "cuda" or "llvm".
+
+    Chosen once in a process. Raises ValueError for another name, or for another backend than the one chosen before,
+    and BackendError where it cannot run.
+    """
+    global _selected
+    if name not in NAMES:
+        raise ValueError(f"backend: expected one of {', '.join(NAMES)}, found {name!r}")
+    if _selected is not None:
+        if name not in ("auto", _selected):
+            raise ValueError(f"backend: {_selected} has been chosen in this process, {name} cannot follow")
+        return _selected
+    reasons = available()
+    wanted = ["cuda", "llvm"] if name == "auto" else [name]
+    usable = [backend for backend in wanted if reasons[backend] is None]
+    if not usable:
+        raise BackendError("; ".join(f"{backend}: {reasons[backend]}" for backend in wanted))
+    _selected = usable[0]
+    return _selected
+
+
+def mitsuba() -> ModuleType:
+    """The mitsuba module with `cuda_ad_rgb` or `llvm_ad_rgb` set, unless the caller has set one of them before.
+
+    Raises BackendError where another variant is set, which our records cannot be computed with.
+    """
+    name = select()
+    import mitsuba as mi
+
+    variant = mi.variant()
+    if variant is None:
+        mi.set_variant(f"{name}_ad_rgb")
+    elif variant != f"{name}_ad_rgb":
+        raise BackendError(f"mitsuba's variant is {variant}, expected {name}_ad_rgb or none set")
+    return mi
+
+
+class _Arrays:
+    """Dr.Jit's differentiable array types of the chosen backend, looked up at first use."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        value = getattr(importlib.import_module(f"drjit.{select()}.ad"), name)
+        setattr(self, name, value)
+        return value
+
+
+ad: Any = _Arrays()

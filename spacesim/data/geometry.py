@@ -1,0 +1,100 @@
+"""Rotations, camera axes and directions, in float64 numpy.
+
+World axes are right-handed with z up. Camera axes, when nothing else is said, are OpenCV's: x right, y down,
+z forward along the optical axis. Quaternions are (w, x, y, z). See docs/conventions.md.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+OPENCV_FROM_OPENGL: Array = np.diag([1.0, -1.0, -1.0, 1.0])
+"""[4, 4] OpenGL camera axes (x right, y up, z backward) to OpenCV's; its own inverse."""
+
+OPENCV_FROM_MITSUBA: Array = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""[4, 4] Mitsuba camera axes (x left, y up, z forward) to OpenCV's; its own inverse."""
+
+
+def normalize(vectors: ArrayLike) -> Array:
+    """Unit vectors of `vectors` [..., 3]; a zero vector raises ValueError."""
+    vectors = np.asarray(vectors, dtype=np.float64)
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    if not np.all(lengths > 0):
+        raise ValueError("vectors: expected non-zero vectors, found one of length 0 or NaN")
+    return vectors / lengths
+
+
+def direction_from_angles(azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> Array:
+    """Unit vector(s) [..., 3] at an azimuth from +x towards +y and an elevation from the xy plane (thesis 4.1)."""
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    return np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
+    )
+
+
+def angles_from_direction(direction: ArrayLike) -> tuple[float, float]:
+    """Azimuth in [0, 360) and elevation in [-90, 90], degrees, of `direction` [3] (inverse of thesis 4.1)."""
+    x, y, z = normalize(direction)
+    azimuth = float(np.degrees(np.arctan2(y, x)) % 360.0)
+    return (0.0 if azimuth >= 360.0 else azimuth), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
+
+
+def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """world_from_camera [4, 4] (OpenCV axes) of a camera at `origin` [3] that looks at `target` [3], metres.
+
+    Where the optical axis is within 0.1 degrees of `up`, +y takes the place of `up`.
+    """
+    origin = np.asarray(origin, dtype=np.float64)
+    forward = normalize(np.asarray(target, dtype=np.float64) - origin)
+    up = normalize(up)
+    if np.linalg.norm(np.cross(forward, up)) < np.sin(np.radians(0.1)):
+        up = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    right = normalize(np.cross(forward, up))
+    world_from_camera = np.eye(4)
+    world_from_camera[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    world_from_camera[:3, 3] = origin
+    return world_from_camera
+
+
+def rotation_from_quaternion(quaternions: ArrayLike) -> Array:
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (w, x, y, z), normalised first."""
+    q = np.asarray(quaternions, dtype=np.float64)
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_rotation(rotation: ArrayLike) -> Array:
+    """Quaternion [4] (w, x, y, z), w >= 0, of a rotation matrix [3, 3] (largest eigenvector of Bar-Itzhack's K)."""
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
+    K = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, d + b, g + c],
+            [c - g, d + b, e - a - i, h + f],
+            [d - b, g + c, h + f, i - a - e],
+        ]
+    )
+    quaternion = np.linalg.eigh(K)[1][:, -1]
+    return quaternion if quaternion[0] >= 0 else -quaternion
+
+
+def fibonacci_sphere(count: int, seed: int | None = None) -> Array:
+    """`count` nearly even unit directions [count, 3] on the spherical Fibonacci lattice.
+
+    With a `seed` the whole lattice is turned by a random rotation, so that two sets do not coincide.
+    """
+    k = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * k / max(count, 1)
+    angle = np.pi * (1.0 + 5.0**0.5) * k
+    radius = np.sqrt(1.0 - z * z)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
+    if seed is None:
+        return points
+    rotation = rotation_from_quaternion(np.random.default_rng(seed).normal(size=4))
+    return points @ rotation.T

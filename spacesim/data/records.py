@@ -1,0 +1,156 @@
+"""What a dataset is made of: frozen records with units in their fields' docs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import OPENCV_FROM_OPENGL, Array, angles_from_direction, direction_from_angles, normalize
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera. The centre of pixel (column i, row j) is at (i + 0.5, j + 0.5).
+
+    world_from_camera: [4, 4] float64, rigid, OpenCV axes (x right, y down, z forward), metres
+    width, height: pixels;  fx, fy: focal lengths, pixels;  cx, cy: principal point, pixels
+    """
+
+    world_from_camera: Array
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        pose = np.asarray(self.world_from_camera, dtype=np.float64)
+        if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
+            raise InputError(f"world_from_camera: expected a finite [4, 4] matrix, found shape {pose.shape}")
+        rotation = pose[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+            raise InputError("world_from_camera: expected a rotation in its upper left [3, 3], found none")
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"camera: expected a size of at least 1x1 pixels, found {self.width}x{self.height}")
+        if not (self.fx > 0 and self.fy > 0 and np.all(np.isfinite([self.fx, self.fy, self.cx, self.cy]))):
+            raise InputError(f"camera: expected positive finite focal lengths, found {self.fx} and {self.fy}")
+        object.__setattr__(self, "world_from_camera", pose)
+
+    @property
+    def position(self) -> Array:
+        """[3] camera centre in the world, metres."""
+        return self.world_from_camera[:3, 3]
+
+    @property
+    def camera_from_world(self) -> Array:
+        """[4, 4] inverse of `world_from_camera`."""
+        inverse = np.eye(4)
+        inverse[:3, :3] = self.world_from_camera[:3, :3].T
+        inverse[:3, 3] = -inverse[:3, :3] @ self.position
+        return inverse
+
+    @property
+    def opengl(self) -> Array:
+        """[4, 4] camera-to-world with OpenGL axes, as Nerfstudio stores it."""
+        return self.world_from_camera @ OPENCV_FROM_OPENGL
+
+    @staticmethod
+    def from_fov(world_from_camera: Array, width: int, height: int, fov_x_deg: float) -> "Camera":
+        """A camera with square pixels, a centred principal point and a horizontal field of view in degrees."""
+        focal = 0.5 * width / np.tan(0.5 * np.radians(fov_x_deg))
+        return Camera(world_from_camera, width, height, focal, focal, 0.5 * width, 0.5 * height)
+
+
+@dataclass(frozen=True, eq=False)
+class Sun:
+    """The Sun as a direction. direction: [3] unit vector, world frame, from the scene towards the Sun."""
+
+    direction: Array
+
+    def __post_init__(self) -> None:
+        direction = np.asarray(self.direction, dtype=np.float64)
+        if direction.shape != (3,) or not np.all(np.isfinite(direction)) or not np.any(direction):
+            raise InputError(f"sun direction: expected 3 finite numbers, not all 0, found {self.direction}")
+        object.__setattr__(self, "direction", normalize(direction))
+
+    @staticmethod
+    def from_angles(azimuth_deg: float, elevation_deg: float) -> "Sun":
+        """Azimuth from +x towards +y, elevation from the xy plane, degrees (thesis 4.1)."""
+        return Sun(direction_from_angles(azimuth_deg, elevation_deg))
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """(azimuth in [0, 360), elevation in [-90, 90]), degrees."""
+        return angles_from_direction(self.direction)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What the path tracer knows of a frame. All [H, W] or [H, W, 3] float32 unless said otherwise.
+
+    Label fields come from the ray through the pixel's centre; they are 0 where it meets no surface.
+    """
+
+    radiance: np.ndarray  #: [H, W, 3] linear, W m^-2 sr^-1 a channel, pixel-filtered, background 0
+    alpha: np.ndarray  #: [H, W] coverage in [0, 1], pixel-filtered
+    depth: np.ndarray  #: [H, W] along the optical axis, metres
+    distance: np.ndarray  #: [H, W] along the ray, metres
+    normal: np.ndarray  #: [H, W, 3] unit, world frame, towards the viewer's side
+    albedo: np.ndarray  #: [H, W, 3] diffuse or specular reflectance, linear
+    object_id: np.ndarray  #: [H, W] uint8, 1 for the first object, 0 none
+    part_id: np.ndarray  #: [H, W] uint8, 1 for the first part of the scene, 0 none
+    sun_visibility: np.ndarray  #: [H, W] fraction of the solar disc seen, 0 where the surface faces away
+    sun_cosine: np.ndarray  #: [H, W] n . s
+    shadow: np.ndarray  #: [H, W] uint8 class: see `spacesim.data.store.SHADOW_*`
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One view. Paths are relative to the dataset's root; truth that is not there is None."""
+
+    file_path: str  #: the image
+    camera: Camera
+    sun: Sun | None = None
+    gt_path: str | None = None
+    shadow_path: str | None = None
+    silhouette_path: str | None = None
+    id_path: str | None = None
+    depth_file_path: str | None = None
+    mask_path: str | None = None  #: 0 = ignore this pixel
+    distortion: tuple[float, ...] = ()  #: Brown-Conrady k1, k2, p1, p2, k3 of the stored image; () for none
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A folder of frames: `root` and what transforms.json says."""
+
+    root: Path
+    train: tuple[Frame, ...]
+    test: tuple[Frame, ...]
+    ply_file_path: str | None = None  #: points to start from
+    mesh_path: str | None = None  #: the ground-truth mesh, world frame, metres
+    scene: Mapping[str, Any] = field(default_factory=dict)  #: scene.json, {} for data from elsewhere
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """All frames, training ones first."""
+        return self.train + self.test
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """An image as trained on and compared with. rgb: [H, W, 3] float32 sRGB values in [0, 1], straight alpha;
+    alpha: [H, W] float32; valid: [H, W] bool, False where `mask_path` says to ignore the pixel."""
+
+    rgb: np.ndarray
+    alpha: np.ndarray
+    valid: np.ndarray
+
+    def over(self, background: np.ndarray) -> np.ndarray:
+        """[H, W, 3] this image over a background colour [3] or image [H, W, 3] (on sRGB values, as the thesis)."""
+        a = self.alpha[..., None]
+        return self.rgb * a + np.asarray(background, np.float32) * (1 - a)
