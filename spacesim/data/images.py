@@ -1,0 +1,258 @@
+"""Images in and out: PNG (sRGB, labels), EXR (linear truth), and what a frame shows to training and judging.
+
+EXR layout: one multi-part file a frame, each part one layer, ZIP-compressed scan lines of float32. Layers of
+three channels are R, G, B (radiance, albedo) or X, Y, Z (normal); single ones A (alpha), Z (depth) or Y (all
+else), so that viewers show each part as a picture. Labels are stored as whole numbers in float32. Nothing in the
+bytes depends on when or where they were written.
+"""
+
+import io
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image as PillowImage
+from scipy.ndimage import map_coordinates
+
+from spacesim.data.errors import InputError
+from spacesim.data.files import write_bytes
+from spacesim.data.records import Camera, Dataset, Frame, Image
+
+Float = NDArray[np.floating]
+
+_CHANNELS = {"alpha": "A", "depth": "Z", "normal": "XYZ"}  # other layers: Y, or RGB
+_GREY_16 = ("I", "I;16", "I;16B", "I;16L", "I;16N")
+_PILLOW_ERRORS = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    struct.error,
+    PillowImage.DecompressionBombError,
+)
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
+_EXR_MULTIPART = 0x1000
+
+
+def srgb_from_linear(linear: ArrayLike) -> Float:
+    """sRGB values of linear ones, clipped to [0, 1] first (IEC 61966-2-1). Any shape; float32 stays so."""
+    x = np.clip(_as_float(linear), 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055).astype(x.dtype)
+
+
+def linear_from_srgb(srgb: ArrayLike) -> Float:
+    """Linear values of sRGB ones, clipped to [0, 1] first (IEC 61966-2-1). Any shape; float32 stays so."""
+    x = np.clip(_as_float(srgb), 0, 1)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(x.dtype)
+
+
+def luminance(rgb: ArrayLike) -> Float:
+    """[...] luminance of the values `rgb` [..., 3] as they are, by the weights of Rec. 709."""
+    rgb = _as_float(rgb)
+    return rgb @ np.array([0.2126, 0.7152, 0.0722], rgb.dtype)
+
+
+def read_png(path: Path) -> np.ndarray:
+    """Pixels of an image file: [H, W], [H, W, 3] or [H, W, 4] uint8, or [H, W] uint16 for 16-bit grey.
+
+    Takes what Pillow reads (JPEG, TIFF, ... too). Palettes and grey with alpha become RGB or RGBA. Raises
+    InputError where the file is missing, broken or no image.
+    """
+    try:
+        with PillowImage.open(path) as picture:
+            if picture.mode in _GREY_16:
+                return np.clip(np.asarray(picture), 0, 65535).astype(np.uint16)
+            has_alpha = "A" in picture.getbands() or "transparency" in picture.info
+            is_grey = picture.mode in ("1", "L")
+            return np.array(picture.convert("RGBA" if has_alpha else "L" if is_grey else "RGB"))
+    except _PILLOW_ERRORS as error:
+        raise InputError(_describe_failure(path, error)) from None
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) of an image file, from its header alone. Raises InputError as `read_png` does."""
+    try:
+        with PillowImage.open(path) as picture:
+            return picture.size
+    except _PILLOW_ERRORS as error:
+        raise InputError(_describe_failure(path, error)) from None
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Write [H, W], [H, W, 3] or [H, W, 4] uint8, or [H, W] uint16, as PNG: whole or not at all."""
+    is_grey = pixels.ndim == 2 and pixels.dtype in (np.uint8, np.uint16)
+    is_colour = pixels.ndim == 3 and pixels.shape[2] in (3, 4) and pixels.dtype == np.uint8
+    if pixels.size == 0 or not (is_grey or is_colour):
+        raise ValueError(
+            "pixels: expected [H, W], [H, W, 3] or [H, W, 4] uint8 or [H, W] uint16, "
+            f"found {list(pixels.shape)} {pixels.dtype}"
+        )
+    stream = io.BytesIO()
+    PillowImage.fromarray(np.ascontiguousarray(pixels)).save(stream, format="PNG")
+    write_bytes(path, stream.getvalue())
+
+
+def write_exr(path: Path, layers: Mapping[str, np.ndarray]) -> None:
+    """Write layers {name: [H, W] or [H, W, 3]} as parts of one EXR file (see above): whole or not at all."""
+    parts = []
+    for name, layer in layers.items():
+        pixels = np.asarray(layer, np.float32)
+        names = _CHANNELS.get(name, "RGB" if pixels.ndim == 3 else "Y")
+        if pixels.size == 0 or pixels.ndim < 2 or pixels.shape[2:] != ((3,) if len(names) == 3 else ()):
+            raise ValueError(f"layers: expected [H, W] or [H, W, 3] for {name!r}, found {list(pixels.shape)}")
+        planes = pixels.reshape(*pixels.shape[:2], len(names))
+        channels = {channel: np.ascontiguousarray(planes[..., k]) for k, channel in enumerate(names)}
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        parts.append(OpenEXR.Part(header, channels, name))
+    stream = io.BytesIO()
+    OpenEXR.File(parts).write(stream)
+    write_bytes(path, stream.getvalue())
+
+
+def read_exr(path: Path) -> dict[str, np.ndarray]:
+    """Layers {name: [H, W] or [H, W, 3] float32} of an EXR file; a lone unnamed part is "".
+
+    Raises InputError where the file is missing, cut off, damaged or no EXR.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(_describe_failure(path, error)) from None
+    expected = _count_exr_parts(content)  # OpenEXR itself only warns, and leaves out what it cannot read
+    if expected is None:
+        raise InputError(f"{path}: expected an EXR file, found one that is cut off or damaged")
+    try:
+        parts = OpenEXR.File(io.BytesIO(content), separate_channels=True).parts
+        layers = {part.name(): _layer_of(part) for part in parts}
+    except Exception as error:  # OpenEXR documents none of what it raises
+        raise InputError(f"{path}: expected an EXR file, found a damaged one ({error})") from None
+    if len(layers) != expected:
+        raise InputError(f"{path}: expected {expected} readable parts in the EXR file, found {len(layers)}")
+    return layers
+
+
+def load_image(dataset: Dataset, frame: Frame) -> Image:
+    """The image of `frame` as trained on and compared with, undistorted where the frame says so.
+
+    Straight alpha comes from the file, else from the frame's silhouette, else it is 1. Raises InputError where a
+    file is missing, broken or of another size than the camera.
+    """
+    pixels = _read_sized(dataset.root / frame.file_path, frame.camera)
+    values = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    alpha = np.ones(values.shape[:2], np.float32)
+    if values.shape[2] == 4:
+        alpha = np.ascontiguousarray(values[..., 3])
+    elif frame.silhouette_path is not None:
+        alpha = (_read_grey(dataset.root / frame.silhouette_path, frame.camera) > 0).astype(np.float32)
+    valid = np.ones(alpha.shape, bool)
+    if frame.mask_path is not None:
+        valid = _read_grey(dataset.root / frame.mask_path, frame.camera) > 0
+    rgb = np.ascontiguousarray(np.broadcast_to(values[..., :3], (*alpha.shape, 3)))
+    image = Image(rgb, alpha, valid)
+    return undistort(image, frame.camera, frame.distortion) if any(frame.distortion) else image
+
+
+def undistort(image: Image, camera: Camera, distortion: tuple[float, ...]) -> Image:
+    """`image` as the pinhole `camera` sees it, resampled bilinearly; what comes from outside is not valid.
+
+    distortion: k1, k2, p1, p2, k3 of the Brown-Conrady model (D. C. Brown, "Close-range camera calibration",
+    1971, in OpenCV's order). Colours are weighted by alpha, so that none bleeds in from where alpha is 0.
+    """
+    rows, columns, inside = _distorted_pixels(camera, distortion)
+
+    def sample(plane: np.ndarray) -> np.ndarray:
+        return map_coordinates(plane, [rows, columns], output=np.float32, order=1, mode="nearest")
+
+    alpha = sample(image.alpha)
+    weighted = np.stack([sample(image.rgb[..., k] * image.alpha) for k in range(3)], axis=-1)
+    rgb = np.clip(weighted / np.where(alpha > 0, alpha, 1)[..., None], 0, 1)
+    valid = inside & (sample(image.valid.astype(np.float32)) > 0.999)  # no ignored pixel takes part
+    return Image(np.where(inside[..., None], rgb, 0), np.where(inside, alpha, 0), valid)
+
+
+def _distorted_pixels(camera: Camera, distortion: tuple[float, ...]) -> tuple[Float, Float, np.ndarray]:
+    """(rows, columns, inside), each [H, W]: where in the stored image a pixel of the pinhole image is."""
+    k1, k2, p1, p2, k3 = distortion
+    x = (np.arange(camera.width) + 0.5 - camera.cx)[None, :] / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy)[:, None] / camera.fy
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    columns = (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) * camera.fx + camera.cx - 0.5
+    rows = (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) * camera.fy + camera.cy - 0.5
+    inside = (columns >= -0.5) & (columns <= camera.width - 0.5)
+    inside &= (rows >= -0.5) & (rows <= camera.height - 0.5)
+    inside &= 1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) > 0  # past this the model folds back on itself
+    return rows, columns, inside
+
+
+def _read_sized(path: Path, camera: Camera) -> np.ndarray:
+    pixels = read_png(path)
+    expected, found = f"{camera.width}x{camera.height}", f"{pixels.shape[1]}x{pixels.shape[0]}"
+    if found != expected:
+        raise InputError(f"{path}: expected {expected} pixels as the camera says, found {found}")
+    return pixels
+
+
+def _read_grey(path: Path, camera: Camera) -> np.ndarray:
+    pixels = _read_sized(path, camera)
+    return pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=-1)
+
+
+def _as_float(values: ArrayLike) -> Float:
+    array = np.asarray(values)
+    return array if np.issubdtype(array.dtype, np.floating) else array.astype(np.float64)
+
+
+def _describe_failure(path: Path, error: BaseException) -> str:
+    if isinstance(error, FileNotFoundError):
+        return f"{path}: expected a file, found none"
+    return f"{path}: expected a readable image, found a file that is broken or cut off ({error})"
+
+
+def _layer_of(part: OpenEXR.Part) -> np.ndarray:
+    planes = {name: channel.pixels for name, channel in part.channels.items()}
+    for names in ("RGB", "XYZ"):
+        if set(planes) == set(names):
+            return np.stack([planes[name] for name in names], axis=-1)
+    if len(planes) != 1:
+        raise ValueError(f"part {part.name()!r} has channels {', '.join(sorted(planes)) or 'none'}")
+    return next(iter(planes.values()))
+
+
+def _count_exr_parts(content: bytes) -> int | None:
+    """Number of parts of an EXR file, None where a chunk of a multi-part one is not wholly within `content`.
+
+    After the OpenEXR file layout: magic, version, headers of (name, type, size, value), a table of chunk offsets
+    a part, then chunks that begin with part number, line number and their own size.
+    """
+    try:
+        if content[:4] != _EXR_MAGIC:
+            return None
+        if not struct.unpack_from("<I", content, 4)[0] & _EXR_MULTIPART:
+            return 1
+        position, chunks = 8, []
+        while content[position]:
+            count, position = _walk_exr_header(content, position)
+            chunks.append(count)
+        for offset in np.frombuffer(content, "<u8", sum(chunks), position + 1).tolist():
+            size = struct.unpack_from("<i", content, offset + 8)[0]
+            if size < 0 or offset + 12 + size > len(content):
+                return None
+        return len(chunks)
+    except (struct.error, IndexError, ValueError, KeyError, OverflowError):
+        return None
+
+
+def _walk_exr_header(content: bytes, position: int) -> tuple[int, int]:
+    """(number of chunks that the header at `position` tells, position after it)."""
+    attributes = {}
+    while content[position]:
+        name, kind, _ = content[position : position + 1024].split(b"\0", 2)
+        position += len(name) + len(kind) + 2
+        size = struct.unpack_from("<I", content, position)[0]
+        attributes[name] = content[position + 4 : position + 4 + size]
+        position += 4 + size
+    return struct.unpack("<i", attributes[b"chunkCount"])[0], position + 1
