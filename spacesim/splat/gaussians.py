@@ -1,0 +1,81 @@
+"""The model: N anisotropic 3D Gaussians (thesis 2.7) as named tensors, and their activations.
+
+Stored parameters are unconstrained: log scales, logit opacities, quaternions of any length. Arrays are kept
+component by component ([3, N] in memory), the layout in which a Dr.Jit kernel reads them without gathers.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim.backend import ad
+
+SH_C0 = 0.28209479177387814  #: Y_00, the constant spherical harmonic
+NAMES = ("means", "log_scales", "quaternions", "logit_opacities", "sh")
+
+
+class Gaussians:
+    """The one mutable owner of the parameters. Assign to a field to change it.
+
+    means: Array3f [3, N] metres, world or model frame
+    log_scales: Array3f [3, N] natural logarithm of the standard deviations in metres
+    quaternions: Array4f [4, N] (w, x, y, z), world from principal axes; need not be of unit length
+    logit_opacities: Float [N]
+    sh: ArrayXf [3 K, N] spherical-harmonic coefficients, row 3 k + channel; K = 1, 4, 9 or 16
+    """
+
+    def __init__(self, means: Any, log_scales: Any, quaternions: Any, logit_opacities: Any, sh: Any) -> None:
+        self.means = means
+        self.log_scales = log_scales
+        self.quaternions = quaternions
+        self.logit_opacities = logit_opacities
+        self.sh = sh
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return int(dr.width(self.logit_opacities))
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree L of the coefficients, K = (L + 1)^2."""
+        return round((len(self.sh) // 3) ** 0.5) - 1
+
+    def parameters(self) -> dict[str, Any]:
+        """{name: array} of all parameters, in a fixed order."""
+        return {name: getattr(self, name) for name in NAMES}
+
+    def to_numpy(self) -> dict[str, np.ndarray]:
+        """{name: float32 array with N first}: means [N, 3], log_scales [N, 3], quaternions [N, 4],
+        logit_opacities [N], sh [N, K, 3]."""
+        arrays = {name: np.array(value, dtype=np.float32).T for name, value in self.parameters().items()}
+        arrays["sh"] = arrays["sh"].reshape(self.count, -1, 3)
+        return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+
+    @staticmethod
+    def from_numpy(arrays: Mapping[str, np.ndarray]) -> "Gaussians":
+        """The inverse of `to_numpy`. Raises ValueError naming the array whose shape does not fit."""
+        count = len(arrays["means"])
+        expected = {"means": (count, 3), "log_scales": (count, 3), "quaternions": (count, 4)}
+        expected["logit_opacities"] = (count,)
+        for name, shape in expected.items():
+            if np.shape(arrays[name]) != shape:
+                raise ValueError(f"{name}: expected shape {shape}, found {np.shape(arrays[name])}")
+        sh = np.asarray(arrays["sh"], dtype=np.float32)
+        if sh.ndim != 3 or sh.shape[0] != count or sh.shape[1] not in (1, 4, 9, 16) or sh.shape[2] != 3:
+            raise ValueError(f"sh: expected shape ({count}, 1 | 4 | 9 | 16, 3), found {sh.shape}")
+        rows = {name: np.asarray(arrays[name], dtype=np.float32).T for name in expected}
+        return Gaussians(
+            means=ad.Array3f(rows["means"]),
+            log_scales=ad.Array3f(rows["log_scales"]),
+            quaternions=ad.Array4f(rows["quaternions"]),
+            logit_opacities=ad.Float(np.ascontiguousarray(rows["logit_opacities"])),
+            sh=ad.ArrayXf(np.ascontiguousarray(sh.reshape(count, sh.shape[1] * 3).T)),
+        )
+
+
+def opacities(logit_opacities: Any) -> Any:
+    """o = sigmoid(logit) [N], in (0, 1)."""
+    return dr.rcp(1 + dr.exp(-logit_opacities))

@@ -1,0 +1,217 @@
+"""The Dr.Jit rasterizer against its float64 twin: pictures, gradients, symmetries, hostile input."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from spacesim.backend import ad
+from spacesim.data.geometry import look_at, quaternion_from_rotation, rotation_from_quaternion
+from spacesim.data.records import Camera
+from spacesim.splat.gaussians import NAMES, Gaussians
+from spacesim.splat.project import Pinhole
+from spacesim.splat.reference import real_spherical_harmonics, render_reference
+from spacesim.splat.render import render
+
+SIZE = (40, 28)
+
+
+def camera(width: int = SIZE[0], height: int = SIZE[1]) -> Camera:
+    pose = look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0])
+    return Camera(pose, width, height, 1.3 * width, 1.2 * width, 0.52 * width, 0.47 * height)
+
+
+def random_splats(count: int, seed: int = 0, degree: int = 3) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {
+        "means": rng.uniform(-0.6, 0.6, (count, 3)),
+        "log_scales": rng.uniform(-3.2, -1.4, (count, 3)),
+        "quaternions": rng.normal(size=(count, 4)),
+        "logit_opacities": rng.uniform(-2.5, 2.0, count),
+        "sh": rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.25,
+    }
+
+
+def placed_splats() -> dict[str, np.ndarray]:
+    """Four wide, half-transparent splats whose colours stay off the clamp: no discontinuity in a pixel's reach."""
+    rng = np.random.default_rng(7)
+    sh = rng.normal(size=(4, 16, 3)) * 0.04
+    sh[:, 0] = rng.uniform(0.2, 0.8, (4, 3))
+    return {
+        "means": np.array([[0.3, 0.05, 0.0], [0.0, -0.2, 0.1], [-0.3, 0.15, -0.1], [-0.6, 0.0, 0.05]]),
+        "log_scales": np.log([[0.9, 0.7, 0.8], [0.8, 1.0, 0.7], [1.1, 0.8, 0.9], [1.0, 1.2, 0.8]]),
+        "quaternions": rng.normal(size=(4, 4)),
+        "logit_opacities": np.array([-0.4, 0.2, -0.8, 0.5]),
+        "sh": sh,
+    }
+
+
+def picture(arrays: dict[str, np.ndarray], view: Camera) -> dict[str, np.ndarray]:
+    output = render(Gaussians.from_numpy(arrays), Pinhole.of(view))
+    shape = (view.height, view.width)
+    return {
+        "colour": np.array(output.colour).T.reshape(*shape, 3),
+        "alpha": np.array(output.alpha).reshape(shape),
+        "depth": np.array(output.depth).reshape(shape),
+    }
+
+
+def loss_weights(view: Camera) -> list[np.ndarray]:
+    rng = np.random.default_rng(3)
+    return [rng.normal(size=view.width * view.height) for _ in range(5)]
+
+
+def gradients(arrays: dict[str, np.ndarray], view: Camera) -> dict[str, np.ndarray]:
+    """Of sum(weights * (r, g, b, alpha, depth * alpha)), with N first."""
+    gaussians = Gaussians.from_numpy(arrays)
+    for parameter in gaussians.parameters().values():
+        dr.enable_grad(parameter)
+    output = render(gaussians, Pinhole.of(view))
+    planes = [*output.colour, output.alpha, output.depth * output.alpha]
+    loss = ad.Float(0)
+    for weight, plane in zip(loss_weights(view), planes, strict=True):
+        loss += dr.sum(ad.Float(weight.astype(np.float32)) * plane)
+    dr.backward(loss)
+    result = {name: np.array(dr.grad(value)).T for name, value in gaussians.parameters().items()}
+    result["sh"] = result["sh"].reshape(len(arrays["means"]), -1, 3)
+    return result
+
+
+def reference_loss(arrays: dict[str, np.ndarray], view: Camera) -> float:
+    output = render_reference(arrays, view)
+    planes = [*np.moveaxis(output.colour, -1, 0), output.alpha, output.depth * output.alpha]
+    return float(sum((w * p.ravel()).sum() for w, p in zip(loss_weights(view), planes, strict=True)))
+
+
+def central_differences(arrays: dict[str, np.ndarray], view: Camera, step: float = 1e-5) -> dict[str, np.ndarray]:
+    result = {}
+    for name in NAMES:
+        values = np.array(arrays[name], dtype=np.float64)
+        slope = np.empty_like(values)
+        for index in np.ndindex(values.shape):
+            ends = []
+            for sign in (1, -1):
+                moved = values.copy()
+                moved[index] += sign * step
+                ends.append(reference_loss({**arrays, name: moved}, view))
+            slope[index] = (ends[0] - ends[1]) / (2 * step)
+        result[name] = slope
+    return result
+
+
+@pytest.mark.parametrize(("count", "size"), [(1, SIZE), (4, (16, 8)), (60, SIZE), (300, (33, 47))])
+def test_picture_matches_the_twin(count, size):
+    arrays, view = random_splats(count, seed=count), camera(*size)
+    ours, twin = picture(arrays, view), render_reference(arrays, view)
+    assert twin.alpha.max() > 0.1
+    np.testing.assert_allclose(ours["colour"], twin.colour, atol=1e-5)
+    np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=1e-5)
+    solid = twin.alpha > 0.01  # below, depth divides by next to nothing
+    np.testing.assert_allclose(ours["depth"][solid], twin.depth[solid], atol=1e-5)
+
+
+def test_gradients_match_central_differences_on_placed_splats():
+    arrays, view = placed_splats(), camera(24, 17)
+    ours, twin = gradients(arrays, view), central_differences(arrays, view)
+    for name in NAMES:
+        scale = np.abs(twin[name]).max()
+        assert scale > 0
+        np.testing.assert_allclose(ours[name], twin[name], rtol=1e-3, atol=1e-4 * scale, err_msg=name)
+
+
+def test_gradients_match_central_differences_on_a_random_scene():
+    arrays, view = random_splats(25, seed=11, degree=1), camera(24, 17)
+    ours, twin = gradients(arrays, view), central_differences(arrays, view, step=1e-7)
+    for name in NAMES:
+        error = np.linalg.norm(ours[name] - twin[name]) / np.linalg.norm(twin[name])
+        assert error < 1e-3, (name, error)
+
+
+def test_permuting_splats_changes_nothing():
+    arrays, view = random_splats(200, seed=5), camera()
+    order = np.random.default_rng(1).permutation(200)
+    shuffled = {name: value[order] for name, value in arrays.items()}
+    first, second = picture(arrays, view), picture(shuffled, view)
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name])
+    before, after = gradients(arrays, view), gradients(shuffled, view)
+    for name in NAMES:
+        np.testing.assert_array_equal(before[name][order], after[name])
+
+
+def test_rigid_motion_of_scene_and_camera_changes_nothing():
+    arrays, view = random_splats(150, seed=8, degree=0), camera()
+    motion = np.eye(4)
+    motion[:3, :3] = rotation_from_quaternion([0.3, -0.5, 0.7, 0.4])
+    motion[:3, 3] = [0.4, -0.9, 0.2]
+    turn = quaternion_from_rotation(motion[:3, :3])
+    moved = dict(arrays)
+    moved["means"] = arrays["means"] @ motion[:3, :3].T + motion[:3, 3]
+    moved["quaternions"] = np.array([_product(turn, q) for q in arrays["quaternions"]])
+    moved_view = Camera(motion @ view.world_from_camera, view.width, view.height, view.fx, view.fy, view.cx, view.cy)
+    first, second = picture(arrays, view), picture(moved, moved_view)
+    for name in ("colour", "alpha"):
+        np.testing.assert_allclose(first[name], second[name], atol=2e-5)
+
+
+def _product(p, q):
+    w, v = p[0] * q[0] - p[1:] @ q[1:], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
+    return np.array([w, *v])
+
+
+def test_same_input_same_bits():
+    arrays, view = random_splats(5000, seed=2), camera(200, 150)
+    first, second = gradients(arrays, view), gradients(arrays, view)
+    for name in NAMES:
+        np.testing.assert_array_equal(first[name], second[name])
+
+
+def test_no_splats_at_all():
+    view = camera()
+    empty = {name: value[:0] for name, value in random_splats(3).items()}
+    output = picture(empty, view)
+    assert not output["colour"].any()
+    assert not output["alpha"].any()
+
+
+def test_all_behind_the_camera():
+    arrays, view = random_splats(20), camera()
+    arrays["means"] = arrays["means"] + 10 * (view.position / np.linalg.norm(view.position))
+    assert not picture(arrays, view)["alpha"].any()
+    for gradient in gradients(arrays, view).values():
+        assert not gradient.any()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, 1e38, -1e38, 1e-38, 1e9, -80.0, 60.0])
+@pytest.mark.parametrize("name", NAMES)
+def test_hostile_values_stay_finite_and_alone(name, value):
+    arrays, view = random_splats(30, seed=4), camera()
+    hostile = {key: array.copy() for key, array in arrays.items()}
+    hostile[name][7] = value
+    output, slope = picture(hostile, view), gradients(hostile, view)
+    for plane in output.values():
+        assert np.isfinite(plane).all()
+    for gradient in slope.values():
+        assert np.isfinite(gradient).all()
+    if not np.isfinite(value) and name != "sh":  # such a splat is not drawn, and the others are as without it
+        others = picture({key: np.delete(array, 7, axis=0) for key, array in arrays.items()}, view)
+        np.testing.assert_array_equal(output["colour"], others["colour"])
+
+
+def test_extremes_of_size_and_number():
+    giant = random_splats(3)
+    giant["log_scales"][:] = 3.0
+    assert picture(giant, camera(130, 90))["alpha"].min() > 0.1
+    crowd = random_splats(10_000, seed=6, degree=0)
+    crowd["means"][:] *= 1e-6
+    crowd["log_scales"][:] = -9.0
+    crowd["logit_opacities"][:] = -5.0
+    view = camera(16, 16)
+    ours, twin = picture(crowd, view), render_reference(crowd, view, 0)
+    np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=2e-5)
+
+
+def test_the_twin_knows_its_spherical_harmonics():
+    directions = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    basis = real_spherical_harmonics(directions, 1)
+    c0, c1 = 0.28209479177387814, 0.4886025119029199
+    np.testing.assert_allclose(basis, [[c0, 0, c1, 0], [c0, 0, 0, -c1], [c0, -c1, 0, 0]], atol=1e-12)
