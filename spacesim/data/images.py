@@ -2,8 +2,8 @@
 
 EXR layout: one multi-part file a frame, each part one layer, ZIP-compressed scan lines of float32. Layers of
 three channels are R, G, B (radiance, albedo) or X, Y, Z (normal); single ones A (alpha), Z (depth) or Y (all
-else), so that viewers show each part as a picture. Labels are stored as whole numbers in float32. Nothing in the
-bytes depends on when or where they were written.
+else), so that viewers show each part as a picture. Labels are stored as whole numbers in float32. Nothing in
+the bytes depends on when or where they were written.
 """
 
 import io
@@ -137,8 +137,8 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
 def load_image(dataset: Dataset, frame: Frame) -> Image:
     """The image of `frame` as trained on and compared with, undistorted where the frame says so.
 
-    Straight alpha comes from the file, else from the frame's silhouette, else it is 1. Raises InputError where a
-    file is missing, broken or of another size than the camera.
+    Straight alpha comes from the file, else from the frame's silhouette, else it is 1. Raises InputError where
+    a file is missing, broken or of another size than the camera.
     """
     pixels = _read_sized(dataset.root / frame.file_path, frame.camera)
     values = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
@@ -225,8 +225,8 @@ def _layer_of(part: OpenEXR.Part) -> np.ndarray:
 def _count_exr_parts(content: bytes) -> int | None:
     """Number of parts of an EXR file, None where a chunk of a multi-part one is not wholly within `content`.
 
-    After the OpenEXR file layout: magic, version, headers of (name, type, size, value), a table of chunk offsets
-    a part, then chunks that begin with part number, line number and their own size.
+    After the OpenEXR file layout: magic, version, headers of (name, type, size, value), a table of chunk
+    offsets a part, then chunks that begin with part number, line number and their own size.
     """
     try:
         if content[:4] != _EXR_MAGIC:

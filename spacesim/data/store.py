@@ -1,0 +1,288 @@
+"""The dataset on disk that we write: Nerfstudio's transforms.json and, beside it, the path tracer's truth.
+
+Reading any such folder is `spacesim.data.transforms`; this module re-exports `read_dataset`.
+
+    transforms.json  images/  gt/  shadow/  silhouette/  id/  depth/  points.ply  mesh.ply  scene.json
+"""
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
+
+from spacesim.data.errors import InputError, WorkError
+from spacesim.data.files import read_json, write_bytes, write_json
+from spacesim.data.images import load_image, read_exr, read_png, srgb_from_linear, write_exr, write_png
+from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
+from spacesim.data.transforms import read_dataset
+
+__all__ = [
+    "SHADOW_ATTACHED",
+    "SHADOW_LIT",
+    "SHADOW_NONE",
+    "SHADOW_SELF_CAST",
+    "DatasetWriter",
+    "load_truth",
+    "read_dataset",
+    "read_points",
+    "verify_dataset",
+    "write_points",
+]
+
+SHADOW_NONE = 0  #: no surface
+SHADOW_ATTACHED = 85  #: the surface faces away from the Sun
+SHADOW_SELF_CAST = (
+    170  #: cast by the same object; 170 + k: cast by object k, 1 to 84, where that is another one
+)
+SHADOW_LIT = 255  #: at least half of the solar disc is seen
+
+_FILES = {
+    "images": ".png",
+    "shadow": ".png",
+    "silhouette": ".png",
+    "id": ".png",
+    "depth": ".png",
+    "gt": ".exr",  # written last
+}
+_LABELS = ("object_id", "part_id", "shadow")
+_DEPTH_UNIT = 1e-3  # metres a step of depth/*.png: Nerfstudio's default depth_unit_scale_factor
+
+_log = logging.getLogger(__name__)
+
+
+def load_truth(dataset: Dataset, frame: Frame) -> Truth:
+    """What the path tracer knows of `frame`. Raises InputError where that is missing or broken."""
+    if frame.gt_path is None:
+        raise InputError(f"{dataset.root}: expected ground truth of {frame.file_path}, found no gt_path")
+    path = dataset.root / frame.gt_path
+    layers = read_exr(path)
+    names = [field.name for field in fields(Truth)]
+    missing = [name for name in names if name not in layers]
+    if missing:
+        raise InputError(f"{path}: expected the layers {', '.join(names)}, found no {', '.join(missing)}")
+    sizes = {layers[name].shape[:2] for name in names}
+    if sizes != {(frame.camera.height, frame.camera.width)}:
+        expected = f"{frame.camera.width}x{frame.camera.height}"
+        found = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
+        raise InputError(f"{path}: expected {expected} pixels as the camera says, found {found}")
+    return Truth(**{name: layers[name].astype(np.uint8 if name in _LABELS else np.float32) for name in names})
+
+
+class DatasetWriter:
+    """Writes a dataset folder; an interrupted run leaves whole files only, which a later run completes.
+
+    root: the folder, made here; scene: what to render, as JSON values, written to scene.json first;
+    resume: go on with a folder that holds the same scene. Raises InputError where it holds anything else.
+    """
+
+    def __init__(self, root: Path, scene: Mapping[str, Any], resume: bool = False) -> None:
+        self.root = Path(root)
+        self._warned = False
+        scene = json.loads(json.dumps(scene, allow_nan=False))  # as it reads back
+        if self.root.exists() and not self.root.is_dir():
+            raise InputError(f"{self.root}: expected a folder to write to, found a file")
+        present = sorted(p.name for p in self.root.glob("*") if not p.name.endswith(".part"))
+        if "scene.json" in present:
+            self._check_resumable(scene, resume)
+        elif present:
+            raise InputError(f"{self.root}: expected a new or empty folder, found {present[0]} in it")
+        else:
+            write_json(self.root / "scene.json", scene)
+        for leftover in self.root.glob("**/.*.part"):
+            leftover.unlink(missing_ok=True)
+
+    def has(self, name: str) -> bool:
+        """All files of frame `name` are whole on disk, e.g. from an interrupted run."""
+        paths = [self.root / folder / f"{name}{suffix}" for folder, suffix in _FILES.items()]
+        return all(path.is_file() and path.stat().st_size > 0 for path in paths)
+
+    def write_frame(self, name: str, truth: Truth, exposure: float) -> None:
+        """Write the files of frame `name`, e.g. "train_00012".
+
+        images/NAME.png holds the sRGB encoding of `exposure` (per W m^-2 sr^-1) times radiance over alpha.
+        """
+        surface = truth.object_id > 0
+        labels = {
+            "images": encode_image(truth.radiance, truth.alpha, exposure),
+            "shadow": truth.shadow,
+            "silhouette": np.where(surface, 255, 0).astype(np.uint8),
+            "id": truth.object_id.astype(np.uint8),
+            "depth": self._encode_depth(truth.depth, surface),
+        }
+        for folder, pixels in labels.items():
+            write_png(self.root / folder / f"{name}.png", pixels)
+        write_exr(self.root / "gt" / f"{name}.exr", {f.name: getattr(truth, f.name) for f in fields(Truth)})
+
+    def finish(
+        self,
+        train: Sequence[tuple[str, Camera, Sun]],
+        test: Sequence[tuple[str, Camera, Sun]],
+        points: np.ndarray,
+        colors: np.ndarray,
+        mesh: trimesh.Trimesh,
+    ) -> Dataset:
+        """Write points.ply, mesh.ply and, last, transforms.json; returns the dataset as it reads back.
+
+        train, test: (frame name, camera, sun) of each frame; points: [N, 3] metres; colors: [N, 3] uint8.
+        """
+        missing = [name for name, _, _ in (*train, *test) if not self.has(name)]
+        if missing:
+            raise WorkError(f"{self.root}: expected all frames to be written, {missing[0]} is not")
+        write_points(self.root / "points.ply", points, colors)
+        write_bytes(self.root / "mesh.ply", mesh.export(file_type="ply", vertex_normal=False))
+        write_json(self.root / "transforms.json", _describe_frames(train, test))
+        return read_dataset(self.root)
+
+    def _check_resumable(self, scene: Mapping[str, Any], resume: bool) -> None:
+        if not resume:
+            raise InputError(
+                f"{self.root}: expected a new or empty folder, found a dataset; go on with --resume"
+            )
+        path = self.root / "scene.json"
+        found = read_json(path)
+        found = found if isinstance(found, dict) else {}
+        for key in [*scene, *found]:
+            if key not in found or key not in scene or found[key] != scene[key]:
+                raise InputError(
+                    f"{path}: expected the scene asked for, {key!r} differs; choose another folder"
+                )
+
+    def _encode_depth(self, depth: np.ndarray, surface: np.ndarray) -> np.ndarray:
+        steps = np.round(np.where(surface, depth, 0).astype(np.float64) / _DEPTH_UNIT)
+        beyond = ~(steps <= np.iinfo(np.uint16).max)
+        if beyond.any() and not self._warned:
+            _log.warning("depth/*.png: surfaces beyond 65.535 m are stored as 0; gt/*.exr has their depth")
+            self._warned = True
+        return np.where(beyond, 0, steps).astype(np.uint16)
+
+
+def encode_image(radiance: np.ndarray, alpha: np.ndarray, exposure: float) -> np.ndarray:
+    """[H, W, 4] uint8 sRGB, straight alpha, of linear radiance [H, W, 3] that is weighted by alpha [H, W]."""
+    straight = radiance / np.where(alpha > 0, alpha, 1)[..., None]
+    values = np.concatenate([srgb_from_linear(exposure * straight), np.clip(alpha, 0, 1)[..., None]], axis=-1)
+    return np.round(255 * values).astype(np.uint8)
+
+
+def write_points(path: Path, points: ArrayLike, colors: ArrayLike) -> None:
+    """Write points [N, 3] and colors [N, 3] uint8 as binary PLY with x y z red green blue alone."""
+    points, colors = np.asarray(points, "<f4"), np.asarray(colors, np.uint8)
+    if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
+        raise ValueError(f"points, colors: expected [N, 3] each, found {points.shape} and {colors.shape}")
+    vertices = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    vertices["xyz"], vertices["rgb"] = points, colors
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property float {name}" for name in ("x", "y", "z")]
+    header += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    write_bytes(path, "\n".join([*header, "end_header", ""]).encode() + vertices.tobytes())
+
+
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(points [N, 3] float64, colors [N, 3] uint8) of an ascii or binary PLY file; grey 128 without colours.
+
+    Raises InputError where the file is missing, cut off, no PLY, or holds positions that are not finite.
+    """
+    try:
+        with open(path, "rb") as file:
+            cloud = trimesh.load(file, file_type="ply", process=False)
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a PLY file, found none") from None
+    except Exception as error:  # trimesh documents none of what it raises
+        raise InputError(
+            f"{path}: expected a PLY file, found one that is broken or cut off ({error})"
+        ) from None
+    points = np.asarray(getattr(cloud, "vertices", np.empty((0, 3))), np.float64)
+    if len(points) == 0 or not np.isfinite(points).all():
+        raise InputError(f"{path}: expected points with finite positions, found none or others")
+    colors = np.full((len(points), 3), 128, np.uint8)
+    if cloud.visual.kind == "vertex":
+        colors = np.array(cloud.visual.vertex_colors)[:, :3].astype(np.uint8)
+    return points, colors
+
+
+def verify_dataset(path: Path) -> list[str]:
+    """Sentences about what is wrong with a dataset folder, [] where every file is there and fits."""
+    try:
+        dataset = read_dataset(path)
+    except InputError as error:
+        return [str(error)]
+    problems: list[str] = []
+
+    def check(load: Any, *arguments: Any) -> None:
+        try:
+            load(*arguments)
+        except InputError as error:
+            if str(error) not in problems:
+                problems.append(str(error))
+
+    for frame in dataset.frames:
+        check(load_image, dataset, frame)
+        if frame.gt_path is not None:
+            check(load_truth, dataset, frame)
+        for key in ("shadow_path", "silhouette_path", "id_path", "depth_file_path"):
+            if getattr(frame, key) is not None:
+                check(_read_label, dataset.root / getattr(frame, key), frame.camera)
+    for ply in (dataset.ply_file_path, dataset.mesh_path):
+        if ply is not None:
+            check(read_points, dataset.root / ply)
+    return problems
+
+
+def _read_label(path: Path, camera: Camera) -> None:
+    found = read_png(path).shape[:2]
+    if found != (camera.height, camera.width):
+        expected = f"{camera.width}x{camera.height}"
+        raise InputError(
+            f"{path}: expected {expected} pixels as the camera says, found {found[1]}x{found[0]}"
+        )
+
+
+def _describe_frames(
+    train: Sequence[tuple[str, Camera, Sun]], test: Sequence[tuple[str, Camera, Sun]]
+) -> dict[str, Any]:
+    """transforms.json: intrinsics stand at the top where all frames share them."""
+    intrinsics = [_describe_intrinsics(camera) for _, camera, _ in (*train, *test)]
+    shared = all(entry == intrinsics[0] for entry in intrinsics)
+    frames = []
+    for (name, camera, sun), own in zip((*train, *test), intrinsics, strict=True):
+        azimuth, elevation = sun.angles
+        frames.append(
+            {
+                "file_path": f"images/{name}.png",
+                "transform_matrix": camera.opengl.tolist(),
+                **({} if shared else own),
+                "sun_direction": sun.direction.tolist(),
+                "sun_azimuth_deg": azimuth,
+                "sun_elevation_deg": elevation,
+                "gt_path": f"gt/{name}.exr",
+                "shadow_path": f"shadow/{name}.png",
+                "silhouette_path": f"silhouette/{name}.png",
+                "id_path": f"id/{name}.png",
+                "depth_file_path": f"depth/{name}.png",
+            }
+        )
+    return {
+        "camera_model": "OPENCV",
+        **(intrinsics[0] if shared and intrinsics else {}),
+        "ply_file_path": "points.ply",
+        "mesh_path": "mesh.ply",
+        "train_filenames": [f"images/{name}.png" for name, _, _ in train],
+        "test_filenames": [f"images/{name}.png" for name, _, _ in test],
+        "frames": frames,
+    }
+
+
+def _describe_intrinsics(camera: Camera) -> dict[str, float]:
+    return {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+    }

@@ -1,0 +1,227 @@
+"""Reads a dataset by the rules of Nerfstudio's transforms.json (docs.nerf.studio, "Data conventions").
+
+Blender's pair transforms_train.json and transforms_test.json is taken too. Poses are used as written
+(`applied_transform` is already in them), and so are their units. Which frames are held out for testing:
+
+1. those of `test_filenames`, else of `val_filenames`, where transforms.json has such lists;
+2. else those in a folder named test, else val, where there is a folder named train beside it;
+3. else every 8th frame, beginning with the first, in the order of their file paths.
+"""
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from spacesim.data.errors import InputError
+from spacesim.data.files import read_json
+from spacesim.data.geometry import OPENCV_FROM_OPENGL
+from spacesim.data.images import image_size
+from spacesim.data.records import Camera, Dataset, Frame, Sun
+
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+TRUTH_PATHS = ("gt_path", "shadow_path", "silhouette_path", "id_path", "depth_file_path", "mask_path")
+_HOLD_OUT = 8
+_SPLITS = ("train", "val", "test")
+_BLENDER_TESTS = ("transforms_test.json", "transforms_val.json")
+
+Json = Mapping[str, Any]
+
+
+def read_dataset(path: Path) -> Dataset:
+    """The dataset in a folder, or of the transforms.json named.
+
+    Raises InputError, naming the file, where it is no such dataset: nothing there, an unfinished `generate`,
+    malformed JSON, no frames, a missing image, a pose or a camera that cannot be, or a camera model with no
+    pinhole equivalent. Files of truth are only looked for when they are loaded.
+    """
+    path = Path(path)
+    root = path if path.is_dir() else path.parent
+    own = root / "transforms.json" if path.is_dir() else path
+    if own.is_file() and own.name != "transforms_train.json":
+        meta = _read_object(own)
+        train, test = _split(own, meta, _read_frames(own, meta))
+    elif (root / "transforms_train.json").is_file():
+        meta, train, test = _read_blender(root)
+    else:
+        raise InputError(_say_what_is_missing(path, root))
+    if not train:
+        raise InputError(f"{own}: expected frames to train on, found none")
+    scene = _read_object(root / "scene.json") if (root / "scene.json").is_file() else {}
+    return Dataset(root, train, test, _path(own, meta, "ply_file_path"), _path(own, meta, "mesh_path"), scene)
+
+
+def _say_what_is_missing(path: Path, root: Path) -> str:
+    if not path.exists():
+        return f"{path}: expected a dataset folder or a transforms.json, found nothing"
+    if (root / "scene.json").is_file():
+        return f"{path}: expected transforms.json, found an unfinished dataset; run generate with --resume"
+    return f"{path}: expected a dataset folder with a transforms.json, found none in it"
+
+
+def _read_blender(root: Path) -> tuple[Json, tuple[Frame, ...], tuple[Frame, ...]]:
+    """(content of transforms_train.json, train, test) of a folder laid out as Blender's scenes are."""
+    source = root / "transforms_train.json"
+    meta = _read_object(source)
+    held_out = next(
+        (p for p in (root / "transforms_test.json", root / "transforms_val.json") if p.is_file()), None
+    )
+    test = _read_frames(held_out, _read_object(held_out)) if held_out else ()
+    return meta, _read_frames(source, meta), test
+
+
+def _read_object(path: Path) -> Json:
+    value = read_json(path)
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: expected a JSON object, found {type(value).__name__}")
+    return value
+
+
+def _read_frames(source: Path, meta: Json) -> tuple[Frame, ...]:
+    """All frames in the order of their file paths."""
+    entries = meta.get("frames")
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(
+            f"{source}: expected a list of frames, found {'none' if not entries else 'another value'}"
+        )
+    frames = sorted(
+        (_read_frame(source, meta, entry) for entry in entries), key=lambda frame: frame.file_path
+    )
+    for one, other in pairwise(frames):
+        if one.file_path == other.file_path:
+            raise InputError(f"{source}: expected each image once, found {one.file_path} twice")
+    return tuple(frames)
+
+
+def _read_frame(source: Path, meta: Json, entry: Json) -> Frame:
+    file_path = _path(source, entry, "file_path")
+    if file_path is None:
+        raise InputError(f"{source}: expected file_path in every frame, found a frame without")
+    if not (source.parent / file_path).is_file() and (source.parent / f"{file_path}.png").is_file():
+        file_path += ".png"  # Blender's files leave the suffix out
+    image = source.parent / file_path
+    values = {**meta, **entry}
+    try:
+        if not image.is_file():
+            raise InputError("expected an image file, found none")
+        camera, distortion, sun = _read_camera(values, image), _read_distortion(values), _read_sun(values)
+    except InputError as error:
+        raise InputError(f"{source}: frame {file_path}: {error}") from None
+    paths = {key: _path(source, entry, key) for key in TRUTH_PATHS}
+    return Frame(file_path, camera, sun, **paths, distortion=distortion)
+
+
+def _read_camera(values: Json, image: Path) -> Camera:
+    model = values.get("camera_model", "OPENCV")
+    if model not in _PERSPECTIVE:
+        raise InputError(f"expected a camera_model among {', '.join(_PERSPECTIVE)}, found {model}")
+    if "w" in values and "h" in values:
+        width, height = round(_number(values, "w")), round(_number(values, "h"))
+    else:
+        width, height = image_size(image)
+    fx = _focal_length(values, "fl_x", "camera_angle_x", width)
+    fy = _focal_length(values, "fl_y", "camera_angle_y", height) or fx
+    if fx is None or fy is None:
+        raise InputError("expected fl_x or camera_angle_x, found neither")
+    cx, cy = _number(values, "cx", 0.5 * width), _number(values, "cy", 0.5 * height)
+    return Camera(_read_pose(values) @ OPENCV_FROM_OPENGL, width, height, fx, fy, cx, cy)
+
+
+def _focal_length(values: Json, key: str, angle_key: str, size: int) -> float | None:
+    """In pixels, of a focal length or an angle of view (radians) across `size` pixels; None of neither."""
+    if key in values:
+        return _number(values, key)
+    if angle_key in values:
+        return 0.5 * size / math.tan(0.5 * _number(values, angle_key))
+    return None
+
+
+def _read_pose(values: Json) -> np.ndarray:
+    """[4, 4] camera to world, OpenGL axes."""
+    try:
+        pose = np.asarray(values.get("transform_matrix"), np.float64)
+    except (TypeError, ValueError):
+        pose = np.empty(0)
+    if pose.shape == (3, 4):
+        pose = np.vstack([pose, [0, 0, 0, 1]])
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise InputError("expected a transform_matrix of 4x4 finite numbers, found another value")
+    return pose
+
+
+def _read_distortion(values: Json) -> tuple[float, ...]:
+    """Brown-Conrady k1, k2, p1, p2, k3, or () where all are 0."""
+    coefficients = tuple(_number(values, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
+    if _number(values, "k4", 0.0) != 0:
+        raise InputError("expected distortion k1, k2, k3, p1, p2, found k4 as well")
+    return coefficients if any(coefficients) else ()
+
+
+def _read_sun(values: Json) -> Sun | None:
+    if "sun_direction" in values:
+        try:
+            return Sun(np.asarray(values["sun_direction"], np.float64))
+        except (TypeError, ValueError):
+            raise InputError(
+                f"expected 3 finite numbers as sun_direction, found {values['sun_direction']!r}"
+            ) from None
+    if "sun_azimuth_deg" in values and "sun_elevation_deg" in values:
+        return Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
+    return None
+
+
+def _split(
+    source: Path, meta: Json, frames: tuple[Frame, ...]
+) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+    """(train, test) of `frames` by the rules above."""
+    known = [frame.file_path for frame in frames]
+    listed = {
+        key: _listed(source, meta[f"{key}_filenames"], known) for key in _SPLITS if f"{key}_filenames" in meta
+    }
+    folders = {key: {path for path in known if key in PurePosixPath(path).parts[:-1]} for key in _SPLITS}
+    if listed:
+        test = listed.get("test", listed.get("val"))
+        train = listed.get("train", set(known) - (test or set()))
+        test = set(known) - train if test is None else test
+    elif folders["train"] and (folders["test"] or folders["val"]):
+        train, test = folders["train"], folders["test"] or folders["val"]
+    else:
+        test = set(known[::_HOLD_OUT]) if len(known) > 1 else set()
+        train = set(known) - test
+    if train & test:
+        both = min(train & test)
+        raise InputError(f"{source}: expected frames for training and testing apart, found {both} in both")
+    return tuple(f for f in frames if f.file_path in train), tuple(f for f in frames if f.file_path in test)
+
+
+def _listed(source: Path, names: Any, known: list[str]) -> set[str]:
+    """The file paths of a list such as `train_filenames`, each of which must be one of a frame."""
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{source}: expected lists of file paths as train_filenames and the like")
+    listed = {f"{PurePosixPath(name)}" for name in names}
+    listed = {name if name in known else f"{name}.png" for name in listed}
+    unknown = sorted(listed.difference(known))
+    if unknown:
+        raise InputError(
+            f"{source}: expected a frame for each name in its lists, found none for {unknown[0]}"
+        )
+    return listed
+
+
+def _number(values: Json, key: str, default: float | None = None) -> float:
+    value = values.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise InputError(f"expected a finite number as {key}, found {value!r}")
+    return float(value)
+
+
+def _path(source: Path, values: Json, key: str) -> str | None:
+    value = values.get(key)
+    if value is None:
+        return None
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{source}: expected a file path as {key}, found {value!r}")
+    return str(PurePosixPath(value))
