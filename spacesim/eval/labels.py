@@ -1,0 +1,100 @@
+"""What the metrics are called, which way is better, and what each means: for notes, tables and the report."""
+
+from dataclasses import dataclass
+
+from spacesim.eval.lpips import MINIMUM_SIZE
+from spacesim.eval.shadow import BAND, THRESHOLD
+
+HIGHER, LOWER = "↑", "↓"
+
+
+@dataclass(frozen=True)
+class Metric:
+    """key: name in metrics.json;  goal: "↑", "↓" or "→ x", the value to come close to;  digits: decimals
+    meaning: a sentence;  null: why it can be missing in a frame that shows the object
+    """
+
+    key: str
+    label: str
+    unit: str
+    goal: str
+    digits: int
+    meaning: str
+    null: str = "no pixel is there to measure"
+
+    def distance(self, value: float) -> float:
+        """How far `value` is from the goal; the smaller, the better."""
+        if self.goal in (HIGHER, LOWER):
+            return value if self.goal == LOWER else -value
+        return abs(value - float(self.goal.removeprefix("→")))
+
+
+IMAGE = (
+    Metric(
+        "psnr", "PSNR", "dB", HIGHER, 2,
+        "Peak signal-to-noise ratio (2.18), peak 1.",
+        "prediction and truth are equal, so it is infinite",
+    ),
+    Metric(
+        "ssim", "SSIM", "", HIGHER, 4,
+        "Structural similarity (2.19), 11 × 11 Gaussian window, the mean of its map.",
+        "the frame is smaller than its window",
+    ),
+    Metric(
+        "lpips", "LPIPS", "", LOWER, 4,
+        "Learned perceptual distance (2.20), AlexNet, version 0.1.",
+        f"a side of the picture is below the network's {MINIMUM_SIZE} pixels",
+    ),
+    Metric("mae", "MAE", "", LOWER, 4, "Mean absolute error of the sRGB values in [0, 1] (2.21)."),
+    Metric("rmse", "RMSE", "", LOWER, 4, "Root mean squared error of the sRGB values in [0, 1] (2.22)."),
+    Metric("flip", "FLIP", "", LOWER, 4, "Mean perceived difference (LDR FLIP at 67 pixels per degree)."),
+)  # fmt: skip
+
+SHADOW = (
+    Metric(
+        "ber", "BER", "", LOWER, 4,
+        f"Share of pixels put on the wrong side of luminance {THRESHOLD} (2.23).",
+    ),
+    Metric(
+        "bias", "Shadow bias", "", "→ 0", 4,
+        "Mean luminance error over true shadow (2.24); above 0: shadows too bright.",
+        "no pixel of the truth is shadowed",
+    ),
+    Metric(
+        "boundary_mae", "Boundary MAE", "", LOWER, 4,
+        f"Mean absolute luminance error within {BAND} pixels of the true shadow's boundary (2.25).",
+        "the truth has no shadow boundary",
+    ),
+    Metric(
+        "sharpness_ratio", "Sharpness ratio", "", "→ 1", 3,
+        "Mean luminance gradient there, prediction by truth (2.26); below 1: too soft.",
+        "the truth has no shadow boundary",
+    ),
+)  # fmt: skip
+
+SHADOW_MASK = (
+    Metric("error_rate", "Error rate", "", LOWER, 4, "Share of lit and cast-shadow pixels put wrong."),
+    Metric(
+        "balanced_error_rate", "Balanced error rate", "", LOWER, 4,
+        "Mean of the error rates of truly shadowed and truly lit pixels.",
+        "the truth lacks lit or cast-shadow pixels",
+    ),
+    Metric(
+        "iou", "IoU", "", HIGHER, 4,
+        "Intersection over union of predicted and true cast shadow.",
+        "neither prediction nor truth has a cast shadow",
+    ),
+    Metric(
+        "visibility_mae", "Visibility MAE", "", LOWER, 4,
+        "Mean absolute error of the visible fraction of the solar disc.",
+    ),
+)  # fmt: skip
+
+GROUPS = {
+    "image": ("over the silhouette", IMAGE),
+    "image_full": ("over whole frames", IMAGE),
+    "shadow": ("over the silhouette", SHADOW),
+    "shadow_full": ("over whole frames", SHADOW),
+    "shadow_mask": ("over lit and cast-shadow pixels", SHADOW_MASK),
+}
+"""metrics.json's groups: where each is taken and what is in it."""

@@ -1,0 +1,84 @@
+"""Pictures of a judged frame for people to look at: the error in colours, shadow masks with mistakes."""
+
+from functools import cache
+
+import numpy as np
+
+from spacesim.data.images import srgb_from_linear
+from spacesim.eval.image import Mask
+
+ERROR_SCALE = 0.25
+"""Mean absolute error of the channels at the bright end of the colour map; more is drawn as that."""
+
+LIT, SHADOWED = (222, 222, 216), (58, 64, 82)
+WRONGLY_SHADOWED, WRONGLY_LIT = (213, 94, 0), (86, 180, 233)
+"""sRGB colours of shadow masks; the mistakes' are Okabe and Ito's, which colour-blind readers tell apart."""
+
+
+def as_bytes(picture: np.ndarray) -> np.ndarray:
+    """uint8 of values in [0, 1], rounded."""
+    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+
+
+def error_picture(prediction: np.ndarray, truth: np.ndarray, valid: Mask) -> np.ndarray:
+    """[H, W, 3] uint8 colours of the mean absolute error, 0 to `ERROR_SCALE`; black where not valid."""
+    error = np.abs(prediction - truth).mean(axis=-1) * valid
+    return error_colours(error / ERROR_SCALE)
+
+
+def error_colours(values: np.ndarray) -> np.ndarray:
+    """[..., 3] uint8 colours of values in [0, 1]: black, violet, red, yellow, white in even steps."""
+    table = _colour_table()
+    return table[np.rint(np.clip(values, 0, 1) * (len(table) - 1)).astype(np.intp)]
+
+
+def shadow_picture(predicted: Mask, shadowed: Mask, mask: Mask) -> np.ndarray:
+    """[H, W, 3] uint8: the pixels of `mask` as predicted, mistakes in their colours; the rest black."""
+    picture = np.zeros((*mask.shape, 3), np.uint8)
+    picture[mask & ~predicted & ~shadowed] = LIT
+    picture[mask & predicted & shadowed] = SHADOWED
+    picture[mask & predicted & ~shadowed] = WRONGLY_SHADOWED
+    picture[mask & ~predicted & shadowed] = WRONGLY_LIT
+    return picture
+
+
+@cache
+def _colour_table() -> np.ndarray:
+    """[256, 3] uint8: a path of rising lightness through Oklab in even steps."""
+    lightness = [0, 0.2, 0.4, 0.6, 0.78, 0.92, 1]
+    chroma = [0, 0.1, 0.17, 0.19, 0.15, 0.12, 0]
+    hue = np.radians([290, 290, 320, 375, 420, 458, 465])
+    knots = np.linspace(0, 1, len(lightness))
+    fine = np.linspace(0, 1, 2001)
+    C, h = np.interp(fine, knots, chroma), np.interp(fine, knots, hue)
+    path = np.stack([np.interp(fine, knots, lightness), C * np.cos(h), C * np.sin(h)], axis=-1)
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=-1))])
+    even = np.interp(np.linspace(0, length[-1], 256), length, fine)
+    return as_bytes(
+        _srgb_from_oklab(np.stack([np.interp(even, fine, channel) for channel in path.T], axis=-1))
+    )
+
+
+def _srgb_from_oklab(lab: np.ndarray) -> np.ndarray:
+    """sRGB values [..., 3] of Oklab ones (B. Ottosson, 2020)."""
+    cone_roots = (
+        lab
+        @ np.array(
+            [
+                [1, 0.3963377774, 0.2158037573],
+                [1, -0.1055613458, -0.0638541728],
+                [1, -0.0894841775, -1.2914855480],
+            ]
+        ).T
+    )
+    linear = (
+        cone_roots**3
+        @ np.array(
+            [
+                [4.0767416621, -3.3077115913, 0.2309699292],
+                [-1.2684380046, 2.6097574011, -0.3413193965],
+                [-0.0041960863, -0.7034186147, 1.7076147010],
+            ]
+        ).T
+    )
+    return srgb_from_linear(linear)

@@ -1,0 +1,97 @@
+"""A tiny dataset of shaded spheres, written by hand, and runs that predict what a test wants."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from spacesim.data.images import load_image, write_exr, write_png
+from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
+from spacesim.data.store import SHADOW_LIT, SHADOW_SELF_CAST
+
+SIZE = 40
+SUNS = ((30.0, 20.0), (200.0, -10.0))
+
+
+def sphere(sun, size=SIZE):
+    """(rgb [H, W, 3] sRGB values, silhouette [H, W] bool) of a sphere seen along -z, lit by `sun`."""
+    y, x = (np.mgrid[:size, :size] + 0.5) / size * 2.4 - 1.2
+    inside = x * x + y * y < 1
+    normal = np.stack([x, -y, np.sqrt(np.maximum(1 - x * x - y * y, 0))], axis=-1)
+    shade = np.clip(normal @ Sun.from_angles(*sun).direction[[1, 2, 0]], 0, 1)
+    return (shade**0.5 * inside)[..., None] * [0.9, 0.8, 0.6], inside
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Four test frames under two suns, with all truth that judging reads."""
+    root = tmp_path / "data"
+    frames = []
+    for index in range(4):
+        sun = SUNS[index % 2]
+        rgb, inside = sphere(sun)
+        pixels = np.rint(np.dstack([rgb, inside]) * 255).astype(np.uint8)
+        name = f"test_{index:05d}"
+        write_png(root / "images" / f"{name}.png", pixels)
+        write_png(root / "silhouette" / f"{name}.png", inside.astype(np.uint8) * 255)
+        write_exr(root / "gt" / f"{name}.exr", truth_layers(inside))
+        frames.append(
+            Frame(
+                f"images/{name}.png",
+                Camera.from_fov(np.eye(4), SIZE, SIZE, 40),
+                Sun.from_angles(*sun),
+                gt_path=f"gt/{name}.exr",
+                silhouette_path=f"silhouette/{name}.png",
+            )
+        )
+    return Dataset(root, (), tuple(frames), scene={"name": "sphere", "spp": 16, "seed": 1, "parts": ["ball"]})
+
+
+def truth_layers(inside):
+    """The left half of the sphere lies in cast shadow."""
+    visibility = inside * (np.arange(SIZE) >= SIZE // 2).astype(np.float32)
+    shadow = np.where(visibility > 0, SHADOW_LIT, SHADOW_SELF_CAST) * inside
+    planes = {name: inside.astype(np.float32) for name in Truth.__dataclass_fields__}
+    vectors = {name: np.dstack([planes[name]] * 3) for name in ("radiance", "normal", "albedo")}
+    return planes | vectors | {"sun_visibility": visibility, "shadow": shadow.astype(np.float32)}
+
+
+@dataclass
+class FakeRun:
+    """Predicts `change(true rgb)` of each test frame in its order, after one call to warm up."""
+
+    dataset: Dataset
+    change: object = staticmethod(lambda rgb: rgb)
+    visibility: object = None
+    path: Path = Path("runs/fake")
+    gaussians: int = 123
+    bytes: int = 45678
+    backend: str = "llvm"
+    config: dict = field(default_factory=lambda: {"method": "vanilla", "preset": "demo", "seed": 7})
+    training: dict = field(
+        default_factory=lambda: {
+            "history": [
+                {"iteration": i, "loss": 1 / (i + 1), "gaussians": 100 + i} for i in range(0, 300, 100)
+            ],
+            "seconds": 12.5,
+            "backend": "llvm",
+            "versions": {"drjit": "1.5.0"},
+            "command": "spacesim train data --out runs/fake",
+        }
+    )
+    calls: int = 0
+
+    def predict(self, camera, sun):
+        frame = self.dataset.test[max(self.calls - 1, 0) % len(self.dataset.test)]
+        self.calls += 1
+        rgb = load_image(self.dataset, frame).over(np.zeros(3))
+        alpha = np.ones(rgb.shape[:2], np.float32)
+        return SimpleNamespace(rgb=self.change(rgb), alpha=alpha, depth=alpha, visibility=self.visibility)
+
+
+@pytest.fixture
+def make_run(dataset):
+    """make_run(change=..., visibility=..., ...) -> FakeRun on `dataset`."""
+    return lambda *args, **options: FakeRun(dataset, *args, **options)

@@ -1,0 +1,239 @@
+"""A run judged end to end on a tiny dataset."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spacesim.data.errors import InputError, WorkError
+from spacesim.data.images import load_image, luminance, read_png, write_png
+from spacesim.data.records import Camera, Frame
+from spacesim.eval import image, lpips, shadow
+from spacesim.eval.evaluate import EvaluateConfig, evaluate, frame_names, summary
+
+
+@pytest.fixture(autouse=True)
+def no_weights(monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "nowhere"))
+
+
+def shifted(rgb):
+    return np.roll(rgb, 2, axis=1)
+
+
+def test_perfect_prediction(make_run, dataset, tmp_path):
+    metrics = evaluate(make_run(), dataset, tmp_path / "eval")
+    assert metrics == json.loads((tmp_path / "eval" / "metrics.json").read_text())
+    for group in ("image", "image_full"):
+        assert metrics[group]["psnr"] is None
+        assert metrics[group]["mae"] == {"mean": 0, "std": 0, "count": 4}
+        assert metrics[group]["ssim"]["mean"] == pytest.approx(1)
+        assert metrics[group]["flip"]["mean"] == 0
+    assert metrics["shadow"]["ber"]["mean"] == 0
+    assert metrics["shadow"]["sharpness_ratio"]["mean"] == 1
+    assert any("PSNR over the silhouette is null in 4 of 4 frames" in note for note in metrics["notes"])
+    assert not read_png(tmp_path / "eval/frames/test_00000/error.png").any()
+
+
+def test_shifted_prediction_is_worse(make_run, dataset, tmp_path):
+    good = evaluate(make_run(lambda rgb: rgb + 0.01), dataset, tmp_path / "good")
+    bad = evaluate(make_run(shifted), dataset, tmp_path / "bad")
+    for group in ("image", "image_full"):
+        assert bad[group]["psnr"]["mean"] < good[group]["psnr"]["mean"]
+        assert bad[group]["ssim"]["mean"] < good[group]["ssim"]["mean"]
+        for metric in ("mae", "rmse", "flip"):
+            assert bad[group][metric]["mean"] > good[group][metric]["mean"]
+    assert bad["shadow"]["ber"]["mean"] > good["shadow"]["ber"]["mean"]
+
+
+def test_values_are_those_of_the_metrics(make_run, dataset, tmp_path):
+    metrics = evaluate(make_run(shifted), dataset, tmp_path / "eval")
+    decibels = []
+    for frame, judged in zip(dataset.test, metrics["frames"], strict=True):
+        truth = load_image(dataset, frame).over(np.zeros(3))
+        silhouette = read_png(dataset.root / frame.silhouette_path) == 255
+        decibels.append(image.psnr(shifted(truth), truth, silhouette))
+        assert judged["file_path"] == frame.file_path
+        assert judged["sun"] == pytest.approx(frame.sun.angles)
+        assert judged["psnr"] == decibels[-1]
+        assert judged["image_full"]["ssim"] == pytest.approx(image.ssim(shifted(truth), truth))
+        expected = shadow.luminance_metrics(luminance(shifted(truth)), luminance(truth), silhouette)
+        assert {key: judged[key] for key in expected} == expected
+    assert metrics["image"]["psnr"] == {"mean": np.mean(decibels), "std": np.std(decibels), "count": 4}
+
+
+def test_predictions_are_clipped(make_run, dataset, tmp_path):
+    def blinding(rgb):
+        return np.where(rgb > 0.5, 7.0, np.where(rgb < 0.1, -3.0, rgb))
+
+    def shown(rgb):
+        return np.clip(blinding(rgb), 0, 1)
+
+    metrics = [evaluate(make_run(change), dataset, tmp_path / "eval") for change in (blinding, shown)]
+    assert metrics[0]["frames"] == metrics[1]["frames"]
+
+
+def test_layout(make_run, dataset, tmp_path):
+    seen = []
+    metrics = evaluate(
+        make_run(shifted), dataset, tmp_path / "eval", progress=lambda *step: seen.append(step)
+    )
+    assert [step[:2] for step in seen] == [(0, 4), (1, 4), (2, 4), (3, 4), (4, 4)]
+    assert metrics["schema"] == 1
+    assert metrics["split"] == "test"
+    assert metrics["model"]["gaussians"] == 123
+    assert metrics["model"]["bytes"] == 45678
+    assert metrics["model"]["render_ms"] > 0
+    assert metrics["geometry"] is None
+    assert metrics["shadow_mask"] is None
+    assert metrics["image"]["lpips"] is None
+    assert metrics["config"]["seed"] == 7
+    assert metrics["dataset"]["suns"] == 2
+    assert metrics["dataset"]["scene"] == {"name": "sphere", "spp": 16, "seed": 1}
+    for word in ("Geometry", "LPIPS", "Visibility"):
+        assert sum(note.startswith(word) for note in metrics["notes"]) == 1
+    for frame in metrics["frames"]:
+        folder = tmp_path / "eval" / "frames" / frame["name"]
+        names = {"truth", "prediction", "error", "shadow_truth", "shadow_prediction"}
+        assert {path.stem for path in folder.glob("*.png")} == names
+
+
+def test_same_run_same_bytes(make_run, dataset, tmp_path):
+    def written():
+        metrics = evaluate(make_run(shifted), dataset, tmp_path / "eval")
+        metrics["model"]["render_ms"] = 0
+        files = sorted((tmp_path / "eval" / "frames").rglob("*.png"))
+        return json.dumps(metrics), [path.read_bytes() for path in files]
+
+    assert written() == written()
+
+
+def test_lpips_where_there_are_weights(make_run, dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        lpips, "load", lambda path: (lambda a, b: float(np.abs(a - b).max()), "weights are here")
+    )
+    metrics = evaluate(make_run(shifted), dataset, tmp_path / "eval")
+    assert metrics["image_full"]["lpips"]["mean"] >= metrics["image"]["lpips"]["mean"] > 0
+    assert not any("LPIPS" in note for note in metrics["notes"])
+
+
+def test_predicted_visibility(make_run, dataset, tmp_path):
+    columns = np.arange(40)[None] * np.ones((40, 1))
+    exact = evaluate(make_run(visibility=(columns >= 20).astype(float)), dataset, tmp_path / "exact")
+    assert exact["shadow_mask"]["iou"]["mean"] == 1
+    assert exact["shadow_mask"]["error_rate"]["mean"] == 0
+    off = evaluate(make_run(visibility=(columns >= 25).astype(float)), dataset, tmp_path / "off")
+    silhouette = read_png(dataset.root / dataset.test[0].silhouette_path) == 255
+    wrong = silhouette[:, 20:25].sum()
+    assert off["shadow_mask"]["error_rate"]["mean"] == pytest.approx(wrong / silhouette.sum())
+    assert off["shadow_mask"]["visibility_mae"]["mean"] == pytest.approx(wrong / silhouette.sum())
+
+
+def test_nan_names_the_frame(make_run, dataset, tmp_path):
+    def broken(rgb):
+        return np.where(rgb > 0.5, np.nan, rgb)
+
+    with pytest.raises(WorkError, match=r"images/test_00000\.png: the prediction"):
+        evaluate(make_run(broken), dataset, tmp_path / "eval")
+    assert not (tmp_path / "eval" / "metrics.json").exists()
+
+
+def test_no_frames(make_run, dataset, tmp_path):
+    with pytest.raises(InputError, match="expected frames in the split train, found none"):
+        evaluate(make_run(), dataset, tmp_path / "eval", EvaluateConfig(split="train"))
+    with pytest.raises(InputError, match="split"):
+        EvaluateConfig(split="validation")
+
+
+def test_old_numbers_do_not_outlive_new_pictures(make_run, dataset, tmp_path):
+    evaluate(make_run(), dataset, tmp_path / "eval")
+    with pytest.raises(WorkError):
+        evaluate(make_run(lambda rgb: rgb + np.inf), dataset, tmp_path / "eval")
+    assert not (tmp_path / "eval" / "metrics.json").exists()
+
+
+def test_out_is_a_file(make_run, dataset, tmp_path):
+    (tmp_path / "eval").write_text("")
+    with pytest.raises(InputError, match="eval: expected a folder"):
+        evaluate(make_run(), dataset, tmp_path / "eval")
+
+
+def elsewhere(dataset, **changes):
+    return replace(dataset, test=tuple(replace(frame, **changes) for frame in dataset.test))
+
+
+def test_data_without_truth_is_judged_by_alpha(make_run, dataset, tmp_path):
+    poorer = elsewhere(dataset, sun=None, gt_path=None, silhouette_path=None)
+    expected = evaluate(make_run(shifted), dataset, tmp_path / "eval")
+    metrics = evaluate(make_run(shifted), poorer, tmp_path / "eval")
+    assert metrics["image"] == expected["image"]
+    assert metrics["frames"][0]["sun"] is None
+    assert (
+        "In 4 of 4 frames the silhouette is where the image's alpha is at least one half." in metrics["notes"]
+    )
+
+
+def test_data_without_alpha_is_judged_whole(make_run, dataset, tmp_path):
+    for frame in dataset.test:
+        path = dataset.root / frame.file_path
+        write_png(path, np.ascontiguousarray(read_png(path)[..., :3]))
+    metrics = evaluate(make_run(shifted), elsewhere(dataset, silhouette_path=None), tmp_path / "eval")
+    assert metrics["image"]["mae"] == metrics["image_full"]["mae"]
+    assert any("the silhouette is the whole frame" in note for note in metrics["notes"])
+
+
+def test_ignored_pixels_do_not_count(make_run, dataset, tmp_path):
+    mask = np.full((40, 40), 255, np.uint8)
+    mask[:, 15:] = 0
+    write_png(dataset.root / "mask.png", mask)
+
+    def spoiled(rgb):
+        return np.where(mask[..., None] > 0, rgb, 1 - rgb)
+
+    metrics = evaluate(make_run(spoiled), elsewhere(dataset, mask_path="mask.png"), tmp_path / "eval")
+    assert metrics["image"]["mae"]["mean"] == metrics["image_full"]["mae"]["mean"] == 0
+    assert metrics["image_full"]["flip"]["mean"] == 0
+
+
+def test_frame_that_shows_nothing(make_run, dataset, tmp_path):
+    frame = dataset.test[1]
+    for path in (frame.file_path, frame.silhouette_path):
+        write_png(dataset.root / path, np.zeros_like(read_png(dataset.root / path)))
+    metrics = evaluate(make_run(lambda rgb: rgb + 0.1), dataset, tmp_path / "eval")
+    assert metrics["frames"][1]["psnr"] is None
+    assert metrics["frames"][1]["bias"] is None
+    assert metrics["frames"][1]["image_full"]["psnr"] == pytest.approx(20, abs=1e-4)
+    assert metrics["image"]["psnr"]["count"] == 3
+    assert any(note.startswith("1 of 4 frames show no object") for note in metrics["notes"])
+
+
+def test_silhouette_of_another_size(make_run, dataset, tmp_path):
+    write_png(dataset.root / dataset.test[0].silhouette_path, np.zeros((8, 8), np.uint8))
+    with pytest.raises(InputError, match=r"silhouette.*expected"):
+        evaluate(make_run(), dataset, tmp_path / "eval")
+
+
+def test_frame_names_are_unique_and_tame():
+    camera = Camera.from_fov(np.eye(4), 4, 4, 40)
+    paths = [
+        "images/a.png",
+        "images/a.jpg",
+        "../../etc/pass wd.png",
+        "<b>&.png",
+        "left/1.png",
+        "right/1.png",
+        ".png",
+    ]
+    names = frame_names([Frame(path, camera) for path in paths])
+    assert names == ["a", "a_2", "etc_pass_wd", "b_", "left_1", "right_1", "png"]
+    assert all(Path(name).name == name for name in names)
+
+
+def test_summary():
+    assert summary([{"a": 1.0, "b": None}, {"a": 3.0, "b": None}, None]) == {
+        "a": {"mean": 2, "std": 1, "count": 2},
+        "b": None,
+    }
+    assert summary([None, None]) is None
