@@ -1,0 +1,106 @@
+"""Watertight, outward-oriented meshes that spacecraft are built from: boxes, rods, revolved profiles.
+Metres."""
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
+
+from spacesim.data.geometry import Array, normalize
+
+SEGMENTS = 72
+"""Straight segments of a circle where nothing else is said."""
+
+
+def box(size: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    """An axis-aligned box of edge lengths `size` [3]."""
+    mesh = trimesh.creation.box(extents=size)
+    mesh.apply_translation(centre)
+    return mesh
+
+
+def crumpled_box(size: ArrayLike, levels: int, depth: float, seed: int) -> trimesh.Trimesh:
+    """A box about the origin whose faces are 2**levels by 2**levels uneven facets, their corners at random up
+    to `depth` above or below the face: foil that is not quite flat."""
+    mesh = trimesh.creation.box(extents=(1.0, 1.0, 1.0))
+    for _ in range(levels):
+        mesh = mesh.subdivide()
+    along_normal = np.abs(mesh.vertices) == 0.5
+    reach = np.where(along_normal, depth, 0.3 * np.asarray(size) / 2**levels)
+    noise = np.random.default_rng(seed).uniform(-1.0, 1.0, mesh.vertices.shape)
+    return trimesh.Trimesh(mesh.vertices * np.asarray(size) + reach * noise, mesh.faces, process=False)
+
+
+def rod(start: ArrayLike, end: ArrayLike, radius: float, segments: int = 24) -> trimesh.Trimesh:
+    """A solid cylinder from `start` [3] to `end` [3]."""
+    return along(revolved([(0, 0), (radius, 0), (radius, 1), (0, 1)], segments), start, end)
+
+
+def tube(
+    start: ArrayLike, end: ArrayLike, inner: float, outer: float, segments: int = SEGMENTS
+) -> trimesh.Trimesh:
+    """A cylinder from `start` [3] to `end` [3] with a hole through it."""
+    profile = [(inner, 0), (outer, 0), (outer, 1), (inner, 1)]
+    return along(revolved(profile, segments), start, end)
+
+
+def dish(diameter: float, focal_length: float, thickness: float, rings: int = 16) -> trimesh.Trimesh:
+    """A paraboloid shell that opens towards +z, its vertex (inside) at the origin."""
+    radius = np.linspace(0.0, 0.5 * diameter, rings + 1)
+    height = radius**2 / (4.0 * focal_length)
+    inside = np.stack([radius, height], axis=-1)
+    outside = inside - [0.0, thickness]
+    return revolved(np.concatenate([outside, inside[::-1]]))
+
+
+def revolved(profile: ArrayLike, segments: int = SEGMENTS) -> trimesh.Trimesh:
+    """The solid that `profile` [P, 2] of (radius, z) sweeps about the z axis.
+
+    The profile is a polygon, counter-clockwise in the (radius, z) plane, closed by itself; where its first
+    and last points lie on the axis (radius 0) the solid has no hole.
+    """
+    profile = np.asarray(profile, dtype=np.float64)
+    count = len(profile)
+    angle = np.arange(segments) * (2.0 * np.pi / segments)
+    radius, z = profile[:, 0], np.broadcast_to(profile[:, 1], (segments, count))
+    vertices = np.stack([np.outer(np.cos(angle), radius), np.outer(np.sin(angle), radius), z], axis=-1)
+    index = np.arange(segments * count).reshape(segments, count)
+    index = np.where(radius == 0.0, index[:1], index)  # one vertex for all segments on the axis
+    ahead = np.roll(index, -1, axis=0)
+    a, b, c, d = index, np.roll(index, -1, axis=1), np.roll(ahead, -1, axis=1), ahead
+    faces = np.concatenate([np.stack([a, d, b], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
+    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    mesh = trimesh.Trimesh(vertices.reshape(-1, 3), faces[proper], process=False)
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+def along(mesh: trimesh.Trimesh, start: ArrayLike, end: ArrayLike) -> trimesh.Trimesh:
+    """`mesh` with z in [0, 1] stretched and turned so that its axis runs from `start` [3] to `end` [3]."""
+    start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    mesh = mesh.copy()
+    mesh.apply_scale([1.0, 1.0, float(np.linalg.norm(end - start))])
+    return placed(mesh, start, end - start)
+
+
+def placed(mesh: trimesh.Trimesh, origin: ArrayLike, axis: ArrayLike) -> trimesh.Trimesh:
+    """`mesh` with its z axis turned to `axis` [3] and then moved to `origin` [3]."""
+    mesh = mesh.copy()
+    mesh.apply_transform(frame(origin, axis))
+    return mesh
+
+
+def frame(origin: ArrayLike, axis: ArrayLike) -> Array:
+    """A rigid transform [4, 4] that takes the origin to `origin` [3] and +z to the direction of `axis`
+    [3]."""
+    z = normalize(axis)
+    helper = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    y = normalize(np.cross(z, helper))
+    transform = np.eye(4)
+    transform[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
+    transform[:3, 3] = origin
+    return transform
+
+
+def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Several solids as one mesh."""
+    return trimesh.util.concatenate(meshes)
