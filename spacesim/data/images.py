@@ -137,8 +137,8 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
 def load_image(dataset: Dataset, frame: Frame) -> Image:
     """The image of `frame` as trained on and compared with, undistorted where the frame says so.
 
-    Straight alpha comes from the file, else from the silhouette, else it is 1. Raises InputError where a file is
-    missing, broken or of another size than the camera.
+    Straight alpha comes from the file, else from the silhouette, else it is 1. Raises InputError where a file
+    is missing, broken or of another size than the camera.
     """
     pixels = _read_sized(dataset.root / frame.file_path, frame.camera)
     values = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)

@@ -1,0 +1,27 @@
+# make demo: all set-up, then the main job on a small scene.  make test: all set-up, then the tests.
+# PYTHON names the interpreter where the one on the path does not do: make PYTHON=python3.12 test
+
+BIN = .venv/bin
+SOURCES = scripts/setup.sh requirements/lock.txt pyproject.toml
+
+.PHONY: demo test lint setup clean
+
+demo: .venv/base.done
+	$(BIN)/spacesim demo --out out/demo
+
+test: lint
+	$(BIN)/pytest
+
+lint: .venv/test.done
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+setup: .venv/test.done
+
+.venv/base.done .venv/test.done: .venv/%.done: $(SOURCES)
+	@PYTHON="$(PYTHON)" scripts/setup.sh $*
+	@touch .venv/base.done $@
+
+clean:
+	rm -rf .venv out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,110 @@
+#!/bin/sh
+# Makes ./.venv ready: setup.sh base (to run spacesim) or setup.sh test (to test it as well).
+#
+# 1. a Python from 3.10 to 3.13 with venv ($PYTHON, else the first that fits on the path)
+# 2. the versions that requirements/lock.txt pins
+# 3. a backend for Dr.Jit: a CUDA device, else libLLVM 19 or newer (spacesim/backend.py says what it looks for)
+#
+# Debian and Ubuntu keep venv and libLLVM in packages of their own; they are installed with apt-get where missing.
+set -eu
+cd "$(dirname "$0")/.."
+
+WANTED=${1:-base}
+LOCK=requirements/lock.txt
+TORCH_CPU=https://download.pytorch.org/whl/cpu
+LLVM_VERSIONS="22 21 20 19"
+export PIP_NO_INPUT=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+
+say() { printf 'setup: %s\n' "$*"; }
+stop() { printf 'setup: %s\n' "$*" >&2; exit 1; }
+
+fits() { # is command $1 a Python that we run on?
+    "$1" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] < (3, 14))' >/dev/null 2>&1
+}
+
+has_venv() { "$1" -c 'import venv, ensurepip' >/dev/null 2>&1; }
+
+find_python() { # prints a Python that fits, one with venv if there is any
+    fallback=
+    for candidate in ${PYTHON:-python3 python3.13 python3.12 python3.11 python3.10 python}; do
+        fits "$candidate" || continue
+        if has_venv "$candidate"; then
+            echo "$candidate"
+            return
+        fi
+        fallback=${fallback:-$candidate}
+    done
+    echo "$fallback"
+}
+
+apt_install() { # installs package $1 where that takes no questions but sudo's; else fails
+    command -v apt-get >/dev/null || return 1
+    if [ "$(id -u)" = 0 ]; then
+        as_root=env
+    elif command -v sudo >/dev/null; then
+        [ -t 0 ] && as_root="sudo env" || as_root="sudo -n env"
+    else
+        return 1
+    fi
+    apt="$as_root DEBIAN_FRONTEND=noninteractive apt-get -q -y"
+    say "installing the package $1 with apt-get"
+    $apt install "$1" </dev/null >/dev/null 2>&1 || {
+        $apt update </dev/null >/dev/null && $apt install "$1" </dev/null >/dev/null
+    }
+}
+
+make_venv() {
+    if [ -x .venv/bin/python ] && fits .venv/bin/python && .venv/bin/python -c 'import pip' 2>/dev/null; then
+        return
+    fi
+    python=$(find_python)
+    [ -n "$python" ] || stop "Python 3.10 to 3.13 is needed, found $(python3 --version 2>/dev/null || echo none);" \
+        "install one (Debian, Ubuntu: sudo apt-get install python3 python3-venv) or name it: make PYTHON=/path/to/python3"
+    if ! has_venv "$python"; then
+        package="$("$python" -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])')"
+        apt_install "$package" && has_venv "$python" ||
+            stop "$python lacks the venv module; type: sudo apt-get install $package"
+    fi
+    say "creating .venv with $("$python" --version)"
+    rm -rf .venv
+    "$python" -m venv .venv || stop "$python cannot create .venv"
+}
+
+install() { # pip install in the versions of the lock
+    .venv/bin/python -m pip install -q -c "$LOCK" "$@"
+}
+
+backend_ready() { # succeeds, or prints why no backend can run
+    .venv/bin/python - 2>&1 <<'PYTHON'
+from spacesim import backend
+
+library, sentence = backend.find_llvm()
+if library is None and backend.available()["cuda"] is not None:
+    raise SystemExit(sentence)
+PYTHON
+}
+
+make_backend() {
+    reason=$(backend_ready) && return
+    [ -z "${DRJIT_LIBLLVM_PATH:-}" ] || stop "$reason; unset it or name another library"
+    for version in $LLVM_VERSIONS; do
+        apt-cache show "libllvm$version" >/dev/null 2>&1 && break
+    done
+    apt_install "libllvm$version" || true
+    reason=$(backend_ready) && return
+    stop "$reason. Where the archive has no such package: older Debian and Ubuntu: https://apt.llvm.org" \
+        "(sudo ./llvm.sh 19), Fedora: sudo dnf install llvm-libs, macOS: brew install llvm;" \
+        "DRJIT_LIBLLVM_PATH names a library elsewhere"
+}
+
+make_venv
+say "installing the versions of $LOCK (about a minute)"
+install pip setuptools
+install --no-build-isolation -e .
+make_backend
+if [ "$WANTED" = test ]; then
+    install --no-build-isolation -e '.[dev]'
+    install torch 2>/dev/null || install --retries 1 --extra-index-url "$TORCH_CPU" torch 2>/dev/null ||
+        say "torch's CPU build cannot be had here; the tests that need it (LPIPS) are skipped"
+fi
+say "done"
