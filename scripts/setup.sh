@@ -71,7 +71,7 @@ make_venv() {
 }
 
 install() { # pip install in the versions of the lock
-    .venv/bin/python -m pip install -q -c "$LOCK" "$@"
+    PYTHONWARNINGS=ignore .venv/bin/python -m pip install -q -c "$LOCK" "$@"
 }
 
 backend_ready() { # succeeds, or prints why no backend can run
