@@ -14,6 +14,7 @@ from spacesim.backend import ad
 
 SH_C0 = 0.28209479177387814  #: Y_00, the constant spherical harmonic
 NAMES = ("means", "log_scales", "quaternions", "logit_opacities", "sh")
+ROWS = dict(zip(NAMES, (slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 11), slice(11, None)), strict=True))
 
 
 class Gaussians:
@@ -46,6 +47,17 @@ class Gaussians:
     def parameters(self) -> dict[str, Any]:
         """{name: array} of all parameters, in a fixed order."""
         return {name: getattr(self, name) for name in NAMES}
+
+    def rows(self) -> list[Any]:
+        """The parameters as a list of Floats [N], row after row in the order of `ROWS`."""
+        return [*self.means, *self.log_scales, *self.quaternions, self.logit_opacities, *self.sh]
+
+    @staticmethod
+    def from_rows(rows: list[Any]) -> "Gaussians":
+        """The inverse of `rows`; shares the arrays."""
+        means, log_scales, quaternions = (rows[ROWS[name]] for name in NAMES[:3])
+        sh = ad.ArrayXf(rows[ROWS["sh"]])
+        return Gaussians(ad.Array3f(means), ad.Array3f(log_scales), ad.Array4f(quaternions), rows[10], sh)
 
     def to_numpy(self) -> dict[str, np.ndarray]:
         """{name: float32 array with N first}: means [N, 3], log_scales [N, 3], quaternions [N, 4],

@@ -73,7 +73,7 @@ def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) 
     pairs = 0
     if splat_count > 0:
         total = dr.sum(ad.Float64(sorted_count))
-        last = ad.UInt32(splat_count - 1)
+        last = dr.opaque(ad.UInt32, splat_count - 1)
         tail = dr.gather(ad.UInt32, sorted_first, last) + dr.gather(ad.UInt32, sorted_count, last)
         dr.eval(total, tail)
         if total[0] > _LARGEST_PAIRS:
@@ -117,8 +117,9 @@ def _runs(tile: Any, pairs: int, tiles: int) -> tuple[Any, Any]:
     """First and one-past-last position of each tile's run in the sorted array `tile` [P]; 0, 0 where it has none."""
     position = dr.arange(ad.UInt32, pairs)
     previous = dr.gather(ad.UInt32, tile, dr.select(position > 0, position - 1, 0))
-    following = dr.gather(ad.UInt32, tile, dr.minimum(position + 1, pairs - 1))
+    final = dr.opaque(ad.UInt32, pairs - 1)  # a literal would be another kernel every time
+    following = dr.gather(ad.UInt32, tile, dr.minimum(position + 1, final))
     start, end = dr.zeros(ad.UInt32, tiles), dr.zeros(ad.UInt32, tiles)
     dr.scatter(start, position, tile, active=(position == 0) | (previous != tile))
-    dr.scatter(end, position + 1, tile, active=(position == pairs - 1) | (following != tile))
+    dr.scatter(end, position + 1, tile, active=(position == final) | (following != tile))
     return start, end

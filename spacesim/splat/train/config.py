@@ -1,0 +1,104 @@
+"""How to train: one frozen record and its presets."""
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+from spacesim.data.errors import InputError
+from spacesim.splat.train.strategies.default import DefaultStrategyConfig
+
+METHODS = ("vanilla",)
+STRATEGIES = ("default",)
+INITS = ("mesh", "points", "random")
+PRESETS = ("demo", "fast", "thesis")
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's step sizes, splatfacto's values. That of the means falls exponentially; it is per metre of scene scale."""
+
+    means: float = 1.6e-4
+    means_final: float = 1.6e-6
+    log_scales: float = 5e-3
+    quaternions: float = 1e-3
+    logit_opacities: float = 5e-2
+    sh_constant: float = 2.5e-3
+    sh_rest: float = 1.25e-4
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides a trained model, apart from the data and the backend."""
+
+    method: str = "vanilla"
+    strategy: str = "default"
+    init: str | None = None  #: mesh, points or random; None takes the first of points, mesh, random that can be had
+    preset: str = "fast"
+    iterations: int = 7_000
+    seed: int = 0
+    init_count: int = 20_000  #: Gaussians at the start, at most
+    sh_degree: int = 3
+    sh_every: int = 1_000  #: iterations after which one more degree of spherical harmonics joins
+    ssim_weight: float = 0.2  #: lambda of thesis 2.8
+    random_background: bool = True  #: train against alpha; False: over black, as the thesis
+    checkpoint_every: int = 1_000  #: iterations
+    rates: LearningRates = field(default_factory=LearningRates)
+    refinement: DefaultStrategyConfig = field(default_factory=DefaultStrategyConfig)
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("method", METHODS), ("strategy", STRATEGIES), ("preset", PRESETS)):
+            if getattr(self, name) not in allowed:
+                raise InputError(f"--{name}: expected one of {', '.join(allowed)}, found {getattr(self, name)!r}")
+        if self.init is not None and self.init not in INITS:
+            raise InputError(f"--init: expected one of {', '.join(INITS)}, found {self.init!r}")
+        if self.iterations < 1:
+            raise InputError(f"--iterations: expected at least 1, found {self.iterations}")
+        if self.init_count < 1:
+            raise InputError(f"--init-count: expected at least 1, found {self.init_count}")
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"--sh-degree: expected 0 to 3, found {self.sh_degree}")
+        if self.seed < 0:
+            raise InputError(f"--seed: expected 0 or more, found {self.seed}")
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for config.json."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> "TrainConfig":
+        """The inverse of `to_json`. Raises InputError where the keys do not fit."""
+        try:
+            nested = {"rates": LearningRates(**values["rates"])}
+            nested["refinement"] = DefaultStrategyConfig(**values["refinement"])
+            return TrainConfig(**{**values, **nested})
+        except (KeyError, TypeError) as error:
+            raise InputError(f"config.json: expected the keys of this version's TrainConfig ({error})") from None
+
+
+def preset(name: str) -> TrainConfig:
+    """`thesis`: the schedule of section 4.3.6; `fast`: minutes on a GPU; `demo`: a minute or two on two CPU cores.
+
+    Raises InputError for another name.
+    """
+    if name == "thesis":
+        return TrainConfig(
+            preset=name,
+            iterations=200_000,
+            init_count=50_000,
+            checkpoint_every=5_000,
+            refinement=DefaultStrategyConfig(refine_stop=150_000),
+        )
+    if name == "fast":
+        return TrainConfig(preset=name, refinement=DefaultStrategyConfig(refine_stop=5_000))
+    if name == "demo":
+        refinement = DefaultStrategyConfig(
+            prune_screen_size=0.5, split_screen_size=0.1, refine_start=300, refine_stop=1_500, pause_after_reset=0
+        )
+        return TrainConfig(
+            preset=name, iterations=2_000, init_count=8_000, sh_every=400, checkpoint_every=500, refinement=refinement
+        )
+    raise InputError(f"--preset: expected one of {', '.join(PRESETS)}, found {name!r}")
+
+
+def with_options(config: TrainConfig, **options: Any) -> TrainConfig:
+    """`config` with the options that are not None put in."""
+    return replace(config, **{name: value for name, value in options.items() if value is not None})

@@ -1,0 +1,94 @@
+"""Where Gaussians start: on a mesh, at points, or at random."""
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from spacesim.data.errors import InputError
+from spacesim.data.records import Dataset
+from spacesim.data.store import read_points
+from spacesim.splat.gaussians import SH_C0, Gaussians
+
+OPACITY = 0.1  #: of every Gaussian at the start (Kerbl et al. 2023)
+
+
+def initial_gaussians(dataset: Dataset, init: str | None, count: int, sh_degree: int, seed: int) -> Gaussians:
+    """At most `count` Gaussians: isotropic, as wide as the mean distance to their three nearest neighbours.
+
+    init: "mesh" samples the ground-truth mesh evenly, "points" takes the dataset's points, "random" fills the cube
+    around the scene; None takes points, else the mesh, else random. Raises InputError where `init` is not to be had.
+    """
+    rng = np.random.default_rng([seed, 0])
+    if init is None:
+        init = "points" if dataset.ply_file_path else "mesh" if dataset.mesh_path else "random"
+    if init == "points":
+        means, colours = _from_points(dataset, count, rng)
+    elif init == "mesh":
+        means, colours = _from_mesh(dataset, count, rng)
+    else:
+        means, colours = _at_random(dataset, count, rng)
+    return gaussians_at(means, colours, sh_degree)
+
+
+def gaussians_at(means: np.ndarray, colours: np.ndarray, sh_degree: int) -> Gaussians:
+    """Gaussians at means [N, 3] metres with sRGB colours [N, 3] in [0, 1]."""
+    count = len(means)
+    neighbours = min(4, count)
+    distances = cKDTree(means).query(means, k=neighbours)[0].reshape(count, neighbours)[:, 1:]
+    spacing = distances.mean(axis=1) if neighbours > 1 else np.full(count, 0.01)
+    sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = (colours - 0.5) / SH_C0
+    return Gaussians.from_numpy(
+        {
+            "means": means,
+            "log_scales": np.repeat(np.log(np.maximum(spacing, 1e-6))[:, None], 3, axis=1),
+            "quaternions": np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+            "logit_opacities": np.full(count, np.log(OPACITY / (1 - OPACITY))),
+            "sh": sh,
+        }
+    )
+
+
+def scene_scale(dataset: Dataset) -> float:
+    """Metres: largest coordinate of the training cameras about their mean, Nerfstudio's unit of length."""
+    centers = np.array([frame.camera.position for frame in dataset.train])
+    return float(max(np.abs(centers - centers.mean(axis=0)).max(), 1e-6)) if len(centers) > 1 else 1.0
+
+
+def _from_points(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    if dataset.ply_file_path is None:
+        raise InputError(f"{dataset.root}: --init points expects ply_file_path in transforms.json, found none")
+    points, colours = read_points(dataset.root / dataset.ply_file_path)
+    if len(points) > count:
+        chosen = np.sort(rng.choice(len(points), count, replace=False))
+        points, colours = points[chosen], colours[chosen]
+    return points.astype(np.float64), colours / 255.0
+
+
+def _from_mesh(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    if dataset.mesh_path is None or not (dataset.root / dataset.mesh_path).exists():
+        raise InputError(f"{dataset.root}: --init mesh expects a mesh.ply, found none")
+    try:
+        mesh = trimesh.load(dataset.root / dataset.mesh_path, force="mesh", process=False)
+        points, _ = trimesh.sample.sample_surface(mesh, count, seed=rng)
+    except Exception as error:
+        raise InputError(f"{dataset.root / dataset.mesh_path}: expected a mesh, found {error}") from None
+    return np.asarray(points), np.full((count, 3), 0.5)
+
+
+def _at_random(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform in the cube about the point that the cameras look at, within which they all stand."""
+    center = focus_point(dataset)
+    half = 0.5 * min(np.linalg.norm(f.camera.position - center) for f in dataset.train)
+    return center + rng.uniform(-half, half, (count, 3)), rng.uniform(0, 1, (count, 3))
+
+
+def focus_point(dataset: Dataset) -> np.ndarray:
+    """[3] the point nearest to all optical axes, in the least-squares sense."""
+    A, b = 1e-9 * np.eye(3), np.zeros(3)
+    for frame in dataset.train:
+        axis = frame.camera.world_from_camera[:3, 2]
+        across = np.eye(3) - np.outer(axis, axis)
+        A += across
+        b += across @ frame.camera.position
+    return np.linalg.solve(A, b)

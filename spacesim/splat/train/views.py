@@ -1,0 +1,52 @@
+"""The training pictures: decoded once, kept packed in memory, handed out in a seeded order."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from spacesim.data.errors import InputError
+from spacesim.data.images import load_image
+from spacesim.data.records import Camera, Dataset
+
+CACHE_BYTES = 6 * 2**30
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """camera; rgba: [H * W] uint32, 8 bits a channel, red lowest; valid: [H * W] bool, or None where all pixels count."""
+
+    camera: Camera
+    rgba: np.ndarray
+    valid: np.ndarray | None
+
+
+class TrainingViews:
+    """Views of a dataset's training frames by index, decoded at first use and kept while `CACHE_BYTES` last."""
+
+    def __init__(self, dataset: Dataset, seed: int) -> None:
+        if not dataset.train:
+            raise InputError(f"{dataset.root}: expected at least one training image, found none")
+        self.dataset, self.seed = dataset, seed
+        largest = max(4 * f.camera.width * f.camera.height for f in dataset.train)
+        self._cached = lru_cache(maxsize=max(1, CACHE_BYTES // largest))(self._load)
+
+    def __len__(self) -> int:
+        return len(self.dataset.train)
+
+    def __getitem__(self, index: int) -> View:
+        return self._cached(index)
+
+    def at_step(self, step: int) -> View:
+        """The view of a step: every epoch visits all views once, in an order that (seed, epoch) decides."""
+        epoch, place = divmod(step, len(self))
+        order = np.random.default_rng([self.seed, 1, epoch]).permutation(len(self))
+        return self[int(order[place])]
+
+    def _load(self, index: int) -> View:
+        frame = self.dataset.train[index]
+        image = load_image(self.dataset, frame)
+        rgba = np.concatenate([image.rgb, image.alpha[..., None]], axis=-1)
+        bytes_ = np.ascontiguousarray(np.rint(rgba * 255).astype(np.uint8)).reshape(-1, 4)
+        valid = None if image.valid.all() else image.valid.ravel()
+        return View(frame.camera, bytes_.view("<u4").ravel(), valid)
