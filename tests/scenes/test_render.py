@@ -1,0 +1,85 @@
+"""Radiance and alpha against closed-form photometry."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from spacesim.data.geometry import direction_from_angles, look_at
+from spacesim.data.records import Camera, Sun
+from spacesim.scenes import Part, Renderer, Scene, SceneObject, Spacecraft, materials, render
+from spacesim.scenes.sun import EXPOSURE, SOLAR_IRRADIANCE
+
+
+def scene_of(mesh: trimesh.Trimesh, material: materials.Material) -> Scene:
+    return Scene("test", (SceneObject(Spacecraft("test", (Part("part", mesh, material),))),))
+
+
+def test_white_surface_that_faces_the_sun_has_display_value_1():
+    scene = scene_of(trimesh.creation.box((2, 2, 2)), materials.TEST_WHITE)
+    camera = Camera.from_fov(look_at([5, 0, 0], [0, 0, 0]), 8, 8, 10.0)
+    truth = Renderer(scene, spp=4).render(camera, Sun.from_angles(0, 0), seed=1)
+    np.testing.assert_allclose(truth.radiance * EXPOSURE, 1.0, rtol=1e-5)
+    np.testing.assert_array_equal(truth.alpha, 1.0)
+
+
+def test_faces_of_a_lambertian_box_follow_the_cosine_law():
+    sun = Sun.from_angles(30, 50)
+    scene = scene_of(trimesh.creation.box((2, 2, 2)), materials.TEST_GREY)
+    for normal in np.concatenate([np.eye(3), -np.eye(3)]):
+        camera = Camera.from_fov(look_at(6 * normal + [0.1, 0.2, 0.3], [0, 0, 0]), 8, 8, 8.0)
+        truth = Renderer(scene, spp=4).render(camera, sun, seed=1)
+        expected = SOLAR_IRRADIANCE * 0.5 / np.pi * max(0.0, float(normal @ sun.direction))
+        np.testing.assert_allclose(truth.radiance, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("phase_deg", [0.0, 60.0, 120.0])
+def test_lambertian_sphere_has_its_phase_function_and_size(phase_deg):
+    """Flux of a Lambertian sphere (Russell 1916): 2/3 E a r^2 (sin p + (pi - p) cos p) / pi."""
+    sphere = trimesh.creation.icosphere(subdivisions=5, radius=1.0)
+    distance, size, fov = 1000.0, 32, 0.15
+    pose = look_at(distance * direction_from_angles(phase_deg, 0.0), [0, 0, 0])
+    camera = Camera.from_fov(pose, size, size, fov)
+    truth = Renderer(scene_of(sphere, materials.TEST_GREY), spp=64).render(
+        camera, Sun.from_angles(0, 0), seed=3
+    )
+    pixel = (distance / camera.fx) ** 2  # m^2 at the sphere's centre
+    phase = np.radians(phase_deg)
+    expected = 2 / 3 * SOLAR_IRRADIANCE * 0.5 * (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
+    assert truth.radiance[..., 0].sum() * pixel == pytest.approx(expected, rel=0.01)  # facets and noise
+    assert truth.alpha.sum() * pixel == pytest.approx(np.pi, rel=0.005)
+    assert truth.alpha.min() == 0.0
+    assert truth.alpha.max() == 1.0
+    assert not truth.alpha[0].any(), "far from the sphere"
+
+
+def test_passes_change_the_noise_only(monkeypatch):
+    sphere = scene_of(trimesh.creation.icosphere(subdivisions=3), materials.WHITE_PAINT)
+    camera = Camera.from_fov(look_at([6, 0, 0], [0, 0, 0]), 16, 16, 25.0)
+    sun = Sun.from_angles(40, 10)
+    whole = Renderer(sphere, spp=60).render(camera, sun, seed=5)
+    monkeypatch.setattr(render, "MAX_WAVEFRONT", 7 * 256)
+    parts = Renderer(sphere, spp=60).render(camera, sun, seed=5)
+    np.testing.assert_array_equal(parts.alpha, whole.alpha)  # sample positions do not depend on the passes
+    np.testing.assert_allclose(parts.radiance, whole.radiance, rtol=0.02, atol=2.0)
+
+
+def test_sun_can_be_moved_and_moved_back():
+    scene = scene_of(trimesh.creation.box((2, 2, 2)), materials.TEST_GREY)
+    camera = Camera.from_fov(look_at([5, 4, 3], [0, 0, 0]), 16, 16, 30.0)
+    renderer = Renderer(scene, spp=2)
+    suns = [Sun.from_angles(0, 0), Sun.from_angles(90, 20), Sun.from_angles(0, 0)]
+    first, other, again = (renderer.render(camera, sun, seed=2).radiance for sun in suns)
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 100
+
+
+def test_inside_and_exposed():
+    shell = trimesh.util.concatenate([trimesh.creation.box((2, 2, 2)), trimesh.creation.box((1, 1, 3))])
+    renderer = Renderer(scene_of(shell, materials.TEST_GREY), spp=1)
+    positions = np.array(
+        [[0, 0, 0], [0.9, 0.9, 0.9], [0, 0, 1.4], [0, 0, 1.6], [0.7, 0.7, 1.1], [9, 9, 9]], float
+    )
+    np.testing.assert_array_equal(renderer.inside(positions), [True, True, True, False, False, False])
+    points = np.array([[0.5, 0, 0.2], [0.5, 0, 1.2], [1, 0, 0]], float)
+    normals = np.array([[1, 0, 0], [1, 0, 0], [1, 0, 0]], float)
+    np.testing.assert_array_equal(renderer.exposed(points, normals), [False, True, True])
