@@ -1,4 +1,4 @@
-"""What works on this machine, and what to type for the rest. Never raises: what cannot be checked is said so."""
+"""What works here, and what to type for the rest. Never raises: what cannot be checked is said so."""
 
 import importlib
 import importlib.metadata

@@ -5,8 +5,10 @@ Reading any such folder is `spacesim.data.transforms`; this module re-exports `r
     transforms.json  images/  gt/  shadow/  silhouette/  id/  depth/  points.ply  mesh.ply  scene.json
 """
 
+import io
 import json
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -188,21 +190,20 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises InputError where the file is missing, cut off, no PLY, or holds positions that are not finite.
     """
     try:
-        with open(path, "rb") as file:
-            cloud = trimesh.load(file, file_type="ply", process=False)
+        content = Path(path).read_bytes()
+        cloud = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
+        points = np.asarray(cloud.vertices, np.float64)
     except FileNotFoundError:
         raise InputError(f"{path}: expected a PLY file, found none") from None
     except Exception as error:  # trimesh documents none of what it raises
-        raise InputError(
-            f"{path}: expected a PLY file, found one that is broken or cut off ({error})"
-        ) from None
-    points = np.asarray(getattr(cloud, "vertices", np.empty((0, 3))), np.float64)
-    if len(points) == 0 or not np.isfinite(points).all():
-        raise InputError(f"{path}: expected points with finite positions, found none or others")
-    colors = np.full((len(points), 3), 128, np.uint8)
-    if cloud.visual.kind == "vertex":
-        colors = np.array(cloud.visual.vertex_colors)[:, :3].astype(np.uint8)
-    return points, colors
+        raise InputError(f"{path}: expected a PLY file, found a broken or cut off one ({error})") from None
+    declared = re.search(rb"element vertex (\d+)", content)
+    if declared is None or not 0 < len(points) == int(declared.group(1)) or not np.isfinite(points).all():
+        raise InputError(f"{path}: expected as many finite points as its header says, at least one")
+    colors = np.asarray(cloud.visual.vertex_colors) if cloud.visual.kind == "vertex" else np.empty(0)
+    if colors.ndim != 2:  # a cloud without colours claims to have none a vertex
+        return points, np.full((len(points), 3), 128, np.uint8)
+    return points, colors[:, :3].astype(np.uint8)
 
 
 def verify_dataset(path: Path) -> list[str]:

@@ -54,11 +54,28 @@ def read_dataset(path: Path) -> Dataset:
     return Dataset(root, train, test, _path(own, meta, "ply_file_path"), _path(own, meta, "mesh_path"), scene)
 
 
+def read_camera(path: Path) -> Camera:
+    """The camera of a JSON file with the keys of a frame: transform_matrix, w, h, fl_x or camera_angle_x, ...
+
+    A whole transforms.json is taken too: its first frame counts. Raises InputError where a key is missing or broken.
+    """
+    values = dict(_read_object(path))
+    frames = values.pop("frames", None)
+    if isinstance(frames, list) and frames and isinstance(frames[0], dict):
+        values |= frames[0]
+    try:
+        if "w" not in values or "h" not in values:
+            raise InputError("expected w and h, the size in pixels, found none")
+        return _read_camera(values, path)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
 def _say_what_is_missing(path: Path, root: Path) -> str:
     if not path.exists():
         return f"{path}: expected a dataset folder or a transforms.json, found nothing"
     if (root / "scene.json").is_file():
-        return f"{path}: expected transforms.json, found an unfinished dataset; run generate with --resume"
+        return f"{path}: expected transforms.json, found an unfinished dataset; go on with generate --resume"
     return f"{path}: expected a dataset folder with a transforms.json, found none in it"
 
 
