@@ -1,8 +1,8 @@
 """Judge a trained run against a dataset: metrics.json and pictures of every frame (contract: metrics.json).
 
-Predictions are clipped to [0, 1] as a display would; both pictures lie over black. Means and population
-standard deviations are over the frames, without those where a metric is null. Only `render_ms` differs from one
-call to the next.
+Predictions are clipped to [0, 1] as a display would; both pictures lie over black. Means and
+population standard deviations are over the frames, without those where a metric is null. Only `render_ms`
+differs from one call to the next.
 """
 
 import math
@@ -241,14 +241,14 @@ def _write_pictures(folder: Path, view: View) -> None:
 
 
 def _describe(dataset: Dataset, frames: Sequence[Frame]) -> dict[str, Any]:
-    """What the report says about the data; plain values of scene.json come along."""
+    """What the report says about the data: its size, and from scene.json how it was made."""
     suns = {tuple(angles) for frame in frames if (angles := _rounded_angles(frame)) is not None}
     return {
         "frames": len(frames),
         "train_frames": len(dataset.train),
         "suns": len(suns),
         "resolution": [frames[0].camera.width, frames[0].camera.height],
-        "scene": {key: value for key, value in dataset.scene.items() if isinstance(value, str | int | float)},
+        **{key: dataset.scene.get(key) for key in ("scene", "config", "versions")},
     }
 
 

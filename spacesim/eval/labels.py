@@ -52,7 +52,7 @@ IMAGE = (
 
 SHADOW = (
     Metric(
-        "ber", "BER", "", LOWER, 4,
+        "ber", "Shadow BER", "", LOWER, 4,
         f"Share of pixels put on the wrong side of luminance {THRESHOLD} (2.23).",
     ),
     Metric(

@@ -46,7 +46,12 @@ def dataset(tmp_path):
                 silhouette_path=f"silhouette/{name}.png",
             )
         )
-    return Dataset(root, (), tuple(frames), scene={"name": "sphere", "spp": 16, "seed": 1, "parts": ["ball"]})
+    return Dataset(
+        root,
+        (),
+        tuple(frames),
+        scene={"scene": "sphere", "config": {"spp": 16, "seed": 1}, "parts": ["ball"]},
+    )
 
 
 def truth_layers(inside):

@@ -91,7 +91,8 @@ def test_layout(make_run, dataset, tmp_path):
     assert metrics["image"]["lpips"] is None
     assert metrics["config"]["seed"] == 7
     assert metrics["dataset"]["suns"] == 2
-    assert metrics["dataset"]["scene"] == {"name": "sphere", "spp": 16, "seed": 1}
+    assert metrics["dataset"]["scene"] == "sphere"
+    assert metrics["dataset"]["config"] == {"spp": 16, "seed": 1}
     for word in ("Geometry", "LPIPS", "Visibility"):
         assert sum(note.startswith(word) for note in metrics["notes"]) == 1
     for frame in metrics["frames"]:

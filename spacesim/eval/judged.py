@@ -1,0 +1,94 @@
+"""EVAL folders as the report reads them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spacesim.data.errors import InputError
+from spacesim.data.files import read_json
+from spacesim.eval.evaluate import SCHEMA
+from spacesim.eval.labels import GROUPS
+from spacesim.eval.page import escape, swatch
+
+_NEEDED = (
+    "run",
+    "data",
+    "split",
+    "model",
+    "notes",
+    "dataset",
+    "config",
+    "training",
+    "versions",
+    "frames",
+    *GROUPS,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """index: place in the report;  name: the run's, unique there;  metrics: what metrics.json holds"""
+
+    folder: Path
+    index: int
+    name: str
+    metrics: dict[str, Any]
+
+    @property
+    def label(self) -> str:
+        """HTML: the run's coloured dot and its name."""
+        return swatch(self.index) + escape(self.name)
+
+    @property
+    def frames(self) -> dict[str, dict[str, Any]]:
+        """The judged frames by the names of their folders."""
+        return {frame["name"]: frame for frame in self.metrics["frames"]}
+
+    @property
+    def scene(self) -> str:
+        """What the pictures show: the scene's name or else the data folder's."""
+        return str(self.metrics["dataset"].get("scene") or Path(self.metrics["data"]).name)
+
+    def mean(self, group: str, metric: str) -> float | None:
+        """Mean of a metric over the frames; None where it is null."""
+        value = (self.metrics[group] or {}).get(metric)
+        return None if value is None else value["mean"]
+
+
+def read_evals(folders: Sequence[Path]) -> list[Judged]:
+    """The evaluations in `folders`. Raises InputError where there is none or a folder holds no such."""
+    if not folders:
+        raise InputError("report: expected at least one EVAL folder, found none")
+    found = [_read_metrics(Path(folder)) for folder in folders]
+    names = _unique_names(found, [Path(folder) for folder in folders])
+    together = zip(folders, names, found, strict=True)
+    return [
+        Judged(Path(folder), index, name, metrics) for index, (folder, name, metrics) in enumerate(together)
+    ]
+
+
+def _read_metrics(folder: Path) -> dict[str, Any]:
+    path = folder / "metrics.json"
+    metrics = read_json(path)
+    if not isinstance(metrics, dict) or metrics.get("schema") != SCHEMA:
+        raise InputError(f"{path}: expected metrics of schema {SCHEMA}, found something else")
+    missing = [key for key in _NEEDED if key not in metrics]
+    if missing:
+        raise InputError(f"{path}: expected the key {missing[0]}, found none")
+    for frame in metrics["frames"]:
+        if Path(frame["name"]).name != frame["name"]:
+            raise InputError(f"{path}: expected a frame's name without folders, found {frame['name']!r}")
+    return metrics
+
+
+def _unique_names(found: Sequence[dict[str, Any]], folders: Sequence[Path]) -> list[str]:
+    """The runs' last path components if these differ, else the runs' paths, else those of the folders."""
+    for names in (
+        [Path(metrics["run"]).name for metrics in found],
+        [str(metrics["run"]) for metrics in found],
+        [str(folder) for folder in folders],
+    ):
+        if len(set(names)) == len(names) and all(names):
+            return names
+    return [f"{folder} ({number})" for number, folder in enumerate(folders, start=1)]

@@ -1,0 +1,307 @@
+"""The report: one self-contained HTML page about one or several judged runs, side by side."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacesim.data.files import write_bytes
+from spacesim.eval.charts import column_histograms, histogram, line_chart, shared_edges
+from spacesim.eval.gallery import gallery
+from spacesim.eval.judged import Judged, read_evals
+from spacesim.eval.labels import GROUPS, IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric
+from spacesim.eval.page import escape, page, section, table
+
+MANY_SUNS = 12
+"""With more Suns than this, histograms become columns of one chart."""
+
+_NONE = '<span class="none" title="null: see the notes">–</span>'
+_GAUSSIANS = Metric("gaussians", "Gaussians", "", LOWER, 0, "")
+_RENDER = Metric("render_ms", "Render time", "ms", LOWER, 1, "")
+
+Cell = tuple[float | None, str, str]
+"""A mean, its HTML, and the HTML of its spread."""
+
+
+def write_report(evals: Sequence[Path], out: Path) -> None:
+    """Write the page about the EVAL folders `evals` to the file `out`.
+
+    Raises InputError where a folder holds no evaluation or `out` cannot be written.
+    """
+    runs = read_evals(evals)
+    scenes = " and ".join(sorted({run.scene for run in runs}))
+    body = [
+        _header(runs, scenes),
+        _headlines(runs),
+        section("Frames", gallery(runs), "Best, median and worst by PSNR over the silhouette."),
+        section("Results", _results(runs), "Mean ± population standard deviation over the frames."),
+        section(
+            "By Sun",
+            _histograms(runs),
+            "How many frames reach which PSNR [dB] over the silhouette, by azimuth and elevation.",
+        ),
+        _training(runs),
+        section("How it was made", _making(runs)),
+        section("Notes", _notes(runs)),
+        "<footer>Written by spacesim. Equation numbers: the thesis that defines the metrics.</footer>",
+    ]
+    write_bytes(Path(out), page(f"{scenes} · reconstruction report", "\n".join(body)).encode())
+
+
+def _header(runs: Sequence[Judged], scenes: str) -> str:
+    counts = {f"{run.metrics['dataset']['frames']} {run.metrics['split']}" for run in runs}
+    frames = counts.pop() if len(counts) == 1 else "their"
+    what = "One reconstruction" if len(runs) == 1 else f"{len(runs)} reconstructions"
+    lead = f"{what}, judged on {frames} frames against the truth."
+    width, height = runs[0].metrics["dataset"]["resolution"]
+    suns = runs[0].metrics["dataset"]["suns"]
+    facts = [f"{width} × {height} pixels"]
+    if suns:
+        facts.append("one Sun" if suns == 1 else f"{suns} Suns")
+    return (
+        f'<header><p class="eyebrow">Reconstruction report</p><h1>{escape(scenes)}</h1>'
+        f'<p class="lead">{escape(lead)} {escape(", ".join(facts))}.</p></header>'
+    )
+
+
+def _headlines(runs: Sequence[Judged]) -> str:
+    """A card for each number that people ask for first."""
+    psnr, ssim, lpips, *_, flip = IMAGE
+    perceived = lpips if any(run.mean("image", "lpips") is not None for run in runs) else flip
+    cards = [
+        _card(metric, runs, [_summary_cell(run, group, metric) for run in runs])
+        for group, metric in (("image", psnr), ("image", ssim), ("image", perceived), ("shadow", SHADOW[0]))
+    ]
+    for metric in (_GAUSSIANS, _RENDER):
+        cards.append(_card(metric, runs, [_model_cell(run, metric) for run in runs]))
+    many = " many" if len(runs) > 1 else ""
+    lead = "Image and shadow numbers are means over the frames, taken over the object's silhouette."
+    return f'<div class="cards{many}">{"".join(cards)}</div><p class="lead">{lead}</p>'
+
+
+def _card(metric: Metric, runs: Sequence[Judged], cells: Sequence[Cell]) -> str:
+    goal = f" {metric.goal}" if metric is not _GAUSSIANS else ""
+    unit = f" <small>{escape(metric.unit)}</small>" if metric.unit else ""
+    if len(runs) == 1:
+        value, number, spread = cells[0]
+        body = f'<p class="big">{number}{"" if value is None else unit}</p><p class="std">{spread}</p>'
+        return f'<div class="card"><h3>{escape(metric.label + goal)}</h3>{body}</div>'
+    rows = zip(runs, _best_in_bold(metric, cells), strict=True)
+    body = "".join(
+        f'<p class="row"><span>{run.label}</span><span>{number}</span></p>' for run, number in rows
+    )
+    return f'<div class="card"><h3>{escape(metric.label + goal)}{unit}</h3>{body}</div>'
+
+
+def _results(runs: Sequence[Judged]) -> str:
+    parts = []
+    for caption, metrics, groups in (
+        ("Image", IMAGE, ("image", "image_full")),
+        ("Shadow by luminance", SHADOW, ("shadow", "shadow_full")),
+        ("Shadow by predicted visibility", SHADOW_MASK, ("shadow_mask",)),
+    ):
+        present = [group for group in groups if any(run.metrics[group] is not None for run in runs)]
+        if not present:
+            continue
+        head = ["", *(_heading(metric) for metric in metrics)]
+        bodies = [(f"{GROUPS[group][0]}".capitalize(), _rows(runs, group, metrics)) for group in present]
+        parts.append(table(caption, head, bodies))
+        parts.append(_meanings(metrics))
+    return "".join(parts)
+
+
+def _rows(runs: Sequence[Judged], group: str, metrics: Sequence[Metric]) -> list[list[str]]:
+    """A row for each run, the best of each column in bold."""
+    columns = []
+    for metric in metrics:
+        cells = [_summary_cell(run, group, metric) for run in runs]
+        numbers = _best_in_bold(metric, cells)
+        columns.append([f"{n} <small>{cell[2]}</small>" for n, cell in zip(numbers, cells, strict=True)])
+    return [[run.label, *row] for run, *row in zip(runs, *columns, strict=True)]
+
+
+def _summary_cell(run: Judged, group: str, metric: Metric) -> Cell:
+    value = (run.metrics[group] or {}).get(metric.key)
+    if value is None:
+        return None, _NONE, ""
+    return value["mean"], f"{value['mean']:.{metric.digits}f}", f"± {value['std']:.{metric.digits}f}"
+
+
+def _model_cell(run: Judged, metric: Metric) -> Cell:
+    value = run.metrics["model"][metric.key]
+    return value, f"{value:,.{metric.digits}f}", ""
+
+
+def _best_in_bold(metric: Metric, cells: Sequence[Cell]) -> list[str]:
+    """The cells' numbers as HTML, the best in bold where there is something to choose from."""
+    distances = [metric.distance(value) for value, _, _ in cells if value is not None]
+    if len(distances) < 2 or metric is _GAUSSIANS:
+        return [number for _, number, _ in cells]
+    return [
+        f'<span class="best">{number}</span>'
+        if value is not None and metric.distance(value) == min(distances)
+        else number
+        for value, number, _ in cells
+    ]
+
+
+def _heading(metric: Metric) -> str:
+    unit = f" <small>[{escape(metric.unit)}]</small>" if metric.unit else ""
+    return f"{escape(metric.label)}{unit} {escape(metric.goal)}"
+
+
+def _meanings(metrics: Sequence[Metric]) -> str:
+    items = "".join(f"<dt>{escape(m.label)}</dt><dd>{escape(m.meaning)}</dd>" for m in metrics)
+    return f"<dl>{items}</dl>"
+
+
+def _histograms(runs: Sequence[Judged]) -> str:
+    by_sun = [_by_sun(run) for run in runs]
+    every = [value for suns in by_sun for values in suns.values() for value in values]
+    if not every:
+        return "<p>No frame has a PSNR.</p>"
+    edges = shared_edges(every)
+    suns = sorted({sun for groups in by_sun for sun in groups})
+    if len(suns) > MANY_SUNS:
+        return _legend(runs) + "".join(
+            column_histograms(
+                f"{run.name}: PSNR [dB] of the frames under each Sun, by azimuth",
+                [(_sun_name(sun), groups.get(sun, [])) for sun in suns],
+                edges,
+                run.index,
+            )
+            for run, groups in zip(runs, by_sun, strict=True)
+        )
+    tallest = max(
+        int(np.histogram(values, edges)[0].max()) for groups in by_sun for values in groups.values()
+    )
+    charts = [
+        histogram(_sun_name(sun), [groups.get(sun, []) for groups in by_sun], edges, tallest) for sun in suns
+    ]
+    return _legend(runs) + f'<div class="multiples">{"".join(charts)}</div>'
+
+
+def _by_sun(run: Judged) -> dict[tuple[float, ...], list[float]]:
+    """PSNR of the frames by the Sun's (azimuth, elevation), () where there is none."""
+    groups: dict[tuple[float, ...], list[float]] = {}
+    for frame in run.metrics["frames"]:
+        if frame["psnr"] is not None:
+            groups.setdefault(tuple(round(angle, 1) for angle in frame["sun"] or ()), []).append(
+                frame["psnr"]
+            )
+    return groups
+
+
+def _sun_name(sun: tuple[float, ...]) -> str:
+    return "{:.0f}°, {:.0f}°".format(*sun) if sun else "Sun not known"
+
+
+def _legend(runs: Sequence[Judged]) -> str:
+    if len(runs) == 1:
+        return ""
+    return f'<p class="key">{"".join(f"<span>{run.label}</span>" for run in runs)}</p>'
+
+
+def _training(runs: Sequence[Judged]) -> str:
+    histories = [run.metrics["training"].get("history") or [] for run in runs]
+    if not any(histories):
+        return ""
+
+    def curves(key: str, lowest: float) -> list[list[tuple[float, float]]]:
+        return [
+            [
+                (step["iteration"], step[key])
+                for step in history
+                if step.get(key) is not None and step[key] > lowest
+            ]
+            for history in histories
+        ]
+
+    charts = [
+        line_chart("Loss", "iteration", curves("loss", 0.0), log=True),
+        line_chart("Gaussians", "iteration", curves("gaussians", -1.0)),
+    ]
+    return section("Training", _legend(runs) + f'<div class="charts">{"".join(charts)}</div>')
+
+
+def _making(runs: Sequence[Judged]) -> str:
+    """Tables of data, configuration and software, a column for each run; rows that differ stand out."""
+    tables: list[tuple[str, Callable[[Judged], Mapping[str, Any]]]] = [
+        ("Data", _data_facts),
+        ("Model and time", _model_facts),
+        ("Training configuration", lambda run: run.metrics["config"]),
+        (
+            "Software",
+            lambda run: {**run.metrics["versions"], **(run.metrics["training"].get("versions") or {})},
+        ),
+    ]
+    bodies = [_facts_table(caption, runs, [_flat(facts(run)) for run in runs]) for caption, facts in tables]
+    pair = " pair" if len(runs) == 1 else ""
+    parts = [f'<div class="facts{pair}">{"".join(bodies)}</div>']
+    for run in runs:
+        command = run.metrics["training"].get("command")
+        if command:
+            text = " ".join(map(str, command)) if isinstance(command, list) else str(command)
+            parts.append(f"<h4>{run.label}</h4><pre>{escape(text)}</pre>")
+    return "".join(parts)
+
+
+def _data_facts(run: Judged) -> dict[str, Any]:
+    data = run.metrics["dataset"]
+    width, height = data["resolution"]
+    return {
+        "folder": run.metrics["data"],
+        "scene": data.get("scene"),
+        "judged frames": f"{data['frames']} ({run.metrics['split']})",
+        "training frames": data["train_frames"],
+        "resolution": f"{width} × {height}",
+        **(data.get("config") or {}),
+    }
+
+
+def _model_facts(run: Judged) -> dict[str, Any]:
+    model, training = run.metrics["model"], run.metrics["training"]
+    seconds = training.get("seconds")
+    return {
+        "run": run.metrics["run"],
+        "Gaussians": f"{model['gaussians']:,}",
+        "file": f"{model['bytes'] / 1e6:.2f} MB",
+        "rendering a frame": f"{model['render_ms']:.1f} ms",
+        "rendered on": model["backend"],
+        "training": None if seconds is None else f"{seconds:.1f} s",
+        "trained on": " ".join(str(training[key]) for key in ("backend", "device") if training.get(key)),
+    }
+
+
+def _facts_table(caption: str, runs: Sequence[Judged], facts: Sequence[Mapping[str, str]]) -> str:
+    keys = list(dict.fromkeys(key for column in facts for key in column))
+    if not keys:
+        return ""
+    rows = []
+    for key in keys:
+        values = [column.get(key, "–") for column in facts]
+        mark = '<span class="differs">{}</span>' if len(set(values)) > 1 else "{}"
+        rows.append([escape(key), *(mark.format(escape(value)) for value in values)])
+    head = ["", *(run.label for run in runs)] if len(runs) > 1 else ["", ""]
+    return table(caption, head, [("", rows)])
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Nested mappings as {"outer.inner": text}; what is None or empty is left out."""
+    flat: dict[str, str] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{key}.")
+        elif value not in (None, "", [], ()):
+            flat[f"{prefix}{key}"] = str(value)
+    return flat
+
+
+def _notes(runs: Sequence[Judged]) -> str:
+    parts = []
+    for run in runs:
+        items = "".join(f"<li>{escape(note)}</li>" for note in run.metrics["notes"])
+        heading = f"<h4>{run.label}</h4>" if len(runs) > 1 else ""
+        parts.append(f"{heading}<ul>{items}</ul>")
+    return "".join(parts)

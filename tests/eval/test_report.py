@@ -1,0 +1,262 @@
+"""The report as a browser parses it: its numbers, its pictures, and nothing from outside."""
+
+import base64
+import io
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from spacesim.data.errors import InputError
+from spacesim.data.images import read_png
+from spacesim.eval import charts
+from spacesim.eval.evaluate import evaluate
+from spacesim.eval.report import write_report
+
+VOID = {"meta", "img", "path", "rect", "br"}
+
+
+class Page(HTMLParser):
+    """Collects text, tags and attributes; fails where tags do not close in their order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.attributes, self.text = [], [], [], []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value or "") for name, value in attributes]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value or "") for name, value in attributes]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] != ["style"]:
+            self.text.append(data)
+
+    def values(self, tag, name):
+        return [value for t, n, value in self.attributes if (t, n) == (tag, name)]
+
+
+@pytest.fixture
+def folder(make_run, dataset, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "nowhere"))
+    evaluate(make_run(lambda rgb: np.roll(rgb, 1, axis=1)), dataset, tmp_path / "eval")
+    return tmp_path / "eval"
+
+
+def another(folder, name, change):
+    """A copy of an EVAL folder with metrics.json changed in place by `change`."""
+    copy = folder.with_name(name)
+    shutil.copytree(folder, copy)
+    metrics = json.loads((copy / "metrics.json").read_text())
+    change(metrics)
+    (copy / "metrics.json").write_text(json.dumps(metrics))
+    return copy
+
+
+def page_of(*folders):
+    out = folders[0].parent / "report.html"
+    write_report(folders, out)
+    return Page(out.read_text())
+
+
+def test_numbers_are_there(folder):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    text = "".join(page_of(folder).text)
+    for group, keys in {
+        "image": ("ssim", "mae", "rmse", "flip"),
+        "image_full": ("ssim", "mae", "rmse", "flip"),
+        "shadow": ("ber", "bias", "boundary_mae"),
+        "shadow_full": ("ber", "bias", "boundary_mae"),
+    }.items():
+        for key in keys:
+            value = metrics[group][key]
+            assert f"{value['mean']:.4f} ± {value['std']:.4f}" in text
+    for group in ("image", "image_full"):
+        assert f"{metrics[group]['psnr']['mean']:.2f} ± {metrics[group]['psnr']['std']:.2f}" in text
+    for fact in (
+        "sphere",
+        "vanilla",
+        "spacesim train data --out runs/fake",
+        "1.5.0",
+        "123",
+        "12.5 s",
+        "llvm",
+    ):
+        assert fact in text
+    for note in metrics["notes"]:
+        assert note in text
+
+
+def test_nothing_from_outside(folder):
+    page = page_of(folder)
+    assert not {"script", "link", "iframe", "object", "embed", "base", "form"} & set(page.tags)
+    references = [
+        v for _, name, v in page.attributes if name in ("src", "href", "srcset", "data", "xlink:href")
+    ]
+    assert references
+    assert all(value.startswith("data:image/png;base64,") for value in references)
+    pictures = re.compile("data:image/png;base64,[A-Za-z0-9+/=]+")
+    rest = pictures.sub("", (folder.parent / "report.html").read_text())
+    assert not re.search(r"https?:|//|url\(|@import", rest)
+
+
+def test_pictures_are_the_folders(folder):
+    page = page_of(folder)
+    assert all(page.values("img", "alt"))
+    pictures = [base64.b64decode(value.partition(",")[2]) for value in page.values("img", "src")]
+    assert len(pictures) == 15
+    shown = {np.asarray(Image.open(io.BytesIO(data))).tobytes() for data in pictures}
+    frames = sorted(
+        json.loads((folder / "metrics.json").read_text())["frames"], key=lambda frame: -frame["psnr"]
+    )
+    for frame in (frames[0], frames[2], frames[-1]):
+        for panel in ("truth", "prediction", "error", "shadow_truth", "shadow_prediction"):
+            assert read_png(folder / "frames" / frame["name"] / f"{panel}.png").tobytes() in shown
+
+
+def test_hostile_names_are_escaped(folder):
+    attack = '<script>alert("x")</script>\'"><img src=http://evil.example/x onerror=alert(1)>'
+
+    def spoil(metrics):
+        metrics |= {"run": f"runs/{attack}", "data": attack, "notes": [attack]}
+        metrics["config"]["method"] = attack
+        metrics["config"][attack] = attack
+        metrics["training"]["command"] = attack
+        metrics["versions"][attack] = attack
+        metrics["dataset"]["scene"] = attack
+        metrics["model"]["backend"] = attack
+        for frame in metrics["frames"]:
+            frame["file_path"] = attack
+
+    hostile = another(folder, "hostile", spoil)
+    for folders in ((hostile,), (hostile, folder)):
+        page = page_of(*folders)
+        assert "script" not in page.tags
+        assert all(value.startswith("data:") for value in page.values("img", "src"))
+        assert not any(name.startswith("on") for _, name, _ in page.attributes)
+        assert attack in "".join(page.text)
+
+
+def test_folders_cannot_be_left(folder):
+    def climb(metrics):
+        metrics["frames"][0]["name"] = "../../data"
+
+    with pytest.raises(InputError, match="without folders"):
+        page_of(another(folder, "climbing", climb))
+
+
+def test_runs_side_by_side(folder):
+    def better(metrics):
+        metrics["run"] = "runs/better"
+        metrics["config"]["seed"] = 8
+        metrics["image"]["psnr"]["mean"] += 1
+        metrics["shadow"]["sharpness_ratio"]["mean"] = 3.0
+
+    copy = another(folder, "better", better)
+    page = page_of(folder, copy)
+    text = "".join(page.text)
+    assert len(page.values("img", "src")) == 30
+    assert text.count("fake") >= 4
+    assert text.count("better") >= 4
+    best = re.findall(r'class="best">([\d.]+)', (folder.parent / "report.html").read_text())
+    metrics = [json.loads((f / "metrics.json").read_text()) for f in (folder, copy)]
+    assert f"{metrics[1]['image']['psnr']['mean']:.2f}" in best
+    assert f"{metrics[0]['shadow']['sharpness_ratio']['mean']:.3f}" in best
+    assert "3.000" not in best
+
+
+def test_runs_of_the_same_name_are_told_apart(folder):
+    def moved(metrics):
+        metrics["run"] = "elsewhere/fake"
+
+    text = "".join(page_of(folder, another(folder, "moved", moved)).text)
+    assert "runs/fake" in text
+    assert "elsewhere/fake" in text
+    assert "(2)" in "".join(page_of(folder, folder).text)
+
+
+@pytest.mark.parametrize("suns", [1, 100])
+def test_histograms_of_few_and_many_suns(folder, suns):
+    def multiply(metrics):
+        frames = metrics["frames"]
+        metrics["frames"] = [
+            {**frames[i % 4], "psnr": 20 + i % 7 + 0.1 * i, "sun": [3.0 * (i % suns), 10.0]}
+            for i in range(200)
+        ]
+
+    page = page_of(another(folder, "multiplied", multiply))
+    titles = [value for value in page.values("svg", "aria-label") if "3°, 10°" in value or "0°, 10°" in value]
+    if suns == 1:
+        assert titles == ["Histogram, 0°, 10°"]
+        assert "200 frames" in page.text
+    else:
+        assert sum("mean" in text and "of 2" in text for text in page.text) == 100
+
+
+def test_nulls_everywhere(folder):
+    def empty(metrics):
+        for group in ("image", "image_full", "shadow", "shadow_full"):
+            metrics[group] = dict.fromkeys(metrics[group])
+        for frame in metrics["frames"]:
+            frame["psnr"] = frame["sun"] = None
+        metrics["training"] = {}
+        metrics["dataset"] |= {"scene": None, "config": None, "versions": None, "suns": 0}
+
+    text = "".join(page_of(another(folder, "empty", empty)).text)
+    assert "None" not in text
+    assert not re.search(r"\bnan\b", text)
+    assert "No frame has a PSNR." in text
+
+
+def test_one_frame_is_shown_once(folder):
+    def only(metrics):
+        metrics["frames"] = metrics["frames"][:1]
+
+    assert len(page_of(another(folder, "only", only)).values("img", "src")) == 5
+
+
+def test_what_is_no_evaluation(folder, tmp_path):
+    out = tmp_path / "report.html"
+    with pytest.raises(InputError, match="at least one EVAL folder"):
+        write_report([], out)
+    with pytest.raises(InputError, match=r"nothing.metrics\.json"):
+        write_report([tmp_path / "nothing"], out)
+    with pytest.raises(InputError, match="schema 1"):
+        write_report([another(folder, "newer", lambda metrics: metrics.update(schema=2))], out)
+    with pytest.raises(InputError, match="expected the key model"):
+        write_report([another(folder, "lacking", lambda metrics: metrics.pop("model"))], out)
+    shutil.rmtree(folder / "frames")
+    with pytest.raises(InputError, match="expected a picture"):
+        write_report([folder], out)
+    assert not out.exists()
+
+
+def test_same_folder_same_bytes(folder, tmp_path):
+    write_report([folder], tmp_path / "a.html")
+    write_report([folder], tmp_path / "b.html")
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+
+
+def test_ticks_are_round_and_reach_around():
+    assert charts.nice_ticks(0, 2000, 5) == [0, 500, 1000, 1500, 2000]
+    assert charts.nice_ticks(7, 7, 4)[0] <= 7 <= charts.nice_ticks(7, 7, 4)[-1]
+    assert [charts.compact(value) for value in (0.05, 1500, 2e6)] == ["0.05", "1.5k", "2M"]
+    for values in ([30.0], [12.3, 44.4], [0.0, 0.0], [-3.0, 99.0]):
+        edges = charts.shared_edges(values)
+        assert edges[0] <= min(values) <= max(values) <= edges[-1]
+        assert np.histogram(values, edges)[0].sum() == len(values)
