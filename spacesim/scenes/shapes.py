@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from spacesim.data.geometry import Array, normalize
 
-SEGMENTS = 72
+SEGMENTS = 96
 """Straight segments of a circle where nothing else is said."""
 
 

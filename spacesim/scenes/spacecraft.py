@@ -51,15 +51,17 @@ def boxsat() -> Spacecraft:
 
 
 def _bus() -> list[Part]:
-    x, _, z = 0.5 * BUS
-    deck = [BUS[0] + 0.06, BUS[1] + 0.06, 0.04]
+    x, y, z = 0.5 * BUS
+    deck = [BUS[0] + 0.09, BUS[1] + 0.09, 0.04]
     ring = s.tube([0, 0, -z - 0.14], [0, 0, -z - 0.03], 0.38, 0.43)
     nozzle = s.revolved([(0.155, -0.26), (0.17, -0.26), (0.05, 0), (0.035, 0)])
     nozzle.apply_translation([0, 0, -z - 0.03])
+    rails = [s.box([0.05, 0.05, BUS[2]], [i * x, j * y, 0]) for i in (-1, 1) for j in (-1, 1)]
     return [
         Part("bus", s.crumpled_box(BUS, levels=4, depth=0.007, seed=1), m.GOLD_FOIL),
         Part("deck_top", s.box(deck, [0, 0, z + 0.01]), m.CARBON_FIBRE),
         Part("deck_bottom", s.box(deck, [0, 0, -z - 0.01]), m.CARBON_FIBRE),
+        Part("rails", s.joined(rails), m.ALUMINIUM),
         Part("radiator", s.box([0.03, 0.9, 1.0], [-x - 0.01, 0, 0.1]), m.WHITE_PAINT),
         Part("adapter_ring", ring, m.ALUMINIUM),
         Part("nozzle", nozzle, m.ALUMINIUM),
