@@ -57,7 +57,8 @@ def read_dataset(path: Path) -> Dataset:
 def read_camera(path: Path) -> Camera:
     """The camera of a JSON file with the keys of a frame: transform_matrix, w, h, fl_x or camera_angle_x, ...
 
-    A whole transforms.json is taken too: its first frame counts. Raises InputError where a key is missing or broken.
+    A whole transforms.json is taken too: its first frame counts. Raises InputError where a key is missing or
+    broken.
     """
     values = dict(_read_object(path))
     frames = values.pop("frames", None)
@@ -75,7 +76,7 @@ def _say_what_is_missing(path: Path, root: Path) -> str:
     if not path.exists():
         return f"{path}: expected a dataset folder or a transforms.json, found nothing"
     if (root / "scene.json").is_file():
-        return f"{path}: expected transforms.json, found an unfinished dataset; go on with generate --resume"
+        return f"{path}: expected transforms.json, found an unfinished one; go on with generate --resume"
     return f"{path}: expected a dataset folder with a transforms.json, found none in it"
 
 

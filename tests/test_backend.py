@@ -1,0 +1,146 @@
+"""Finding libLLVM and saying what is missing, in processes of their own: none aborts or shows a traceback."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from spacesim import backend, doctor
+
+FAKE = "void LLVMGetVersion(unsigned *a, unsigned *b, unsigned *c) {{ *a = {}; *b = 1; *c = 7; }}\n"
+
+
+def run(program: str, **environment: str) -> str:
+    """What a Python program prints; it must end well and say nothing on stderr but Dr.Jit's own log."""
+    inherited = {key: value for key, value in os.environ.items() if key != "DRJIT_LIBLLVM_PATH"}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(
+        command, env=inherited | environment, capture_output=True, text=True, timeout=100, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stdout.strip()
+
+
+def find_in(folder: Path) -> str:
+    """What find_llvm prints where only `folder` is looked into."""
+    places = (f"{folder}/libLLVM*.so*",)
+    return run(
+        f"from spacesim import backend; backend._LIBRARY_PLACES = {places!r}; print(*backend.find_llvm())"
+    )
+
+
+@pytest.fixture(scope="module")
+def fakes(tmp_path_factory) -> Path:
+    """A folder of libraries that report versions 15, 16, 20 and 21 as libLLVM does."""
+    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        pytest.skip("no C compiler makes libraries to find")
+    folder = tmp_path_factory.mktemp("fakes")
+    for version in (15, 16, 20, 21):
+        source = folder / f"{version}.c"
+        source.write_text(FAKE.format(version))
+        library = folder / f"libLLVM-{version}.so"
+        subprocess.run([compiler, "-shared", "-fPIC", "-o", library, source], check=True)
+    return folder
+
+
+def test_newest_is_taken(fakes):
+    path, sentence = find_in(fakes).split(" ", 1)
+    assert path == str(fakes / "libLLVM-21.so")
+    assert sentence == f"libLLVM 21 at {path}"
+
+
+def test_all_ways_of_naming_are_known(fakes, tmp_path):
+    for name in ("libLLVM-20.so", "libLLVM-20.so.1", "libLLVM.so.20.1", "libLLVM.so.20", "libLLVM-20.1.7.so"):
+        folder = tmp_path / name.replace(".", "_")
+        folder.mkdir()
+        shutil.copy(fakes / "libLLVM-20.so", folder / name)
+        assert find_in(folder).startswith(str(folder / name)), name
+
+
+def test_old_and_broken_libraries_are_passed_over(fakes, tmp_path):
+    (tmp_path / "libLLVM-22.so").write_bytes(b"no library")
+    (tmp_path / "libLLVM-19.so").symlink_to("absent")
+    shutil.copy(fakes / "libLLVM-16.so", tmp_path / "libLLVM-23.so")  # says that it is 16
+    for version in (15, 16):
+        shutil.copy(fakes / f"libLLVM-{version}.so", tmp_path)
+    found = find_in(tmp_path)
+    assert found.startswith("None libLLVM 19 or newer is needed")
+    assert "15, 16" in found
+    shutil.copy(fakes / "libLLVM-20.so", tmp_path)
+    assert find_in(tmp_path).startswith(str(tmp_path / "libLLVM-20.so"))
+
+
+def test_nothing_to_find(tmp_path):
+    assert find_in(tmp_path) == (
+        f"None libLLVM 19 or newer is needed, found none; type: {backend.INSTALL_LLVM}"
+    )
+
+
+def test_named_library(fakes):
+    program = "from spacesim import backend; print(*backend.find_llvm())"
+    good = fakes / "libLLVM-20.so"
+    assert run(program, DRJIT_LIBLLVM_PATH=str(good)) == f"{good} libLLVM 20 at {good}"
+    for bad in (fakes / "libLLVM-16.so", fakes / "absent.so", fakes / "16.c"):
+        found = run(program, DRJIT_LIBLLVM_PATH=str(bad))
+        assert found.startswith("None DRJIT_LIBLLVM_PATH names ")
+        assert "19 or newer" in found
+
+
+def old_library() -> str | None:
+    """A real libLLVM older than 19, if this machine has one."""
+    for pattern in backend._LIBRARY_PLACES:
+        for path in Path("/").glob(pattern.lstrip("/")):
+            match = re.search(r"libLLVM(?:-|\.so\.)(\d+)", path.name)
+            if match and 14 <= int(match.group(1)) < backend.MINIMUM_LLVM:
+                return str(path)
+    return None
+
+
+def test_an_old_library_ends_in_a_sentence(fakes):
+    program = """
+from spacesim import backend
+try:
+    backend.select("llvm")
+except backend.BackendError as error:
+    print(error)
+"""
+    found = run(program, DRJIT_LIBLLVM_PATH=old_library() or str(fakes / "libLLVM-16.so"))
+    assert found.startswith("llvm: DRJIT_LIBLLVM_PATH names ")
+    assert "\n" not in found
+
+
+def test_doctor_describes_a_machine_without_a_library(fakes):
+    program = "from spacesim import doctor; print(doctor.describe(doctor.report()))"
+    lines = run(program, DRJIT_LIBLLVM_PATH=old_library() or str(fakes / "libLLVM-16.so")).splitlines()
+    assert any(line.startswith("LLVM") and "no: DRJIT_LIBLLVM_PATH names" in line for line in lines)
+    assert lines[-1].startswith(("Nothing can be rendered here", "Ready: --backend auto runs on cuda"))
+
+
+def test_doctor_survives_a_broken_installation(monkeypatch):
+    def broken():
+        raise ImportError("libcudart is gone")
+
+    monkeypatch.setattr(backend, "available", broken)
+    found = doctor.report()
+    assert found["backend"] is None
+    assert not found["llvm"]["ok"]
+    assert "libcudart is gone" in doctor.describe(found)
+
+
+def test_doctor_agrees_with_the_backend():
+    found = doctor.report()
+    reasons = backend.available()
+    assert {name: found[name]["ok"] for name in reasons} == {name: reasons[name] is None for name in reasons}
+    assert found["backend"] in (*reasons, None)
+    assert found["versions"]["spacesim"] is not None
+
+
+def test_select_takes_known_names_alone():
+    with pytest.raises(ValueError, match="found 'metal'"):
+        backend.select("metal")
