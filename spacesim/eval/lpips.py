@@ -87,17 +87,20 @@ def find_weights(path: Path | None = None) -> tuple[Path | None, str]:
     """
     folder = path or _torch_cache()
     if path is not None and path.suffix == ".safetensors" and path.is_file():
-        return path, f"LPIPS weights in {path}"
+        return path, f"weights in {path}"
     missing = [name for name in (BACKBONE_FILE, LINEAR_FILE) if not (folder / name).is_file()]
     if not missing:
-        return folder, f"LPIPS weights in {folder}"
+        return folder, f"weights in {folder}"
     if path is not None:
         raise InputError(
             f"--lpips-weights {path}: expected a .safetensors file or a folder with {BACKBONE_FILE} and "
             f"{LINEAR_FILE}, found no {' and no '.join(missing)}"
         )
     files = " and ".join(missing)
-    return None, f"LPIPS needs its weights: put {files} into {folder} or name a folder with --lpips-weights"
+    return (
+        None,
+        f"its weights are missing: put {files} into {folder} or name their folder with --lpips-weights",
+    )
 
 
 def load(path: Path | None = None) -> tuple[Lpips | None, str]:
@@ -107,7 +110,7 @@ def load(path: Path | None = None) -> tuple[Lpips | None, str]:
     """
     location, sentence = find_weights(path)
     if importlib.util.find_spec("torch") is None:
-        return None, f"LPIPS needs torch: {INSTALL}"
+        return None, f"torch is not installed; type: {INSTALL}"
     if location is None:
         return None, sentence
     import torch

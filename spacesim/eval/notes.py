@@ -21,7 +21,7 @@ def explain(
     total = len(records)
     notes = ["Geometry is null: no mesh is extracted from this run yet."]
     if no_lpips:
-        notes.append(f"LPIPS is null: {no_lpips}.")
+        notes.append(f"LPIPS is null; {no_lpips}.")
     if all(record["shadow_mask"] is None for record in records):
         notes.append(f"Visibility is null: {method} predicts none, or the data has no path-traced one.")
     for source, sentence in _STAND_INS.items():
