@@ -63,8 +63,8 @@ GOLD_FOIL = metal(
     "gold foil",
     (0.83, 0.56, 0.18),
     0.35,
-    "aluminised Kapton, Kapton outside: absorptance 0.40 (table 11.3); hue and roughness chosen, "
-    "Kapton absorbs below 500 nm",
+    "aluminised Kapton, Kapton outside: absorptance 0.40 (table 11.3), as the luminance; hue and roughness "
+    "chosen, Kapton absorbs below 500 nm",
 )
 WHITE_PAINT = coated(
     "white paint",
@@ -96,9 +96,9 @@ SOLAR_CELL = coated(
 )
 CARBON_FIBRE = coated(
     "carbon fibre",
-    (0.06, 0.06, 0.065),
+    (0.05, 0.05, 0.055),
     0.3,
-    "as black epoxy paint: absorptance 0.95 (table 11.3), resin n = 1.5",
+    "as black epoxy paint: absorptance 0.95 (table 11.3); gloss of its resin (n = 1.5) chosen",
 )
 BOOM_GREY = lambertian("boom grey", (0.32, 0.32, 0.33), "grey paint between black and white, chosen")
 LENS = coated("lens", (0.01, 0.012, 0.02), 0.1, "coated glass over a dark barrel, n = 1.5; chosen")

@@ -2,8 +2,7 @@
 
 Radiance and alpha are means over samples spread evenly over the pixel (a box filter), summed pixel by pixel
 in a fixed order: splatting into a film adds floats in whatever order threads arrive. Labels come from one ray
-through the pixel's centre, so that none is ever averaged. The same seed on the same backend gives the same
-bits.
+through the pixel's centre, so that none is ever averaged. Same seed, same backend: same bits.
 """
 
 from collections.abc import Sequence
@@ -22,12 +21,17 @@ from spacesim.scenes.shapes import frame
 MAX_WAVEFRONT = 1 << 22
 """Most samples in flight at once: more are rendered in several passes."""
 
+_R2_STEPS = (3242174889, 2447445414)
+"""2^32 / g and 2^32 / g^2 with g^3 = g + 1 (Roberts 2018, "The unreasonable effectiveness of quasirandom
+sequences"): unsigned overflow keeps the fraction."""
+
+_DIRECTIONS = fibonacci_sphere(64)
+
 
 class Renderer:
     """A scene loaded once, from which frames are rendered under any Sun.
 
-    spp: samples a pixel; max_depth: longest path in edges from the camera to the Sun (2 is direct light
-    only).
+    spp: samples a pixel; max_depth: longest path in edges from camera to Sun (2 is direct light only).
     """
 
     def __init__(self, scene: Scene, spp: int, max_depth: int = 6) -> None:
@@ -61,7 +65,7 @@ class Renderer:
         """Radiance [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
         mi = backend.mitsuba()
         pixels = camera.width * camera.height
-        passes = -(-self.spp * pixels // MAX_WAVEFRONT)
+        passes = min(self.spp, -(-self.spp * pixels // MAX_WAVEFRONT))
         seeds = np.random.SeedSequence(seed).generate_state(passes)
         sums = np.zeros((4, pixels), np.float32)
         for i in range(passes):
@@ -129,32 +133,32 @@ class Renderer:
     def inside(self, positions: Array) -> np.ndarray:
         """[N] bool: which of the `positions` [N, 3] are within a part.
 
-        From outside, a ray meets a closed surface from its front; from within a part, many rays meet a back
-        first.
+        From outside, a ray meets a closed surface from its front; from within, many rays meet a back first.
         """
         mi = backend.mitsuba()
-        origin, direction = _pairs(positions, fibonacci_sphere(64))
+        lane = dr.arange(mi.UInt32, len(positions) * len(_DIRECTIONS))
+        direction = _gathered(_DIRECTIONS, lane % len(_DIRECTIONS))
+        origin = _gathered(positions, lane // len(_DIRECTIONS))
         surface = self._scene.ray_intersect(mi.Ray3f(origin, direction))
         back = surface.is_valid() & (dr.dot(surface.n, direction) > 0)
         return back.numpy().reshape(len(positions), -1).mean(axis=1) > 0.1
 
     def exposed(self, points: Array, normals: Array) -> np.ndarray:
-        """[N] bool: from which of the surface `points` [N, 3] with outward `normals` [N, 3] space can be
-        seen.
+        """[N] bool: which of the surface `points` [N, 3] with outward `normals` [N, 3] can see space.
 
         Where parts touch or overlap, their surfaces are hidden for good.
         """
         mi = backend.mitsuba()
-        origin, direction = _pairs(points + 1e-4 * normals, fibonacci_sphere(64))
-        normal, _ = _pairs(normals, np.empty((64, 3)))
-        ray = mi.Ray3f(origin, dr.normalize(direction + 1.001 * normal))  # cosine-weighted about the normal
-        free = ~self._scene.ray_test(ray)
+        lane = dr.arange(mi.UInt32, len(points) * len(_DIRECTIONS))
+        normal = _gathered(normals, lane // len(_DIRECTIONS))
+        origin = _gathered(points + 1e-4 * normals, lane // len(_DIRECTIONS))
+        direction = _gathered(_DIRECTIONS, lane % len(_DIRECTIONS)) + 1.001 * normal  # cosine-weighted
+        free = ~self._scene.ray_test(mi.Ray3f(origin, dr.normalize(direction)))
         return free.numpy().reshape(len(points), -1).any(axis=1)
 
 
 def _primary_rays(camera: Camera, pixel: Any, offset: Any) -> Any:
-    """Rays through the pixels of index `pixel` (row by row) at `offset` in [0, 1)^2 from their upper left
-    corners."""
+    """Rays through pixels (index row by row), each at an `offset` in [0, 1)^2 from the pixel's upper left."""
     mi = backend.mitsuba()
     right, down, forward, origin = (_vector(camera.world_from_camera[:3, i]) for i in range(4))
     fx, fy, cx, cy = (dr.opaque(mi.Float, float(x)) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
@@ -164,28 +168,18 @@ def _primary_rays(camera: Camera, pixel: Any, offset: Any) -> Any:
 
 
 def _pixel_offsets(pixel: Any, sample: Any, seed: int) -> Any:
-    """Where in its pixel a sample lies, in [0, 1)^2: the R2 sequence (Roberts 2018, "The unreasonable
-    effectiveness of quasirandom sequences") shifted at random for each pixel, so that few samples cover it
-    evenly."""
+    """Where in its pixel a sample lies, in [0, 1)^2: the R2 sequence, shifted at random for each pixel, so
+    that few samples cover it evenly."""
     mi = backend.mitsuba()
     shift = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, seed))
-    steps = (
-        3242174889,
-        2447445414,
-    )  # 2^32 / g and 2^32 / g^2, g^3 = g + 1; unsigned overflow is the fraction
-    x, y = (
-        mi.Float((sample * step + start) >> 8) * 2.0**-24 for step, start in zip(steps, shift, strict=True)
-    )
-    return mi.Point2f(x, y)
+    fractions = [(sample * step + start) >> 8 for step, start in zip(_R2_STEPS, shift, strict=True)]
+    return mi.Point2f(*(mi.Float(fraction) * 2.0**-24 for fraction in fractions))
 
 
-def _pairs(first: Array, second: Array) -> tuple[Any, Any]:
-    """Every vector of `first` [N, 3] with every one of `second` [M, 3]: two Vector3f of N * M lanes."""
+def _gathered(vectors: Array, index: Any) -> Any:
+    """Rows `index` of `vectors` [N, 3]."""
     vector = backend.mitsuba().Vector3f
-    one, other = (vector(np.ascontiguousarray(np.asarray(x, np.float32).T)) for x in (first, second))
-    lane = dr.arange(backend.mitsuba().UInt32, len(first) * len(second))
-    index = lane // len(second)
-    return dr.gather(vector, one, index), dr.gather(vector, other, lane - index * len(second))
+    return dr.gather(vector, vector(np.ascontiguousarray(np.asarray(vectors, np.float32).T)), index)
 
 
 def _vector(values: Array) -> Any:

@@ -6,7 +6,18 @@ import trimesh
 
 from spacesim.data.geometry import direction_from_angles, look_at
 from spacesim.data.records import Camera, Sun
-from spacesim.scenes import Part, Renderer, Scene, SceneObject, Spacecraft, materials, render
+from spacesim.scenes import (
+    GenerateConfig,
+    Part,
+    Renderer,
+    Scene,
+    SceneObject,
+    Spacecraft,
+    built_in_scene,
+    materials,
+    render,
+)
+from spacesim.scenes.generate import plan_views
 from spacesim.scenes.sun import EXPOSURE, SOLAR_IRRADIANCE
 
 
@@ -47,6 +58,9 @@ def test_lambertian_sphere_has_its_phase_function_and_size(phase_deg):
     expected = 2 / 3 * SOLAR_IRRADIANCE * 0.5 * (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
     assert truth.radiance[..., 0].sum() * pixel == pytest.approx(expected, rel=0.01)  # facets and noise
     assert truth.alpha.sum() * pixel == pytest.approx(np.pi, rel=0.005)
+    j, i = np.mgrid[:size, :size] + 0.5
+    centre = [(truth.alpha * i).sum() / truth.alpha.sum(), (truth.alpha * j).sum() / truth.alpha.sum()]
+    assert centre == pytest.approx([camera.cx, camera.cy], abs=0.02), "pixel centres are at halves"
     assert truth.alpha.min() == 0.0
     assert truth.alpha.max() == 1.0
     assert not truth.alpha[0].any(), "far from the sphere"
@@ -61,6 +75,29 @@ def test_passes_change_the_noise_only(monkeypatch):
     parts = Renderer(sphere, spp=60).render(camera, sun, seed=5)
     np.testing.assert_array_equal(parts.alpha, whole.alpha)  # sample positions do not depend on the passes
     np.testing.assert_allclose(parts.radiance, whole.radiance, rtol=0.02, atol=2.0)
+
+
+def test_alpha_is_one_within_and_zero_away_from_the_labels_silhouette():
+    scene = built_in_scene("boxsat")
+    camera = plan_views(scene, GenerateConfig(views=1, resolution=96))[0][0][1].camera
+    truth = Renderer(scene, spp=16).render(camera, Sun.from_angles(45, 35), seed=0)
+    surface = truth.object_id > 0
+    shifts = [np.roll(surface, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    assert np.isfinite(truth.radiance).all()
+    assert truth.radiance.min() >= 0
+    assert truth.radiance[surface].mean() > 1
+    assert not truth.radiance[truth.alpha == 0].any()
+    assert truth.alpha[np.all(shifts, axis=0)].min() > 0.7  # a gap can be thinner than a pixel
+    assert np.abs(truth.alpha.mean() - surface.mean()) < 0.005
+    assert truth.alpha[~np.any(shifts, axis=0)].max() < 0.5  # and so can a boom
+
+
+def test_more_pixels_than_a_wavefront_holds(monkeypatch):
+    monkeypatch.setattr(render, "MAX_WAVEFRONT", 100)
+    scene = scene_of(trimesh.creation.box((2, 2, 2)), materials.TEST_WHITE)
+    camera = Camera.from_fov(look_at([5, 0, 0], [0, 0, 0]), 16, 16, 10.0)
+    truth = Renderer(scene, spp=3).render(camera, Sun.from_angles(0, 0), seed=1)
+    np.testing.assert_allclose(truth.radiance * EXPOSURE, 1.0, rtol=1e-5)
 
 
 def test_sun_can_be_moved_and_moved_back():
