@@ -76,6 +76,8 @@ def _read_metrics(folder: Path) -> dict[str, Any]:
     missing = [key for key in _NEEDED if key not in metrics]
     if missing:
         raise InputError(f"{path}: expected the key {missing[0]}, found none")
+    if not metrics["frames"]:
+        raise InputError(f"{path}: expected frames, found none")
     for frame in metrics["frames"]:
         if Path(frame["name"]).name != frame["name"]:
             raise InputError(f"{path}: expected a frame's name without folders, found {frame['name']!r}")

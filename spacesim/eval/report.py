@@ -86,12 +86,12 @@ def _card(metric: Metric, runs: Sequence[Judged], cells: Sequence[Cell]) -> str:
     if len(runs) == 1:
         value, number, spread = cells[0]
         body = f'<p class="big">{number}{"" if value is None else unit}</p><p class="std">{spread}</p>'
-        return f'<div class="card"><h3>{escape(metric.label + goal)}</h3>{body}</div>'
+        return f'<div class="card"><h2>{escape(metric.label + goal)}</h2>{body}</div>'
     rows = zip(runs, _best_in_bold(metric, cells), strict=True)
     body = "".join(
         f'<p class="row"><span>{run.label}</span><span>{number}</span></p>' for run, number in rows
     )
-    return f'<div class="card"><h3>{escape(metric.label + goal)}{unit}</h3>{body}</div>'
+    return f'<div class="card"><h2>{escape(metric.label + goal)}{unit}</h2>{body}</div>'
 
 
 def _results(runs: Sequence[Judged]) -> str:
@@ -243,21 +243,21 @@ def _making(runs: Sequence[Judged]) -> str:
         command = run.metrics["training"].get("command")
         if command:
             text = " ".join(map(str, command)) if isinstance(command, list) else str(command)
-            parts.append(f"<h4>{run.label}</h4><pre>{escape(text)}</pre>")
+            parts.append(f"<h3>{run.label}</h3><pre>{escape(text)}</pre>")
     return "".join(parts)
 
 
 def _data_facts(run: Judged) -> dict[str, Any]:
     data = run.metrics["dataset"]
     width, height = data["resolution"]
-    return {
+    facts = {
         "folder": run.metrics["data"],
         "scene": data.get("scene"),
         "judged frames": f"{data['frames']} ({run.metrics['split']})",
         "training frames": data["train_frames"],
         "resolution": f"{width} × {height}",
-        **(data.get("config") or {}),
     }
+    return facts | {key: value for key, value in (data.get("config") or {}).items() if key not in facts}
 
 
 def _model_facts(run: Judged) -> dict[str, Any]:
@@ -302,6 +302,6 @@ def _notes(runs: Sequence[Judged]) -> str:
     parts = []
     for run in runs:
         items = "".join(f"<li>{escape(note)}</li>" for note in run.metrics["notes"])
-        heading = f"<h4>{run.label}</h4>" if len(runs) > 1 else ""
+        heading = f"<h3>{run.label}</h3>" if len(runs) > 1 else ""
         parts.append(f"{heading}<ul>{items}</ul>")
     return "".join(parts)

@@ -45,7 +45,7 @@ section { margin-top: 4.2rem; padding-top: 2.2rem; border-top: 1px solid var(--l
 .card {
   background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 1rem 1.1rem 1.1rem;
 }
-.card h3 { font: 600 0.84rem var(--sans); color: var(--muted); margin: 0 0 0.5rem; }
+.card h2 { font: 600 0.84rem var(--sans); color: var(--muted); margin: 0 0 0.5rem; }
 .card p { margin: 0; font-variant-numeric: tabular-nums; }
 .card .big { font-size: 1.85rem; line-height: 1.15; letter-spacing: -0.02em; }
 .card .big small { font-size: 0.95rem; letter-spacing: 0; color: var(--muted); margin-left: 0.25rem; }

@@ -1,0 +1,39 @@
+"""The error's colours and the shadow masks."""
+
+import numpy as np
+from skimage.color import rgb2lab
+
+from spacesim.eval import pictures
+
+
+def test_error_colours_rise_evenly_from_black_to_white():
+    colours = pictures.error_colours(np.linspace(0, 1, 33))
+    assert colours[0].tolist() == [0, 0, 0]
+    assert colours[-1].tolist() == [255, 255, 255]
+    lab = rgb2lab(colours / 255)
+    assert np.all(np.diff(lab[:, 0]) > 0)
+    steps = np.linalg.norm(np.diff(lab, axis=0), axis=1)[
+        2:
+    ]  # the first two are near black, where CIELAB is steep
+    assert steps.max() / steps.min() < 3
+
+
+def test_error_picture_has_a_fixed_scale():
+    truth = np.zeros((1, 4, 3))
+    prediction = np.array([0, 0.5, 1, 7])[None, :, None] * pictures.ERROR_SCALE * np.ones(3)
+    picture = pictures.error_picture(prediction, truth, np.ones((1, 4), bool))
+    assert picture[0].tolist() == pictures.error_colours(np.array([0, 0.5, 1, 1])).tolist()
+    assert not pictures.error_picture(prediction, truth, np.zeros((1, 4), bool)).any()
+
+
+def test_shadow_picture_tells_mistakes():
+    predicted = np.array([[False, True, True, False, True]])
+    shadowed = np.array([[False, True, False, True, True]])
+    mask = np.array([[True, True, True, True, False]])
+    picture = pictures.shadow_picture(predicted, shadowed, mask)
+    expected = [pictures.LIT, pictures.SHADOWED, pictures.WRONGLY_SHADOWED, pictures.WRONGLY_LIT, (0, 0, 0)]
+    assert picture[0].tolist() == [list(colour) for colour in expected]
+
+
+def test_bytes_are_rounded_and_clipped():
+    assert pictures.as_bytes(np.array([-1, 0.4999 / 255, 0.5001 / 255, 1, 2])).tolist() == [0, 0, 1, 255, 255]
