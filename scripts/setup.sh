@@ -58,7 +58,7 @@ make_venv() {
         return
     fi
     python=$(find_python)
-    [ -n "$python" ] || stop "Python 3.10 to 3.13 is needed, found $(python3 --version 2>/dev/null || echo none);" \
+    [ -n "$python" ] || stop "Python 3.10 to 3.13 is needed, found $("${PYTHON:-python3}" --version 2>/dev/null || echo none);" \
         "install one (Debian, Ubuntu: sudo apt-get install python3 python3-venv) or name it: make PYTHON=/path/to/python3"
     if ! has_venv "$python"; then
         package="$("$python" -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])')"
@@ -75,12 +75,13 @@ install() { # pip install in the versions of the lock
 }
 
 backend_ready() { # succeeds, or prints why no backend can run
-    .venv/bin/python - 2>&1 <<'PYTHON'
+    .venv/bin/python - 2>/dev/null <<'PYTHON'
 from spacesim import backend
 
 library, sentence = backend.find_llvm()
 if library is None and backend.available()["cuda"] is not None:
-    raise SystemExit(sentence)
+    print(sentence)
+    raise SystemExit(1)
 PYTHON
 }
 
