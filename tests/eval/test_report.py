@@ -252,6 +252,17 @@ def test_same_folder_same_bytes(folder, tmp_path):
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
 
 
+def test_histogram_bars_stand_for_counts():
+    svg = charts.histogram("a", [[0.5, 1.5, 1.5], [1.5]], [0, 1, 2, 3], 4)
+    paths = re.findall(r'class="block (s\d)" d="M0 (\d+)V([\d.]+)H[\d.]+V([\d.]+)H[\d.]+V([\d.]+)', svg)
+    base = float(paths[0][1])
+    heights = {name: [base - float(top) for top in tops] for name, _, *tops in paths}
+    unit = heights["s1"][1]
+    assert unit > 0
+    assert heights == {"s0": [unit, 2 * unit, 0], "s1": [0, unit, 0]}
+    assert 4 * unit < base
+
+
 def test_ticks_are_round_and_reach_around():
     assert charts.nice_ticks(0, 2000, 5) == [0, 500, 1000, 1500, 2000]
     assert charts.nice_ticks(7, 7, 4)[0] <= 7 <= charts.nice_ticks(7, 7, 4)[-1]

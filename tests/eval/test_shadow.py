@@ -61,6 +61,7 @@ def test_outline_of_the_silhouette_is_no_shadow_boundary():
     lit = np.zeros((6, 10))
     lit[:, 3:7] = 0.6
     assert not shadow.boundary_band(lit < 0.1, lit > 0).any()
+    assert not shadow.boundary_band(lit < 0.1, lit == 0).any()
     assert shadow.boundary_band(lit < 0.1, EVERYWHERE).any()
 
 
