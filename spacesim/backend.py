@@ -1,15 +1,14 @@
 """Floor 0: which Dr.Jit backend runs, chosen once: CUDA where a device works, else LLVM on the CPU.
 
 `ad` names Dr.Jit's array types of the chosen backend (`ad.Float`, `ad.Array3f`, ...); the first use chooses, if
-`select` has not. Dr.Jit takes the first libLLVM that it finds, and versions before 19 abort the whole process, so
-the library is looked for here and named in DRJIT_LIBLLVM_PATH before Dr.Jit loads.
+`select` has not. Dr.Jit takes the first libLLVM that it finds, when it is imported, and versions before 19 abort the
+whole process: so the package, when it is imported, has `name_llvm` put a good one into DRJIT_LIBLLVM_PATH.
 """
 
 import ctypes
 import importlib
 import os
 import re
-import sys
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -44,22 +43,39 @@ def find_llvm() -> tuple[Path | None, str]:
     if named:
         version = _library_version(Path(named))
         if version is None:
-            return None, f"DRJIT_LIBLLVM_PATH names {named}, which cannot be loaded as libLLVM {MINIMUM_LLVM} or newer"
+            return (
+                None,
+                f"DRJIT_LIBLLVM_PATH names {named}, which cannot be loaded as libLLVM {MINIMUM_LLVM} or newer",
+            )
         if version < MINIMUM_LLVM:
             return None, f"DRJIT_LIBLLVM_PATH names libLLVM {version}, expected {MINIMUM_LLVM} or newer"
         return Path(named), f"libLLVM {version} at {named}"
-    candidates: dict[Path, int] = {}
+    candidates = _candidates()
+    for path, version in candidates:
+        if version >= MINIMUM_LLVM and (_library_version(path) or 0) >= MINIMUM_LLVM:
+            return path, f"libLLVM {version} at {path}"
+    found = sorted({version for _, version in candidates})
+    other = f"only version {', '.join(map(str, found))}" if found else "none"
+    return None, f"libLLVM {MINIMUM_LLVM} or newer is needed, found {other}; type: {INSTALL_LLVM}"
+
+
+def name_llvm() -> None:
+    """Name the newest libLLVM in DRJIT_LIBLLVM_PATH, unless the user has named one. Judges by file names alone."""
+    good = [path for path, version in _candidates() if version >= MINIMUM_LLVM]
+    if good:
+        os.environ.setdefault("DRJIT_LIBLLVM_PATH", str(good[0]))
+
+
+@cache
+def _candidates() -> list[tuple[Path, int]]:
+    """(library, version by its name) in the usual places, newest first."""
+    found: dict[Path, int] = {}
     for pattern in _LIBRARY_PLACES:
         for path in Path("/").glob(pattern.lstrip("/")):
             match = re.search(r"libLLVM(?:-|\.so\.|\.)?(\d+)", path.name)
             if match and path.exists():
-                candidates.setdefault(path.resolve(), int(match.group(1)))
-    for path, version in sorted(candidates.items(), key=lambda item: (-item[1], str(item[0]))):
-        if version >= MINIMUM_LLVM and (_library_version(path) or 0) >= MINIMUM_LLVM:
-            return path, f"libLLVM {version} at {path}"
-    found = sorted(set(candidates.values()))
-    other = f"only version {', '.join(map(str, found))}" if found else "none"
-    return None, f"libLLVM {MINIMUM_LLVM} or newer is needed, found {other}; type: {INSTALL_LLVM}"
+                found.setdefault(path.resolve(), int(match.group(1)))
+    return sorted(found.items(), key=lambda item: (-item[1], str(item[0])))
 
 
 def _library_version(path: Path) -> int | None:
@@ -76,8 +92,6 @@ def _library_version(path: Path) -> int | None:
 def available() -> dict[str, str | None]:
     """{backend: None where it can run, else one sentence that says why not and what to type}."""
     library, sentence = find_llvm()
-    if library is not None and "drjit" not in sys.modules:
-        os.environ["DRJIT_LIBLLVM_PATH"] = str(library)
     import drjit as dr
 
     reasons: dict[str, str | None] = {"cuda": None, "llvm": None}
@@ -86,7 +100,7 @@ def available() -> dict[str, str | None]:
     if library is None:
         reasons["llvm"] = sentence
     elif not dr.has_backend(dr.JitBackend.LLVM):
-        reasons["llvm"] = f"Dr.Jit cannot load {sentence}; import spacesim before drjit"
+        reasons["llvm"] = f"Dr.Jit cannot load {sentence}; import spacesim before drjit and mitsuba"
     return reasons
 
 

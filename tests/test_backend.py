@@ -29,9 +29,7 @@ def run(program: str, **environment: str) -> str:
 def find_in(folder: Path) -> str:
     """What find_llvm prints where only `folder` is looked into."""
     places = (f"{folder}/libLLVM*.so*",)
-    return run(
-        f"from spacesim import backend; backend._LIBRARY_PLACES = {places!r}; print(*backend.find_llvm())"
-    )
+    return run(f"from spacesim import backend; backend._LIBRARY_PLACES = {places!r}; print(*backend.find_llvm())")
 
 
 @pytest.fixture(scope="module")
@@ -77,9 +75,7 @@ def test_old_and_broken_libraries_are_passed_over(fakes, tmp_path):
 
 
 def test_nothing_to_find(tmp_path):
-    assert find_in(tmp_path) == (
-        f"None libLLVM 19 or newer is needed, found none; type: {backend.INSTALL_LLVM}"
-    )
+    assert find_in(tmp_path) == (f"None libLLVM 19 or newer is needed, found none; type: {backend.INSTALL_LLVM}")
 
 
 def test_named_library(fakes):

@@ -17,20 +17,11 @@ FORBIDDEN = {
         "mitsuba",
         "drjit",
         "spacesim.backend",
-        *(
-            f"spacesim.{top}"
-            for top in ("scenes", "splat", "nerf", "eval", "viewer", "cli", "demo", "doctor")
-        ),
+        *(f"spacesim.{top}" for top in ("scenes", "splat", "nerf", "eval", "viewer", "cli", "demo", "doctor")),
     ),
-    "scenes": tuple(
-        f"spacesim.{top}" for top in ("splat", "nerf", "eval", "viewer", "cli", "demo", "doctor")
-    ),
-    "splat": tuple(
-        f"spacesim.{top}" for top in ("scenes", "nerf", "eval", "viewer", "cli", "demo", "doctor")
-    ),
-    "nerf": tuple(
-        f"spacesim.{top}" for top in ("scenes", "splat", "eval", "viewer", "cli", "demo", "doctor")
-    ),
+    "scenes": tuple(f"spacesim.{top}" for top in ("splat", "nerf", "eval", "viewer", "cli", "demo", "doctor")),
+    "splat": tuple(f"spacesim.{top}" for top in ("scenes", "nerf", "eval", "viewer", "cli", "demo", "doctor")),
+    "nerf": tuple(f"spacesim.{top}" for top in ("scenes", "splat", "eval", "viewer", "cli", "demo", "doctor")),
     "eval": tuple(f"spacesim.{top}" for top in ("viewer", "cli", "demo", "doctor")),
     "viewer": ("spacesim.cli", "spacesim.demo", "spacesim.doctor"),
 }

@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import OPENCV_FROM_OPENGL, Array, angles_from_direction, direction_from_angles, normalize
+from spacesim.data.geometry import (
+    OPENCV_FROM_OPENGL,
+    Array,
+    angles_from_direction,
+    direction_from_angles,
+    normalize,
+)
 
 
 @dataclass(frozen=True, eq=False)

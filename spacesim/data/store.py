@@ -39,9 +39,7 @@ __all__ = [
 
 SHADOW_NONE = 0  #: no surface
 SHADOW_ATTACHED = 85  #: the surface faces away from the Sun
-SHADOW_SELF_CAST = (
-    170  #: cast by the same object; 170 + k: cast by object k, 1 to 84, where that is another one
-)
+SHADOW_SELF_CAST = 170  #: cast by the same object; 170 + k: cast by object k, 1 to 84, where that is another one
 SHADOW_LIT = 255  #: at least half of the solar disc is seen
 
 _FILES = {
@@ -143,17 +141,13 @@ class DatasetWriter:
 
     def _check_resumable(self, scene: Mapping[str, Any], resume: bool) -> None:
         if not resume:
-            raise InputError(
-                f"{self.root}: expected a new or empty folder, found a dataset; go on with --resume"
-            )
+            raise InputError(f"{self.root}: expected a new or empty folder, found a dataset; go on with --resume")
         path = self.root / "scene.json"
         found = read_json(path)
         found = found if isinstance(found, dict) else {}
         for key in [*scene, *found]:
             if key not in found or key not in scene or found[key] != scene[key]:
-                raise InputError(
-                    f"{path}: expected the scene asked for, {key!r} differs; choose another folder"
-                )
+                raise InputError(f"{path}: expected the scene asked for, {key!r} differs; choose another folder")
 
     def _encode_depth(self, depth: np.ndarray, surface: np.ndarray) -> np.ndarray:
         steps = np.round(np.where(surface, depth, 0).astype(np.float64) / _DEPTH_UNIT)
@@ -238,9 +232,7 @@ def _read_label(path: Path, camera: Camera) -> None:
     found = read_png(path).shape[:2]
     if found != (camera.height, camera.width):
         expected = f"{camera.width}x{camera.height}"
-        raise InputError(
-            f"{path}: expected {expected} pixels as the camera says, found {found[1]}x{found[0]}"
-        )
+        raise InputError(f"{path}: expected {expected} pixels as the camera says, found {found[1]}x{found[0]}")
 
 
 def _describe_frames(

@@ -84,9 +84,7 @@ def _read_blender(root: Path) -> tuple[Json, tuple[Frame, ...], tuple[Frame, ...
     """(content of transforms_train.json, train, test) of a folder laid out as Blender's scenes are."""
     source = root / "transforms_train.json"
     meta = _read_object(source)
-    held_out = next(
-        (p for p in (root / "transforms_test.json", root / "transforms_val.json") if p.is_file()), None
-    )
+    held_out = next((p for p in (root / "transforms_test.json", root / "transforms_val.json") if p.is_file()), None)
     test = _read_frames(held_out, _read_object(held_out)) if held_out else ()
     return meta, _read_frames(source, meta), test
 
@@ -102,12 +100,8 @@ def _read_frames(source: Path, meta: Json) -> tuple[Frame, ...]:
     """All frames in the order of their file paths."""
     entries = meta.get("frames")
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
-        raise InputError(
-            f"{source}: expected a list of frames, found {'none' if not entries else 'another value'}"
-        )
-    frames = sorted(
-        (_read_frame(source, meta, entry) for entry in entries), key=lambda frame: frame.file_path
-    )
+        raise InputError(f"{source}: expected a list of frames, found {'none' if not entries else 'another value'}")
+    frames = sorted((_read_frame(source, meta, entry) for entry in entries), key=lambda frame: frame.file_path)
     for one, other in pairwise(frames):
         if one.file_path == other.file_path:
             raise InputError(f"{source}: expected each image once, found {one.file_path} twice")
@@ -183,22 +177,16 @@ def _read_sun(values: Json) -> Sun | None:
         try:
             return Sun(np.asarray(values["sun_direction"], np.float64))
         except (TypeError, ValueError):
-            raise InputError(
-                f"expected 3 finite numbers as sun_direction, found {values['sun_direction']!r}"
-            ) from None
+            raise InputError(f"expected 3 finite numbers as sun_direction, found {values['sun_direction']!r}") from None
     if "sun_azimuth_deg" in values and "sun_elevation_deg" in values:
         return Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
     return None
 
 
-def _split(
-    source: Path, meta: Json, frames: tuple[Frame, ...]
-) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+def _split(source: Path, meta: Json, frames: tuple[Frame, ...]) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
     """(train, test) of `frames` by the rules above."""
     known = [frame.file_path for frame in frames]
-    listed = {
-        key: _listed(source, meta[f"{key}_filenames"], known) for key in _SPLITS if f"{key}_filenames" in meta
-    }
+    listed = {key: _listed(source, meta[f"{key}_filenames"], known) for key in _SPLITS if f"{key}_filenames" in meta}
     folders = {key: {path for path in known if key in PurePosixPath(path).parts[:-1]} for key in _SPLITS}
     if listed:
         test = listed.get("test", listed.get("val"))
@@ -223,9 +211,7 @@ def _listed(source: Path, names: Any, known: list[str]) -> set[str]:
     listed = {name if name in known else f"{name}.png" for name in listed}
     unknown = sorted(listed.difference(known))
     if unknown:
-        raise InputError(
-            f"{source}: expected a frame for each name in its lists, found none for {unknown[0]}"
-        )
+        raise InputError(f"{source}: expected a frame for each name in its lists, found none for {unknown[0]}")
     return listed
 
 

@@ -58,15 +58,11 @@ def histogram(title: str, groups: Sequence[Sequence[float]], edges: Sequence[flo
         counts, _ = np.histogram(values, edges)
         tops = [height - bottom - count / tallest * (height - bottom - 24) for count in counts]
         path = "".join(f"V{top:.1f}H{step * (i + 1):.1f}" for i, top in enumerate(tops))
-        marks.append(
-            f'<path class="block s{index % SERIES}" d="M0 {height - bottom}{path}V{height - bottom}Z"/>'
-        )
+        marks.append(f'<path class="block s{index % SERIES}" d="M0 {height - bottom}{path}V{height - bottom}Z"/>')
     marks.append(f'<path class="base" d="M0 {height - bottom}H{width}"/>')
     for position, anchor in ((0, "start"), (len(edges) // 2, "middle"), (len(edges) - 1, "end")):
         x = step * position
-        marks.append(
-            f'<text x="{x:.1f}" y="{height - 6}" text-anchor="{anchor}">{compact(edges[position])}</text>'
-        )
+        marks.append(f'<text x="{x:.1f}" y="{height - 6}" text-anchor="{anchor}">{compact(edges[position])}</text>')
     return _svg(f"Histogram, {title}", width, height, marks)
 
 
@@ -100,9 +96,7 @@ def column_histograms(
     every = max(len(columns) // 8, 1)
     for column in range(0, len(columns), every):
         x = _LEFT + step_x * (column + 0.5)
-        marks.append(
-            f'<text x="{x:.1f}" y="{height - 22}" text-anchor="middle">{escape(columns[column][0])}</text>'
-        )
+        marks.append(f'<text x="{x:.1f}" y="{height - 22}" text-anchor="middle">{escape(columns[column][0])}</text>')
     return _svg(title, width, height, marks)
 
 
@@ -150,6 +144,4 @@ def _round_step(step: float) -> float:
 
 
 def _svg(label: str, width: float, height: float, marks: Sequence[str]) -> str:
-    return (
-        f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">{"".join(marks)}</svg>'
-    )
+    return f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">{"".join(marks)}</svg>'

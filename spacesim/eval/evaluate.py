@@ -113,9 +113,7 @@ def evaluate(
         },
         **{group: summary(record[group] for record in records) for group in GROUPS},
         "geometry": None,
-        "notes": explain(
-            records, sources, None if network else lpips_sentence, str(run.config.get("method"))
-        ),
+        "notes": explain(records, sources, None if network else lpips_sentence, str(run.config.get("method"))),
         "dataset": _describe(dataset, frames),
         "config": dict(run.config),
         "training": dict(run.training),
@@ -161,9 +159,7 @@ def summary(records: Iterable[Mapping[str, float | None] | None]) -> dict[str, A
     for metric in present[0]:
         values = [value for record in present if (value := record[metric]) is not None]
         result[metric] = (
-            {"mean": float(np.mean(values)), "std": float(np.std(values)), "count": len(values)}
-            if values
-            else None
+            {"mean": float(np.mean(values)), "std": float(np.std(values)), "count": len(values)} if values else None
         )
     return result
 
@@ -171,9 +167,7 @@ def summary(records: Iterable[Mapping[str, float | None] | None]) -> dict[str, A
 def _view(dataset: Dataset, frame: Frame, prediction: "Prediction") -> tuple[View, str]:
     """The pictures to compare, and where the silhouette is from: "truth", "alpha" or "frame"."""
     if not all(np.all(np.isfinite(p)) for p in (prediction.rgb, prediction.alpha)):
-        raise WorkError(
-            f"{frame.file_path}: the prediction has values that are not finite; train the run again"
-        )
+        raise WorkError(f"{frame.file_path}: the prediction has values that are not finite; train the run again")
     loaded = load_image(dataset, frame)
     if frame.silhouette_path is not None and not any(frame.distortion):
         silhouette, source = read_png(dataset.root / frame.silhouette_path) > 0, "truth"
@@ -215,17 +209,13 @@ def _image_metrics(view: View, mask: Mask, windows: Mask, network: lpips.Lpips |
     }
 
 
-def _judge_visibility(
-    dataset: Dataset, frame: Frame, prediction: "Prediction", view: View
-) -> shadow.Metrics | None:
+def _judge_visibility(dataset: Dataset, frame: Frame, prediction: "Prediction", view: View) -> shadow.Metrics | None:
     """Predicted sun visibility (already divided by alpha) against the truth; None where either is missing."""
     if prediction.visibility is None or frame.gt_path is None:
         return None
     truth = load_truth(dataset, frame)
     sees_the_sun_or_a_caster = truth.shadow >= SHADOW_SELF_CAST
-    return shadow.visibility_metrics(
-        prediction.visibility, truth.sun_visibility, view.valid & sees_the_sun_or_a_caster
-    )
+    return shadow.visibility_metrics(prediction.visibility, truth.sun_visibility, view.valid & sees_the_sun_or_a_caster)
 
 
 def _write_pictures(folder: Path, view: View) -> None:

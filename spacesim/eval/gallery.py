@@ -92,8 +92,7 @@ def _keys() -> str:
     stops = ", ".join(_css(colour) for colour in error_colours(np.linspace(0, 1, 17)))
     bar = f'<span class="bar" style="background: linear-gradient(90deg, {stops})"></span>'
     swatches = "".join(
-        f'<span><b style="background: {_css(colour)}"></b>{label}</span>'
-        for label, colour in _SWATCHES.items()
+        f'<span><b style="background: {_css(colour)}"></b>{label}</span>' for label, colour in _SWATCHES.items()
     )
     return (
         f'<p class="key"><span>Error, mean of the channels: 0 {bar} {ERROR_SCALE} and more</span></p>'

@@ -63,9 +63,7 @@ def read_evals(folders: Sequence[Path]) -> list[Judged]:
     found = [_read_metrics(Path(folder)) for folder in folders]
     names = _unique_names(found, [Path(folder) for folder in folders])
     together = zip(folders, names, found, strict=True)
-    return [
-        Judged(Path(folder), index, name, metrics) for index, (folder, name, metrics) in enumerate(together)
-    ]
+    return [Judged(Path(folder), index, name, metrics) for index, (folder, name, metrics) in enumerate(together)]
 
 
 def _read_metrics(folder: Path) -> dict[str, Any]:

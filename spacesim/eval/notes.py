@@ -11,9 +11,7 @@ _STAND_INS = {
 }
 
 
-def explain(
-    records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips: str | None, method: str
-) -> list[str]:
+def explain(records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips: str | None, method: str) -> list[str]:
     """Sentences about the frames `records`: {group: {metric: value or None} or None}.
 
     sources: where each silhouette is from ("truth", "alpha" or "frame");  no_lpips: why there is none at all
@@ -29,9 +27,7 @@ def explain(
             notes.append(f"In {count} of {total} frames {sentence}.")
     unseen = sum(not _shows_object(record) for record in records)
     if unseen:
-        notes.append(
-            f"{unseen} of {total} frames show no object: what is taken over its silhouette is null there."
-        )
+        notes.append(f"{unseen} of {total} frames show no object: what is taken over its silhouette is null there.")
     for group in GROUPS:
         notes += _explain_group(records, group, bool(no_lpips))
     return notes

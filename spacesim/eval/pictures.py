@@ -54,9 +54,7 @@ def _colour_table() -> np.ndarray:
     path = np.stack([np.interp(fine, knots, lightness), C * np.cos(h), C * np.sin(h)], axis=-1)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=-1))])
     even = np.interp(np.linspace(0, length[-1], 256), length, fine)
-    return as_bytes(
-        _srgb_from_oklab(np.stack([np.interp(even, fine, channel) for channel in path.T], axis=-1))
-    )
+    return as_bytes(_srgb_from_oklab(np.stack([np.interp(even, fine, channel) for channel in path.T], axis=-1)))
 
 
 def _srgb_from_oklab(lab: np.ndarray) -> np.ndarray:

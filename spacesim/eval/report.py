@@ -88,9 +88,7 @@ def _card(metric: Metric, runs: Sequence[Judged], cells: Sequence[Cell]) -> str:
         body = f'<p class="big">{number}{"" if value is None else unit}</p><p class="std">{spread}</p>'
         return f'<div class="card"><h2>{escape(metric.label + goal)}</h2>{body}</div>'
     rows = zip(runs, _best_in_bold(metric, cells), strict=True)
-    body = "".join(
-        f'<p class="row"><span>{run.label}</span><span>{number}</span></p>' for run, number in rows
-    )
+    body = "".join(f'<p class="row"><span>{run.label}</span><span>{number}</span></p>' for run, number in rows)
     return f'<div class="card"><h2>{escape(metric.label + goal)}{unit}</h2>{body}</div>'
 
 
@@ -173,12 +171,8 @@ def _histograms(runs: Sequence[Judged]) -> str:
             )
             for run, groups in zip(runs, by_sun, strict=True)
         )
-    tallest = max(
-        int(np.histogram(values, edges)[0].max()) for groups in by_sun for values in groups.values()
-    )
-    charts = [
-        histogram(_sun_name(sun), [groups.get(sun, []) for groups in by_sun], edges, tallest) for sun in suns
-    ]
+    tallest = max(int(np.histogram(values, edges)[0].max()) for groups in by_sun for values in groups.values())
+    charts = [histogram(_sun_name(sun), [groups.get(sun, []) for groups in by_sun], edges, tallest) for sun in suns]
     return _legend(runs) + f'<div class="multiples">{"".join(charts)}</div>'
 
 
@@ -187,9 +181,7 @@ def _by_sun(run: Judged) -> dict[tuple[float, ...], list[float]]:
     groups: dict[tuple[float, ...], list[float]] = {}
     for frame in run.metrics["frames"]:
         if frame["psnr"] is not None:
-            groups.setdefault(tuple(round(angle, 1) for angle in frame["sun"] or ()), []).append(
-                frame["psnr"]
-            )
+            groups.setdefault(tuple(round(angle, 1) for angle in frame["sun"] or ()), []).append(frame["psnr"])
     return groups
 
 
@@ -210,11 +202,7 @@ def _training(runs: Sequence[Judged]) -> str:
 
     def curves(key: str, lowest: float) -> list[list[tuple[float, float]]]:
         return [
-            [
-                (step["iteration"], step[key])
-                for step in history
-                if step.get(key) is not None and step[key] > lowest
-            ]
+            [(step["iteration"], step[key]) for step in history if step.get(key) is not None and step[key] > lowest]
             for history in histories
         ]
 

@@ -64,9 +64,7 @@ def fitting_distance(radius: float, fov_deg: float) -> float:
     return MARGIN * radius / float(np.sin(0.5 * np.radians(fov_deg)))
 
 
-def views_around(
-    suns: Sequence[Sun], lens: Lens, count: int, seed: int, split: Literal["train", "test"]
-) -> list[View]:
+def views_around(suns: Sequence[Sun], lens: Lens, count: int, seed: int, split: Literal["train", "test"]) -> list[View]:
     """`count` cameras for each Sun, all around the target. The lattice is turned at random for each Sun and
     split, so that no two sets of cameras coincide."""
     stream = _TRAIN if split == "train" else _TEST

@@ -35,9 +35,7 @@ def rod(start: ArrayLike, end: ArrayLike, radius: float, segments: int = 24) -> 
     return along(revolved([(0, 0), (radius, 0), (radius, 1), (0, 1)], segments), start, end)
 
 
-def tube(
-    start: ArrayLike, end: ArrayLike, inner: float, outer: float, segments: int = SEGMENTS
-) -> trimesh.Trimesh:
+def tube(start: ArrayLike, end: ArrayLike, inner: float, outer: float, segments: int = SEGMENTS) -> trimesh.Trimesh:
     """A cylinder from `start` [3] to `end` [3] with a hole through it."""
     profile = [(inner, 0), (outer, 0), (outer, 1), (inner, 1)]
     return along(revolved(profile, segments), start, end)

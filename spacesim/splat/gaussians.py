@@ -70,7 +70,11 @@ class Gaussians:
     def from_numpy(arrays: Mapping[str, np.ndarray]) -> "Gaussians":
         """The inverse of `to_numpy`. Raises ValueError naming the array whose shape does not fit."""
         count = len(arrays["means"])
-        expected = {"means": (count, 3), "log_scales": (count, 3), "quaternions": (count, 4)}
+        expected: dict[str, tuple[int, ...]] = {
+            "means": (count, 3),
+            "log_scales": (count, 3),
+            "quaternions": (count, 4),
+        }
         expected["logit_opacities"] = (count,)
         for name, shape in expected.items():
             if np.shape(arrays[name]) != shape:

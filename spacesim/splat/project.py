@@ -35,7 +35,14 @@ class Pinhole:
     def of(camera: Camera) -> "Pinhole":
         """Upload a `Camera` record."""
         tangents = (0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
-        numbers = [*camera.camera_from_world[:3].ravel(), camera.fx, camera.fy, camera.cx, camera.cy, *tangents]
+        numbers = [
+            *camera.camera_from_world[:3].ravel(),
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            *tangents,
+        ]
         return Pinhole(ad.Float(np.asarray(numbers, dtype=np.float32)), camera.width, camera.height)
 
     def __getitem__(self, index: int) -> Any:
@@ -105,13 +112,14 @@ def project(gaussians: Gaussians, camera: Pinhole) -> tuple[Splats, Footprints]:
     held_x = dr.clip(tan_x, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
     held_y = dr.clip(tan_y, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
     axes, scales = _rotation_columns(quaternions), dr.exp(log_scales)
-    m_x, m_y = [], []
+    rows_x: list[Any] = []
+    rows_y: list[Any] = []
     for i in range(3):
         axis = axes[i] * scales[i] * inverse_z
         forward = dr.dot(camera.row(2), axis)
-        m_x.append(fx * (dr.dot(camera.row(0), axis) - held_x * forward))
-        m_y.append(fy * (dr.dot(camera.row(1), axis) - held_y * forward))
-    m_x, m_y = ad.Array3f(m_x), ad.Array3f(m_y)
+        rows_x.append(fx * (dr.dot(camera.row(0), axis) - held_x * forward))
+        rows_y.append(fy * (dr.dot(camera.row(1), axis) - held_y * forward))
+    m_x, m_y = ad.Array3f(rows_x), ad.Array3f(rows_y)
     small = dr.detach(dr.max(dr.abs(m_x)) < _LARGEST) & dr.detach(dr.max(dr.abs(m_y)) < _LARGEST)
     sane &= small
     m_x, m_y = dr.select(small, m_x, ad.Array3f(0)), dr.select(small, m_y, ad.Array3f(0))

@@ -199,7 +199,8 @@ class _Rasterize(dr.CustomOp):
         return [*self.blended.features, self.blended.transmittance]
 
     def backward(self) -> None:
-        *by_feature, by_transmittance = self.grad_out()
+        gradients: Any = self.grad_out()
+        *by_feature, by_transmittance = gradients
         result = backward(self.splats, self.blended, self.lists, self.size, by_feature, by_transmittance)
         self.set_grad_in("splats", result.splats)
         self.set_grad_in("features", result.features)
@@ -208,9 +209,7 @@ class _Rasterize(dr.CustomOp):
         return "rasterize"
 
 
-def rasterize(
-    splats: Splats, features: list[Any], lists: TileLists, width: int, height: int
-) -> tuple[list[Any], Any]:
+def rasterize(splats: Splats, features: list[Any], lists: TileLists, width: int, height: int) -> tuple[list[Any], Any]:
     """Differentiable blending. Returns (C feature planes, transmittance plane), [height * width] each."""
     *planes, transmittance = dr.custom(_Rasterize, splats, features, lists, width, height)
     return planes, transmittance
@@ -286,7 +285,9 @@ def _gather_slots(slots: list[Any], splats: Splats, lists: TileLists, channels: 
         return position < end
 
     def add(position: Any, sums: list[Any]) -> Any:
-        return position + 1, [total + dr.gather(ad.Array4f, slot, position) for total, slot in zip(sums, slots, strict=True)]
+        return position + 1, [
+            total + dr.gather(ad.Array4f, slot, position) for total, slot in zip(sums, slots, strict=True)
+        ]
 
     _, sums = dr.while_loop((position, sums), remaining, add, mode="symbolic", label="gather slots")
     s0, sx, sy, sxx, sxy, syy, absolute_x, absolute_y, *by_feature = (v for total in sums for v in total)

@@ -77,9 +77,7 @@ def test_quaternions_against_scipy_and_back():
 def test_quaternions_of_half_turns():
     for axis in np.eye(3):
         matrix = 2 * np.outer(axis, axis) - np.eye(3)
-        np.testing.assert_allclose(
-            rotation_from_quaternion(quaternion_from_rotation(matrix)), matrix, atol=1e-9
-        )
+        np.testing.assert_allclose(rotation_from_quaternion(quaternion_from_rotation(matrix)), matrix, atol=1e-9)
 
 
 def test_axes_by_hand():

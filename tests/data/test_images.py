@@ -45,9 +45,7 @@ def test_luminance_weights():
     assert luminance(np.ones((2, 5, 3), np.float32)).shape == (2, 5)
 
 
-@pytest.mark.parametrize(
-    ("shape", "dtype"), [((5, 7), "u1"), ((5, 7, 3), "u1"), ((5, 7, 4), "u1"), ((5, 7), "u2")]
-)
+@pytest.mark.parametrize(("shape", "dtype"), [((5, 7), "u1"), ((5, 7, 3), "u1"), ((5, 7, 4), "u1"), ((5, 7), "u2")])
 def test_png_round_trip_and_same_bytes(tmp_path, shape, dtype):
     pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape, endpoint=True).astype(dtype)
     write_png(tmp_path / "a.png", pixels)
@@ -181,9 +179,7 @@ def test_images_of_other_kinds(tmp_path):
         assert picture.mode == mode
         picture.save(tmp_path / "image.png")
         image = load(tmp_path, make_camera())
-        np.testing.assert_allclose(
-            image.rgb, np.repeat(grey[..., None], 3, -1) / 255, atol=1e-6, err_msg=mode
-        )
+        np.testing.assert_allclose(image.rgb, np.repeat(grey[..., None], 3, -1) / 255, atol=1e-6, err_msg=mode)
         np.testing.assert_array_equal(image.alpha, np.ones((6, 8)), err_msg=mode)
 
 

@@ -105,9 +105,7 @@ def test_records_and_truth_read_back(root):
     assert [frame.file_path for frame in dataset.train] == [f"images/{name}.png" for name in TRAIN]
     assert [frame.file_path for frame in dataset.test] == [f"images/{name}.png" for name in TEST]
     assert (dataset.ply_file_path, dataset.mesh_path, dataset.scene) == ("points.ply", "mesh.ply", SCENE)
-    for seed, (frame, (_, camera, sun)) in enumerate(
-        zip(dataset.frames, make_frames(TRAIN + TEST), strict=True)
-    ):
+    for seed, (frame, (_, camera, sun)) in enumerate(zip(dataset.frames, make_frames(TRAIN + TEST), strict=True)):
         np.testing.assert_array_equal(frame.camera.world_from_camera, camera.world_from_camera)
         assert (frame.camera.fx, frame.camera.cy) == (camera.fx, camera.cy)
         assert frame.sun is not None
@@ -215,9 +213,7 @@ def test_a_killed_writer_leaves_whole_frames_only(tmp_path):
         for index in range(10_000):
             writer.write_frame(f"train_{{index:05d}}", make_truth(index), 0.8)
     """
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(program)], stdout=subprocess.PIPE, text=True
-    )
+    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(program)], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     process.stdout.readline()
     try:
@@ -336,8 +332,7 @@ def test_points_of_others(tmp_path):
     assert points.tolist() == [[1, 2, 3], [4, 5, 6.5]]
     assert (colors == 128).all()
     path.write_text(
-        head + "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
-        "1 2 3 9 8 7\n4 5 6 255 0 1\n"
+        head + "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n1 2 3 9 8 7\n4 5 6 255 0 1\n"
     )
     assert read_points(path)[1].tolist() == [[9, 8, 7], [255, 0, 1]]
     trimesh.creation.box().export(path)

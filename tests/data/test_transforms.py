@@ -29,9 +29,7 @@ def names_of(frames):
 
 
 def test_camera_and_pose(tmp_path):
-    dataset = read_dataset(
-        write_folder(tmp_path, ["images/a.jpg"], applied_transform=[[0, 1, 0, 0]], aabb_scale=4)
-    )
+    dataset = read_dataset(write_folder(tmp_path, ["images/a.jpg"], applied_transform=[[0, 1, 0, 0]], aabb_scale=4))
     (frame,) = dataset.train
     camera = frame.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20.0, 21.0, 7.5, 6.0)
@@ -195,9 +193,7 @@ def test_hostile_json_is_refused_in_one_sentence(tmp_path, change, sentence):
     assert "\n" not in message
 
 
-@pytest.mark.parametrize(
-    "content", ["", "{", '{"frames": [{"file_path": "a.pn', "[]", "3", "\x00\x01", "null"]
-)
+@pytest.mark.parametrize("content", ["", "{", '{"frames": [{"file_path": "a.pn', "[]", "3", "\x00\x01", "null"])
 def test_cut_off_json_is_refused(tmp_path, content):
     (tmp_path / "transforms.json").write_text(content)
     with pytest.raises(InputError, match=r"transforms\.json"):

@@ -77,9 +77,7 @@ class FakeRun:
     config: dict = field(default_factory=lambda: {"method": "vanilla", "preset": "demo", "seed": 7})
     training: dict = field(
         default_factory=lambda: {
-            "history": [
-                {"iteration": i, "loss": 1 / (i + 1), "gaussians": 100 + i} for i in range(0, 300, 100)
-            ],
+            "history": [{"iteration": i, "loss": 1 / (i + 1), "gaussians": 100 + i} for i in range(0, 300, 100)],
             "seconds": 12.5,
             "backend": "llvm",
             "versions": {"drjit": "1.5.0"},

@@ -77,9 +77,7 @@ def test_predictions_are_clipped(make_run, dataset, tmp_path):
 
 def test_layout(make_run, dataset, tmp_path):
     seen = []
-    metrics = evaluate(
-        make_run(shifted), dataset, tmp_path / "eval", progress=lambda *step: seen.append(step)
-    )
+    metrics = evaluate(make_run(shifted), dataset, tmp_path / "eval", progress=lambda *step: seen.append(step))
     assert [step[:2] for step in seen] == [(0, 4), (1, 4), (2, 4), (3, 4), (4, 4)]
     assert metrics["schema"] == 1
     assert metrics["split"] == "test"
@@ -112,9 +110,7 @@ def test_same_run_same_bytes(make_run, dataset, tmp_path):
 
 
 def test_lpips_where_there_are_weights(make_run, dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        lpips, "load", lambda path: (lambda a, b: float(np.abs(a - b).max()), "weights are here")
-    )
+    monkeypatch.setattr(lpips, "load", lambda path: (lambda a, b: float(np.abs(a - b).max()), "weights are here"))
     metrics = evaluate(make_run(shifted), dataset, tmp_path / "eval")
     assert metrics["image_full"]["lpips"]["mean"] >= metrics["image"]["lpips"]["mean"] > 0
     assert not any("LPIPS" in note for note in metrics["notes"])
@@ -171,9 +167,7 @@ def test_data_without_truth_is_judged_by_alpha(make_run, dataset, tmp_path):
     metrics = evaluate(make_run(shifted), poorer, tmp_path / "eval")
     assert metrics["image"] == expected["image"]
     assert metrics["frames"][0]["sun"] is None
-    assert (
-        "In 4 of 4 frames the silhouette is where the image's alpha is at least one half." in metrics["notes"]
-    )
+    assert "In 4 of 4 frames the silhouette is where the image's alpha is at least one half." in metrics["notes"]
 
 
 def test_data_without_alpha_is_judged_whole(make_run, dataset, tmp_path):

@@ -74,9 +74,7 @@ def test_flip_is_the_packages_own_mean(pictures):
     rows, columns = np.nonzero(mask)
     box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
     inside = [np.ascontiguousarray((p * mask[..., None])[box], np.float32) for p in (truth, prediction)]
-    assert image.flip(prediction, truth, mask) == pytest.approx(
-        flip_evaluator.evaluate(*inside, "LDR")[1], abs=1e-6
-    )
+    assert image.flip(prediction, truth, mask) == pytest.approx(flip_evaluator.evaluate(*inside, "LDR")[1], abs=1e-6)
 
 
 def test_mask_hides_everything_outside(pictures):

@@ -25,9 +25,7 @@ def weights():
     tensors = {}
     for layer, (name, (outputs, inputs, size)) in enumerate(CONVOLUTIONS.items()):
         deviation = (2 / (inputs * size * size)) ** 0.5
-        tensors[f"{name}.weight"] = generator.normal(0, deviation, (outputs, inputs, size, size)).astype(
-            np.float32
-        )
+        tensors[f"{name}.weight"] = generator.normal(0, deviation, (outputs, inputs, size, size)).astype(np.float32)
         tensors[f"{name}.bias"] = generator.normal(0, 0.1, outputs).astype(np.float32)
         tensors[f"lin{layer}.model.1.weight"] = generator.random((1, outputs, 1, 1)).astype(np.float32)
     return tensors
@@ -72,9 +70,7 @@ def pool(x):
 def features(picture, w):
     """The five rectified activations [C, h, w], float64."""
     x = (picture * 2 - 1).transpose(2, 0, 1)
-    x = (x - np.array([-0.030, -0.088, -0.188])[:, None, None]) / np.array([0.458, 0.448, 0.450])[
-        :, None, None
-    ]
+    x = (x - np.array([-0.030, -0.088, -0.188])[:, None, None]) / np.array([0.458, 0.448, 0.450])[:, None, None]
     w = {name: value.astype(np.float64) for name, value in w.items()}
     a = np.maximum(convolve(x, w["features.0.weight"], w["features.0.bias"], 4, 2), 0)
     b = np.maximum(convolve(pool(a), w["features.3.weight"], w["features.3.bias"], 1, 2), 0)

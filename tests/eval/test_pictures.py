@@ -12,9 +12,7 @@ def test_error_colours_rise_evenly_from_black_to_white():
     assert colours[-1].tolist() == [255, 255, 255]
     lab = rgb2lab(colours / 255)
     assert np.all(np.diff(lab[:, 0]) > 0)
-    steps = np.linalg.norm(np.diff(lab, axis=0), axis=1)[
-        2:
-    ]  # the first two are near black, where CIELAB is steep
+    steps = np.linalg.norm(np.diff(lab, axis=0), axis=1)[2:]  # the first two are near black, where CIELAB is steep
     assert steps.max() / steps.min() < 3
 
 

@@ -105,9 +105,7 @@ def test_numbers_are_there(folder):
 def test_nothing_from_outside(folder):
     page = page_of(folder)
     assert not {"script", "link", "iframe", "object", "embed", "base", "form"} & set(page.tags)
-    references = [
-        v for _, name, v in page.attributes if name in ("src", "href", "srcset", "data", "xlink:href")
-    ]
+    references = [v for _, name, v in page.attributes if name in ("src", "href", "srcset", "data", "xlink:href")]
     assert references
     assert all(value.startswith("data:image/png;base64,") for value in references)
     pictures = re.compile("data:image/png;base64,[A-Za-z0-9+/=]+")
@@ -121,9 +119,7 @@ def test_pictures_are_the_folders(folder):
     pictures = [base64.b64decode(value.partition(",")[2]) for value in page.values("img", "src")]
     assert len(pictures) == 15
     shown = {np.asarray(Image.open(io.BytesIO(data))).tobytes() for data in pictures}
-    frames = sorted(
-        json.loads((folder / "metrics.json").read_text())["frames"], key=lambda frame: -frame["psnr"]
-    )
+    frames = sorted(json.loads((folder / "metrics.json").read_text())["frames"], key=lambda frame: -frame["psnr"])
     for frame in (frames[0], frames[2], frames[-1]):
         for panel in ("truth", "prediction", "error", "shadow_truth", "shadow_prediction"):
             assert read_png(folder / "frames" / frame["name"] / f"{panel}.png").tobytes() in shown
@@ -195,8 +191,7 @@ def test_histograms_of_few_and_many_suns(folder, suns):
     def multiply(metrics):
         frames = metrics["frames"]
         metrics["frames"] = [
-            {**frames[i % 4], "psnr": 20 + i % 7 + 0.1 * i, "sun": [3.0 * (i % suns), 10.0]}
-            for i in range(200)
+            {**frames[i % 4], "psnr": 20 + i % 7 + 0.1 * i, "sun": [3.0 * (i % suns), 10.0]} for i in range(200)
         ]
 
     page = page_of(another(folder, "multiplied", multiply))

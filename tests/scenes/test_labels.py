@@ -60,10 +60,7 @@ class RayCaster:
 def _differs(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> np.ndarray:
     """[N] bool: labels that are not the same, up to 1 mm and 0.001 of a normal or cosine."""
     return np.any(
-        [
-            np.abs(found[k].astype(float) - expected[k]).reshape(len(found[k]), -1).max(1) > 1e-3
-            for k in expected
-        ],
+        [np.abs(found[k].astype(float) - expected[k]).reshape(len(found[k]), -1).max(1) > 1e-3 for k in expected],
         axis=0,
     )
 
@@ -92,9 +89,7 @@ def test_labels_agree_with_another_ray_caster(name, view, classes):
 
     caster = RayCaster(scene)
     expected = caster.labels(camera, sun, centres)
-    found = {
-        key: getattr(truth, key).reshape(128 * 128, -1)[pixels].squeeze().astype(float) for key in expected
-    }
+    found = {key: getattr(truth, key).reshape(128 * 128, -1)[pixels].squeeze().astype(float) for key in expected}
     different = np.flatnonzero(_differs(found, expected))
 
     assert set(np.unique(truth.shadow)) == classes
@@ -132,6 +127,4 @@ def test_albedo_is_that_of_the_parts_material():
     truth = Renderer(scene, spp=1).render(camera, Sun.from_angles(45, 35), seed=0)
     for placed in scene.parts:
         seen = truth.part_id == placed.part_id
-        np.testing.assert_allclose(
-            truth.albedo[seen], np.tile(placed.part.material.albedo, (seen.sum(), 1)), rtol=1e-6
-        )
+        np.testing.assert_allclose(truth.albedo[seen], np.tile(placed.part.material.albedo, (seen.sum(), 1)), rtol=1e-6)

@@ -50,9 +50,7 @@ def test_lambertian_sphere_has_its_phase_function_and_size(phase_deg):
     distance, size, fov = 1000.0, 32, 0.15
     pose = look_at(distance * direction_from_angles(phase_deg, 0.0), [0, 0, 0])
     camera = Camera.from_fov(pose, size, size, fov)
-    truth = Renderer(scene_of(sphere, materials.TEST_GREY), spp=64).render(
-        camera, Sun.from_angles(0, 0), seed=3
-    )
+    truth = Renderer(scene_of(sphere, materials.TEST_GREY), spp=64).render(camera, Sun.from_angles(0, 0), seed=3)
     pixel = (distance / camera.fx) ** 2  # m^2 at the sphere's centre
     phase = np.radians(phase_deg)
     expected = 2 / 3 * SOLAR_IRRADIANCE * 0.5 * (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
@@ -113,9 +111,7 @@ def test_sun_can_be_moved_and_moved_back():
 def test_inside_and_exposed():
     shell = trimesh.util.concatenate([trimesh.creation.box((2, 2, 2)), trimesh.creation.box((1, 1, 3))])
     renderer = Renderer(scene_of(shell, materials.TEST_GREY), spp=1)
-    positions = np.array(
-        [[0, 0, 0], [0.9, 0.9, 0.9], [0, 0, 1.4], [0, 0, 1.6], [0.7, 0.7, 1.1], [9, 9, 9]], float
-    )
+    positions = np.array([[0, 0, 0], [0.9, 0.9, 0.9], [0, 0, 1.4], [0, 0, 1.6], [0.7, 0.7, 1.1], [9, 9, 9]], float)
     np.testing.assert_array_equal(renderer.inside(positions), [True, True, True, False, False, False])
     points = np.array([[0.5, 0, 0.2], [0.5, 0, 1.2], [1, 0, 0]], float)
     normals = np.array([[1, 0, 0], [1, 0, 0], [1, 0, 0]], float)

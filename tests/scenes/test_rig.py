@@ -64,9 +64,7 @@ def test_test_views_are_of_the_training_suns_unless_others_are_asked_for():
 
 def test_seed_turns_the_views_and_nothing_else():
     first, again, other = (
-        np.array(
-            [view.camera.position for _, view in plan_views(SCENE, GenerateConfig(views=8, seed=seed))[0]]
-        )
+        np.array([view.camera.position for _, view in plan_views(SCENE, GenerateConfig(views=8, seed=seed))[0]])
         for seed in (4, 4, 5)
     )
     np.testing.assert_array_equal(first, again)

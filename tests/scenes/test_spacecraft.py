@@ -40,9 +40,7 @@ def test_pair_is_two_boxsats_three_metres_apart_on_each_axis():
 def test_barrel_is_hollow_and_light_passes_between_the_struts():
     caster = RayMeshIntersector(built_in_scene("boxsat").mesh)
     rim = max(part.mesh.bounds[1][0] for part in PARTS if part.name == "camera_barrel")
-    into_barrel, _, _ = caster.intersects_location(
-        [[3.0, 0.05, -0.1]], [[-1.0, 0.0, 0.0]], multiple_hits=False
-    )
+    into_barrel, _, _ = caster.intersects_location([[3.0, 0.05, -0.1]], [[-1.0, 0.0, 0.0]], multiple_hits=False)
     assert rim - into_barrel[0][0] > 0.3
     turn = trimesh.transformations.rotation_matrix(np.radians(25.0), [0, 1, 0])[:3, :3]
     between, towards = turn @ [0.0, 0.9, 3.0], turn @ [0.0, 0.0, -1.0]

@@ -67,9 +67,8 @@ class TrainConfig:
     def from_json(values: dict[str, Any]) -> "TrainConfig":
         """The inverse of `to_json`. Raises InputError where the keys do not fit."""
         try:
-            nested = {"rates": LearningRates(**values["rates"])}
-            nested["refinement"] = DefaultStrategyConfig(**values["refinement"])
-            return TrainConfig(**{**values, **nested})
+            rates, refinement = LearningRates(**values["rates"]), DefaultStrategyConfig(**values["refinement"])
+            return TrainConfig(**{**values, "rates": rates, "refinement": refinement})
         except (KeyError, TypeError) as error:
             raise InputError(f"config.json: expected the keys of this version's TrainConfig ({error})") from None
 
@@ -91,10 +90,19 @@ def preset(name: str) -> TrainConfig:
         return TrainConfig(preset=name, refinement=DefaultStrategyConfig(refine_stop=5_000))
     if name == "demo":
         refinement = DefaultStrategyConfig(
-            prune_screen_size=0.5, split_screen_size=0.1, refine_start=300, refine_stop=1_500, pause_after_reset=0
+            prune_screen_size=0.5,
+            split_screen_size=0.1,
+            refine_start=300,
+            refine_stop=1_500,
+            pause_after_reset=0,
         )
         return TrainConfig(
-            preset=name, iterations=2_000, init_count=8_000, sh_every=400, checkpoint_every=500, refinement=refinement
+            preset=name,
+            iterations=2_000,
+            init_count=8_000,
+            sh_every=400,
+            checkpoint_every=500,
+            refinement=refinement,
         )
     raise InputError(f"--preset: expected one of {', '.join(PRESETS)}, found {name!r}")
 

@@ -41,7 +41,8 @@ class _Ssim(dr.CustomOp):
         for x, y in zip(prediction, target, strict=True):
             planes += [x, y, x * x, y * y, x * y]
         blurred = gaussian_blur(planes, width, height)
-        self.partials, total = [], ad.Float(0)
+        self.partials: list[Any] = []
+        total: Any = ad.Float(0)
         for c in range(3):
             mx, my, mxx, myy, mxy = blurred[5 * c : 5 * c + 5]
             a1, a2 = 2 * mx * my + _C1, 2 * (mxy - mx * my) + _C2
@@ -57,7 +58,8 @@ class _Ssim(dr.CustomOp):
     def backward(self) -> None:
         width, height = self.size
         blurred = gaussian_blur(self.partials, width, height)
-        scale = self.grad_out() / (3 * width * height)
+        by_mean_ssim: Any = self.grad_out()
+        scale = by_mean_ssim / (3 * width * height)
         gradient = []
         for c, (x, y) in enumerate(zip(*self.pair, strict=True)):
             by_mean, by_square, by_product = blurred[3 * c : 3 * c + 3]

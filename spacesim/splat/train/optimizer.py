@@ -25,7 +25,12 @@ class Adam:
         return 1 / (1 - self.beta1**self.steps), 1 / (1 - self.beta2**self.steps)
 
     def update(
-        self, rows: list[Any], gradients: list[Any], moments: tuple[list[Any], list[Any]], rates: list[Any], unbias: Any
+        self,
+        rows: list[Any],
+        gradients: list[Any],
+        moments: tuple[list[Any], list[Any]],
+        rates: list[Any],
+        unbias: Any,
     ) -> tuple[list[Any], list[Any], list[Any]]:
         """(rows, first, second) after a step. rates: [R] step sizes; unbias: what `corrections` gave."""
         moved, first, second = [], [], []

@@ -4,8 +4,6 @@ A step is five stages. Those of fixed shape (project, loss, update) are recorded
 binning and blending, whose lists change length from step to step, stand between them.
 """
 
-import logging
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,8 +29,6 @@ from spacesim.splat.train.strategies.default import DefaultStrategy
 from spacesim.splat.train.views import TrainingViews, View
 
 HISTORY_EVERY = 50  #: iterations between two entries of the history
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -86,18 +82,18 @@ class Trainer:
         splats, footprints, colour = self._project(rows, camera, degree)
         lists = bin_splats(splats, footprints, width, height)
         blended = forward(splats, colour, lists, width, height)
-        target = ad.UInt32(view.rgba), self._background(index), _valid(view)
+        target = ad.UInt32(view.rgba), ad.Float(self.background(index)), _valid(view)
         loss, by_colour, by_transmittance = self._loss(
             blended.features, blended.transmittance, target, (width, height), config.ssim_weight
         )
         by_splat = backward(splats, blended, lists, (width, height), by_colour, by_transmittance)
         moments = self.optimizer.first, self.optimizer.second
-        factors = ad.Float([*self.optimizer.corrections(), *self._rates(index)])
-        rows, *moments = self._update(
+        factors = ad.Float([*self.optimizer.corrections(), *self.rates(index)])
+        rows, first, second = self._update(
             rows, moments, camera, degree, (by_splat.splats, by_splat.features), factors, self.optimizer
         )
         self.gaussians = Gaussians.from_rows(rows)
-        self.optimizer.first, self.optimizer.second = moments
+        self.optimizer.first, self.optimizer.second = first, second
 
         gradient = dr.sqrt(
             dr.square(by_splat.absolute_x * (0.5 * width)) + dr.square(by_splat.absolute_y * (0.5 * height))
@@ -133,13 +129,13 @@ class Trainer:
         except (KeyError, ValueError) as error:
             raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {error}") from None
 
-    def _background(self, index: int) -> Any:
-        """Float [3]: the colour that this step's picture and its truth are laid over."""
+    def background(self, index: int) -> np.ndarray:
+        """[3] float32: the colour that a step's picture and its truth are laid over."""
         if not self.config.random_background:
-            return ad.Float([0.0, 0.0, 0.0])
-        return ad.Float(np.random.default_rng([self.config.seed, 3, index]).uniform(size=3).astype(np.float32))
+            return np.zeros(3, np.float32)
+        return np.random.default_rng([self.config.seed, 3, index]).uniform(size=3).astype(np.float32)
 
-    def _rates(self, index: int) -> Iterator[float]:
+    def rates(self, index: int) -> Iterator[float]:
         """The step size of each row; that of the means falls exponentially over the whole training."""
         rates, done = self.config.rates, index / self.config.iterations
         means = self.scene_scale * rates.means ** (1 - done) * rates.means_final**done
@@ -164,7 +160,11 @@ def _project(rows: list[Any], camera: Pinhole, degree: int) -> tuple[Splats, Foo
 
 
 def _loss(
-    colour: list[Any], transmittance: Any, target: tuple[Any, Any, Any], size: tuple[int, int], ssim_weight: float
+    colour: list[Any],
+    transmittance: Any,
+    target: tuple[Any, Any, Any],
+    size: tuple[int, int],
+    ssim_weight: float,
 ) -> tuple[Any, list[Any], Any]:
     """Loss of a picture over the target's background, and its gradients by colour (3 planes) and transmittance."""
     rgba, background, valid = target
@@ -204,5 +204,3 @@ def _update(
     numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(2 + len(rows))]
     by_row = [dr.grad(row) for row in rows]
     return optimizer.update(dr.detach(rows), by_row, moments, numbers[2:], numbers[:2])
-
-

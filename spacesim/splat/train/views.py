@@ -14,7 +14,7 @@ CACHE_BYTES = 6 * 2**30
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """camera; rgba: [H * W] uint32, 8 bits a channel, red lowest; valid: [H * W] bool, or None where all pixels count."""
+    """rgba: [H * W] uint32, 8 bits a channel, red lowest; valid: [H * W] bool, or None where all pixels count."""
 
     camera: Camera
     rgba: np.ndarray

@@ -65,9 +65,7 @@ class DefaultStrategy:
             limit_opacities(gaussians, optimizer, 2 * config.prune_opacity)
         return done
 
-    def _grow_and_prune(
-        self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator
-    ) -> Refinement:
+    def _grow_and_prune(self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator) -> Refinement:
         config = self.config
         seen, radius = np.array(self.state["seen"]), np.array(self.state["radius"])
         gradient = np.array(self.state["gradient"]) / np.maximum(seen, 1)

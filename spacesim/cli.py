@@ -1,0 +1,260 @@
+"""The command line: parse, call one function, print. Exit codes: 0 done, 1 the work failed, 2 bad usage or input."""
+
+import argparse
+import json
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn
+
+from spacesim import __version__, backend
+from spacesim.data.errors import InputError, WorkError
+
+KINDS = ("rgb", "depth", "alpha")
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with the usage in one sentence."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
+    options = _parser().parse_args(arguments)
+    try:
+        if options.needs_backend:
+            backend.select(options.backend)
+        options.run(options)
+    except (InputError, WorkError, backend.BackendError) as error:
+        print(f"spacesim: {error}", file=sys.stderr)
+        return 2 if isinstance(error, InputError) else 1
+    except KeyboardInterrupt:
+        print("spacesim: stopped; what was finished is kept, --resume goes on from there", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="spacesim", description="Simulate spacecraft images, reconstruct them, judge the result.")
+    parser.add_argument("--version", action="version", version=f"spacesim {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
+
+    def command(name: str, run: Callable[[argparse.Namespace], None], text: str, needs_backend: bool = True) -> _Parser:
+        one: _Parser = commands.add_parser(name, help=text, description=text)
+        one.set_defaults(run=run, needs_backend=needs_backend, backend="auto")
+        if needs_backend:
+            one.add_argument("--backend", choices=backend.NAMES, default="auto", help="default: CUDA, else LLVM")
+        return one
+
+    one = command("doctor", _doctor, "what can run here, and what to type if not", needs_backend=False)
+    one.add_argument("--json", action="store_true", help="print the findings as JSON alone")
+
+    one = command("demo", _demo, "generate, train, evaluate, report: a few minutes on two cores")
+    one.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+    one = command("generate", _generate, "path-trace a dataset with its truth")
+    one.add_argument("scene", metavar="SCENE", help="a built-in scene: boxsat, boxsat-pair")
+    one.add_argument("--out", type=Path, required=True, metavar="DATA")
+    one.add_argument("--suns", type=int, metavar="N", help="training Suns on a Fibonacci lattice (1)")
+    one.add_argument("--views", type=int, metavar="N", help="training views for each Sun (100)")
+    one.add_argument("--test-suns", type=int, metavar="N", help="Suns kept for testing (0: those of training)")
+    one.add_argument("--test-views", type=int, metavar="N", help="test views for each test Sun (20)")
+    one.add_argument("--resolution", type=int, metavar="PX", help="pixels of each side (256)")
+    one.add_argument("--spp", type=int, metavar="N", help="samples a pixel (64)")
+    one.add_argument("--seed", type=int, metavar="N")
+    one.add_argument(
+        "--sun", type=_angles, action="append", metavar="AZ,EL", help="a training Sun, degrees; repeatable"
+    )
+    one.add_argument("--resume", action="store_true", help="complete what an interrupted run left")
+
+    one = command("train", _train, "reconstruct a dataset with Gaussian splatting")
+    one.add_argument("data", type=Path, metavar="DATA")
+    one.add_argument("--out", type=Path, required=True, metavar="RUN")
+    one.add_argument("--method", help="vanilla")
+    one.add_argument("--strategy", help="default")
+    one.add_argument("--init", help="mesh, points or random (the first of points, mesh, random that is there)")
+    one.add_argument("--init-count", type=int, metavar="N", help="Gaussians at the start, at most")
+    one.add_argument("--preset", default="fast", help="demo, fast (default) or thesis")
+    one.add_argument("--iterations", type=int, metavar="N")
+    one.add_argument("--seed", type=int, metavar="N")
+    one.add_argument(
+        "--black-background", action="store_true", help="train over black, as the thesis, not against alpha"
+    )
+    one.add_argument("--resume", action="store_true", help="go on from the newest checkpoint")
+
+    one = command("eval", _eval, "judge a run: EVAL/metrics.json, EVAL/report.html, EVAL/frames")
+    one.add_argument("path", type=Path, metavar="RUN")
+    one.add_argument("--data", type=Path, required=True, metavar="DATA")
+    one.add_argument("--out", type=Path, required=True, metavar="EVAL")
+    one.add_argument("--split", default="test", help="test (default), train or all")
+    one.add_argument("--lpips-weights", type=Path, metavar="FILE", help="AlexNet and linear weights for LPIPS")
+    one.add_argument("--json", action="store_true", help="print metrics.json alone")
+
+    one = command("report", _report, "one page about several evaluations side by side", needs_backend=False)
+    one.add_argument("evals", type=Path, nargs="+", metavar="EVAL")
+    one.add_argument("--out", type=Path, required=True, metavar="FILE.html")
+
+    one = command("render", _render, "one picture of a run")
+    one.add_argument("path", type=Path, metavar="RUN")
+    one.add_argument("--out", type=Path, required=True, metavar="FILE.png|.exr")
+    where = one.add_mutually_exclusive_group()
+    where.add_argument("--camera", type=Path, metavar="FILE", help="JSON with transform_matrix, w, h, fl_x, ...")
+    where.add_argument("--frame", type=int, metavar="K", help="frame K of the dataset, training frames first (0)")
+    one.add_argument("--data", type=Path, metavar="DATA", help="the dataset, where it has moved since training")
+    one.add_argument("--sun", type=_angles, metavar="AZ,EL", help="degrees; a vanilla run knows one light only")
+    one.add_argument("--kind", choices=KINDS, default="rgb")
+
+    one = command("export", _export, "the Gaussians as a file for other tools")
+    one.add_argument("path", type=Path, metavar="RUN")
+    one.add_argument(
+        "--ply", type=Path, required=True, metavar="FILE", help="INRIA layout, the dataset's frame and scale"
+    )
+    return parser
+
+
+def _angles(text: str) -> tuple[float, float]:
+    try:
+        azimuth, elevation = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected AZ,EL in degrees, found {text!r}") from None
+    return azimuth, elevation
+
+
+def _doctor(options: argparse.Namespace) -> None:
+    from spacesim import doctor
+
+    findings = doctor.report()
+    print(json.dumps(findings, indent=1) if options.json else doctor.describe(findings))
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from spacesim.demo import demo
+    from spacesim.progress import reporting
+
+    done = demo(options.out, reporting)
+    _print_headline(done["metrics"])
+    parts = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in done["seconds"].items())
+    print(f"{parts}\nreport: {done['report'].resolve()}")
+
+
+def _generate(options: argparse.Namespace) -> None:
+    from spacesim.progress import reporting
+    from spacesim.scenes import GenerateConfig, generate
+
+    names = ("suns", "views", "test_suns", "test_views", "resolution", "spp", "seed")
+    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    if options.sun:
+        given["sun"] = tuple(options.sun)
+    config = GenerateConfig(**given)
+    with reporting("generate", "frames") as report:
+        dataset = generate(options.scene, options.out, config, options.resume, report)
+    print(f"{options.out}: {len(dataset.train)} training and {len(dataset.test)} test frames of {options.scene}")
+
+
+def _train(options: argparse.Namespace) -> None:
+    from spacesim.data.store import read_dataset
+    from spacesim.demo import training
+    from spacesim.progress import reporting
+    from spacesim.splat.train.config import preset, with_options
+    from spacesim.splat.train.train import train
+
+    names = ("method", "strategy", "init", "init_count", "iterations", "seed")
+    config = with_options(preset(options.preset), **{name: getattr(options, name) for name in names})
+    if options.black_background:
+        config = with_options(config, random_background=False)
+    dataset = read_dataset(options.data)
+    with reporting("train", "iterations") as report:
+        run = train(dataset, options.out, config, options.resume, training(report))
+    history = run.training["history"]
+    print(
+        f"{options.out}: {run.gaussians} Gaussians after {config.iterations} iterations in "
+        f"{run.training['seconds']:.0f} s on {run.training['backend']}, final loss {history[-1]['loss']:.4f}"
+    )
+
+
+def _eval(options: argparse.Namespace) -> None:
+    from spacesim.data.store import read_dataset
+    from spacesim.eval.evaluate import EvaluateConfig, evaluate
+    from spacesim.eval.report import write_report
+    from spacesim.progress import reporting
+    from spacesim.splat.run import load_run
+
+    config = EvaluateConfig(options.split, options.lpips_weights)
+    run, dataset = load_run(options.path), read_dataset(options.data)
+    with reporting("evaluate", "frames", quiet=options.json) as report:
+        metrics = evaluate(run, dataset, options.out, config, report)
+    write_report([options.out], options.out / "report.html")
+    if options.json:
+        print(json.dumps(metrics, indent=1))
+    else:
+        _print_headline(metrics)
+        print(f"report: {(options.out / 'report.html').resolve()}")
+
+
+def _report(options: argparse.Namespace) -> None:
+    from spacesim.eval.report import write_report
+
+    write_report(options.evals, options.out)
+    print(f"report: {options.out.resolve()}")
+
+
+def _render(options: argparse.Namespace) -> None:
+    from spacesim.data.records import Sun
+    from spacesim.data.transforms import read_camera, read_dataset
+    from spacesim.splat.picture import write_picture
+    from spacesim.splat.run import load_run
+
+    run = load_run(options.path)
+    sun = Sun.from_angles(*options.sun) if options.sun else None
+    if sun is not None:
+        print(
+            "a vanilla run knows the light that it was trained under only; --sun changes nothing",
+            file=sys.stderr,
+        )
+    if options.camera:
+        camera = read_camera(options.camera)
+    else:
+        frames = read_dataset(options.data or Path(run.config["data"]["path"])).frames
+        index = options.frame or 0
+        if not 0 <= index < len(frames):
+            raise InputError(f"--frame: expected 0 to {len(frames) - 1}, found {index}")
+        camera, sun = frames[index].camera, sun or frames[index].sun
+    write_picture(run.predict(camera, sun), options.kind, options.out)
+    print(options.out)
+
+
+def _export(options: argparse.Namespace) -> None:
+    from spacesim.splat.ply import write_ply
+    from spacesim.splat.run import load_run
+
+    run = load_run(options.path)
+    write_ply(run.model, options.ply)
+    print(f"{options.ply}: {run.gaussians} Gaussians")
+
+
+def _print_headline(metrics: dict[str, Any]) -> None:
+    """PSNR, SSIM and shadow errors in a line each."""
+    show = partial(_mean, metrics)
+    print(f"silhouette: PSNR {show('image', 'psnr', 2)} dB, SSIM {show('image', 'ssim', 4)}", end="")
+    print(f", FLIP {show('image', 'flip', 4)}; full frame: PSNR {show('image_full', 'psnr', 2)} dB")
+    print(f"shadows: BER {show('shadow', 'ber', 4)}, boundary MAE {show('shadow', 'boundary_mae', 4)}")
+    for note in metrics.get("notes", []):
+        print(f"note: {note}")
+
+
+def _mean(metrics: dict[str, Any], group: str, name: str, digits: int) -> str:
+    value = ((metrics.get(group) or {}).get(name) or {}).get("mean")
+    return "null" if value is None else f"{value:.{digits}f}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,56 @@
+"""Progress of long work: a bar on a terminal, a plain line every few seconds elsewhere; all on standard error."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+LINE_EVERY = 5.0  #: seconds between two plain lines
+
+
+class Reporter:
+    """Told how far a piece of work is; knows its speed and what is left."""
+
+    def __init__(self, title: str, unit: str, bar: Progress | None) -> None:
+        self.title, self.unit, self.bar = title, unit, bar
+        self.task = bar.add_task(title, total=None, detail="") if bar else None
+        self.first: tuple[float, int] | None = None
+        self.last_line = 0.0
+
+    def __call__(self, done: int, total: int, detail: str = "") -> None:
+        """`done` of `total` units are finished."""
+        now = time.monotonic()
+        if self.first is None:
+            self.first = now, done
+        speed = (done - self.first[1]) / max(now - self.first[0], 1e-9)
+        rate = f"{speed:.1f} {self.unit}/s" if done > self.first[1] else ""
+        text = "  ".join(part for part in (rate, detail) if part)
+        if self.bar is not None and self.task is not None:
+            self.bar.update(self.task, completed=done, total=total, detail=text)
+        elif now - self.last_line >= LINE_EVERY or done == total:
+            left = f"  {(total - done) / speed:.0f} s left" if rate and done < total else ""
+            print(f"{self.title}: {done}/{total}  {text}{left}", file=sys.stderr, flush=True)
+            self.last_line = now
+
+
+@contextmanager
+def reporting(title: str, unit: str, quiet: bool = False) -> Iterator[Reporter]:
+    """A `Reporter` for the work of the `with` block. quiet: no bar (plain lines go on)."""
+    console = Console(stderr=True)
+    if quiet or not console.is_terminal:
+        yield Reporter(title, unit, None)
+        return
+    columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
+    columns += [TimeRemainingColumn(), TextColumn("{task.fields[detail]}")]
+    with Progress(*columns, console=console) as bar:
+        yield Reporter(title, unit, bar)

@@ -1,0 +1,82 @@
+"""A trained run on disk, and what it predicts.
+
+RUN/config.json        how it was trained and on what
+RUN/checkpoints/*      where training can go on
+RUN/model.safetensors  the trained Gaussians: there once training is done
+RUN/training.json      history, time, backend, versions
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacesim import backend
+from spacesim.data.errors import InputError
+from spacesim.data.files import read_json
+from spacesim.data.records import Camera, Sun
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.project import Pinhole
+from spacesim.splat.render import render
+from spacesim.splat.train.checkpoint import read_tensors
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A rendered view, float32. rgb: [H, W, 3] sRGB values over black; alpha: [H, W];
+    depth: [H, W] expected depth in metres, 0 where alpha is 0; visibility: [H, W], or None from a method without."""
+
+    rgb: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+    visibility: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A trained model with its history. bytes: size of the model's file."""
+
+    path: Path
+    config: dict[str, Any]
+    training: dict[str, Any]
+    model: Gaussians
+    bytes: int
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians."""
+        return self.model.count
+
+    @property
+    def backend(self) -> str:
+        """The backend that renders now."""
+        return backend.select()
+
+    def predict(self, camera: Camera, sun: Sun | None) -> Prediction:
+        """Render one view. The method `vanilla` knows one light: `sun` changes nothing."""
+        output = render(self.model, Pinhole.of(camera))
+        shape = (camera.height, camera.width)
+        return Prediction(
+            rgb=np.ascontiguousarray(np.array(output.colour).T).reshape(*shape, 3),
+            alpha=np.array(output.alpha).reshape(shape),
+            depth=np.array(output.depth).reshape(shape),
+            visibility=None,
+        )
+
+
+def load_run(path: Path) -> Run:
+    """Load a finished run. Raises InputError where the folder is no run or its training has not ended."""
+    path = Path(path)
+    model_path = path / "model.safetensors"
+    if not (path / "config.json").exists():
+        raise InputError(f"{path}: expected a run of `spacesim train`, found no config.json in it")
+    if not model_path.exists():
+        raise InputError(f"{path}: training has not ended; complete it with `spacesim train ... --resume`")
+    config, training = read_json(path / "config.json"), read_json(path / "training.json")
+    tensors, _ = read_tensors(model_path)
+    try:
+        model = Gaussians.from_numpy(tensors)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{model_path}: expected the tensors of a model, found none or others ({error})") from None
+    return Run(path, config, training, model, model_path.stat().st_size)

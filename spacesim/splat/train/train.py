@@ -1,0 +1,125 @@
+"""`train`: a dataset and a configuration to a run on disk, resumable at any time."""
+
+import logging
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import spacesim
+from spacesim import backend
+from spacesim.data.errors import InputError
+from spacesim.data.files import read_json, write_json
+from spacesim.data.records import Dataset
+from spacesim.splat.run import Run, load_run
+from spacesim.splat.train.checkpoint import write_tensors
+from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.trainer import Progress, Trainer
+
+KEEP_CHECKPOINTS = 2
+
+log = logging.getLogger(__name__)
+
+
+def train(
+    dataset: Dataset,
+    out: Path,
+    config: TrainConfig,
+    resume: bool = False,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> Run:
+    """Train and write RUN (see `spacesim.splat.run`). With `resume`, go on from the newest checkpoint, with the
+    same result to the bit; a finished run is returned as it is.
+
+    Raises InputError where `out` holds a run and `resume` is not asked for, or one of another configuration.
+    """
+    out = Path(out)
+    identity = {"train": config.to_json(), "data": _identity(dataset)}
+    if (out / "config.json").exists():
+        _check_resumable(out, identity, resume)
+        if (out / "model.safetensors").exists():
+            return load_run(out)
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: expected an empty or new folder for the run, found other files in it")
+
+    trainer = Trainer(dataset, config)
+    write_json(out / "config.json", {**config.to_json(), **identity})
+    newest = max(_checkpoints(out), default=None)
+    if newest is not None:
+        trainer.restore(newest)
+        log.info("resumed at iteration %d from %s", trainer.iteration, newest)
+    seconds = _Seconds(out, trainer.iteration)
+
+    def checkpoint() -> None:
+        trainer.save(out / "checkpoints" / f"step_{trainer.iteration:08d}.safetensors")
+        seconds.write(trainer.iteration)
+        for old in _checkpoints(out)[:-KEEP_CHECKPOINTS]:
+            old.unlink(missing_ok=True)
+
+    trainer.run(on_progress, checkpoint)
+    write_json(
+        out / "training.json",
+        {
+            "history": trainer.history,
+            "seconds": round(seconds.total(), 3),
+            "gaussians": trainer.gaussians.count,
+            "backend": backend.select(),
+            "device": platform.processor() or platform.machine(),
+            "versions": versions(),
+        },
+    )
+    header = {"iteration": trainer.iteration, "config": config.to_json()}
+    write_tensors(out / "model.safetensors", trainer.gaussians.to_numpy(), header)
+    return load_run(out)
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    found = {"spacesim": spacesim.__version__, "drjit": version("drjit"), "numpy": np.__version__}
+    return {**found, "python": platform.python_version()}
+
+
+def _identity(dataset: Dataset) -> dict[str, Any]:
+    """What a run remembers of its data: enough to find it again and to notice another one in its place."""
+    return {
+        "path": str(dataset.root.resolve()),
+        "train_frames": len(dataset.train),
+        "test_frames": len(dataset.test),
+    }
+
+
+def _check_resumable(out: Path, identity: dict[str, Any], resume: bool) -> None:
+    if not resume:
+        raise InputError(f"{out}: holds a run already; pass --resume to complete it, or name another folder")
+    before = read_json(out / "config.json")
+    for key, value in identity["train"].items():
+        if before.get(key) != value and not isinstance(value, dict):
+            raise InputError(f"{out}: was started with {key} {before.get(key)!r}, --resume asks for {value!r}")
+    if before.get("train") != identity["train"]:
+        raise InputError(f"{out}: was started with other rates or refinement, --resume expects the same")
+    frames = ("train_frames", "test_frames")
+    if any(before.get("data", {}).get(key) != identity["data"][key] for key in frames):
+        raise InputError(f"{out}: was started on data with another number of frames")
+
+
+def _checkpoints(out: Path) -> list[Path]:
+    return sorted((out / "checkpoints").glob("step_*.safetensors"))
+
+
+class _Seconds:
+    """Wall-clock time of training, kept across interruptions beside the checkpoints."""
+
+    def __init__(self, out: Path, iteration: int) -> None:
+        self.path = out / "checkpoints" / "seconds.json"
+        known = read_json(self.path) if self.path.exists() else {}
+        self.before, self.start = float(known.get(str(iteration), 0.0)), time.monotonic()
+
+    def total(self) -> float:
+        return self.before + time.monotonic() - self.start
+
+    def write(self, iteration: int) -> None:
+        write_json(self.path, {str(iteration): self.total()})
