@@ -27,9 +27,16 @@ def run(program: str, **environment: str) -> str:
 
 
 def find_in(folder: Path) -> str:
-    """What find_llvm prints where only `folder` is looked into."""
+    """What find_llvm prints where only `folder` is looked into and nobody has named a library."""
     places = (f"{folder}/libLLVM*.so*",)
-    return run(f"from spacesim import backend; backend._LIBRARY_PLACES = {places!r}; print(*backend.find_llvm())")
+    return run(f"""
+import os
+from spacesim import backend
+os.environ.pop("DRJIT_LIBLLVM_PATH", None)  # named by the package when it was imported
+backend._candidates.cache_clear()
+backend._LIBRARY_PLACES = {places!r}
+print(*backend.find_llvm())
+""")
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +103,66 @@ def old_library() -> str | None:
             if match and 14 <= int(match.group(1)) < backend.MINIMUM_LLVM:
                 return str(path)
     return None
+
+
+LOADED = """
+{imports}
+import drjit as dr
+from drjit.llvm import Float
+print(dr.minimum(Float(2, 3), Float(1, 4)))  # aborts the process with an old library
+print(*sorted({{line.split()[-1] for line in open("/proc/self/maps") if "libLLVM" in line}}))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="no /proc tells which library is loaded")
+@pytest.mark.parametrize(
+    "imports",
+    ["import spacesim", "import spacesim.splat.render", "import spacesim.scenes.render"],
+)
+def test_importing_the_package_first_is_enough(imports):
+    """A fresh interpreter in which nobody has named a library loads a new one alone, whatever older ones are there."""
+    if backend.available()["llvm"] is not None:
+        pytest.skip(f"LLVM cannot run here: {backend.available()['llvm']}")
+    minima, libraries = run(LOADED.format(imports=imports)).splitlines()
+    assert minima == "[1, 3]"
+    (library,) = libraries.split()
+    assert backend._library_version(Path(library)) >= backend.MINIMUM_LLVM
+
+
+def test_the_newest_is_named_unless_the_user_has_named_one(fakes):
+    program = f"""
+import os
+from spacesim import backend
+os.environ.pop("DRJIT_LIBLLVM_PATH", None)
+backend._candidates.cache_clear()
+backend._LIBRARY_PLACES = ("{fakes}/libLLVM*.so*",)
+backend.name_llvm()
+print(os.environ["DRJIT_LIBLLVM_PATH"])
+os.environ["DRJIT_LIBLLVM_PATH"] = "mine"
+backend.name_llvm()
+print(os.environ["DRJIT_LIBLLVM_PATH"])
+"""
+    assert run(program).split() == [str(fakes / "libLLVM-21.so"), "mine"]
+
+
+def test_only_old_libraries_are_not_named(fakes, tmp_path):
+    shutil.copy(fakes / "libLLVM-16.so", tmp_path)
+    program = f"""
+import os
+from spacesim import backend
+os.environ.pop("DRJIT_LIBLLVM_PATH", None)
+backend._candidates.cache_clear()
+backend._LIBRARY_PLACES = ("{tmp_path}/libLLVM*.so*",)
+backend.name_llvm()
+print(os.environ.get("DRJIT_LIBLLVM_PATH"))
+try:
+    backend.select("llvm")
+except backend.BackendError as error:
+    print(error)
+"""
+    named, sentence = run(program).splitlines()
+    assert named == "None"
+    assert sentence.startswith("llvm: libLLVM 19 or newer is needed, found only version 16")
 
 
 def test_an_old_library_ends_in_a_sentence(fakes):
