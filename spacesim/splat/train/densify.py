@@ -6,6 +6,7 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
+from spacesim.data.errors import WorkError
 from spacesim.data.geometry import rotation_from_quaternion
 from spacesim.splat.gaussians import ROWS, Gaussians
 from spacesim.splat.train.optimizer import Adam
@@ -64,8 +65,10 @@ def grow(
 
 
 def prune(gaussians: Gaussians, optimizer: Adam, remove: np.ndarray) -> np.ndarray:
-    """Take the marked Gaussians out ([N] bool). Returns the index of each that stays."""
+    """Take the marked Gaussians out ([N] bool). Returns the index of each that stays; WorkError where none does."""
     index = np.flatnonzero(~remove)
+    if len(index) == 0:
+        raise WorkError("training: refinement would prune every Gaussian; lower prune_opacity or the learning rates")
     if remove.any():
         rearrange(gaussians, optimizer, index, np.zeros(len(index), bool))
     return index

@@ -103,8 +103,6 @@ class Trainer:
         self.iteration += 1
         rng = np.random.default_rng([config.seed, 2, self.iteration])
         self.strategy.refine(self.iteration, self.gaussians, self.optimizer, rng)
-        if self.gaussians.count == 0:
-            raise WorkError(f"training: refinement at iteration {self.iteration} left no Gaussians")
         return loss
 
     def save(self, path: Path) -> None:

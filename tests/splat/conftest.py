@@ -1,0 +1,65 @@
+"""A small dataset whose truth is known: pictures of random Gaussians by the float64 twin, in Nerfstudio's layout."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from spacesim.data.geometry import fibonacci_sphere, look_at
+from spacesim.data.records import Camera, Dataset
+from spacesim.data.store import read_dataset, write_points
+from spacesim.splat.gaussians import SH_C0
+from spacesim.splat.reference import render_reference
+
+VIEWS, TESTS, SIZE = 8, 2, 32
+
+
+@pytest.fixture(scope="session")
+def known_gaussians() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    sh = 0.1 * rng.normal(size=(60, 4, 3))
+    sh[:, 0] = rng.uniform(-1, 1.5, (60, 3))
+    return {
+        "means": rng.uniform(-0.5, 0.5, (60, 3)),
+        "log_scales": rng.uniform(-2.6, -1.8, (60, 3)),
+        "quaternions": rng.normal(size=(60, 4)),
+        "logit_opacities": rng.uniform(1, 4, 60),
+        "sh": sh,
+    }
+
+
+@pytest.fixture(scope="session")
+def small_dataset(tmp_path_factory, known_gaussians) -> Dataset:
+    return write_dataset(tmp_path_factory.mktemp("small"), known_gaussians)
+
+
+@pytest.fixture(scope="session")
+def black_dataset(tmp_path_factory, known_gaussians) -> Dataset:
+    """The same shape, every surface black."""
+    sh = np.zeros_like(known_gaussians["sh"])
+    sh[:, 0] = -0.5 / SH_C0
+    return write_dataset(tmp_path_factory.mktemp("black"), {**known_gaussians, "sh": sh})
+
+
+def write_dataset(root: Path, gaussians: dict[str, np.ndarray]) -> Dataset:
+    (root / "images").mkdir()
+    frames = []
+    for index, direction in enumerate(fibonacci_sphere(VIEWS + TESTS)):
+        camera = Camera.from_fov(look_at(3 * direction, np.zeros(3)), SIZE, SIZE, 35)
+        picture = render_reference(gaussians, camera)
+        alpha = picture.alpha[..., None]
+        straight = np.where(alpha > 0, picture.colour / np.maximum(alpha, 1e-9), 0)
+        rgba = np.rint(255 * np.clip(np.concatenate([straight, alpha], axis=-1), 0, 1)).astype(np.uint8)
+        name = f"images/{'test' if index % 5 == 4 else 'train'}_{index:02d}.png"
+        Image.fromarray(rgba).save(root / name)
+        frames.append({"file_path": name, "transform_matrix": camera.opengl.tolist()})
+    listed = {
+        f"{split}_filenames": [f["file_path"] for f in frames if split in f["file_path"]] for split in ("train", "test")
+    }
+    write_points(root / "points.ply", gaussians["means"], np.full((60, 3), 128, np.uint8))
+    meta = {"w": SIZE, "h": SIZE, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    meta |= {"ply_file_path": "points.ply", "frames": frames, **listed}
+    (root / "transforms.json").write_text(json.dumps(meta))
+    return read_dataset(root)

@@ -1,0 +1,203 @@
+"""Training as a whole: it learns, it repeats to the bit, it survives interruption."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spacesim.data.errors import InputError, WorkError
+from spacesim.data.images import load_image
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.ply import read_ply, write_ply
+from spacesim.splat.project import Pinhole
+from spacesim.splat.render import render
+from spacesim.splat.run import load_run
+from spacesim.splat.train.config import TrainConfig, preset, with_options
+from spacesim.splat.train.initialise import focus_point, initial_gaussians, scene_scale
+from spacesim.splat.train.strategies.default import DefaultStrategyConfig
+from spacesim.splat.train.train import train
+from spacesim.splat.train.trainer import Trainer
+
+REFINEMENT = DefaultStrategyConfig(
+    refine_start=10, refine_every=20, pause_after_reset=0, reset_every=4, refine_stop=150, screen_size_stop=0
+)
+CONFIG = TrainConfig(iterations=160, checkpoint_every=50, sh_every=40, sh_degree=1, refinement=REFINEMENT)
+
+
+def psnr(model: Gaussians, dataset) -> float:
+    errors = []
+    for frame in dataset.test:
+        colour = np.array(render(model, Pinhole.of(frame.camera)).colour).T
+        truth = load_image(dataset, frame).over(np.zeros(3)).reshape(-1, 3)
+        errors.append(np.mean((np.clip(colour, 0, 1) - truth) ** 2))
+    return float(np.mean(-10 * np.log10(errors)))
+
+
+@pytest.fixture(scope="module")
+def finished(small_dataset, tmp_path_factory):
+    return train(small_dataset, tmp_path_factory.mktemp("runs") / "run", CONFIG)
+
+
+def test_training_learns_views_that_it_has_not_seen(small_dataset, finished):
+    start = initial_gaussians(small_dataset, None, 60, 1, 0)
+    assert psnr(finished.model, small_dataset) > psnr(start, small_dataset) + 6
+
+
+def test_same_seed_same_model_to_the_bit(small_dataset, finished, tmp_path):
+    again = train(small_dataset, tmp_path / "again", CONFIG)
+    name = "model.safetensors"
+    assert (again.path / name).read_bytes() == (finished.path / name).read_bytes()
+    assert again.training["history"] == finished.training["history"]
+    other = train(small_dataset, tmp_path / "other", replace(CONFIG, seed=1, iterations=20))
+    assert not np.array_equal(other.model.to_numpy()["means"][:10], finished.model.to_numpy()["means"][:10])
+
+
+@pytest.mark.parametrize("stop", [50, 100])
+def test_a_restored_trainer_goes_on_as_if_never_stopped(small_dataset, tmp_path, stop):
+    straight = Trainer(small_dataset, CONFIG)
+    for _ in range(stop):
+        straight.step()
+    straight.save(tmp_path / "checkpoint.safetensors")
+    resumed = Trainer(small_dataset, CONFIG)
+    resumed.restore(tmp_path / "checkpoint.safetensors")
+    for _ in range(30):
+        straight.step()
+        resumed.step()
+    one, other = straight.gaussians.to_numpy(), resumed.gaussians.to_numpy()
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, other[name])
+
+
+def test_killed_training_is_completed_by_resume(small_dataset, finished, tmp_path):
+    """The process dies without warning right after a checkpoint; --resume gives the same model to the bit."""
+    script = f"""
+import os, signal
+from pathlib import Path
+from spacesim.data.store import read_dataset
+from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.train import train
+config = TrainConfig.from_json({CONFIG.to_json()!r})
+def die(progress):
+    if progress.iteration == 100 and progress.gaussians:
+        os.kill(os.getpid(), signal.SIGKILL)
+train(read_dataset(Path({str(small_dataset.root)!r})), Path({str(tmp_path / "run")!r}), config, on_progress=die)
+"""
+    died = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert died.returncode == -9, died.stderr
+    with pytest.raises(InputError, match="resume"):
+        load_run(tmp_path / "run")
+    with pytest.raises(InputError, match="holds a run already"):
+        train(small_dataset, tmp_path / "run", CONFIG)
+    with pytest.raises(InputError, match="seed"):
+        train(small_dataset, tmp_path / "run", replace(CONFIG, seed=5), resume=True)
+    resumed = train(small_dataset, tmp_path / "run", CONFIG, resume=True)
+    name = "model.safetensors"
+    assert (resumed.path / name).read_bytes() == (finished.path / name).read_bytes()
+
+
+def test_a_finished_run_is_left_alone_by_resume(small_dataset, finished):
+    before = (finished.path / "model.safetensors").stat().st_mtime_ns
+    train(small_dataset, finished.path, CONFIG, resume=True)
+    assert (finished.path / "model.safetensors").stat().st_mtime_ns == before
+
+
+def test_the_run_says_how_it_was_made(finished):
+    config = json.loads((finished.path / "config.json").read_text())
+    assert TrainConfig.from_json(config["train"]) == CONFIG
+    assert finished.training["history"][-1]["iteration"] == CONFIG.iterations
+    assert finished.training["gaussians"] == finished.gaussians
+    assert len(list((finished.path / "checkpoints").glob("step_*.safetensors"))) == 2
+
+
+def test_refinement_that_leaves_nothing_is_said(small_dataset):
+    trainer = Trainer(small_dataset, replace(CONFIG, refinement=replace(REFINEMENT, prune_opacity=0.999)))
+    with pytest.raises(WorkError, match="prune every Gaussian"):
+        trainer.run(lambda progress: None, lambda: None)
+
+
+def test_random_background_keeps_a_black_hull_solid(black_dataset):
+    """Over black a black hull costs nothing to lose, and all of it goes; against alpha its silhouette stays."""
+    over_black = Trainer(black_dataset, replace(CONFIG, random_background=False))
+    with pytest.raises(WorkError, match="prune every Gaussian"):
+        over_black.run(lambda progress: None, lambda: None)
+    against_alpha = Trainer(black_dataset, CONFIG)
+    against_alpha.run(lambda progress: None, lambda: None)
+    frame = black_dataset.test[0]
+    alpha = np.array(render(against_alpha.gaussians, Pinhole.of(frame.camera)).alpha)
+    truth = load_image(black_dataset, frame).alpha.ravel()
+    assert alpha[truth > 0.99].mean() > 0.9
+    assert alpha[truth < 0.01].mean() < 0.05
+
+
+@pytest.mark.parametrize("init", ["points", "random"])
+def test_initial_gaussians(small_dataset, init):
+    one, two = (initial_gaussians(small_dataset, init, 40, 2, 3).to_numpy() for _ in range(2))
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, two[name])
+    assert one["means"].shape == (40, 3)
+    assert one["sh"].shape == (40, 9, 3)
+    np.testing.assert_allclose(1 / (1 + np.exp(-one["logit_opacities"])), 0.1, rtol=1e-5)
+    assert np.abs(one["means"]).max() < 2
+
+
+def test_initialising_from_what_is_not_there(small_dataset):
+    with pytest.raises(InputError, match="mesh"):
+        initial_gaussians(small_dataset, "mesh", 40, 0, 0)
+    with pytest.raises(InputError, match="ply_file_path"):
+        initial_gaussians(replace(small_dataset, ply_file_path=None), "points", 40, 0, 0)
+
+
+def test_scene_scale_and_focus(small_dataset):
+    np.testing.assert_allclose(focus_point(small_dataset), 0, atol=1e-6)
+    centers = np.array([frame.camera.position for frame in small_dataset.train])
+    assert scene_scale(small_dataset) == pytest.approx(np.abs(centers - centers.mean(0)).max())
+
+
+def test_ply_round_trip(finished, tmp_path):
+    write_ply(finished.model, tmp_path / "model.ply")
+    ours, back = finished.model.to_numpy(), read_ply(tmp_path / "model.ply").to_numpy()
+    for name in ("means", "log_scales", "logit_opacities", "sh"):
+        np.testing.assert_array_equal(ours[name], back[name])
+    header = (tmp_path / "model.ply").read_bytes().split(b"end_header\n")[0].decode()
+    names = [line.split()[-1] for line in header.splitlines() if line.startswith("property")]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert names[-8:] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    # INRIA's files hold the rest channel by channel: f_rest_0 .. 2 are the red ones of degree 1
+    table = np.frombuffer((tmp_path / "model.ply").read_bytes().split(b"end_header\n")[1], "<f4")
+    row = table.reshape(-1, len(names))[0]
+    np.testing.assert_array_equal(row[9:12], ours["sh"][0, 1:4, 0])
+
+
+def test_broken_files_are_named(finished, tmp_path):
+    whole = (finished.path / "model.safetensors").read_bytes()
+    for name in ("config.json", "training.json"):
+        (tmp_path / name).write_text((finished.path / name).read_text())
+    for content in (whole[: len(whole) // 2], b"", b"nonsense"):
+        (tmp_path / "model.safetensors").write_bytes(content)
+        with pytest.raises(InputError, match="safetensors"):
+            load_run(tmp_path)
+    (tmp_path / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+    with pytest.raises(InputError, match=r"broken\.ply"):
+        read_ply(tmp_path / "broken.ply")
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("iterations", 0), ("method", "magic"), ("init", "dreams"), ("seed", -1), ("sh_degree", 4)]
+)
+def test_configurations_that_cannot_be(option, value):
+    with pytest.raises(InputError, match=option.replace("_", "-")):
+        with_options(preset("demo"), **{option: value})
+
+
+def test_presets_and_table_5_1():
+    table = preset("thesis").refinement
+    values = (table.prune_opacity, table.prune_scale, table.reset_every, table.prune_screen_size)
+    assert values == (0.05, 0.05, 30, 0.05)
+    more = (table.split_screen_size, table.refine_every, table.pause_after_reset, table.max_gaussians)
+    assert more == (0.01, 100, 1000, 250_000)
+    assert (preset("thesis").iterations, table.refine_stop) == (200_000, 150_000)
+    with pytest.raises(InputError, match="preset"):
+        preset("miracle")
