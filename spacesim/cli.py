@@ -26,7 +26,9 @@ class _Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
+    arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
+    options.command = ("spacesim", *arguments)
     try:
         if options.needs_backend:
             backend.select(options.backend)
@@ -96,7 +98,9 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--data", type=Path, required=True, metavar="DATA")
     one.add_argument("--out", type=Path, required=True, metavar="EVAL")
     one.add_argument("--split", default="test", help="test (default), train or all")
-    one.add_argument("--lpips-weights", type=Path, metavar="FILE", help="AlexNet and linear weights for LPIPS")
+    one.add_argument(
+        "--lpips-weights", type=Path, metavar="PATH", help="AlexNet and linear weights for LPIPS, a file or a folder"
+    )
     one.add_argument("--json", action="store_true", help="print metrics.json alone")
 
     one = command("report", _report, "one page about several evaluations side by side", needs_backend=False)
@@ -162,8 +166,7 @@ def _generate(options: argparse.Namespace) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from spacesim.data.store import read_dataset
-    from spacesim.demo import training
-    from spacesim.progress import reporting
+    from spacesim.progress import reporting, training
     from spacesim.splat.train.config import preset, with_options
     from spacesim.splat.train.train import train
 
@@ -173,7 +176,7 @@ def _train(options: argparse.Namespace) -> None:
         config = with_options(config, random_background=False)
     dataset = read_dataset(options.data)
     with reporting("train", "iterations") as report:
-        run = train(dataset, options.out, config, options.resume, training(report))
+        run = train(dataset, options.out, config, options.resume, training(report), options.command)
     history = run.training["history"]
     print(
         f"{options.out}: {run.gaussians} Gaussians after {config.iterations} iterations in "

@@ -8,11 +8,10 @@ from typing import Any
 
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report import write_report
-from spacesim.progress import Reporter
+from spacesim.progress import Reporter, training
 from spacesim.scenes import GenerateConfig, generate
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.train import train
-from spacesim.splat.train.trainer import Progress
 
 SCENE = "boxsat"
 DATA = GenerateConfig(views=72, test_views=12, resolution=192, spp=32, sun=((40.0, 25.0),))
@@ -34,15 +33,11 @@ def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Repor
         dataset = generate(SCENE, out / "data", DATA, resume=(out / "data").exists(), progress=report)
     finished("generate")
     with reporting("train", "iterations") as report:
-        run = train(dataset, out / "run", preset("demo"), resume=(out / "run").exists(), on_progress=training(report))
+        resume, command = (out / "run").exists(), ("spacesim", "demo", "--out", str(out))
+        run = train(dataset, out / "run", preset("demo"), resume, training(report), command)
     finished("train")
     with reporting("evaluate", "frames") as report:
         metrics = evaluate(run, dataset, out / "eval", EvaluateConfig(), report)
     write_report([out / "eval"], out / "report.html")
     finished("evaluate and report")
     return {"report": out / "report.html", "metrics": metrics, "seconds": seconds}
-
-
-def training(report: Reporter) -> Callable[[Progress], None]:
-    """Tell `report` of a training's progress."""
-    return lambda p: report(p.iteration, p.iterations, f"loss {p.loss:.4f}  {p.gaussians} Gaussians")

@@ -2,18 +2,13 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+
+from spacesim.splat.train.trainer import Progress
 
 LINE_EVERY = 5.0  #: seconds between two plain lines
 
@@ -21,7 +16,7 @@ LINE_EVERY = 5.0  #: seconds between two plain lines
 class Reporter:
     """Told how far a piece of work is; knows its speed and what is left."""
 
-    def __init__(self, title: str, unit: str, bar: Progress | None) -> None:
+    def __init__(self, title: str, unit: str, bar: progress.Progress | None) -> None:
         self.title, self.unit, self.bar = title, unit, bar
         self.task = bar.add_task(title, total=None, detail="") if bar else None
         self.first: tuple[float, int] | None = None
@@ -43,6 +38,11 @@ class Reporter:
             self.last_line = now
 
 
+def training(report: Reporter) -> Callable[[Progress], None]:
+    """What tells `report` of a training's progress."""
+    return lambda p: report(p.iteration, p.iterations, f"loss {p.loss:.4f}  {p.gaussians} Gaussians")
+
+
 @contextmanager
 def reporting(title: str, unit: str, quiet: bool = False) -> Iterator[Reporter]:
     """A `Reporter` for the work of the `with` block. quiet: no bar (plain lines go on)."""
@@ -50,7 +50,12 @@ def reporting(title: str, unit: str, quiet: bool = False) -> Iterator[Reporter]:
     if quiet or not console.is_terminal:
         yield Reporter(title, unit, None)
         return
-    columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
-    columns += [TimeRemainingColumn(), TextColumn("{task.fields[detail]}")]
-    with Progress(*columns, console=console) as bar:
+    columns: list[progress.ProgressColumn] = [
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
+    ]
+    columns += [progress.TimeRemainingColumn(), progress.TextColumn("{task.fields[detail]}")]
+    with progress.Progress(*columns, console=console) as bar:
         yield Reporter(title, unit, bar)

@@ -1,9 +1,11 @@
 """`train`: a dataset and a configuration to a run on disk, resumable at any time."""
 
 import logging
+import os
 import platform
+import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,9 +33,10 @@ def train(
     config: TrainConfig,
     resume: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
+    command: Sequence[str] = (),
 ) -> Run:
     """Train and write RUN (see `spacesim.splat.run`). With `resume`, go on from the newest checkpoint, with the
-    same result to the bit; a finished run is returned as it is.
+    same result to the bit; a finished run is returned as it is. command: what the user typed, for the report.
 
     Raises InputError where `out` holds a run and `resume` is not asked for, or one of another configuration.
     """
@@ -68,7 +71,8 @@ def train(
             "seconds": round(seconds.total(), 3),
             "gaussians": trainer.gaussians.count,
             "backend": backend.select(),
-            "device": platform.processor() or platform.machine(),
+            "device": device(),
+            "command": shlex.join(command) if command else None,
             "versions": versions(),
         },
     )
@@ -81,6 +85,15 @@ def versions() -> dict[str, str]:
     """Versions of what the numbers depend on."""
     found = {"spacesim": spacesim.__version__, "drjit": version("drjit"), "numpy": np.__version__}
     return {**found, "python": platform.python_version()}
+
+
+def device() -> str:
+    """What computes, in words."""
+    if backend.select() == "cuda":
+        import drjit as dr
+
+        return f"CUDA device of compute capability {dr.detail.cuda_compute_capability() / 10:.1f}"
+    return f"{platform.machine()} CPU, {os.cpu_count()} cores"
 
 
 def _identity(dataset: Dataset) -> dict[str, Any]:

@@ -24,11 +24,12 @@ from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.initialise import initial_gaussians, scene_scale
 from spacesim.splat.train.losses import photometric_loss
-from spacesim.splat.train.optimizer import Adam
+from spacesim.splat.train.optimizer import Adam, adam_step
 from spacesim.splat.train.strategies.default import DefaultStrategy
 from spacesim.splat.train.views import TrainingViews, View
 
 HISTORY_EVERY = 50  #: iterations between two entries of the history
+RECORDINGS = 64  #: of a stage that are kept: one for each size of picture and degree of harmonics
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,9 @@ class Trainer:
         self.optimizer = Adam(self.gaussians.rows())
         self.strategy = DefaultStrategy(config.refinement, self.scene_scale, self.gaussians.count)
         self.history: list[dict[str, float]] = []
-        self._project, self._loss, self._update = dr.freeze(_project), dr.freeze(_loss), dr.freeze(_update)
+        self._project: Any = _recorded(_project)
+        self._loss: Any = _recorded(_loss)
+        self._update: Any = _recorded(_update)
 
     def run(self, on_progress: Callable[[Progress], None], on_checkpoint: Callable[[], None]) -> None:
         """Train from `self.iteration` to the end."""
@@ -89,9 +92,7 @@ class Trainer:
         by_splat = backward(splats, blended, lists, (width, height), by_colour, by_transmittance)
         moments = self.optimizer.first, self.optimizer.second
         factors = ad.Float([*self.optimizer.corrections(), *self.rates(index)])
-        rows, first, second = self._update(
-            rows, moments, camera, degree, (by_splat.splats, by_splat.features), factors, self.optimizer
-        )
+        rows, first, second = self._update(rows, moments, camera, degree, (by_splat.splats, by_splat.features), factors)
         self.gaussians = Gaussians.from_rows(rows)
         self.optimizer.first, self.optimizer.second = first, second
 
@@ -146,6 +147,10 @@ class Trainer:
         self.history.append({"iteration": self.iteration, "loss": loss, "gaussians": self.gaussians.count})
 
 
+def _recorded(stage: Callable[..., Any]) -> Any:
+    return dr.freeze(stage, limit=RECORDINGS, warn_after=RECORDINGS)
+
+
 def _valid(view: View) -> Any:
     return ad.Bool(True) if view.valid is None else ad.Bool(view.valid)
 
@@ -184,9 +189,11 @@ def _update(
     degree: int,
     gradients: tuple[Splats, list[Any]],
     factors: Any,
-    optimizer: Adam,
 ) -> tuple[list[Any], list[Any], list[Any]]:
-    """Gradients of the splats to gradients of the parameters, and an Adam step. factors: [2 + R] see `Trainer.step`."""
+    """Gradients of the splats to gradients of the parameters, and an Adam step.
+
+    factors: Float [2 + R], Adam's two corrections and the step size of each row.
+    """
     rows = [ad.Float(row) for row in rows]
     dr.enable_grad(rows)
     gaussians = Gaussians.from_rows(rows)
@@ -201,4 +208,4 @@ def _update(
     dr.backward(along)
     numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(2 + len(rows))]
     by_row = [dr.grad(row) for row in rows]
-    return optimizer.update(dr.detach(rows), by_row, moments, numbers[2:], numbers[:2])
+    return adam_step(dr.detach(rows), by_row, moments, numbers[2:], (numbers[0], numbers[1]))

@@ -29,6 +29,7 @@ class TrainingViews:
             raise InputError(f"{dataset.root}: expected at least one training image, found none")
         self.dataset, self.seed = dataset, seed
         largest = max(4 * f.camera.width * f.camera.height for f in dataset.train)
+        self._order = lru_cache(maxsize=1)(self._shuffle)
         self._cached = lru_cache(maxsize=max(1, CACHE_BYTES // largest))(self._load)
 
     def __len__(self) -> int:
@@ -40,8 +41,10 @@ class TrainingViews:
     def at_step(self, step: int) -> View:
         """The view of a step: every epoch visits all views once, in an order that (seed, epoch) decides."""
         epoch, place = divmod(step, len(self))
-        order = np.random.default_rng([self.seed, 1, epoch]).permutation(len(self))
-        return self[int(order[place])]
+        return self[int(self._order(epoch)[place])]
+
+    def _shuffle(self, epoch: int) -> np.ndarray:
+        return np.random.default_rng([self.seed, 1, epoch]).permutation(len(self))
 
     def _load(self, index: int) -> View:
         frame = self.dataset.train[index]
