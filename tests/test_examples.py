@@ -1,0 +1,68 @@
+"""The examples run as they stand, only smaller, each on what the one before it has left."""
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from spacesim.data.images import read_exr, read_png
+from spacesim.data.store import verify_dataset
+from spacesim.splat.ply import read_ply
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def example(name: str) -> Any:
+    """The example's module, without running it."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    out = tmp_path_factory.mktemp("examples") / "data"
+    example("01_simulate").main(out, views=6, resolution=48, spp=4)
+    return out
+
+
+@pytest.fixture(scope="module")
+def run(data):
+    out = data.parent / "run"
+    example("02_reconstruct").main(data, out, iterations=60, gaussians=500)
+    return out
+
+
+def test_simulate(data, capsys):
+    assert verify_dataset(data) == []
+    dataset = example("01_simulate").main(data, views=6, resolution=48, spp=4)  # all there already
+    assert (len(dataset.train), len(dataset.test)) == (6, 4)
+    printed = capsys.readouterr().out
+    shares = [int(line.split(":")[1].split("%")[0]) for line in printed.splitlines() if "of the surface's" in line]
+    assert len(shares) == 3
+    assert sum(shares) == pytest.approx(100, abs=2)
+
+
+def test_reconstruct(run):
+    assert read_png(run / "view.png").shape == (48, 48, 4)
+    depth = read_exr(run / "depth.exr")["depth"]
+    assert 5 < np.median(depth[depth > 0]) < 15
+    assert read_ply(run / "gaussians.ply").count == 500
+
+
+def test_evaluate(data, run):
+    out = data.parent / "eval"
+    metrics = example("03_evaluate").main(data, run, out)
+    assert metrics["image_full"]["psnr"]["mean"] > 15
+    assert (out / "report.html").stat().st_size > 10_000
+
+
+def test_rasterizer_gradients(tmp_path):
+    losses = example("04_rasterizer_gradients").main(tmp_path / "fit.png", count=60, size=40, steps=40)
+    assert losses[-1] < 0.6 * losses[0]
+    assert read_png(tmp_path / "fit.png").shape == (40, 80)
