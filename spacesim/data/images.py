@@ -137,8 +137,9 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
 def load_image(dataset: Dataset, frame: Frame) -> Image:
     """The image of `frame` as trained on and compared with, undistorted where the frame says so.
 
-    Straight alpha comes from the file, else from the silhouette, else it is 1. Raises InputError where a file
-    is missing, broken or of another size than the camera.
+    Straight alpha comes from the file, else from the silhouette, else it is 1. Pixels to be ignored are opaque
+    black whatever the file holds, so that it cannot reach their neighbours through a window. Raises InputError
+    where a file is missing, broken or of another size than the camera.
     """
     pixels = _read_sized(dataset.root / frame.file_path, frame.camera)
     values = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
@@ -151,6 +152,7 @@ def load_image(dataset: Dataset, frame: Frame) -> Image:
     if frame.mask_path is not None:
         valid = _read_grey(dataset.root / frame.mask_path, frame.camera) > 0
     rgb = np.ascontiguousarray(np.broadcast_to(values[..., :3], (*alpha.shape, 3)))
+    rgb, alpha = np.where(valid[..., None], rgb, np.float32(0)), np.where(valid, alpha, np.float32(1))
     image = Image(rgb, alpha, valid)
     return undistort(image, frame.camera, frame.distortion) if any(frame.distortion) else image
 

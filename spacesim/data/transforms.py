@@ -64,6 +64,7 @@ def read_camera(path: Path) -> Camera:
     frames = values.pop("frames", None)
     if isinstance(frames, list) and frames and isinstance(frames[0], dict):
         values |= frames[0]
+    values = _without_nulls(values)
     try:
         if "w" not in values or "h" not in values:
             raise InputError("expected w and h, the size in pixels, found none")
@@ -115,7 +116,7 @@ def _read_frame(source: Path, meta: Json, entry: Json) -> Frame:
     if not (source.parent / file_path).is_file() and (source.parent / f"{file_path}.png").is_file():
         file_path += ".png"  # Blender's files leave the suffix out
     image = source.parent / file_path
-    values = {**meta, **entry}
+    values = _without_nulls({**meta, **entry})
     try:
         if not image.is_file():
             raise InputError("expected an image file, found none")
@@ -186,7 +187,8 @@ def _read_sun(values: Json) -> Sun | None:
 def _split(source: Path, meta: Json, frames: tuple[Frame, ...]) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
     """(train, test) of `frames` by the rules above."""
     known = [frame.file_path for frame in frames]
-    listed = {key: _listed(source, meta[f"{key}_filenames"], known) for key in _SPLITS if f"{key}_filenames" in meta}
+    lists = {key: meta.get(f"{key}_filenames") for key in _SPLITS}
+    listed = {key: _listed(source, names, known) for key, names in lists.items() if names is not None}
     folders = {key: {path for path in known if key in PurePosixPath(path).parts[:-1]} for key in _SPLITS}
     if listed:
         test = listed.get("test", listed.get("val"))
@@ -213,6 +215,11 @@ def _listed(source: Path, names: Any, known: list[str]) -> set[str]:
     if unknown:
         raise InputError(f"{source}: expected a frame for each name in its lists, found none for {unknown[0]}")
     return listed
+
+
+def _without_nulls(values: Json) -> dict[str, Any]:
+    """A key whose value is null counts as absent."""
+    return {key: value for key, value in values.items() if value is not None}
 
 
 def _number(values: Json, key: str, default: float | None = None) -> float:

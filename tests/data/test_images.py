@@ -190,7 +190,8 @@ def test_alpha_from_silhouette_and_ignored_pixels(tmp_path):
     write_png(tmp_path / "silhouette.png", silhouette)
     write_png(tmp_path / "mask.png", mask)
     image = load(tmp_path, make_camera(), silhouette_path="silhouette.png", mask_path="mask.png")
-    np.testing.assert_array_equal(image.alpha, silhouette / 255)
+    np.testing.assert_array_equal(image.alpha, np.where(mask > 0, silhouette / 255, 1))
+    np.testing.assert_array_equal(image.rgb, np.repeat((mask > 0)[..., None] * np.float32(90 / 255), 3, axis=-1))
     np.testing.assert_array_equal(image.valid, mask > 0)
 
 
