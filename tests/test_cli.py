@@ -1,0 +1,286 @@
+"""The commands of the contract: what they print and write, and how they refuse bad usage and bad input."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny import GENERATE, TRAIN
+
+from spacesim.data.images import read_exr, read_png
+from spacesim.data.store import read_dataset, verify_dataset
+from spacesim.splat.ply import read_ply
+from spacesim.splat.run import load_run
+
+COMMANDS = ("doctor", "demo", "generate", "train", "eval", "report", "render", "export")
+
+
+def test_help_names_every_command(spacesim):
+    shown = spacesim("--help")
+    assert shown.code == 0
+    assert all(re.search(rf"^ +{name} ", shown.output, re.MULTILINE) for name in COMMANDS)
+    assert spacesim("--version").output.startswith("spacesim ")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(spacesim, command):
+    shown = spacesim(command, "--help")
+    assert shown.code == 0
+    assert shown.output.startswith(f"usage: spacesim {command}")
+
+
+def test_the_module_is_a_program_too():
+    done = subprocess.run([sys.executable, "-m", "spacesim.cli", "--version"], capture_output=True, text=True)
+    assert done.returncode == 0
+    assert done.stdout.startswith("spacesim ")
+
+
+def test_demo_is_importable():
+    from spacesim.demo import DATA, SCENE, demo
+    from spacesim.scenes import built_in_scene
+
+    assert callable(demo)
+    assert built_in_scene(SCENE).name == SCENE
+    assert DATA.views > 0
+
+
+def test_doctor(spacesim):
+    spoken, parsed = spacesim("doctor"), spacesim("doctor", "--json")
+    assert spoken.code == parsed.code == 0
+    findings = json.loads(parsed.output)
+    assert findings["backend"] in ("cuda", "llvm", None)
+    assert spoken.output.splitlines()[-1].startswith(("Ready:", "Nothing can be rendered"))
+
+
+def test_generate_writes_a_whole_dataset(tiny_data):
+    assert verify_dataset(tiny_data) == []
+    dataset = read_dataset(tiny_data)
+    assert (len(dataset.train), len(dataset.test)) == (6, 2)
+    assert json.loads((tiny_data / "scene.json").read_text())["config"]["spp"] == 4
+
+
+def test_suns_are_given_by_azimuth_and_elevation(spacesim, tmp_path):
+    small = ("--views", "1", "--test-views", "0", "--resolution", "8", "--spp", "1")
+    done = spacesim("generate", "boxsat", "--out", tmp_path / "data", *small, "--sun", "200,-10", "--sun", "5.5,80")
+    assert done.code == 0, done.errors
+    angles = [frame.sun.angles for frame in read_dataset(tmp_path / "data").train]
+    assert np.allclose(angles, [(200, -10), (5.5, 80)])
+
+
+def test_train_leaves_a_run(tiny_run, tiny_data):
+    run = load_run(tiny_run)
+    assert run.config["iterations"] == 50
+    assert run.config["data"]["path"] == str(tiny_data.resolve())
+    assert run.training["history"][-1]["iteration"] == 50
+    assert run.gaussians == 300
+
+
+def test_training_again_needs_resume_and_resuming_a_finished_run_changes_nothing(spacesim, tiny_run, tiny_data):
+    before = {path: path.read_bytes() for path in tiny_run.rglob("*") if path.is_file()}
+    assert spacesim("train", tiny_data, "--out", tiny_run, *TRAIN).is_refusal(tiny_run, "--resume")
+    done = spacesim("train", tiny_data, "--out", tiny_run, *TRAIN, "--resume")
+    assert done.code == 0
+    assert {path: path.read_bytes() for path in tiny_run.rglob("*") if path.is_file()} == before
+
+
+def test_resuming_with_another_configuration_is_refused(spacesim, tiny_run, tiny_data):
+    other = spacesim("train", tiny_data, "--out", tiny_run, *TRAIN, "--seed", 3, "--resume")
+    assert other.is_refusal(tiny_run, "seed 0", "3")
+
+
+def test_generating_again_needs_resume(spacesim, tiny_data):
+    assert spacesim("generate", "boxsat", "--out", tiny_data, *GENERATE).is_refusal(tiny_data, "--resume")
+    assert spacesim("generate", "boxsat", "--out", tiny_data, *GENERATE, "--seed", 1, "--resume").is_refusal("config")
+    done = spacesim("generate", "boxsat", "--out", tiny_data, *GENERATE, "--resume")
+    assert done.code == 0
+
+
+def test_eval_writes_numbers_pictures_and_a_page(tiny_eval):
+    metrics = json.loads((tiny_eval / "metrics.json").read_text())
+    assert metrics["schema"] == 1
+    assert metrics["split"] == "test"
+    assert metrics["model"]["gaussians"] == 300
+    assert len(metrics["frames"]) == 2
+    assert metrics["image"]["psnr"]["mean"] > 5
+    assert (tiny_eval / "report.html").read_text().startswith("<!")
+    assert read_png(tiny_eval / "frames" / metrics["frames"][0]["name"] / "truth.png").shape == (40, 40, 3)
+
+
+def test_json_of_eval_stands_alone(tiny_run, tiny_data, tmp_path):
+    command = [sys.executable, "-m", "spacesim.cli", "eval", tiny_run, "--data", tiny_data, "--out", tmp_path / "eval"]
+    done = subprocess.run([*command, "--json", "--split", "train"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == json.loads((tmp_path / "eval/metrics.json").read_text())
+    assert "Traceback" not in done.stderr
+
+
+def test_report_shows_runs_side_by_side(spacesim, tiny_eval, tmp_path):
+    other = tmp_path / "<script>alert(1)<"
+    shutil.copytree(tiny_eval, other)
+    metrics = json.loads((other / "metrics.json").read_text())
+    (other / "metrics.json").write_text(json.dumps({**metrics, "run": "<script>alert(2)</script>", "data": str(other)}))
+    done = spacesim("report", tiny_eval, other, "--out", tmp_path / "both.html")
+    assert done.code == 0, done.errors
+    page = (tmp_path / "both.html").read_text()
+    assert "2 reconstructions" in page
+    assert "<script>alert" not in page
+    assert not re.search(r"""(src|href)=["']?(https?:|//|file:)""", page)
+
+
+@pytest.mark.parametrize("kind", ["rgb", "depth", "alpha"])
+def test_render_a_frame(spacesim, tiny_run, tiny_data, tmp_path, kind):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for suffix in ("png", "exr"):
+            out = tmp_path / f"{kind}.{suffix}"
+            done = spacesim("render", tiny_run, "--frame", 3, "--kind", kind, "--out", out)
+            assert (done.code, done.output) == (0, f"{out}\n"), done.errors
+    layer = read_exr(tmp_path / f"{kind}.exr")[kind]
+    picture = read_png(tmp_path / f"{kind}.png")
+    assert picture.shape == ((40, 40, 4) if kind == "rgb" else (40, 40))
+    assert layer.shape == ((40, 40, 3) if kind == "rgb" else (40, 40))
+    predicted = load_run(tiny_run).predict(read_dataset(tiny_data).frames[3].camera, None)
+    assert np.array_equal(layer, getattr(predicted, kind))
+
+
+def test_render_a_camera_file(spacesim, tiny_run, tiny_data, tmp_path):
+    meta = json.loads((tiny_data / "transforms.json").read_text())
+    frame = next(frame for frame in meta["frames"] if frame["file_path"] == "images/test_00001.png")
+    camera = {key: meta[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
+    (tmp_path / "camera.json").write_text(json.dumps({**camera, "transform_matrix": frame["transform_matrix"]}))
+    assert spacesim("render", tiny_run, "--camera", tmp_path / "camera.json", "--out", tmp_path / "a.png").code == 0
+    assert spacesim("render", tiny_run, "--frame", 7, "--out", tmp_path / "b.png").code == 0
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_render_where_the_data_has_moved(spacesim, tiny_data, tmp_path):
+    shutil.copytree(tiny_data, tmp_path / "data")
+    short = ("--iterations", 5, "--init-count", 50, "--preset", "demo")
+    assert spacesim("train", tmp_path / "data", "--out", tmp_path / "run", *short).code == 0
+    (tmp_path / "data").rename(tmp_path / "moved")
+    out = tmp_path / "a.png"
+    assert spacesim("render", tmp_path / "run", "--out", out).is_refusal(tmp_path / "data")
+    assert spacesim("render", tmp_path / "run", "--data", tmp_path / "moved", "--out", out).code == 0
+    done = spacesim("train", tmp_path / "moved", "--out", tmp_path / "run", *short, "--resume")
+    assert done.code == 0, done.errors
+
+
+def test_export(spacesim, tiny_run, tmp_path):
+    out = tmp_path / "model.ply"
+    done = spacesim("export", tiny_run, "--ply", out)
+    assert (done.code, done.output) == (0, f"{out}: 300 Gaussians\n")
+    means = read_ply(out).to_numpy()["means"]
+    assert np.array_equal(means, load_run(tiny_run).model.to_numpy()["means"])
+
+
+def test_paths_with_spaces_and_other_letters(spacesim, tiny_data, tmp_path):
+    root = tmp_path / "Größe & Maß <1>"
+    shutil.copytree(tiny_data, root / "данные")
+    short = ("--iterations", 3, "--init-count", 20, "--preset", "demo")
+    assert spacesim("train", root / "данные", "--out", root / "run 1", *short).code == 0
+    assert spacesim("eval", root / "run 1", "--data", root / "данные", "--out", root / "e %20").code == 0
+    assert "Größe &amp; Maß &lt;1&gt;" in (root / "e %20/report.html").read_text()
+
+
+def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "data").mkdir()
+    small = ("--views", "1", "--test-views", "0", "--resolution", "8", "--spp", "1")
+    assert spacesim("generate", "boxsat", "--out", tmp_path / "data", *small).code == 0
+    short = ("--iterations", 2, "--init-count", 20, "--preset", "demo")
+    assert spacesim("train", tiny_data, "--out", tmp_path / "run", *short).code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "names"),
+    [
+        ("", ["COMMAND"]),
+        ("fly", ["fly"]),
+        ("generate teapot --out OUT", ["scene", "boxsat", "teapot"]),
+        ("generate boxsat", ["--out"]),
+        ("generate boxsat --out OUT --views 0", ["views", "at least 1", "found 0"]),
+        ("generate boxsat --out OUT --views two", ["--views", "two"]),
+        ("generate boxsat --out OUT --suns 0", ["suns", "found 0"]),
+        ("generate boxsat --out OUT --test-views -1", ["test_views"]),
+        ("generate boxsat --out OUT --resolution 0", ["resolution", "found 0"]),
+        ("generate boxsat --out OUT --spp 0", ["spp", "found 0"]),
+        ("generate boxsat --out OUT --seed -1", ["seed", "found -1"]),
+        ("generate boxsat --out OUT --sun 10", ["--sun", "AZ,EL", "10"]),
+        ("generate boxsat --out OUT --sun 10,north", ["--sun", "10,north"]),
+        ("generate boxsat --out OUT --sun 1,2,3", ["--sun", "1,2,3"]),
+        ("generate boxsat --out OUT --sun 10,91", ["sun", "91"]),
+        ("generate boxsat --out OUT --sun nan,0", ["sun", "nan"]),
+        ("generate boxsat --out OUT --backend metal", ["--backend", "metal"]),
+        ("train ABSENT --out OUT", ["ABSENT", "found nothing"]),
+        ("train RUN --out OUT", ["RUN", "transforms.json"]),
+        ("train DATA --out OUT --iterations 0", ["--iterations", "at least 1", "found 0"]),
+        ("train DATA --out OUT --iterations 1e3", ["--iterations", "1e3"]),
+        ("train DATA --out OUT --method park", ["--method", "vanilla", "park"]),
+        ("train DATA --out OUT --strategy none", ["--strategy", "default", "none"]),
+        ("train DATA --out OUT --preset huge", ["--preset", "thesis", "huge"]),
+        ("train DATA --out OUT --init sphere", ["--init", "points", "sphere"]),
+        ("train DATA --out OUT --init-count 0", ["--init-count", "found 0"]),
+        ("train DATA --out OUT --seed -1", ["--seed", "found -1"]),
+        ("train DATA --out OUT --backend vulkan", ["--backend", "vulkan"]),
+        ("train DATA --out DATA", ["DATA", "empty or new folder"]),
+        ("eval ABSENT --data DATA --out OUT", ["ABSENT", "config.json"]),
+        ("eval DATA --data DATA --out OUT", ["DATA", "config.json"]),
+        ("eval RUN --data RUN --out OUT", ["RUN", "transforms.json"]),
+        ("eval RUN --data ABSENT --out OUT", ["ABSENT"]),
+        ("eval RUN --data DATA --out OUT --split some", ["split", "some"]),
+        ("eval RUN --data DATA --out OUT --lpips-weights ABSENT", ["ABSENT"]),
+        ("report ABSENT --out OUT.html", ["ABSENT"]),
+        ("report RUN --out OUT.html", ["RUN", "metrics.json"]),
+        ("report --out OUT.html", ["EVAL"]),
+        ("render RUN --out OUT.png --frame 8", ["--frame", "0 to 7", "found 8"]),
+        ("render RUN --out OUT.png --frame -1", ["--frame", "found -1"]),
+        ("render RUN --out OUT.png --frame 0 --camera X", ["--camera", "--frame"]),
+        ("render RUN --out OUT.png --camera ABSENT", ["ABSENT"]),
+        ("render RUN --out OUT.png --camera DATA/scene.json", ["scene.json", "w and h"]),
+        ("render RUN --out OUT.png --kind shade", ["--kind", "shade"]),
+        ("render RUN --out OUT.png --sun 5", ["--sun", "5"]),
+        ("render RUN --out OUT.jpg", ["OUT.jpg", ".png"]),
+        ("render RUN --out OUT", [".png", ".exr"]),
+        ("render DATA --out OUT.png", ["DATA", "config.json"]),
+        ("export RUN", ["--ply"]),
+        ("export DATA --ply OUT.ply", ["DATA", "config.json"]),
+    ],
+)
+def test_bad_usage_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tmp_path, arguments, names):
+    places = {"DATA": tiny_data, "RUN": tiny_run, "ABSENT": tmp_path / "absent", "OUT": tmp_path / "out"}
+    words = [re.sub("|".join(places), lambda match: str(places[match.group()]), word) for word in arguments.split()]
+    names = [str(places.get(name, name)).replace("OUT", "out") for name in names]
+    refused = spacesim(*words)
+    assert refused.is_refusal(*names), refused
+    assert not (tmp_path / "out").exists()
+
+
+UNWRITABLE = ["BELOW_A_FILE/out", *(path for path in ("/proc/out", "/dev/full") if Path(path).parent.is_dir())]
+
+
+@pytest.mark.parametrize("place", UNWRITABLE)
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "generate boxsat --views 1 --test-views 0 --resolution 8 --spp 1 --out OUT",
+        "train DATA --preset demo --iterations 2 --init-count 10 --out OUT",
+        "eval RUN --data DATA --out OUT",
+        "report EVAL --out OUT/a.html",
+        "render RUN --out OUT/a.png",
+        "render RUN --out OUT/a.exr",
+        "export RUN --ply OUT/a.ply",
+    ],
+)
+def test_unwritable_output_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tiny_eval, tmp_path, arguments, place):
+    (tmp_path / "file").write_text("a file, no folder")
+    place = place.replace("BELOW_A_FILE", str(tmp_path / "file"))
+    places = {"DATA": tiny_data, "RUN": tiny_run, "EVAL": tiny_eval, "OUT": place}
+    words = [re.sub("|".join(places), lambda match: str(places[match.group()]), word) for word in arguments.split()]
+    refused = spacesim(*words)
+    assert refused.is_refusal(place), refused
+    assert (tmp_path / "file").read_text() == "a file, no folder"

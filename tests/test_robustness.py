@@ -1,0 +1,466 @@
+"""Interruption, full disks, broken files and foreign data: nothing is lost, and what is wrong is said in a sentence."""
+
+import copy
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny import GENERATE, PROGRESS, outcome
+
+from spacesim.data.errors import InputError
+from spacesim.data.store import load_truth, read_dataset, verify_dataset
+from spacesim.scenes import GenerateConfig, generate
+from spacesim.splat.run import load_run
+from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.train import train
+
+CONFIG = TrainConfig(preset="demo", iterations=40, init_count=200, checkpoint_every=10, sh_every=20)
+FEW = ("--preset", "demo", "--iterations", "8", "--init-count", "100")
+
+KILLED = """
+import os, signal, sys
+moment, after = int(sys.argv[1]), sys.argv[2] == "after"
+done, put = 0, os.replace
+
+def dying(*paths):
+    global done
+    done += 1
+    if done == moment and not after:
+        os.kill(os.getpid(), signal.SIGKILL)
+    put(*paths)
+    if done == moment:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+os.replace = dying
+"""
+GENERATING = "from spacesim.cli import main; main(sys.argv[3:])"
+TRAINING = f"""
+from pathlib import Path
+from spacesim.data.store import read_dataset
+from spacesim.splat.train.config import *
+from spacesim.splat.train.train import train
+train(read_dataset(sys.argv[3]), Path(sys.argv[4]), {CONFIG!r})
+"""
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """{path: bytes} of all files in a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def kill(program: str, moment: int, after: bool, *arguments: object) -> None:
+    """Run a program that gets SIGKILL before or after it has put its file number `moment` in place."""
+    command = [sys.executable, "-c", KILLED + program, moment, "after" if after else "before", *arguments]
+    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, timeout=100)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+
+
+# --- kill -9 ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("moment", "after"), [(1, False), (5, False), (30, True), (52, False)])
+def test_generate_completes_what_a_kill_has_left(spacesim, tiny_data, tmp_path, moment, after):
+    """Before scene.json; amid the first frame; amid a later one; before transforms.json."""
+    out = tmp_path / "data"
+    arguments = ("generate", "boxsat", "--out", out, *GENERATE)
+    kill(GENERATING, moment, after, *arguments)
+    left = {name: content for name, content in contents(out).items() if not name.endswith(".part")}
+    assert len(left) == (moment if after else moment - 1)
+    assert spacesim("train", out, "--out", tmp_path / "run").is_refusal(out)
+    done = spacesim(*arguments, "--resume")
+    assert done.code == 0, done.errors
+    found = contents(out)
+    assert found == contents(tiny_data)
+    assert {name: found[name] for name in left} == left
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tiny_data, tmp_path_factory) -> Path:
+    return train(read_dataset(tiny_data), tmp_path_factory.mktemp("straight") / "run", CONFIG).path
+
+
+@pytest.mark.parametrize(("moment", "after"), [(1, False), (2, False), (3, True), (7, False), (9, False)])
+def test_train_completes_what_a_kill_has_left(tiny_data, uninterrupted, tmp_path, moment, after):
+    """Before config.json; before the first checkpoint; after a later one; before training.json; before the model."""
+    out = tmp_path / "run"
+    kill(TRAINING, moment, after, tiny_data, out)
+    assert not (out / "model.safetensors").exists()
+    with pytest.raises(InputError, match=f"{out}"):
+        load_run(out)
+    run = train(read_dataset(tiny_data), out, CONFIG, resume=True)
+    assert (out / "model.safetensors").read_bytes() == (uninterrupted / "model.safetensors").read_bytes()
+    assert run.training["history"] == load_run(uninterrupted).training["history"]
+
+
+def test_an_unfinished_run_is_refused(spacesim, tiny_run, tiny_data, tmp_path):
+    shutil.copytree(tiny_run, tmp_path / "run")
+    (tmp_path / "run/model.safetensors").unlink()
+    for arguments in (
+        ("eval", tmp_path / "run", "--data", tiny_data, "--out", tmp_path / "out"),
+        ("render", tmp_path / "run", "--out", tmp_path / "a.png"),
+        ("export", tmp_path / "run", "--ply", tmp_path / "a.ply"),
+    ):
+        assert spacesim(*arguments).is_refusal(tmp_path / "run", "--resume")
+
+
+# --- Ctrl-C ----------------------------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_during_training(spacesim, tiny_data, tmp_path):
+    arguments = ("train", tiny_data, "--out", tmp_path / "run", "--preset", "demo", "--init-count", 200)
+    command = [sys.executable, "-m", "spacesim.cli", *map(str, arguments), "--iterations", "150"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    first = process.stderr.readline()
+    assert PROGRESS.match(first), first
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    stopped = outcome(process.returncode, output, errors)
+    assert stopped.code == 130, stopped
+    assert len(stopped.errors) == 1
+    assert "--resume" in stopped.errors[0]
+    done = spacesim(*arguments, "--iterations", 150, "--resume")
+    assert done.code == 0, done.errors
+
+
+# --- a full disk -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 256 KiB, which can be made larger."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(place)]
+    if not sys.platform.startswith("linux") or os.geteuid() != 0:
+        pytest.skip("only root on Linux can mount a small file system")
+    if subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("mounting a small file system is not permitted here")
+
+    def enlarge() -> None:
+        subprocess.run(["mount", "-o", "remount,size=64m", str(place)], check=True)
+
+    yield place, enlarge
+    subprocess.run(["umount", str(place)], check=True)
+
+
+def test_a_full_disk_while_generating(spacesim, tiny_data, small_disk):
+    place, enlarge = small_disk
+    arguments = ("generate", "boxsat", "--out", place / "data", *GENERATE)
+    failed = spacesim(*arguments)
+    assert failed.code == 1
+    assert len(failed.errors) == 1
+    assert "disk is full" in failed.errors[0]
+    whole, expected = contents(place / "data"), contents(tiny_data)
+    assert whole.items() <= expected.items()
+    assert len(whole) > 6
+    enlarge()
+    assert spacesim(*arguments, "--resume").code == 0
+    assert contents(place / "data") == expected
+
+
+def test_a_full_disk_while_training(spacesim, tiny_data, uninterrupted, small_disk):
+    place, enlarge = small_disk
+    (place / "ballast").write_bytes(bytes(100_000))
+    from spacesim.data.errors import WorkError
+
+    with pytest.raises(WorkError, match="disk is full"):
+        train(read_dataset(tiny_data), place / "run", CONFIG)
+    whole = contents(place / "run")
+    assert "config.json" in whole
+    assert not any(name.endswith(".part") for name in whole)
+    enlarge()
+    train(read_dataset(tiny_data), place / "run", CONFIG, resume=True)
+    assert (place / "run/model.safetensors").read_bytes() == (uninterrupted / "model.safetensors").read_bytes()
+
+
+# --- the same seed ---------------------------------------------------------------------------------------------------
+
+
+def test_same_seed_same_bits(spacesim, tiny_data, uninterrupted, tmp_path):
+    dataset = read_dataset(tiny_data)
+    again = train(dataset, tmp_path / "again", CONFIG).path / "model.safetensors"
+    other = train(dataset, tmp_path / "other", replace(CONFIG, seed=1)).path / "model.safetensors"
+    assert again.read_bytes() == (uninterrupted / "model.safetensors").read_bytes()
+    assert other.read_bytes() != again.read_bytes()
+    assert spacesim("generate", "boxsat", "--out", tmp_path / "data", *GENERATE).code == 0
+    assert contents(tmp_path / "data") == contents(tiny_data)
+
+
+# --- broken files ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def broken(tiny_data, tmp_path) -> Path:
+    """A copy of the dataset, to be broken."""
+    return Path(shutil.copytree(tiny_data, tmp_path / "broken"))
+
+
+def cut(path: Path, fraction: float = 0.5) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(fraction * len(content))])
+
+
+def edit(path: Path, change) -> None:
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+
+
+BREAKAGES = {
+    "transforms.json": ("transforms.json", lambda root: cut(root / "transforms.json")),
+    "no transforms.json": ("--resume", lambda root: (root / "transforms.json").unlink()),
+    "no list": ("transforms.json", lambda root: (root / "transforms.json").write_text("[]")),
+    "no frames": ("transforms.json", lambda root: edit(root / "transforms.json", lambda m: m.update(frames=[]))),
+    "no training frames": (
+        "transforms.json",
+        lambda root: edit(
+            root / "transforms.json",
+            lambda m: m.update(train_filenames=[], test_filenames=[f["file_path"] for f in m["frames"]]),
+        ),
+    ),
+    "pose": (
+        "train_00002.png",
+        lambda root: edit(
+            root / "transforms.json", lambda m: m["frames"][2]["transform_matrix"][0].__setitem__(3, float("nan"))
+        ),
+    ),
+    "mirror": (
+        "train_00001.png",
+        lambda root: edit(
+            root / "transforms.json",
+            lambda m: m["frames"][1].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()),
+        ),
+    ),
+    "size": ("41x40", lambda root: edit(root / "transforms.json", lambda m: m.update(w=41))),
+    "picture's size": (
+        "train_00003.png",
+        lambda root: Image.new("RGBA", (39, 40)).save(root / "images/train_00003.png"),
+    ),
+    "picture": ("train_00003.png", lambda root: cut(root / "images/train_00003.png")),
+    "empty picture": ("train_00003.png", lambda root: cut(root / "images/train_00003.png", 0)),
+    "no picture": ("train_00003.png", lambda root: (root / "images/train_00003.png").unlink()),
+    "points": ("points.ply", lambda root: cut(root / "points.ply")),
+    "no points": ("points.ply", lambda root: (root / "points.ply").unlink()),
+    "scene": ("scene.json", lambda root: cut(root / "scene.json")),
+}
+
+
+@pytest.mark.parametrize("breakage", BREAKAGES)
+def test_training_on_broken_data_ends_in_a_sentence(spacesim, broken, tmp_path, breakage):
+    name, damage = BREAKAGES[breakage]
+    damage(broken)
+    refused = spacesim("train", broken, "--out", tmp_path / "run", *FEW)
+    assert refused.is_refusal(broken, name), refused
+
+
+def test_a_broken_mesh_ends_in_a_sentence(spacesim, broken, tmp_path):
+    cut(broken / "mesh.ply", 0.3)
+    refused = spacesim("train", broken, "--out", tmp_path / "run", *FEW, "--init", "mesh")
+    assert refused.is_refusal(broken / "mesh.ply"), refused
+
+
+@pytest.mark.parametrize("fraction", [0, 0.01, 0.5, 0.999])
+def test_a_truncated_exr_is_found(broken, fraction):
+    dataset = read_dataset(broken)
+    path = broken / dataset.test[0].gt_path
+    cut(path, fraction)
+    with pytest.raises(InputError, match=path.name):
+        load_truth(dataset, dataset.test[0])
+    (problem,) = verify_dataset(broken)
+    assert str(path) in problem
+
+
+def test_evaluating_on_broken_data_ends_in_a_sentence(spacesim, broken, tiny_run, tmp_path):
+    cut(broken / "images/test_00001.png")
+    refused = spacesim("eval", tiny_run, "--data", broken, "--out", tmp_path / "eval")
+    assert refused.is_refusal(broken / "images/test_00001.png"), refused
+    assert not (tmp_path / "eval/metrics.json").exists()
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "config.json", "training.json"])
+@pytest.mark.parametrize("fraction", [0, 0.4])
+def test_a_broken_run_ends_in_a_sentence(spacesim, tiny_run, tiny_data, tmp_path, name, fraction):
+    run = Path(shutil.copytree(tiny_run, tmp_path / "run"))
+    cut(run / name, fraction)
+    refused = spacesim("eval", run, "--data", tiny_data, "--out", tmp_path / "eval")
+    assert refused.is_refusal(run / name), refused
+
+
+def test_a_broken_evaluation_ends_in_a_sentence(spacesim, tiny_eval, tmp_path):
+    for name in ("metrics.json", "frames/test_00000/truth.png"):
+        folder = Path(shutil.copytree(tiny_eval, tmp_path / Path(name).stem))
+        cut(folder / name)
+        assert spacesim("report", folder, "--out", tmp_path / "a.html").is_refusal(folder / name)
+
+
+def test_a_broken_checkpoint_ends_in_a_sentence(tiny_data, tmp_path):
+    kill(TRAINING, 5, True, tiny_data, tmp_path / "run")
+    newest = max((tmp_path / "run/checkpoints").glob("*.safetensors"))
+    cut(newest)
+    with pytest.raises(InputError, match=newest.name):
+        train(read_dataset(tiny_data), tmp_path / "run", CONFIG, resume=True)
+
+
+def test_a_camera_within_the_object_is_refused(tmp_path):
+    with pytest.raises(InputError, match="distance: expected cameras outside of boxsat"):
+        generate("boxsat", tmp_path / "data", GenerateConfig(views=3, test_views=0, resolution=16, distance=0.2))
+    assert not (tmp_path / "data").exists()
+
+
+# --- data from elsewhere ---------------------------------------------------------------------------------------------
+
+
+def foreign(source: Path, root: Path, mode: str = "RGB", suffix: str = "png", views: int | None = None) -> Path:
+    """The dataset's pictures and poses alone, as other tools would leave them."""
+    meta = json.loads((source / "transforms.json").read_text())
+    (root / "images").mkdir(parents=True)
+    frames = []
+    for index, frame in enumerate(meta["frames"][:views]):
+        picture = Image.open(source / frame["file_path"])
+        black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
+        picture = picture if "A" in mode else Image.alpha_composite(black, picture)
+        name = f"images/frame_{index:03d}.{suffix}"
+        picture.convert(mode).save(root / name)
+        frames.append({"file_path": name, "transform_matrix": copy.deepcopy(frame["transform_matrix"])})
+    intrinsics = {key: meta[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model")}
+    (root / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
+    return root
+
+
+def judge(spacesim, root: Path, work: Path, *options: object) -> dict:
+    """metrics.json of a short training on a folder."""
+    done = spacesim("train", root, "--out", work / "run", *FEW)
+    assert done.code == 0, done.errors
+    done = spacesim("eval", work / "run", "--data", root, "--out", work / "eval", *options)
+    assert done.code == 0, done.errors
+    assert (work / "eval/report.html").stat().st_size > 10_000
+    return json.loads((work / "eval/metrics.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("mode", "suffix"), [("RGB", "png"), ("RGB", "jpg"), ("L", "png"), ("LA", "png"), ("RGBA", "png"), ("P", "png")]
+)
+def test_pictures_of_all_kinds_without_truth(spacesim, tiny_data, tmp_path, mode, suffix):
+    metrics = judge(spacesim, foreign(tiny_data, tmp_path / "data", mode, suffix), tmp_path)
+    assert len(metrics["frames"]) == 1  # every 8th is held out
+    assert metrics["frames"][0]["sun"] is None
+    assert metrics["shadow_mask"] is None
+    assert metrics["geometry"] is None
+    assert metrics["image"]["psnr"]["mean"] > 0
+    assert metrics["notes"]
+
+
+def test_pictures_of_different_sizes(spacesim, tiny_data, tmp_path):
+    root = foreign(tiny_data, tmp_path / "data", "RGBA")
+
+    def resize(meta: dict) -> None:
+        for key in ("w", "h", "fl_x", "fl_y", "cx", "cy"):
+            del meta[key]
+        for index, frame in enumerate(meta["frames"]):
+            width, height = 24 + 6 * (index % 3), 30
+            Image.open(root / frame["file_path"]).resize((width, height)).save(root / frame["file_path"])
+            frame.update(w=width, h=height, fl_x=1.87 * width, fl_y=1.87 * height, cx=0.5 * width, cy=0.5 * height)
+
+    edit(root / "transforms.json", resize)
+    assert judge(spacesim, root, tmp_path, "--split", "all")["image"]["psnr"]["count"] == 8
+
+
+def test_masked_pixels_take_no_part(spacesim, tiny_data, tmp_path):
+    """Whatever stands in pixels that the mask ignores: the same model, the same numbers."""
+    numbers = []
+    for value in (0, 255):
+        root = foreign(tiny_data, tmp_path / f"data_{value}")
+        (root / "masks").mkdir()
+        mask = np.full((40, 40), 255, np.uint8)
+        mask[:15] = 0
+
+        def add(meta: dict, root=root, mask=mask, value=value) -> None:
+            for frame in meta["frames"]:
+                pixels = np.array(Image.open(root / frame["file_path"]))
+                pixels[mask == 0] = value
+                Image.fromarray(pixels).save(root / frame["file_path"])
+                frame["mask_path"] = frame["file_path"].replace("images", "masks")
+                Image.fromarray(mask).save(root / frame["mask_path"])
+
+        edit(root / "transforms.json", add)
+        work = tmp_path / f"work_{value}"
+        numbers.append(judge(spacesim, root, work)["image"]["psnr"])
+        numbers.append((work / "run/model.safetensors").read_bytes())
+    assert numbers[0] == numbers[2]
+    assert numbers[1] == numbers[3]
+
+
+def test_nothing_but_masked_or_transparent_pixels(spacesim, tiny_data, tmp_path):
+    root = foreign(tiny_data, tmp_path / "data")
+    for path in (root / "images").iterdir():
+        Image.new("RGBA", (40, 40), (0, 0, 0, 0)).save(path)
+    metrics = judge(spacesim, root, tmp_path)
+    assert metrics["image"]["psnr"] is None
+    assert metrics["shadow"]["ber"] is None
+    assert metrics["image_full"]["psnr"]["mean"] > 0
+
+
+def test_a_single_picture(spacesim, tiny_data, tmp_path):
+    root = foreign(tiny_data, tmp_path / "data", "RGBA", views=1)
+    assert judge(spacesim, root, tmp_path, "--split", "train")["image"]["psnr"]["count"] == 1
+    refused = spacesim("eval", tmp_path / "run", "--data", root, "--out", tmp_path / "other")
+    assert refused.is_refusal(root, "test")
+
+
+def test_blender_style(spacesim, tiny_data, tmp_path):
+    root = tmp_path / "data"
+    meta = json.loads((tiny_data / "transforms.json").read_text())
+    angle = 2 * np.arctan(0.5 * meta["w"] / meta["fl_x"])
+    for split in ("train", "test"):
+        (root / split).mkdir(parents=True)
+        frames = []
+        for index, frame in enumerate(f for f in meta["frames"] if split in f["file_path"]):
+            shutil.copy(tiny_data / frame["file_path"], root / split / f"r_{index}.png")
+            frames.append({"file_path": f"./{split}/r_{index}", "transform_matrix": frame["transform_matrix"]})
+        (root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    metrics = judge(spacesim, root, tmp_path)
+    assert [frame["file_path"] for frame in metrics["frames"]] == ["test/r_0.png", "test/r_1.png"]
+
+
+def test_data_without_test_frames(spacesim, tiny_data, tiny_run, tmp_path):
+    root = foreign(tiny_data, tmp_path / "data", "RGBA")
+    edit(
+        root / "transforms.json",
+        lambda m: m.update(train_filenames=[f["file_path"] for f in m["frames"]], test_filenames=[]),
+    )
+    assert spacesim("eval", tiny_run, "--data", root, "--out", tmp_path / "e").is_refusal(root, "test")
+    assert judge(spacesim, root, tmp_path, "--split", "train")["image"]["psnr"]["count"] == 8
+
+
+def test_extra_and_empty_keys_are_passed_over(spacesim, tiny_data, tmp_path):
+    root = foreign(tiny_data, tmp_path / "data", "RGBA")
+
+    def add(meta: dict) -> None:
+        meta.update(k1=None, ply_file_path=None, aabb_scale=16, train_filenames=None, applied_transform=[[1, 0, 0, 0]])
+        meta["frames"][0].update(mask_path=None, colmap_im_id=7, sharpness=3.5, sun_direction=None)
+
+    edit(root / "transforms.json", add)
+    assert judge(spacesim, root, tmp_path)["image"]["psnr"]["mean"] > 0
+
+
+def test_wide_coordinates(spacesim, tiny_data, tmp_path):
+    """Poses in millimetres, far from the origin."""
+    root = foreign(tiny_data, tmp_path / "data", "RGBA")
+
+    def move(meta: dict) -> None:
+        for frame in meta["frames"]:
+            for row, offset in enumerate((1e4, -2e4, 5e3)):
+                frame["transform_matrix"][row][3] = 1e3 * frame["transform_matrix"][row][3] + offset
+
+    edit(root / "transforms.json", move)
+    model = judge(spacesim, root, tmp_path)
+    assert model["image_full"]["psnr"]["mean"] > 0
+    assert all(np.isfinite(value).all() for value in load_run(tmp_path / "run").model.to_numpy().values())

@@ -1,0 +1,47 @@
+"""A way to call the command line in a test, and options that keep its work tiny."""
+
+import contextlib
+import io
+import re
+from dataclasses import dataclass
+
+from spacesim.cli import main
+
+GENERATE = ("--views", "6", "--test-views", "2", "--resolution", "40", "--spp", "4")
+TRAIN = ("--preset", "demo", "--iterations", "50", "--init-count", "300")
+PROGRESS = re.compile(r"(generate|train|evaluate): \d+/\d+ ")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command left behind. errors: lines of standard error that are no progress."""
+
+    code: int
+    output: str
+    errors: list[str]
+
+    def is_refusal(self, *names: object) -> bool:
+        """Exit code 2, nothing but one sentence, and that names the file or option."""
+        return (
+            self.code == 2
+            and self.output == ""
+            and len(self.errors) == 1
+            and self.errors[0].startswith("spacesim")
+            and all(str(name) in self.errors[0] for name in names)
+        )
+
+
+def outcome(code: int, output: str, errors: str) -> Outcome:
+    """Of a command that has ended."""
+    return Outcome(code, output, [line for line in errors.splitlines() if not PROGRESS.match(line)])
+
+
+def call(*arguments: object) -> Outcome:
+    """Run a command in this process."""
+    output, errors = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return outcome(code, output.getvalue(), errors.getvalue())
