@@ -137,7 +137,7 @@ def backward(
         last.append(dr.select(inside, dr.gather(ad.UInt32, blended.last, lane * rows + p), 0))
 
     mode = dr.ReduceMode.Local if select() == "cuda" else dr.ReduceMode.Auto
-    slots = [dr.zeros(ad.Float, 4 * pairs) for _ in range(2 + -(-channels // 4))]
+    slots = [dr.zeros(ad.Float, 4 * _capacity(pairs)) for _ in range(2 + -(-channels // 4))]
     records, start = blended.records, dr.gather(ad.UInt32, lists.start, tile)
 
     def remaining(k: Any, _transmittance: Any, _behind: Any) -> Any:
@@ -213,6 +213,13 @@ def rasterize(splats: Splats, features: list[Any], lists: TileLists, width: int,
     """Differentiable blending. Returns (C feature planes, transmittance plane), [height * width] each."""
     *planes, transmittance = dr.custom(_Rasterize, splats, features, lists, width, height)
     return planes, transmittance
+
+
+def _capacity(pairs: int) -> int:
+    """`pairs` rounded up by at most an eighth. On LLVM the size of what is scattered into is part of the kernel's
+    text: few sizes are few kernels to compile, where every step has another number of pairs."""
+    step = max(1024, 1 << max(0, pairs.bit_length() - 4))
+    return -(-pairs // step) * step
 
 
 def _list_records(splats: Splats, features: list[Any], lists: TileLists) -> list[Any]:

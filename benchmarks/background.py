@@ -1,0 +1,61 @@
+"""What training against alpha is worth: the same data, once over random backgrounds, once over black.
+
+    python benchmarks/background.py DATA [--preset demo] [--iterations N]
+
+Over the test views: mean alpha of the pixels that the object covers and of those that it does not, the share of
+covered pixels that are less than half opaque (holes), and the PSNR of whole frames over black and over white.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from spacesim.data.images import load_image
+from spacesim.data.records import Dataset
+from spacesim.data.store import read_dataset
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.project import Pinhole
+from spacesim.splat.render import render
+from spacesim.splat.train.config import preset, with_options
+from spacesim.splat.train.trainer import Trainer
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--preset", default="demo")
+    parser.add_argument("--iterations", type=int)
+    options = parser.parse_args()
+    dataset = read_dataset(options.data)
+    config = with_options(preset(options.preset), iterations=options.iterations)
+    print("background  alpha inside  alpha outside  holes [%]  PSNR over black [dB]  over white  Gaussians")
+    for name, against_alpha in (("random", True), ("black", False)):
+        trainer = Trainer(dataset, replace(config, random_background=against_alpha))
+        trainer.run(lambda progress: None, lambda: None)
+        inside, outside, holes, black, white = judge(trainer.gaussians, dataset)
+        print(
+            f"{name:<10}  {inside:12.4f}  {outside:13.5f}  {100 * holes:9.2f}  {black:20.2f}  {white:10.2f}"
+            f"  {trainer.gaussians.count:9}"
+        )
+
+
+def judge(gaussians: Gaussians, dataset: Dataset) -> np.ndarray:
+    """Means over the test views of the five figures that `main` prints."""
+    rows = []
+    for frame in dataset.test:
+        output, truth = render(gaussians, Pinhole.of(frame.camera)), load_image(dataset, frame)
+        shape = truth.alpha.shape
+        colour, alpha = np.array(output.colour).T.reshape(*shape, 3), np.array(output.alpha).reshape(shape)
+        covered, empty = truth.alpha > 0.999, truth.alpha < 0.001
+        errors = []
+        for background in (0.0, 1.0):
+            picture = np.clip(colour + (1 - alpha[..., None]) * background, 0, 1)
+            errors.append(-10 * np.log10(np.mean((picture - truth.over(np.full(3, background))) ** 2)))
+        rows.append([alpha[covered].mean(), alpha[empty].mean(), (alpha[covered] < 0.5).mean(), *errors])
+    return np.mean(rows, axis=0)
+
+
+if __name__ == "__main__":
+    main()
