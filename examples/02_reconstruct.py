@@ -1,6 +1,6 @@
 """2. Reconstruct: train Gaussians on the dataset of 01_simulate.py, render a held-out view, export a PLY.
 
-python examples/02_reconstruct.py     one or two minutes on two cores; writes out/examples/run
+python examples/02_reconstruct.py     about half a minute on two cores; writes out/examples/run
 """
 
 from pathlib import Path

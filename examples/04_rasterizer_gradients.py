@@ -1,6 +1,6 @@
 """4. Differentiate: fit a few hundred Gaussians to a picture by gradient descent, without the training loop.
 
-    python examples/04_rasterizer_gradients.py      10 to 30 seconds on two cores; writes out/examples/fit.png
+    python examples/04_rasterizer_gradients.py      5 to 15 seconds on two cores; writes out/examples/fit.png
 
 `render` is an ordinary Dr.Jit function: enable gradients on any of its parameters and go backward.
 """
