@@ -113,12 +113,12 @@ def _read_frame(source: Path, meta: Json, entry: Json) -> Frame:
     file_path = _path(source, entry, "file_path")
     if file_path is None:
         raise InputError(f"{source}: expected file_path in every frame, found a frame without")
-    if not (source.parent / file_path).is_file() and (source.parent / f"{file_path}.png").is_file():
+    if not _is_file(source.parent / file_path) and _is_file(source.parent / f"{file_path}.png"):
         file_path += ".png"  # Blender's files leave the suffix out
     image = source.parent / file_path
     values = _without_nulls({**meta, **entry})
     try:
-        if not image.is_file():
+        if not _is_file(image):
             raise InputError("expected an image file, found none")
         camera, distortion, sun = _read_camera(values, image), _read_distortion(values), _read_sun(values)
     except InputError as error:
@@ -148,7 +148,10 @@ def _focal_length(values: Json, key: str, angle_key: str, size: int) -> float | 
     if key in values:
         return _number(values, key)
     if angle_key in values:
-        return 0.5 * size / math.tan(0.5 * _number(values, angle_key))
+        angle = _number(values, angle_key)
+        if not 0 < angle < math.pi:
+            raise InputError(f"expected an angle from 0 to pi as {angle_key}, found {angle}")
+        return 0.5 * size / math.tan(0.5 * angle)
     return None
 
 
@@ -156,7 +159,7 @@ def _read_pose(values: Json) -> np.ndarray:
     """[4, 4] camera to world, OpenGL axes."""
     try:
         pose = np.asarray(values.get("transform_matrix"), np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
@@ -177,8 +180,8 @@ def _read_sun(values: Json) -> Sun | None:
     if "sun_direction" in values:
         try:
             return Sun(np.asarray(values["sun_direction"], np.float64))
-        except (TypeError, ValueError):
-            raise InputError(f"expected 3 finite numbers as sun_direction, found {values['sun_direction']!r}") from None
+        except (TypeError, ValueError, OverflowError):
+            raise InputError("expected 3 finite numbers, not all 0, as sun_direction, found other values") from None
     if "sun_azimuth_deg" in values and "sun_elevation_deg" in values:
         return Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
     return None
@@ -217,6 +220,13 @@ def _listed(source: Path, names: Any, known: list[str]) -> set[str]:
     return listed
 
 
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name that is too long, or has a null in it
+        return False
+
+
 def _without_nulls(values: Json) -> dict[str, Any]:
     """A key whose value is null counts as absent."""
     return {key: value for key, value in values.items() if value is not None}
@@ -224,9 +234,12 @@ def _without_nulls(values: Json) -> dict[str, Any]:
 
 def _number(values: Json, key: str, default: float | None = None) -> float:
     value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(f"expected a finite number as {key}, found {value!r}")
-    return float(value)
+    try:
+        if not isinstance(value, bool) and isinstance(value, (int, float)) and math.isfinite(value):
+            return float(value)
+    except OverflowError:
+        value = "one beyond all bounds"
+    raise InputError(f"expected a finite number as {key}, found {value!r}")
 
 
 def _path(source: Path, values: Json, key: str) -> str | None:

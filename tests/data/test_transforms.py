@@ -79,6 +79,14 @@ def test_suns(tmp_path):
     np.testing.assert_allclose(frame.sun.direction, [0, 1, 0], atol=1e-15)
 
 
+def test_a_null_counts_as_absent(tmp_path):
+    frame = {"sun_direction": None, "mask_path": None}
+    dataset = read_dataset(write_folder(tmp_path, ["a.png", "b.png"], frame=frame, k1=None, train_filenames=None))
+    assert dataset.frames[0].sun is None
+    assert dataset.frames[0].distortion == ()
+    assert names_of(dataset.test) == ["a.png"]
+
+
 def test_truth_is_named_and_not_looked_for(tmp_path):
     frame = {"gt_path": "gt/a.exr", "depth_file_path": "depth/a.png", "mask_path": "./masks/a.png"}
     found = read_dataset(write_folder(tmp_path, ["a.png"], frame=frame)).train[0]
@@ -172,6 +180,11 @@ NAN_POSE = [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (lambda m: m.update(k4=0.1), "found k4"),
         (lambda m: m["frames"][0].update(sun_direction=[0, 0, 0]), "sun_direction"),
         (lambda m: m["frames"][0].update(sun_direction="up"), "sun_direction"),
+        (lambda m: m["frames"][0].update(sun_direction=[10**400, 0, 0]), "sun_direction"),
+        (lambda m: m.update(w=10**400), "expected a finite number as w"),
+        (lambda m: m["frames"][0]["transform_matrix"][0].__setitem__(0, 10**400), "transform_matrix"),
+        (lambda m: (m.pop("fl_x"), m.pop("fl_y"), m.update(camera_angle_x=0)), "camera_angle_x, found 0"),
+        (lambda m: m["frames"][0].update(file_path="x" * 5000), "expected an image file"),
         (lambda m: m.update(train_filenames=["images/z.png"]), "none for images/z.png"),
         (lambda m: m.update(train_filenames="images/a.png"), "lists of file paths"),
         (lambda m: m.update(test_filenames=["images/a.png", "images/b.png"]), "frames to train on"),
@@ -193,7 +206,20 @@ def test_hostile_json_is_refused_in_one_sentence(tmp_path, change, sentence):
     assert "\n" not in message
 
 
-@pytest.mark.parametrize("content", ["", "{", '{"frames": [{"file_path": "a.pn', "[]", "3", "\x00\x01", "null"])
+CUT_OFF = [
+    "",
+    "{",
+    '{"frames": [{"file_path": "a.pn',
+    "[]",
+    "3",
+    "\x00\x01",
+    "null",
+    100_000 * "[",
+    f'{{"w": {5000 * "9"}}}',
+]
+
+
+@pytest.mark.parametrize("content", CUT_OFF, ids=range(len(CUT_OFF)))
 def test_cut_off_json_is_refused(tmp_path, content):
     (tmp_path / "transforms.json").write_text(content)
     with pytest.raises(InputError, match=r"transforms\.json"):
