@@ -3,9 +3,10 @@
 #
 # 1. a Python from 3.10 to 3.13 with venv ($PYTHON, else the first that fits on the path)
 # 2. the versions that requirements/lock.txt pins
-# 3. a backend for Dr.Jit: a CUDA device, else libLLVM 19 or newer (spacesim/backend.py says what it looks for)
+# 3. libatomic, which Dr.Jit's wheel takes for granted
+# 4. a backend for Dr.Jit: a CUDA device, else libLLVM 19 or newer (spacesim/backend.py says what it looks for)
 #
-# Debian and Ubuntu keep venv and libLLVM in packages of their own; they are installed with apt-get where missing.
+# Debian and Ubuntu keep venv, libatomic and libLLVM in packages of their own; they are installed with apt-get where missing.
 set -eu
 cd "$(dirname "$0")/.."
 
@@ -85,6 +86,14 @@ if library is None and backend.available()["cuda"] is not None:
 PYTHON
 }
 
+make_runtime() { # libatomic, which Dr.Jit's wheel takes for granted and a bare Debian lacks
+    have_atomic() { .venv/bin/python -c 'import ctypes; ctypes.CDLL("libatomic.so.1")' 2>/dev/null; }
+    if [ "$(uname -s)" = Linux ] && ! have_atomic; then
+        apt_install libatomic1 && have_atomic ||
+            stop "libatomic.so.1 is needed; type: sudo apt-get install libatomic1 (Fedora: sudo dnf install libatomic)"
+    fi
+}
+
 make_backend() {
     reason=$(backend_ready) && return
     [ -z "${DRJIT_LIBLLVM_PATH:-}" ] || stop "$reason; unset it or name another library"
@@ -102,6 +111,7 @@ make_venv
 say "installing the versions of $LOCK (about a minute)"
 install pip setuptools
 install --no-build-isolation -e .
+make_runtime
 make_backend
 if [ "$WANTED" = test ]; then
     install --no-build-isolation -e '.[dev]'

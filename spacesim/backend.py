@@ -17,6 +17,7 @@ from typing import Any
 NAMES = ("auto", "cuda", "llvm")
 MINIMUM_LLVM = 19
 INSTALL_LLVM = "sudo apt-get install libllvm19"
+INSTALL_ATOMIC = "sudo apt-get install libatomic1"
 
 _LIBRARY_PLACES = (
     "/usr/lib/*-linux-gnu*/libLLVM*.so*",
@@ -92,8 +93,7 @@ def _library_version(path: Path) -> int | None:
 def available() -> dict[str, str | None]:
     """{backend: None where it can run, else one sentence that says why not and what to type}."""
     library, sentence = find_llvm()
-    import drjit as dr
-
+    dr = _load_drjit()
     reasons: dict[str, str | None] = {"cuda": None, "llvm": None}
     if not dr.has_backend(dr.JitBackend.CUDA):
         reasons["cuda"] = "no CUDA device answers; an NVIDIA GPU with driver 535 or newer is needed"
@@ -102,6 +102,16 @@ def available() -> dict[str, str | None]:
     elif not dr.has_backend(dr.JitBackend.LLVM):
         reasons["llvm"] = f"Dr.Jit cannot load {sentence}; import spacesim before drjit and mitsuba"
     return reasons
+
+
+def _load_drjit() -> ModuleType:
+    """drjit; BackendError in one sentence where a library that its wheel takes for granted is missing."""
+    try:
+        return importlib.import_module("drjit")
+    except (ImportError, NameError) as error:  # drjit 1.5 trips over its own handler of the ImportError
+        cause = error.__context__ if isinstance(error, NameError) else error
+        hint = f"; type: {INSTALL_ATOMIC}" if "libatomic" in str(cause) else ""
+        raise BackendError(f"Dr.Jit cannot be loaded ({cause}){hint}") from None
 
 
 def select(name: str = "auto") -> str:
