@@ -15,10 +15,11 @@ import pytest
 from PIL import Image
 from tiny import GENERATE, PROGRESS, outcome
 
-from spacesim.data.errors import InputError
-from spacesim.data.store import load_truth, read_dataset, verify_dataset
+from spacesim.data.errors import InputError, WorkError
+from spacesim.data.store import load_truth, read_dataset, verify_dataset, write_points
 from spacesim.scenes import GenerateConfig, generate
 from spacesim.splat.run import load_run
+from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.train import train
 
@@ -169,8 +170,6 @@ def test_a_full_disk_while_generating(spacesim, tiny_data, small_disk):
 def test_a_full_disk_while_training(spacesim, tiny_data, uninterrupted, small_disk):
     place, enlarge = small_disk
     (place / "ballast").write_bytes(bytes(100_000))
-    from spacesim.data.errors import WorkError
-
     with pytest.raises(WorkError, match="disk is full"):
         train(read_dataset(tiny_data), place / "run", CONFIG)
     whole = contents(place / "run")
@@ -464,3 +463,77 @@ def test_wide_coordinates(spacesim, tiny_data, tmp_path):
     model = judge(spacesim, root, tmp_path)
     assert model["image_full"]["psnr"]["mean"] > 0
     assert all(np.isfinite(value).all() for value in load_run(tmp_path / "run").model.to_numpy().values())
+
+
+def points_at(root: Path, *points: tuple[float, float, float]) -> None:
+    write_points(root / "points.ply", np.array(points), np.full((len(points), 3), 128, np.uint8))
+    edit(root / "transforms.json", lambda meta: meta.update(ply_file_path="points.ply"))
+
+
+def test_a_view_in_which_nothing_is_seen(spacesim, tiny_data, tmp_path):
+    root = foreign(tiny_data, tmp_path / "data", "RGBA")
+    points_at(root, (1000, 0, 0), (1000, 1, 0))
+    assert judge(spacesim, root, tmp_path)["image_full"]["psnr"]["mean"] > 0
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (3, 2)])
+def test_pictures_smaller_than_a_window(spacesim, tiny_data, tmp_path, size):
+    root = foreign(tiny_data, tmp_path / "data", "RGBA")
+    for path in (root / "images").iterdir():
+        Image.new("RGBA", size, (200, 50, 20, 255)).save(path)
+    edit(root / "transforms.json", lambda m: m.update(w=size[0], h=size[1], cx=0.5 * size[0], cy=0.5 * size[1]))
+    assert judge(spacesim, root, tmp_path)["image_full"]["psnr"]["mean"] > 0
+
+
+@pytest.mark.parametrize("points", [[(0, 0, 0)], 5 * [(0, 0, 0)]])
+def test_few_points_to_start_from(spacesim, tiny_data, tmp_path, points):
+    root = foreign(tiny_data, tmp_path / "data", "RGBA")
+    points_at(root, *points)
+    assert judge(spacesim, root, tmp_path)["model"]["gaussians"] == len(points)
+
+
+@pytest.mark.parametrize("name", ["config.json", "training.json"])
+@pytest.mark.parametrize("content", ["[]", "{}", "null"])
+def test_a_run_with_other_json_ends_in_a_sentence(spacesim, tiny_run, tiny_data, tmp_path, name, content):
+    run = Path(shutil.copytree(tiny_run, tmp_path / "run"))
+    (run / name).write_text(content)
+    for arguments in (
+        ("render", run, "--out", tmp_path / "a.png"),
+        ("eval", run, "--data", tiny_data, "--out", tmp_path / "eval"),
+    ):
+        refused = spacesim(*arguments)
+        assert refused.is_refusal(run / name), refused
+
+
+def test_resuming_on_other_data_is_refused(tiny_data, tmp_path):
+    other = Path(shutil.copytree(tiny_data, tmp_path / "other"))
+    edit(other / "transforms.json", lambda m: m["frames"][0]["transform_matrix"][0].__setitem__(3, 0.1))
+    kill(TRAINING, 5, True, tiny_data, tmp_path / "run")
+    with pytest.raises(InputError, match="data"):
+        train(read_dataset(other), tmp_path / "run", CONFIG, resume=True)
+
+
+def test_more_than_fits_into_memory(spacesim, tiny_data, tmp_path):
+    for arguments in (
+        ("generate", "boxsat", "--out", tmp_path / "data", "--resolution", 10**7, "--views", 1),
+        ("train", tiny_data, "--out", tmp_path / "run", "--init", "random", "--init-count", 10**12),
+    ):
+        failed = spacesim(*arguments)
+        assert failed.code == 1
+        assert len(failed.errors) == 1
+        assert "memory" in failed.errors[0]
+
+
+def test_a_model_that_is_not_finite_is_refused(spacesim, tiny_run, tmp_path):
+    run = Path(shutil.copytree(tiny_run, tmp_path / "run"))
+    tensors, header = read_tensors(run / "model.safetensors")
+    write_tensors(run / "model.safetensors", {**tensors, "means": np.full_like(tensors["means"], np.nan)}, header)
+    refused = spacesim("export", run, "--ply", tmp_path / "a.ply")
+    assert refused.is_refusal(run / "model.safetensors"), refused
+
+
+def test_an_azimuth_below_zero(spacesim, tmp_path):
+    small = ("--views", "1", "--test-views", "0", "--resolution", "8", "--spp", "1")
+    done = spacesim("generate", "boxsat", "--out", tmp_path / "data", *small, "--sun", "-40,10")
+    assert done.code == 0, done.errors
+    assert np.allclose(read_dataset(tmp_path / "data").train[0].sun.angles, (320, 10))
