@@ -97,8 +97,7 @@ def compare_pictures(count: int, size: int) -> dict[str, Any]:
     (torch.cat([image[..., :3], alpha], -1) * torch.tensor(weights, device="cuda")).sum().backward()
 
     image_np, alpha_np = image.detach().cpu().numpy(), alpha.detach().cpu().numpy()[..., 0]
-    colour = np.array(output.colour).T.reshape(size, size, 3)
-    shape = (size, size)
+    colour, our_alpha, depth = output.to_numpy()
     solid = alpha_np > 0.01
     off = np.abs(colour - image_np[..., :3]).max(axis=-1)
     result = {
@@ -106,8 +105,8 @@ def compare_pictures(count: int, size: int) -> dict[str, Any]:
         "pixels": size,
         "colour": float(off.max()),
         "pixels off by more than 2e-3": int((off > 2e-3).sum()),
-        "alpha": float(np.abs(np.array(output.alpha).reshape(shape) - alpha_np).max()),
-        "depth": float(np.abs(np.array(output.depth).reshape(shape) - image_np[..., 3])[solid].max()),
+        "alpha": float(np.abs(our_alpha - alpha_np).max()),
+        "depth": float(np.abs(depth - image_np[..., 3])[solid].max()),
     }
     gradients = {name: np.array(dr.grad(value)).T for name, value in ours.parameters().items()}
     for name, gradient in gradients.items():
@@ -154,8 +153,7 @@ def compare_training(data: Path, iterations: int) -> dict[str, Any]:
     ours = {"seconds": time.monotonic() - began, "gaussians": trainer.gaussians.count}
     pictures = []
     for camera, _ in truth:
-        colour = render(trainer.gaussians, Pinhole.of(camera)).colour
-        pictures.append(np.array(colour).T.reshape(camera.height, camera.width, 3))
+        pictures.append(render(trainer.gaussians, Pinhole.of(camera)).to_numpy()[0])
     ours["psnr"] = psnr(pictures, [image for _, image in truth])
 
     began = time.monotonic()
@@ -233,7 +231,7 @@ def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainC
         strategy.step_pre_backward(splats, optimizers, state, index, info)
         rgba = torch.tensor(view.rgba.view(np.uint8).reshape(view.camera.height, view.camera.width, 4), device="cuda")
         rgba = rgba.float() / 255
-        below = torch.tensor(schedule.background(index), device="cuda")
+        below = torch.tensor(schedule.background(index, view), device="cuda")
         target = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:]) * below
         picture = image + (1 - alpha) * below
         l1 = (picture - target).abs().mean()

@@ -45,9 +45,8 @@ def judge(gaussians: Gaussians, dataset: Dataset) -> np.ndarray:
     """Means over the test views of the five figures that `main` prints."""
     rows = []
     for frame in dataset.test:
-        output, truth = render(gaussians, Pinhole.of(frame.camera)), load_image(dataset, frame)
-        shape = truth.alpha.shape
-        colour, alpha = np.array(output.colour).T.reshape(*shape, 3), np.array(output.alpha).reshape(shape)
+        colour, alpha, _ = render(gaussians, Pinhole.of(frame.camera)).to_numpy()
+        truth = load_image(dataset, frame)
         covered, empty = truth.alpha > 0.999, truth.alpha < 0.001
         errors = []
         for background in (0.0, 1.0):

@@ -83,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--out", type=Path, required=True, metavar="RUN")
     one.add_argument("--method", help="vanilla")
     one.add_argument("--strategy", help="default")
-    one.add_argument("--init", help="mesh, points or random (the first of points, mesh, random that is there)")
+    one.add_argument("--init", help="mesh, points or random (default: points, else mesh, else random)")
     one.add_argument("--init-count", type=int, metavar="N", help="Gaussians at the start, at most")
     one.add_argument("--preset", default="fast", help="demo, fast (default) or thesis")
     one.add_argument("--iterations", type=int, metavar="N")
@@ -166,7 +166,7 @@ def _generate(options: argparse.Namespace) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from spacesim.data.store import read_dataset
-    from spacesim.progress import reporting, training
+    from spacesim.progress import reporting, tell_training
     from spacesim.splat.train.config import preset, with_options
     from spacesim.splat.train.train import train
 
@@ -176,7 +176,7 @@ def _train(options: argparse.Namespace) -> None:
         config = with_options(config, random_background=False)
     dataset = read_dataset(options.data)
     with reporting("train", "iterations") as report:
-        run = train(dataset, options.out, config, options.resume, training(report), options.command)
+        run = train(dataset, options.out, config, options.resume, tell_training(report), options.command)
     history = run.training["history"]
     print(
         f"{options.out}: {run.gaussians} Gaussians after {config.iterations} iterations in "
@@ -226,13 +226,20 @@ def _render(options: argparse.Namespace) -> None:
     if options.camera:
         camera = read_camera(options.camera)
     else:
-        frames = read_dataset(options.data or Path(run.config["data"]["path"])).frames
+        frames = read_dataset(options.data or _data_of(run.config)).frames
         index = options.frame or 0
         if not 0 <= index < len(frames):
             raise InputError(f"--frame: expected 0 to {len(frames) - 1}, found {index}")
         camera, sun = frames[index].camera, sun or frames[index].sun
     write_picture(run.predict(camera, sun), options.kind, options.out)
     print(options.out)
+
+
+def _data_of(config: dict[str, Any]) -> Path:
+    path = Path(config["data"]["path"])
+    if not path.exists():
+        raise InputError(f"{path}: expected the data that the run was trained on, found nothing; name it with --data")
+    return path
 
 
 def _export(options: argparse.Namespace) -> None:

@@ -8,13 +8,13 @@ from typing import Any
 
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report import write_report
-from spacesim.progress import Reporter, training
+from spacesim.progress import Reporter, tell_training
 from spacesim.scenes import GenerateConfig, generate
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.train import train
 
 SCENE = "boxsat"
-DATA = GenerateConfig(views=72, test_views=12, resolution=192, spp=32, sun=((40.0, 25.0),))
+DATA = GenerateConfig(views=80, test_views=12, resolution=256, spp=32, sun=((40.0, 25.0),))
 
 
 def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Reporter]]) -> dict[str, Any]:
@@ -30,11 +30,11 @@ def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Repor
         seconds[part], start = time.monotonic() - start, time.monotonic()
 
     with reporting("generate", "frames") as report:
-        dataset = generate(SCENE, out / "data", DATA, resume=(out / "data").exists(), progress=report)
+        dataset = generate(SCENE, out / "data", DATA, resume=True, progress=report)
     finished("generate")
     with reporting("train", "iterations") as report:
-        resume, command = (out / "run").exists(), ("spacesim", "demo", "--out", str(out))
-        run = train(dataset, out / "run", preset("demo"), resume, training(report), command)
+        command = ("spacesim", "demo", "--out", str(out))
+        run = train(dataset, out / "run", preset("demo"), True, tell_training(report), command)
     finished("train")
     with reporting("evaluate", "frames") as report:
         metrics = evaluate(run, dataset, out / "eval", EvaluateConfig(), report)

@@ -81,7 +81,7 @@ def _check_llvm() -> Finding:
 
 def _check_lpips() -> Finding:
     if _version("torch") is None:
-        return _finding(False, 'torch is not installed; type: pip install "spacesim[lpips]"')
+        return _finding(False, "torch is not installed; type: pip install torch")
     importlib.import_module("torch")
     weights, sentence = importlib.import_module("spacesim.eval.lpips").find_weights()
     return _finding(weights is not None, sentence)
@@ -90,7 +90,7 @@ def _check_lpips() -> Finding:
 def _check_viewer() -> Finding:
     version = _version("viser")
     if version is None:
-        return _finding(False, 'viser is not installed; type: pip install "spacesim[viewer]"')
+        return _finding(False, "viser is not installed; type: pip install viser")
     return _finding(True, f"viser {version}")
 
 

@@ -4,11 +4,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from rich import progress
 from rich.console import Console
 
-from spacesim.splat.train.trainer import Progress
+if TYPE_CHECKING:
+    from spacesim.splat.train.trainer import Progress
 
 LINE_EVERY = 5.0  #: seconds between two plain lines
 
@@ -38,7 +40,7 @@ class Reporter:
             self.last_line = now
 
 
-def training(report: Reporter) -> Callable[[Progress], None]:
+def tell_training(report: Reporter) -> "Callable[[Progress], None]":
     """What tells `report` of a training's progress."""
     return lambda p: report(p.iteration, p.iterations, f"loss {p.loss:.4f}  {p.gaussians} Gaussians")
 

@@ -27,7 +27,7 @@ LINEAR_FILE = "alex.pth"
 MINIMUM_SIZE = 31
 """Smallest height and width, pixels, that leave AlexNet's second pooling something to pool."""
 
-INSTALL = "pip install 'spacesim[lpips]'"
+INSTALL = "pip install torch"
 
 # AlexNet's convolutions: place in torchvision's `features`, weight shape, stride, padding, pooling before it.
 _LAYERS = (

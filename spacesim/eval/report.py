@@ -218,7 +218,7 @@ def _making(runs: Sequence[Judged]) -> str:
     tables: list[tuple[str, Callable[[Judged], Mapping[str, Any]]]] = [
         ("Data", _data_facts),
         ("Model and time", _model_facts),
-        ("Training configuration", lambda run: run.metrics["config"].get("train", run.metrics["config"])),
+        ("Training configuration", lambda run: run.metrics["config"]),
         (
             "Software",
             lambda run: {**run.metrics["versions"], **(run.metrics["training"].get("versions") or {})},

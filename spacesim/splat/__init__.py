@@ -1,0 +1,1 @@
+"""Gaussian splatting in Dr.Jit: rasterizer, training, trained runs."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from spacesim.backend import ad
 from spacesim.splat.gaussians import SH_C0, Gaussians
@@ -14,7 +15,7 @@ from spacesim.splat.tiles import bin_splats
 
 @dataclass
 class RenderOutput:
-    """Planes are [height * width], row by row; `numpy.reshape` them with (height, width).
+    """Planes are [height * width], row by row; `to_numpy` gives them their shape.
 
     colour: Array3f, premultiplied (over black), sRGB values;  alpha: Float in [0, 1]
     depth: Float, expected depth: z of the centres averaged with the blending weights, metres; 0 where alpha is 0
@@ -25,6 +26,12 @@ class RenderOutput:
     depth: Any
     width: int
     height: int
+
+    def to_numpy(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(colour [H, W, 3], alpha [H, W], depth [H, W]), float32."""
+        shape = (self.height, self.width)
+        colour = np.stack([np.array(plane).reshape(shape) for plane in self.colour], axis=-1)
+        return colour, np.array(self.alpha).reshape(shape), np.array(self.depth).reshape(shape)
 
     def over(self, background: Any) -> Any:
         """Array3f: the picture over a background colour (Array3f) or picture."""

@@ -53,16 +53,10 @@ class Run:
         """The backend that renders now."""
         return backend.select()
 
-    def predict(self, camera: Camera, sun: Sun | None) -> Prediction:
+    def predict(self, camera: Camera, sun: Sun | None = None) -> Prediction:
         """Render one view. The method `vanilla` knows one light: `sun` changes nothing."""
-        output = render(self.model, Pinhole.of(camera))
-        shape = (camera.height, camera.width)
-        return Prediction(
-            rgb=np.ascontiguousarray(np.array(output.colour).T).reshape(*shape, 3),
-            alpha=np.array(output.alpha).reshape(shape),
-            depth=np.array(output.depth).reshape(shape),
-            visibility=None,
-        )
+        colour, alpha, depth = render(self.model, Pinhole.of(camera)).to_numpy()
+        return Prediction(rgb=colour, alpha=alpha, depth=depth, visibility=None)
 
 
 def load_run(path: Path) -> Run:

@@ -32,7 +32,7 @@ def known_gaussians() -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="session")
 def small_dataset(tmp_path_factory, known_gaussians) -> Dataset:
-    return write_dataset(tmp_path_factory.mktemp("small"), known_gaussians)
+    return _write_dataset(tmp_path_factory.mktemp("small"), known_gaussians)
 
 
 @pytest.fixture(scope="session")
@@ -40,10 +40,16 @@ def black_dataset(tmp_path_factory, known_gaussians) -> Dataset:
     """The same shape, every surface black."""
     sh = np.zeros_like(known_gaussians["sh"])
     sh[:, 0] = -0.5 / SH_C0
-    return write_dataset(tmp_path_factory.mktemp("black"), {**known_gaussians, "sh": sh})
+    return _write_dataset(tmp_path_factory.mktemp("black"), {**known_gaussians, "sh": sh})
 
 
-def write_dataset(root: Path, gaussians: dict[str, np.ndarray]) -> Dataset:
+@pytest.fixture(scope="session")
+def write_dataset():
+    """The function (root, gaussians) -> Dataset."""
+    return _write_dataset
+
+
+def _write_dataset(root: Path, gaussians: dict[str, np.ndarray]) -> Dataset:
     (root / "images").mkdir()
     frames = []
     for index, direction in enumerate(fibonacci_sphere(VIEWS + TESTS)):

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image
@@ -106,7 +107,7 @@ def test_a_finished_run_is_left_alone_by_resume(small_dataset, finished):
 
 def test_the_run_says_how_it_was_made(finished):
     config = json.loads((finished.path / "config.json").read_text())
-    assert TrainConfig.from_json(config["train"]) == CONFIG
+    assert TrainConfig.from_json(config) == CONFIG
     assert finished.training["history"][-1]["iteration"] == CONFIG.iterations
     assert finished.training["gaussians"] == finished.gaussians
     assert len(list((finished.path / "checkpoints").glob("step_*.safetensors"))) == 2
@@ -201,3 +202,17 @@ def test_presets_and_table_5_1():
     assert (preset("thesis").iterations, table.refine_stop) == (200_000, 150_000)
     with pytest.raises(InputError, match="preset"):
         preset("miracle")
+
+
+def test_opaque_pictures_are_trained_over_black(tmp_path, known_gaussians, write_dataset):
+    """Pictures without alpha: the black sky is black for want of light, not for want of splats."""
+    dataset = write_dataset(tmp_path, known_gaussians)
+    for frame in dataset.frames:
+        rgba = Image.open(tmp_path / frame.file_path)
+        sky = Image.new("RGBA", rgba.size, (0, 0, 0, 255))
+        sky.alpha_composite(rgba)
+        sky.convert("RGB").save(tmp_path / frame.file_path)
+    trainer = Trainer(dataset, CONFIG)
+    assert not trainer.background(3, trainer.views[0]).any()
+    trainer.run(lambda progress: None, lambda: None)
+    assert psnr(trainer.gaussians, dataset) > 20

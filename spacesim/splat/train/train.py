@@ -41,16 +41,16 @@ def train(
     Raises InputError where `out` holds a run and `resume` is not asked for, or one of another configuration.
     """
     out = Path(out)
-    identity = {"train": config.to_json(), "data": _identity(dataset)}
+    described = {**config.to_json(), "data": _identity(dataset)}
     if (out / "config.json").exists():
-        _check_resumable(out, identity, resume)
+        _check_resumable(out, described, resume)
         if (out / "model.safetensors").exists():
             return load_run(out)
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+    elif out.exists() and (not out.is_dir() or any(not path.name.startswith(".") for path in out.iterdir())):
         raise InputError(f"{out}: expected an empty or new folder for the run, found other files in it")
 
     trainer = Trainer(dataset, config)
-    write_json(out / "config.json", {**config.to_json(), **identity})
+    write_json(out / "config.json", described)
     newest = max(_checkpoints(out), default=None)
     if newest is not None:
         trainer.restore(newest)
@@ -105,18 +105,16 @@ def _identity(dataset: Dataset) -> dict[str, Any]:
     }
 
 
-def _check_resumable(out: Path, identity: dict[str, Any], resume: bool) -> None:
+def _check_resumable(out: Path, described: dict[str, Any], resume: bool) -> None:
     if not resume:
         raise InputError(f"{out}: holds a run already; pass --resume to complete it, or name another folder")
     before = read_json(out / "config.json")
-    for key, value in identity["train"].items():
-        if before.get(key) != value and not isinstance(value, dict):
+    if not isinstance(before, dict):
+        raise InputError(f"{out / 'config.json'}: expected a JSON object, found {type(before).__name__}")
+    before["data"] = {**(before.get("data") or {}), "path": described["data"]["path"]}  # it may have moved
+    for key, value in described.items():
+        if before.get(key) != value:
             raise InputError(f"{out}: was started with {key} {before.get(key)!r}, --resume asks for {value!r}")
-    if before.get("train") != identity["train"]:
-        raise InputError(f"{out}: was started with other rates or refinement, --resume expects the same")
-    frames = ("train_frames", "test_frames")
-    if any(before.get("data", {}).get(key) != identity["data"][key] for key in frames):
-        raise InputError(f"{out}: was started on data with another number of frames")
 
 
 def _checkpoints(out: Path) -> list[Path]:

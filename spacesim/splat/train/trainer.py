@@ -85,7 +85,7 @@ class Trainer:
         splats, footprints, colour = self._project(rows, camera, degree)
         lists = bin_splats(splats, footprints, width, height)
         blended = forward(splats, colour, lists, width, height)
-        target = ad.UInt32(view.rgba), ad.Float(self.background(index)), _valid(view)
+        target = ad.UInt32(view.rgba), ad.Float(self.background(index, view)), _valid(view)
         loss, by_colour, by_transmittance = self._loss(
             blended.features, blended.transmittance, target, (width, height), config.ssim_weight
         )
@@ -128,9 +128,9 @@ class Trainer:
         except (KeyError, ValueError) as error:
             raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {error}") from None
 
-    def background(self, index: int) -> np.ndarray:
-        """[3] float32: the colour that a step's picture and its truth are laid over."""
-        if not self.config.random_background:
+    def background(self, index: int, view: View) -> np.ndarray:
+        """[3] float32: the colour that a step's picture and its truth are laid over; black below opaque pictures."""
+        if view.opaque or not self.config.random_background:
             return np.zeros(3, np.float32)
         return np.random.default_rng([self.config.seed, 3, index]).uniform(size=3).astype(np.float32)
 

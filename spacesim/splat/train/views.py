@@ -14,11 +14,13 @@ CACHE_BYTES = 6 * 2**30
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """rgba: [H * W] uint32, 8 bits a channel, red lowest; valid: [H * W] bool, or None where all pixels count."""
+    """rgba: [H * W] uint32, 8 bits a channel, red lowest; valid: [H * W] bool, or None where all pixels count;
+    opaque: the picture has no transparency, so that what is behind the object is part of it."""
 
     camera: Camera
     rgba: np.ndarray
     valid: np.ndarray | None
+    opaque: bool
 
 
 class TrainingViews:
@@ -52,4 +54,4 @@ class TrainingViews:
         rgba = np.concatenate([image.rgb, image.alpha[..., None]], axis=-1)
         bytes_ = np.ascontiguousarray(np.rint(rgba * 255).astype(np.uint8)).reshape(-1, 4)
         valid = None if image.valid.all() else image.valid.ravel()
-        return View(frame.camera, bytes_.view("<u4").ravel(), valid)
+        return View(frame.camera, bytes_.view("<u4").ravel(), valid, bool((image.alpha == 1).all()))
