@@ -14,7 +14,7 @@ from spacesim.splat.train.config import preset
 from spacesim.splat.train.train import train
 
 SCENE = "boxsat"
-DATA = GenerateConfig(views=80, test_views=12, resolution=256, spp=32, sun=((40.0, 25.0),))
+DATA = GenerateConfig(views=80, test_views=12, resolution=256, spp=64, sun=((40.0, 25.0),))
 
 
 def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Reporter]]) -> dict[str, Any]:
