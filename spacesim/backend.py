@@ -9,6 +9,7 @@ import ctypes
 import importlib
 import os
 import re
+import sys
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -74,9 +75,19 @@ def _candidates() -> list[tuple[Path, int]]:
     for pattern in _LIBRARY_PLACES:
         for path in Path("/").glob(pattern.lstrip("/")):
             match = re.search(r"libLLVM(?:-|\.so\.|\.)?(\d+)", path.name)
-            if match and path.exists():
+            if match and path.exists() and _is_for_this_machine(path):
                 found.setdefault(path.resolve(), int(match.group(1)))
     return sorted(found.items(), key=lambda item: (-item[1], str(item[0])))
+
+
+def _is_for_this_machine(path: Path) -> bool:
+    """An ELF file's class and machine are those of the interpreter: i386 libraries may lie beside those of x86-64."""
+    try:
+        with path.open("rb") as library, open(sys.executable, "rb") as interpreter:
+            one, other = library.read(20), interpreter.read(20)
+    except OSError:
+        return False
+    return other[:4] != b"\x7fELF" or (one[:6], one[18:]) == (other[:6], other[18:])
 
 
 def _library_version(path: Path) -> int | None:

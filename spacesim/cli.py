@@ -4,6 +4,7 @@ import argparse
 import json
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -17,7 +18,11 @@ KINDS = ("rgb", "depth", "alpha")
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with the usage in one sentence."""
+    """Says what is wrong with the usage in one sentence, and takes "-40,10" for an argument, not for an option."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._negative_number_matcher = re.compile(r"^-\.?\d")
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
@@ -36,13 +41,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (InputError, WorkError, backend.BackendError) as error:
         print(f"spacesim: {error}", file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1
-    except KeyboardInterrupt:
-        print("spacesim: stopped; what was finished is kept, --resume goes on from there", file=sys.stderr)
-        return 130
+    except MemoryError as error:
+        print(f"spacesim: the memory is short ({error})", file=sys.stderr)
+        return 1
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except (KeyboardInterrupt, RuntimeError) as error:
+        if not _is_interrupt(error):
+            raise
+        print("spacesim: stopped; what was finished is kept, --resume goes on from there", file=sys.stderr)
+        return 130
     return 0
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Ctrl-C; Dr.Jit turns one that comes while it traces into the cause of a RuntimeError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -63,7 +63,7 @@ class Gaussians:
         """{name: float32 array with N first}: means [N, 3], log_scales [N, 3], quaternions [N, 4],
         logit_opacities [N], sh [N, K, 3]."""
         arrays = {name: np.array(value, dtype=np.float32).T for name, value in self.parameters().items()}
-        arrays["sh"] = arrays["sh"].reshape(self.count, -1, 3)
+        arrays["sh"] = arrays["sh"].reshape(self.count, len(self.sh) // 3, 3)
         return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
 
     @staticmethod

@@ -119,7 +119,7 @@ def backward(
     channels, rows, lanes = len(feature_gradients), lists.shape.rows, lists.shape.lanes
     count, pairs = dr.width(splats.x), lists.pairs
     if pairs == 0:
-        zeros = [dr.zeros(ad.Float, count) for _ in range(9 + channels)]
+        zeros = [dr.opaque(ad.Float, 0, count) for _ in range(9 + channels)]  # no literals: they fold gradients away
         return SplatGradients(Splats(*zeros[:7]), zeros[9:], zeros[7], zeros[8])
     lane = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * lanes)
     tile = lane // lanes

@@ -67,10 +67,19 @@ def load_run(path: Path) -> Run:
         raise InputError(f"{path}: expected a run of `spacesim train`, found no config.json in it")
     if not model_path.exists():
         raise InputError(f"{path}: training has not ended; complete it with `spacesim train ... --resume`")
-    config, training = read_json(path / "config.json"), read_json(path / "training.json")
+    config, training = _read_keys(path / "config.json", "data"), _read_keys(path / "training.json", "history")
     tensors, _ = read_tensors(model_path)
     try:
         model = Gaussians.from_numpy(tensors)
     except (KeyError, ValueError) as error:
         raise InputError(f"{model_path}: expected the tensors of a model, found none or others ({error})") from None
+    if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
+        raise InputError(f"{model_path}: expected finite numbers, found others; train the run again")
     return Run(path, config, training, model, model_path.stat().st_size)
+
+
+def _read_keys(path: Path, key: str) -> dict[str, Any]:
+    values = read_json(path)
+    if not isinstance(values, dict) or key not in values:
+        raise InputError(f"{path}: expected an object with the key {key}, found none")
+    return values

@@ -16,6 +16,7 @@ from spacesim.splat.ply import read_ply, write_ply
 from spacesim.splat.project import Pinhole
 from spacesim.splat.render import render
 from spacesim.splat.run import load_run
+from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig, preset, with_options
 from spacesim.splat.train.initialise import focus_point, initial_gaussians, scene_scale
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
@@ -72,12 +73,34 @@ def test_a_restored_trainer_goes_on_as_if_never_stopped(small_dataset, tmp_path,
         np.testing.assert_array_equal(value, other[name])
 
 
+def test_checkpoints_that_do_not_fit_are_refused(small_dataset, tmp_path):
+    trainer = Trainer(small_dataset, CONFIG)
+    trainer.save(tmp_path / "good.safetensors")
+    tensors, header = read_tensors(tmp_path / "good.safetensors")
+    broken = [
+        ({**tensors, "adam.first": tensors["adam.first"][:, 1:]}, header),
+        ({**tensors, "adam.second": tensors["adam.second"][1:]}, header),
+        ({**tensors, "strategy.seen": tensors["strategy.seen"][1:]}, header),
+        ({name: value for name, value in tensors.items() if name != "means"}, header),
+        (tensors, {**header, "iteration": 10**6}),
+        (tensors, {**header, "iteration": "many"}),
+        (tensors, {**header, "history": None}),
+    ]
+    for number, (content, told) in enumerate(broken):
+        path = tmp_path / f"broken_{number}.safetensors"
+        write_tensors(path, content, {key: value for key, value in told.items() if key != "format"})
+        with pytest.raises(InputError, match=path.name):
+            trainer.restore(path)
+    trainer.restore(tmp_path / "good.safetensors")
+
+
 def test_killed_training_is_completed_by_resume(small_dataset, finished, tmp_path):
     """The process dies without warning right after a checkpoint; --resume gives the same model to the bit."""
     script = f"""
 import os, signal
 from pathlib import Path
 from spacesim.data.store import read_dataset
+from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.train import train
 config = TrainConfig.from_json({CONFIG.to_json()!r})

@@ -80,7 +80,8 @@ def gaussian_blur(planes: list[Any], width: int, height: int) -> list[Any]:
         dr.eval(planes)
         sums = [ad.Float(0) for _ in planes]
         for offset, weight in zip(offsets.tolist(), weights.tolist(), strict=True):
-            inside = position < extent - offset if offset >= 0 else position >= -offset
+            there = ad.Int32(position) + offset
+            inside = (there >= 0) & (there < extent)
             source = ad.UInt32(ad.Int32(pixel) + offset * stride)
             sums = [
                 dr.fma(weight, dr.gather(ad.Float, plane, source, inside), total)

@@ -1,5 +1,6 @@
 """`train`: a dataset and a configuration to a run on disk, resumable at any time."""
 
+import hashlib
 import logging
 import os
 import platform
@@ -100,9 +101,19 @@ def _identity(dataset: Dataset) -> dict[str, Any]:
     """What a run remembers of its data: enough to find it again and to notice another one in its place."""
     return {
         "path": str(dataset.root.resolve()),
+        "digest": _digest(dataset),
         "train_frames": len(dataset.train),
         "test_frames": len(dataset.test),
     }
+
+
+def _digest(dataset: Dataset) -> str:
+    """Of the training frames: names and sizes of the files, poses, focal lengths."""
+    told = [
+        (f.file_path, (dataset.root / f.file_path).stat().st_size, f.camera.opengl.tolist(), f.camera.fx, f.camera.fy)
+        for f in dataset.train
+    ]
+    return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
 
 def _check_resumable(out: Path, described: dict[str, Any], resume: bool) -> None:

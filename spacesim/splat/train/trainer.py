@@ -119,14 +119,20 @@ class Trainer:
         """Continue from what `save` wrote. Raises InputError where the file does not fit."""
         tensors, header = read_tensors(path)
         try:
-            self.gaussians = Gaussians.from_numpy(tensors)
-            self.optimizer.first = [ad.Float(row) for row in tensors["adam.first"]]
-            self.optimizer.second = [ad.Float(row) for row in tensors["adam.second"]]
-            self.strategy.state = {name: ad.Float(tensors[f"strategy.{name}"]) for name in self.strategy.state}
-            self.iteration, self.optimizer.steps = header["iteration"], header["adam_steps"]
-            self.history = header["history"]
-        except (KeyError, ValueError) as error:
+            gaussians = Gaussians.from_numpy(tensors)
+            first, second = ([ad.Float(row) for row in tensors[f"adam.{name}"]] for name in ("first", "second"))
+            state = {name: ad.Float(tensors[f"strategy.{name}"]) for name in self.strategy.state}
+            iteration, steps, history = int(header["iteration"]), int(header["adam_steps"]), list(header["history"])
+        except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {error}") from None
+        lengths = {dr.width(row) for row in (*first, *second, *state.values())}
+        if lengths != {gaussians.count} or not len(first) == len(second) == len(gaussians.rows()):
+            raise InputError(f"{path}: expected moments and statistics of {gaussians.count} Gaussians, found others")
+        if not 0 <= iteration <= self.config.iterations:
+            raise InputError(f"{path}: expected an iteration up to {self.config.iterations}, found {iteration}")
+        self.gaussians, self.strategy.state = gaussians, state
+        self.optimizer.first, self.optimizer.second, self.optimizer.steps = first, second, steps
+        self.iteration, self.history = iteration, history
 
     def background(self, index: int, view: View) -> np.ndarray:
         """[3] float32: the colour that a step's picture and its truth are laid over; black below opaque pictures."""
