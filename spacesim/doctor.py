@@ -7,9 +7,9 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from spacesim import backend
+from spacesim import __version__, backend
 
-_PACKAGES = ("spacesim", "mitsuba", "drjit", "numpy", "torch", "viser")
+_PACKAGES = ("mitsuba", "drjit", "numpy", "torch", "viser")
 _TITLES = {"python": "Python", "cuda": "CUDA", "llvm": "LLVM", "lpips": "LPIPS", "viewer": "viewer"}
 
 Finding = dict[str, Any]
@@ -23,7 +23,7 @@ def report() -> dict[str, Any]:
     """
     return {
         "backend": _default_backend(),
-        "versions": {name: _version(name) for name in _PACKAGES},
+        "versions": {"spacesim": __version__, **{name: _version(name) for name in _PACKAGES}},
         "python": _attempt(_check_python),
         "cuda": _attempt(_check_cuda),
         "llvm": _attempt(_check_llvm),
