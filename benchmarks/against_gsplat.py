@@ -57,6 +57,7 @@ def main() -> None:
     parser.add_argument("what", choices=["picture", "training"])
     parser.add_argument("--data", type=Path)
     parser.add_argument("--iterations", type=int, default=7_000)
+    parser.add_argument("--json", action="store_true", help="as always: the result is JSON")
     options = parser.parse_args()
     backend.select("cuda")
     if options.what == "picture":

@@ -1,12 +1,13 @@
 """What training against alpha is worth: the same data, once over random backgrounds, once over black.
 
-    python benchmarks/background.py DATA [--preset demo] [--iterations N]
+    python benchmarks/background.py DATA [--preset demo] [--iterations N] [--json]
 
 Over the test views: mean alpha of the pixels that the object covers and of those that it does not, the share of
 covered pixels that are less than half opaque (holes), and the PSNR of whole frames over black and over white.
 """
 
 import argparse
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,17 +28,25 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--preset", default="demo")
     parser.add_argument("--iterations", type=int)
+    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     dataset = read_dataset(options.data)
     config = with_options(preset(options.preset), iterations=options.iterations)
-    print("background  alpha inside  alpha outside  holes [%]  PSNR over black [dB]  over white  Gaussians")
+    columns = ("alpha inside", "alpha outside", "holes", "psnr over black", "psnr over white")
+    rows: dict[str, dict[str, float]] = {}
     for name, against_alpha in (("random", True), ("black", False)):
         trainer = Trainer(dataset, replace(config, random_background=against_alpha))
         trainer.run(lambda progress: None, lambda: None)
-        inside, outside, holes, black, white = judge(trainer.gaussians, dataset)
+        rows[name] = dict(zip(columns, judge(trainer.gaussians, dataset).tolist(), strict=True))
+        rows[name]["gaussians"] = trainer.gaussians.count
+    if options.json:
+        print(json.dumps(rows, indent=1))
+        return
+    print("background  alpha inside  alpha outside  holes [%]  PSNR over black [dB]  over white  Gaussians")
+    for name, row in rows.items():
+        inside, outside, holes, black, white, count = row.values()
         print(
-            f"{name:<10}  {inside:12.4f}  {outside:13.5f}  {100 * holes:9.2f}  {black:20.2f}  {white:10.2f}"
-            f"  {trainer.gaussians.count:9}"
+            f"{name:<10}  {inside:12.4f}  {outside:13.5f}  {100 * holes:9.2f}  {black:20.2f}  {white:10.2f}  {count:9}"
         )
 
 

@@ -3,6 +3,7 @@
 import argparse
 import json
 import logging
+import math
 import os
 import re
 import sys
@@ -34,6 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
     options.command = ("spacesim", *arguments)
+    if options.debug:
+        logging.getLogger("spacesim").setLevel(logging.DEBUG)
     try:
         if options.needs_backend:
             backend.select(options.backend)
@@ -49,7 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except (KeyboardInterrupt, RuntimeError) as error:
         if not _is_interrupt(error):
-            raise
+            logging.getLogger("spacesim").debug("traceback", exc_info=error)
+            reason = " ".join(str(error).split())
+            print(f"spacesim: the computation failed ({reason}); --debug shows where", file=sys.stderr)
+            return 1
         print("spacesim: stopped; what was finished is kept, --resume goes on from there", file=sys.stderr)
         return 130
     return 0
@@ -70,6 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     def command(name: str, run: Callable[[argparse.Namespace], None], text: str, needs_backend: bool = True) -> _Parser:
         one: _Parser = commands.add_parser(name, help=text, description=text)
         one.set_defaults(run=run, needs_backend=needs_backend, backend="auto")
+        one.add_argument("--debug", action="store_true", help="log more, and tracebacks of what failed")
         if needs_backend:
             one.add_argument("--backend", choices=backend.NAMES, default="auto", help="default: CUDA, else LLVM")
         return one
@@ -147,6 +154,8 @@ def _angles(text: str) -> tuple[float, float]:
         azimuth, elevation = (float(part) for part in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected AZ,EL in degrees, found {text!r}") from None
+    if not (math.isfinite(azimuth) and -90 <= elevation <= 90):
+        raise argparse.ArgumentTypeError(f"expected a finite azimuth and an elevation up to 90, found {text!r}")
     return azimuth, elevation
 
 

@@ -1,11 +1,20 @@
 """`spacesim demo`: one satellite from a scene to a report, small enough for two CPU cores and three minutes."""
 
+import json
+import logging
+import platform
+import shutil
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from spacesim import __version__, backend
+from spacesim.data.errors import InputError
+from spacesim.data.files import read_json, write_json
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report import write_report
 from spacesim.progress import Reporter, tell_training
@@ -13,16 +22,20 @@ from spacesim.scenes import GenerateConfig, generate
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.train import train
 
+log = logging.getLogger(__name__)
+
 SCENE = "boxsat"
 DATA = GenerateConfig(views=80, test_views=12, resolution=256, spp=64, sun=((40.0, 25.0),))
 
 
 def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Reporter]]) -> dict[str, Any]:
-    """Generate, train, evaluate and report into `out`; what an earlier call has finished is kept.
+    """Generate, train, evaluate and report into `out`; what an earlier call of the same demo has finished is kept.
 
-    Returns {"report": path, "metrics": metrics.json, "seconds": {part: s}}.
+    Returns {"report": path, "metrics": metrics.json, "seconds": {part: s}}. Raises InputError where `out` holds other
+    files than a demo's.
     """
     out = Path(out)
+    _prepare(out)
     seconds, start = {}, time.monotonic()
 
     def finished(part: str) -> None:
@@ -38,6 +51,23 @@ def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Repor
     finished("train")
     with reporting("evaluate", "frames") as report:
         metrics = evaluate(run, dataset, out / "eval", EvaluateConfig(), report)
-    write_report([out / "eval"], out / "report.html")
+    write_report([out / "eval"], out / "eval" / "report.html")
     finished("evaluate and report")
-    return {"report": out / "report.html", "metrics": metrics, "seconds": seconds}
+    return {"report": out / "eval" / "report.html", "metrics": metrics, "seconds": seconds}
+
+
+def _prepare(out: Path) -> None:
+    """Make the folder; take away what a demo of another version or another backend has left in it."""
+    marker, packages = out / "demo.json", ("mitsuba", "drjit", "numpy", "trimesh")
+    versions = {"spacesim": __version__, "python": platform.python_version(), **{p: version(p) for p in packages}}
+    this = {"data": asdict(DATA), "train": preset("demo").to_json(), "backend": backend.select(), "versions": versions}
+    this = json.loads(json.dumps(this))
+    if marker.exists():
+        if read_json(marker) == this:
+            return
+        log.info("%s: is of another version or backend; starting afresh", out)
+        for part in ("data", "run", "eval"):
+            shutil.rmtree(out / part, ignore_errors=True)
+    elif out.is_dir() and any(not path.name.startswith(".") for path in out.iterdir()):
+        raise InputError(f"{out}: expected an empty or new folder, or an earlier demo, found other files in it")
+    write_json(marker, this)

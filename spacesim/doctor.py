@@ -9,8 +9,8 @@ from typing import Any
 
 from spacesim import __version__, backend
 
-_PACKAGES = ("mitsuba", "drjit", "numpy", "torch", "viser")
-_TITLES = {"python": "Python", "cuda": "CUDA", "llvm": "LLVM", "lpips": "LPIPS", "viewer": "viewer"}
+_PACKAGES = ("mitsuba", "drjit", "numpy", "torch")
+_TITLES = {"python": "Python", "cuda": "CUDA", "llvm": "LLVM", "lpips": "LPIPS"}
 
 Finding = dict[str, Any]
 
@@ -19,7 +19,7 @@ def report() -> dict[str, Any]:
     """Findings as JSON values.
 
     "versions": {package: version or null}; "backend": the one that runs by default, or null; and an entry
-    {"ok": bool, "found": sentence} for each of python, cuda, llvm, lpips and viewer.
+    {"ok": bool, "found": sentence} for each of python, cuda, llvm and lpips.
     """
     return {
         "backend": _default_backend(),
@@ -28,7 +28,6 @@ def report() -> dict[str, Any]:
         "cuda": _attempt(_check_cuda),
         "llvm": _attempt(_check_llvm),
         "lpips": _attempt(_check_lpips),
-        "viewer": _attempt(_check_viewer),
     }
 
 
@@ -85,13 +84,6 @@ def _check_lpips() -> Finding:
     importlib.import_module("torch")
     weights, sentence = importlib.import_module("spacesim.eval.lpips").find_weights()
     return _finding(weights is not None, sentence)
-
-
-def _check_viewer() -> Finding:
-    version = _version("viser")
-    if version is None:
-        return _finding(False, "viser is not installed; type: pip install viser")
-    return _finding(True, f"viser {version}")
 
 
 def _version(package: str) -> str | None:

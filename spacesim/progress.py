@@ -54,9 +54,8 @@ def reporting(title: str, unit: str, quiet: bool = False) -> Iterator[Reporter]:
         return
     columns: list[progress.ProgressColumn] = [
         progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
+        progress.BarColumn(bar_width=20),
         progress.MofNCompleteColumn(),
-        progress.TimeElapsedColumn(),
     ]
     columns += [progress.TimeRemainingColumn(), progress.TextColumn("{task.fields[detail]}")]
     with progress.Progress(*columns, console=console) as bar:

@@ -515,7 +515,7 @@ def test_resuming_on_other_data_is_refused(tiny_data, tmp_path):
 
 def test_more_than_fits_into_memory(spacesim, tiny_data, tmp_path):
     for arguments in (
-        ("generate", "boxsat", "--out", tmp_path / "data", "--resolution", 10**7, "--views", 1),
+        ("generate", "boxsat", "--out", tmp_path / "data", "--resolution", 8, "--views", 10**17),
         ("train", tiny_data, "--out", tmp_path / "run", "--init", "random", "--init-count", 10**15),
     ):
         failed = spacesim(*arguments)

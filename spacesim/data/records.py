@@ -16,6 +16,8 @@ from spacesim.data.geometry import (
     normalize,
 )
 
+MOST_PIXELS = 2**28  #: of a picture: 16,384 x 16,384
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -42,6 +44,8 @@ class Camera:
             raise InputError("world_from_camera: expected a rotation in its upper left [3, 3], found none")
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: expected a size of at least 1x1 pixels, found {self.width}x{self.height}")
+        if self.width * self.height > MOST_PIXELS:
+            raise InputError(f"camera: expected at most {MOST_PIXELS} pixels, found {self.width}x{self.height}")
         if not (self.fx > 0 and self.fy > 0 and np.all(np.isfinite([self.fx, self.fy, self.cx, self.cy]))):
             raise InputError(f"camera: expected positive finite focal lengths, found {self.fx} and {self.fy}")
         object.__setattr__(self, "world_from_camera", pose)

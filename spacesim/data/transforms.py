@@ -26,7 +26,6 @@ _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"
 TRUTH_PATHS = ("gt_path", "shadow_path", "silhouette_path", "id_path", "depth_file_path", "mask_path")
 _HOLD_OUT = 8
 _SPLITS = ("train", "val", "test")
-_BLENDER_TESTS = ("transforms_test.json", "transforms_val.json")
 
 Json = Mapping[str, Any]
 

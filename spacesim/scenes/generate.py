@@ -31,6 +31,7 @@ from spacesim.scenes.sun import EXPOSURE
 SCHEMA = 1  #: of scene.json
 
 Progress = Callable[[int, int, str], None]
+Named = list[tuple[str, View]]  #: views with the names of their frames
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def generate(
     if inside.any():
         name = frames[int(inside.argmax())][0]
         raise InputError(f"distance: expected cameras outside of {scene}, found that of {name} within a part")
-    writer = DatasetWriter(Path(out), describe(described, config), resume)
+    writer = DatasetWriter(Path(out), describe(described, config, train, test), resume)
     for index, (name, view) in enumerate(frames):
         if not writer.has(name):
             truth = renderer.render(view.camera, view.sun, (config.seed, index))
@@ -115,7 +116,7 @@ def generate(
     return writer.finish(_listed(train), _listed(test), points, colors, described.mesh)
 
 
-def plan_views(scene: Scene, config: GenerateConfig) -> tuple[list[tuple[str, View]], list[tuple[str, View]]]:
+def plan_views(scene: Scene, config: GenerateConfig) -> tuple[Named, Named]:
     """The named training and test views."""
     centre, radius = scene.bounding_sphere
     distance = config.distance or fitting_distance(radius, config.fov_deg)
@@ -130,12 +131,13 @@ def plan_views(scene: Scene, config: GenerateConfig) -> tuple[list[tuple[str, Vi
     )
 
 
-def describe(scene: Scene, config: GenerateConfig) -> dict[str, Any]:
+def describe(scene: Scene, config: GenerateConfig, train: Named, test: Named) -> dict[str, Any]:
     """scene.json: all that is needed to render the same dataset again."""
     versions = {name: version(name) for name in ("mitsuba", "drjit", "numpy", "trimesh")}
     return {
         "schema": SCHEMA,
         **scene.describe(),
+        "suns": {"train": _angles(train), "test": _angles(test)},
         "exposure": config.exposure,
         "config": asdict(config),
         "backend": backend.select(),
@@ -143,5 +145,10 @@ def describe(scene: Scene, config: GenerateConfig) -> dict[str, Any]:
     }
 
 
-def _listed(named: list[tuple[str, View]]) -> list[tuple[str, Camera, Sun]]:
+def _angles(named: Named) -> list[list[float]]:
+    """Azimuth and elevation, degrees, of each Sun once, in the order of the views."""
+    return [list(angles) for angles in dict.fromkeys(view.sun.angles for _, view in named)]
+
+
+def _listed(named: Named) -> list[tuple[str, Camera, Sun]]:
     return [(name, view.camera, view.sun) for name, view in named]

@@ -16,6 +16,8 @@ from spacesim.scenes.materials import Material
 from spacesim.scenes.spacecraft import Part, Spacecraft, boxsat
 from spacesim.scenes.sun import SOLAR_IRRADIANCE, directional
 
+MOST_OBJECTS, MOST_PARTS = 84, 255  #: 170 + object id is a shadow class below 255, part ids are bytes
+
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
@@ -47,6 +49,14 @@ class Scene:
     name: str
     objects: tuple[SceneObject, ...]
     irradiance: float = SOLAR_IRRADIANCE  #: of the Sun, W m^-2 in each of R, G and B
+
+    def __post_init__(self) -> None:
+        parts = sum(len(item.spacecraft.parts) for item in self.objects)
+        if len(self.objects) > MOST_OBJECTS or parts > MOST_PARTS:
+            raise InputError(
+                f"scene {self.name}: expected at most {MOST_OBJECTS} objects and {MOST_PARTS} parts, which "
+                f"8-bit labels can tell apart, found {len(self.objects)} and {parts}"
+            )
 
     @cached_property
     def parts(self) -> tuple[PlacedPart, ...]:

@@ -1,10 +1,13 @@
 """Adam, the moves of refinement, and the default strategy's decisions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from spacesim.backend import ad
 from spacesim.splat.gaussians import NAMES, Gaussians
+from spacesim.splat.train.config import preset
 from spacesim.splat.train.densify import grow, limit_opacities, prune
 from spacesim.splat.train.optimizer import Adam, adam_step
 from spacesim.splat.train.strategies.default import DefaultStrategy, DefaultStrategyConfig
@@ -134,10 +137,18 @@ def test_screen_size_splits_and_prunes_until_its_stop():
     config = DefaultStrategyConfig(screen_size_stop=5000)
     assert refine_once(1100, config, radius=radius)[3] == (0, 1, 1)
     assert refine_once(5100, config, radius=radius)[3] == (0, 0, 2)
-    huge = DefaultStrategyConfig(split_screen_size=1.0)
-    assert refine_once(3900 + 100, huge, radius=[0.0, 0.0, 0.06, 0.0, 0.0, 0.0])[3] == (0, 0, 2)
-    wide = DefaultStrategyConfig(split_screen_size=1.0, screen_size_stop=9000)
-    assert refine_once(4100, wide, radius=[0.0, 0.0, 0.06, 0.0, 0.0, 0.0])[3] == (0, 0, 3)
+    wide, radius = DefaultStrategyConfig(split_screen_size=1.0), [0.0, 0.0, 0.06, 0.0, 0.0, 0.0]
+    assert refine_once(2900, wide, radius=radius)[3] == (0, 0, 1)  # pruned by size after the first reset alone
+    assert refine_once(4100, wide, radius=radius)[3] == (0, 0, 3)
+    assert refine_once(4100, replace(wide, screen_size_stop=4000), radius=radius)[3] == (0, 0, 2)
+
+
+def test_every_rule_of_table_5_1_has_its_time_under_the_thesis_preset():
+    config = preset("thesis").refinement
+    cycle = config.reset_every * config.refine_every
+    refined = [step for step in range(100, 200_000, 100) if config.refine_start < step < config.refine_stop]
+    refined = [step for step in refined if step % cycle >= config.pause_after_reset]
+    assert sum(cycle < step < config.screen_size_stop for step in refined) > 900
 
 
 @pytest.mark.parametrize("step", [100, 500, 999, 1150, 3500, 15_000, 20_000])

@@ -32,7 +32,7 @@ class TrainConfig:
     method: str = "vanilla"
     strategy: str = "default"
     init: str | None = None  #: mesh, points or random; None takes the first of points, mesh, random that can be had
-    preset: str = "fast"
+    preset: str | None = None  #: the preset that this started from
     iterations: int = 7_000
     seed: int = 0
     init_count: int = 20_000  #: Gaussians at the start, at most
@@ -45,9 +45,11 @@ class TrainConfig:
     refinement: DefaultStrategyConfig = field(default_factory=DefaultStrategyConfig)
 
     def __post_init__(self) -> None:
-        for name, allowed in (("method", METHODS), ("strategy", STRATEGIES), ("preset", PRESETS)):
+        for name, allowed in (("method", METHODS), ("strategy", STRATEGIES), ("preset", (None, *PRESETS))):
             if getattr(self, name) not in allowed:
-                raise InputError(f"--{name}: expected one of {', '.join(allowed)}, found {getattr(self, name)!r}")
+                raise InputError(
+                    f"--{name}: expected one of {', '.join(filter(None, allowed))}, found {getattr(self, name)!r}"
+                )
         if self.init is not None and self.init not in INITS:
             raise InputError(f"--init: expected one of {', '.join(INITS)}, found {self.init!r}")
         if self.iterations < 1:
@@ -88,7 +90,7 @@ def preset(name: str) -> TrainConfig:
             iterations=200_000,
             init_count=50_000,
             checkpoint_every=5_000,
-            refinement=DefaultStrategyConfig(refine_stop=150_000),
+            refinement=DefaultStrategyConfig(refine_stop=150_000, screen_size_stop=150_000),
         )
     gentle = DefaultStrategyConfig(prune_screen_size=0.5, split_screen_size=0.1)
     if name == "fast":

@@ -41,9 +41,14 @@ def adam_step(
     rates: list[Any],
     corrections: tuple[Any, Any],
 ) -> tuple[list[Any], list[Any], list[Any]]:
-    """(rows, first, second) after a step; pure, so that it can be recorded once and replayed. rates: a row each."""
+    """(rows, first, second) after a step; pure, so that it can be recorded once and replayed. rates: a row each.
+
+    Gradients below EPSILON count as 0. They are round-off, and their squares are denormal numbers, which Dr.Jit's
+    worker threads flush to zero and the main thread does not: Adam would make the number of threads visible.
+    """
     moved, first, second = [], [], []
     for row, gradient, m, v, rate in zip(rows, gradients, *moments, rates, strict=True):
+        gradient = dr.select(dr.abs(gradient) < EPSILON, 0, gradient)
         m = BETA1 * m + (1 - BETA1) * gradient
         v = BETA2 * v + (1 - BETA2) * gradient * gradient
         moved.append(row - rate * (corrections[0] * m) / (dr.sqrt(corrections[1] * v) + EPSILON))

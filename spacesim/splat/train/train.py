@@ -17,7 +17,7 @@ import spacesim
 from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_json, write_json
-from spacesim.data.records import Dataset
+from spacesim.data.records import Camera, Dataset
 from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.checkpoint import write_tensors
 from spacesim.splat.train.config import TrainConfig
@@ -108,12 +108,13 @@ def _identity(dataset: Dataset) -> dict[str, Any]:
 
 
 def _digest(dataset: Dataset) -> str:
-    """Of the training frames: names and sizes of the files, poses, focal lengths."""
-    told = [
-        (f.file_path, (dataset.root / f.file_path).stat().st_size, f.camera.opengl.tolist(), f.camera.fx, f.camera.fy)
-        for f in dataset.train
-    ]
+    """Of the training frames: names and sizes of the files, poses, intrinsics."""
+    told = [(f.file_path, (dataset.root / f.file_path).stat().st_size, _numbers(f.camera)) for f in dataset.train]
     return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
+
+
+def _numbers(camera: Camera) -> list[float]:
+    return [*camera.opengl.ravel().tolist(), camera.fx, camera.fy, camera.cx, camera.cy]
 
 
 def _check_resumable(out: Path, described: dict[str, Any], resume: bool) -> None:

@@ -31,7 +31,7 @@ class DefaultStrategyConfig:
     duplicate_scale: float = 0.01  #: larger Gaussians are split, smaller ones duplicated
     refine_start: int = 500  #: iterations
     refine_stop: int = 15_000  #: iterations
-    screen_size_stop: int = 4_000  #: iterations after which screen sizes no longer count
+    screen_size_stop: int = 15_000  #: iterations; until then screen sizes split and, after the first reset, prune
 
 
 class DefaultStrategy:
