@@ -61,8 +61,8 @@ def revolved(profile: ArrayLike, segments: int = SEGMENTS) -> trimesh.Trimesh:
     angle = np.arange(segments) * (2.0 * np.pi / segments)
     radius, z = profile[:, 0], np.broadcast_to(profile[:, 1], (segments, count))
     vertices = np.stack([np.outer(np.cos(angle), radius), np.outer(np.sin(angle), radius), z], axis=-1)
-    index = np.arange(segments * count).reshape(segments, count)
-    index = np.where(radius == 0.0, index[:1], index)  # one vertex for all segments on the axis
+    grid = np.arange(segments * count).reshape(segments, count)
+    index = np.where(radius == 0.0, grid[:1], grid)  # one vertex for all segments on the axis
     ahead = np.roll(index, -1, axis=0)
     a, b, c, d = index, np.roll(index, -1, axis=1), np.roll(ahead, -1, axis=1), ahead
     faces = np.concatenate([np.stack([a, d, b], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])

@@ -211,8 +211,8 @@ class _Rasterize(dr.CustomOp):
 
 def rasterize(splats: Splats, features: list[Any], lists: TileLists, width: int, height: int) -> tuple[list[Any], Any]:
     """Differentiable blending. Returns (C feature planes, transmittance plane), [height * width] each."""
-    *planes, transmittance = dr.custom(_Rasterize, splats, features, lists, width, height)
-    return planes, transmittance
+    outputs: list[Any] = dr.custom(_Rasterize, splats, features, lists, width, height)
+    return outputs[:-1], outputs[-1]
 
 
 def _capacity(pairs: int) -> int:
