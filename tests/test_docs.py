@@ -27,3 +27,9 @@ def test_links_lead_somewhere(document):
     links = re.findall(r"\]\(([^)#\s]+)", document.read_text(encoding="utf-8"))
     local = [link for link in links if not link.startswith("https://")]
     assert [link for link in local if not (document.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda path: path.name)
+def test_documents_that_the_code_names_are_there(module):
+    named = re.findall(r"\bdocs/[\w-]+\.md\b", module.read_text(encoding="utf-8"))
+    assert [name for name in named if not (ROOT / name).exists()] == []
