@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from spacesim.data.errors import InputError
 from spacesim.data.files import write_bytes
 from spacesim.eval.charts import column_histograms, histogram, line_chart, shared_edges
 from spacesim.eval.gallery import gallery
@@ -29,7 +30,16 @@ def write_report(evals: Sequence[Path], out: Path) -> None:
 
     Raises InputError where a folder holds no evaluation or `out` cannot be written.
     """
-    runs = read_evals(evals)
+    try:
+        content = _content(read_evals(evals))
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        named = ", ".join(str(Path(folder) / "metrics.json") for folder in evals)
+        raise InputError(f"{named}: expected metrics of this version, found a damaged file ({error!r})") from error
+    write_bytes(Path(out), content.encode())
+
+
+def _content(runs: Sequence[Judged]) -> str:
+    """The page."""
     scenes = " and ".join(sorted({run.scene for run in runs}))
     body = [
         _header(runs, scenes),
@@ -46,7 +56,7 @@ def write_report(evals: Sequence[Path], out: Path) -> None:
         section("Notes", _notes(runs)),
         "<footer>Written by spacesim. Equation numbers: the thesis that defines the metrics.</footer>",
     ]
-    write_bytes(Path(out), page(f"{scenes} · reconstruction report", "\n".join(body)).encode())
+    return page(f"{scenes} · reconstruction report", "\n".join(body))
 
 
 def _header(runs: Sequence[Judged], scenes: str) -> str:

@@ -266,3 +266,14 @@ def test_ticks_are_round_and_reach_around():
         edges = charts.shared_edges(values)
         assert edges[0] <= min(values) <= max(values) <= edges[-1]
         assert np.histogram(values, edges)[0].sum() == len(values)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("model", None), ("model", 7), ("dataset", {}), ("dataset", None), ("frames", [{}]), ("notes", 7)],
+)
+def test_damaged_metrics_end_in_a_sentence(folder, tmp_path, key, value):
+    damaged = another(folder, "damaged", lambda metrics: metrics.update({key: value}))
+    with pytest.raises(InputError, match="damaged"):
+        write_report([damaged], tmp_path / "report.html")
+    assert not (tmp_path / "report.html").exists()
