@@ -2,23 +2,22 @@
 
 import json
 import logging
-import platform
 import shutil
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from spacesim import __version__, backend
+from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_json, write_json
+from spacesim.data.files import holds_files, read_json, write_json
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report import write_report
 from spacesim.progress import Reporter, tell_training
 from spacesim.scenes import GenerateConfig, generate
+from spacesim.scenes.generate import versions
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.train import train
 
@@ -58,9 +57,13 @@ def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Repor
 
 def _prepare(out: Path) -> None:
     """Make the folder; take away what a demo of another version or another backend has left in it."""
-    marker, packages = out / "demo.json", ("mitsuba", "drjit", "numpy", "trimesh")
-    versions = {"spacesim": __version__, "python": platform.python_version(), **{p: version(p) for p in packages}}
-    this = {"data": asdict(DATA), "train": preset("demo").to_json(), "backend": backend.select(), "versions": versions}
+    marker = out / "demo.json"
+    this = {
+        "data": asdict(DATA),
+        "train": preset("demo").to_json(),
+        "backend": backend.select(),
+        "versions": versions(),
+    }
     this = json.loads(json.dumps(this))
     if marker.exists():
         if read_json(marker) == this:
@@ -68,6 +71,6 @@ def _prepare(out: Path) -> None:
         log.info("%s: is of another version or backend; starting afresh", out)
         for part in ("data", "run", "eval"):
             shutil.rmtree(out / part, ignore_errors=True)
-    elif out.is_dir() and any(not path.name.startswith(".") for path in out.iterdir()):
+    elif holds_files(out):
         raise InputError(f"{out}: expected an empty or new folder, or an earlier demo, found other files in it")
     write_json(marker, this)

@@ -33,6 +33,11 @@ def write_bytes(path: Path, content: bytes) -> None:
             temporary.unlink(missing_ok=True)
 
 
+def holds_files(folder: Path) -> bool:
+    """There is something visible in a folder; what an interrupted `write_bytes` leaves behind is hidden."""
+    return folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir())
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write `value` as indented JSON (no NaN: a missing number is null)."""
     write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())

@@ -133,7 +133,6 @@ def plan_views(scene: Scene, config: GenerateConfig) -> tuple[Named, Named]:
 
 def describe(scene: Scene, config: GenerateConfig, train: Named, test: Named) -> dict[str, Any]:
     """scene.json: all that is needed to render the same dataset again."""
-    versions = {name: version(name) for name in ("mitsuba", "drjit", "numpy", "trimesh")}
     return {
         "schema": SCHEMA,
         **scene.describe(),
@@ -141,8 +140,14 @@ def describe(scene: Scene, config: GenerateConfig, train: Named, test: Named) ->
         "exposure": config.exposure,
         "config": asdict(config),
         "backend": backend.select(),
-        "versions": {"spacesim": spacesim.__version__, "python": platform.python_version(), **versions},
+        "versions": versions(),
     }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the pictures depend on."""
+    packages = {name: version(name) for name in ("mitsuba", "drjit", "numpy", "trimesh")}
+    return {"spacesim": spacesim.__version__, "python": platform.python_version(), **packages}
 
 
 def _angles(named: Named) -> list[list[float]]:

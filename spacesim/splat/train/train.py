@@ -16,7 +16,7 @@ import numpy as np
 import spacesim
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_json, write_json
+from spacesim.data.files import holds_files, read_json, write_json
 from spacesim.data.records import Camera, Dataset
 from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.checkpoint import write_tensors
@@ -47,7 +47,7 @@ def train(
         _check_resumable(out, described, resume)
         if (out / "model.safetensors").exists():
             return load_run(out)
-    elif out.exists() and (not out.is_dir() or any(not path.name.startswith(".") for path in out.iterdir())):
+    elif holds_files(out) or (out.exists() and not out.is_dir()):
         raise InputError(f"{out}: expected an empty or new folder for the run, found other files in it")
 
     trainer = Trainer(dataset, config)
