@@ -1,10 +1,7 @@
-"""Spacecraft as named parts: closed meshes in the body frame (metres), a material each.
+"""boxsat: a box satellite with two solar panels, a dish, a camera barrel and a boom.
 
-Body axes of boxsat: +x the camera looks along, +z the deck with the antenna dish, solar panels along -y and
-+y.
+Body axes: +x the camera looks along, +z the deck with the antenna dish, solar panels along -y and +y.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 import trimesh
@@ -12,25 +9,7 @@ import trimesh
 from spacesim.data.geometry import normalize
 from spacesim.scenes import materials as m
 from spacesim.scenes import shapes as s
-from spacesim.scenes.materials import Material
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """A named solid. mesh: watertight, faces outward, body frame, metres."""
-
-    name: str
-    mesh: trimesh.Trimesh
-    material: Material
-
-
-@dataclass(frozen=True, eq=False)
-class Spacecraft:
-    """Parts that together make one rigid object."""
-
-    name: str
-    parts: tuple[Part, ...]
-
+from spacesim.scenes.spacecraft.part import Part, Spacecraft
 
 BUS = np.array([1.4, 1.2, 1.5])
 """Edge lengths of boxsat's bus, metres."""

@@ -1,0 +1,17 @@
+"""The built-in spacecraft by name."""
+
+from collections.abc import Callable
+
+from spacesim.data.errors import InputError
+from spacesim.scenes.spacecraft.boxsat import boxsat
+from spacesim.scenes.spacecraft.part import Spacecraft
+
+_BUILT_IN: dict[str, Callable[[], Spacecraft]] = {"boxsat": boxsat}
+SPACECRAFT = tuple(_BUILT_IN)  #: names of the built-in spacecraft
+
+
+def spacecraft(name: str) -> Spacecraft:
+    """The built-in spacecraft called `name`; InputError lists the names where there is none."""
+    if name not in _BUILT_IN:
+        raise InputError(f"spacecraft: expected one of {', '.join(SPACECRAFT)}, found {name!r}")
+    return _BUILT_IN[name]()
