@@ -1,4 +1,5 @@
-"""Surface materials of spacecraft: a small table of reflectances and Mitsuba BSDFs, each with its source.
+"""Surface materials of spacecraft: a table of presets (assets/materials.toml), each with its source, and
+constructors for others.
 
 The solar absorptances are those of Fortescue, Swinerd and Stark, "Spacecraft Systems Engineering", 4th
 edition, Wiley 2011, table 11.3; 1 - absorptance is the reflectance over the whole solar spectrum. Hue and
@@ -6,22 +7,41 @@ roughness are not in that table: they are our choice, and each record says so. N
 because a mirror never meets a directional Sun.
 """
 
+import importlib
+import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+from spacesim.data.errors import InputError
+from spacesim.data.images import linear_from_srgb, srgb_from_linear
 
 Color = tuple[float, float, float]
 
+TABLE = Path(__file__).parents[1] / "assets" / "materials.toml"
 
-@dataclass(frozen=True)
+SMOOTHEST = 0.05  #: least `roughness` of `principled`, chosen: smoother facets would hardly ever meet the Sun
+
+
+@dataclass(frozen=True, eq=False)
 class Material:
-    """A surface. albedo: linear RGB reflectance, diffuse or (metals) specular; bsdf: Mitsuba's description of
-    it, plain JSON values only; source: where the numbers are from."""
+    """A surface and how light leaves it.
+
+    `bsdf` holds plain JSON values only. A texture in it is {"type": "bitmap", "image": KEY, "raw": bool}, its
+    pixels are `images[KEY]`: uint8 [H, W], [H, W, 3] or [H, W, 4], sRGB-encoded colours or, where "raw", data.
+    """
 
     name: str
-    albedo: Color
-    bsdf: Mapping[str, Any]
-    source: str
+    albedo: Color  #: mean linear camera RGB reflectance, diffuse or (metals) specular
+    bsdf: Mapping[str, Any]  #: Mitsuba's description
+    source: str  #: where the numbers are from
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)
+    tile: float | None = None  #: metres that one repeat of the images covers where a part has no uv of its own
+    reflectance: tuple[tuple[float, float], ...] = ()  #: (wavelength nm, reflectance); the albedo follows from it
 
 
 def _rgb(color: Color) -> dict[str, Any]:
@@ -55,6 +75,144 @@ def coated(name: str, albedo: Color, alpha: float, source: str, ior: float = 1.5
         "diffuse_reflectance": _rgb(albedo),
     }
     return Material(name, albedo, bsdf, source)
+
+
+def principled(
+    name: str,
+    base_color: Color = (1.0, 1.0, 1.0),
+    metallic: float = 0.0,
+    roughness: float = 0.5,
+    source: str = "",
+    images: Mapping[str, np.ndarray] | None = None,
+    tile: float | None = None,
+) -> Material:
+    """A surface of glTF 2.0's metallic-roughness model (section 3.9.2) as Mitsuba's principled BSDF, which has
+    its dielectric n = 1.5 and its GGX alpha = roughness^2.
+
+    base_color: linear RGB; metallic, roughness: in [0, 1]. images: any of "base_color" [H, W, 3] uint8
+    (sRGB-encoded), "metallic" and "roughness" [H, W] uint8 and "normal" [H, W, 3] uint8 (raw, tangent space,
+    +y up); as in glTF, the numbers multiply the images. Raises InputError for a number out of range.
+    """
+    for key, values in (("base_color", base_color), ("metallic", [metallic]), ("roughness", [roughness])):
+        _check_unit(f"material {name}: {key}", values)
+    images = dict(images or {})
+    albedo = base_color
+    if "base_color" in images:
+        linear = linear_from_srgb(images["base_color"][..., :3] / np.float32(255)) * np.asarray(base_color)
+        albedo = _color(linear.mean(axis=(0, 1)))
+        images["base_color"] = np.round(255 * srgb_from_linear(linear)).astype(np.uint8)
+    for key, factor in (("metallic", metallic), ("roughness", roughness)):
+        if key in images:
+            lowest = SMOOTHEST if key == "roughness" else 0.0
+            images[key] = np.round(np.maximum(factor * images[key], 255 * lowest)).astype(np.uint8)
+    bsdf: dict[str, Any] = {
+        "type": "principled",
+        "base_color": _bitmap("base_color", raw=False) if "base_color" in images else _rgb(base_color),
+        "metallic": _bitmap("metallic") if "metallic" in images else metallic,
+        "roughness": _bitmap("roughness") if "roughness" in images else max(roughness, SMOOTHEST),
+    }
+    if "normal" in images:
+        bsdf = _with_normals(bsdf, "normal")
+    return Material(name, albedo, bsdf, source, images, tile)
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A row of the table."""
+
+    kind: str
+    source: str
+    albedo: Color
+    roughness: float | None = None
+    ior: float | None = None
+    tile: float | None = None
+
+    def material(self, name: str) -> Material:
+        if self.kind == "coated":
+            made = coated(name, self.albedo, self.roughness or 0.0, self.source, self.ior or 1.5)
+        elif self.kind == "metal":
+            made = metal(name, self.albedo, self.roughness or 0.0, self.source)
+        else:
+            made = lambertian(name, self.albedo, self.source)
+        return replace(made, tile=self.tile)
+
+
+@cache
+def _table() -> dict[str, _Row]:
+    toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+    rows = toml.loads(TABLE.read_text(encoding="utf-8"))
+    return {name: _Row(**{**row, "albedo": _color(row["albedo"])}) for name, row in rows.items()}
+
+
+def material_names() -> tuple[str, ...]:
+    """The names of the presets."""
+    return tuple(_table())
+
+
+def _row(name: str) -> _Row:
+    if name not in _table():
+        raise InputError(f"material: expected one of {', '.join(material_names())}, found {name!r}")
+    return _table()[name]
+
+
+@cache
+def material(name: str) -> Material:
+    """The preset called `name`; InputError lists the names where there is none."""
+    return _row(name).material(name)
+
+
+def customised(
+    name: str,
+    preset: str,
+    albedo: Color | None = None,
+    roughness: float | None = None,
+    ior: float | None = None,
+    tile: float | None = None,
+) -> Material:
+    """The preset `preset` under another name and with other numbers, those that are not None.
+
+    albedo: linear camera RGB in [0, 1]; roughness: GGX alpha in (0, 1]; ior: refractive index of the coat;
+    tile: metres. Raises InputError for an unknown preset, a number out of range or one that the preset has not.
+    """
+    row = _row(preset)
+    changes: dict[str, Any] = {}
+    if albedo is not None:
+        _check_unit(f"material {name}: albedo", albedo)
+        changes["albedo"] = _color(albedo)
+    limits = {"roughness": (roughness, 0.01, 1.0), "ior": (ior, 1.0, 4.0), "tile": (tile, 0.0, 1e6)}
+    for key, (value, low, high) in limits.items():
+        if value is None:
+            continue
+        if getattr(row, key) is None:
+            raise InputError(f"material {name}: expected no {key}, which {preset} does not have, found {value}")
+        if not low < value <= high:
+            raise InputError(f"material {name}: {key}: expected a number above {low} up to {high}, found {value}")
+        changes[key] = float(value)
+    if not changes:
+        return replace(material(preset), name=name)
+    source = f"{preset} with {', '.join(changes)} of the scene file; {row.source}"
+    return replace(row, source=source, **changes).material(name)
+
+
+def _check_unit(what: str, values: Any) -> None:
+    if not all(0.0 <= x <= 1.0 for x in values):
+        found = ", ".join(f"{x:g}" for x in values)
+        raise InputError(f"{what}: expected numbers from 0 to 1, found {found}")
+
+
+def _color(values: Any) -> Color:
+    red, green, blue = (float(x) for x in values)
+    return red, green, blue
+
+
+def _bitmap(key: str, raw: bool = True) -> dict[str, Any]:
+    """A texture in a BSDF, its pixels in `Material.images[key]`."""
+    return {"type": "bitmap", "image": key, "raw": raw}
+
+
+def _with_normals(bsdf: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """`bsdf` with the normals of the image `key` (tangent space)."""
+    return {"type": "normalmap", "normalmap": _bitmap(key), "bsdf": dict(bsdf)}
 
 
 TEST_WHITE = lambertian("test white", (1.0, 1.0, 1.0), "ideal Lambertian reflector, for checks")
