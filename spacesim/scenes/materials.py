@@ -1,10 +1,8 @@
 """Surface materials of spacecraft: a table of presets (assets/materials.toml), each with its source, and
 constructors for others.
 
-The solar absorptances are those of Fortescue, Swinerd and Stark, "Spacecraft Systems Engineering", 4th
-edition, Wiley 2011, table 11.3; 1 - absorptance is the reflectance over the whole solar spectrum. Hue and
-roughness are not in that table: they are our choice, and each record says so. No surface is perfectly smooth,
-because a mirror never meets a directional Sun.
+A material's albedo is its spectrum weighted with sunlight and the camera's response (spectra.py). No surface is
+perfectly smooth, because a mirror never meets a directional Sun.
 """
 
 import importlib
@@ -19,6 +17,7 @@ import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
+from spacesim.scenes import textures
 
 Color = tuple[float, float, float]
 
@@ -54,7 +53,8 @@ def lambertian(name: str, albedo: Color, source: str) -> Material:
 
 
 def metal(name: str, albedo: Color, alpha: float, source: str) -> Material:
-    """A rough metal: GGX facets of roughness `alpha`, each reflecting `albedo` at every angle."""
+    """A rough metal: GGX facets of roughness `alpha`, each reflecting `albedo` at every angle. Light that would meet
+    a second facet is lost, as in all microfacet models of one bounce: the surface reflects less than `albedo`."""
     bsdf = {
         "type": "roughconductor",
         "material": "none",
@@ -118,14 +118,18 @@ def principled(
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of the table."""
+    """A row of the table; its columns are explained in materials.toml."""
 
     kind: str
     source: str
     albedo: Color
+    absorptance: float | None = None
     roughness: float | None = None
     ior: float | None = None
+    normals: str | None = None
+    pattern: str | None = None
     tile: float | None = None
+    spectrum: tuple[tuple[float, float], ...] = ()
 
     def material(self, name: str) -> Material:
         if self.kind == "coated":
@@ -134,14 +138,36 @@ class _Row:
             made = metal(name, self.albedo, self.roughness or 0.0, self.source)
         else:
             made = lambertian(name, self.albedo, self.source)
-        return replace(made, tile=self.tile)
+        if self.pattern is not None:
+            made = _patterned(made, self.pattern)
+        if self.normals is not None:
+            images = {**made.images, self.normals: NORMALS[self.normals]()}
+            made = replace(made, bsdf=_with_normals(made.bsdf, self.normals), images=images)
+        return replace(made, tile=self.tile, reflectance=self.spectrum)
+
+
+NORMALS = {"crinkle": textures.crinkle, "grain": textures.grain}
+PATTERNS = {"cells": textures.cells}
+
+
+def _patterned(plain: Material, pattern: str) -> Material:
+    """`plain`, diffuse or coated, with the image of a pattern of its albedo."""
+    image = PATTERNS[pattern](plain.albedo)
+    key = "diffuse_reflectance" if "diffuse_reflectance" in plain.bsdf else "reflectance"
+    bsdf = {**plain.bsdf, key: _bitmap(pattern, raw=False)}
+    mean = linear_from_srgb(image / np.float32(255)).mean(axis=(0, 1), dtype=np.float64)
+    return replace(plain, albedo=_color(mean), bsdf=bsdf, images={**plain.images, pattern: image})
 
 
 @cache
 def _table() -> dict[str, _Row]:
     toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
-    rows = toml.loads(TABLE.read_text(encoding="utf-8"))
-    return {name: _Row(**{**row, "albedo": _color(row["albedo"])}) for name, row in rows.items()}
+    return {name: _row_of(values) for name, values in toml.loads(TABLE.read_text(encoding="utf-8")).items()}
+
+
+def _row_of(values: Mapping[str, Any]) -> _Row:
+    spectrum = tuple((float(nm), float(value)) for nm, value in values.get("spectrum", ()))
+    return _Row(**{**values, "albedo": _color(values["albedo"]), "spectrum": spectrum})
 
 
 def material_names() -> tuple[str, ...]:
@@ -178,7 +204,7 @@ def customised(
     changes: dict[str, Any] = {}
     if albedo is not None:
         _check_unit(f"material {name}: albedo", albedo)
-        changes["albedo"] = _color(albedo)
+        changes.update(albedo=_color(albedo), spectrum=())
     limits = {"roughness": (roughness, 0.01, 1.0), "ior": (ior, 1.0, 4.0), "tile": (tile, 0.0, 1e6)}
     for key, (value, low, high) in limits.items():
         if value is None:
@@ -190,7 +216,7 @@ def customised(
         changes[key] = float(value)
     if not changes:
         return replace(material(preset), name=name)
-    source = f"{preset} with {', '.join(changes)} of the scene file; {row.source}"
+    source = f"{preset} with {', '.join(key for key in changes if key != 'spectrum')} of the scene file; {row.source}"
     return replace(row, source=source, **changes).material(name)
 
 
