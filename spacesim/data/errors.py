@@ -7,3 +7,9 @@ class InputError(ValueError):
 
 class WorkError(RuntimeError):
     """The input was fine but the work could not be done, e.g. memory or disk is short (exit code 1)."""
+
+
+def expect(condition: bool, name: str, expected: str, found: object) -> None:
+    """Raise InputError "name: expected ..., found ..." unless `condition` holds."""
+    if not condition:
+        raise InputError(f"{name}: expected {expected}, found {found!r}")

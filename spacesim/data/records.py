@@ -116,6 +116,7 @@ class Truth:
     sun_visibility: np.ndarray  #: [H, W] fraction of the solar disc seen, 0 where the surface faces away
     sun_cosine: np.ndarray  #: [H, W] n . s
     shadow: np.ndarray  #: [H, W] uint8 class: see `spacesim.data.store.SHADOW_*`
+    radiance_earth: np.ndarray | None = None  #: [H, W, 3] the Earth's part of `radiance`, where there is an Earth
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import read_json, write_bytes, write_json
-from spacesim.data.images import load_image, read_exr, read_png, srgb_from_linear, write_exr, write_png
+from spacesim.data.images import load_image, read_exr, read_png, write_exr, write_png
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
 from spacesim.data.transforms import read_dataset
 
@@ -51,6 +51,7 @@ _FILES = {
     "gt": ".exr",  # written last
 }
 _LABELS = ("object_id", "part_id", "shadow")
+_OPTIONAL = ("radiance_earth",)
 _DEPTH_UNIT = 1e-3  # metres a step of depth/*.png: Nerfstudio's default depth_unit_scale_factor
 
 _log = logging.getLogger(__name__)
@@ -63,15 +64,16 @@ def load_truth(dataset: Dataset, frame: Frame) -> Truth:
     path = dataset.root / frame.gt_path
     layers = read_exr(path)
     names = [field.name for field in fields(Truth)]
-    missing = [name for name in names if name not in layers]
+    missing = [name for name in names if name not in layers and name not in _OPTIONAL]
     if missing:
         raise InputError(f"{path}: expected the layers {', '.join(names)}, found no {', '.join(missing)}")
-    sizes = {layers[name].shape[:2] for name in names}
+    present = [name for name in names if name in layers]
+    sizes = {layers[name].shape[:2] for name in present}
     if sizes != {(frame.camera.height, frame.camera.width)}:
         expected = f"{frame.camera.width}x{frame.camera.height}"
         found = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
         raise InputError(f"{path}: expected {expected} pixels as the camera says, found {found}")
-    return Truth(**{name: layers[name].astype(np.uint8 if name in _LABELS else np.float32) for name in names})
+    return Truth(**{name: layers[name].astype(np.uint8 if name in _LABELS else np.float32) for name in present})
 
 
 class DatasetWriter:
@@ -102,22 +104,27 @@ class DatasetWriter:
         paths = [self.root / folder / f"{name}{suffix}" for folder, suffix in _FILES.items()]
         return all(path.is_file() and path.stat().st_size > 0 for path in paths)
 
-    def write_frame(self, name: str, truth: Truth, exposure: float) -> None:
+    def write_frame(self, name: str, truth: Truth, image: np.ndarray, raw: np.ndarray | None = None) -> None:
         """Write the files of frame `name`, e.g. "train_00012".
 
-        images/NAME.png holds the sRGB encoding of `exposure` (per W m^-2 sr^-1) times radiance over alpha.
+        image: the picture, uint8 [H, W], [H, W, 3] or [H, W, 4]; raw: a sensor's digital numbers, uint16 [H, W], or
+        [3, H, W] for R, G and B, written to raw/ where given.
         """
         surface = truth.object_id > 0
-        labels = {
-            "images": encode_image(truth.radiance, truth.alpha, exposure),
-            "shadow": truth.shadow,
-            "silhouette": np.where(surface, 255, 0).astype(np.uint8),
-            "id": truth.object_id.astype(np.uint8),
-            "depth": self._encode_depth(truth.depth, surface),
+        pictures = {
+            f"images/{name}": image,
+            f"shadow/{name}": truth.shadow,
+            f"silhouette/{name}": np.where(surface, 255, 0).astype(np.uint8),
+            f"id/{name}": truth.object_id.astype(np.uint8),
+            f"depth/{name}": self._encode_depth(truth.depth, surface),
         }
-        for folder, pixels in labels.items():
-            write_png(self.root / folder / f"{name}.png", pixels)
-        write_exr(self.root / "gt" / f"{name}.exr", {f.name: getattr(truth, f.name) for f in fields(Truth)})
+        if raw is not None:
+            planes = {"": raw} if raw.ndim == 2 else dict(zip(("_r", "_g", "_b"), raw, strict=True))
+            pictures |= {f"raw/{name}{suffix}": plane for suffix, plane in planes.items()}
+        for path, pixels in pictures.items():
+            write_png(self.root / f"{path}.png", pixels)
+        layers = {f.name: getattr(truth, f.name) for f in fields(Truth)}
+        write_exr(self.root / "gt" / f"{name}.exr", {key: value for key, value in layers.items() if value is not None})
 
     def finish(
         self,
@@ -126,17 +133,19 @@ class DatasetWriter:
         points: np.ndarray,
         colors: np.ndarray,
         mesh: trimesh.Trimesh,
+        distortion: Sequence[float] = (),
     ) -> Dataset:
         """Write points.ply, mesh.ply and, last, transforms.json; returns the dataset as it reads back.
 
-        train, test: (frame name, camera, sun) of each frame; points: [N, 3] metres; colors: [N, 3] uint8.
+        train, test: (frame name, camera, sun) of each frame; points: [N, 3] metres; colors: [N, 3] uint8;
+        distortion: Brown-Conrady k1, k2, p1, p2, k3 of all frames, () none.
         """
         missing = [name for name, _, _ in (*train, *test) if not self.has(name)]
         if missing:
             raise WorkError(f"{self.root}: expected all frames to be written, {missing[0]} is not")
         write_points(self.root / "points.ply", points, colors)
         write_bytes(self.root / "mesh.ply", mesh.export(file_type="ply", vertex_normal=False))
-        write_json(self.root / "transforms.json", _describe_frames(train, test))
+        write_json(self.root / "transforms.json", _describe_frames(train, test, distortion))
         return read_dataset(self.root)
 
     def _check_resumable(self, scene: Mapping[str, Any], resume: bool) -> None:
@@ -156,13 +165,6 @@ class DatasetWriter:
             _log.warning("depth/*.png: surfaces beyond 65.535 m are stored as 0; gt/*.exr has their depth")
             self._warned = True
         return np.where(beyond, 0, steps).astype(np.uint16)
-
-
-def encode_image(radiance: np.ndarray, alpha: np.ndarray, exposure: float) -> np.ndarray:
-    """[H, W, 4] uint8 sRGB, straight alpha, of linear radiance [H, W, 3] that is weighted by alpha [H, W]."""
-    straight = radiance / np.where(alpha > 0, alpha, 1)[..., None]
-    values = np.concatenate([srgb_from_linear(exposure * straight), np.clip(alpha, 0, 1)[..., None]], axis=-1)
-    return np.round(255 * values).astype(np.uint8)
 
 
 def write_points(path: Path, points: ArrayLike, colors: ArrayLike) -> None:
@@ -236,7 +238,7 @@ def _read_label(path: Path, camera: Camera) -> None:
 
 
 def _describe_frames(
-    train: Sequence[tuple[str, Camera, Sun]], test: Sequence[tuple[str, Camera, Sun]]
+    train: Sequence[tuple[str, Camera, Sun]], test: Sequence[tuple[str, Camera, Sun]], distortion: Sequence[float]
 ) -> dict[str, Any]:
     """transforms.json: intrinsics stand at the top where all frames share them."""
     intrinsics = [_describe_intrinsics(camera) for _, camera, _ in (*train, *test)]
@@ -262,6 +264,7 @@ def _describe_frames(
     return {
         "camera_model": "OPENCV",
         **(intrinsics[0] if shared and intrinsics else {}),
+        **dict(zip(("k1", "k2", "p1", "p2", "k3"), distortion, strict=False)),
         "ply_file_path": "points.ply",
         "mesh_path": "mesh.ply",
         "train_filenames": [f"images/{name}.png" for name, _, _ in train],

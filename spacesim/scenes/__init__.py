@@ -1,19 +1,24 @@
 """Spacecraft under the Sun, path-traced with all their truth: `generate` writes a dataset."""
 
-from spacesim.scenes.generate import GenerateConfig, generate
+from spacesim.scenes.build import build
+from spacesim.scenes.config import SceneConfig, with_options
+from spacesim.scenes.generate import generate
 from spacesim.scenes.render import Renderer
-from spacesim.scenes.scene import BUILT_IN_SCENES, Scene, SceneObject, built_in_scene
+from spacesim.scenes.scene import Scene, SceneObject
+from spacesim.scenes.scenefile import BUILT_IN_SCENES, read_scene
 from spacesim.scenes.spacecraft import Part, Spacecraft, boxsat
 
 __all__ = [
     "BUILT_IN_SCENES",
-    "GenerateConfig",
     "Part",
     "Renderer",
     "Scene",
+    "SceneConfig",
     "SceneObject",
     "Spacecraft",
     "boxsat",
-    "built_in_scene",
+    "build",
     "generate",
+    "read_scene",
+    "with_options",
 ]

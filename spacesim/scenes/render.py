@@ -5,7 +5,7 @@ in a fixed order: splatting into a film adds floats in whatever order threads ar
 through the pixel's centre, so that none is ever averaged. Same seed, same backend: same bits.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import drjit as dr
@@ -15,11 +15,16 @@ from spacesim import backend
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_NONE, SHADOW_SELF_CAST
+from spacesim.scenes.emitters import Limb
 from spacesim.scenes.scene import Scene, load
-from spacesim.scenes.shapes import frame
+from spacesim.scenes.visibility import SunVisibility
 
 MAX_WAVEFRONT = 1 << 22
 """Most samples in flight at once: more are rendered in several passes."""
+
+UNDISTORT_STEPS = 12
+
+_EARTH = 1  # stream of random numbers
 
 _R2_STEPS = (3242174889, 2447445414)
 """2^32 / g and 2^32 / g^2 with g^3 = g + 1 (Roberts 2018, "The unreasonable effectiveness of quasirandom
@@ -31,38 +36,36 @@ _DIRECTIONS = fibonacci_sphere(64)
 class Renderer:
     """A scene loaded once, from which frames are rendered under any Sun.
 
-    spp: samples a pixel; max_depth: longest path in edges from camera to Sun (2 is direct light only).
+    spp: samples a pixel; max_depth: longest path in edges from camera to source (2 is direct light only);
+    distortion: Brown-Conrady k1, k2, p1, p2, k3 of the lens, () none.
     """
 
-    def __init__(self, scene: Scene, spp: int, max_depth: int = 6) -> None:
+    def __init__(self, scene: Scene, spp: int, max_depth: int = 6, distortion: Sequence[float] = ()) -> None:
         mi = backend.mitsuba()
         self.scene = scene
         self.spp = spp
-        self._sun: Sun | None = None
-        self._scene = load(scene)
-        self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
+        self._distortion = tuple(distortion)
+        self._loaded = load(scene)
+        self._scene = self._loaded.sunlit
+        self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
         self._sampler = mi.load_dict({"type": "independent"})
-        self._parameters = mi.traverse(self._scene)
         self._labels_of_shape = _labels_of_shape(scene, self._scene)
+        self._textured = _textured(self._labels_of_shape, scene)
+        limb = Limb(scene.earth) if scene.earth else None
+        self._visibility = SunVisibility(self._scene, scene.sun, limb)
 
-    def render(self, camera: Camera, sun: Sun, seed: int | Sequence[int]) -> Truth:
+    def render(self, camera: Camera, sun: Sun, seed: Sequence[int]) -> Truth:
         """What `camera` sees under `sun`; `seed` makes the noise."""
-        self._point_sun(sun)
-        radiance, alpha = self._radiance(camera, seed)
-        return Truth(radiance=radiance, alpha=alpha, **self._labels(camera, sun))
+        self._loaded.point(sun)
+        radiance, alpha = self._radiance(self._scene, camera, seed)
+        earth = None
+        if self._loaded.earthlit is not None:
+            earth, _ = self._radiance(self._loaded.earthlit, camera, (*seed, _EARTH))
+            radiance = radiance + earth
+        return Truth(radiance=radiance, alpha=alpha, **self._labels(camera, sun), radiance_earth=earth)
 
-    def _point_sun(self, sun: Sun) -> None:
-        if self._sun is not None and np.array_equal(sun.direction, self._sun.direction):
-            return
-        mi = backend.mitsuba()
-        to_world = mi.AffineTransform4f(mi.Matrix4f(frame([0, 0, 0], -sun.direction)))
-        dr.make_opaque(to_world)
-        self._parameters["sun.to_world"] = to_world
-        self._parameters.update()
-        self._sun = sun
-
-    def _radiance(self, camera: Camera, seed: int | Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Radiance [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
+    def _radiance(self, scene: Any, camera: Camera, seed: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Radiance from one source [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
         mi = backend.mitsuba()
         pixels = camera.width * camera.height
         passes = min(self.spp, -(-self.spp * pixels // MAX_WAVEFRONT))
@@ -75,8 +78,8 @@ class Renderer:
             lane = dr.arange(mi.UInt32, spp * pixels)
             pixel = lane // spp
             offset = _pixel_offsets(pixel, lane - pixel * spp + dr.opaque(mi.UInt32, first), int(seeds[0]))
-            ray = _primary_rays(camera, pixel, offset)
-            radiance, hit, _ = self._integrator.sample(self._scene, self._sampler, ray)
+            ray = _primary_rays(camera, pixel, offset, self._distortion)
+            radiance, hit, _ = self._integrator.sample(scene, self._sampler, ray)
             channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
             dr.eval(channels)
             sums += np.stack([dr.block_sum(x, spp, mode="evaluated").numpy() for x in channels])
@@ -87,20 +90,22 @@ class Renderer:
         """All fields of Truth but radiance and alpha, from the ray through each pixel's centre."""
         mi = backend.mitsuba()
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
-        ray = _primary_rays(camera, pixel, mi.Point2f(0.5))
+        ray = _primary_rays(camera, pixel, mi.Point2f(0.5), self._distortion)
         surface = self._scene.ray_intersect(ray)
         hit = surface.is_valid()
         normal = dr.select(dr.dot(surface.n, ray.d) > 0, -surface.n, surface.n)
         object_id, part_id, albedo = self._labels_of(surface.shape, hit)
+        if self._textured is not None:
+            textured = dr.gather(mi.Bool, self._textured, dr.reinterpret_array(mi.UInt32, surface.shape), hit)
+            looked_up = surface.bsdf().eval_diffuse_reflectance(surface, textured)
+            albedo = dr.select(textured, looked_up, albedo)
 
-        to_sun = _vector(sun.direction)
-        cosine = dr.dot(normal, to_sun)
+        cosine = dr.dot(normal, _vector(sun.direction))
         faces_sun = hit & (cosine > 0)
-        blocker = self._scene.ray_intersect_preliminary(surface.spawn_ray(to_sun), active=faces_sun)
-        blocked = faces_sun & blocker.is_valid()
-        blocker_id, _, _ = self._labels_of(blocker.shape, blocked)
-        cast = SHADOW_SELF_CAST + dr.select(blocker_id == object_id, 0, blocker_id)
-        shadow = dr.select(blocked, cast, SHADOW_LIT)
+        visibility, blocker = self._visibility(surface, normal, faces_sun, sun)
+        blocker_id, _, _ = self._labels_of(blocker, faces_sun)
+        cast = SHADOW_SELF_CAST + dr.select((blocker_id == 0) | (blocker_id == object_id), 0, blocker_id)
+        shadow = dr.select(visibility < 0.5, cast, SHADOW_LIT)
         shadow = dr.select(hit, dr.select(faces_sun, shadow, SHADOW_ATTACHED), SHADOW_NONE)
 
         axis = _vector(camera.world_from_camera[:3, 2])
@@ -112,7 +117,7 @@ class Renderer:
             "albedo": albedo,
             "object_id": object_id,
             "part_id": part_id,
-            "sun_visibility": dr.select(faces_sun & ~blocked, mi.Float(1.0), 0.0),
+            "sun_visibility": dr.select(faces_sun, visibility, 0.0),
             "sun_cosine": dr.select(hit, cosine, 0.0),
             "shadow": shadow,
         }
@@ -157,14 +162,29 @@ class Renderer:
         return free.numpy().reshape(len(points), -1).any(axis=1)
 
 
-def _primary_rays(camera: Camera, pixel: Any, offset: Any) -> Any:
+def _primary_rays(camera: Camera, pixel: Any, offset: Any, distortion: Sequence[float]) -> Any:
     """Rays through pixels (index row by row), each at an `offset` in [0, 1)^2 from the pixel's upper left."""
     mi = backend.mitsuba()
     right, down, forward, origin = (_vector(camera.world_from_camera[:3, i]) for i in range(4))
     fx, fy, cx, cy = (dr.opaque(mi.Float, float(x)) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
     x = (mi.Float(pixel % camera.width) + offset.x - cx) / fx
     y = (mi.Float(pixel // camera.width) + offset.y - cy) / fy
+    if distortion:
+        x, y = _undistorted(x, y, [dr.opaque(mi.Float, float(k)) for k in distortion])
     return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(origin), dr.normalize(x * right + y * down + forward)))
+
+
+def _undistorted(x: Any, y: Any, distortion: Sequence[Any]) -> tuple[Any, Any]:
+    """Where a distorted point of the plane at depth 1 is without distortion: the Brown-Conrady model is solved by repeated
+    substitution (as OpenCV's undistortPoints does), which settles to float32 for lenses that image without folds."""
+    k1, k2, p1, p2, k3 = distortion
+    u, v = x, y
+    for _ in range(UNDISTORT_STEPS):
+        r2 = u * u + v * v
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        du, dv = 2 * p1 * u * v + p2 * (r2 + 2 * u * u), p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
+        u, v = (x - du) / radial, (y - dv) / radial
+    return u, v
 
 
 def _pixel_offsets(pixel: Any, sample: Any, seed: int) -> Any:
@@ -187,6 +207,20 @@ def _vector(values: Array) -> Any:
     vector = backend.mitsuba().Vector3f(values.tolist())
     dr.make_opaque(vector)
     return vector
+
+
+def _textured(labels_of_shape: tuple[Any, Any, Any], scene: Scene) -> Any:
+    """Which shapes, by number, have an albedo that varies over them; None where none has."""
+    mi = backend.mitsuba()
+    varied = [False, *(_has_color_image(p.part.material.bsdf) for p in scene.parts)]
+    return dr.gather(mi.Bool, mi.Bool(varied), labels_of_shape[1]) if any(varied) else None
+
+
+def _has_color_image(bsdf: Mapping[str, Any]) -> bool:
+    """Conductors have no diffuse reflectance to look up."""
+    if bsdf.get("type") in ("bitmap", "roughconductor", "conductor"):
+        return bsdf["type"] == "bitmap" and not bsdf.get("raw", False)
+    return any(_has_color_image(value) for value in bsdf.values() if isinstance(value, Mapping))
 
 
 def _labels_of_shape(scene: Scene, loaded: Any) -> tuple[Any, Any, Any]:

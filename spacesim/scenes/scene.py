@@ -1,6 +1,7 @@
-"""A scene: objects (a spacecraft and its pose each), and its one way into Mitsuba."""
+"""A scene: objects (a spacecraft and its pose each) and what shines on them, and their one way into Mitsuba."""
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -12,9 +13,11 @@ from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
+from spacesim.scenes.earth import EarthConfig
+from spacesim.scenes.emitters import earthshine, solar_disc
 from spacesim.scenes.materials import Material
-from spacesim.scenes.spacecraft import Part, Spacecraft, boxsat
-from spacesim.scenes.sun import SOLAR_IRRADIANCE, directional
+from spacesim.scenes.spacecraft import Part, Spacecraft
+from spacesim.scenes.sun import SunConfig
 
 MOST_OBJECTS, MOST_PARTS = 84, 255  #: 170 + object id is a shadow class below 255, part ids are bytes
 
@@ -44,11 +47,12 @@ class PlacedPart:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is rendered: objects under the Sun, nothing else."""
+    """What is rendered: objects under the Sun and, perhaps, the Earth."""
 
     name: str
     objects: tuple[SceneObject, ...]
-    irradiance: float = SOLAR_IRRADIANCE  #: of the Sun, W m^-2 in each of R, G and B
+    sun: SunConfig = field(default_factory=SunConfig)
+    earth: EarthConfig | None = None
 
     def __post_init__(self) -> None:
         parts = sum(len(item.spacecraft.parts) for item in self.objects)
@@ -107,53 +111,89 @@ class Scene:
                 }
                 for p in self.parts
             ],
-            "materials": {
-                name: {"albedo": list(material.albedo), "bsdf": material.bsdf, "source": material.source}
-                for name, material in self.materials.items()
-            },
-            "sun_irradiance": self.irradiance,
+            "materials": {name: _describe_material(material) for name, material in self.materials.items()},
+            "sun_irradiance": self.sun.irradiance.tolist(),
+            "sun_angular_radius_deg": float(np.degrees(self.sun.angular_radius)),
         }
 
 
-def _boxsat_scene() -> Scene:
-    return Scene("boxsat", (SceneObject(boxsat()),))
+def _describe_material(material: Material) -> dict[str, Any]:
+    digests = {name: hashlib.sha256(image.tobytes()).hexdigest() for name, image in material.images.items()}
+    described = {"albedo": list(material.albedo), "bsdf": material.bsdf, "source": material.source}
+    return {**described, "images": digests} if digests else described
 
 
-def _boxsat_pair_scene() -> Scene:
-    """Two boxsats, the second at [-3, -3, -3] m (thesis 4.3.6)."""
-    second = np.eye(4)
-    second[:3, 3] = -3.0
-    return Scene("boxsat-pair", (SceneObject(boxsat()), SceneObject(boxsat(), second)))
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """A scene in Mitsuba. sunlit and earthlit (None without an Earth) hold the same shapes, and one emitter each."""
+
+    sunlit: Any
+    sun: Any
+    earthlit: Any = None
+    earth: Any = None
+
+    def point(self, sun: Sun) -> None:
+        """Move the Sun; the Earth's phase follows."""
+        self.sun.point(sun)
+        if self.earth is not None:
+            self.earth.point(sun)
 
 
-_BUILT_IN: dict[str, Callable[[], Scene]] = {"boxsat": _boxsat_scene, "boxsat-pair": _boxsat_pair_scene}
-BUILT_IN_SCENES = tuple(_BUILT_IN)
-
-
-def built_in_scene(name: str) -> Scene:
-    """The built-in scene called `name`; InputError lists the names where there is none."""
-    if name not in _BUILT_IN:
-        raise InputError(f"scene: expected one of {', '.join(BUILT_IN_SCENES)}, found {name!r}")
-    return _BUILT_IN[name]()
-
-
-def load(scene: Scene, sun: Sun | None = None) -> Any:
-    """`scene` as a mitsuba.Scene: one flat-shaded mesh a part, and the emitter "sun" (along +x if not
-    given)."""
+def load(scene: Scene) -> Loaded:
+    """`scene` in Mitsuba: one flat-shaded mesh a part."""
     mi = backend.mitsuba()
-    bsdfs = {name: mi.load_dict(dict(material.bsdf)) for name, material in scene.materials.items()}
-    shapes = {p.shape_id: _mitsuba_mesh(p.shape_id, p.mesh, bsdfs[p.part.material.name]) for p in scene.parts}
-    sun = sun or Sun(np.array([1.0, 0.0, 0.0]))
-    return mi.load_dict({"type": "scene", "sun": directional(sun, scene.irradiance), **shapes})
+    keys = {p.shape_id: (p.part.material, not p.mesh.is_watertight) for p in scene.parts}
+    bsdfs = {key: _mitsuba_bsdf(*key) for key in dict.fromkeys(keys.values())}
+    shapes = {p.shape_id: _mitsuba_mesh(p, bsdfs[keys[p.shape_id]]) for p in scene.parts}
+    sun = solar_disc(scene.sun, scene.earth)
+    sunlit = mi.load_dict({"type": "scene", "sun": sun, **shapes})
+    if scene.earth is None:
+        return Loaded(sunlit, sun)
+    earth = earthshine(scene.earth, scene.sun)
+    return Loaded(sunlit, sun, mi.load_dict({"type": "scene", "earth": earth, **shapes}), earth)
 
 
-def _mitsuba_mesh(name: str, mesh: trimesh.Trimesh, bsdf: Any) -> Any:
+def _mitsuba_mesh(placed: PlacedPart, bsdf: Any) -> Any:
     mi = backend.mitsuba()
+    mesh, material = placed.mesh, placed.part.material
+    vertices, faces, uv = mesh.vertices, mesh.faces, None
+    if material.images:
+        uv = getattr(placed.part.mesh.visual, "uv", None)
+        if uv is None:  # corners of faces stand alone, so that each face has its own projection
+            uv = box_projection(placed.part.mesh)
+            vertices, faces = vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3)
+        uv = np.asarray(uv) / (material.tile or 1.0)
     properties = mi.Properties()
     properties["bsdf"] = bsdf
-    result = mi.Mesh(name, len(mesh.vertices), len(mesh.faces), props=properties)
+    result = mi.Mesh(placed.shape_id, len(vertices), len(faces), props=properties, has_vertex_texcoords=uv is not None)
     parameters = mi.traverse(result)
-    parameters["vertex_positions"] = mi.Float(np.asarray(mesh.vertices, dtype=np.float32).ravel())
-    parameters["faces"] = mi.UInt32(np.asarray(mesh.faces, dtype=np.uint32).ravel())
+    parameters["vertex_positions"] = mi.Float(np.asarray(vertices, dtype=np.float32).ravel())
+    parameters["faces"] = mi.UInt32(np.asarray(faces, dtype=np.uint32).ravel())
+    if uv is not None:
+        parameters["vertex_texcoords"] = mi.Float(np.asarray(uv, dtype=np.float32).ravel())
     parameters.update()
     return result
+
+
+def box_projection(mesh: trimesh.Trimesh) -> Array:
+    """[3 F, 2] metres: the corners of each face [F, 3], seen along the axis that its normal is nearest to."""
+    axis = np.abs(mesh.face_normals).argmax(axis=1)
+    across = np.array([[1, 2], [0, 2], [0, 1]])[axis]  # [F, 2]
+    return np.take_along_axis(mesh.triangles, across[:, None, :], axis=2).reshape(-1, 2)
+
+
+def _mitsuba_bsdf(material: Material, both_sides: bool) -> Any:
+    """A closed part shows its outside alone; an open one is the same on both sides."""
+    mi = backend.mitsuba()
+
+    def resolved(value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        if "image" not in value:
+            return {key: resolved(item) for key, item in value.items()}
+        bitmap = mi.Bitmap(np.ascontiguousarray(material.images[value["image"]]))
+        bitmap.set_srgb_gamma(not value.get("raw", False))
+        return {**{key: item for key, item in value.items() if key != "image"}, "bitmap": bitmap}
+
+    bsdf = resolved(material.bsdf)
+    return mi.load_dict({"type": "twosided", "bsdf": bsdf} if both_sides else bsdf)

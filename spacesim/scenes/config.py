@@ -1,0 +1,121 @@
+"""What a scene file says: spacecraft and poses, materials, sources, rig, camera, quality."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from spacesim.data.errors import InputError, expect
+from spacesim.scenes.camera import CameraConfig
+from spacesim.scenes.earth import EarthConfig
+from spacesim.scenes.rig import RIGS, FibonacciRig, RigConfig
+from spacesim.scenes.sun import SunConfig
+
+Vector = tuple[float, float, float]
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "in": 0.0254, "ft": 0.3048}
+"""Metres of the units that a mesh file may be in."""
+
+
+@dataclass(frozen=True)
+class ObjectConfig:
+    """An object and its pose. Raises InputError unless it names one of spacecraft and mesh.
+
+    spacecraft: a built-in one; mesh: a mesh file, relative to the scene file; name: "" the spacecraft's or the file's;
+    position: metres, world frame; rotation_wxyz: quaternion that turns body axes into world axes, of any length;
+    scale: factor on its size; units, up: of the mesh file, "" the format's own axis (z where it has none);
+    materials: a material's name for each part or pattern of parts ("panel_*"), the last that fits counts.
+    """
+
+    spacecraft: str = ""
+    mesh: str = ""
+    name: str = ""
+    position: Vector = (0.0, 0.0, 0.0)
+    rotation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    scale: float = 1.0
+    units: str = "m"
+    up: str = ""
+    materials: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        one = bool(self.spacecraft) != bool(self.mesh)
+        expect(one, "objects", "either spacecraft or mesh", "both" if self.mesh else "neither")
+        expect(all(map(math.isfinite, self.position)), "position", "finite metres", list(self.position))
+        turns = all(map(math.isfinite, self.rotation_wxyz)) and any(self.rotation_wxyz)
+        expect(turns, "rotation_wxyz", "four finite numbers, not all 0", list(self.rotation_wxyz))
+        expect(0 < self.scale < math.inf, "scale", "a factor above 0", self.scale)
+        expect(self.units in UNITS, "units", f"one of {', '.join(UNITS)}", self.units)
+        expect(self.up in ("", "x", "y", "z"), "up", "x, y or z", self.up)
+
+
+@dataclass(frozen=True)
+class MaterialConfig:
+    """A material of a scene file: a preset, changed. albedo: linear camera RGB, 0 to 1; roughness: GGX alpha; None: as
+    the preset."""
+
+    preset: str
+    albedo: Vector | None = None
+    roughness: float | None = None
+
+    def __post_init__(self) -> None:
+        albedo = self.albedo or (0.0,)
+        expect(min(albedo) >= 0 and max(albedo) <= 1, "albedo", "fractions from 0 to 1", self.albedo)
+        expect(self.roughness is None or 0.01 <= self.roughness <= 1, "roughness", "0.01 to 1", self.roughness)
+
+
+@dataclass(frozen=True)
+class QualityConfig:
+    """spp: samples a pixel; max_depth: longest light path in edges, 2 is direct light alone; points: surface samples in
+    points.ply. Raises InputError for a value out of range."""
+
+    spp: int = 64
+    max_depth: int = 6
+    points: int = 20_000
+
+    def __post_init__(self) -> None:
+        for name, lowest in {"spp": 1, "max_depth": 2, "points": 1}.items():
+            expect(getattr(self, name) >= lowest, name, f"at least {lowest}", getattr(self, name))
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """All of a scene. seed: of view lattices, noise and points; folder: where relative paths of meshes begin."""
+
+    name: str
+    objects: tuple[ObjectConfig, ...]
+    seed: int = 0
+    materials: Mapping[str, MaterialConfig] = field(default_factory=dict)
+    sun: SunConfig = field(default_factory=SunConfig)
+    earth: EarthConfig | None = None
+    rig: RigConfig = field(default_factory=FibonacciRig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    quality: QualityConfig = field(default_factory=QualityConfig)
+    folder: Path | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        expect(bool(self.name), "name", "a name", self.name)
+        expect(len(self.objects) > 0, "objects", "at least one object", "none")
+        expect(self.seed >= 0, "seed", "at least 0", self.seed)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain JSON values, without the folder: a dataset does not depend on where its scene file lay."""
+        values = {key: value for key, value in asdict(replace(self, folder=None)).items() if key != "folder"}
+        kind = next(name for name, rig in RIGS.items() if type(self.rig) is rig)
+        return {**values, "rig": {"kind": kind, **values["rig"]}}
+
+
+def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
+    """`scene` with fields of its own, its rig, camera or quality changed by name; None changes nothing.
+
+    Raises InputError for a name that this scene's rig does not know, or a value out of range.
+    """
+    changes: dict[str, dict[str, Any]] = {"": {}, "rig": {}, "camera": {}, "quality": {}}
+    owners = {part: {f.name for f in fields(getattr(scene, part) if part else scene)} for part in changes}
+    for name, value in options.items():
+        part = next((part for part, known in owners.items() if name in known), None)
+        if part is None:
+            raise InputError(f"{name}: expected an option that {scene.name}'s {type(scene.rig).__name__} knows")
+        if value is not None:
+            changes[part][name] = value
+    parts = {part: replace(getattr(scene, part), **changed) for part, changed in changes.items() if part}
+    return replace(scene, **changes[""], **parts)

@@ -1,0 +1,48 @@
+"""The Earth as a second source: a Lambertian sphere, lit by the same Sun, that fills part of the sky."""
+
+import math
+from dataclasses import dataclass
+
+from spacesim.data.errors import expect
+from spacesim.data.geometry import Array, direction_from_angles
+
+EARTH_RADIUS_KM = 6371.0084
+"""Arithmetic mean radius of the Earth (Moritz 2000, "Geodetic Reference System 1980")."""
+
+EARTH_ALBEDO = 0.294
+"""Bond albedo of the Earth (Stephens et al. 2015, "The albedo of Earth", Reviews of Geophysics 53: 0.29)."""
+
+
+@dataclass(frozen=True)
+class EarthConfig:
+    """Where the Earth is and how bright. Raises InputError for a value out of range.
+
+    azimuth_deg, elevation_deg: direction from the scene towards the Earth's centre, world frame; altitude_km: of the
+    scene above the ground; albedo: of the sphere, the same in all channels.
+    """
+
+    azimuth_deg: float = 0.0
+    elevation_deg: float = -90.0
+    altitude_km: float = 500.0
+    albedo: float = EARTH_ALBEDO
+
+    def __post_init__(self) -> None:
+        expect(math.isfinite(self.azimuth_deg), "azimuth_deg", "a finite angle", self.azimuth_deg)
+        expect(-90 <= self.elevation_deg <= 90, "elevation_deg", "an angle from -90 to 90 degrees", self.elevation_deg)
+        expect(10 <= self.altitude_km <= 1e7, "altitude_km", "an altitude from 10 to 10,000,000 km", self.altitude_km)
+        expect(0 <= self.albedo <= 1, "albedo", "a fraction from 0 to 1", self.albedo)
+
+    @property
+    def direction(self) -> Array:
+        """[3] unit vector towards the Earth's centre."""
+        return direction_from_angles(self.azimuth_deg, self.elevation_deg)
+
+    @property
+    def distance(self) -> float:
+        """Of the Earth's centre, in Earth radii."""
+        return 1 + self.altitude_km / EARTH_RADIUS_KM
+
+    @property
+    def angular_radius(self) -> float:
+        """Radians from the Earth's centre to its limb."""
+        return math.asin(1 / self.distance)
