@@ -1,5 +1,8 @@
-"""Watertight, outward-oriented meshes that spacecraft are built from: boxes, rods, revolved profiles.
-Metres."""
+"""Watertight, outward-oriented meshes that spacecraft are built from: boxes, rods, pipes, revolved profiles and
+sectors of them. Metres.
+"""
+
+from collections.abc import Sequence
 
 import numpy as np
 import trimesh
@@ -72,6 +75,90 @@ def revolved(profile: ArrayLike, segments: int = SEGMENTS) -> trimesh.Trimesh:
     return mesh
 
 
+def dome(radius: float, height: float, rings: int = 12) -> list[tuple[float, float]]:
+    """Profile [(radius, z)] of half an ellipse of revolution, from its rim (radius, 0) to its pole (0, height)."""
+    angle = np.linspace(0.0, 0.5 * np.pi, rings + 1)
+    points = np.stack([radius * np.cos(angle), height * np.sin(angle)], axis=-1)
+    points[-1, 0] = 0.0
+    return [(float(r), float(z)) for r, z in points]
+
+
+def sector(profile: ArrayLike, start_deg: float, end_deg: float, segments: int = 24) -> trimesh.Trimesh:
+    """The solid that `profile` [P, 2] of (radius > 0, z) sweeps about the z axis from azimuth `start_deg` to
+    `end_deg`, closed by a flat face at either end.
+
+    The profile is a convex polygon, counter-clockwise in the (radius, z) plane.
+    """
+    profile = np.asarray(profile, dtype=np.float64)
+    count = len(profile)
+    angle = np.radians(np.linspace(start_deg, end_deg, segments + 1))
+    radius, z = profile[:, 0], np.broadcast_to(profile[:, 1], (segments + 1, count))
+    vertices = np.stack([np.outer(np.cos(angle), radius), np.outer(np.sin(angle), radius), z], axis=-1)
+    grid = np.arange((segments + 1) * count).reshape(segments + 1, count)
+    a, d = grid[:-1], grid[1:]
+    b, c = np.roll(a, -1, axis=1), np.roll(d, -1, axis=1)
+    sides = np.concatenate([np.stack([a, d, b], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
+    fan = np.array([[0, i, i + 1] for i in range(1, count - 1)])
+    faces = np.concatenate([sides, grid[0][fan], grid[-1][fan][:, ::-1]])
+    return trimesh.Trimesh(vertices.reshape(-1, 3), faces, process=False)
+
+
+def prism(outline: ArrayLike, height: float) -> trimesh.Trimesh:
+    """The solid over the convex, counter-clockwise polygon `outline` [P, 2] in the xy plane, from z = 0 to
+    `height`."""
+    outline = np.asarray(outline, dtype=np.float64)
+    count = len(outline)
+    vertices = np.concatenate([np.c_[outline, np.zeros(count)], np.c_[outline, np.full(count, height)]])
+    index = np.arange(count)
+    ahead = np.roll(index, -1)
+    sides = np.concatenate(
+        [np.stack([index, ahead, index + count], -1), np.stack([ahead, ahead + count, index + count], -1)]
+    )
+    fan = np.array([[0, i, i + 1] for i in range(1, count - 1)])
+    return trimesh.Trimesh(vertices, np.concatenate([sides, fan[:, ::-1], fan + count]), process=False)
+
+
+def pipe(points: ArrayLike, radius: float, segments: int = 12) -> trimesh.Trimesh:
+    """A bent round bar through `points` [P, 3], at least two: mitred at every bend, flat at either end.
+
+    The cross-section is carried along without twist. No bend may be sharper than 90 degrees.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    heading = normalize(np.diff(points, axis=0))
+    angle = np.arange(segments) * (2.0 * np.pi / segments)
+    turn = frame(points[0], heading[0])[:3, :3]
+    ring = points[0] + radius * (np.outer(np.cos(angle), turn[:, 0]) + np.outer(np.sin(angle), turn[:, 1]))
+    rings = [ring]
+    for i, point in enumerate(points[1:]):
+        mitre = normalize(heading[i] + heading[min(i + 1, len(heading) - 1)])
+        step = (point - ring) @ mitre / (heading[i] @ mitre)  # along the segment until the plane of the bend
+        ring = ring + step[:, None] * heading[i]
+        rings.append(ring)
+    vertices = np.concatenate([*rings, points[[0, -1]]])
+    grid = np.arange(len(points) * segments).reshape(len(points), segments)
+    a, b = grid[:-1], np.roll(grid[:-1], -1, axis=1)
+    d, c = grid[1:], np.roll(grid[1:], -1, axis=1)
+    first, last = grid[0], grid[-1]
+    bottom, top = len(vertices) - 2, len(vertices) - 1
+    faces = np.concatenate(
+        [
+            np.stack([a, b, d], -1).reshape(-1, 3),
+            np.stack([b, c, d], -1).reshape(-1, 3),
+            np.stack([np.roll(first, -1), first, np.full(segments, bottom)], -1),
+            np.stack([last, np.roll(last, -1), np.full(segments, top)], -1),
+        ]
+    )
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def handrail(start: ArrayLike, end: ArrayLike, away: ArrayLike, height: float, radius: float) -> trimesh.Trimesh:
+    """A bent bar that leaves the surface at `start` [3], runs `height` above it along direction `away` [3], and
+    comes back at `end` [3]."""
+    start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    lift = height * normalize(np.asarray(away, dtype=np.float64))
+    return pipe([start, start + lift, end + lift, end], radius, 8)
+
+
 def along(mesh: trimesh.Trimesh, start: ArrayLike, end: ArrayLike) -> trimesh.Trimesh:
     """`mesh` with z in [0, 1] stretched and turned so that its axis runs from `start` [3] to `end` [3]."""
     start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
@@ -99,6 +186,20 @@ def frame(origin: ArrayLike, axis: ArrayLike) -> Array:
     return transform
 
 
-def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+def turned(mesh: trimesh.Trimesh, angle_deg: float, axis: ArrayLike, about: ArrayLike = (0, 0, 0)) -> trimesh.Trimesh:
+    """`mesh` turned by `angle_deg` about the line through `about` [3] along `axis` [3], right-handed."""
+    mesh = mesh.copy()
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.radians(angle_deg), axis, about))
+    return mesh
+
+
+def moved(mesh: trimesh.Trimesh, offset: ArrayLike) -> trimesh.Trimesh:
+    """`mesh` moved by `offset` [3]."""
+    mesh = mesh.copy()
+    mesh.apply_translation(offset)
+    return mesh
+
+
+def joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """Several solids as one mesh."""
-    return trimesh.util.concatenate(meshes)
+    return trimesh.util.concatenate(list(meshes))

@@ -7,8 +7,8 @@ import numpy as np
 import trimesh
 
 from spacesim.data.geometry import normalize
-from spacesim.scenes import materials as m
 from spacesim.scenes import shapes as s
+from spacesim.scenes.materials import material
 from spacesim.scenes.spacecraft.part import Part, Spacecraft
 
 BUS = np.array([1.4, 1.2, 1.5])
@@ -37,13 +37,13 @@ def _bus() -> list[Part]:
     nozzle.apply_translation([0, 0, -z - 0.03])
     rails = [s.box([0.05, 0.05, BUS[2]], [i * x, j * y, 0]) for i in (-1, 1) for j in (-1, 1)]
     return [
-        Part("bus", s.crumpled_box(BUS, levels=4, depth=0.007, seed=1), m.GOLD_FOIL),
-        Part("deck_top", s.box(deck, [0, 0, z + 0.01]), m.CARBON_FIBRE),
-        Part("deck_bottom", s.box(deck, [0, 0, -z - 0.01]), m.CARBON_FIBRE),
-        Part("rails", s.joined(rails), m.ALUMINIUM),
-        Part("radiator", s.box([0.03, 0.9, 1.0], [-x - 0.01, 0, 0.1]), m.WHITE_PAINT),
-        Part("adapter_ring", ring, m.ALUMINIUM),
-        Part("nozzle", nozzle, m.ALUMINIUM),
+        Part("bus", s.crumpled_box(BUS, levels=4, depth=0.007, seed=1), material("gold-mli")),
+        Part("deck_top", s.box(deck, [0, 0, z + 0.01]), material("carbon-fibre")),
+        Part("deck_bottom", s.box(deck, [0, 0, -z - 0.01]), material("carbon-fibre")),
+        Part("rails", s.joined(rails), material("bare-aluminium")),
+        Part("radiator", s.box([0.03, 0.9, 1.0], [-x - 0.01, 0, 0.1]), material("white-paint")),
+        Part("adapter_ring", ring, material("bare-aluminium")),
+        Part("nozzle", nozzle, material("bare-aluminium")),
     ]
 
 
@@ -69,16 +69,16 @@ def _panel(name: str, side: float) -> list[Part]:
         for x in (-1.0, 1.0)
     ]
     solids = [
-        ("panel", substrate, m.CARBON_FIBRE),
-        ("cells", s.joined(cells), m.SOLAR_CELL),
-        ("yoke", bar, m.ALUMINIUM),
-        ("hinge", hub, m.ALUMINIUM),
-        ("strut_1", struts[0], m.ALUMINIUM),
-        ("strut_2", struts[1], m.ALUMINIUM),
+        ("panel", substrate, material("carbon-fibre")),
+        ("cells", s.joined(cells), material("solar-cell")),
+        ("yoke", bar, material("bare-aluminium")),
+        ("hinge", hub, material("bare-aluminium")),
+        ("strut_1", struts[0], material("bare-aluminium")),
+        ("strut_2", struts[1], material("bare-aluminium")),
     ]
     for _, mesh, _ in solids:
         mesh.apply_transform(turn)
-    return [Part(f"{part}_{name}", mesh, material) for part, mesh, material in solids]
+    return [Part(f"{part}_{name}", mesh, surface) for part, mesh, surface in solids]
 
 
 def _camera() -> list[Part]:
@@ -91,12 +91,12 @@ def _camera() -> list[Part]:
     bulge = np.stack([0.4 * np.sin(angle), 0.05 + 0.4 * np.cos(angle) - 0.4 * np.cos(angle[-1])], axis=-1)
     lens = s.revolved(np.concatenate([[(0, 0.05)], bulge[::-1]]))
     solids = [
-        ("camera_barrel", barrel, m.WHITE_PAINT),
-        ("camera_flange", flange, m.ALUMINIUM),
-        ("camera_recess", recess, m.BLACK_PAINT),
-        ("camera_lens", lens, m.LENS),
+        ("camera_barrel", barrel, material("white-paint")),
+        ("camera_flange", flange, material("bare-aluminium")),
+        ("camera_recess", recess, material("black-paint")),
+        ("camera_lens", lens, material("glass")),
     ]
-    return [Part(name, s.placed(mesh, start, axis), material) for name, mesh, material in solids]
+    return [Part(name, s.placed(mesh, start, axis), surface) for name, mesh, surface in solids]
 
 
 def _dish() -> list[Part]:
@@ -112,14 +112,14 @@ def _dish() -> list[Part]:
     struts = [s.rod([x, y, 0.16 / (4 * focal) - 0.005], feed, 0.008, 12) for x, y in rim]
     horn = s.revolved([(0, focal - 0.04), (0.055, focal - 0.04), (0.035, focal + 0.05), (0, focal + 0.05)])
     solids = [
-        ("dish", s.dish(0.9, focal, 0.015), m.DISH_WHITE),
-        ("dish_struts", s.joined(struts), m.CARBON_FIBRE),
-        ("dish_feed", horn, m.ALUMINIUM),
-        ("dish_hub", s.rod([0, 0, -0.12], [0, 0, -0.01], 0.09, s.SEGMENTS), m.ALUMINIUM),
+        ("dish", s.dish(0.9, focal, 0.015), material("white-paint-matt")),
+        ("dish_struts", s.joined(struts), material("carbon-fibre")),
+        ("dish_feed", horn, material("bare-aluminium")),
+        ("dish_hub", s.rod([0, 0, -0.12], [0, 0, -0.01], 0.09, s.SEGMENTS), material("bare-aluminium")),
     ]
-    parts = [Part(name, mesh.apply_transform(place), material) for name, mesh, material in solids]
+    parts = [Part(name, mesh.apply_transform(place), surface) for name, mesh, surface in solids]
     stem = s.rod(foot, vertex - 0.07 * axis, 0.04, 36)
-    return [Part("dish_stem", stem, m.ALUMINIUM), *parts]
+    return [Part("dish_stem", stem, material("bare-aluminium")), *parts]
 
 
 def _sensors() -> list[Part]:
@@ -132,12 +132,12 @@ def _sensors() -> list[Part]:
     ]
     blocks = [s.box([0.16, 0.16, 0.13], [0.42, y, top + 0.06]) for y in (0.38, -0.38)]
     return [
-        Part("tracker_1_block", blocks[0], m.ALUMINIUM),
-        Part("tracker_1_baffle", trackers[0], m.BLACK_PAINT),
-        Part("tracker_2_block", blocks[1], m.ALUMINIUM),
-        Part("tracker_2_baffle", trackers[1], m.BLACK_PAINT),
-        Part("patch_antenna", s.box([0.3, 0.3, 0.05], [-0.42, -0.33, top + 0.02]), m.WHITE_PAINT),
-        Part("electronics", s.box([0.22, 0.26, 0.3], [0.5 * BUS[0] + 0.09, -0.38, 0.42]), m.BLACK_PAINT),
+        Part("tracker_1_block", blocks[0], material("bare-aluminium")),
+        Part("tracker_1_baffle", trackers[0], material("black-paint")),
+        Part("tracker_2_block", blocks[1], material("bare-aluminium")),
+        Part("tracker_2_baffle", trackers[1], material("black-paint")),
+        Part("patch_antenna", s.box([0.3, 0.3, 0.05], [-0.42, -0.33, top + 0.02]), material("white-paint")),
+        Part("electronics", s.box([0.22, 0.26, 0.3], [0.5 * BUS[0] + 0.09, -0.38, 0.42]), material("black-paint")),
     ]
 
 
@@ -147,6 +147,6 @@ def _boom() -> list[Part]:
     end = start + 1.2 * normalize([-1.0, -0.25, -0.2])
     head = s.box([0.12, 0.12, 0.16], end)
     return [
-        Part("boom", s.rod(start, end, 0.018, 18), m.BOOM_GREY),
-        Part("magnetometer", head, m.WHITE_PAINT),
+        Part("boom", s.rod(start, end, 0.018, 18), material("grey-paint")),
+        Part("magnetometer", head, material("white-paint")),
     ]

@@ -4,9 +4,17 @@ from collections.abc import Callable
 
 from spacesim.data.errors import InputError
 from spacesim.scenes.spacecraft.boxsat import boxsat
+from spacesim.scenes.spacecraft.cubesat import cubesat
 from spacesim.scenes.spacecraft.part import Spacecraft
+from spacesim.scenes.spacecraft.small_body import small_body
+from spacesim.scenes.spacecraft.telescope import telescope
 
-_BUILT_IN: dict[str, Callable[[], Spacecraft]] = {"boxsat": boxsat}
+_BUILT_IN: dict[str, Callable[[], Spacecraft]] = {
+    "boxsat": boxsat,
+    "telescope": telescope,
+    "cubesat": cubesat,
+    "small-body": small_body,
+}
 SPACECRAFT = tuple(_BUILT_IN)  #: names of the built-in spacecraft
 
 
