@@ -15,12 +15,12 @@ from spacesim.data.images import load_image, write_png
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_SELF_CAST, load_truth
 from spacesim.eval.pictures import ERROR_SCALE, as_bytes, error_picture
-from spacesim.scenes import GenerateConfig, generate
+from spacesim.scenes import generate, read_scene
 from spacesim.splat.run import Run
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.train import train
 
-DATA = GenerateConfig(views=60, test_views=6, resolution=256, spp=64, sun=((40.0, 25.0),))
+DATA = read_scene("boxsat", views=60, test_views=6, resolution=256, spp=64, sun=((40.0, 25.0),))
 VIEWS = (3, 0, 1)  #: of the held-out ones, from easy to hard
 WIDTH, HEIGHT = 240, 160  #: of a panel, pixels
 GAP, HEADER = 6, 46  #: pixels
@@ -32,7 +32,7 @@ Panel = np.ndarray
 
 
 def main(folder: Path, out: Path) -> None:
-    dataset = generate("boxsat", folder / "data", DATA, resume=(folder / "data").exists())
+    dataset = generate(DATA, folder / "data", resume=(folder / "data").exists())
     run = train(dataset, folder / "run", preset("demo"), resume=(folder / "run").exists())
     rows = [panels(dataset, run, dataset.test[index]) for index in VIEWS]
     write_png(out, np.asarray(with_titles(np.vstack([strip(row) for row in rows]))))

@@ -6,7 +6,6 @@ import shutil
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from spacesim.data.files import holds_files, read_json, write_json
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report import write_report
 from spacesim.progress import Reporter, tell_training
-from spacesim.scenes import GenerateConfig, generate
+from spacesim.scenes import generate, read_scene
 from spacesim.scenes.generate import versions
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.train import train
@@ -24,7 +23,7 @@ from spacesim.splat.train.train import train
 log = logging.getLogger(__name__)
 
 SCENE = "boxsat"
-DATA = GenerateConfig(views=80, test_views=12, resolution=256, spp=64, sun=((40.0, 25.0),))
+DATA = {"views": 80, "test_views": 12, "resolution": 256, "spp": 64, "sun": ((40.0, 25.0),)}
 
 
 def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Reporter]]) -> dict[str, Any]:
@@ -42,7 +41,7 @@ def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Repor
         seconds[part], start = time.monotonic() - start, time.monotonic()
 
     with reporting("generate", "frames") as report:
-        dataset = generate(SCENE, out / "data", DATA, resume=True, progress=report)
+        dataset = generate(read_scene(SCENE, **DATA), out / "data", resume=True, progress=report)
     finished("generate")
     with reporting("train", "iterations") as report:
         command = ("spacesim", "demo", "--out", str(out))
@@ -59,7 +58,7 @@ def _prepare(out: Path) -> None:
     """Make the folder; take away what a demo of another version or another backend has left in it."""
     marker = out / "demo.json"
     this = {
-        "data": asdict(DATA),
+        "data": read_scene(SCENE, **DATA).to_json(),
         "train": preset("demo").to_json(),
         "backend": backend.select(),
         "versions": versions(),

@@ -17,7 +17,7 @@ from tiny import GENERATE, PROGRESS, outcome
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.store import load_truth, read_dataset, verify_dataset, write_points
-from spacesim.scenes import GenerateConfig, generate
+from spacesim.scenes import generate, read_scene
 from spacesim.splat.run import load_run
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
@@ -310,7 +310,7 @@ def test_a_broken_checkpoint_ends_in_a_sentence(tiny_data, tmp_path):
 
 def test_a_camera_within_the_object_is_refused(tmp_path):
     with pytest.raises(InputError, match="distance: expected cameras outside of boxsat"):
-        generate("boxsat", tmp_path / "data", GenerateConfig(views=3, test_views=0, resolution=16, distance=0.2))
+        generate(read_scene("boxsat", views=3, test_views=0, resolution=16, distance=0.2), tmp_path / "data")
     assert not (tmp_path / "data").exists()
 
 

@@ -105,17 +105,18 @@ class SceneConfig:
 
 
 def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
-    """`scene` with fields of its own, its rig, camera or quality changed by name; None changes nothing.
+    """`scene` with its name or seed, or fields of its rig, camera or quality changed by name; None changes nothing.
+    `resolution` may be one number, of a square.
 
     Raises InputError for a name that this scene's rig does not know, or a value out of range.
     """
     changes: dict[str, dict[str, Any]] = {"": {}, "rig": {}, "camera": {}, "quality": {}}
-    owners = {part: {f.name for f in fields(getattr(scene, part) if part else scene)} for part in changes}
+    owners = {part: {f.name for f in fields(getattr(scene, part))} if part else {"name", "seed"} for part in changes}
     for name, value in options.items():
         part = next((part for part, known in owners.items() if name in known), None)
         if part is None:
             raise InputError(f"{name}: expected an option that {scene.name}'s {type(scene.rig).__name__} knows")
         if value is not None:
-            changes[part][name] = value
+            changes[part][name] = (value, value) if name == "resolution" and isinstance(value, int) else value
     parts = {part: replace(getattr(scene, part), **changed) for part, changed in changes.items() if part}
     return replace(scene, **changes[""], **parts)

@@ -105,8 +105,8 @@ def _classes() -> tuple[type, type]:
             return mi.Frame3f(self.direction).to_world(local)
 
     class Earthshine(Distant):
-        """Sunlight that a Lambertian sphere reflects: radiance albedo E / pi max(n . s, 0), n its normal where a direction
-        meets it. Its night side is dark."""
+        """Sunlight that a Lambertian sphere reflects: radiance albedo E / pi max(n . s, 0), n its normal where a
+        direction meets it. Its night side is dark."""
 
         def __init__(self, earth: EarthConfig, sun: SunConfig) -> None:
             super().__init__()

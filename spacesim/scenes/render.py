@@ -175,8 +175,8 @@ def _primary_rays(camera: Camera, pixel: Any, offset: Any, distortion: Sequence[
 
 
 def _undistorted(x: Any, y: Any, distortion: Sequence[Any]) -> tuple[Any, Any]:
-    """Where a distorted point of the plane at depth 1 is without distortion: the Brown-Conrady model is solved by repeated
-    substitution (as OpenCV's undistortPoints does), which settles to float32 for lenses that image without folds."""
+    """Where a distorted point of the plane at depth 1 is without distortion: the Brown-Conrady model is solved by
+    repeated substitution (as OpenCV's undistortPoints does), which settles for lenses that image without folds."""
     k1, k2, p1, p2, k3 = distortion
     u, v = x, y
     for _ in range(UNDISTORT_STEPS):

@@ -6,39 +6,32 @@ import trimesh
 
 from spacesim.data.geometry import direction_from_angles, look_at
 from spacesim.data.records import Camera, Sun
-from spacesim.scenes import (
-    GenerateConfig,
-    Part,
-    Renderer,
-    Scene,
-    SceneObject,
-    Spacecraft,
-    built_in_scene,
-    materials,
-    render,
-)
+from spacesim.scenes import Part, Renderer, Scene, SceneObject, Spacecraft, build, read_scene, render
 from spacesim.scenes.generate import plan_views
-from spacesim.scenes.sun import EXPOSURE, SOLAR_IRRADIANCE
+from spacesim.scenes.materials import Material, material
+from spacesim.scenes.sun import EXPOSURE, SOLAR_IRRADIANCE, SunConfig
+
+PARALLEL = SunConfig("directional")
 
 
-def scene_of(mesh: trimesh.Trimesh, material: materials.Material) -> Scene:
-    return Scene("test", (SceneObject(Spacecraft("test", (Part("part", mesh, material),))),))
+def scene_of(mesh: trimesh.Trimesh, surface: Material, sun: SunConfig = PARALLEL) -> Scene:
+    return Scene("test", (SceneObject(Spacecraft("test", (Part("part", mesh, surface),))),), sun)
 
 
 def test_white_surface_that_faces_the_sun_has_display_value_1():
-    scene = scene_of(trimesh.creation.box((2, 2, 2)), materials.TEST_WHITE)
+    scene = scene_of(trimesh.creation.box((2, 2, 2)), material("lambertian-white"))
     camera = Camera.from_fov(look_at([5, 0, 0], [0, 0, 0]), 8, 8, 10.0)
-    truth = Renderer(scene, spp=4).render(camera, Sun.from_angles(0, 0), seed=1)
+    truth = Renderer(scene, spp=4).render(camera, Sun.from_angles(0, 0), seed=(1,))
     np.testing.assert_allclose(truth.radiance * EXPOSURE, 1.0, rtol=1e-5)
     np.testing.assert_array_equal(truth.alpha, 1.0)
 
 
 def test_faces_of_a_lambertian_box_follow_the_cosine_law():
     sun = Sun.from_angles(30, 50)
-    scene = scene_of(trimesh.creation.box((2, 2, 2)), materials.TEST_GREY)
+    scene = scene_of(trimesh.creation.box((2, 2, 2)), material("lambertian-grey"))
     for normal in np.concatenate([np.eye(3), -np.eye(3)]):
         camera = Camera.from_fov(look_at(6 * normal + [0.1, 0.2, 0.3], [0, 0, 0]), 8, 8, 8.0)
-        truth = Renderer(scene, spp=4).render(camera, sun, seed=1)
+        truth = Renderer(scene, spp=4).render(camera, sun, seed=(1,))
         expected = SOLAR_IRRADIANCE * 0.5 / np.pi * max(0.0, float(normal @ sun.direction))
         np.testing.assert_allclose(truth.radiance, expected, rtol=1e-5, atol=1e-5)
 
@@ -50,7 +43,9 @@ def test_lambertian_sphere_has_its_phase_function_and_size(phase_deg):
     distance, size, fov = 1000.0, 32, 0.15
     pose = look_at(distance * direction_from_angles(phase_deg, 0.0), [0, 0, 0])
     camera = Camera.from_fov(pose, size, size, fov)
-    truth = Renderer(scene_of(sphere, materials.TEST_GREY), spp=64).render(camera, Sun.from_angles(0, 0), seed=3)
+    truth = Renderer(scene_of(sphere, material("lambertian-grey")), spp=64).render(
+        camera, Sun.from_angles(0, 0), seed=(3,)
+    )
     pixel = (distance / camera.fx) ** 2  # m^2 at the sphere's centre
     phase = np.radians(phase_deg)
     expected = 2 / 3 * SOLAR_IRRADIANCE * 0.5 * (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
@@ -65,20 +60,21 @@ def test_lambertian_sphere_has_its_phase_function_and_size(phase_deg):
 
 
 def test_passes_change_the_noise_only(monkeypatch):
-    sphere = scene_of(trimesh.creation.icosphere(subdivisions=3), materials.WHITE_PAINT)
+    sphere = scene_of(trimesh.creation.icosphere(subdivisions=3), material("white-paint"))
     camera = Camera.from_fov(look_at([6, 0, 0], [0, 0, 0]), 16, 16, 25.0)
     sun = Sun.from_angles(40, 10)
-    whole = Renderer(sphere, spp=60).render(camera, sun, seed=5)
+    whole = Renderer(sphere, spp=60).render(camera, sun, seed=(5,))
     monkeypatch.setattr(render, "MAX_WAVEFRONT", 7 * 256)
-    parts = Renderer(sphere, spp=60).render(camera, sun, seed=5)
+    parts = Renderer(sphere, spp=60).render(camera, sun, seed=(5,))
     np.testing.assert_array_equal(parts.alpha, whole.alpha)  # sample positions do not depend on the passes
     np.testing.assert_allclose(parts.radiance, whole.radiance, rtol=0.02, atol=2.0)
 
 
 def test_alpha_is_one_within_and_zero_away_from_the_labels_silhouette():
-    scene = built_in_scene("boxsat")
-    camera = plan_views(scene, GenerateConfig(views=1, resolution=96))[0][0][1].camera
-    truth = Renderer(scene, spp=16).render(camera, Sun.from_angles(45, 35), seed=0)
+    config = read_scene("boxsat", views=1, resolution=96)
+    scene = build(config)
+    camera = plan_views(scene, config)[0][0][1].camera
+    truth = Renderer(scene, spp=16).render(camera, Sun.from_angles(45, 35), seed=(0,))
     surface = truth.object_id > 0
     shifts = [np.roll(surface, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     assert np.isfinite(truth.radiance).all()
@@ -92,25 +88,25 @@ def test_alpha_is_one_within_and_zero_away_from_the_labels_silhouette():
 
 def test_more_pixels_than_a_wavefront_holds(monkeypatch):
     monkeypatch.setattr(render, "MAX_WAVEFRONT", 100)
-    scene = scene_of(trimesh.creation.box((2, 2, 2)), materials.TEST_WHITE)
+    scene = scene_of(trimesh.creation.box((2, 2, 2)), material("lambertian-white"))
     camera = Camera.from_fov(look_at([5, 0, 0], [0, 0, 0]), 16, 16, 10.0)
-    truth = Renderer(scene, spp=3).render(camera, Sun.from_angles(0, 0), seed=1)
+    truth = Renderer(scene, spp=3).render(camera, Sun.from_angles(0, 0), seed=(1,))
     np.testing.assert_allclose(truth.radiance * EXPOSURE, 1.0, rtol=1e-5)
 
 
 def test_sun_can_be_moved_and_moved_back():
-    scene = scene_of(trimesh.creation.box((2, 2, 2)), materials.TEST_GREY)
+    scene = scene_of(trimesh.creation.box((2, 2, 2)), material("lambertian-grey"))
     camera = Camera.from_fov(look_at([5, 4, 3], [0, 0, 0]), 16, 16, 30.0)
     renderer = Renderer(scene, spp=2)
     suns = [Sun.from_angles(0, 0), Sun.from_angles(90, 20), Sun.from_angles(0, 0)]
-    first, other, again = (renderer.render(camera, sun, seed=2).radiance for sun in suns)
+    first, other, again = (renderer.render(camera, sun, seed=(2,)).radiance for sun in suns)
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 100
 
 
 def test_inside_and_exposed():
     shell = trimesh.util.concatenate([trimesh.creation.box((2, 2, 2)), trimesh.creation.box((1, 1, 3))])
-    renderer = Renderer(scene_of(shell, materials.TEST_GREY), spp=1)
+    renderer = Renderer(scene_of(shell, material("lambertian-grey")), spp=1)
     positions = np.array([[0, 0, 0], [0.9, 0.9, 0.9], [0, 0, 1.4], [0, 0, 1.6], [0.7, 0.7, 1.1], [9, 9, 9]], float)
     np.testing.assert_array_equal(renderer.inside(positions), [True, True, True, False, False, False])
     points = np.array([[0.5, 0, 0.2], [0.5, 0, 1.2], [1, 0, 0]], float)
