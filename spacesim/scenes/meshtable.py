@@ -1,0 +1,197 @@
+"""Reads obj, stl, ply and off through trimesh: parts with the colours and textures that these formats know."""
+
+import io
+import math
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from spacesim.data.errors import InputError
+from spacesim.data.images import linear_from_srgb
+from spacesim.scenes.materials import Color
+from spacesim.scenes.meshpart import RawPart
+from spacesim.scenes.meshtexture import NORMALS, Folder, Notes, Surface, decoded, unit
+
+_UNUSED = ("ke", "map_ke", "map_ks", "map_ka", "map_bump", "bump", "map_d", "disp", "norm", "map_ns", "refl")
+
+
+def read_table(path: Path, notes: Notes) -> list[RawPart]:
+    """The triangles of an obj, stl, ply or off file. Raises InputError, or whatever trimesh raises on damaged data."""
+    kind = path.suffix.lower().lstrip(".")
+    data = path.read_bytes()
+    _check_promise(kind, data)
+    if (kind == "obj" and b"\nvn " in data) or (kind == "ply" and b" nx" in data[: data.find(b"end_header")]):
+        notes.drop(NORMALS)
+    if kind == "obj":
+        data = _with_positive_indices(data)
+    resolver = _Files(path, notes)
+    options = {"split_objects": True} if kind == "obj" else {}
+    # `load` with force="scene": its successor load_scene is not in trimesh 4.5
+    scene = trimesh.load(io.BytesIO(data), kind, resolver=resolver, force="scene", process=False, **options)
+    parts = []
+    for name, mesh in scene.geometry.items():
+        if not isinstance(mesh, trimesh.Trimesh):
+            notes.drop("points and lines are not rendered")
+        elif len(mesh.faces):
+            own = name if len(scene.geometry) > 1 else path.stem
+            surface = _surface(mesh, resolver, notes)
+            uv = _uv(mesh) if surface is not None and surface.pictures else None
+            if surface is not None and surface.pictures and uv is None:
+                notes.drop("textures of parts without texture coordinates are not used", surface.name)
+                surface = surface.bare()
+            parts.append(RawPart(own, np.array(mesh.vertices), np.array(mesh.faces), uv, surface))
+    return parts
+
+
+class _Files(trimesh.resolvers.Resolver):
+    """What trimesh may open while it reads a file: what `Folder` allows; the rest is noted."""
+
+    def __init__(self, path: Path, notes: Notes) -> None:
+        self.folder, self.notes, self.file_name = Folder(path), notes, path.name
+        self.pictures: dict[int, np.ndarray | None] = {}
+
+    def get(self, key: str) -> bytes:
+        """The bytes of the file called `key`; FileNotFoundError (and a note) where it cannot be had."""
+        try:
+            return self.folder.read(str(key))
+        except InputError as error:
+            self.notes.drop("files that cannot be had are not used", str(error))
+            raise FileNotFoundError(str(error)) from None
+
+    def keys(self) -> tuple[str, ...]:
+        """No listing: files are asked for by name."""
+        return ()
+
+    def write(self, name: str, data: Any) -> None:
+        """Nothing is written."""
+        raise PermissionError(name)
+
+    def namespaced(self, namespace: str) -> "_Files":
+        """Folders below are reached by their relative names."""
+        return self
+
+
+def _check_promise(kind: str, data: bytes) -> None:
+    """Raises InputError where a header promises more than the file holds, before anyone makes room for it."""
+    if kind == "stl" and len(data) >= 84 and not (data[:5] == b"solid" and b"facet" in data[:1024]):
+        count = struct.unpack_from("<I", data, 80)[0]
+        if 84 + 50 * count != len(data):
+            raise InputError(
+                f"expected {84 + 50 * count:,} bytes for the {count:,} faces that its header promises, "
+                f"found {len(data):,}"
+            )
+    if kind == "ply":
+        head, end, body = data.partition(b"end_header")
+        if not data.startswith(b"ply") or not end:
+            raise InputError('expected a ply file, from "ply" to "end_header", found something else')
+        for element, count in re.findall(rb"element\s+(\S+)\s+(\d+)", head):
+            if int(count) > len(body):
+                raise InputError(
+                    f"expected {int(count):,} elements {element.decode('ascii', 'replace')}, as its header promises, "
+                    f"found {len(body):,} bytes"
+                )
+
+
+def _with_positive_indices(data: bytes) -> bytes:
+    """An obj file whose negative indices, which count from the last vertex so far, are turned into plain ones."""
+    if not re.search(rb"^f[^\n]*[ /\t]-\d", data, re.MULTILINE):
+        return data
+    counts = {b"v": 0, b"vt": 0, b"vn": 0}
+    lines = data.replace(b"\\\n", b" ").splitlines()
+    for i, line in enumerate(lines):
+        words = line.split()
+        if not words:
+            continue
+        if words[0] in counts:
+            counts[words[0]] += 1
+        elif words[0] == b"f":
+            totals = (counts[b"v"], counts[b"vt"], counts[b"vn"])
+            corners = [_positive(word, totals) for word in words[1:] if not word.startswith(b"#")]
+            lines[i] = b"f " + b" ".join(corners)
+    return b"\n".join(lines) + b"\n"
+
+
+def _positive(corner: bytes, totals: tuple[int, int, int]) -> bytes:
+    indices = [(int(text), total) if text else (0, 0) for text, total in zip(corner.split(b"/"), totals, strict=False)]
+    plain = [index if index >= 0 else total + 1 + index for index, total in indices]
+    return b"/".join(str(index).encode() if index else b"" for index in plain)
+
+
+def _uv(mesh: trimesh.Trimesh) -> np.ndarray | None:
+    """[V, 2], v down (trimesh's points up), None where there is none."""
+    uv = getattr(mesh.visual, "uv", None)
+    if uv is None or np.shape(uv) != (len(mesh.vertices), 2):
+        return None
+    return np.array(uv, dtype=np.float64) * [1.0, -1.0] + [0.0, 1.0]
+
+
+def _surface(mesh: trimesh.Trimesh, files: _Files, notes: Notes) -> Surface | None:
+    visual = mesh.visual
+    if visual.kind in ("vertex", "face"):
+        colors = visual.vertex_colors if visual.kind == "vertex" else visual.face_colors
+        mean = linear_from_srgb(np.asarray(colors)[:, :3] / 255.0).mean(axis=0)
+        notes.change("colours of vertices or faces become one mean colour, taken as sRGB and matt")
+        return Surface("colour", _color(mean), matt=True)
+    found = getattr(visual, "material", None)
+    if found is None or type(found).__name__ != "SimpleMaterial":
+        return None
+    values = {str(key).lower(): value for key, value in (found.kwargs or {}).items()}
+    if found.image is None and not values:
+        return None  # texture coordinates alone
+    return _obj_surface(str(found.name or "texture")[:80], values, found.image, files, notes)
+
+
+def _obj_surface(name: str, values: dict[str, Any], image: Any, files: _Files, notes: Notes) -> Surface:
+    """A material of an mtl file. Kd is taken as linear; gloss: refractive index 1.5, its roughness from Ns as Walter et
+    al. 2007 compare Blinn-Phong with microfacets, alpha^2 = 2 / (Ns + 2), or Pr where that is given."""
+    for key in sorted(set(values) & set(_UNUSED)):
+        if key != "ke" or max(_numbers(values[key], 0.0)) > 0:
+            notes.drop(f"{key} of materials is not used", name)
+    opacity = min(_numbers(values.get("d"), 1.0)[0], 1.0 - _numbers(values.get("tr"), 0.0)[0])
+    if opacity < 1.0:
+        notes.drop("transparent surfaces are rendered opaque", name)
+    pictures = {}
+    if image is not None:
+        picture = _picture(image, name, files, notes)
+        if picture is not None:
+            pictures["base_color"] = picture
+    default = 1.0 if pictures else 0.8
+    color = _color((_numbers(values.get("kd"), default) * 3)[:3])
+    metallic = unit(_numbers(values.get("pm"), 0.0)[0])
+    glossy = metallic > 0 or "pr" in values or max(_numbers(values.get("ks"), 0.0)) > 0
+    exponent = max(_numbers(values.get("ns"), 0.0)[0], 0.0)
+    roughness = math.sqrt(math.sqrt(2.0 / (exponent + 2.0)))
+    if "pr" in values:
+        roughness = unit(_numbers(values["pr"], 1.0)[0])
+    return Surface(name, color, metallic, roughness, pictures, matt=not glossy)
+
+
+def _picture(image: Any, name: str, files: _Files, notes: Notes) -> np.ndarray | None:
+    """trimesh has opened the image; its pixels are read here, where damage and size are looked after."""
+    stream = getattr(image, "fp", None)
+    if stream is None:
+        return None
+    if id(image) not in files.pictures:
+        stream.seek(0)
+        files.pictures[id(image)] = decoded(stream.read(), name, notes)
+    return files.pictures[id(image)]
+
+
+def _numbers(value: Any, default: float) -> list[float]:
+    """The finite numbers at the front of an mtl entry; [default] where there is none."""
+    numbers: list[float] = []
+    for item in value if isinstance(value, (list, tuple)) else [value]:
+        try:
+            numbers.append(float(item))
+        except (TypeError, ValueError):
+            break
+    return numbers if numbers and all(map(math.isfinite, numbers)) else [default]
+
+
+def _color(values: Any) -> Color:
+    red, green, blue = (unit(float(v)) for v in values)
+    return red, green, blue
