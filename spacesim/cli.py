@@ -87,20 +87,28 @@ def _parser() -> argparse.ArgumentParser:
     one = command("demo", _demo, "generate, train, evaluate, report: a few minutes on two cores")
     one.add_argument("--out", type=Path, required=True, metavar="DIR")
 
-    one = command("generate", _generate, "path-trace a dataset with its truth")
-    one.add_argument("scene", metavar="SCENE", help="a built-in scene: boxsat, boxsat-pair")
-    one.add_argument("--out", type=Path, required=True, metavar="DATA")
-    one.add_argument("--suns", type=int, metavar="N", help="training Suns on a Fibonacci lattice (1)")
-    one.add_argument("--views", type=int, metavar="N", help="training views for each Sun (100)")
+    one = command("generate", _generate, "path-trace a dataset with its truth", needs_backend=False)
+    scenes = f"a built-in scene ({', '.join(_built_in_scenes())}), a scene file (.toml) or a mesh file"
+    one.add_argument("scene", metavar="SCENE", help=scenes)
+    one.add_argument("--out", type=Path, metavar="DATA")
+    one.add_argument("--backend", choices=backend.NAMES, default="auto", help="default: CUDA, else LLVM")
+    one.add_argument("--suns", type=int, metavar="N", help="training Suns")
+    one.add_argument("--views", type=int, metavar="N", help="training views for each Sun")
     one.add_argument("--test-suns", type=int, metavar="N", help="Suns kept for testing (0: those of training)")
-    one.add_argument("--test-views", type=int, metavar="N", help="test views for each test Sun (20)")
-    one.add_argument("--resolution", type=int, metavar="PX", help="pixels of each side (256)")
-    one.add_argument("--spp", type=int, metavar="N", help="samples a pixel (64)")
-    one.add_argument("--seed", type=int, metavar="N")
+    one.add_argument("--test-views", type=int, metavar="N", help="test views for each test Sun")
     one.add_argument(
         "--sun", type=_angles, action="append", metavar="AZ,EL", help="a training Sun, degrees; repeatable"
     )
+    one.add_argument("--distance", type=float, metavar="M", help="metres from the cameras to the target's centre")
+    one.add_argument("--resolution", type=_resolution, metavar="PX", help="pixels of each side, or WIDTHxHEIGHT")
+    one.add_argument("--fov", type=float, metavar="DEG", help="angle that the image's width covers")
+    one.add_argument("--exposure", type=float, metavar="X", help="display value of a radiance of 1 W/m2/sr")
+    one.add_argument("--spp", type=int, metavar="N", help="samples a pixel")
+    one.add_argument("--seed", type=int, metavar="N")
+    one.add_argument("--units", metavar="UNIT", help="of a mesh file: m (default), cm, mm, km, in or ft")
+    one.add_argument("--up", metavar="AXIS", help="of a mesh file: x, y or z (default: the format's own)")
     one.add_argument("--resume", action="store_true", help="complete what an interrupted run left")
+    one.add_argument("--print", action="store_true", help="render nothing, print the whole scene as a scene file")
 
     one = command("train", _train, "reconstruct a dataset with Gaussian splatting")
     one.add_argument("data", type=Path, metavar="DATA")
@@ -159,6 +167,18 @@ def _angles(text: str) -> tuple[float, float]:
     return azimuth, elevation
 
 
+def _resolution(text: str) -> int | tuple[int, int]:
+    sides = text.lower().split("x")
+    if not all(side.isascii() and side.lstrip("-").isdigit() for side in sides) or len(sides) > 2:
+        raise argparse.ArgumentTypeError(f"expected pixels of each side, or WIDTHxHEIGHT, found {text!r}")
+    return (int(sides[0]), int(sides[1])) if len(sides) == 2 else int(sides[0])
+
+
+def _built_in_scenes() -> list[str]:
+    """Names, for the help: to import the scenes would take seconds."""
+    return sorted(path.stem for path in Path(__file__).parent.glob("assets/scenes/*.toml"))
+
+
 def _doctor(options: argparse.Namespace) -> None:
     from spacesim import doctor
 
@@ -176,18 +196,28 @@ def _demo(options: argparse.Namespace) -> None:
     print(f"{parts}\nreport: {done['report'].resolve()}")
 
 
+_SCENE_OPTIONS = (
+    *("suns", "views", "test_suns", "test_views", "sun", "distance"),
+    *("resolution", "exposure", "spp", "seed", "units", "up"),
+)
+
+
 def _generate(options: argparse.Namespace) -> None:
     from spacesim.progress import reporting
-    from spacesim.scenes import GenerateConfig, generate
+    from spacesim.scenes import generate, read_scene
+    from spacesim.scenes.scenefile import scene_text
 
-    names = ("suns", "views", "test_suns", "test_views", "resolution", "spp", "seed")
-    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    if options.sun:
-        given["sun"] = tuple(options.sun)
-    config = GenerateConfig(**given)
+    changes = {name: getattr(options, name) for name in _SCENE_OPTIONS}
+    scene = read_scene(options.scene, **changes, fov_deg=options.fov)
+    if options.print:
+        print(scene_text(scene), end="")
+        return
+    if options.out is None:
+        raise InputError("--out: expected a folder for the dataset, found none")
+    backend.select(options.backend)
     with reporting("generate", "frames") as report:
-        dataset = generate(options.scene, options.out, config, options.resume, report)
-    print(f"{options.out}: {len(dataset.train)} training and {len(dataset.test)} test frames of {options.scene}")
+        dataset = generate(scene, options.out, options.resume, report)
+    print(f"{options.out}: {len(dataset.train)} training and {len(dataset.test)} test frames of {scene.name}")
 
 
 def _train(options: argparse.Namespace) -> None:

@@ -60,7 +60,7 @@ def test_generate_writes_a_whole_dataset(tiny_data):
     assert verify_dataset(tiny_data) == []
     dataset = read_dataset(tiny_data)
     assert (len(dataset.train), len(dataset.test)) == (6, 2)
-    assert json.loads((tiny_data / "scene.json").read_text())["config"]["spp"] == 4
+    assert json.loads((tiny_data / "scene.json").read_text())["config"]["quality"]["spp"] == 4
 
 
 def test_suns_are_given_by_azimuth_and_elevation(spacesim, tmp_path):
@@ -94,7 +94,7 @@ def test_resuming_with_another_configuration_is_refused(spacesim, tiny_run, tiny
 
 def test_generating_again_needs_resume(spacesim, tiny_data):
     assert spacesim("generate", "boxsat", "--out", tiny_data, *GENERATE).is_refusal(tiny_data, "--resume")
-    assert spacesim("generate", "boxsat", "--out", tiny_data, *GENERATE, "--seed", 1, "--resume").is_refusal("config")
+    assert spacesim("generate", "boxsat", "--out", tiny_data, *GENERATE, "--seed", 1, "--resume").is_refusal("seed")
     done = spacesim("generate", "boxsat", "--out", tiny_data, *GENERATE, "--resume")
     assert done.code == 0
 

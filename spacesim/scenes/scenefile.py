@@ -1,25 +1,125 @@
-"""Scene files, and the scenes that are built in."""
+"""Scenes by name, from a scene file (docs/scenes.md) or around a mesh file, and scenes as text."""
 
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import is_dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError
+from spacesim.scenes import toml
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
+from spacesim.scenes.materials import material_names
+from spacesim.scenes.rig import RIGS, RigConfig
+from spacesim.scenes.spacecraft import SPACECRAFT
+from spacesim.scenes.structure import Rules, keys_of, near, structure
+from spacesim.scenes.sun import SunConfig
 
-_BUILT_IN = {
-    "boxsat": SceneConfig("boxsat", (ObjectConfig(spacecraft="boxsat"),)),
-    "boxsat-pair": SceneConfig(  # the second at [-3, -3, -3] m (thesis 4.3.6)
-        "boxsat-pair",
-        (ObjectConfig(spacecraft="boxsat"), ObjectConfig(spacecraft="boxsat", position=(-3.0, -3.0, -3.0))),
-    ),
-}
-BUILT_IN_SCENES = tuple(_BUILT_IN)
+SCENES = Path(__file__).parents[1] / "assets" / "scenes"
+BUILT_IN_SCENES = tuple(sorted(path.stem for path in SCENES.glob("*.toml")))
+
+RULES = Rules(
+    kinds={RigConfig: RIGS},
+    hidden=((SceneConfig, "folder"), (SunConfig, "color")),  # the place of the file; what the white balance makes of it
+    spread=("resolution", "albedo"),
+)
 
 
-def read_scene(source: str, **options: Any) -> SceneConfig:
-    """The built-in scene called `source`, with `options` changed (see `with_options`).
+def read_scene(source: str | Path, **options: Any) -> SceneConfig:
+    """The scene that is built in under the name `source`, that the TOML file `source` describes, or that shows the mesh
+    file `source` alone.
 
-    Raises InputError, which lists the names, where there is none.
+    options: fields of the scene, its rig, camera or quality by name (see `with_options`), e.g. views=40,
+    sun=[(azimuth, elevation), ...] degrees, resolution=256 or (width, height); None changes nothing. For a mesh file
+    also units and up (see `ObjectConfig`). Raises InputError where there is no such scene, or for what it cannot be.
     """
-    if source not in _BUILT_IN:
-        raise InputError(f"scene: expected one of {', '.join(BUILT_IN_SCENES)}, found {source!r}")
-    return with_options(_BUILT_IN[source], **options)
+    path = Path(source)
+    given = {name: value for name, value in options.items() if value is not None}
+    if str(source) in BUILT_IN_SCENES:
+        path = SCENES / f"{source}.toml"
+    reading: dict[str, Any] = {name: given.pop(name) for name in ("units", "up") if name in given}
+    if path.suffix.lower() != ".toml":
+        return _changed(_mesh_scene(path, str(source), reading), given)
+    for name in reading:
+        raise InputError(f"{name}: expected a mesh file as the scene, found {source}, whose objects say it themselves")
+    return _changed(_read_file(path), given)
+
+
+def scene_text(scene: SceneConfig) -> str:
+    """The scene as a TOML file that `read_scene` reads; meshes are relative to the working directory where they lie
+    below it."""
+    folder = scene.folder or Path()
+    objects = tuple(replace(one, mesh=_from_here(folder / one.mesh)) if one.mesh else one for one in scene.objects)
+    return toml.dump(_plain(replace(scene, objects=objects)))
+
+
+def _mesh_scene(path: Path, source: str, reading: Mapping[str, Any]) -> SceneConfig:
+    """A mesh file alone, which `reading` says how to read."""
+    if path.is_file():
+        return SceneConfig(path.stem, (ObjectConfig(mesh=path.name, **reading),), folder=path.parent)
+    wanted = f"scene: expected one of {', '.join(BUILT_IN_SCENES)}, a scene file (.toml) or a mesh file"
+    if path.is_dir():
+        raise InputError(f"{wanted}, found the folder {source}")
+    if path.suffix or len(path.parts) > 1:
+        raise InputError(f"{wanted}, found no file {source}")
+    raise InputError(f"{wanted}, found {source!r}{near(source, BUILT_IN_SCENES)}")
+
+
+def _read_file(path: Path) -> SceneConfig:
+    document = toml.read_document(path)
+    scene = structure(SceneConfig, document, RULES, {"name": path.stem, "folder": path.parent})
+    _check_names(scene, document)
+    return scene
+
+
+def _check_names(scene: SceneConfig, document: toml.Document) -> None:
+    """Raises InputError, with file and line, for a spacecraft, material or mesh file that there is none of."""
+    presets = material_names()
+
+    def check(name: str, known: Iterable[str], *keys: str | int) -> None:
+        known = tuple(known)
+        if name not in known:
+            expected = f"one of {', '.join(known)}"
+            raise InputError(f"{document.label(keys)}: expected {expected}, found {name!r}{near(name, known)}")
+
+    for index, one in enumerate(scene.objects):
+        for pattern, name in one.materials.items():
+            check(name, (*scene.materials, *presets), "objects", index, "materials", pattern)
+        if one.spacecraft:
+            check(one.spacecraft, SPACECRAFT, "objects", index, "spacecraft")
+        elif scene.folder is not None and not (scene.folder / one.mesh).exists():
+            label = document.label(("objects", index, "mesh"))
+            raise InputError(f"{label}: expected a mesh file, found no file {scene.folder / one.mesh}")
+    for name, custom in scene.materials.items():
+        check(custom.preset, presets, "materials", name, "preset")
+
+
+def _changed(scene: SceneConfig, options: Mapping[str, Any]) -> SceneConfig:
+    """`scene` with options; a list of Suns takes the place of the rig's own arrangement, whatever their number."""
+    options = dict(options)
+    if isinstance(options.get("resolution"), int):
+        options["resolution"] = (options["resolution"],) * 2
+    if "sun" in options:
+        sun = tuple((float(azimuth), float(elevation)) for azimuth, elevation in options.pop("sun"))
+        scene = replace(scene, rig=replace(scene.rig, sun=sun, suns=options.pop("suns", len(sun))))
+    elif "suns" in options:
+        scene = replace(scene, rig=replace(scene.rig, sun=(), suns=options.pop("suns")))
+    return with_options(scene, **options)
+
+
+def _from_here(mesh: Path) -> str:
+    absolute = Path(os.path.abspath(mesh))
+    return str(absolute.relative_to(Path.cwd()) if absolute.is_relative_to(Path.cwd()) else absolute)
+
+
+def _plain(value: Any) -> Any:
+    """Plain values of a dataclass, for TOML: what is None, "" or an empty table is left out."""
+    if not is_dataclass(value):
+        if isinstance(value, Mapping):
+            return {key: _plain(one) for key, one in value.items()}
+        return [_plain(one) for one in value] if isinstance(value, tuple) else value
+    values = {name: getattr(value, name) for name in keys_of(type(value), RULES)}
+    kinds = next((kinds for base, kinds in RULES.kinds.items() if isinstance(value, base)), {})
+    kind = [name for name, cls in kinds.items() if type(value) is cls]
+    plain = {name: _plain(one) for name, one in values.items() if one is not None and one not in ("", {})}
+    return {"kind": kind[0], **plain} if kind else plain

@@ -1,0 +1,155 @@
+"""Plain values of a file to frozen dataclasses: the fields and their annotations are all that says what is allowed."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from difflib import get_close_matches
+from types import NoneType, UnionType
+from typing import Any, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from spacesim.data.errors import InputError
+from spacesim.scenes.toml import Document, Keys, dotted
+
+T = TypeVar("T")
+_NOUNS = {int: "a whole number", float: "a finite number", bool: "true or false", str: "text in quotes"}
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What annotations alone do not say. kinds: classes that the key `kind` chooses among, the first is the default;
+    hidden: fields that are no keys; spread: fields of which one number stands for all."""
+
+    kinds: Mapping[type, Mapping[str, type]] = field(default_factory=dict)
+    hidden: Sequence[tuple[type, str]] = ()
+    spread: Sequence[str] = ()
+
+
+def structure(cls: type[T], document: Document, rules: Rules, defaults: Mapping[str, Any] | None = None) -> T:
+    """The `cls` that `document` says; defaults: of keys of the outermost table.
+
+    Raises InputError with file, line and key for a key that is not known, a value of a wrong type or an impossible one.
+    """
+    return _Reader(document, rules, cls).table(cls, document.values, (), defaults or {})
+
+
+def keys_of(cls: type, rules: Rules) -> dict[str, Any]:
+    """The keys of a table that gives a `cls`, with their annotations."""
+    hints = get_type_hints(cls)
+    hidden = {name for owner, name in rules.hidden if issubclass(cls, owner)}
+    return {f.name: hints[f.name] for f in fields(cls) if f.name not in hidden}
+
+
+def places_of(cls: type, rules: Rules, at: Keys = ()) -> Iterator[Keys]:
+    """Where keys are in a document that gives a `cls`, but for those in lists and in tables with free names."""
+    for kind in dict.fromkeys([cls, *rules.kinds.get(cls, {}).values()]):
+        for key, hint in keys_of(kind, rules).items():
+            yield (*at, key)
+            inner = [one for one in get_args(hint) if get_origin(hint) in (Union, UnionType)]
+            for table in (one for one in (hint, *inner) if isinstance(one, type) and is_dataclass(one)):
+                yield from places_of(table, rules, (*at, key))
+
+
+def near(word: object, known: Iterable[str]) -> str:
+    """ "; did you mean ...?" where one of the `known` words is close to `word`, else nothing."""
+    close = get_close_matches(str(word), list(known), n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+class _Reader:
+    def __init__(self, document: Document, rules: Rules, root: type) -> None:
+        self._document = document
+        self._rules = rules
+        self._root = root
+
+    def table(self, cls: Any, values: Any, at: Keys, defaults: Mapping[str, Any] | None = None) -> Any:
+        """The dataclass `cls`, or the one that `kind` chooses, from a table."""
+        if not isinstance(values, Mapping):
+            self._refuse(at, "a table", values)
+        values = dict(values)
+        kinds = self._rules.kinds.get(cls, {})
+        if kinds:
+            kind = values.pop("kind", next(iter(kinds)))
+            if not isinstance(kind, str) or kind not in kinds:
+                self._refuse((*at, "kind"), f"one of {', '.join(kinds)}", kind, near(kind, kinds))
+            cls = kinds[kind]
+        known = keys_of(cls, self._rules)
+        for key in values:
+            if key not in known:
+                self._unknown(key, at, [*(["kind"] if kinds else []), *known])
+        given = {key: self.value(known[key], value, (*at, key)) for key, value in values.items()}
+        given = {**(defaults or {}), **given}
+        for f in fields(cls):
+            if f.default is MISSING and f.default_factory is MISSING and f.name not in given:
+                self._refuse((*at, f.name), _noun(known[f.name]), None)
+        return self._made(cls, given, at)
+
+    def value(self, hint: Any, value: Any, at: Keys) -> Any:
+        """`value` as its annotation `hint` wants it."""
+        origin, inner = get_origin(hint), get_args(hint)
+        if origin in (Union, UnionType):
+            (hint,) = (one for one in inner if one is not NoneType)
+            return self.value(hint, value, at)
+        if origin is tuple:
+            return self._list(hint, value, at)
+        if origin is not None and issubclass(origin, Mapping):
+            if not isinstance(value, Mapping):
+                self._refuse(at, "a table", value)
+            return {key: self.value(inner[1], one, (*at, key)) for key, one in value.items()}
+        if is_dataclass(hint):
+            return self.table(hint, value, at)
+        return self._plain(hint, value, at)
+
+    def _list(self, hint: Any, value: Any, at: Keys) -> tuple[Any, ...]:
+        inner = get_args(hint)
+        is_open, may_spread = inner[-1] is Ellipsis, at[-1] in self._rules.spread
+        if may_spread and type(value) in (int, float):
+            value = [value] * len(inner)
+        if not isinstance(value, list) or (not is_open and len(value) != len(inner)):
+            self._refuse(at, _noun(hint) + (" or one for all" if may_spread else ""), value)
+        hints = [inner[0]] * len(value) if is_open else inner
+        return tuple(self.value(one, item, (*at, i)) for i, (one, item) in enumerate(zip(hints, value, strict=True)))
+
+    def _plain(self, hint: Any, value: Any, at: Keys) -> Any:
+        if hint not in _NOUNS:
+            raise TypeError(f"{dotted(at)}: expected an annotation that a file can fill, found {hint!r}")
+        number = float(value) if hint is float and type(value) is int and abs(value) < 1e300 else value
+        if type(number) is not hint or (hint is float and not math.isfinite(number)):
+            self._refuse(at, _noun(hint), value)
+        return number
+
+    def _made(self, cls: Any, given: Mapping[str, Any], at: Keys) -> Any:
+        """`cls` with the fields `given`; its own InputError, which begins with a field's name, gets file and line."""
+        try:
+            return cls(**given)
+        except InputError as error:
+            name, _, rest = str(error).partition(": ")
+            where = (*at, name) if any(name == f.name for f in fields(cls)) else at
+            raise InputError(f"{self._document.label(where)}: {rest}") from None
+
+    def _unknown(self, key: str, at: Keys, known: Sequence[str]) -> NoReturn:
+        elsewhere = [dotted(place) for place in places_of(self._root, self._rules) if place[-1] == key]
+        hint = f"; did you mean {elsewhere[0]}?" if elsewhere else near(key, known)
+        self._refuse((*at, key), f"one of {', '.join(known)}", key, hint)
+
+    def _refuse(self, at: Keys, expected: str, found: Any, hint: str = "") -> NoReturn:
+        what = "none" if found is None else _short(found)
+        raise InputError(f"{self._document.label(at)}: expected {expected}, found {what}{hint}")
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "a table"
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _noun(hint: Any) -> str:
+    """What an annotation asks for, in words."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return _noun(next(one for one in inner if one is not NoneType))
+    if origin is tuple and inner[-1] is Ellipsis:
+        return "tables in double brackets" if is_dataclass(inner[0]) else f"a list, each item {_noun(inner[0])}"
+    if origin is tuple:
+        return f"a list of {len(inner)} {'whole numbers' if set(inner) == {int} else 'numbers'}"
+    return _NOUNS.get(hint, "a table")
