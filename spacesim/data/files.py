@@ -3,26 +3,31 @@
 import errno
 import json
 import os
+import uuid
 from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError, WorkError
 
 
-def write_bytes(path: Path, content: bytes) -> None:
+def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
     """Write `content` to `path` so that a reader sees the old file or the new one, never a part.
 
-    Raises InputError where the folder cannot be written, WorkError where the disk is full.
+    Several processes and machines may write the same file: the last one counts. durable: the content is on the disk
+    before the file has its name; without that a process may die at any moment, but not the machine (a power cut can
+    leave a file empty or cut off). Raises InputError where the folder cannot be written, WorkError where the disk is
+    full.
     """
     path = Path(path)
     temporary: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.parent / f".{path.name}.part"
+        temporary = path.parent / f".{path.name}.{uuid.uuid4().hex}.part"
         with temporary.open("wb") as file:
             file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -31,6 +36,18 @@ def write_bytes(path: Path, content: bytes) -> None:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what killed calls of `write_bytes` have left in and below `folder`, where nothing else writes now."""
+    for leftover in Path(folder).glob("**/.*.part"):
+        leftover.unlink(missing_ok=True)
+
+
+def flush_disks() -> None:
+    """Wait until the disks hold all that was written, where the system can do that."""
+    if hasattr(os, "sync"):
+        os.sync()
 
 
 def holds_files(folder: Path) -> bool:

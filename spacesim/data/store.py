@@ -19,8 +19,9 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.files import read_json, write_bytes, write_json
-from spacesim.data.images import load_image, read_exr, read_png, write_exr, write_png
+from spacesim.data.files import flush_disks, read_json, remove_leftovers, write_bytes, write_json
+from spacesim.data.images import Undistortion, load_image, read_exr, read_png, write_exr, write_png
+from spacesim.data.integrity import is_whole
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
 from spacesim.data.transforms import read_dataset
 
@@ -30,6 +31,7 @@ __all__ = [
     "SHADOW_NONE",
     "SHADOW_SELF_CAST",
     "DatasetWriter",
+    "FrameWriter",
     "load_truth",
     "read_dataset",
     "read_points",
@@ -52,13 +54,20 @@ _FILES = {
 }
 _LABELS = ("object_id", "part_id", "shadow")
 _OPTIONAL = ("radiance_earth",)
+_FILTERED = ("radiance", "alpha", "radiance_earth")
+RAW_MONOCHROME, RAW_COLOR = ("",), ("_r", "_g", "_b")  #: suffixes of the files in raw/
 _DEPTH_UNIT = 1e-3  # metres a step of depth/*.png: Nerfstudio's default depth_unit_scale_factor
 
 _log = logging.getLogger(__name__)
 
 
 def load_truth(dataset: Dataset, frame: Frame) -> Truth:
-    """What the path tracer knows of `frame`. Raises InputError where that is missing or broken."""
+    """What the path tracer knows of `frame`, as its pinhole camera sees it. Raises InputError where that is missing or
+    broken.
+
+    Where the frame's lens distorts, radiance and alpha are resampled bilinearly; labels take the nearest pixel's value,
+    so that none is averaged, and are 0 beyond what the lens sees.
+    """
     if frame.gt_path is None:
         raise InputError(f"{dataset.root}: expected ground truth of {frame.file_path}, found no gt_path")
     path = dataset.root / frame.gt_path
@@ -73,36 +82,29 @@ def load_truth(dataset: Dataset, frame: Frame) -> Truth:
         expected = f"{frame.camera.width}x{frame.camera.height}"
         found = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
         raise InputError(f"{path}: expected {expected} pixels as the camera says, found {found}")
-    return Truth(**{name: layers[name].astype(np.uint8 if name in _LABELS else np.float32) for name in present})
+    values = {name: layers[name].astype(np.uint8 if name in _LABELS else np.float32) for name in present}
+    if any(frame.distortion):
+        source = Undistortion(frame.camera, frame.distortion)
+        values = {k: source.linear(v) if k in _FILTERED else source.nearest(v) for k, v in values.items()}
+    return Truth(**values)
 
 
-class DatasetWriter:
-    """Writes a dataset folder; an interrupted run leaves whole files only, which a later run completes.
+class FrameWriter:
+    """Writes the frames of a dataset folder that exists; any number of processes and machines may do so at once.
 
-    root: the folder, made here; scene: what to render, as JSON values, written to scene.json first;
-    resume: go on with a folder that holds the same scene. Raises InputError where it holds anything else.
+    root: the folder; raw: suffixes of the names of a sensor's pictures in raw/: () none, RAW_MONOCHROME or RAW_COLOR.
     """
 
-    def __init__(self, root: Path, scene: Mapping[str, Any], resume: bool = False) -> None:
+    def __init__(self, root: Path, raw: Sequence[str] = ()) -> None:
         self.root = Path(root)
+        self.raw = tuple(raw)
         self._warned = False
-        scene = json.loads(json.dumps(scene, allow_nan=False))  # as it reads back
-        if self.root.exists() and not self.root.is_dir():
-            raise InputError(f"{self.root}: expected a folder to write to, found a file")
-        present = sorted(p.name for p in self.root.glob("*") if not p.name.endswith(".part"))
-        if "scene.json" in present:
-            self._check_resumable(scene, resume)
-        elif present:
-            raise InputError(f"{self.root}: expected a new or empty folder, found {present[0]} in it")
-        else:
-            write_json(self.root / "scene.json", scene)
-        for leftover in self.root.glob("**/.*.part"):
-            leftover.unlink(missing_ok=True)
 
     def has(self, name: str) -> bool:
-        """All files of frame `name` are whole on disk, e.g. from an interrupted run."""
+        """All files of frame `name` are whole on disk, e.g. from an interrupted run (see `spacesim.data.integrity`)."""
         paths = [self.root / folder / f"{name}{suffix}" for folder, suffix in _FILES.items()]
-        return all(path.is_file() and path.stat().st_size > 0 for path in paths)
+        paths += [self.root / "raw" / f"{name}{suffix}.png" for suffix in self.raw]
+        return all(is_whole(path) for path in reversed(paths))
 
     def write_frame(self, name: str, truth: Truth, image: np.ndarray, raw: np.ndarray | None = None) -> None:
         """Write the files of frame `name`, e.g. "train_00012".
@@ -119,12 +121,43 @@ class DatasetWriter:
             f"depth/{name}": self._encode_depth(truth.depth, surface),
         }
         if raw is not None:
-            planes = {"": raw} if raw.ndim == 2 else dict(zip(("_r", "_g", "_b"), raw, strict=True))
-            pictures |= {f"raw/{name}{suffix}": plane for suffix, plane in planes.items()}
+            planes = raw[None] if raw.ndim == 2 else raw
+            pictures |= {f"raw/{name}{suffix}": plane for suffix, plane in zip(self.raw, planes, strict=True)}
         for path, pixels in pictures.items():
-            write_png(self.root / f"{path}.png", pixels)
+            write_png(self.root / f"{path}.png", pixels, durable=False)
         layers = {f.name: getattr(truth, f.name) for f in fields(Truth)}
-        write_exr(self.root / "gt" / f"{name}.exr", {key: value for key, value in layers.items() if value is not None})
+        present = {key: value for key, value in layers.items() if value is not None}
+        write_exr(self.root / "gt" / f"{name}.exr", present, durable=False)
+
+    def _encode_depth(self, depth: np.ndarray, surface: np.ndarray) -> np.ndarray:
+        steps = np.round(np.where(surface, depth, 0).astype(np.float64) / _DEPTH_UNIT)
+        beyond = ~(steps <= np.iinfo(np.uint16).max)
+        if beyond.any() and not self._warned:
+            _log.warning("depth/*.png: surfaces beyond 65.535 m are stored as 0; gt/*.exr has their depth")
+            self._warned = True
+        return np.where(beyond, 0, steps).astype(np.uint16)
+
+
+class DatasetWriter(FrameWriter):
+    """Writes a dataset folder; an interrupted run leaves whole files only, which a later run completes.
+
+    root: the folder, made here; scene: what to render, as JSON values, written to scene.json first; resume: go on with a
+    folder that holds the same scene; raw: as in FrameWriter. Only one at a time may work on a folder. Raises InputError where it holds anything else.
+    """
+
+    def __init__(self, root: Path, scene: Mapping[str, Any], resume: bool = False, raw: Sequence[str] = ()) -> None:
+        super().__init__(root, raw)
+        scene = json.loads(json.dumps(scene, allow_nan=False))  # as it reads back
+        if self.root.exists() and not self.root.is_dir():
+            raise InputError(f"{self.root}: expected a folder to write to, found a file")
+        present = sorted(p.name for p in self.root.glob("*") if not p.name.endswith(".part"))
+        if "scene.json" in present:
+            self._check_resumable(scene, resume)
+        elif present:
+            raise InputError(f"{self.root}: expected a new or empty folder, found {present[0]} in it")
+        else:
+            write_json(self.root / "scene.json", scene)
+        remove_leftovers(self.root)
 
     def finish(
         self,
@@ -135,7 +168,8 @@ class DatasetWriter:
         mesh: trimesh.Trimesh,
         distortion: Sequence[float] = (),
     ) -> Dataset:
-        """Write points.ply, mesh.ply and, last, transforms.json; returns the dataset as it reads back.
+        """Write points.ply, mesh.ply and, once the disks hold everything, transforms.json; returns the dataset as it
+        reads back.
 
         train, test: (frame name, camera, sun) of each frame; points: [N, 3] metres; colors: [N, 3] uint8;
         distortion: Brown-Conrady k1, k2, p1, p2, k3 of all frames, () none.
@@ -145,6 +179,7 @@ class DatasetWriter:
             raise WorkError(f"{self.root}: expected all frames to be written, {missing[0]} is not")
         write_points(self.root / "points.ply", points, colors)
         write_bytes(self.root / "mesh.ply", mesh.export(file_type="ply", vertex_normal=False))
+        flush_disks()
         write_json(self.root / "transforms.json", _describe_frames(train, test, distortion))
         return read_dataset(self.root)
 
@@ -157,14 +192,6 @@ class DatasetWriter:
         for key in [*scene, *found]:
             if key not in found or key not in scene or found[key] != scene[key]:
                 raise InputError(f"{path}: expected the scene asked for, {key!r} differs; choose another folder")
-
-    def _encode_depth(self, depth: np.ndarray, surface: np.ndarray) -> np.ndarray:
-        steps = np.round(np.where(surface, depth, 0).astype(np.float64) / _DEPTH_UNIT)
-        beyond = ~(steps <= np.iinfo(np.uint16).max)
-        if beyond.any() and not self._warned:
-            _log.warning("depth/*.png: surfaces beyond 65.535 m are stored as 0; gt/*.exr has their depth")
-            self._warned = True
-        return np.where(beyond, 0, steps).astype(np.uint16)
 
 
 def write_points(path: Path, points: ArrayLike, colors: ArrayLike) -> None:
