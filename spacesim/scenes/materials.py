@@ -6,6 +6,7 @@ perfectly smooth, because a mirror never meets a directional Sun.
 """
 
 import importlib
+import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -53,26 +54,43 @@ def lambertian(name: str, albedo: Color, source: str) -> Material:
 
 
 def metal(name: str, albedo: Color, alpha: float, source: str) -> Material:
-    """A rough metal: GGX facets of roughness `alpha`, each reflecting `albedo` at every angle. Light that would meet
-    a second facet is lost, as in all microfacet models of one bounce: the surface reflects less than `albedo`."""
+    """A rough metal of GGX roughness `alpha` whose reflectance at normal incidence is `albedo`, at other angles
+    within a few per cent of it. Microfacets of one bounce lose the light that meets a second facet (17 % at alpha
+    0.35), so each facet reflects `albedo` / `facet_albedo(alpha)`, at most 1."""
+    kept = facet_albedo(alpha)
     bsdf = {
         "type": "roughconductor",
         "material": "none",
         "distribution": "ggx",
         "alpha": alpha,
-        "specular_reflectance": _rgb(albedo),
+        "specular_reflectance": _rgb(_color(min(x / kept, 1.0) for x in albedo)),
     }
     return Material(name, albedo, bsdf, source)
 
 
+def facet_albedo(alpha: float) -> float:
+    """What a surface of perfect GGX mirrors reflects after one bounce at normal incidence: the mean of Smith's
+    shadowing G1 over the mirrored directions (Walter et al. 2007, eqs. 33 to 35)."""
+    u = (np.arange(4096) + 0.5) / 4096
+    tilt = np.arctan(alpha * np.sqrt(u / (1.0 - u)))  # of facets, as many as are seen from above
+    leaving = np.cos(2.0 * tilt)
+    shadowing = 2.0 / (1.0 + np.sqrt(1.0 + (alpha * np.tan(2.0 * tilt)) ** 2))
+    return float(np.where(leaving > 0.0, shadowing, 0.0).mean())
+
+
 def coated(name: str, albedo: Color, alpha: float, source: str, ior: float = 1.5) -> Material:
-    """A diffuse base of `albedo` under a clear coat of refractive index `ior` and GGX roughness `alpha`."""
+    """A diffuse base under a clear coat of refractive index `ior` and GGX roughness `alpha`. albedo: of the base, as
+    seen through the coat; the surface reflects ((ior - 1) / (ior + 1))^2 more, so that their sum stays below 1.
+
+    Mitsuba's principled BSDF (Burley 2012), whose roughness is the root of alpha: the diffuse light of its
+    "roughplastic" fades with roughness, to 0.6 of its value at alpha 0.4.
+    """
     bsdf = {
-        "type": "roughplastic",
-        "distribution": "ggx",
-        "alpha": alpha,
-        "int_ior": ior,
-        "diffuse_reflectance": _rgb(albedo),
+        "type": "principled",
+        "base_color": _rgb(albedo),
+        "metallic": 0.0,
+        "roughness": math.sqrt(alpha),
+        "eta": ior,
     }
     return Material(name, albedo, bsdf, source)
 
@@ -92,6 +110,9 @@ def principled(
     base_color: linear RGB; metallic, roughness: in [0, 1]. images: any of "base_color" [H, W, 3] uint8
     (sRGB-encoded), "metallic" and "roughness" [H, W] uint8 and "normal" [H, W, 3] uint8 (raw, tangent space,
     +y up); as in glTF, the numbers multiply the images. Raises InputError for a number out of range.
+
+    Disney's diffuse lobe, which this BSDF has, does not conserve energy at grazing angles: a white surface that is
+    lit from everywhere has radiance 1.00 seen at normal incidence and 1.17 at 80 degrees.
     """
     for key, values in (("base_color", base_color), ("metallic", [metallic]), ("roughness", [roughness])):
         _check_unit(f"material {name}: {key}", values)
@@ -117,8 +138,8 @@ def principled(
 
 
 @dataclass(frozen=True)
-class _Row:
-    """A row of the table; its columns are explained in materials.toml."""
+class Preset:
+    """A row of the table; its columns are explained there."""
 
     kind: str
     source: str
@@ -132,6 +153,7 @@ class _Row:
     spectrum: tuple[tuple[float, float], ...] = ()
 
     def material(self, name: str) -> Material:
+        """The row as a Material of that name."""
         if self.kind == "coated":
             made = coated(name, self.albedo, self.roughness or 0.0, self.source, self.ior or 1.5)
         elif self.kind == "metal":
@@ -153,21 +175,21 @@ PATTERNS = {"cells": textures.cells}
 def _patterned(plain: Material, pattern: str) -> Material:
     """`plain`, diffuse or coated, with the image of a pattern of its albedo."""
     image = PATTERNS[pattern](plain.albedo)
-    key = "diffuse_reflectance" if "diffuse_reflectance" in plain.bsdf else "reflectance"
+    key = "base_color" if "base_color" in plain.bsdf else "reflectance"
     bsdf = {**plain.bsdf, key: _bitmap(pattern, raw=False)}
     mean = linear_from_srgb(image / np.float32(255)).mean(axis=(0, 1), dtype=np.float64)
     return replace(plain, albedo=_color(mean), bsdf=bsdf, images={**plain.images, pattern: image})
 
 
 @cache
-def _table() -> dict[str, _Row]:
+def _table() -> dict[str, Preset]:
     toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
-    return {name: _row_of(values) for name, values in toml.loads(TABLE.read_text(encoding="utf-8")).items()}
+    return {name: _preset_of(values) for name, values in toml.loads(TABLE.read_text(encoding="utf-8")).items()}
 
 
-def _row_of(values: Mapping[str, Any]) -> _Row:
+def _preset_of(values: Mapping[str, Any]) -> Preset:
     spectrum = tuple((float(nm), float(value)) for nm, value in values.get("spectrum", ()))
-    return _Row(**{**values, "albedo": _color(values["albedo"]), "spectrum": spectrum})
+    return Preset(**{**values, "albedo": _color(values["albedo"]), "spectrum": spectrum})
 
 
 def material_names() -> tuple[str, ...]:
@@ -175,7 +197,8 @@ def material_names() -> tuple[str, ...]:
     return tuple(_table())
 
 
-def _row(name: str) -> _Row:
+def preset(name: str) -> Preset:
+    """The row called `name`; InputError lists the names where there is none."""
     if name not in _table():
         raise InputError(f"material: expected one of {', '.join(material_names())}, found {name!r}")
     return _table()[name]
@@ -184,23 +207,23 @@ def _row(name: str) -> _Row:
 @cache
 def material(name: str) -> Material:
     """The preset called `name`; InputError lists the names where there is none."""
-    return _row(name).material(name)
+    return preset(name).material(name)
 
 
 def customised(
     name: str,
-    preset: str,
+    base: str,
     albedo: Color | None = None,
     roughness: float | None = None,
     ior: float | None = None,
     tile: float | None = None,
 ) -> Material:
-    """The preset `preset` under another name and with other numbers, those that are not None.
+    """The preset `base` under another name and with other numbers, those that are not None.
 
     albedo: linear camera RGB in [0, 1]; roughness: GGX alpha in (0, 1]; ior: refractive index of the coat;
     tile: metres. Raises InputError for an unknown preset, a number out of range or one that the preset has not.
     """
-    row = _row(preset)
+    row = preset(base)
     changes: dict[str, Any] = {}
     if albedo is not None:
         _check_unit(f"material {name}: albedo", albedo)
@@ -210,13 +233,13 @@ def customised(
         if value is None:
             continue
         if getattr(row, key) is None:
-            raise InputError(f"material {name}: expected no {key}, which {preset} does not have, found {value}")
+            raise InputError(f"material {name}: expected no {key}, which {base} does not have, found {value}")
         if not low < value <= high:
             raise InputError(f"material {name}: {key}: expected a number above {low} up to {high}, found {value}")
         changes[key] = float(value)
     if not changes:
-        return replace(material(preset), name=name)
-    source = f"{preset} with {', '.join(key for key in changes if key != 'spectrum')} of the scene file; {row.source}"
+        return replace(material(base), name=name)
+    source = f"{base} with {', '.join(key for key in changes if key != 'spectrum')} of the scene file; {row.source}"
     return replace(row, source=source, **changes).material(name)
 
 
@@ -239,50 +262,3 @@ def _bitmap(key: str, raw: bool = True) -> dict[str, Any]:
 def _with_normals(bsdf: Mapping[str, Any], key: str) -> dict[str, Any]:
     """`bsdf` with the normals of the image `key` (tangent space)."""
     return {"type": "normalmap", "normalmap": _bitmap(key), "bsdf": dict(bsdf)}
-
-
-TEST_WHITE = lambertian("test white", (1.0, 1.0, 1.0), "ideal Lambertian reflector, for checks")
-TEST_GREY = lambertian("test grey", (0.5, 0.5, 0.5), "ideal Lambertian reflector, for checks")
-GOLD_FOIL = metal(
-    "gold foil",
-    (0.83, 0.56, 0.18),
-    0.35,
-    "aluminised Kapton, Kapton outside: absorptance 0.40 (table 11.3), as the luminance; hue and roughness "
-    "chosen, Kapton absorbs below 500 nm",
-)
-WHITE_PAINT = coated(
-    "white paint",
-    (0.74, 0.74, 0.72),
-    0.4,
-    "white silicone paint: absorptance 0.26 (table 11.3); roughness chosen",
-)
-DISH_WHITE = lambertian(
-    "dish white",
-    (0.85, 0.85, 0.84),
-    "white silicate paint: absorptance 0.12 to 0.14 (table 11.3), taken as matt",
-)
-BLACK_PAINT = lambertian(
-    "black paint",
-    (0.05, 0.05, 0.05),
-    "black polyurethane paint: absorptance 0.95 (table 11.3), taken as matt",
-)
-ALUMINIUM = metal(
-    "aluminium",
-    (0.76, 0.76, 0.77),
-    0.35,
-    "polished aluminium: absorptance 0.24 (table 11.3); roughness chosen, milled",
-)
-SOLAR_CELL = coated(
-    "solar cell",
-    (0.015, 0.03, 0.12),
-    0.15,
-    "GaAs cells: absorptance 0.88 (table 11.3), of which the cover glass (n = 1.5) reflects 0.04; hue chosen",
-)
-CARBON_FIBRE = coated(
-    "carbon fibre",
-    (0.05, 0.05, 0.055),
-    0.3,
-    "as black epoxy paint: absorptance 0.95 (table 11.3); gloss of its resin (n = 1.5) chosen",
-)
-BOOM_GREY = lambertian("boom grey", (0.32, 0.32, 0.33), "grey paint between black and white, chosen")
-LENS = coated("lens", (0.01, 0.012, 0.02), 0.1, "coated glass over a dark barrel, n = 1.5; chosen")

@@ -5,9 +5,9 @@ Camera RGB is in linear sRGB primaries (IEC 61966-2-1) for the CIE 1931 2 degree
 that sunlight of E W m^-2 has the value E in R, G and B. Under "d65" only one factor is common to all: sunlight of
 E W m^-2 has the luminance E, and is a little yellower than D65.
 
-The observer's tables are those of colour-science, the reference implementation of colorimetry in Python. It takes
-about a second to import, so this happens on first use only; presets of materials carry their albedo and need none
-of it (a test computes them again).
+The observer's tables are those of colour-science, colorimetry's reference implementation in Python: typed by hand
+they could not be trusted. Its import takes half a second to a second, so it happens on first use; presets of
+materials carry their albedo and need none of it (a test computes them again).
 """
 
 import sys
@@ -136,12 +136,11 @@ def _sunlight(low: float, high: float) -> tuple[Array, Array]:
 
 
 def _colour_science() -> ModuleType:
-    """colour-science, without its warning that Matplotlib is missing and without the mock of Matplotlib that it
-    leaves behind for everyone else."""
+    """colour-science, without its warning that Matplotlib is missing and without the mocks of Matplotlib that it
+    would leave behind for everyone else."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import colour
-    for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
-        if isinstance(sys.modules[name], Mock):
-            del sys.modules[name]
+    for name in [name for name, module in sys.modules.items() if isinstance(module, Mock)]:
+        del sys.modules[name]
     return colour
