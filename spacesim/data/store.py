@@ -141,8 +141,9 @@ class FrameWriter:
 class DatasetWriter(FrameWriter):
     """Writes a dataset folder; an interrupted run leaves whole files only, which a later run completes.
 
-    root: the folder, made here; scene: what to render, as JSON values, written to scene.json first; resume: go on with a
-    folder that holds the same scene; raw: as in FrameWriter. Only one at a time may work on a folder. Raises InputError where it holds anything else.
+    root: the folder, made here; scene: what to render, as JSON values, written to scene.json first; resume: go on with
+    a folder that holds the same scene; raw: as in FrameWriter. Only one at a time may work on a folder. Raises
+    InputError where it holds anything else.
     """
 
     def __init__(self, root: Path, scene: Mapping[str, Any], resume: bool = False, raw: Sequence[str] = ()) -> None:
