@@ -103,21 +103,6 @@ def sector(profile: ArrayLike, start_deg: float, end_deg: float, segments: int =
     return trimesh.Trimesh(vertices.reshape(-1, 3), faces, process=False)
 
 
-def prism(outline: ArrayLike, height: float) -> trimesh.Trimesh:
-    """The solid over the convex, counter-clockwise polygon `outline` [P, 2] in the xy plane, from z = 0 to
-    `height`."""
-    outline = np.asarray(outline, dtype=np.float64)
-    count = len(outline)
-    vertices = np.concatenate([np.c_[outline, np.zeros(count)], np.c_[outline, np.full(count, height)]])
-    index = np.arange(count)
-    ahead = np.roll(index, -1)
-    sides = np.concatenate(
-        [np.stack([index, ahead, index + count], -1), np.stack([ahead, ahead + count, index + count], -1)]
-    )
-    fan = np.array([[0, i, i + 1] for i in range(1, count - 1)])
-    return trimesh.Trimesh(vertices, np.concatenate([sides, fan[:, ::-1], fan + count]), process=False)
-
-
 def pipe(points: ArrayLike, radius: float, segments: int = 12) -> trimesh.Trimesh:
     """A bent round bar through `points` [P, 3], at least two: mitred at every bend, flat at either end.
 

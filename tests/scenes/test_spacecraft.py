@@ -1,45 +1,117 @@
+"""What is built in: closed parts, real dimensions, the same bytes every time."""
+
+import re
+
 import numpy as np
 import pytest
 import trimesh
 from trimesh.ray.ray_triangle import RayMeshIntersector
 
 from spacesim.data.errors import InputError
-from spacesim.scenes import boxsat, built_in_scene, shapes
+from spacesim.scenes import build, read_scene
+from spacesim.scenes.materials import material
+from spacesim.scenes.scene import Scene, SceneObject
+from spacesim.scenes.spacecraft import SPACECRAFT, boxsat, spacecraft
+from spacesim.scenes.spacecraft.cubesat import CELL, SIZE
+from spacesim.scenes.spacecraft.small_body import crater_profile, noise, power_law
 
-PARTS = boxsat().parts
+CRAFT = {name: spacecraft(name) for name in SPACECRAFT}
+PARTS = [(name, part) for name, craft in CRAFT.items() for part in craft.parts]
+MOST_PARTS, MOST_FACES = 120, 120_000
 
 
-@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.name)
-def test_parts_are_closed_and_face_outward(part):
+def _mesh(name, *parts):
+    """The named parts as one mesh; all of them where none is named."""
+    return trimesh.util.concatenate([part.mesh for part in CRAFT[name].parts if not parts or part.name in parts])
+
+
+def _part(name, part):
+    return next(item.mesh for item in CRAFT[name].parts if item.name == part)
+
+
+def _size(mesh):
+    return np.ptp(mesh.bounds, axis=0)
+
+
+@pytest.mark.parametrize(("name", "part"), PARTS, ids=lambda item: getattr(item, "name", item))
+def test_parts_are_closed_and_face_outward(name, part):
     assert part.mesh.is_watertight
     assert part.mesh.is_winding_consistent
-    assert all(body.volume > 0 for body in part.mesh.split(only_watertight=False))
     assert part.mesh.area_faces.min() > 0
+    labels = trimesh.graph.connected_component_labels(part.mesh.face_adjacency, node_count=len(part.mesh.faces))
+    a, b, c = np.moveaxis(part.mesh.triangles - part.mesh.bounds[0], 1, 0)
+    volumes = np.bincount(labels, weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
+    assert volumes.min() > 0
 
 
-def test_names_are_unique_and_ids_fit_a_byte():
-    scene = built_in_scene("boxsat-pair")
-    assert len({part.name for part in PARTS}) == len(PARTS)
-    assert [placed.part_id for placed in scene.parts] == list(range(1, 2 * len(PARTS) + 1))
-    assert {placed.object_id for placed in scene.parts} == {1, 2}
-    assert len(scene.parts) < 256
+@pytest.mark.parametrize("name", SPACECRAFT)
+def test_counts_and_names(name):
+    craft = CRAFT[name]
+    names = [part.name for part in craft.parts]
+    assert craft.name == name
+    assert len(set(names)) == len(names) <= MOST_PARTS
+    assert all(re.fullmatch(r"[a-z][a-z0-9_]*", item) for item in names)
+    assert len(_mesh(name).faces) <= MOST_FACES
 
 
-def test_size_is_that_of_a_small_satellite():
-    low, high = built_in_scene("boxsat").mesh.bounds
-    assert 4.0 < high[1] - low[1] < 5.0
-    assert (high - low).max() == high[1] - low[1]
+@pytest.mark.parametrize("name", SPACECRAFT)
+def test_same_bytes_every_time(name):
+    again = spacecraft(name)
+    for first, second in zip(CRAFT[name].parts, again.parts, strict=True):
+        assert first.mesh.vertices.tobytes() == second.mesh.vertices.tobytes()
+        assert first.mesh.faces.tobytes() == second.mesh.faces.tobytes()
+
+
+@pytest.mark.parametrize("name", SPACECRAFT)
+def test_materials_name_their_source_and_reflect_less_than_they_get(name):
+    surfaces = {part.material.name: part.material for part in CRAFT[name].parts}
+    for key, surface in surfaces.items():
+        assert surface.source
+        assert all(0 <= channel < 1 for channel in surface.albedo)
+        if key not in ("foam-insulation", "handrail-yellow"):
+            assert surface is material(key), "a preset of the table"
+
+
+def test_all_fit_into_one_scene():
+    scene = Scene("all", tuple(SceneObject(craft) for craft in CRAFT.values()))
+    assert len(scene.parts) <= 255
 
 
 def test_pair_is_two_boxsats_three_metres_apart_on_each_axis():
-    scene = built_in_scene("boxsat-pair")
-    first, second = (scene.parts[i * len(PARTS)].mesh.vertices for i in (0, 1))
+    scene = build(read_scene("boxsat-pair"))
+    count = len(CRAFT["boxsat"].parts)
+    first, second = (scene.parts[i * count].mesh.vertices for i in (0, 1))
     np.testing.assert_allclose(second - first, np.full_like(first, -3.0), atol=1e-12)
+    assert [placed.part_id for placed in scene.parts] == list(range(1, 2 * count + 1))
+    assert {placed.object_id for placed in scene.parts} == {1, 2}
 
 
-def test_barrel_is_hollow_and_light_passes_between_the_struts():
-    caster = RayMeshIntersector(built_in_scene("boxsat").mesh)
-    rim = max(part.mesh.bounds[1][0] for part in PARTS if part.name == "camera_barrel")
+@pytest.mark.parametrize("name", SPACECRAFT)
+def test_bounding_sphere_holds_all_and_is_nearly_smallest(name):
+    scene = Scene(name, (SceneObject(CRAFT[name]),))
+    centre, radius = scene.bounding_sphere
+    distances = np.linalg.norm(scene.mesh.vertices - centre, axis=1)
+    assert distances.max() == pytest.approx(radius)
+    low, high = scene.mesh.bounds
+    assert radius >= 0.5 * (high - low).max()
+    if name == "boxsat":  # the exact search takes long on large meshes
+        assert radius <= 1.01 * trimesh.nsphere.minimum_nsphere(scene.mesh)[1]
+
+
+def test_unknown_name_lists_the_known_ones():
+    with pytest.raises(InputError, match=r"boxsat, telescope, cubesat, upper-stage, small-body, found 'bixsat'"):
+        spacecraft("bixsat")
+
+
+def test_boxsat_is_as_large_as_a_small_satellite():
+    x, y, z = _size(_mesh("boxsat"))
+    assert 4.0 < y < 5.0
+    assert y > max(x, z)
+
+
+def test_boxsats_barrel_is_hollow_and_light_passes_between_the_struts():
+    caster = RayMeshIntersector(_mesh("boxsat"))
+    rim = max(part.mesh.bounds[1][0] for part in boxsat().parts if part.name == "camera_barrel")
     into_barrel, _, _ = caster.intersects_location([[3.0, 0.05, -0.1]], [[-1.0, 0.0, 0.0]], multiple_hits=False)
     assert rim - into_barrel[0][0] > 0.3
     turn = trimesh.transformations.rotation_matrix(np.radians(25.0), [0, 1, 0])[:3, :3]
@@ -49,30 +121,105 @@ def test_barrel_is_hollow_and_light_passes_between_the_struts():
     assert caster.intersects_any([on_strut], [towards])[0]
 
 
-def test_bounding_sphere_holds_all_and_is_nearly_smallest():
-    scene = built_in_scene("boxsat")
-    centre, radius = scene.bounding_sphere
-    distances = np.linalg.norm(scene.mesh.vertices - centre, axis=1)
-    assert distances.max() == pytest.approx(radius)
-    assert radius <= 1.01 * trimesh.nsphere.minimum_nsphere(scene.mesh)[1]
+def test_telescope_has_hubbles_dimensions():
+    tube = _mesh("telescope", "light_shield", "forward_shell", "equipment_section", "aft_shroud")
+    assert _size(tube)[0] == pytest.approx(13.2, abs=0.01)
+    assert _size(_mesh("telescope", "aft_shroud", "shroud_bands"))[1:] == pytest.approx([4.2, 4.2], abs=0.01)
+    assert _size(_part("telescope", "light_shield")) == pytest.approx([4.0, 3.1, 3.1], abs=0.01)
+    assert _size(_part("telescope", "aft_shroud"))[0] == pytest.approx(3.5, abs=0.01)
+    assert _size(_part("telescope", "primary_mirror"))[1:] == pytest.approx([2.4, 2.4], abs=0.01)
+    assert _size(_part("telescope", "secondary_mirror"))[1:] == pytest.approx([0.3, 0.3], abs=0.01)
+    for side in ("left", "right"):
+        array = _part("telescope", f"array_frames_{side}").bounding_box_oriented.primitive.extents
+        assert sorted(array)[1:] == pytest.approx([2.6, 7.1], abs=0.01)
 
 
-def test_materials_name_their_source_and_reflect_less_than_they_get():
-    for part in PARTS:
-        assert part.material.source
-        assert all(0 < channel <= 1 for channel in part.material.albedo)
-        assert part.material.bsdf.get("alpha", 1.0) >= 0.1, "a mirror never meets a directional Sun"
+def test_telescopes_door_is_open_by_105_degrees():
+    door = _part("telescope", "door")
+    thin = np.linalg.eigh(np.cov(door.vertices.T))[1][:, 0]  # across the plate
+    outward = thin * np.sign(thin[2])  # closed, it faced +x; the hinge on +z turns that towards +z and on to -x
+    assert np.degrees(np.arccos(outward[0])) == pytest.approx(105.0, abs=0.1)
+    assert door.bounds[0][0] > 6.6, "in front of the tube"
 
 
-def test_revolved_square_has_the_volume_of_pappus():
-    tube = shapes.tube([0, 0, 0], [0, 0, 2], inner=1.0, outer=1.5, segments=2000)
-    assert tube.is_watertight
-    assert tube.volume == pytest.approx(np.pi * (1.5**2 - 1.0) * 2, rel=1e-4)
-    rod = shapes.rod([1, 2, 3], [2, 4, 5], radius=0.5, segments=2000)
-    assert rod.volume == pytest.approx(np.pi * 0.25 * 3, rel=1e-4)
-    np.testing.assert_allclose(rod.center_mass, [1.5, 3, 4], atol=1e-9)
+def test_starlight_reaches_the_telescopes_primary_mirror():
+    """Parallel rays down the tube land on the mirror, but for those that the secondary's hub stops."""
+    craft = _mesh("telescope")
+    sizes = [len(part.mesh.faces) for part in CRAFT["telescope"].parts]
+    owner = np.repeat([part.name for part in CRAFT["telescope"].parts], sizes)
+    y = np.array([0.6, 0.9, -0.6, -0.9, 0.0, 0.0, 0.0])
+    z = np.array([0.0, 0.0, 0.0, 0.0, -0.6, -0.9, -0.2])
+    origins = np.stack([np.full(7, 9.9), y, z], axis=-1)
+    faces = RayMeshIntersector(craft).intersects_first(origins, np.tile([-1.0, 0, 0], (7, 1)))
+    assert list(owner[faces]) == ["primary_mirror"] * 6 + ["secondary_hub"]
 
 
-def test_unknown_scene_lists_the_known_ones():
-    with pytest.raises(InputError, match="boxsat, boxsat-pair, found 'bixsat'"):
-        built_in_scene("bixsat")
+def test_cubesat_has_the_size_of_the_standard_and_whole_cells():
+    assert _size(_mesh("cubesat", "rails")) == pytest.approx([0.366, 0.2263, 0.1])
+    assert _size(_mesh("cubesat", "structure", "end_frames")) == pytest.approx(SIZE, abs=0.01)
+    for side in ("left", "right"):
+        for board in _part("cubesat", f"wing_cells_{side}").split():
+            assert (board.bounds[:, 0] / CELL[1]) % 1.0 == pytest.approx([0, 0], abs=1e-9)
+            rows = board.bounds[:, 1] / CELL[0]
+            assert rows == pytest.approx(np.round(rows), abs=1e-9)
+
+
+def test_upper_stage_has_the_dimensions_of_an_h2a_second_stage():
+    assert _size(_mesh("upper-stage"))[0] == pytest.approx(11.0)
+    assert _size(_part("upper-stage", "hydrogen_tank"))[1:] == pytest.approx([4.0, 4.0], abs=0.07)
+    assert _size(_part("upper-stage", "front_skirt"))[1:] == pytest.approx([4.0, 4.0])
+    assert _size(_part("upper-stage", "adapter_ring"))[1:] == pytest.approx([1.194, 1.194])
+    engine = _mesh("upper-stage", "nozzle", "chamber")
+    assert _size(engine)[0] == pytest.approx(2.79, abs=0.01)
+
+
+def test_upper_stages_tanks_do_not_meet():
+    hydrogen, oxygen = _part("upper-stage", "hydrogen_tank"), _part("upper-stage", "oxygen_tank")
+    assert hydrogen.bounds[0][0] >= oxygen.bounds[1][0]
+
+
+def test_small_body_has_its_volume_and_centre():
+    surface = _part("small-body", "surface")
+    assert surface.volume == pytest.approx(np.pi / 6.0 * 500.0**3, rel=1e-6)
+    np.testing.assert_allclose(surface.center_mass, 0.0, atol=0.1)
+    x, y, z = _size(surface)
+    assert x > y > z
+    assert 40_000 <= len(surface.faces) <= 90_000
+
+
+def test_small_bodys_surface_hides_nothing_from_its_centre():
+    """Each direction has one height: no facet is folded over."""
+    surface = _part("small-body", "surface")
+    assert np.einsum("ij,ij->i", surface.face_normals, surface.triangles_center).min() > 0
+
+
+def test_boulders_lie_on_the_small_body():
+    surface, boulders = _part("small-body", "surface"), _part("small-body", "boulders")
+    rocks = boulders.split()
+    tree = trimesh.proximity.ProximityQuery(surface)
+    for rock in rocks[::20]:
+        heights = -tree.signed_distance(rock.vertices)
+        assert heights.min() < 0 < heights.max()
+
+
+def test_crater_is_as_deep_as_pikes():
+    distance = np.linspace(0.0, 3.0, 3001)
+    height = crater_profile(distance)
+    assert height.max() - height[0] == pytest.approx(0.196, abs=0.01)
+    assert distance[height.argmax()] == pytest.approx(1.0, abs=0.05)
+    assert height[-1] < 0.05 * height.max()
+
+
+def test_power_law_has_its_slope_and_limits():
+    sizes = power_law(np.random.default_rng(0), 200_000, (2.0, 50.0), 2.5)
+    assert sizes.min() >= 2.0
+    assert sizes.max() <= 50.0
+    larger = [(sizes > limit).mean() + 50.0**-2.5 / (2.0**-2.5 - 50.0**-2.5) for limit in (3.0, 6.0)]
+    assert np.log(larger[0] / larger[1]) / np.log(2.0) == pytest.approx(2.5, abs=0.03)
+
+
+def test_noise_has_its_amplitude():
+    points = np.random.default_rng(1).uniform(-50.0, 50.0, (20_000, 3))
+    field = noise(points, np.random.default_rng(2), octaves=1, lowest=3.0, amplitude=0.2)
+    assert field.std() == pytest.approx(0.2, rel=0.05)
+    assert field.mean() == pytest.approx(0.0, abs=0.01)

@@ -8,11 +8,13 @@ from spacesim.scenes.spacecraft.cubesat import cubesat
 from spacesim.scenes.spacecraft.part import Spacecraft
 from spacesim.scenes.spacecraft.small_body import small_body
 from spacesim.scenes.spacecraft.telescope import telescope
+from spacesim.scenes.spacecraft.upper_stage import upper_stage
 
 _BUILT_IN: dict[str, Callable[[], Spacecraft]] = {
     "boxsat": boxsat,
     "telescope": telescope,
     "cubesat": cubesat,
+    "upper-stage": upper_stage,
     "small-body": small_body,
 }
 SPACECRAFT = tuple(_BUILT_IN)  #: names of the built-in spacecraft

@@ -4,7 +4,7 @@ Body axes: +x the camera looks along, +z the side with cells and star tracker, w
 the middle of the body.
 
 The body has the size of the CubeSat Design Specification (Cal Poly, revision 14.1, 2022) for 6U: 226.3 mm by 100 mm
-by 366 mm with rails 8.5 mm wide. Cells are of 40 mm by 80 mm, as common triple-junction cells are. The rest is chosen.
+by 366 mm with rails 8.5 mm wide. Cells are 40 mm by 80 mm, as common triple-junction ones are. The rest is chosen.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ _X, _Y, _Z = 0.5 * SIZE
 
 
 def cubesat() -> Spacecraft:
-    """A 6U cubesat, 1.1 m across its wings."""
+    """A 6U cubesat, 1.2 m across its wings."""
     parts = [
         *_body(),
         *_wing("left", -1.0),
@@ -66,39 +66,31 @@ def _body() -> list[Part]:
 
 
 def _wing(name: str, side: float) -> list[Part]:
-    """Two panels hinged to the upper edge of the body, and to each other."""
-    width, length, thick, gap = 0.20, 0.34, 0.0024, 0.012
-    z = _Z - 0.006
-    boards, cells, diodes = [], [], []
-    for i in range(2):
-        y = _Y + gap + 0.5 * width + i * (width + gap)
-        boards.append(s.box([length, width, thick], [0, side * y, z]))
-        for column in range(8):
-            for row in (-1, 1):
-                place = [(column - 3.5) * 0.0415, side * (y + row * 0.0425), z + 0.5 * thick + 0.0004]
-                cells.append(s.box([CELL[0] - 0.0005, CELL[1], 0.001], place))
-        for x in (-0.12, 0.0, 0.12):
-            diodes.append(s.box([0.012, 0.02, 0.003], [x, side * (y + 0.05), z - 0.5 * thick - 0.0012]))
-    hinges = [
-        s.rod(
-            [x - 0.014, side * (_Y + 0.5 * gap + i * (width + gap)), z],
-            [x + 0.014, side * (_Y + 0.5 * gap + i * (width + gap)), z],
-            0.0045,
-            16,
-        )
-        for x in (-0.11, 0.11)
-        for i in range(2)
-    ]
-    leaves = [
-        s.box([0.02, gap + 0.012, 0.002], [x, side * (_Y + 0.5 * gap + i * (width + gap)), z - 0.003])
-        for x in (-0.11, 0.11)
-        for i in range(2)
-    ]
+    """Two boards of 20 cells, hinged to the upper edge of the body and to each other.
+
+    Cells start at whole multiples of their size, as their pattern does (80 mm along x, 40 mm along y).
+    """
+    length, margin, thick, z = 0.336, 0.011, 0.0024, _Z - 0.006
+    rows, columns = 5, 4
+    width = rows * CELL[0]
+    boards, cells, diodes, hinges = [], [], [], []
+    for first in (0.16, 0.40):
+        y = first + 0.5 * width
+        boards.append(s.box([length, width + 2 * margin, thick], [0, side * y, z]))
+        cells.append(s.box([columns * CELL[1], width, 0.001], [0, side * y, z + 0.5 * thick + 0.0003]))
+        diodes += [
+            s.box([0.012, 0.02, 0.003], [x, side * (y + 0.05), z - 0.5 * thick - 0.0012]) for x in (-0.12, 0, 0.12)
+        ]
+    for inner, outer in ((_Y - 0.002, 0.16 - margin), (0.36 + margin, 0.40 - margin)):
+        for x in (-0.11, 0.11):
+            y = 0.5 * (inner + outer)
+            hinges.append(s.rod([x - 0.014, side * y, z - 0.001], [x + 0.014, side * y, z - 0.001], 0.0045, 16))
+            hinges.append(s.box([0.02, outer - inner + 0.02, 0.002], [x, side * y, z - 0.5 * thick - 0.0008]))
     return [
         Part(f"wing_boards_{name}", s.joined(boards), material("carbon-fibre")),
         Part(f"wing_cells_{name}", s.joined(cells), material("solar-cell")),
         Part(f"wing_diodes_{name}", s.joined(diodes), material("kapton")),
-        Part(f"wing_hinges_{name}", s.joined([*hinges, *leaves]), material("bare-aluminium")),
+        Part(f"wing_hinges_{name}", s.joined(hinges), material("bare-aluminium")),
     ]
 
 
@@ -146,12 +138,8 @@ def _back() -> list[Part]:
 
 def _top() -> list[Part]:
     """+z: body cells, a star tracker with its baffle, a GNSS antenna, sun sensors."""
-    plate = s.box([0.19, 0.186, 0.0025], [-0.075, 0, _Z - 0.0025])
-    cells = [
-        s.box([CELL[0], CELL[1], 0.001], [-0.075 + (i - 1.5) * 0.044, j * 0.0425, _Z - 0.0008])
-        for i in range(4)
-        for j in (-1, 1)
-    ]
+    plate = s.box([0.17, 0.172, 0.0025], [-0.08, 0, _Z - 0.0025])
+    cells = s.box([2 * CELL[1], 4 * CELL[0], 0.001], [-0.08, 0, _Z - 0.0009])
     baffle = s.revolved([(0, 0), (0.02, 0), (0.034, 0.06), (0.0325, 0.06), (0.018, 0.012), (0, 0.012)])
     block = s.box([0.055, 0.055, 0.026], [0.10, 0.05, _Z + 0.008])
     tracker = s.placed(baffle, [0.10, 0.054, _Z + 0.016], [0.25, 0.45, 1.0])
@@ -160,7 +148,7 @@ def _top() -> list[Part]:
     ]
     return [
         Part("top_plate", plate, material("white-paint-matt")),
-        Part("top_cells", s.joined(cells), material("solar-cell")),
+        Part("top_cells", cells, material("solar-cell")),
         Part("tracker_block", block, material("anodised-aluminium")),
         Part("tracker_baffle", tracker, material("black-paint")),
         Part("navigation_antenna", s.box([0.045, 0.045, 0.009], [0.10, -0.045, _Z + 0.001]), material("white-paint")),

@@ -21,9 +21,10 @@ DIAMETER = 500.0  #: of the sphere of equal volume, metres
 _SEED = 7
 _SUBDIVISIONS = 6  # 81,920 facets
 _AXES = np.array([1.16, 1.0, 0.87])
-_CRATERS, _CRATER_DIAMETERS = 190, (26.0, 210.0)
-_BOULDERS, _BOULDER_DIAMETERS = 90, (7.0, 40.0)
+_CRATERS, _CRATER_DIAMETERS = 190, (34.0, 210.0)
+_BOULDERS, _BOULDER_DIAMETERS = 240, (6.0, 40.0)
 _DEPTH, _RIM = 0.196, 0.036  # of a fresh simple crater, in diameters (Pike 1977)
+_SHARPNESS = 100.0  # of the rim, chosen
 
 
 def small_body() -> Spacecraft:
@@ -42,13 +43,14 @@ def small_body() -> Spacecraft:
 def _body(random: np.random.Generator) -> trimesh.Trimesh:
     """The surface: an ellipsoid, uneven in several octaves, struck by craters from the largest to the smallest."""
     sphere = trimesh.creation.icosphere(subdivisions=_SUBDIVISIONS)
-    unit = np.asarray(sphere.vertices)
+    spacing = float(sphere.edges_unique_length.mean())
+    unit = normalize(sphere.vertices + random.uniform(-0.3, 0.3, sphere.vertices.shape) * spacing)  # no pattern shows
     form = 1.0 / np.linalg.norm(unit / _AXES, axis=1)
     height = 0.5 * DIAMETER * form * (1.0 + noise(unit, random, octaves=3, lowest=1.3, amplitude=0.07))
     for diameter in np.sort(power_law(random, _CRATERS, _CRATER_DIAMETERS, 2.0))[::-1]:
         centre = normalize(random.normal(size=3))
         height = height + _crater(unit, height, centre, diameter, freshness=random.uniform(0.35, 1.0))
-    height = height + 0.5 * DIAMETER * noise(unit, random, octaves=4, lowest=9.0, amplitude=0.006)
+    height = height + 0.5 * DIAMETER * noise(unit, random, octaves=4, lowest=9.0, amplitude=0.009)
     mesh = trimesh.Trimesh(unit * height[:, None], sphere.faces, process=False)
     mesh.apply_translation(-mesh.center_mass)
     mesh.apply_scale(DIAMETER / (6.0 * mesh.volume / np.pi) ** (1 / 3))
@@ -80,10 +82,13 @@ def power_law(random: np.random.Generator, count: int, limits: tuple[float, floa
 
 def crater_profile(distance: Array) -> Array:
     """Height [N] of a fresh simple crater, in diameters, at `distance` [N] from its centre in radii: a parabolic
-    bowl up to the rim at 1, and ejecta that thin out with the cube of the distance (McGetchin et al. 1973)."""
-    bowl = -(_DEPTH - _RIM) + _DEPTH * distance**2
-    ejecta = _RIM * np.maximum(distance, 1.0) ** -3
-    return np.where(distance < 1.0, bowl, ejecta)
+    bowl up to the rim at 1, and ejecta that thin out with the cube of the distance (McGetchin et al. 1973).
+
+    A smooth minimum of the two rounds the rim over about a tenth of the radius and lowers it by 0.007.
+    """
+    bowl = -(_DEPTH - _RIM) + _DEPTH * np.minimum(distance, 2.0) ** 2
+    ejecta = _RIM * np.maximum(distance, 0.8) ** -3
+    return np.asarray(-np.logaddexp(-_SHARPNESS * bowl, -_SHARPNESS * ejecta) / _SHARPNESS)
 
 
 def _crater(unit: Array, height: Array, centre: Array, diameter: float, freshness: float) -> Array:
@@ -107,10 +112,10 @@ def _crater(unit: Array, height: Array, centre: Array, diameter: float, freshnes
 
 
 def _boulders(body: trimesh.Trimesh, random: np.random.Generator) -> trimesh.Trimesh:
-    """Angular rocks, a third of each in the ground."""
+    """Angular rocks, almost half of each in the ground."""
     rocks = []
     for diameter in power_law(random, _BOULDERS, _BOULDER_DIAMETERS, 3.0):
-        rock = trimesh.creation.icosphere(subdivisions=2)
+        rock = trimesh.creation.icosphere(subdivisions=2 if diameter > 12.0 else 1)
         unit = np.asarray(rock.vertices)
         shape = random.uniform(0.7, 1.15, 3)
         cut = _facets(unit, random)
@@ -118,7 +123,7 @@ def _boulders(body: trimesh.Trimesh, random: np.random.Generator) -> trimesh.Tri
         turn = trimesh.transformations.random_rotation_matrix(random.uniform(size=3))[:3, :3]
         vertices = (unit * (cut * rough)[:, None] * shape * 0.5 * diameter) @ turn.T
         foot = random.integers(len(body.vertices))
-        place = body.vertices[foot] + 0.15 * diameter * body.vertex_normals[foot]
+        place = body.vertices[foot] + 0.06 * diameter * body.vertex_normals[foot]
         rocks.append(trimesh.Trimesh(vertices + place, rock.faces, process=False))
     return trimesh.util.concatenate(rocks)
 
