@@ -1,5 +1,6 @@
 """Reads obj, stl, ply and off through trimesh: parts with the colours and textures that these formats know."""
 
+import inspect
 import io
 import math
 import re
@@ -9,12 +10,16 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from trimesh.exchange.obj import load_obj
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb
 from spacesim.scenes.materials import Color
 from spacesim.scenes.meshpart import RawPart
-from spacesim.scenes.meshtexture import NORMALS, Folder, Notes, Surface, decoded, unit
+from spacesim.scenes.meshtexture import NORMALS, Folder, Notes, Surface, check_picture, decoded, unit
+
+_SPLIT = next(name for name in inspect.signature(load_obj).parameters if name in ("split_objects", "split_object"))
+"""The option of trimesh (5, 4) that keeps objects apart."""
 
 _UNUSED = ("ke", "map_ke", "map_ks", "map_ka", "map_bump", "bump", "map_d", "disp", "norm", "map_ns", "refl")
 
@@ -29,7 +34,7 @@ def read_table(path: Path, notes: Notes) -> list[RawPart]:
     if kind == "obj":
         data = _with_positive_indices(data)
     resolver = _Files(path, notes)
-    options = {"split_objects": True} if kind == "obj" else {}
+    options = {_SPLIT: True} if kind == "obj" else {}
     # `load` with force="scene": its successor load_scene is not in trimesh 4.5
     scene = trimesh.load(io.BytesIO(data), kind, resolver=resolver, force="scene", process=False, **options)
     parts = []
@@ -57,10 +62,13 @@ class _Files(trimesh.resolvers.Resolver):
     def get(self, key: str) -> bytes:
         """The bytes of the file called `key`; FileNotFoundError (and a note) where it cannot be had."""
         try:
-            return self.folder.read(str(key))
+            data = self.folder.read(str(key))
         except InputError as error:
             self.notes.drop("files that cannot be had are not used", str(error))
             raise FileNotFoundError(str(error)) from None
+        if not str(key).strip().lower().endswith(".mtl"):
+            check_picture(data, str(key)[:80], self.notes)
+        return data
 
     def keys(self) -> tuple[str, ...]:
         """No listing: files are asked for by name."""
@@ -140,9 +148,11 @@ def _surface(mesh: trimesh.Trimesh, files: _Files, notes: Notes) -> Surface | No
     if found is None or type(found).__name__ != "SimpleMaterial":
         return None
     values = {str(key).lower(): value for key, value in (found.kwargs or {}).items()}
-    if found.image is None and not values:
+    image = found.image if getattr(found.image, "fp", None) is not None else None  # else trimesh's own placeholder
+    if image is None and not values:
         return None  # texture coordinates alone
-    return _obj_surface(str(found.name or "texture")[:80], values, found.image, files, notes)
+    name = str(values.get("name") or getattr(found, "name", None) or "texture")[:80]
+    return _obj_surface(name, values, image, files, notes)
 
 
 def _obj_surface(name: str, values: dict[str, Any], image: Any, files: _Files, notes: Notes) -> Surface:
@@ -172,12 +182,9 @@ def _obj_surface(name: str, values: dict[str, Any], image: Any, files: _Files, n
 
 def _picture(image: Any, name: str, files: _Files, notes: Notes) -> np.ndarray | None:
     """trimesh has opened the image; its pixels are read here, where damage and size are looked after."""
-    stream = getattr(image, "fp", None)
-    if stream is None:
-        return None
     if id(image) not in files.pictures:
-        stream.seek(0)
-        files.pictures[id(image)] = decoded(stream.read(), name, notes)
+        image.fp.seek(0)
+        files.pictures[id(image)] = decoded(image.fp.read(), name, notes)
     return files.pictures[id(image)]
 
 

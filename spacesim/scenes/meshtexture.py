@@ -28,6 +28,8 @@ undiminished diffuse base, reflects more of an even sky than it gets."""
 
 NORMALS = "normals of vertices are not used, facets are flat"
 
+_UNDECODED = "textures that cannot be decoded are not used"
+
 UNTOLD = "grey-paint"  #: preset of parts whose file says nothing of their surface, chosen
 
 
@@ -119,13 +121,24 @@ def decoded(data: bytes, what: str, notes: Notes) -> np.ndarray | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             image = Image.open(io.BytesIO(data))
-            if image.width * image.height > LARGEST_PICTURE:
-                notes.drop(f"textures of more than {LARGEST_PICTURE:,} pixels are not used", what)
-                return None
-            return _rgb_picture(image, what, notes)
+            if image.width * image.height <= LARGEST_PICTURE:
+                return _rgb_picture(image, what, notes)
     except Exception as error:  # Pillow raises what it likes on damaged data
-        notes.drop("textures that cannot be decoded are not used", f"{what} ({type(error).__name__})")
+        notes.drop(_UNDECODED, f"{what} ({type(error).__name__})")
         return None
+    notes.drop(f"textures of more than {LARGEST_PICTURE:,} pixels are not used", what)
+    return None
+
+
+def check_picture(data: bytes, what: str, notes: Notes) -> None:
+    """FileNotFoundError (and a note) where `data` does not begin as an image does."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            Image.open(io.BytesIO(data))
+    except Exception as error:
+        notes.drop(_UNDECODED, f"{what} ({type(error).__name__})")
+        raise FileNotFoundError(what) from None
 
 
 def _rgb_picture(image: Any, what: str, notes: Notes) -> np.ndarray:
