@@ -223,3 +223,36 @@ def test_noise_has_its_amplitude():
     field = noise(points, np.random.default_rng(2), octaves=1, lowest=3.0, amplitude=0.2)
     assert field.std() == pytest.approx(0.2, rel=0.05)
     assert field.mean() == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["telescope", "cubesat", "upper-stage"])
+def test_no_two_parts_share_a_surface(name):
+    """Where faces of two parts lay in one plane and looked the same way, the part that a ray meets, and with it
+    the truth, would be a matter of rounding."""
+    parts = CRAFT[name].parts
+    owner = np.repeat(np.arange(len(parts)), [len(part.mesh.faces) for part in parts])
+    triangles = np.concatenate([part.mesh.triangles for part in parts])
+    normals = np.concatenate([part.mesh.face_normals for part in parts])
+    scale = np.ptp(triangles.reshape(-1, 3), axis=0).max()
+    planes = np.round(np.c_[200 * normals, np.einsum("ij,ij->i", triangles[:, 0], normals) / (2e-6 * scale)])
+    _, plane = np.unique(planes, axis=0, return_inverse=True)
+    shared = set()
+    for faces in np.split(np.argsort(plane.ravel(), kind="stable"), np.cumsum(np.bincount(plane.ravel()))[:-1]):
+        if len(np.unique(owner[faces])) > 1:
+            flat = np.delete(triangles[faces], np.abs(normals[faces[0]]).argmax(), axis=2)
+            for i, j in zip(*np.triu_indices(len(faces), 1), strict=True):
+                a, b = owner[faces[i]], owner[faces[j]]
+                if a != b and _overlap(flat[i], flat[j], 1e-5 * scale):
+                    shared.add((parts[a].name, parts[b].name))
+    assert shared == set()
+
+
+def _overlap(first, second, margin):
+    """Whether two triangles [3, 2] overlap by more than `margin`: no side of either separates them."""
+    for corners in (first, second):
+        side = np.roll(corners, -1, axis=0) - corners
+        across = np.stack([-side[:, 1], side[:, 0]]) / np.maximum(np.linalg.norm(side, axis=1), 1e-12)
+        a, b = first @ across, second @ across
+        if (np.minimum(a.max(0), b.max(0)) - np.maximum(a.min(0), b.min(0)) <= margin).any():
+            return False
+    return True

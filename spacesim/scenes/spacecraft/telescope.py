@@ -4,8 +4,8 @@ Body axes: +x the line of sight (V1), solar arrays along -y and +y (V2), high-ga
 the aperture door hinged on the +z side. The origin is half-way along the tube.
 
 Public figures that it keeps to (NASA, "Hubble Space Telescope Servicing Mission 4 Media Reference Guide", 2009,
-and NASA's "Hubble by the numbers"): length 13.2 m, largest diameter 4.2 m, light shield and forward shell 4 m
-long and 3.1 m wide each, equipment section 1.5 m and aft shroud 3.5 m long, primary mirror 2.4 m, secondary
+and NASA's "Hubble by the numbers"): length 13.2 m, largest diameter 4.2 m, light shield and forward
+shell about 4 m long and 3.1 m wide each, equipment section about 1.5 m and aft shroud 3.5 m long, primary mirror 2.4 m, secondary
 0.3 m, arrays of 7.1 m by 2.6 m, door opened by up to 105 degrees, antenna dishes 1.3 m wide. Everything smaller
 is placed by eye after public photographs.
 
@@ -156,7 +156,11 @@ def _equipment() -> Solids:
         ("bay_doors_silver", s.joined(doors["silver"]), material("silver-mli")),
         ("bay_doors_white", s.joined(doors["white"]), material("white-paint")),
         ("bay_latches", s.joined(latches), material("anodised-aluminium")),
-        ("forward_collar", s.tube([0, 0, _BAY], [0, 0, _BAY + 0.12], inner, 1.72), material("white-paint")),
+        (
+            "forward_collar",
+            s.tube([0, 0, _BAY - 0.01], [0, 0, _BAY + 0.12], _TUBE - 0.02, 1.72),
+            material("white-paint"),
+        ),
     ]
 
 
@@ -201,11 +205,11 @@ def _aft() -> Solids:
     ring = s.tube([0, 0, _AFT - 0.42], [0, 0, _AFT - 0.34], 0.83, 0.91)
     posts = [
         s.rod(
-            [0.87 * np.cos(a), 0.87 * np.sin(a), _AFT + 0.01], [0.87 * np.cos(a), 0.87 * np.sin(a), _AFT - 0.35], 0.04
+            [0.87 * np.cos(a), 0.87 * np.sin(a), _AFT - 0.01], [0.87 * np.cos(a), 0.87 * np.sin(a), _AFT - 0.35], 0.04
         )
         for a in np.radians([30.0, 150.0, 270.0])
     ]
-    boxes = [s.box([0.5, 0.3, 0.16], [x, y, _AFT - 0.07]) for x, y in ((1.3, 0.7), (-1.3, 0.7), (-1.2, -0.8))]
+    boxes = [s.box([0.5, 0.3, 0.16], [x, y, _AFT - 0.08]) for x, y in ((1.3, 0.7), (-1.3, 0.7), (-1.2, -0.8))]
     pins = [
         s.rod(
             [1.65 * np.cos(a), 1.65 * np.sin(a), _AFT + 0.05], [1.65 * np.cos(a), 1.65 * np.sin(a), _AFT - 0.22], 0.06
@@ -232,7 +236,7 @@ def _array(name: str, side: float) -> Solids:
     length, width = ARRAY
     inner, middle, slot = 2.95, -0.75, 0.24
     half = 0.5 * (length - slot)
-    pitch = half / 4
+    pitch = (half - 0.1) / 4
     plates, frames, cells = [], [], []
     for end in (-1.0, 1.0):
         centre = [side * (inner + 0.5 * width), 0.0, end * 0.5 * (slot + half)]
@@ -242,8 +246,8 @@ def _array(name: str, side: float) -> Solids:
         for z in (-1.0, 1.0):
             frames.append(s.box([width - 0.1, 0.05, 0.05], centre + np.array([0, 0, z * (0.5 * half - 0.025)])))
         for i in range(4):
-            z = end * (0.5 * slot + (i + 0.5) * pitch)
-            cells.append(s.box([width - 0.14, 0.012, pitch - 0.07], [centre[0], 0.019, z]))
+            z = end * (0.5 * slot + 0.05 + (i + 0.5) * pitch)
+            cells.append(s.box([width - 0.14, 0.012, pitch - 0.05], [centre[0], 0.02, z]))
     mast = s.rod([side * (inner - 0.02), 0, 0], [side * (inner + width), 0, 0], 0.06)
     arm = s.rod([side * 1.66, 0, 0], [side * (inner - 0.01), 0, 0], 0.09)
     braces = [

@@ -88,19 +88,18 @@ def _skirts() -> Solids:
 def _adapter() -> Solids:
     """The equipment shelf with its boxes, and the payload adapter: an open cone with a clamp-band ring."""
     foot, top, wall = 1.35, 0.5 * ADAPTER, 0.02
-    shelf = s.revolved([(1.2, _SHELF - 0.05), (_RADIUS - 0.08, _SHELF - 0.05), (_RADIUS - 0.08, _SHELF), (1.2, _SHELF)])
-    cone = s.revolved(
-        [(foot - wall, _SHELF - 0.02), (foot, _SHELF - 0.02), (top, _TOP - 0.1), (top - wall, _TOP - 0.1)]
-    )
+    low, high = _SHELF - 0.07, _SHELF - 0.02
+    shelf = s.revolved([(1.2, low), (_RADIUS - 0.08, low), (_RADIUS - 0.08, high), (1.2, high)])
+    cone = s.revolved([(foot - wall, high - 0.02), (foot, high - 0.02), (top, _TOP - 0.1), (top - wall, _TOP - 0.1)])
     ring = s.tube([0, 0, _TOP - 0.12], [0, 0, _TOP], top - 0.05, top)
-    collar = s.tube([0, 0, _SHELF - 0.02], [0, 0, _SHELF + 0.05], foot - 0.04, foot + 0.03)
+    collar = s.tube([0, 0, high - 0.01], [0, 0, high + 0.05], foot - 0.04, foot + 0.03)
     ribs = []
     for angle in range(0, 360, 15):
-        spine = s.pipe([[foot - 0.012, 0, _SHELF], [top + 0.008, 0, _TOP - 0.12]], 0.02, 8)
+        spine = s.pipe([[foot - 0.012, 0, high], [top + 0.008, 0, _TOP - 0.12]], 0.02, 8)
         ribs.append(s.turned(spine, angle + 7.5, [0, 0, 1]))
     boxes: dict[str, list[trimesh.Trimesh]] = {"black": [], "silver": [], "white": []}
     for i, (angle, width, height) in enumerate(_AVIONICS):
-        case = s.box([0.32, width, height], [1.65, 0, _SHELF + 0.5 * height - 0.01])
+        case = s.box([0.32, width, height], [1.65, 0, high + 0.5 * height - 0.01])
         boxes[("black", "silver", "white")[i % 3]].append(s.turned(case, angle, [0, 0, 1]))
     return [
         ("equipment_shelf", shelf, material("anodised-aluminium")),
@@ -205,7 +204,7 @@ def _fittings() -> Solids:
             jets += [s.turned(s.placed(jet, [_RADIUS + 0.14, y, -0.2 + h], axis), a, [0, 0, 1]) for h in (-0.1, 0.1)]
         jets.append(s.turned(s.placed(jet, [_RADIUS + 0.14, 0, -0.41], [0, 0, -1]), a, [0, 0, 1]))
     antennas = [
-        s.turned(s.box([0.05, 0.2, 0.2], [_RADIUS + 0.015, 0, 4.22]), a, [0, 0, 1]) for a in (60.0, 180.0, 300.0)
+        s.turned(s.box([0.05, 0.2, 0.2], [_RADIUS + 0.02, 0, 4.22]), a, [0, 0, 1]) for a in (60.0, 180.0, 300.0)
     ]
     return [
         ("cable_tunnel", tunnel, material("white-paint")),
