@@ -3,8 +3,11 @@
 import math
 from dataclasses import dataclass
 
-from spacesim.data.errors import expect
+import numpy as np
+
+from spacesim.data.errors import InputError, expect
 from spacesim.data.geometry import Array
+from spacesim.data.images import distorted, undistorted
 from spacesim.data.records import MOST_PIXELS, Camera
 from spacesim.scenes.sensor import TONES, SensorConfig
 from spacesim.scenes.sun import EXPOSURE
@@ -16,10 +19,10 @@ WHITE_BALANCES = ("sun", "d65")
 class CameraConfig:
     """A camera. Raises InputError for a value out of range.
 
-    resolution: (width, height), pixels; fov_deg: angle that the width covers; distortion: Brown-Conrady k1, k2, p1, p2, k3
-    in OpenCV's order, () none; exposure: display value of a radiance of 1 W m^-2 sr^-1; tone: curve of the 8-bit image,
-    "srgb" or "filmic"; white_balance: sunlight is white ("sun") or has its colour under a white of D65 ("d65"); sensor:
-    noise and limits of a real one, None for none.
+    resolution: (width, height), pixels; fov_deg: angle that the width covers without distortion; distortion:
+    Brown-Conrady k1, k2, p1, p2, k3 in OpenCV's order, () none; exposure: display value of a radiance of
+    1 W m^-2 sr^-1; tone: curve of the 8-bit image, "srgb" or "filmic"; white_balance: sunlight is white ("sun") or has
+    its colour under a white of D65 ("d65"); sensor: noise and limits of a real one, None for none.
     """
 
     resolution: tuple[int, int] = (256, 256)
@@ -41,12 +44,58 @@ class CameraConfig:
         expect(self.tone in TONES, "tone", f"one of {', '.join(TONES)}", self.tone)
         expect(self.white_balance in WHITE_BALANCES, "white_balance", " or ".join(WHITE_BALANCES), self.white_balance)
 
+        if any(self.distortion):
+            folds = self._first_fold()
+            limit = 0.5 * math.hypot(width, height)
+            found = f"one that folds {folds:.0f} of {limit:.0f} pixels from its centre"
+            if math.isfinite(folds):
+                raise InputError(f"distortion: expected a lens that is one-to-one over the image, found {found}")
+
+    @property
+    def half_tangents(self) -> tuple[float, float]:
+        """Tangents of half the angles that the width and the height cover, without distortion."""
+        width, height = self.resolution
+        half = math.tan(0.5 * math.radians(self.fov_deg))
+        return half, half * height / width
+
     @property
     def smallest_fov(self) -> float:
-        """Radians that the shorter side of the image covers."""
+        """Radians that the shorter side of the image covers, without distortion."""
         width, height = self.resolution
-        return 2 * math.atan(math.tan(math.radians(self.fov_deg) / 2) * min(1.0, height / width))
+        return math.radians(self.fov_deg) if width <= height else 2 * math.atan(self.half_tangents[1])
 
     def at(self, world_from_camera: Array) -> Camera:
         """The pinhole camera at a pose [4, 4]."""
         return Camera.from_fov(world_from_camera, *self.resolution, self.fov_deg)
+
+    def _first_fold(self) -> float:
+        """Pixels from the image's centre to the nearest of its points that no ray, or more than one, reaches; infinity
+        where there is none.
+
+        Rays are followed from the centre outwards: the map is one-to-one up to where the determinant of its derivative
+        is no longer positive. The inverse that pictures are rendered with must find its way back, too.
+        """
+        u, v = self.half_tangents
+        side = np.linspace(-1, 1, 33)
+        border = np.concatenate([[[s, e], [e, s]] for s in side for e in (-1.0, 1.0)]).T  # [2, 132], twice the corners
+        lines = border[:, :, None] * np.linspace(0, 4, 257)[1:] * np.array([u, v])[:, None, None]
+        with np.errstate(all="ignore"):
+            turned = ~(_determinant(lines, self.distortion) > 0)
+            first = np.take_along_axis(lines, turned.argmax(axis=1)[None, :, None], axis=2)[..., 0]
+            images = np.array(distorted(first[0], first[1], self.distortion))
+            inside = turned.any(axis=1) & (np.abs(images) <= np.array([[u], [v]])).all(axis=0)
+            points = lines[:, :, :64]
+            x, y = undistorted(points[0], points[1], self.distortion)
+            back = np.array(distorted(x, y, self.distortion))
+            missed = ~(np.hypot(*(back - points)) <= 1e-6)
+        folds = np.concatenate([np.hypot(*images)[inside], np.hypot(*points)[missed]])
+        return float(np.min(folds, initial=math.inf)) * 0.5 * self.resolution[0] / u
+
+
+def _determinant(points: Array, distortion: tuple[float, ...]) -> Array:
+    """[...] of the derivative of `distorted` at points [2, ...], by central differences."""
+    x, y = points
+    h = 1e-5
+    du = (np.array(distorted(x + h, y, distortion)) - distorted(x - h, y, distortion)) / (2 * h)
+    dv = (np.array(distorted(x, y + h, distortion)) - distorted(x, y - h, distortion)) / (2 * h)
+    return du[0] * dv[1] - du[1] * dv[0]

@@ -1,15 +1,18 @@
-"""Where the Suns and the cameras are: spherical Fibonacci lattices (thesis 4.3.6)."""
+"""Where the Suns and the cameras are: lattices, random poses, approaches and fly-arounds."""
 
 import math
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 from spacesim.data.errors import expect
-from spacesim.data.geometry import Array, fibonacci_sphere, look_at
+from spacesim.data.geometry import Array, fibonacci_sphere, look_at, rotation_from_quaternion
 from spacesim.data.records import Camera, Sun
 from spacesim.scenes.camera import CameraConfig
+from spacesim.scenes.orbit import ORBIT_NORMAL, WORLD_FROM_LVLH, ellipse, mean_motion, star_direction
 
 SINGLE_SUN = (45.0, 35.0)
 """Azimuth and elevation, degrees, of the Sun where only one is asked for: the thesis's single-Sun
@@ -18,7 +21,21 @@ evaluation."""
 MARGIN = 1.05
 """How much larger than the object's bounding sphere the frame is."""
 
-_TRAIN, _TEST, _HELD_OUT = range(3)  # streams of random rotations
+FAR = 4.0
+"""Farthest depth of random poses over the nearest where none is given (chosen: SPEED+ reaches 10 m, thesis 6.3.2)."""
+
+START = 5.0
+"""Where an approach begins over where it ends, if that is not given (chosen)."""
+
+APPROACHES = {
+    "v-bar": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "-v-bar": ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "r-bar": ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0)),
+    "-r-bar": ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
+}
+"""Where the camera comes from, and what is up in its image, world frame (see orbit.py for V-bar and R-bar)."""
+
+_TRAIN, _TEST, _HELD_OUT = range(3)  # streams of random numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +54,11 @@ class Target:
     radius: float
 
 
+Views = tuple[list[View], list[View]]  #: of training and of testing
+
+
 @dataclass(frozen=True)
-class RigConfig:
+class RigConfig(ABC):
     """Suns and views of every rig. Raises InputError for a value out of range.
 
     Every training Sun has `views` training views. Every test Sun has `test_views` test views; the test Suns
@@ -60,42 +80,236 @@ class RigConfig:
             wanted = "a finite azimuth and an elevation from -90 to 90 degrees"
             expect(possible, "sun", wanted, (azimuth, elevation))
         if self.sun:
-            expect(self.suns in (1, len(self.sun)), "suns", f"{len(self.sun)} as in sun", self.suns)
+            fits = self.suns in (type(self).suns, len(self.sun))
+            expect(fits, "suns", f"{len(self.sun)} as in sun", self.suns)
+
+    @abstractmethod
+    def views_of(self, target: Target, camera: CameraConfig, seed: int) -> Views:
+        """The training and the test views of `target`. Raises InputError where the rig does not suit it."""
+
+    def sun_directions(self, seed: int) -> tuple[list[Sun], list[Sun]]:
+        """The training and the test Suns: lattices, unless the rig arranges them."""
+        suns = training_suns(self.suns, self.sun)
+        return suns, held_out_suns(self.test_suns, seed) if self.test_suns else suns
 
 
 @dataclass(frozen=True)
 class FibonacciRig(RigConfig):
-    """Cameras all around, that look at the target. distance: metres from its centre; None: the target just fits into the
-    image. One Sun alone stands at SINGLE_SUN, several on a Fibonacci lattice (thesis 4.3.6)."""
+    """Cameras all around, that look at the target. distance: metres from its centre; None: the target just fits into
+    the image. One Sun alone stands at SINGLE_SUN, several on a Fibonacci lattice (thesis 4.3.6)."""
 
     distance: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.distance is not None:
-            expect(0 < self.distance < math.inf, "distance", "metres above 0", self.distance)
+        _expect_metres(distance=self.distance)
+
+    def views_of(self, target: Target, camera: CameraConfig, seed: int) -> Views:
+        return _all_around(self.sun_directions(seed), self, self.distance, target, camera, seed)
 
 
-RIGS: dict[str, type[RigConfig]] = {"fibonacci": FibonacciRig}
+@dataclass(frozen=True)
+class PolarArcRig(RigConfig):
+    """Cameras all around, Suns on an arc over the pole (+z), as of the thesis's Hubble dataset (6.2.2).
+
+    arc_azimuth_deg: of the side from which the Suns rise; arc_deg: length of the arc, whose middle is the pole: 180
+    from horizon to horizon, 360 a whole circle; distance: as of the Fibonacci rig. `suns` Suns stand in the middles of
+    as many equal pieces; test Suns stand on the same arc, halfway between them.
+    """
+
+    suns: int = 24
+    views: int = 614
+    arc_azimuth_deg: float = 0.0
+    arc_deg: float = 180.0
+    distance: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        expect(math.isfinite(self.arc_azimuth_deg), "arc_azimuth_deg", "a finite angle", self.arc_azimuth_deg)
+        expect(0 < self.arc_deg <= 360, "arc_deg", "an angle above 0, up to 360 degrees", self.arc_deg)
+        _expect_metres(distance=self.distance)
+
+    def views_of(self, target: Target, camera: CameraConfig, seed: int) -> Views:
+        return _all_around(self.sun_directions(seed), self, self.distance, target, camera, seed)
+
+    def sun_directions(self, seed: int) -> tuple[list[Sun], list[Sun]]:
+        if self.sun:
+            return super().sun_directions(seed)
+        closed = self.suns == 1 or self.arc_deg == 360
+        suns = [self._sun(step) for step in range(self.suns)]
+        return suns, [self._sun(float(step)) for step in between(self.suns, self.test_suns, closed)] or suns
+
+    def _sun(self, step: float) -> Sun:
+        angle = math.radians(self.arc_deg) * ((step + 0.5) / self.suns % 1 - 0.5)  # from the pole
+        azimuth = math.radians(self.arc_azimuth_deg)
+        across = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+        return Sun(-math.sin(angle) * across + math.cos(angle) * np.array([0.0, 0.0, 1.0]))
+
+
+@dataclass(frozen=True)
+class RandomRig(RigConfig):
+    """Random poses, as pose-estimation datasets have them (SPEED+: Park et al. 2022): every attitude is as likely, and
+    the target stands anywhere in the image.
+
+    near, far: depth of the target's centre along the optical axis, metres; None: near is where the target just fits
+    into the image, far is FAR times that; sigma: metres, depths follow a normal law of this width about near, cut at
+    near and far; None: all are as likely; cropped: the target's centre may be anywhere in the image, which may cut
+    parts off; else all of its bounding sphere is in the image; random_suns: every frame has its own Sun, from anywhere.
+    """
+
+    near: float | None = None
+    far: float | None = None
+    sigma: float | None = None
+    cropped: bool = False
+    random_suns: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _expect_metres(near=self.near, far=self.far, sigma=self.sigma)
+        if self.near is not None and self.far is not None:
+            expect(self.near <= self.far, "far", f"at least near, {self.near:g} m", self.far)
+        expect(not (self.random_suns and self.sun), "random_suns", "false where sun names the Suns", True)
+        one = self.suns == 1 and self.test_suns == 0
+        many = f"{self.suns} suns, {self.test_suns} test_suns"
+        expect(one or not self.random_suns, "random_suns", "suns 1 and test_suns 0, as every frame has its own", many)
+
+    def views_of(self, target: Target, camera: CameraConfig, seed: int) -> Views:
+        near = self.near or min(fitting_distance(target.radius, camera), self.far or math.inf)
+        far = self.far or FAR * near
+        suns, test_suns = self.sun_directions(seed)
+
+        def some(suns: Sequence[Sun], count: int, stream: int) -> list[View]:
+            views = []
+            for i, sun in enumerate(suns):
+                for k in range(count):
+                    random = np.random.default_rng([seed, stream, i, k])
+                    pose = self._pose(random, target, camera, (near, far))
+                    own = Sun(random.normal(size=3)) if self.random_suns else sun
+                    views.append(View(camera.at(pose), own))
+            return views
+
+        return some(suns, self.views, _TRAIN), some(test_suns, self.test_views, _TEST)
+
+    def _pose(self, random: np.random.Generator, target: Target, camera: CameraConfig, depths: Array | tuple) -> Array:
+        """[4, 4] world_from_camera. In camera axes the centre is at z (u, v, 1), z between the two `depths`."""
+        near, far = depths
+        fraction = random.random()
+        z = near + fraction * (far - near)
+        if self.sigma is not None:  # the inverse of the law's distribution
+            z = near + self.sigma * float(ndtri(0.5 + fraction * (ndtr((far - near) / self.sigma) - 0.5)))
+        half = np.array(camera.half_tangents)
+        room = half  # of u and v: the sphere touches a side's plane where z u = z half - radius sqrt(1 + half^2)
+        if not self.cropped:
+            room = np.maximum(half - target.radius / z * np.sqrt(1 + half**2), 0)
+        u, v = room * random.uniform(-1, 1, 2)
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_from_quaternion(random.normal(size=4))  # uniform: a normal law has no direction
+        pose[:3, 3] = target.centre - pose[:3, :3] @ (z * np.array([u, v, 1.0]))
+        return pose
+
+
+@dataclass(frozen=True)
+class ApproachRig(RigConfig):
+    """A straight approach, at constant speed, of a camera that looks at the target.
+
+    axis: "v-bar" from ahead, "-v-bar" from behind, "r-bar" from below, "-r-bar" from above; start, end: metres from the
+    target's centre; None: it ends where the target just fits into the image and starts START times as far away; jitter:
+    standard deviation of the position across the line, metres. Test frames lie halfway between training frames.
+    """
+
+    axis: str = "v-bar"
+    start: float | None = None
+    end: float | None = None
+    jitter: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        expect(self.axis in APPROACHES, "axis", f"one of {', '.join(APPROACHES)}", self.axis)
+        _expect_metres(start=self.start, end=self.end)
+        expect(0 <= self.jitter < math.inf, "jitter", "metres of at least 0", self.jitter)
+        if self.start is not None and self.end is not None:
+            expect(self.end < self.start, "end", f"less than start, {self.start:g} m", self.end)
+
+    def views_of(self, target: Target, camera: CameraConfig, seed: int) -> Views:
+        end = self.end or fitting_distance(target.radius, camera)
+        start = self.start or START * end
+        expect(end < start, "start", f"more than end, {end:.3g} m", start)
+        away, up = (np.array(axis) for axis in APPROACHES[self.axis])
+        lateral = np.stack([up, np.cross(away, up)])
+
+        def at(step: float, sun: Sun, stream: Sequence[int]) -> View:
+            distance = start + (end - start) * step / max(self.views - 1, 1)
+            offset = self.jitter * np.random.default_rng([seed, *stream]).normal(size=2)
+            pose = look_at(target.centre + distance * away + offset @ lateral, target.centre, up)
+            return View(camera.at(pose), sun)
+
+        return _along(self, self.sun_directions(seed), at, closed=False)
+
+
+@dataclass(frozen=True)
+class FlyAroundRig(RigConfig):
+    """A free relative orbit around the target (Clohessy and Wiltshire, see orbit.py); the camera looks at the target,
+    with the orbit's normal upwards in the image.
+
+    size: half the radial extent, metres, and a quarter of that along V-bar; None: the target just fits into the image
+    where it is nearest; across: amplitude out of the orbit's plane, metres; across_phase_deg: how far that motion is
+    ahead; phase_deg: where the first frame is, 0 below the target, 90 ahead of it; altitude_km: of the target's
+    circular orbit; duration_s: seconds that the frames cover; None: one revolution; sun_moves: the Sun stands still
+    among the stars, and so turns in the world frame; `sun` is where it is in the first frame. Test frames lie halfway
+    between training frames.
+    """
+
+    size: float | None = None
+    across: float = 0.0
+    across_phase_deg: float = 0.0
+    phase_deg: float = 0.0
+    altitude_km: float = 500.0
+    duration_s: float | None = None
+    sun_moves: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _expect_metres(size=self.size)
+        expect(0 <= self.across < math.inf, "across", "metres of at least 0", self.across)
+        for name in ("across_phase_deg", "phase_deg"):
+            expect(math.isfinite(getattr(self, name)), name, "a finite angle", getattr(self, name))
+        expect(100 <= self.altitude_km <= 1e5, "altitude_km", "an altitude from 100 to 100,000 km", self.altitude_km)
+        if self.duration_s is not None:
+            limit = 2 * math.pi / mean_motion(self.altitude_km)
+            wanted = f"seconds above 0, up to one revolution of {limit:.1f}"
+            expect(0 < self.duration_s <= limit, "duration_s", wanted, self.duration_s)
+
+    def views_of(self, target: Target, camera: CameraConfig, seed: int) -> Views:
+        size = self.size or fitting_distance(target.radius, camera)
+        n = mean_motion(self.altitude_km)
+        closed = self.duration_s is None
+        angle = 2 * math.pi if self.duration_s is None else n * self.duration_s
+        steps = self.views if closed else max(self.views - 1, 1)
+        first, ahead = math.radians(self.phase_deg), math.radians(self.across_phase_deg)
+
+        def at(step: float, sun: Sun, _: Sequence[int]) -> View:
+            phase = angle * step / steps
+            state = ellipse(np.array(first + phase), n, size, self.across, ahead)
+            pose = look_at(target.centre + WORLD_FROM_LVLH @ state[:3], target.centre, ORBIT_NORMAL)
+            turned = Sun(star_direction(sun.direction, phase)) if self.sun_moves else sun
+            return View(camera.at(pose), turned)
+
+        return _along(self, self.sun_directions(seed), at, closed)
+
+
+RIGS: dict[str, type[RigConfig]] = {
+    "fibonacci": FibonacciRig,
+    "polar-arc": PolarArcRig,
+    "random": RandomRig,
+    "approach": ApproachRig,
+    "fly-around": FlyAroundRig,
+}
 """The kinds of rig, as scene files name them."""
 
 
-def plan(rig: RigConfig, target: Target, camera: CameraConfig, seed: int) -> tuple[list[View], list[View]]:
+def plan(rig: RigConfig, target: Target, camera: CameraConfig, seed: int) -> Views:
     """The training and the test views of a rig. Random streams are derived from (seed, purpose, index)."""
-    assert isinstance(rig, FibonacciRig)
-    distance = rig.distance or fitting_distance(target.radius, camera)
-    suns = training_suns(rig.suns, rig.sun)
-    test_suns = held_out_suns(rig.test_suns, seed) if rig.test_suns else suns
-
-    def around(suns: Sequence[Sun], count: int, stream: int) -> list[View]:
-        """The lattice of cameras is turned at random for each Sun, so that no two sets coincide."""
-        return [
-            View(camera.at(look_at(target.centre + distance * direction, target.centre)), sun)
-            for i, sun in enumerate(suns)
-            for direction in fibonacci_sphere(count, seed=_stream(seed, stream, i))
-        ]
-
-    return around(suns, rig.views, _TRAIN), around(test_suns, rig.test_views, _TEST)
+    return rig.views_of(target, camera, seed)
 
 
 def training_suns(count: int, angles: Sequence[tuple[float, float]] = ()) -> list[Sun]:
@@ -116,7 +330,56 @@ def held_out_suns(count: int, seed: int) -> list[Sun]:
 
 def fitting_distance(radius: float, camera: CameraConfig) -> float:
     """Distance, metres, from which a sphere of `radius` metres fills the shorter side of the frame but for MARGIN."""
-    return MARGIN * radius / math.sin(0.5 * camera.smallest_fov)
+    return MARGIN * radius / float(np.sin(0.5 * camera.smallest_fov))
+
+
+def between(count: int, wanted: int, closed: bool) -> Array:
+    """[wanted] places between the steps 0, 1, ..., count - 1, spread evenly, that are none of these steps: middles,
+    where there are enough gaps. closed: there is a gap after the last step, too."""
+    gaps = max(count if closed else count - 1, 1)
+    in_each = max(-(-wanted // gaps), 1)
+    place = np.floor((np.arange(wanted) + 0.5) / max(wanted, 1) * gaps * in_each)
+    return place // in_each + (place % in_each + 1) / (in_each + 1)
+
+
+def _all_around(
+    suns: tuple[list[Sun], list[Sun]],
+    rig: RigConfig,
+    distance: float | None,
+    target: Target,
+    camera: CameraConfig,
+    seed: int,
+) -> Views:
+    """Cameras on a Fibonacci lattice, turned at random for each Sun, so that no two sets coincide."""
+    metres = distance or fitting_distance(target.radius, camera)
+
+    def around(suns: Sequence[Sun], count: int, stream: int) -> list[View]:
+        return [
+            View(camera.at(look_at(target.centre + metres * direction, target.centre)), sun)
+            for i, sun in enumerate(suns)
+            for direction in fibonacci_sphere(count, seed=_stream(seed, stream, i))
+        ]
+
+    return around(suns[0], rig.views, _TRAIN), around(suns[1], rig.test_views, _TEST)
+
+
+def _along(
+    rig: RigConfig,
+    suns: tuple[list[Sun], list[Sun]],
+    at: Callable[[float, Sun, Sequence[int]], View],
+    closed: bool,
+) -> Views:
+    """Views at the steps of a trajectory, for each Sun; at: (step, Sun, random stream) to a view."""
+    train, test = range(rig.views), between(rig.views, rig.test_views, closed).tolist()
+    return (
+        [at(step, sun, (_TRAIN, i, k)) for i, sun in enumerate(suns[0]) for k, step in enumerate(train)],
+        [at(step, sun, (_TEST, i, k)) for i, sun in enumerate(suns[1]) for k, step in enumerate(test)],
+    )
+
+
+def _expect_metres(**lengths: float | None) -> None:
+    for name, metres in lengths.items():
+        expect(metres is None or 0 < metres < math.inf, name, "metres above 0", metres)
 
 
 def _stream(seed: int, stream: int, index: int) -> int:

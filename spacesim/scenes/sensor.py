@@ -1,30 +1,133 @@
-"""What becomes of the light: the tone curve of the 8-bit image."""
+"""What becomes of the light: a sensor's electrons, noise and digital numbers, and the tone curve of the 8-bit image.
 
+The sensor follows the linear camera model of EMVA standard 1288 (release 4.0 Linear, 2021, chapter 2): electrons are
+counted with Poisson statistics, dark ones among them; the amplifier adds normal noise; the system gain turns electrons
+into digital numbers (DN), which are rounded. Left out are nonuniformity of pixels, blooming, a colour filter array.
+"""
+
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
+from spacesim.data.errors import expect
 from spacesim.data.images import srgb_from_linear
 
+if TYPE_CHECKING:
+    from spacesim.scenes.camera import CameraConfig
+
 TONES = ("srgb", "filmic")
+
+_NOISE = 2  # stream of random numbers
+_MOST_ELECTRONS = 1e12  # far above any full well; Poisson numbers end at 2^63
 
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """A real sensor's noise and limits."""
+    """A sensor that records the linear image. Raises InputError for a value out of range. The defaults are chosen: a
+    quiet CMOS sensor of 12 bits.
+
+    psf_sigma_px: standard deviation of a Gaussian point spread function, pixels; full_well_e: electrons at which a
+    pixel is full, which is also what a display value of 1 makes; shot_noise: Poisson statistics of electrons; dark_e:
+    mean electrons of a frame without light; read_noise_e: standard deviation of the amplifier's noise, electrons; bits:
+    of a digital number; black_level_dn: digital number of no electrons; gain_dn_per_e: digital numbers an electron
+    makes, None: a full well makes the highest; monochrome: one number a pixel, of the mean of R, G and B.
+    """
+
+    psf_sigma_px: float = 0.0
+    full_well_e: float = 10_000.0
+    shot_noise: bool = True
+    dark_e: float = 0.0
+    read_noise_e: float = 2.5
+    bits: int = 12
+    black_level_dn: int = 64
+    gain_dn_per_e: float | None = None
+    monochrome: bool = False
+
+    def __post_init__(self) -> None:
+        expect(0 <= self.psf_sigma_px <= 100, "psf_sigma_px", "0 to 100 pixels", self.psf_sigma_px)
+        expect(1 <= self.full_well_e <= 1e9, "full_well_e", "1 to 1e9 electrons", self.full_well_e)
+        for name in ("dark_e", "read_noise_e"):
+            wanted = f"electrons from 0 to the full well's {self.full_well_e:g}"
+            expect(0 <= getattr(self, name) <= self.full_well_e, name, wanted, getattr(self, name))
+        expect(1 <= self.bits <= 16, "bits", "1 to 16", self.bits)
+        wanted = f"at least 0, below {self.highest}, the highest of {self.bits} bits"
+        expect(0 <= self.black_level_dn < self.highest, "black_level_dn", wanted, self.black_level_dn)
+        if self.gain_dn_per_e is not None:
+            wanted = "digital numbers an electron, above 0"
+            expect(0 < self.gain_dn_per_e < math.inf, "gain_dn_per_e", wanted, self.gain_dn_per_e)
+
+    @property
+    def highest(self) -> int:
+        """The highest digital number."""
+        return 2**self.bits - 1
+
+    @property
+    def gain(self) -> float:
+        """Digital numbers that an electron makes: EMVA 1288's system gain K."""
+        return self.gain_dn_per_e or (self.highest - self.black_level_dn) / self.full_well_e
+
+    def expose(self, light: np.ndarray, random: np.random.Generator) -> NDArray[np.uint16]:
+        """Digital numbers of linear `light` [H, W], or [H, W, C] for a sensor a channel, of which 1 fills the well."""
+        if self.psf_sigma_px > 0:  # what lies beyond the border is taken to be as bright as the border
+            axes = (self.psf_sigma_px, self.psf_sigma_px, 0.0)[: light.ndim]
+            light = gaussian_filter(light, axes, mode="nearest", truncate=5.0)
+        electrons = np.clip(self.full_well_e * light + self.dark_e, 0, _MOST_ELECTRONS)
+        if self.shot_noise:
+            electrons = random.poisson(electrons).astype(np.float64)
+        electrons = np.minimum(electrons, self.full_well_e)
+        if self.read_noise_e > 0:
+            electrons = electrons + random.normal(0.0, self.read_noise_e, electrons.shape)
+        numbers = np.rint(self.black_level_dn + self.gain * electrons)
+        return np.clip(numbers, 0, self.highest).astype(np.uint16)
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a camera records. image: [H, W, 4], [H, W, 3] or [H, W] uint8; raw: digital numbers, uint16, or None."""
+    """What a camera records. image: [H, W, 4], [H, W, 3] or [H, W] uint8; raw: digital numbers, [H, W] or [3, H, W]
+    uint16, None without a sensor."""
 
     image: np.ndarray
     raw: np.ndarray | None = None
 
 
-def record(radiance: np.ndarray, alpha: np.ndarray, camera: "object", seed: tuple[int, ...]) -> Recording:
-    """[H, W, 4] uint8 sRGB, straight alpha, of linear radiance [H, W, 3] that is weighted by alpha [H, W]."""
-    straight = radiance / np.where(alpha > 0, alpha, 1)[..., None]
-    exposed = camera.exposure * straight  # type: ignore[attr-defined]
-    values = np.concatenate([srgb_from_linear(exposed), np.clip(alpha, 0, 1)[..., None]], axis=-1)
-    return Recording(np.round(255 * values).astype(np.uint8))
+def record(radiance: np.ndarray, alpha: np.ndarray, camera: "CameraConfig", seed: Sequence[int]) -> Recording:
+    """What `camera` makes of linear radiance [H, W, 3], W m^-2 sr^-1, that is weighted by alpha [H, W].
+
+    Without a sensor: [H, W, 4] uint8 with straight alpha. With one: opaque over black, from digital numbers, and its
+    noise made by `seed`. The same seed gives the same noise with the same version of numpy, which promises no more for
+    distributions (NEP 19), and as far as two machines' logarithms agree in their last bit.
+    """
+    if camera.sensor is None:
+        straight = radiance / np.where(alpha > 0, alpha, 1)[..., None]
+        colours = displayed(camera.exposure * straight, camera.tone)
+        return Recording(_as_bytes(np.concatenate([colours, np.clip(alpha, 0, 1)[..., None]], axis=-1)))
+    sensor = camera.sensor
+    light = camera.exposure * radiance.astype(np.float64)
+    random = np.random.Generator(np.random.PCG64(np.random.SeedSequence([*seed, _NOISE])))
+    raw = sensor.expose(light.mean(axis=-1) if sensor.monochrome else light, random)
+    signal = (raw.astype(np.float64) - sensor.black_level_dn) / (sensor.highest - sensor.black_level_dn)
+    image = _as_bytes(displayed(signal, camera.tone))
+    return Recording(image, raw if sensor.monochrome else np.ascontiguousarray(np.moveaxis(raw, -1, 0)))
+
+
+def displayed(linear: np.ndarray, tone: str) -> np.ndarray:
+    """sRGB values in [0, 1] of linear display values, of which 1 is white, by one of TONES."""
+    return srgb_from_linear(filmic(linear) if tone == "filmic" else linear)
+
+
+def filmic(linear: np.ndarray) -> np.ndarray:
+    """Linear values of a film-like curve that keeps highlights up to 7.2 apart: 0.8 for 1, clipped to [0, 1].
+
+    K. Narkowicz, "ACES Filmic Tone Mapping Curve", 2016: a rational fit to the ACES reference and output transforms.
+    """
+    x = np.maximum(linear, 0)
+    return np.minimum(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1).astype(np.asarray(linear).dtype)
+
+
+def _as_bytes(values: np.ndarray) -> NDArray[np.uint8]:
+    return np.round(255 * values).astype(np.uint8)
