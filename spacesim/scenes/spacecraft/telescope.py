@@ -4,10 +4,10 @@ Body axes: +x the line of sight (V1), solar arrays along -y and +y (V2), high-ga
 the aperture door hinged on the +z side. The origin is half-way along the tube.
 
 Public figures that it keeps to (NASA, "Hubble Space Telescope Servicing Mission 4 Media Reference Guide", 2009,
-and NASA's "Hubble by the numbers"): length 13.2 m, largest diameter 4.2 m, light shield and forward
-shell about 4 m long and 3.1 m wide each, equipment section about 1.5 m and aft shroud 3.5 m long, primary mirror 2.4 m, secondary
-0.3 m, arrays of 7.1 m by 2.6 m, door opened by up to 105 degrees, antenna dishes 1.3 m wide. Everything smaller
-is placed by eye after public photographs.
+and NASA's "Hubble by the numbers"): length 13.2 m, largest diameter 4.2 m, light shield and forward shell about
+4 m long and 3.1 m wide each, equipment section about 1.5 m and aft shroud 3.5 m long, primary mirror 2.4 m,
+secondary 0.3 m, arrays of 7.1 m by 2.6 m, door opened by up to 105 degrees, antenna dishes 1.3 m wide. Everything
+smaller is placed by eye after public photographs.
 
 All is built upright first, z along the line of sight, x along V2, y along V3.
 """
@@ -23,7 +23,7 @@ LENGTH, DIAMETER = 13.2, 4.2  #: of the tube; of the aft shroud, metres
 ARRAY = (7.1, 2.6)  #: edge lengths of a solar array, metres
 DOOR_DEG = 105.0  #: the door's angle from closed
 
-_FRONT, _SHELL, _BAY, _SHROUD, _AFT = 6.6, 2.6, -1.5, -3.1, -6.6  # stations along the tube, metres
+_FRONT, _SHELL, _BAY, _SHROUD, _AFT = 0.5 * LENGTH, 2.6, -1.5, -3.1, -0.5 * LENGTH  # stations along the tube, metres
 _TUBE, _WALL = 1.55, 0.06  # radius of light shield and forward shell; thickness
 _BAYS = 12
 
@@ -67,7 +67,7 @@ def _tube() -> Solids:
         ("forward_shell", shell, material("silver-mli")),
         ("shell_rings", s.joined(rings), material("white-paint")),
         ("blanket_seams", s.joined(seams), material("anodised-aluminium")),
-        ("aperture_rim", s.moved(_ring(_FRONT - 0.09, _TUBE + 0.05, 0.1), [0, 0, 0]), material("white-paint")),
+        ("aperture_rim", _ring(_FRONT - 0.09, _TUBE + 0.05, 0.1), material("white-paint")),
         ("interior", _interior(inner), material("black-paint")),
     ]
 
@@ -115,7 +115,7 @@ def _door() -> Solids:
     """The aperture door, silver outside, black inside, with its hinge on the +V3 side."""
     hinge = [0.0, _TUBE + 0.07, _FRONT + 0.03]
     plate = s.rod([0, 0, _FRONT + 0.02], [0, 0, _FRONT + 0.08], _TUBE, s.SEGMENTS)
-    lining = s.rod([0, 0, _FRONT + 0.0], [0, 0, _FRONT + 0.021], _TUBE - 0.06, s.SEGMENTS)
+    lining = s.rod([0, 0, _FRONT], [0, 0, _FRONT + 0.021], _TUBE - 0.06, s.SEGMENTS)
     ribs = [
         s.box([2.0 * reach, 0.05, 0.04], [0, y, _FRONT + 0.095]) for y, reach in ((-0.7, 1.3), (0.0, 1.5), (0.7, 1.3))
     ]

@@ -21,7 +21,7 @@ from spacesim.scenes.spacecraft.part import Part, Spacecraft
 LENGTH, DIAMETER = 11.0, 4.0  #: over nozzle and adapter; of the hydrogen tank, metres
 ADAPTER = 1.194  #: diameter of the adapter's front ring, metres
 
-_TOP, _SHELF, _FRONT, _BACK, _SKIRT, _EXIT = 5.5, 4.45, 4.0, 0.05, -0.5, -5.5  # stations, metres
+_TOP, _SHELF, _FRONT, _BACK, _SKIRT, _EXIT = 0.5 * LENGTH, 4.45, 4.0, 0.05, -0.5, -0.5 * LENGTH  # stations
 _RADIUS = 0.5 * DIAMETER
 _OXYGEN, _OXYGEN_RADIUS, _OXYGEN_HALF = -1.55, 1.55, 0.95  # middle of the oxygen tank, its half axes, metres
 _THROAT = -3.25
