@@ -122,7 +122,10 @@ class Surfaces:
             return "repeat"
         sampler = self._document["samplers"][texture["sampler"]]
         modes = {_WRAPS.get(sampler.get(key, 10497), "repeat") for key in ("wrapS", "wrapT")}
-        return modes.pop() if len(modes) == 1 else "repeat"
+        if len(modes) > 1:
+            self._notes.change("textures that continue in two ways in u and v repeat in both")
+            return "repeat"
+        return modes.pop()
 
     def texture(self, info: dict[str, Any]) -> dict[str, Any]:
         """The texture that a material refers to."""

@@ -1,6 +1,5 @@
 """Reads obj, stl, ply and off through trimesh: parts with the colours and textures that these formats know."""
 
-import inspect
 import io
 import math
 import re
@@ -10,16 +9,12 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from trimesh.exchange.obj import load_obj
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb
 from spacesim.scenes.materials import Color
 from spacesim.scenes.meshpart import RawPart
 from spacesim.scenes.meshtexture import NORMALS, Folder, Notes, Surface, check_picture, decoded, unit
-
-_SPLIT = next(name for name in inspect.signature(load_obj).parameters if name in ("split_objects", "split_object"))
-"""The option of trimesh (5, 4) that keeps objects apart."""
 
 _UNUSED = ("ke", "map_ke", "map_ks", "map_ka", "map_bump", "bump", "map_d", "disp", "norm", "map_ns", "refl")
 
@@ -31,10 +26,12 @@ def read_table(path: Path, notes: Notes) -> list[RawPart]:
     _check_promise(kind, data)
     if (kind == "obj" and b"\nvn " in data) or (kind == "ply" and b" nx" in data[: data.find(b"end_header")]):
         notes.drop(NORMALS)
+    if not data.isascii():
+        data = _as_utf8(kind, data)
     if kind == "obj":
         data = _with_positive_indices(data)
     resolver = _Files(path, notes)
-    options = {_SPLIT: True} if kind == "obj" else {}
+    options = {"split_objects": True} if kind == "obj" else {}
     # `load` with force="scene": its successor load_scene is not in trimesh 4.5
     scene = trimesh.load(io.BytesIO(data), kind, resolver=resolver, force="scene", process=False, **options)
     parts = []
@@ -66,8 +63,9 @@ class _Files(trimesh.resolvers.Resolver):
         except InputError as error:
             self.notes.drop("files that cannot be had are not used", str(error))
             raise FileNotFoundError(str(error)) from None
-        if not str(key).strip().lower().endswith(".mtl"):
-            check_picture(data, str(key)[:80], self.notes)
+        if str(key).strip().lower().endswith(".mtl"):
+            return _as_utf8("mtl", data)
+        check_picture(data, str(key)[:80], self.notes)
         return data
 
     def keys(self) -> tuple[str, ...]:
@@ -102,6 +100,20 @@ def _check_promise(kind: str, data: bytes) -> None:
                     f"expected {int(count):,} elements {element.decode('ascii', 'replace')}, as its header promises, "
                     f"found {len(body):,} bytes"
                 )
+
+
+def _as_utf8(kind: str, data: bytes) -> bytes:
+    """A text file as UTF-8, from that or else from Latin-1, and the header of a ply as ASCII; else `data` as it is."""
+    if kind == "ply":
+        head, end, body = data.partition(b"end_header")
+        return head.decode("ascii", "replace").encode("ascii", "replace") + end + body
+    if kind == "stl" and not data.lstrip().startswith(b"solid"):
+        return data
+    try:
+        data.decode("utf-8")
+        return data
+    except UnicodeDecodeError:
+        return data.decode("latin-1").encode("utf-8")
 
 
 def _with_positive_indices(data: bytes) -> bytes:

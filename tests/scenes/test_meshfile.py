@@ -198,6 +198,15 @@ def test_obj_objects_materials_and_relative_indices(tmp_path):
     np.testing.assert_allclose(corner, [0, 1, 0])  # uv (0, 0), the picture's top row, is obj's vt (0, 1)
 
 
+def test_latin_1_is_read_as_well_as_utf_8(tmp_path):
+    path = write_obj(tmp_path, "")
+    (tmp_path / "paint.mtl").write_bytes("# Farbe für Bézier\nnewmtl paint\nKd 0.25 0.5 1\n".encode("latin-1"))
+    for encoding in ("latin-1", "utf-8"):
+        path.write_bytes(OBJ.replace("Bus", "Bézier").encode(encoding))
+        craft, _ = read_mesh(path)
+        assert (0.25, 0.5, 1.0) in {part.material.albedo for part in craft.parts}
+
+
 @pytest.mark.parametrize(
     ("mtl", "said"),
     [
