@@ -55,13 +55,17 @@ def scene_text(scene: SceneConfig) -> str:
 
 def _mesh_scene(path: Path, source: str, reading: Mapping[str, Any]) -> SceneConfig:
     """A mesh file alone, which `reading` says how to read."""
-    if path.is_file():
+    try:
+        is_file, is_folder = path.is_file(), path.is_dir()
+    except (OSError, ValueError):  # a name that no file can have
+        is_file = is_folder = False
+    if is_file:
         return SceneConfig(path.stem, (ObjectConfig(mesh=path.name, **reading),), folder=path.parent)
     wanted = f"scene: expected one of {', '.join(BUILT_IN_SCENES)}, a scene file (.toml) or a mesh file"
-    if path.is_dir():
-        raise InputError(f"{wanted}, found the folder {source}")
+    if is_folder:
+        raise InputError(f"{wanted}, found the folder {source!r}")
     if path.suffix or len(path.parts) > 1:
-        raise InputError(f"{wanted}, found no file {source}")
+        raise InputError(f"{wanted}, found no file {source!r}")
     raise InputError(f"{wanted}, found {source!r}{near(source, BUILT_IN_SCENES)}")
 
 

@@ -24,7 +24,7 @@ else:
 Keys = tuple[str | int, ...]  #: where a value is: names of tables and keys, numbers of what is in a list
 
 LARGEST_FILE = 1 << 20  #: bytes, chosen: far more than anybody writes by hand
-_DEEPEST = 16  #: nested keys whose lines are kept
+_DEEPEST = 16  # parts of a key, nested tables that lines are kept of
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,15 @@ def read_document(path: Path) -> Document:
         raise InputError(f"{path}: expected a scene file, found none that can be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: expected text in UTF-8, found byte {error.object[error.start]:#04x}") from None
+    except ValueError as error:  # a name that no file can have
+        raise InputError(f"{str(path)!r}: expected a scene file, found none that can be read ({error})") from None
     return parse(text, str(path))
 
 
 def parse(text: str, name: str) -> Document:
     """The document that `text` says; `name` stands in messages. Raises InputError."""
+    if _LONG_KEY.search(text):
+        raise InputError(f"{name}: expected keys of at most {_DEEPEST} parts, found one of more")
     try:
         values = tomllib.loads(text)
         lines = dict(_lines(text.replace("\r\n", "\n")))
@@ -90,6 +94,9 @@ def _syntax_error(message: str, text: str, name: str) -> str:
 
 _KEY_PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')"""
 _KEY = re.compile(rf"{_KEY_PART}(?:[ \t]*\.[ \t]*{_KEY_PART})*")
+_LONG_KEY = re.compile(rf"""(?<![\w-])(?:(?:[\w-]+|"[^"\\\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){{{_DEEPEST}}}""")
+"""Parsers keep every beginning of a dotted key, which takes memory as the square of its length."""
+
 _BLANK = re.compile(r"(?:[ \t\n]|#[^\n]*)*")
 _SPACE = re.compile(r"[ \t]*")
 _VALUE = re.compile(
