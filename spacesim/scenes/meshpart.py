@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from spacesim.scenes.meshtexture import Notes, Surface
 
 FARTHEST = 1e9  #: metres; vertices beyond it are taken for damage, chosen (the Moon is at 3.8e8)
-MOST_SHELLS = 500  #: closed shells of a part up to which inverted ones are told from cavities, chosen
+MOST_ANGLES = 20_000_000  #: solid angles worth computing to tell cavities from inverted surfaces, chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +58,13 @@ def corner_ids(vertices: np.ndarray) -> np.ndarray:
 
 def is_closed(faces: np.ndarray) -> bool:
     """Each edge of faces [F, 3] lies between exactly two of them."""
-    return bool(len(faces)) and bool((np.unique(_edges(faces), axis=0, return_counts=True)[1] == 2).all())
+    return bool(len(faces)) and bool((np.unique(_edges(faces), return_counts=True)[1] == 2).all())
 
 
 def _edges(faces: np.ndarray) -> np.ndarray:
-    """[3 F, 2] ends of edges, lower number first: edge k of face f is row 3 f + k."""
-    return np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    """[3 F] a number for the ends of each edge, in either order: edge k of face f is item 3 f + k."""
+    ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    return ends.min(axis=1) * (int(faces.max(initial=0)) + 1) + ends.max(axis=1)
 
 
 def _without_broken_faces(part: RawPart, notes: Notes) -> RawPart:
@@ -123,7 +124,7 @@ def _without_repeated_faces(part: RawPart, notes: Notes) -> RawPart:
 def _wound(part: RawPart, notes: Notes, open_too: bool) -> RawPart:
     """Consistent winding on each connected piece that is closed, and outward (open_too: on open ones, consistent)."""
     faces = corner_ids(part.vertices)[part.faces]
-    _, edge_of, uses = np.unique(_edges(faces), axis=0, return_inverse=True, return_counts=True)
+    _, edge_of, uses = np.unique(_edges(faces), return_inverse=True, return_counts=True)
     edge_of = edge_of.reshape(-1)
     turned, piece = _agreement(faces, edge_of, uses)
     pieces = int(piece.max()) + 1
@@ -178,7 +179,7 @@ def _inverted(vertices: np.ndarray, faces: np.ndarray, piece: np.ndarray, is_ope
     volumes = np.bincount(piece, np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0
     inverted = ~is_open & (volumes < 0)
     outer = ~is_open & (volumes > 0)
-    if not outer.any() or inverted.sum() > MOST_SHELLS:
+    if not outer.any() or inverted.sum() * outer[piece].sum() > MOST_ANGLES:
         return inverted
     shell = corners[outer[piece]]
     for index in np.flatnonzero(inverted):
