@@ -71,6 +71,53 @@ def test_suns_are_given_by_azimuth_and_elevation(spacesim, tmp_path):
     assert np.allclose(angles, [(200, -10), (5.5, 80)])
 
 
+def test_help_lists_the_built_in_scenes(spacesim):
+    from spacesim.scenes import BUILT_IN_SCENES
+
+    shown = "".join(spacesim("generate", "--help").output.split())  # lines may break at hyphens
+    assert f"({','.join(BUILT_IN_SCENES)})" in shown
+
+
+def test_a_printed_scene_makes_the_same_dataset(spacesim, tmp_path):
+    small = (
+        "--views",
+        "1",
+        "--test-views",
+        "0",
+        "--resolution",
+        "12x8",
+        "--spp",
+        "1",
+        "--fov",
+        "20",
+        "--distance",
+        "9",
+    )
+    options = (*small, "--exposure", "0.001", "--seed", "5", "--sun", "200,-10")
+    printed = spacesim("generate", "boxsat", *options, "--print")
+    assert printed.code == 0, printed.errors
+    (tmp_path / "boxsat.toml").write_text(printed.output, encoding="utf-8")
+    assert spacesim("generate", "boxsat", *options, "--out", tmp_path / "a").code == 0
+    done = spacesim("generate", tmp_path / "boxsat.toml", "--out", tmp_path / "b")
+    assert done.code == 0, done.errors
+    assert done.output == f"{tmp_path / 'b'}: 1 training and 0 test frames of boxsat\n"
+    made = [
+        {p.relative_to(root): p.read_bytes() for p in root.rglob("*.*")} for root in (tmp_path / "a", tmp_path / "b")
+    ]
+    assert made[0] == made[1]
+    camera = read_dataset(tmp_path / "a").train[0].camera
+    assert (camera.width, camera.height) == (12, 8)
+    assert np.isclose(camera.fx, 6 / np.tan(np.radians(10)))
+    assert np.isclose(json.loads((tmp_path / "a/scene.json").read_text())["exposure"], 0.001)
+
+
+def test_a_broken_scene_file_ends_in_a_sentence_with_its_line(spacesim, tmp_path):
+    (tmp_path / "my.toml").write_text('[[objects]]\nspacecraft = "boxsat"\n\n[rig]\nveiws = 3\n', encoding="utf-8")
+    refused = spacesim("generate", tmp_path / "my.toml", "--out", tmp_path / "out")
+    assert refused.is_refusal(f"{tmp_path / 'my.toml'}, line 5: rig.veiws:", "did you mean views?")
+    assert not (tmp_path / "out").exists()
+
+
 def test_train_leaves_a_run(tiny_run, tiny_data):
     run = load_run(tiny_run)
     assert run.config["iterations"] == 50
@@ -202,6 +249,17 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("fly", ["fly"]),
         ("generate teapot --out OUT", ["scene", "boxsat", "teapot"]),
         ("generate boxsat", ["--out"]),
+        ("generate boxsta --print", ["scene", "boxsta", "did you mean boxsat?"]),
+        ("generate ABSENT.toml --out OUT", ["absent.toml"]),
+        ("generate ABSENT.glb --out OUT", ["scene", "absent.glb"]),
+        ("generate DATA --out OUT", ["scene", "DATA"]),
+        ("generate boxsat --out OUT --units mm", ["units", "mesh file", "boxsat"]),
+        ("generate boxsat --out OUT --resolution 8x8x8", ["--resolution", "8x8x8"]),
+        ("generate boxsat --out OUT --resolution 8x0", ["resolution", "found 0"]),
+        ("generate boxsat --out OUT --fov 180", ["fov_deg", "found 180"]),
+        ("generate boxsat --out OUT --exposure nan", ["exposure", "found nan"]),
+        ("generate boxsat --out OUT --distance 0", ["distance", "found 0"]),
+        ("generate upper-stage --out OUT --distance 9", ["distance", "upper-stage"]),
         ("generate boxsat --out OUT --views 0", ["views", "at least 1", "found 0"]),
         ("generate boxsat --out OUT --views two", ["--views", "two"]),
         ("generate boxsat --out OUT --suns 0", ["suns", "found 0"]),
