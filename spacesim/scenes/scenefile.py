@@ -1,17 +1,18 @@
 """Scenes by name, from a scene file (docs/scenes.md) or around a mesh file, and scenes as text."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import is_dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from spacesim.data.errors import InputError
 from spacesim.scenes import toml
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
 from spacesim.scenes.materials import material_names
 from spacesim.scenes.rig import RIGS, RigConfig
-from spacesim.scenes.spacecraft import SPACECRAFT
+from spacesim.scenes.spacecraft import SPACECRAFT, spacecraft
 from spacesim.scenes.structure import Rules, keys_of, near, structure
 from spacesim.scenes.sun import SunConfig
 
@@ -55,14 +56,10 @@ def scene_text(scene: SceneConfig) -> str:
 
 def _mesh_scene(path: Path, source: str, reading: Mapping[str, Any]) -> SceneConfig:
     """A mesh file alone, which `reading` says how to read."""
-    try:
-        is_file, is_folder = path.is_file(), path.is_dir()
-    except (OSError, ValueError):  # a name that no file can have
-        is_file = is_folder = False
-    if is_file:
+    if os.path.isfile(path):  # which, unlike Path.is_file, takes any name
         return SceneConfig(path.stem, (ObjectConfig(mesh=path.name, **reading),), folder=path.parent)
     wanted = f"scene: expected one of {', '.join(BUILT_IN_SCENES)}, a scene file (.toml) or a mesh file"
-    if is_folder:
+    if os.path.isdir(path):
         raise InputError(f"{wanted}, found the folder {source!r}")
     if path.suffix or len(path.parts) > 1:
         raise InputError(f"{wanted}, found no file {source!r}")
@@ -77,25 +74,31 @@ def _read_file(path: Path) -> SceneConfig:
 
 
 def _check_names(scene: SceneConfig, document: toml.Document) -> None:
-    """Raises InputError, with file and line, for a spacecraft, material or mesh file that there is none of."""
-    presets = material_names()
+    """Raises InputError, with file and line, for a spacecraft, part, material or mesh file that there is none of."""
+    presets, folder = material_names(), scene.folder or Path()
 
-    def check(name: str, known: Iterable[str], *keys: str | int) -> None:
-        known = tuple(known)
+    def refuse(expected: str, found: str, *keys: str | int) -> NoReturn:
+        raise InputError(f"{document.label(keys)}: expected {expected}, found {found}")
+
+    def check(name: str, known: Collection[str], *keys: str | int) -> None:
         if name not in known:
-            expected = f"one of {', '.join(known)}"
-            raise InputError(f"{document.label(keys)}: expected {expected}, found {name!r}{near(name, known)}")
+            refuse(f"one of {', '.join(known)}", f"{name!r}{near(name, known)}", *keys)
 
+    for name, custom in scene.materials.items():
+        check(custom.preset, presets, "materials", name, "preset")
     for index, one in enumerate(scene.objects):
         for pattern, name in one.materials.items():
             check(name, (*scene.materials, *presets), "objects", index, "materials", pattern)
-        if one.spacecraft:
-            check(one.spacecraft, SPACECRAFT, "objects", index, "spacecraft")
-        elif scene.folder is not None and not (scene.folder / one.mesh).exists():
-            label = document.label(("objects", index, "mesh"))
-            raise InputError(f"{label}: expected a mesh file, found no file {scene.folder / one.mesh}")
-    for name, custom in scene.materials.items():
-        check(custom.preset, presets, "materials", name, "preset")
+        if one.mesh:
+            if not os.path.isfile(folder / one.mesh):
+                refuse("a mesh file", f"no file {str(folder / one.mesh)!r}", "objects", index, "mesh")
+            continue
+        check(one.spacecraft, SPACECRAFT, "objects", index, "spacecraft")
+        parts = [part.name for part in spacecraft(one.spacecraft).parts] if one.materials else []
+        for pattern in one.materials:
+            if not any(fnmatchcase(part, pattern) for part in parts):
+                found = f"none that fits{near(pattern, parts)}"
+                refuse(f"a part of {one.spacecraft}, or a pattern", found, "objects", index, "materials", pattern)
 
 
 def _changed(scene: SceneConfig, options: Mapping[str, Any]) -> SceneConfig:

@@ -327,6 +327,8 @@ BOXSAT = '[[objects]]\nspacecraft = "boxsat"\n'
         ("folder = '/'\n" + BOXSAT, ", line 1: folder: expected"),
         (BOXSAT.replace("boxsat", "boxsta"), ", line 2: objects[0].spacecraft: expected one of boxsat"),
         (BOXSAT.replace("boxsat", "boxsta"), "found 'boxsta'; did you mean boxsat?"),
+        ('[[objects]]\nmesh = "a\\u0000b"', ", line 2: objects[0].mesh: expected a mesh file"),
+        (f"[[objects]]\nmesh = '{'long' * 999}'", ", line 2: objects[0].mesh: expected a mesh file"),
         ("[[objects]]\n\nmesh = 'none.glb'", ", line 3: objects[0].mesh: expected a mesh file, found no file"),
         (BOXSAT + "[objects.materials]\nbus = 'gold'", ", line 4: objects[0].materials.bus: expected one of"),
         (
@@ -339,6 +341,9 @@ BOXSAT = '[[objects]]\nspacecraft = "boxsat"\n'
         ),
         (BOXSAT + "[materials.x]\npreset = 'gold'", ", line 4: materials.x.preset: expected one of"),
         (BOXSAT + "[materials.x]\npreset = 'glass'\nalbedo = 2", ", line 5: materials.x.albedo: expected fractions"),
+        (BOXSAT + "materials = { bux = 'glass' }", ", line 3: objects[0].materials.bux: expected a part of boxsat"),
+        (BOXSAT + "materials = { bux = 'glass' }", "found none that fits; did you mean bus?"),
+        (BOXSAT + "materials = { bus = 'glass', 'z*' = 'glass' }", ': objects[0].materials."z*": expected a part'),
         (BOXSAT + "materials = 'x'", ", line 3: objects[0].materials: expected a table, found 'x'"),
         (BOXSAT + "[sun]\n\nshape disc\n", ", line 5: expected TOML, found an error: expected '=' after a key"),
         (BOXSAT + "[sun]\n[sun]\n", ", line 4: expected TOML, found an error: cannot declare"),
