@@ -50,6 +50,12 @@ def flush_disks() -> None:
         os.sync()
 
 
+def existing_parent(path: Path) -> Path:
+    """The folder that `path` is, or the nearest one above that exists."""
+    path = Path(path).absolute()
+    return next(folder for folder in (path, *path.parents) if folder.is_dir())
+
+
 def holds_files(folder: Path) -> bool:
     """There is something visible in a folder; what an interrupted `write_bytes` leaves behind is hidden."""
     return folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir())

@@ -1,57 +1,131 @@
 """Sweep cameras and Suns over a scene and write the dataset."""
 
-import platform
-from collections.abc import Callable
-from importlib.metadata import version
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-import spacesim
 from spacesim import backend
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, expect
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import DatasetWriter
 from spacesim.scenes.build import build
 from spacesim.scenes.config import SceneConfig
+from spacesim.scenes.estimate import LONG, Estimate, measure, samples
+from spacesim.scenes.frames import FrameMaker, Job, Shot, raw_suffixes, versions, writing_threads
+from spacesim.scenes.overview import write_overview
 from spacesim.scenes.points import surface_points
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.rig import Target, View, plan
 from spacesim.scenes.scene import Scene
-from spacesim.scenes.sensor import record
 
 SCHEMA = 2  #: of scene.json
 
 Progress = Callable[[int, int, str], None]
 Named = list[tuple[str, View]]  #: views with the names of their frames
 
+_log = logging.getLogger(__name__)
 
-def generate(config: SceneConfig, out: Path, resume: bool = False, progress: Progress | None = None) -> Dataset:
+
+def generate(
+    config: SceneConfig,
+    out: Path,
+    resume: bool = False,
+    progress: Progress | None = None,
+    workers: int = 1,
+    ray: str | None = None,
+) -> Dataset:
     """Render the scene that `config` describes into the new folder `out` and return the dataset there.
 
-    resume: complete a folder that an interrupted run of the same scene has left; the result has the same bytes as
-    an uninterrupted run's. progress: called with (frames done, frames in all, name of the frame). Raises
-    InputError for a scene that cannot be built, a camera within an object or a folder that cannot be used.
+    resume: complete a folder that an interrupted run of the same scene has left; progress: called with (frames done,
+    frames in all, name of the frame last done); workers: processes of this machine; ray: address of a Ray cluster that
+    shares the folder, "local" for one of this machine alone. The bytes depend on none of these. Raises InputError for a
+    scene that cannot be built, a camera within an object or a folder that cannot be used, WorkError where disk, memory
+    or processes fail.
     """
-    scene = build(config)
-    train, test = plan_views(scene, config)
-    renderer = Renderer(scene, config.quality.spp, config.quality.max_depth, config.camera.distortion)
-    frames = train + test
-    inside = renderer.inside(np.stack([view.camera.position for _, view in frames]))
-    if inside.any():
-        name = frames[int(inside.argmax())][0]
-        raise InputError(f"distance: expected cameras outside of {config.name}, found that of {name} within a part")
-    writer = DatasetWriter(Path(out), describe(scene, config, train, test), resume)
-    for index, (name, view) in enumerate(frames):
-        if not writer.has(name):
-            truth = renderer.render(view.camera, view.sun, (config.seed, index))
-            recording = record(truth.radiance, truth.alpha, config.camera, (config.seed, index))
-            writer.write_frame(name, truth, recording.image, recording.raw)
+    expect(workers >= 1, "workers", "at least 1", workers)
+    expect(ray is None or workers == 1, "workers", "none beside ray, which counts for itself", workers)
+    if ray is not None:
+        from spacesim.scenes.cluster import load_ray
+
+        load_ray(ray)  # missing, it is missed before anything is written
+    sweep = _Sweep(config)
+    job = replace(sweep.job, root=Path(out).absolute())
+    described = describe(sweep.scene, config, sweep.train, sweep.test)
+    writer = DatasetWriter(Path(out), described, resume, raw_suffixes(config.camera))
+    left = [shot for shot in sweep.shots if not writer.has(shot.name)]
+    done = len(sweep.shots) - len(left)
+
+    def tell(name: str) -> None:
+        nonlocal done
+        done += 1
         if progress is not None:
-            progress(index + 1, len(frames), name)
-    points, colors = surface_points(renderer, config.quality.points, config.seed)
-    return writer.finish(_listed(train), _listed(test), points, colors, scene.mesh, config.camera.distortion)
+            progress(done, len(sweep.shots), name)
+
+    if progress is not None and done:
+        progress(done, len(sweep.shots), sweep.shots[-1].name)
+    for name in _made(job, sweep.renderer, left, workers, ray):
+        tell(name)
+    points, colors = surface_points(sweep.renderer, config.quality.points, config.seed)
+    listed = _listed(sweep.train), _listed(sweep.test)
+    dataset = writer.finish(*listed, points, colors, sweep.scene.mesh, config.camera.distortion)
+    write_overview(dataset.root, dataset)
+    return dataset
+
+
+def estimate(config: SceneConfig, out: Path) -> Estimate:
+    """Time and disk that `generate` needs for the frames that are not in `out` yet; leaves no file behind.
+
+    Raises InputError as `generate` does.
+    """
+    sweep = _Sweep(config)
+    there = replace(sweep.job, root=Path(out).absolute()).writer
+    left = [shot for shot in sweep.shots if not there.has(shot.name)]
+    with TemporaryDirectory(prefix="spacesim-") as folder:
+        maker = FrameMaker(replace(sweep.job, root=Path(folder)), sweep.renderer)
+        return measure(maker, samples(left or sweep.shots), len(left), there.root)
+
+
+def _made(job: Job, renderer: Renderer, shots: Sequence[Shot], workers: int, ray: str | None) -> Iterator[str]:
+    """Frames, by whoever makes them. A long run begins with a few that tell how long and how large it will be."""
+    if len(shots) > LONG:
+        first = samples(shots)
+        found = measure(FrameMaker(job, renderer), first, len(shots), job.root)
+        _log.info("generate: %s", found)
+        found.check(job.root)
+        names = {shot.name for shot in first}
+        yield from names
+        shots = [shot for shot in shots if shot.name not in names]
+    if ray is not None:
+        from spacesim.scenes.cluster import make_on_cluster
+
+        yield from make_on_cluster(job, shots, ray)
+    elif workers > 1:
+        from spacesim.scenes.workers import make_in_processes
+
+        yield from make_in_processes(job, shots, workers)
+    else:
+        yield from FrameMaker(job, renderer).make(shots)
+
+
+class _Sweep:
+    """A scene that is built and loaded, with all of its frames. Raises InputError for a camera within an object."""
+
+    def __init__(self, config: SceneConfig) -> None:
+        self.scene = build(config)
+        self.train, self.test = plan_views(self.scene, config)
+        quality = config.quality
+        self.renderer = Renderer(self.scene, quality.spp, quality.max_depth, config.camera.distortion)
+        self.shots = [Shot(i, name, view.camera, view.sun) for i, (name, view) in enumerate(self.train + self.test)]
+        self.job = Job(self.scene, config.camera, quality, config.seed, Path(), writing_threads(1))
+        inside = self.renderer.inside(np.stack([shot.camera.position for shot in self.shots]))
+        if inside.any():
+            name = self.shots[int(inside.argmax())].name
+            raise InputError(f"distance: expected cameras outside of {config.name}, found that of {name} within a part")
 
 
 def plan_views(scene: Scene, config: SceneConfig) -> tuple[Named, Named]:
@@ -68,6 +142,7 @@ def describe(scene: Scene, config: SceneConfig, train: Named, test: Named) -> di
     return {
         "schema": SCHEMA,
         **scene.describe(),
+        "mesh": [_share_of_mesh(scene, i) for i in range(1, len(scene.objects) + 1)],
         "suns": {"train": _angles(train), "test": _angles(test)},
         "exposure": config.camera.exposure,
         "seed": config.seed,
@@ -78,10 +153,11 @@ def describe(scene: Scene, config: SceneConfig, train: Named, test: Named) -> di
     }
 
 
-def versions() -> dict[str, str]:
-    """Versions of what the pictures depend on."""
-    packages = {name: version(name) for name in ("mitsuba", "drjit", "numpy", "trimesh")}
-    return {"spacesim": spacesim.__version__, "python": platform.python_version(), **packages}
+def _share_of_mesh(scene: Scene, object_id: int) -> dict[str, int]:
+    """How many vertices and faces of mesh.ply, where objects stand in the order of their ids, are an object's."""
+    meshes = [placed.mesh for placed in scene.parts if placed.object_id == object_id]
+    vertices, faces = (sum(len(getattr(mesh, name)) for mesh in meshes) for name in ("vertices", "faces"))
+    return {"object": object_id, "vertices": vertices, "faces": faces}
 
 
 def _angles(named: Named) -> list[list[float]]:
