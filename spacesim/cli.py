@@ -108,6 +108,12 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--units", metavar="UNIT", help="of a mesh file: m (default), cm, mm, km, in or ft")
     one.add_argument("--up", metavar="AXIS", help="of a mesh file: x, y or z (default: the format's own)")
     one.add_argument("--resume", action="store_true", help="complete what an interrupted run left")
+    many = one.add_mutually_exclusive_group()
+    many.add_argument("--workers", type=int, default=1, metavar="N", help="processes that render (1)")
+    many.add_argument(
+        "--ray", metavar="ADDRESS", help="render on a Ray cluster: auto, HOST:PORT, or local to start one"
+    )
+    one.add_argument("--estimate", action="store_true", help="render a few frames, tell time and disk, keep nothing")
     one.add_argument("--print", action="store_true", help="render nothing, print the whole scene as a scene file")
 
     one = command("train", _train, "reconstruct a dataset with Gaussian splatting")
@@ -149,11 +155,17 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--sun", type=_angles, metavar="AZ,EL", help="degrees; a vanilla run knows one light only")
     one.add_argument("--kind", choices=KINDS, default="rgb")
 
-    one = command("export", _export, "the Gaussians as a file for other tools")
-    one.add_argument("path", type=Path, metavar="RUN")
-    one.add_argument(
-        "--ply", type=Path, required=True, metavar="FILE", help="INRIA layout, the dataset's frame and scale"
-    )
+    one = command("verify", _verify, "whether every file of a dataset is there and can be read", needs_backend=False)
+    one.add_argument("data", type=Path, metavar="DATA")
+
+    one = command("export", _export, "a run or a dataset as files for other tools", needs_backend=False)
+    one.add_argument("path", type=Path, metavar="RUN|DATA")
+    one.add_argument("--backend", choices=backend.NAMES, default="auto", help="default: CUDA, else LLVM")
+    form = one.add_mutually_exclusive_group(required=True)
+    form.add_argument("--ply", type=Path, metavar="FILE", help="Gaussians: INRIA layout, the dataset's frame and scale")
+    form.add_argument("--speedplus", type=Path, metavar="DIR", help="a dataset's images and poses as SPEED+ has them")
+    form.add_argument("--bop", type=Path, metavar="DIR", help="a dataset's images, depth, masks, poses, models for BOP")
+    one.add_argument("--object", metavar="K", help="for SPEED+: whose poses, by number or name (the first)")
     return parser
 
 
@@ -205,6 +217,7 @@ _SCENE_OPTIONS = (
 def _generate(options: argparse.Namespace) -> None:
     from spacesim.progress import reporting
     from spacesim.scenes import generate, read_scene
+    from spacesim.scenes.generate import estimate
     from spacesim.scenes.scenefile import scene_text
 
     changes = {name: getattr(options, name) for name in _SCENE_OPTIONS}
@@ -212,11 +225,15 @@ def _generate(options: argparse.Namespace) -> None:
     if options.print:
         print(scene_text(scene), end="")
         return
+    if options.estimate:
+        backend.select(options.backend)
+        print(estimate(scene, options.out or Path()))
+        return
     if options.out is None:
         raise InputError("--out: expected a folder for the dataset, found none")
     backend.select(options.backend)
     with reporting("generate", "frames") as report:
-        dataset = generate(scene, options.out, options.resume, report)
+        dataset = generate(scene, options.out, options.resume, report, options.workers, options.ray)
     print(f"{options.out}: {len(dataset.train)} training and {len(dataset.test)} test frames of {scene.name}")
 
 
@@ -298,13 +315,63 @@ def _data_of(config: dict[str, Any]) -> Path:
     return path
 
 
+def _verify(options: argparse.Namespace) -> None:
+    from spacesim.data.store import read_dataset, verify_dataset
+
+    dataset = read_dataset(options.data)
+    problems = verify_dataset(options.data)
+    for problem in problems:
+        print(problem, file=sys.stderr)
+    if problems:
+        raise WorkError(
+            f"{options.data}: {len(problems)} faulty files; delete them, generate --resume makes them again"
+        )
+    print(f"{options.data}: {len(dataset.frames)} frames, every file is there and whole")
+
+
 def _export(options: argparse.Namespace) -> None:
+    if options.object is not None and options.speedplus is None:
+        raise InputError("--object: expected with --speedplus, found without it")
+    if options.speedplus is not None:
+        _export_speedplus(options)
+    elif options.bop is not None:
+        _export_bop(options)
+    else:
+        _export_ply(options)
+
+
+def _export_ply(options: argparse.Namespace) -> None:
     from spacesim.splat.ply import write_ply
     from spacesim.splat.run import load_run
 
+    backend.select(options.backend)
     run = load_run(options.path)
     write_ply(run.model, options.ply)
     print(f"{options.ply}: {run.gaussians} Gaussians")
+
+
+def _export_speedplus(options: argparse.Namespace) -> None:
+    from spacesim.data.exporters import write_speedplus
+    from spacesim.data.store import read_dataset
+    from spacesim.progress import reporting
+
+    dataset = read_dataset(options.path)
+    with reporting("export", "frames") as report:
+        target = write_speedplus(dataset, options.speedplus, options.object, report)
+    print(f"{options.speedplus}: {len(dataset.frames)} images with the pose of {target.name}")
+
+
+def _export_bop(options: argparse.Namespace) -> None:
+    from spacesim.data.exporters import write_bop
+    from spacesim.data.store import read_dataset
+    from spacesim.progress import reporting
+    from spacesim.scenes.silhouette import outline
+
+    backend.select(options.backend)
+    dataset = read_dataset(options.path)
+    with reporting("export", "frames") as report:
+        targets = write_bop(dataset, options.bop, outline, report)
+    print(f"{options.bop}: {len(dataset.frames)} images with the poses of {', '.join(t.name for t in targets)}")
 
 
 def _print_headline(metrics: dict[str, Any]) -> None:

@@ -1,0 +1,208 @@
+"""BOP, the benchmark for 6D object pose estimation (T. Hodan et al., ECCV 2018), scene-wise, as its toolkit has it.
+
+    DIR/camera.json                 DIR/models/models_info.json, obj_000001.ply (mm)
+    DIR/train/000000, test/000000   scene_camera.json  scene_gt.json  scene_gt_info.json
+                                    rgb/ or gray/  depth/  mask/  mask_visib/
+
+A point p of a model is at cam_R_m2c p + cam_t_m2c in the camera, in millimetres, the axes OpenCV's. In BOP's rendered
+datasets the centres of pixels have whole coordinates, so cam_K's principal point is half a pixel less than ours.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial.distance import pdist
+
+from spacesim.data.errors import InputError
+from spacesim.data.exporters.objects import Progress, Target, new_folder, opaque, targets_of
+from spacesim.data.files import write_bytes, write_json
+from spacesim.data.images import write_png
+from spacesim.data.records import Camera, Dataset, Frame
+from spacesim.data.store import load_truth
+
+MM = 1000.0
+HALF = 0.5  # from our pixel coordinates to those of BOP
+SEEN_ENOUGH = 0.1  #: visible fraction from which on an instance is a target of the test (BOP challenge)
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouette:
+    """Of one object as if it were alone. mask: [H, W] bool, in the image; count: pixels, those outside of the image
+    too; box: (x, y, width, height) of all of them, pixels."""
+
+    mask: np.ndarray
+    count: int
+    box: tuple[int, int, int, int]
+
+
+Outline = Callable[[Camera], Sequence[Silhouette]]  #: silhouettes of all targets, in their order
+
+
+def write_bop(
+    dataset: Dataset,
+    out: Path,
+    outline: Callable[[list[Target]], Outline],
+    progress: Progress | None = None,
+) -> list[Target]:
+    """Write `dataset` into the new folder `out`; returns the objects whose poses are labels.
+
+    outline: makes what finds silhouettes, which takes rays (see `spacesim.scenes.silhouette`). Raises InputError for
+    distorted images, which BOP does not know, and for a folder that is not empty.
+    """
+    for frame in dataset.frames:
+        if any(frame.distortion):
+            raise InputError(f"{frame.file_path}: expected an image without lens distortion, which BOP does not know")
+    targets = targets_of(dataset)
+    out = new_folder(out)
+    models = _models(targets)
+    _write_models(out / "models", targets, models)
+    find = outline(targets)
+    done = 0
+    for split, frames in (("train", dataset.train), ("test", dataset.test)):
+        scene = out / split / "000000"
+        cameras, poses, infos = {}, {}, {}
+        for image, frame in enumerate(frames):
+            cameras[str(image)], infos[str(image)] = _write_frame(scene, image, dataset, frame, targets, find)
+            poses[str(image)] = [_pose(frame.camera, *pair) for pair in zip(targets, models, strict=True)]
+            done += 1
+            if progress is not None:
+                progress(done, len(dataset.frames), frame.file_path)
+        if frames:
+            write_json(scene / "scene_camera.json", cameras)
+            write_json(scene / "scene_gt.json", poses)
+            write_json(scene / "scene_gt_info.json", infos)
+        if split == "test":
+            write_json(out / "test_targets_bop19.json", _test_targets(infos, models))
+    write_json(out / "camera.json", _sensor(dataset.frames[0].camera))
+    return targets
+
+
+def _write_frame(
+    scene: Path, image: int, dataset: Dataset, frame: Frame, targets: list[Target], find: Outline
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Write the pictures of a frame; returns its entries of scene_camera.json and scene_gt_info.json."""
+    truth = load_truth(dataset, frame)
+    picture = opaque(dataset.root / frame.file_path)
+    write_png(scene / ("rgb" if picture.ndim == 3 else "gray") / f"{image:06d}.png", picture, durable=False)
+    depth = np.where(truth.object_id > 0, truth.depth, 0) * MM
+    scale = _depth_scale(float(depth.max()))
+    stored = np.round(depth / scale).astype(np.uint16)
+    write_png(scene / "depth" / f"{image:06d}.png", stored, durable=False)
+    infos = []
+    for index, (target, silhouette) in enumerate(zip(targets, find(frame.camera), strict=True)):
+        visible = truth.object_id == target.id
+        mask = silhouette.mask | visible  # rays through edges may round either way
+        for folder, pixels in (("mask", mask), ("mask_visib", visible)):
+            path = scene / folder / f"{image:06d}_{index:06d}.png"
+            write_png(path, np.where(pixels, 255, 0).astype(np.uint8), durable=False)
+        count = silhouette.count + int((visible & ~silhouette.mask).sum())
+        infos.append(
+            {
+                "bbox_obj": list(silhouette.box if visible.any() else _NO_BOX),
+                "bbox_visib": list(box_of(visible)),
+                "px_count_all": count,
+                "px_count_valid": int((stored[mask] > 0).sum()),
+                "px_count_visib": int(visible.sum()),
+                "visib_fract": float(visible.sum() / count) if count else 0.0,
+            }
+        )
+    pose = frame.camera.camera_from_world
+    entry = {
+        "cam_K": _matrix(frame.camera),
+        "depth_scale": scale,
+        "cam_R_w2c": pose[:3, :3].ravel().tolist(),
+        "cam_t_w2c": (MM * pose[:3, 3]).tolist(),
+    }
+    return entry, infos
+
+
+_NO_BOX = (-1, -1, -1, -1)
+
+
+def box_of(pixels: np.ndarray, origin: tuple[int, int] = (0, 0)) -> tuple[int, int, int, int]:
+    """(x, y, width, height) of what is set in [H, W] bool whose first pixel is at `origin`; -1 each for none."""
+    if not pixels.any():
+        return _NO_BOX
+    columns, rows = np.flatnonzero(pixels.any(axis=0)), np.flatnonzero(pixels.any(axis=1))
+    x, y = int(columns[0]), int(rows[0])
+    return x + origin[0], y + origin[1], int(columns[-1]) - x + 1, int(rows[-1]) - y + 1
+
+
+def _pose(camera: Camera, target: Target, model: int) -> dict[str, Any]:
+    pose = target.camera_from_object(camera)
+    return {
+        "cam_R_m2c": pose[:3, :3].ravel().tolist(),
+        "cam_t_m2c": (MM * pose[:3, 3]).tolist(),
+        "obj_id": model,
+    }
+
+
+def _matrix(camera: Camera) -> list[float]:
+    return [camera.fx, 0.0, camera.cx - HALF, 0.0, camera.fy, camera.cy - HALF, 0.0, 0.0, 1.0]
+
+
+def _sensor(camera: Camera) -> dict[str, float]:
+    names = dict(zip(("fx", "cx", "fy", "cy"), (_matrix(camera)[i] for i in (0, 2, 4, 5)), strict=True))
+    return {**names, "width": camera.width, "height": camera.height, "depth_scale": 1.0}
+
+
+def _depth_scale(farthest: float) -> float:
+    """Millimetres a step: the finest of 0.1, 1, 10, ... with which 16 bits reach `farthest` millimetres."""
+    scale = 0.1
+    while farthest / scale > np.iinfo(np.uint16).max:
+        scale *= 10
+    return round(scale, 1)
+
+
+def _models(targets: list[Target]) -> list[int]:
+    """Number of each target's model, from 1: objects of the same shape are instances of one model."""
+    numbers: list[int] = []
+    for i, target in enumerate(targets):
+        same = (numbers[k] for k in range(i) if _is_same(targets[k], target))
+        numbers.append(next(same, max(numbers, default=0) + 1))
+    return numbers
+
+
+def _is_same(one: Target, other: Target) -> bool:
+    if one.vertices.shape != other.vertices.shape or not np.array_equal(one.faces, other.faces):
+        return False
+    return bool(np.abs(one.vertices - other.vertices).max() < 1e-5 * np.ptp(one.vertices, axis=0).max())
+
+
+def _write_models(folder: Path, targets: list[Target], models: list[int]) -> None:
+    infos = {}
+    for number in dict.fromkeys(models):
+        target = targets[models.index(number)]
+        points = MM * target.vertices
+        mesh = trimesh.Trimesh(points, target.faces, process=False)
+        write_bytes(
+            folder / f"obj_{number:06d}.ply", mesh.export(file_type="ply", encoding="ascii", vertex_normal=True)
+        )
+        low, sizes = points.min(axis=0), np.ptp(points, axis=0)
+        infos[str(number)] = {
+            "diameter": _diameter(mesh),
+            **{f"min_{axis}": float(x) for axis, x in zip("xyz", low, strict=True)},
+            **{f"size_{axis}": float(x) for axis, x in zip("xyz", sizes, strict=True)},
+        }
+    write_json(folder / "models_info.json", infos)
+
+
+def _diameter(mesh: trimesh.Trimesh) -> float:
+    """Largest distance between two vertices, which are corners of the convex hull."""
+    return float(pdist(mesh.convex_hull.vertices).max())
+
+
+def _test_targets(infos: dict[str, list[dict[str, Any]]], models: list[int]) -> list[dict[str, int]]:
+    """How many instances of each model are to be found in each test image."""
+    found = []
+    for image, entries in infos.items():
+        seen = [model for model, info in zip(models, entries, strict=True) if info["visib_fract"] >= SEEN_ENOUGH]
+        found += [
+            {"im_id": int(image), "inst_count": seen.count(model), "obj_id": model, "scene_id": 0}
+            for model in sorted(set(seen))
+        ]
+    return found

@@ -1,0 +1,92 @@
+"""What every exporter needs of a dataset: the objects with their poses and meshes, and opaque pictures."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from spacesim.data.errors import InputError
+from spacesim.data.files import holds_files
+from spacesim.data.geometry import Array
+from spacesim.data.images import read_png
+from spacesim.data.records import Camera, Dataset
+
+Progress = Callable[[int, int, str], None]  #: frames done, frames in all, name of the frame
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """An object whose pose is a label. id: in the label pictures, from 1; world_from_object: [4, 4] rigid, metres;
+    vertices: [V, 3] metres, body frame, as large as in the scene; faces: [F, 3]."""
+
+    id: int
+    name: str
+    world_from_object: Array
+    vertices: Array
+    faces: np.ndarray
+
+    def camera_from_object(self, camera: Camera) -> Array:
+        """[4, 4] rigid, OpenCV's camera axes, metres."""
+        return camera.camera_from_world @ self.world_from_object
+
+
+def targets_of(dataset: Dataset) -> list[Target]:
+    """The objects of a dataset. Raises InputError where scene.json or mesh.ply do not tell them apart."""
+    path = dataset.root / "scene.json"
+    try:
+        objects, counts = dataset.scene["objects"], dataset.scene["mesh"]
+        sizes = [(int(count["vertices"]), int(count["faces"])) for count in counts]
+        poses = [np.array(item["world_from_object"], np.float64).reshape(4, 4) for item in objects]
+        names = [(int(item["id"]), str(item["name"])) for item in objects]
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{path}: expected objects, their poses and shares of mesh.ply, found none") from None
+    mesh = _read_mesh(dataset)
+    if not objects or [sum(size) for size in zip(*sizes, strict=True)] != [len(mesh.vertices), len(mesh.faces)]:
+        raise InputError(f"{path}: expected the vertices and faces of mesh.ply, found other numbers of them")
+    targets = []
+    first_vertex = first_face = 0
+    for (number, name), pose, (vertices, faces) in zip(names, poses, sizes, strict=True):
+        scale = np.cbrt(np.linalg.det(pose[:3, :3]))
+        rigid = pose.copy()
+        rigid[:3, :3] /= scale
+        world = np.asarray(mesh.vertices[first_vertex : first_vertex + vertices])
+        own = np.asarray(mesh.faces[first_face : first_face + faces]) - first_vertex
+        targets.append(Target(number, name, rigid, (world - rigid[:3, 3]) @ rigid[:3, :3], own))
+        first_vertex, first_face = first_vertex + vertices, first_face + faces
+    return targets
+
+
+def chosen(targets: list[Target], wanted: str | None) -> Target:
+    """The target of that number or name; without one the first. Raises InputError where there is none."""
+    for target in targets:
+        if wanted is None or wanted in (str(target.id), target.name):
+            return target
+    known = ", ".join(f"{target.id} {target.name}" for target in targets)
+    raise InputError(f"--object: expected one of {known}, found {wanted!r}")
+
+
+def opaque(path: Path) -> np.ndarray:
+    """[H, W] or [H, W, 3] uint8: a picture over black, as a camera in space records it."""
+    pixels = read_png(path)
+    if pixels.ndim == 2 or pixels.shape[2] == 3:
+        return pixels
+    return np.round(pixels[..., :3] * (pixels[..., 3:] / 255)).astype(np.uint8)
+
+
+def new_folder(out: Path) -> Path:
+    """`out`, which must be new or empty."""
+    out = Path(out)
+    if out.exists() and (not out.is_dir() or holds_files(out)):
+        raise InputError(f"{out}: expected a new or empty folder, found a file or files in it")
+    return out
+
+
+def _read_mesh(dataset: Dataset) -> Any:
+    path = dataset.root / (dataset.mesh_path or "mesh.ply")
+    try:
+        return trimesh.load(path, process=False)
+    except Exception as error:  # trimesh documents none of what it raises
+        raise InputError(f"{path}: expected the mesh of the dataset, found none that can be read ({error})") from None

@@ -1,0 +1,82 @@
+"""SPEED+ (T. H. Park et al., "SPEED+: Next-generation dataset for spacecraft pose estimation across domain gap", 2022).
+
+    DIR/camera.json                      Nu Nv ppx ppy fx fy ccx ccy cameraMatrix distCoeffs
+    DIR/synthetic/train.json             [{filename, q_vbs2tango_true, r_Vo2To_vbs_true}, ...]
+    DIR/synthetic/validation.json        our test split, which is what SPEED+ calls its labelled synthetic images
+    DIR/synthetic/images/NAME.png
+
+A point p of the body is at R(q) p + r in the camera: q is scalar-first, r in metres, the axes OpenCV's; SPEED+'s own
+utilities project it so. Pixels are as everywhere here: the image spans [0, Nu] x [0, Nv].
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from spacesim.data.errors import InputError
+from spacesim.data.exporters.objects import Progress, Target, chosen, new_folder, opaque, targets_of
+from spacesim.data.files import write_json
+from spacesim.data.geometry import quaternion_from_rotation
+from spacesim.data.images import write_png
+from spacesim.data.records import Camera, Dataset, Frame
+
+PIXEL_PITCH = 5.86e-6
+"""Metres: that of the camera of SPEED+. We know focal lengths in pixels alone; SPEED+ gives them in metres as well."""
+
+
+def write_speedplus(dataset: Dataset, out: Path, wanted: str | None = None, progress: Progress | None = None) -> Target:
+    """Write `dataset` into the new folder `out`; returns the object whose poses the labels are.
+
+    wanted: number or name of the object, None the first. Raises InputError for another object, for frames of several
+    cameras, which SPEED+ does not know, and for a folder that is not empty.
+    """
+    target = chosen(targets_of(dataset), wanted)
+    camera = _camera(dataset.frames)
+    out = new_folder(out)
+    frames = dataset.frames
+    for number, frame in enumerate(frames, start=1):
+        write_png(out / "synthetic/images" / _filename(frame), opaque(dataset.root / frame.file_path), durable=False)
+        if progress is not None:
+            progress(number, len(frames), frame.file_path)
+    write_json(out / "synthetic/train.json", [_label(frame, target) for frame in dataset.train])
+    write_json(out / "synthetic/validation.json", [_label(frame, target) for frame in dataset.test])
+    write_json(out / "camera.json", camera)
+    return target
+
+
+def _label(frame: Frame, target: Target) -> dict[str, Any]:
+    pose = target.camera_from_object(frame.camera)
+    return {
+        "filename": _filename(frame),
+        "q_vbs2tango_true": quaternion_from_rotation(pose[:3, :3]).tolist(),
+        "r_Vo2To_vbs_true": pose[:3, 3].tolist(),
+    }
+
+
+def _filename(frame: Frame) -> str:
+    return f"{Path(frame.file_path).stem}.png"
+
+
+def _camera(frames: Sequence[Frame]) -> dict[str, Any]:
+    """camera.json of what all frames share."""
+    first = frames[0]
+    for frame in frames:
+        if _intrinsics(frame.camera) != _intrinsics(first.camera) or frame.distortion != first.distortion:
+            raise InputError(f"{frame.file_path}: expected one camera for all frames, as SPEED+ has, found another")
+    camera = first.camera
+    return {
+        "Nu": camera.width,
+        "Nv": camera.height,
+        "ppx": PIXEL_PITCH,
+        "ppy": PIXEL_PITCH,
+        "fx": camera.fx * PIXEL_PITCH,
+        "fy": camera.fy * PIXEL_PITCH,
+        "ccx": camera.cx,
+        "ccy": camera.cy,
+        "cameraMatrix": [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]],
+        "distCoeffs": list(first.distortion or (0.0,) * 5),
+    }
+
+
+def _intrinsics(camera: Camera) -> tuple[float, ...]:
+    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
