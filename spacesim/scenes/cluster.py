@@ -8,9 +8,12 @@ import hashlib
 import logging
 import os
 import pickle
+import re
 import socket
+import sys
 import uuid
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -45,41 +48,60 @@ class _Order:
     digest: str
 
 
-def make_on_cluster(job: Job, shots: Sequence[Shot], address: str) -> Iterator[str]:
-    """Make frames on the Ray cluster at `address`; yields the name of each once it is on the disk, in no fixed order.
+@contextmanager
+def joined(address: str) -> Iterator[None]:
+    """Within it this process belongs to a Ray cluster, and `make_on_cluster` works.
 
     address: "auto" or host:port of a running one, "local" to start one on this machine. Raises InputError where there
-    is none, what a task raises, and WorkError where processes die again and again.
+    is none.
     """
-    ray = load_ray(address)
-    _join(ray, address)
+    ray = _load_ray(address)
+    started = {"num_cpus": cores(), "include_dashboard": False} if address == "local" else {}
     try:
-        cpus, gpus, places = _shares(ray)
-        job = replace(job, threads=max(1, int(cpus)))
-        name = backend.select()
-        order = ray.put(pickle.dumps(_Order(job, name, max(1, int(cpus)), versions(), _digest(job.root))))
-        task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=RETRIES, max_calls=0)(_make)
-        key = uuid.uuid4().hex
-        size = max(1, min(MOST_FRAMES, len(shots) // (4 * places)))
-        tasks = (list(shots[i : i + size]) for i in range(0, len(shots), size))
-        running = [task.remote(key, [order], group) for group in islice(tasks, WINDOW * places)]
-        while running:
-            ready, running = ray.wait(running)
-            running += [task.remote(key, [order], group) for group in islice(tasks, len(ready))]
-            yield from _result(ray, ready[0])
+        _knock(address)
+        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, **started)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"--ray: expected a Ray cluster at {address!r}, found none ({_first_line(error)})") from None
+    try:
+        yield
     finally:
         ray.shutdown()
 
 
-def load_ray(address: str) -> ModuleType:
+def make_on_cluster(job: Job, shots: Sequence[Shot]) -> Iterator[str]:
+    """Make frames on the Ray cluster; yields the name of each once it is on the disk, in no fixed order.
+
+    Raises what a task raises, and WorkError where processes die again and again.
+    """
+    import ray
+
+    cpus, gpus, places = _shares(ray)
+    threads = max(1, int(cpus))
+    order = _Order(replace(job, threads=threads), backend.select(), threads, versions(), _digest(job.root))
+    sent = ray.put(pickle.dumps(order))  # as bytes, or arrays would come back read-only
+    task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=RETRIES, max_calls=0)(_make)
+    key = uuid.uuid4().hex
+    size = max(1, min(MOST_FRAMES, len(shots) // (4 * places)))
+    tasks = (list(shots[i : i + size]) for i in range(0, len(shots), size))
+    running = [task.remote(key, [sent], group) for group in islice(tasks, WINDOW * places)]
+    while running:
+        ready, running = ray.wait(running)
+        running += [task.remote(key, [sent], group) for group in islice(tasks, len(ready))]
+        yield from _result(ray, ready[0])
+
+
+def _load_ray(address: str) -> ModuleType:
     """The package; InputError says what to type where it is missing.
 
-    What it reads from the environment when it is imported: it sends no statistics of use, and a cluster of this machine
-    alone listens on loopback, to who has its token.
+    What it reads from the environment when it is first imported: it sends no statistics of use; a cluster of this
+    machine alone listens on loopback, to who has its token; one that is joined is shown the user's token, if any.
     """
     os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_task_oom_retries": str(RETRIES)}
-    if address == "local":
-        os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _TOKEN}
+    if "ray" not in sys.modules:
+        if address == "local":
+            os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _TOKEN}
+        elif "RAY_AUTH_TOKEN" in os.environ or (Path.home() / ".ray/auth_token").is_file():
+            os.environ.setdefault("RAY_AUTH_MODE", "token")
     try:
         import ray
     except ImportError:
@@ -87,13 +109,11 @@ def load_ray(address: str) -> ModuleType:
     return ray
 
 
-def _join(ray: ModuleType, address: str) -> None:
-    started = {"num_cpus": cores(), "include_dashboard": False} if address == "local" else {}
-    try:
-        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, **started)
-    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
-        reason = str(error).split("\n")[0]
-        raise InputError(f"--ray: expected a Ray cluster at {address!r}, found none ({reason})") from None
+def _knock(address: str) -> None:
+    """Raises OSError where nothing listens at host:port; Ray itself would try for two minutes."""
+    host, _, port = address.rpartition(":")
+    if host and port.isdigit() and "/" not in host:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
 
 
 def _shares(ray: ModuleType) -> tuple[float, float, int]:
@@ -118,10 +138,15 @@ def _result(ray: ModuleType, done: Any) -> list[str]:
         cause = error.cause
         if isinstance(cause, InputError | WorkError | backend.BackendError):
             raise cause from None
-        raise WorkError(f"--ray: a task failed ({type(cause).__name__}: {cause})") from error
+        if missing := re.search(r"No module named '[\w.]+'", str(cause)):
+            raise InputError(f"--ray: expected spacesim on all of the cluster's machines ({missing[0]})") from None
+        raise WorkError(f"--ray: a task failed ({type(cause).__name__}: {_first_line(cause)})") from error
     except ray.exceptions.RayError as error:
-        reason = str(error).strip().split("\n")[0]
-        raise WorkError(f"--ray: a task was given up after {RETRIES} repetitions ({reason})") from error
+        raise WorkError(f"--ray: a task was given up after {RETRIES} repetitions ({_first_line(error)})") from error
+
+
+def _first_line(error: object) -> str:
+    return str(error).strip().split("\n")[0]
 
 
 def _make(key: str, order: list[Any], shots: list[Shot]) -> list[str]:
@@ -129,7 +154,7 @@ def _make(key: str, order: list[Any], shots: list[Shot]) -> list[str]:
     if key not in _makers:
         import ray
 
-        found: _Order = pickle.loads(ray.get(order[0]))  # as bytes, or arrays would come back read-only
+        found: _Order = pickle.loads(ray.get(order[0]))
         _check(found)
         _makers.clear()
         _makers[key] = FrameMaker(found.job)

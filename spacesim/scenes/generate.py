@@ -2,7 +2,9 @@
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,6 +28,7 @@ from spacesim.scenes.scene import Scene
 SCHEMA = 2  #: of scene.json
 
 Progress = Callable[[int, int, str], None]
+Crew = Callable[[Job, Sequence[Shot]], Iterator[str]]  #: makes frames and yields their names
 Named = list[tuple[str, View]]  #: views with the names of their frames
 
 _log = logging.getLogger(__name__)
@@ -49,27 +52,18 @@ def generate(
     """
     expect(workers >= 1, "workers", "at least 1", workers)
     expect(ray is None or workers == 1, "workers", "none beside ray, which counts for itself", workers)
-    if ray is not None:
-        from spacesim.scenes.cluster import load_ray
-
-        load_ray(ray)  # missing, it is missed before anything is written
     sweep = _Sweep(config)
     job = replace(sweep.job, root=Path(out).absolute())
-    described = describe(sweep.scene, config, sweep.train, sweep.test)
-    writer = DatasetWriter(Path(out), described, resume, raw_suffixes(config.camera))
-    left = [shot for shot in sweep.shots if not writer.has(shot.name)]
-    done = len(sweep.shots) - len(left)
-
-    def tell(name: str) -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, len(sweep.shots), name)
-
-    if progress is not None and done:
-        progress(done, len(sweep.shots), sweep.shots[-1].name)
-    for name in _made(job, sweep.renderer, left, workers, ray):
-        tell(name)
+    with _crew(sweep.renderer, workers, ray) as make:
+        described = describe(sweep.scene, config, sweep.train, sweep.test)
+        writer = DatasetWriter(Path(out), described, resume, raw_suffixes(config.camera))
+        left = [shot for shot in sweep.shots if not writer.has(shot.name)]
+        total, whole = len(sweep.shots), len(sweep.shots) - len(left)
+        if progress is not None and whole:
+            progress(whole, total, "")
+        for done, name in enumerate(_made(make, job, left, sweep.renderer), start=whole + 1):
+            if progress is not None:
+                progress(done, total, name)
     points, colors = surface_points(sweep.renderer, config.quality.points, config.seed)
     listed = _listed(sweep.train), _listed(sweep.test)
     dataset = writer.finish(*listed, points, colors, sweep.scene.mesh, config.camera.distortion)
@@ -90,26 +84,33 @@ def estimate(config: SceneConfig, out: Path) -> Estimate:
         return measure(maker, samples(left or sweep.shots), len(left), there.root)
 
 
-def _made(job: Job, renderer: Renderer, shots: Sequence[Shot], workers: int, ray: str | None) -> Iterator[str]:
-    """Frames, by whoever makes them. A long run begins with a few that tell how long and how large it will be."""
+@contextmanager
+def _crew(renderer: Renderer, workers: int, ray: str | None) -> Iterator[Crew]:
+    """Who makes the frames: a Ray cluster, several processes or this one, with its renderer."""
+    if ray is not None:
+        from spacesim.scenes.cluster import joined, make_on_cluster
+
+        with joined(ray):
+            yield make_on_cluster
+    elif workers > 1:
+        from spacesim.scenes.workers import make_in_processes
+
+        yield partial(make_in_processes, count=workers)
+    else:
+        yield lambda job, shots: FrameMaker(job, renderer).make(shots)
+
+
+def _made(make: Crew, job: Job, shots: Sequence[Shot], renderer: Renderer) -> Iterator[str]:
+    """Frames, as they are made. A long run begins with a few that tell how long and how large it will be."""
+    names: set[str] = set()
     if len(shots) > LONG:
         first = samples(shots)
         found = measure(FrameMaker(job, renderer), first, len(shots), job.root)
         _log.info("generate: %s", found)
         found.check(job.root)
         names = {shot.name for shot in first}
-        yield from names
-        shots = [shot for shot in shots if shot.name not in names]
-    if ray is not None:
-        from spacesim.scenes.cluster import make_on_cluster
-
-        yield from make_on_cluster(job, shots, ray)
-    elif workers > 1:
-        from spacesim.scenes.workers import make_in_processes
-
-        yield from make_in_processes(job, shots, workers)
-    else:
-        yield from FrameMaker(job, renderer).make(shots)
+        yield from sorted(names)
+    yield from make(job, [shot for shot in shots if shot.name not in names])
 
 
 class _Sweep:
