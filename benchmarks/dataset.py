@@ -1,0 +1,156 @@
+"""How fast datasets are made, beside Mitsuba's own rendering, and whether memory stays level.
+
+    python benchmarks/dataset.py [--backend auto] [--scene boxsat] [--resolution PX] [--workers 1,4] [--views 40]
+    python benchmarks/dataset.py --frames 10000       memory after 100, 1,000, ... tiny frames in one process
+
+Rows: `mi.render` of the same scene, views, samples and depth with a box filter as ours, frame by frame in turn with it;
+our radiance alone (it sums pixel by pixel in a fixed order and comes back as numpy); the truth's labels; and whole
+frames with everything on the disk, in one process and in several. Start-up and compilation do not count: what is timed
+begins after the first frames.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim import backend
+from spacesim.data.geometry import OPENCV_FROM_MITSUBA
+from spacesim.data.records import Camera
+from spacesim.scenes import read_scene
+from spacesim.scenes.frames import FrameMaker, cores
+from spacesim.scenes.generate import _Sweep
+from spacesim.scenes.scene import load
+from spacesim.scenes.workers import make_in_processes
+
+WARM = 3  #: frames before the clock starts
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--backend", choices=backend.NAMES, default="auto")
+    parser.add_argument("--scene", default="boxsat")
+    parser.add_argument("--resolution", type=int, help="default: 256 on LLVM, 512 on CUDA")
+    parser.add_argument("--spp", type=int, default=64)
+    parser.add_argument("--views", type=int, default=40, help="frames of each measurement")
+    parser.add_argument("--workers", default="1", help="numbers of processes, as 1,2,4")
+    parser.add_argument("--frames", type=int, help="measure memory over so many tiny frames instead")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    name = backend.select(options.backend)
+    if options.frames:
+        report: dict[str, Any] = {"backend": name, "memory": memory(options.scene, options.frames)}
+    else:
+        size = options.resolution or {"llvm": 256, "cuda": 512}[name]
+        counts = [int(count) for count in options.workers.split(",")]
+        report = {"backend": name, "cores": cores(), "scene": options.scene, "pixels": size, "spp": options.spp}
+        report |= speed(options.scene, size, options.spp, options.views, counts)
+    print(json.dumps(report, indent=1) if options.json else describe(report))
+
+
+def speed(scene: str, size: int, spp: int, views: int, counts: list[int]) -> dict[str, Any]:
+    """Milliseconds a frame of each way of rendering, and the ratios that are judged."""
+    sweep = _Sweep(read_scene(scene, views=views + WARM, test_views=0, resolution=(size, size), spp=spp))
+    shots, renderer = sweep.shots[: views + WARM], sweep.renderer
+    loaded = load(sweep.scene)
+    mi = backend.mitsuba()
+    integrator = mi.load_dict({"type": "path", "max_depth": sweep.job.quality.max_depth, "hide_emitters": True})
+    sensors = [sensor(shot.camera) for shot in shots]
+    times: dict[str, list[float]] = {"mi.render": [], "radiance": [], "labels": []}
+    for shot, view in zip(shots, sensors, strict=True):
+        for held in (loaded, renderer._loaded):
+            held.point(shot.sun)
+        seed = (0, shot.index)
+
+        def raw(view: Any = view, seed: int = shot.index) -> None:
+            dr.eval(mi.render(loaded.sunlit, sensor=view, integrator=integrator, spp=spp, seed=seed))
+
+        times["mi.render"].append(milliseconds(raw))
+        times["radiance"].append(milliseconds(lambda: renderer._radiance(renderer._scene, shot.camera, seed)))  # noqa: B023
+        times["labels"].append(milliseconds(lambda: renderer._labels(shot.camera, shot.sun)))  # noqa: B023
+    mean = {key: float(np.mean(values[WARM:])) for key, values in times.items()}
+    for count in counts:
+        with tempfile.TemporaryDirectory() as folder:
+            job = replace(sweep.job, root=Path(folder))
+            names = FrameMaker(job, renderer).make(shots) if count == 1 else make_in_processes(job, shots, count)
+            key = "written" if count == 1 else f"written, {count} processes"
+            mean[key] = milliseconds_a_frame(names, WARM if count == 1 else 4 * count)
+    written = min(value for key, value in mean.items() if key.startswith("written"))
+    return {
+        "milliseconds": mean,
+        "frames_per_second": {key: 1e3 / value for key, value in mean.items()},
+        "written_to_raw": mean["mi.render"] / written,
+        "labels_to_radiance": mean["labels"] / mean["radiance"],
+    }
+
+
+def sensor(camera: Camera) -> Any:
+    """`camera` in Mitsuba. With its default filter, a Gaussian, `mi.render` takes a quarter longer on two cores."""
+    mi = backend.mitsuba()
+    fov = float(np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx)))
+    pose = mi.ScalarTransform4f((camera.world_from_camera @ OPENCV_FROM_MITSUBA).tolist())
+    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
+    return mi.load_dict({"type": "perspective", "fov": fov, "fov_axis": "x", "to_world": pose, "film": film})
+
+
+def milliseconds(work: Any) -> float:
+    dr.sync_thread()
+    start = time.perf_counter()
+    work()
+    dr.sync_thread()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def milliseconds_a_frame(names: Iterator[str], skipped: int) -> float:
+    """Of frames as they come, without the first ones."""
+    moments = [time.perf_counter() for _ in names]
+    if len(moments) <= skipped + 1:
+        raise SystemExit(f"--views: expected more than {skipped} with so many processes")
+    return 1e3 * (moments[-1] - moments[skipped]) / (len(moments) - 1 - skipped)
+
+
+def memory(scene: str, frames: int) -> list[dict[str, float]]:
+    """Resident memory of this process, MB, on its way through `frames` frames of 16 x 16 pixels."""
+    sweep = _Sweep(read_scene(scene, views=frames, test_views=0, resolution=(16, 16), spp=1))
+    marks = sorted({100, *(frames * i // 10 for i in range(1, 11))})
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        maker = FrameMaker(replace(sweep.job, root=Path(folder)), sweep.renderer)
+        for done, _ in enumerate(maker.make(sweep.shots), start=1):
+            if done in marks:
+                rows.append({"frames": done, "MB": resident(), "seconds": time.perf_counter() - start})
+    return rows
+
+
+def resident() -> float:
+    """MB of memory that this process holds (Linux)."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1e3
+
+
+def describe(report: dict[str, Any]) -> str:
+    """As a table."""
+    if "memory" in report:
+        rows = [f"{row['frames']:>8}{row['MB']:>12.1f}{row['seconds']:>10.1f}" for row in report["memory"]]
+        return "\n".join([f"{'frames':>8}{'memory, MB':>12}{'seconds':>10}", *rows])
+    head = (
+        f"{report['scene']}, {report['pixels']} px, {report['spp']} spp, {report['backend']}, {report['cores']} cores"
+    )
+    lines = [head, f"{'':<24}{'ms a frame':>12}{'frames/s':>10}"]
+    for key, value in report["milliseconds"].items():
+        lines.append(f"{key:<24}{value:>12.2f}{1e3 / value:>10.1f}")
+    lines.append(f"written, of mi.render's speed: {report['written_to_raw']:.0%} (CPU: at least 70%)")
+    lines.append(f"labels, of the radiance's time: {report['labels_to_radiance']:.0%} (at most 15%)")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
