@@ -221,3 +221,35 @@ def test_what_cannot_be_exported_is_refused_in_a_sentence(data, tmp_path):
     write_json(tmp_path / "old/scene.json", scene)
     with pytest.raises(InputError, match=r"scene\.json: expected objects, their poses"):
         targets_of(read_dataset(tmp_path / "old"))
+
+
+def test_commands(spacesim, data, tmp_path):
+    done = spacesim("export", data, "--speedplus", tmp_path / "s", "--object", "twin")
+    assert (done.code, done.errors) == (0, [line for line in done.errors if line.startswith("export: ")])
+    assert "6 images with the pose of twin" in done.output
+    done = spacesim("export", data, "--bop", tmp_path / "b")
+    assert done.code == 0
+    assert "boxsat, cubesat, twin" in done.output
+    assert (tmp_path / "b/models/models_info.json").exists()
+    assert spacesim("export", data, "--bop", tmp_path / "c", "--object", "1").is_refusal("--object", "--speedplus")
+    assert spacesim("export", data, "--bop", tmp_path / "c", "--ply", "x").is_refusal("--bop", "--ply")
+    assert spacesim("export", tmp_path, "--speedplus", tmp_path / "c").is_refusal(tmp_path)
+    assert not (tmp_path / "c").exists()
+
+
+def test_verify_names_what_is_broken(spacesim, data, tmp_path):
+    done = spacesim("verify", data)
+    assert (done.code, done.errors) == (0, [])
+    assert "6 frames" in done.output
+    shutil.copytree(data, tmp_path / "broken")
+    victims = [tmp_path / "broken" / name for name in ("depth/train_00001.png", "gt/test_00000.exr")]
+    for victim in victims:
+        content = bytearray(victim.read_bytes())
+        content[len(content) // 2] ^= 0xFF  # one byte within, which only decoding finds
+        victim.write_bytes(content)
+    done = spacesim("verify", tmp_path / "broken")
+    assert done.code == 1
+    assert len(done.errors) == 3
+    assert all(str(victim) in "\n".join(done.errors[:2]) for victim in victims)
+    assert "2 faulty files" in done.errors[2]
+    assert spacesim("verify", tmp_path / "none").is_refusal(tmp_path / "none")

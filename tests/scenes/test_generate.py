@@ -192,3 +192,17 @@ def test_bad_scene_folder_and_camera_are_refused(made, tmp_path):
         generate(boxsat(), made)
     with pytest.raises(InputError, match="'spp' differs"):
         generate(boxsat(spp=5), made, resume=True)
+
+
+def test_estimate_and_workers_on_the_command_line(spacesim, tmp_path):
+    small = ("--views", 6, "--test-views", 0, "--resolution", 16, "--spp", 1)
+    done = spacesim("generate", "boxsat", *small, "--out", tmp_path / "a", "--estimate")
+    assert (done.code, done.errors) == (0, [])
+    assert done.output.startswith("6 frames left: about ")
+    assert not list(tmp_path.iterdir())
+    assert spacesim("generate", "boxsat", *small, "--out", tmp_path / "a", "--workers", 2).code == 0
+    assert spacesim("generate", "boxsat", *small, "--out", tmp_path / "b").code == 0
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    assert spacesim("generate", "boxsat", "--out", tmp_path / "c", "--workers", 0).is_refusal("workers")
+    refused = spacesim("generate", "boxsat", "--out", tmp_path / "c", "--workers", 2, "--ray", "local")
+    assert refused.is_refusal("--workers", "--ray")
