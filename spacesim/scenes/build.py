@@ -1,8 +1,10 @@
 """From what a scene file says to the scene that is rendered."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from pathlib import Path
 
 import numpy as np
 
@@ -10,22 +12,33 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, rotation_from_quaternion
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, SceneConfig
 from spacesim.scenes.materials import Material, customised, material
+from spacesim.scenes.meshfile import read_mesh
 from spacesim.scenes.scene import Scene, SceneObject
 from spacesim.scenes.spacecraft import Spacecraft, spacecraft
 from spacesim.scenes.spectra import sun_rgb
+
+_log = logging.getLogger(__name__)
 
 
 def build(config: SceneConfig) -> Scene:
     """The scene of a configuration. Raises InputError where a spacecraft, mesh, part or material cannot be had."""
     objects = tuple(_object(item, config) for item in config.objects)
-    color = sun_rgb(config.camera.white_balance, total=1.0)
-    return Scene(config.name, objects, replace(config.sun, color=color), config.earth)
+    red, green, blue = sun_rgb(config.camera.white_balance, total=1.0).tolist()
+    return Scene(config.name, objects, replace(config.sun, color=(red, green, blue)), config.earth)
 
 
 def _object(item: ObjectConfig, config: SceneConfig) -> SceneObject:
-    craft = spacecraft(item.spacecraft)
+    craft = _from_file(item, config) if item.mesh else spacecraft(item.spacecraft)
     changed = _with_materials(craft, item, config.materials)
     return SceneObject(replace(changed, name=item.name or changed.name), _pose(item))
+
+
+def _from_file(item: ObjectConfig, config: SceneConfig) -> Spacecraft:
+    """The object's mesh file, what was dropped or changed in it told in the log."""
+    craft, report = read_mesh((config.folder or Path()) / item.mesh, item.units, item.up)
+    for line in report.lines():
+        _log.info("%s", line)
+    return craft
 
 
 def _pose(item: ObjectConfig) -> Array:

@@ -44,7 +44,7 @@ def _classes() -> tuple[type, type]:
     """(SolarDisc, Earthshine) of the chosen backend."""
     mi = backend.mitsuba()
 
-    class Distant(mi.Emitter):  # type: ignore[misc,name-defined]
+    class Distant(mi.Emitter):  # type: ignore[name-defined]
         """Light from directions alone. Subclasses say what shines (`shines`) and how it is sampled (`draw`)."""
 
         def __init__(self) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.geometry import Array, fibonacci_sphere
+from spacesim.data.images import undistorted
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_NONE, SHADOW_SELF_CAST
 from spacesim.scenes.emitters import Limb
@@ -21,8 +22,6 @@ from spacesim.scenes.visibility import SunVisibility
 
 MAX_WAVEFRONT = 1 << 22
 """Most samples in flight at once: more are rendered in several passes."""
-
-UNDISTORT_STEPS = 12
 
 _EARTH = 1  # stream of random numbers
 
@@ -96,7 +95,8 @@ class Renderer:
         normal = dr.select(dr.dot(surface.n, ray.d) > 0, -surface.n, surface.n)
         object_id, part_id, albedo = self._labels_of(surface.shape, hit)
         if self._textured is not None:
-            textured = dr.gather(mi.Bool, self._textured, dr.reinterpret_array(mi.UInt32, surface.shape), hit)
+            index: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
+            textured = dr.gather(mi.Bool, self._textured, index, hit)
             looked_up = surface.bsdf().eval_diffuse_reflectance(surface, textured)
             albedo = dr.select(textured, looked_up, albedo)
 
@@ -170,21 +170,8 @@ def _primary_rays(camera: Camera, pixel: Any, offset: Any, distortion: Sequence[
     x = (mi.Float(pixel % camera.width) + offset.x - cx) / fx
     y = (mi.Float(pixel // camera.width) + offset.y - cy) / fy
     if distortion:
-        x, y = _undistorted(x, y, [dr.opaque(mi.Float, float(k)) for k in distortion])
+        x, y = undistorted(x, y, [dr.opaque(mi.Float, float(k)) for k in distortion])
     return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(origin), dr.normalize(x * right + y * down + forward)))
-
-
-def _undistorted(x: Any, y: Any, distortion: Sequence[Any]) -> tuple[Any, Any]:
-    """Where a distorted point of the plane at depth 1 is without distortion: the Brown-Conrady model is solved by
-    repeated substitution (as OpenCV's undistortPoints does), which settles for lenses that image without folds."""
-    k1, k2, p1, p2, k3 = distortion
-    u, v = x, y
-    for _ in range(UNDISTORT_STEPS):
-        r2 = u * u + v * v
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        du, dv = 2 * p1 * u * v + p2 * (r2 + 2 * u * u), p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
-        u, v = (x - du) / radial, (y - dv) / radial
-    return u, v
 
 
 def _pixel_offsets(pixel: Any, sample: Any, seed: int) -> Any:

@@ -80,7 +80,9 @@ class Scene:
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
         """All parts as one mesh, world frame, metres."""
-        return trimesh.util.concatenate([placed.mesh for placed in self.parts])
+        return trimesh.util.concatenate(
+            [trimesh.Trimesh(p.mesh.vertices, p.mesh.faces, process=False) for p in self.parts]  # no uv: geometry alone
+        )
 
     @cached_property
     def bounding_sphere(self) -> tuple[Array, float]:
@@ -158,11 +160,10 @@ def _mitsuba_mesh(placed: PlacedPart, bsdf: Any) -> Any:
     mesh, material = placed.mesh, placed.part.material
     vertices, faces, uv = mesh.vertices, mesh.faces, None
     if material.images:
-        uv = getattr(placed.part.mesh.visual, "uv", None)
+        uv = None if material.tile else getattr(placed.part.mesh.visual, "uv", None)
         if uv is None:  # corners of faces stand alone, so that each face has its own projection
-            uv = box_projection(placed.part.mesh)
+            uv = box_projection(placed.part.mesh) / (material.tile or 1.0)
             vertices, faces = vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3)
-        uv = np.asarray(uv) / (material.tile or 1.0)
     properties = mi.Properties()
     properties["bsdf"] = bsdf
     result = mi.Mesh(placed.shape_id, len(vertices), len(faces), props=properties, has_vertex_texcoords=uv is not None)

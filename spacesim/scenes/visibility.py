@@ -1,7 +1,7 @@
 """How much of the Sun a surface point sees: shadow rays towards points of the disc.
 
-All points of a frame are asked for COARSE directions, the centre and the rim; only where these disagree, in penumbrae, for
-FINE ones, spread evenly over the disc. The same directions for every pixel, so the truth has no noise.
+All points of a frame are asked for a few directions, the centre and the rim; only where these disagree, in penumbrae,
+for FINE ones, spread evenly over the disc. The same directions for every pixel, so the truth has no noise.
 """
 
 import math
@@ -17,9 +17,7 @@ from spacesim.scenes.emitters import Limb, opaque
 from spacesim.scenes.shapes import frame
 from spacesim.scenes.sun import SunConfig
 
-RIM = (
-    8  #: coarse directions on the rim: a straight edge that passes between two of them hides 1.2 % of the disc at most
-)
+RIM = 8  #: directions on the rim: a straight edge that passes between two of them hides 1.2 % of the disc at most
 FINE = 256  #: directions in penumbrae: steps of 0.4 %
 
 

@@ -1,0 +1,43 @@
+"""The renderer against closed forms (`truth.py`)."""
+
+import math
+
+import numpy as np
+import pytest
+import truth
+
+
+@pytest.mark.parametrize("elevation_deg", [90.0, 30.0, 5.0])
+def test_plate_has_the_radiance_of_lamberts_law(elevation_deg):
+    assert abs(truth.plate_error(elevation_deg)) < 0.005
+
+
+@pytest.mark.parametrize("distance_au", [0.3, 5.2, 30.0])
+def test_irradiance_falls_with_the_square_of_the_suns_distance(distance_au):
+    assert abs(truth.plate_error(distance_au=distance_au)) < 0.005
+
+
+@pytest.mark.parametrize("elevation_deg", [90.0, 45.0])
+def test_penumbra_of_a_sphere_is_that_of_the_solar_disc(elevation_deg):
+    profile = truth.penumbra_profile(elevation_deg)
+    assert 0.05 < np.mean((profile["expected"] > 0.02) & (profile["expected"] < 0.98)), "there is a penumbra"
+    assert np.abs(profile["visibility"] - profile["expected"]).max() < 0.02
+    assert truth.edge_error(profile) < 1.0
+    assert np.abs(profile["radiance"] - profile["expected"]).mean() < 0.02
+
+
+def test_closed_forms_can_fail():
+    assert truth.disc_seen_beside(np.array([0.0]), np.array([1.0]))[0] == pytest.approx(0)
+    assert truth.disc_seen_beside(np.array([1.0]), np.array([0.1]))[0] == pytest.approx(1)
+    half = truth.disc_seen_beside(np.array([10.0]), np.array([10.0]))[0]
+    assert half == pytest.approx(0.5, abs=1e-3)
+    assert math.degrees(truth.SOLAR_RADIUS) == pytest.approx(0.2666, abs=2e-4)
+
+
+def test_light_in_a_hollow_sphere_is_conserved():
+    assert abs(truth.integrating_sphere_error(0.5)) < 0.02
+
+
+@pytest.mark.parametrize(("phase_deg", "altitude_km"), [(0.0, 500.0), (90.0, 500.0), (0.0, 36_000.0)])
+def test_earth_gives_the_irradiance_of_a_lambertian_sphere(phase_deg, altitude_km):
+    assert abs(truth.earth_error(phase_deg, altitude_km)) < 0.02
