@@ -178,6 +178,7 @@ class DatasetWriter(FrameWriter):
         missing = [name for name, _, _ in (*train, *test) if not self.has(name)]
         if missing:
             raise WorkError(f"{self.root}: expected all frames to be written, {missing[0]} is not")
+        remove_leftovers(self.root)  # of processes that were killed
         write_points(self.root / "points.ply", points, colors)
         write_bytes(self.root / "mesh.ply", mesh.export(file_type="ply", vertex_normal=False))
         flush_disks()
