@@ -29,7 +29,7 @@ class RayCaster:
         )
         face, distance = np.full(len(origins), -1), np.zeros(len(origins))
         face[rays] = faces
-        distance[rays] = np.linalg.norm(points - origins[rays], axis=1)
+        distance[rays] = np.linalg.norm(points.reshape(-1, 3) - origins[rays], axis=1)
         return face, distance
 
     def labels(self, camera: Camera, sun: Sun, at: np.ndarray) -> dict[str, np.ndarray]:
@@ -74,6 +74,8 @@ def _differs(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> n
         ("boxsat", 0, {0, 85, 170, 255}),
         ("boxsat", 3, {0, 85, 170, 255}),
         ("boxsat-pair", 1, {0, 85, 170, 171, 255}),
+        ("telescope", 0, {0, 85, 170, 255}),
+        ("upper-stage", 1, {0, 85, 170, 255}),
     ],
 )
 def test_labels_agree_with_another_ray_caster(name, view, classes):
