@@ -23,15 +23,13 @@ from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
+from spacesim.scenes.sun import ASTRONOMICAL_UNIT_KM, SOLAR_IRRADIANCE, SOLAR_RADIUS_KM
 
 TABLE = Path(__file__).parents[1] / "assets" / "solar_spectrum.csv"
 
-SOLAR_IRRADIANCE = 1361.0  #: nominal total solar irradiance at 1 AU, W m^-2 (IAU 2015 Resolution B3)
 TABLE_IRRADIANCE = 1366.1  #: total irradiance of the table's spectrum over all wavelengths, W m^-2 (ASTM E490-00a)
 
-SOLAR_RADIUS = 6.957e8  #: metres, nominal (IAU 2015 Resolution B3)
 SOLAR_TEMPERATURE = 5772.0  #: kelvin, nominal effective temperature (IAU 2015 Resolution B3)
-ASTRONOMICAL_UNIT = 1.495978707e11  #: metres (IAU 2012 Resolution B2)
 
 PLANCK, LIGHT_SPEED, BOLTZMANN = 6.62607015e-34, 2.99792458e8, 1.380649e-23  #: SI, exact since 2019
 
@@ -68,7 +66,7 @@ def planck(wavelength_nm: ArrayLike, kelvin: float = SOLAR_TEMPERATURE) -> Array
     wavelength = np.asarray(wavelength_nm, dtype=np.float64) * 1e-9
     exponent = PLANCK * LIGHT_SPEED / (wavelength * BOLTZMANN * kelvin)
     radiance = 2.0 * PLANCK * LIGHT_SPEED**2 / wavelength**5 / np.expm1(exponent)  # W m^-3 sr^-1
-    return 1e-9 * np.pi * (SOLAR_RADIUS / ASTRONOMICAL_UNIT) ** 2 * radiance
+    return 1e-9 * np.pi * (SOLAR_RADIUS_KM / ASTRONOMICAL_UNIT_KM) ** 2 * radiance
 
 
 @cache

@@ -14,6 +14,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb
 from spacesim.scenes import materials as m
 from spacesim.scenes import spectra, textures
+from spacesim.scenes.sun import SOLAR_IRRADIANCE
 
 NAMES = m.material_names()
 SPECTRAL = [name for name in NAMES if m.material(name).reflectance]
@@ -108,7 +109,7 @@ def band_weights() -> np.ndarray:
     wavelength, response = spectra.response("sun")
     sunlight = np.interp(wavelength, *spectra.solar_spectrum())
     hats = np.stack([np.interp(wavelength, GRID, row) for row in np.eye(len(GRID))])
-    return hats @ (sunlight[:, None] * response) / spectra.SOLAR_IRRADIANCE
+    return hats @ (sunlight[:, None] * response) / SOLAR_IRRADIANCE
 
 
 def groove(chosen: list[m.Material], count: int = 6000) -> tuple[np.ndarray, np.ndarray]:
