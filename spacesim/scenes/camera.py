@@ -10,9 +10,8 @@ from spacesim.data.geometry import Array
 from spacesim.data.images import distorted, undistorted
 from spacesim.data.records import MOST_PIXELS, Camera
 from spacesim.scenes.sensor import TONES, SensorConfig
+from spacesim.scenes.spectra import WHITE_BALANCES
 from spacesim.scenes.sun import EXPOSURE
-
-WHITE_BALANCES = ("sun", "d65")
 
 
 @dataclass(frozen=True)
