@@ -26,10 +26,7 @@ from spacesim.scenes.frames import FrameMaker, Job, Shot, cores, versions
 
 MOST_FRAMES = 16  #: of a task
 RETRIES = 3  #: times that a task is repeated after its process or its machine has died
-CPUS, GPUS = (
-    4,
-    0.25,
-)  #: of a task, at most: chosen, so that encoding keeps a GPU fed and scenes are not loaded too often
+CPUS, GPUS = 4, 0.25  #: of a task, at most: chosen, so that encoding keeps a GPU fed and scenes are seldom loaded
 WINDOW = 4  #: tasks handed to the cluster ahead for each that can run
 
 _TOKEN = uuid.uuid4().hex
