@@ -68,9 +68,6 @@ def _classes() -> tuple[type, type]:
         def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
             return dr.select(active, self.shines(ds.d), 0)
 
-        def sample_ray(self, *arguments: Any) -> Any:
-            raise NotImplementedError("paths start at the camera")
-
     class SolarDisc(Distant):
         """A disc of even radiance; its rim is `angular_radius` from `direction`. Of parallel light every draw is the
         direction itself, and no path that scatters meets it."""
