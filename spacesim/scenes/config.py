@@ -16,6 +16,9 @@ Vector = tuple[float, float, float]
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 """Metres of the units that a mesh file may be in."""
 
+UP_AXES = ("x", "y", "z")
+"""Axes of a mesh file that may become z."""
+
 
 @dataclass(frozen=True)
 class ObjectConfig:
@@ -45,7 +48,7 @@ class ObjectConfig:
         expect(turns, "rotation_wxyz", "four finite numbers, not all 0", list(self.rotation_wxyz))
         expect(0 < self.scale < math.inf, "scale", "a factor above 0", self.scale)
         expect(self.units in UNITS, "units", f"one of {', '.join(UNITS)}", self.units)
-        expect(self.up in ("", "x", "y", "z"), "up", "x, y or z", self.up)
+        expect(self.up in ("", *UP_AXES), "up", f"one of {', '.join(UP_AXES)}", self.up)
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,8 @@ class SceneConfig:
 
 def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
     """`scene` with its name or seed, or fields of its rig, camera or quality changed by name; None changes nothing.
-    `resolution` may be one number, of a square.
+    `resolution` may be one number, of a square. `sun` takes the place of the rig's own arrangement, whatever the number
+    of its Suns, and `suns` alone that of `sun`.
 
     Raises InputError for a name that this scene's rig does not know, or a value out of range.
     """
@@ -118,5 +122,11 @@ def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
             raise InputError(f"{name}: expected an option that {scene.name}'s {type(scene.rig).__name__} knows")
         if value is not None:
             changes[part][name] = (value, value) if name == "resolution" and isinstance(value, int) else value
+    rig = changes["rig"]
+    if "sun" in rig:
+        rig["sun"] = tuple((float(azimuth), float(elevation)) for azimuth, elevation in rig["sun"])
+        rig.setdefault("suns", len(rig["sun"]))
+    elif "suns" in rig:
+        rig["sun"] = ()
     parts = {part: replace(getattr(scene, part), **changed) for part, changed in changes.items() if part}
     return replace(scene, **changes[""], **parts)

@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from spacesim.data.errors import InputError
+from spacesim.scenes.config import UNITS, UP_AXES
 from spacesim.scenes.gltf import read_gltf
 from spacesim.scenes.materials import Material
 from spacesim.scenes.meshpart import RawPart, corner_ids, is_closed, merged, sound
@@ -16,10 +17,6 @@ from spacesim.scenes.meshtable import read_table
 from spacesim.scenes.meshtexture import LARGEST_FILE, UNTOLD, Notes, Surface, material_of, plain_name
 from spacesim.scenes.spacecraft import Part, Spacecraft
 
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
-"""Metres of a unit."""
-
-UP_AXES = ("x", "y", "z")
 MOST_PARTS = 255  #: part ids are bytes
 
 _READERS: dict[str, Callable[[Path, Notes], list[RawPart]]] = {
@@ -76,7 +73,7 @@ def read_mesh(
 ) -> tuple[Spacecraft, MeshReport]:
     """The parts of a mesh file in metres, z up, and a report.
 
-    units: of the file, one of METRES; up: its axis that becomes z, "x", "y" or "z" (None or "": y for glb and gltf, as
+    units: of the file, one of UNITS; up: its axis that becomes z, "x", "y" or "z" (None or "": y for glb and gltf, as
     their standard says, else z), (x, y, z) becomes (-z, y, x) or (x, -z, y); scale: a factor on top.
     two_sided: closed parts show their outside alone and open ones both sides; True shows both sides of all, False also
     makes the winding of open parts consistent.
@@ -130,11 +127,11 @@ def _reader(path: Path) -> Callable[[Path, Notes], list[RawPart]]:
 
 
 def _factor(units: str, scale: float) -> float:
-    if units not in METRES:
-        raise InputError(f"units: expected one of {', '.join(METRES)}, found {units!r}")
+    if units not in UNITS:
+        raise InputError(f"units: expected one of {', '.join(UNITS)}, found {units!r}")
     if not (math.isfinite(scale) and scale > 0):
         raise InputError(f"scale: expected a number above 0, found {scale}")
-    return METRES[units] * float(scale)
+    return UNITS[units] * float(scale)
 
 
 def _sound_parts(path: Path, raw: list[RawPart], notes: Notes, two_sided: bool | None) -> list[RawPart]:

@@ -40,10 +40,10 @@ def read_scene(source: str | Path, **options: Any) -> SceneConfig:
         path = SCENES / f"{source}.toml"
     reading: dict[str, Any] = {name: given.pop(name) for name in ("units", "up") if name in given}
     if path.suffix.lower() != ".toml":
-        return _changed(_mesh_scene(path, str(source), reading), given)
+        return with_options(_mesh_scene(path, str(source), reading), **given)
     for name in reading:
         raise InputError(f"{name}: expected a mesh file as the scene, found {source}, whose objects say it themselves")
-    return _changed(_read_file(path), given)
+    return with_options(_read_file(path), **given)
 
 
 def scene_text(scene: SceneConfig) -> str:
@@ -99,19 +99,6 @@ def _check_names(scene: SceneConfig, document: toml.Document) -> None:
             if not any(fnmatchcase(part, pattern) for part in parts):
                 found = f"none that fits{near(pattern, parts)}"
                 refuse(f"a part of {one.spacecraft}, or a pattern", found, "objects", index, "materials", pattern)
-
-
-def _changed(scene: SceneConfig, options: Mapping[str, Any]) -> SceneConfig:
-    """`scene` with options; a list of Suns takes the place of the rig's own arrangement, whatever their number."""
-    options = dict(options)
-    if isinstance(options.get("resolution"), int):
-        options["resolution"] = (options["resolution"],) * 2
-    if "sun" in options:
-        sun = tuple((float(azimuth), float(elevation)) for azimuth, elevation in options.pop("sun"))
-        scene = replace(scene, rig=replace(scene.rig, sun=sun, suns=options.pop("suns", len(sun))))
-    elif "suns" in options:
-        scene = replace(scene, rig=replace(scene.rig, sun=(), suns=options.pop("suns")))
-    return with_options(scene, **options)
 
 
 def _from_here(mesh: Path) -> str:

@@ -10,7 +10,8 @@ from PIL import Image
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb
-from spacesim.scenes.meshfile import METRES, read_mesh
+from spacesim.scenes.config import UNITS
+from spacesim.scenes.meshfile import read_mesh
 
 SHARED = Path(__file__).parents[3] / "shared" / "meshes"
 FACES = {"hubble.glb": 19503, "milani.glb": 6018, "bennu.ply": 49152}
@@ -57,7 +58,7 @@ def test_a_box_comes_out_of_every_format(tmp_path, suffix):
     assert (report.parts, report.faces, report.textures) == (1, 12, 0)
 
 
-@pytest.mark.parametrize("unit", METRES)
+@pytest.mark.parametrize("unit", UNITS)
 def test_units_and_scale(tmp_path, unit):
     path = saved(box(1, 2, 3), tmp_path / "crate.stl")
     metres = {"m": 1, "cm": 0.01, "mm": 0.001, "km": 1000, "in": 0.0254, "ft": 0.3048}[unit]
