@@ -1,8 +1,8 @@
 """A scene: objects (a spacecraft and its pose each) and what shines on them, and their one way into Mitsuba."""
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -64,12 +64,14 @@ class Scene:
 
     @cached_property
     def parts(self) -> tuple[PlacedPart, ...]:
-        """All parts of all objects, in the order of their part ids."""
+        """All parts of all objects, in the order of their part ids. Materials that differ have different names."""
+        materials = _told_apart(part.material for item in self.objects for part in item.spacecraft.parts)
         placed: list[PlacedPart] = []
         for object_id, item in enumerate(self.objects, start=1):
             for part in item.spacecraft.parts:
                 mesh = part.mesh.copy().apply_transform(item.world_from_object)
-                placed.append(PlacedPart(object_id, len(placed) + 1, part, mesh))
+                named = replace(part, material=materials[part.material])
+                placed.append(PlacedPart(object_id, len(placed) + 1, named, mesh))
         return tuple(placed)
 
     @property
@@ -117,6 +119,31 @@ class Scene:
             "sun_irradiance": self.sun.irradiance.tolist(),
             "sun_angular_radius_deg": float(np.degrees(self.sun.angular_radius)),
         }
+
+
+def _told_apart(materials: Iterable[Material]) -> dict[Material, Material]:
+    """What each of `materials` becomes: those that are alike one, others of the same name numbered from 2, as two mesh
+    files may both have a material "hull/paint"."""
+    found = list(dict.fromkeys(materials))
+    taken = {material.name for material in found}
+    namesakes: dict[str, list[Material]] = {}
+    result: dict[Material, Material] = {}
+    for material in found:
+        known = namesakes.setdefault(material.name, [])
+        like = next((one for one in known if _alike(one, material)), None)
+        if like is None:
+            name, number = material.name, len(known) + 1
+            while known and name in taken:
+                name, number = f"{material.name}_{number}", number + 1
+            taken.add(name)
+            like = material if name == material.name else replace(material, name=name)
+            known.append(like)
+        result[material] = like
+    return result
+
+
+def _alike(one: Material, other: Material) -> bool:
+    return one.tile == other.tile and _describe_material(one) == _describe_material(other)
 
 
 def _describe_material(material: Material) -> dict[str, Any]:

@@ -1,13 +1,80 @@
-"""The limits of a scene."""
+"""The limits of a scene, and its materials by name."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
+import trimesh
 
 from spacesim.data.errors import InputError
+from spacesim.data.geometry import look_at
+from spacesim.data.records import Camera, Sun
+from spacesim.scenes import Renderer, build
+from spacesim.scenes.config import MaterialConfig, ObjectConfig, SceneConfig
+from spacesim.scenes.materials import lambertian
 from spacesim.scenes.scene import Scene, SceneObject
-from spacesim.scenes.spacecraft import boxsat
+from spacesim.scenes.spacecraft import Part, Spacecraft, boxsat
 
 
 def test_more_than_the_labels_can_tell_apart_is_refused():
     craft = boxsat()
     with pytest.raises(InputError, match="84 objects and 255 parts"):
         Scene("crowd", tuple(SceneObject(craft) for _ in range(255 // len(craft.parts) + 1)))
+
+
+def named_materials(scene: Scene) -> list[tuple[str, list[float]]]:
+    """(name, albedo) of each part, as scene.json says them."""
+    described = scene.describe()
+    names = [part["material"] for part in described["parts"]]
+    return [(name, described["materials"][name]["albedo"]) for name in names]
+
+
+def test_mesh_files_of_one_name_keep_their_materials_apart(tmp_path):
+    """Two files hull.obj, each with a material "paint": named apart in scene.json, and each seen in its own colour."""
+    colours = {"a": [0.7, 0.2, 0.1], "b": [0.1, 0.2, 0.7]}
+    for folder, colour in colours.items():
+        (tmp_path / folder).mkdir()
+        box = trimesh.creation.box((1, 1, 1))
+        lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + [f"f {i + 1} {j + 1} {k + 1}" for i, j, k in box.faces]
+        (tmp_path / folder / "hull.obj").write_text("\n".join(["mtllib hull.mtl", "o Hull", "usemtl paint", *lines]))
+        (tmp_path / folder / "hull.mtl").write_text(f"newmtl paint\nKd {' '.join(map(str, colour))}\n")
+    places = {"a": (0.0, -1.0, 0.0), "b": (0.0, 1.0, 0.0)}
+    objects = [ObjectConfig(mesh=f"{key}/hull.obj", position=place) for key, place in places.items()]
+    objects.append(ObjectConfig(mesh="a/hull.obj", position=(0.0, 5.0, 0.0)))
+    scene = build(SceneConfig("pair", tuple(objects), folder=tmp_path))
+    (first, red), (second, blue), again = named_materials(scene)
+    assert first != second
+    assert again == (first, red)
+    np.testing.assert_allclose([red, blue], list(colours.values()), atol=1e-6)
+
+    camera = Camera.from_fov(look_at(np.array([10.0, 0, 0]), np.zeros(3)), 32, 32, 25.0)
+    truth = Renderer(scene, spp=4).render(camera, Sun(np.array([1.0, 0, 0])), (0,))
+    for number, colour in enumerate(colours.values(), start=1):
+        at = truth.object_id == number
+        assert at.sum() > 20
+        np.testing.assert_allclose(truth.albedo[at], np.broadcast_to(colour, (at.sum(), 3)), atol=1e-6)
+        seen = np.median(truth.radiance[at], axis=0)
+        np.testing.assert_allclose(seen / seen.sum(), colour, rtol=1e-3)
+
+
+def test_a_material_of_the_scene_may_have_a_presets_name():
+    """Its parts have it; parts that nobody named keep the preset."""
+    white = {"white-paint": MaterialConfig("white-paint", albedo=(0.3, 0.3, 0.3))}
+    objects = (ObjectConfig("boxsat", materials={"radiator": "white-paint"}),)
+    scene = build(SceneConfig("dull", objects, materials=white))
+    albedo = {p.part.name: p.part.material.albedo for p in scene.parts}
+    assert albedo["radiator"] == (0.3, 0.3, 0.3)
+    assert albedo["camera_barrel"][0] > 0.7
+    described = scene.describe()
+    names = {part["name"]: part["material"] for part in described["parts"]}
+    for part in ("radiator", "camera_barrel"):
+        assert described["materials"][names[part]]["albedo"] == list(albedo[part])
+
+
+def test_numbers_do_not_meet_names_that_are_there():
+    paints = [lambertian("p", (0.1,) * 3, "x"), lambertian("p_2", (0.2,) * 3, "x"), lambertian("p", (0.3,) * 3, "x")]
+    paints += [replace(paints[0]), replace(paints[2])]
+    parts = tuple(Part(f"part{i}", trimesh.creation.box(), paint) for i, paint in enumerate(paints))
+    found = named_materials(Scene("paints", (SceneObject(Spacecraft("craft", parts)),)))
+    assert [name for name, _ in found] == ["p", "p_2", "p_3", "p", "p_3"]
+    assert [albedo[0] for _, albedo in found] == [0.1, 0.2, 0.3, 0.1, 0.3]
