@@ -69,15 +69,17 @@ class MaterialConfig:
 @dataclass(frozen=True)
 class QualityConfig:
     """spp: samples a pixel; max_depth: longest light path in edges, 2 is direct light alone; points: surface samples in
-    points.ply. Raises InputError for a value out of range."""
+    points.ply. Raises InputError for a value out of range; the upper limits are chosen."""
 
     spp: int = 64
     max_depth: int = 6
     points: int = 20_000
 
     def __post_init__(self) -> None:
-        for name, lowest in {"spp": 1, "max_depth": 2, "points": 1}.items():
+        limits = {"spp": (1, 1_000_000), "max_depth": (2, 1000), "points": (1, 10_000_000)}
+        for name, (lowest, highest) in limits.items():
             expect(getattr(self, name) >= lowest, name, f"at least {lowest}", getattr(self, name))
+            expect(getattr(self, name) <= highest, name, f"at most {highest:,}", getattr(self, name))
 
 
 @dataclass(frozen=True)

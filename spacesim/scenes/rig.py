@@ -35,6 +35,9 @@ APPROACHES = {
 }
 """Where the camera comes from, and what is up in its image, world frame (see orbit.py for V-bar and R-bar)."""
 
+MOST_FRAMES = 10_000_000
+"""Of a dataset, chosen: the plan of all frames is held in memory."""
+
 _TRAIN, _TEST, _HELD_OUT = range(3)  # streams of random numbers
 
 
@@ -75,6 +78,7 @@ class RigConfig(ABC):
     def __post_init__(self) -> None:
         for name, lowest in {"suns": 1, "views": 1, "test_suns": 0, "test_views": 0}.items():
             expect(getattr(self, name) >= lowest, name, f"at least {lowest}", getattr(self, name))
+            expect(getattr(self, name) <= MOST_FRAMES, name, f"at most {MOST_FRAMES:,}", getattr(self, name))
         for azimuth, elevation in self.sun:
             possible = math.isfinite(azimuth) and -90 <= elevation <= 90
             wanted = "a finite azimuth and an elevation from -90 to 90 degrees"
@@ -82,6 +86,9 @@ class RigConfig(ABC):
         if self.sun:
             fits = self.suns in (type(self).suns, len(self.sun))
             expect(fits, "suns", f"{len(self.sun)} as in sun", self.suns)
+        suns = len(self.sun) or self.suns
+        frames = suns * self.views + (self.test_suns or suns) * self.test_views
+        expect(frames <= MOST_FRAMES, "views", f"at most {MOST_FRAMES:,} frames of all Suns", frames)
 
     @abstractmethod
     def views_of(self, target: Target, camera: CameraConfig, seed: int) -> Views:
