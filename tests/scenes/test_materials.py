@@ -71,7 +71,7 @@ def plates_seen(chosen: list[m.Material], emitter: dict[str, Any], angle_deg: fl
     return found.reshape(len(chosen), count, 3).mean(axis=1)
 
 
-@pytest.mark.parametrize("angle_deg", [0.0, 50.0, 80.0])
+@pytest.mark.parametrize("angle_deg", [0.0, 50.0, 60.0, 80.0, 85.0])
 def test_white_furnace(angle_deg):
     """Under light of radiance 1 from everywhere no surface is brighter than 1, and a perfect one is 1."""
     chosen = [m.material(name) for name in NAMES]
@@ -79,13 +79,13 @@ def test_white_furnace(angle_deg):
     constant = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}
     seen = dict(zip([x.name for x in chosen], plates_seen(chosen, constant, angle_deg, 20_000), strict=True))
     for name, value in seen.items():
-        limit = 1.18 if name == "p0.0" else 1.005  # Disney's diffuse lobe, see `principled`
+        limit = 1.21 if name == "p0.0" else 1.005  # Disney's diffuse lobe, see `principled`
         assert value.max() < limit, (name, value)
         assert value.min() > 0.009, (name, value)
     np.testing.assert_allclose(seen["lambertian-white"], 1.0, atol=0.005)
     np.testing.assert_allclose(seen["lambertian-grey"], 0.5, atol=0.005)
     for name in ("bare-aluminium", "nozzle-alloy", "anodised-aluminium", "gold-mli", "silver-mli"):
-        tolerance = (0.16 if name.endswith("mli") else 0.06) if angle_deg else 0.015  # tilted facets lose more
+        tolerance = (0.16 if name.endswith("mli") else 0.07) if angle_deg else 0.015  # tilted facets lose more
         np.testing.assert_allclose(seen[name], m.material(name).albedo, rtol=tolerance, atol=0.003, err_msg=name)
     for name in ("white-paint", "carbon-fibre", "kapton", "glass"):  # a diffuse base and its coat's Fresnel
         coat = ((m.preset(name).ior - 1) / (m.preset(name).ior + 1)) ** 2
