@@ -4,6 +4,7 @@ Which directions shine, and how brightly, are inputs of the compiled kernels: tu
 """
 
 import math
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -27,12 +28,17 @@ def opaque(value: float | Array) -> Any:
     return result
 
 
+@dataclass(frozen=True)
 class Limb:
-    """The Earth's outline, as seen from the scene: what lies behind it is hidden."""
+    """The Earth's outline, as seen from the scene: what lies behind it is hidden. An input of kernels."""
 
-    def __init__(self, earth: EarthConfig) -> None:
-        self.centre = opaque(earth.direction)
-        self.cosine = opaque(math.cos(earth.angular_radius))
+    centre: Any
+    cosine: Any
+
+    @classmethod
+    def of(cls, earth: EarthConfig) -> "Limb":
+        """The outline of `earth`."""
+        return cls(opaque(earth.direction), opaque(math.cos(earth.angular_radius)))
 
     def hides(self, direction: Any) -> Any:
         """Does the Earth fill the sky in unit `direction`?"""
@@ -79,7 +85,7 @@ def _classes() -> tuple[type, type]:
             size = math.pi * max(math.sin(radius), PARALLEL) ** 2  # the cosine to the axis is 1 within 1e-5 at 1 au
             self.density = opaque(1 / size)
             self.radiance = mi.Color3f(opaque(sun.irradiance / size))
-            self.limb = Limb(earth) if earth else None
+            self.limb = Limb.of(earth) if earth else None
             self.point(Sun(np.array([1.0, 0.0, 0.0])))
 
         def point(self, sun: Sun) -> None:
@@ -107,7 +113,7 @@ def _classes() -> tuple[type, type]:
 
         def __init__(self, earth: EarthConfig, sun: SunConfig) -> None:
             super().__init__()
-            self.limb = Limb(earth)
+            self.limb = Limb.of(earth)
             self.centre, self.distance = opaque(earth.direction), opaque(earth.distance)
             self.density = opaque(1 / (2 * math.pi * (1 - math.cos(earth.angular_radius))))
             self.full = mi.Color3f(opaque(earth.albedo / math.pi * sun.irradiance))

@@ -3,9 +3,13 @@
 Radiance and alpha are means over samples spread evenly over the pixel (a box filter), summed pixel by pixel
 in a fixed order: splatting into a film adds floats in whatever order threads arrive. Labels come from one ray
 through the pixel's centre, so that none is ever averaged. Same seed, same backend: same bits.
+
+Both are recorded once for each size of picture and replayed: tracing the integrator anew takes 10 ms a frame.
 """
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -16,12 +20,12 @@ from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.images import undistorted
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_NONE, SHADOW_SELF_CAST
-from spacesim.scenes.emitters import Limb
+from spacesim.scenes.emitters import opaque
 from spacesim.scenes.scene import Scene, load
 from spacesim.scenes.visibility import SunVisibility
 
-MAX_WAVEFRONT = 1 << 22
-"""Most samples in flight at once: more are rendered in several passes."""
+MAX_WAVEFRONT = 1 << 24
+"""Most samples in flight at once, 16 bytes each: more are rendered in several passes."""
 
 _EARTH = 1  # stream of random numbers
 
@@ -30,6 +34,9 @@ _R2_STEPS = (3242174889, 2447445414)
 sequences"): unsigned overflow keeps the fraction."""
 
 _DIRECTIONS = fibonacci_sphere(64)
+
+RECORDINGS = 16
+"""Recorded kernels kept of each kind: one for each size of picture."""
 
 
 class Renderer:
@@ -48,10 +55,10 @@ class Renderer:
         self._scene = self._loaded.sunlit
         self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
         self._sampler = mi.load_dict({"type": "independent"})
-        self._labels_of_shape = _labels_of_shape(scene, self._scene)
-        self._textured = _textured(self._labels_of_shape, scene)
-        limb = Limb(scene.earth) if scene.earth else None
-        self._visibility = SunVisibility(self._scene, scene.sun, limb)
+        self._parts = _PartTable.of(scene, self._scene)
+        self._visibility = SunVisibility(self._scene, scene.sun, self._loaded.sun.limb)
+        self._sums = dr.freeze(self._trace_paths, warn_after=RECORDINGS, limit=RECORDINGS)
+        self._centres = dr.freeze(self._trace_centres, warn_after=RECORDINGS, limit=RECORDINGS)
 
     def render(self, camera: Camera, sun: Sun, seed: Sequence[int]) -> Truth:
         """What `camera` sees under `sun`; `seed` makes the noise."""
@@ -65,75 +72,65 @@ class Renderer:
 
     def _radiance(self, scene: Any, camera: Camera, seed: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Radiance from one source [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
-        mi = backend.mitsuba()
-        pixels = camera.width * camera.height
+        uint, view = backend.mitsuba().UInt32, _View.of(camera)
+        pixels = view.width * view.height
         passes = min(self.spp, -(-self.spp * pixels // MAX_WAVEFRONT))
-        seeds = np.random.SeedSequence(seed).generate_state(passes)
-        sums = np.zeros((4, pixels), np.float32)
+        seeds = [dr.opaque(uint, int(state)) for state in np.random.SeedSequence(seed).generate_state(passes)]
+        sums = np.zeros((view.height, view.width, 4), np.float32)
         for i in range(passes):
             first, last = self.spp * i // passes, self.spp * (i + 1) // passes
-            spp = last - first
-            self._sampler.seed(dr.opaque(mi.UInt32, int(seeds[i])), spp * pixels)
-            lane = dr.arange(mi.UInt32, spp * pixels)
-            pixel = lane // spp
-            offset = _pixel_offsets(pixel, lane - pixel * spp + dr.opaque(mi.UInt32, first), int(seeds[0]))
-            ray = _primary_rays(camera, pixel, offset, self._distortion)
-            radiance, hit, _ = self._integrator.sample(scene, self._sampler, ray)
-            channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
-            dr.eval(channels)
-            sums += np.stack([dr.block_sum(x, spp, mode="evaluated").numpy() for x in channels])
-        mean = (sums / np.float32(self.spp)).reshape(4, camera.height, camera.width)
-        return np.ascontiguousarray(np.moveaxis(mean[:3], 0, -1)), mean[3]
+            state = _Noise(seeds[i], seeds[0], dr.opaque(uint, first))
+            sums += self._sums(scene, view, state, last - first).numpy().reshape(sums.shape)
+        return sums[..., :3] / np.float32(self.spp), sums[..., 3] / np.float32(self.spp)
+
+    def _trace_paths(self, scene: Any, view: "_View", noise: "_Noise", spp: int) -> Any:
+        """Sums of RGB and of alpha over `spp` samples a pixel, [4 H W]."""
+        mi = backend.mitsuba()
+        samples = spp * view.width * view.height
+        self._sampler.seed(noise.sampler, samples)
+        lane = dr.arange(mi.UInt32, samples)
+        pixel = lane // spp
+        ray = view.rays(pixel, _pixel_offsets(pixel, lane - pixel * spp + noise.first, noise.shift), self._distortion)
+        radiance, hit, _ = self._integrator.sample(scene, self._sampler, ray)
+        channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
+        dr.eval(channels)
+        return dr.ravel(mi.Vector4f(*(dr.block_sum(x, spp, mode="evaluated") for x in channels)))
 
     def _labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
         """All fields of Truth but radiance and alpha, from the ray through each pixel's centre."""
+        inputs = _View.of(camera), opaque(sun.direction), self._visibility.inputs(sun)
+        labels = self._centres(self._scene, self._parts, *inputs)
+        return {name: _image(values, camera) for name, values in labels.items()}
+
+    def _trace_centres(self, scene: Any, parts: "_PartTable", view: "_View", sun: Any, disc: Any) -> dict[str, Any]:
+        """The labels as flat arrays, [H W] or [H W 3]. disc: inputs of SunVisibility."""
         mi = backend.mitsuba()
-        pixel = dr.arange(mi.UInt32, camera.width * camera.height)
-        ray = _primary_rays(camera, pixel, mi.Point2f(0.5), self._distortion)
-        surface = self._scene.ray_intersect(ray)
+        ray = view.rays(dr.arange(mi.UInt32, view.width * view.height), mi.Point2f(0.5), self._distortion)
+        surface = scene.ray_intersect(ray)
         hit = surface.is_valid()
         normal = dr.select(dr.dot(surface.n, ray.d) > 0, -surface.n, surface.n)
-        object_id, part_id, albedo = self._labels_of(surface.shape, hit)
-        if self._textured is not None:
-            index: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
-            textured = dr.gather(mi.Bool, self._textured, index, hit)
-            looked_up = surface.bsdf().eval_diffuse_reflectance(surface, textured)
-            albedo = dr.select(textured, looked_up, albedo)
-
-        cosine = dr.dot(normal, _vector(sun.direction))
+        object_id, part_id = parts.ids(surface.shape, hit)
+        albedo = parts.albedo(surface, hit)
+        cosine = dr.dot(normal, sun)
         faces_sun = hit & (cosine > 0)
-        visibility, blocker = self._visibility(surface, normal, faces_sun, sun)
-        blocker_id, _, _ = self._labels_of(blocker, faces_sun)
+        visibility, blocker = self._visibility(surface, normal, faces_sun, disc)
+        blocker_id, _ = parts.ids(blocker, faces_sun)
         cast = SHADOW_SELF_CAST + dr.select((blocker_id == 0) | (blocker_id == object_id), 0, blocker_id)
         shadow = dr.select(visibility < 0.5, cast, SHADOW_LIT)
         shadow = dr.select(hit, dr.select(faces_sun, shadow, SHADOW_ATTACHED), SHADOW_NONE)
 
-        axis = _vector(camera.world_from_camera[:3, 2])
         distance = dr.select(hit, surface.t, 0.0)
-        labels = {
-            "depth": distance * dr.dot(ray.d, axis),
+        return {
+            "depth": distance * dr.dot(ray.d, view.forward),
             "distance": distance,
-            "normal": dr.select(hit, normal, 0.0),
-            "albedo": albedo,
+            "normal": dr.ravel(dr.select(hit, normal, 0.0)),
+            "albedo": dr.ravel(albedo),
             "object_id": object_id,
             "part_id": part_id,
             "sun_visibility": dr.select(faces_sun, visibility, 0.0),
             "sun_cosine": dr.select(hit, cosine, 0.0),
             "shadow": shadow,
         }
-        dr.eval(labels)  # all in one kernel
-        return {name: _image(values, camera) for name, values in labels.items()}
-
-    def _labels_of(self, shape: Any, active: Any) -> tuple[Any, Any, Any]:
-        """(object id, part id, albedo) of shape pointers, 0 where not `active`."""
-        mi = backend.mitsuba()
-        index: Any = dr.reinterpret_array(mi.UInt32, shape)
-        objects, parts, albedos = self._labels_of_shape
-        return (
-            dr.gather(mi.UInt32, objects, index, active),
-            dr.gather(mi.UInt32, parts, index, active),
-            dr.gather(mi.Color3f, albedos, index, active),
-        )
 
     def inside(self, positions: Array) -> np.ndarray:
         """[N] bool: which of the `positions` [N, 3] are within a part.
@@ -162,23 +159,96 @@ class Renderer:
         return free.numpy().reshape(len(points), -1).any(axis=1)
 
 
-def _primary_rays(camera: Camera, pixel: Any, offset: Any, distortion: Sequence[float]) -> Any:
-    """Rays through pixels (index row by row), each at an `offset` in [0, 1)^2 from the pixel's upper left."""
-    mi = backend.mitsuba()
-    right, down, forward, origin = (_vector(camera.world_from_camera[:3, i]) for i in range(4))
-    fx, fy, cx, cy = (dr.opaque(mi.Float, float(x)) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
-    x = (mi.Float(pixel % camera.width) + offset.x - cx) / fx
-    y = (mi.Float(pixel // camera.width) + offset.y - cy) / fy
-    if distortion:
-        x, y = undistorted(x, y, [dr.opaque(mi.Float, float(k)) for k in distortion])
-    return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(origin), dr.normalize(x * right + y * down + forward)))
+@dataclass(frozen=True)
+class _View:
+    """A camera as inputs of kernels: another pose or focal length reuses what was recorded."""
+
+    width: int
+    height: int
+    right: Any
+    down: Any
+    forward: Any
+    origin: Any
+    focal: Any
+    centre: Any
+
+    @classmethod
+    def of(cls, camera: Camera) -> "_View":
+        right, down, forward, origin = (opaque(camera.world_from_camera[:3, i]) for i in range(4))
+        focal, centre = ([opaque(x) for x in pair] for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
+        return cls(camera.width, camera.height, right, down, forward, origin, focal, centre)
+
+    def rays(self, pixel: Any, offset: Any, distortion: Sequence[float]) -> Any:
+        """Rays through pixels (index row by row), each at an `offset` in [0, 1)^2 from the pixel's upper left."""
+        mi = backend.mitsuba()
+        x = (mi.Float(pixel % self.width) + offset.x - self.centre[0]) / self.focal[0]
+        y = (mi.Float(pixel // self.width) + offset.y - self.centre[1]) / self.focal[1]
+        if distortion:
+            x, y = undistorted(x, y, distortion)
+        direction = dr.normalize(x * self.right + y * self.down + self.forward)
+        return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(self.origin), direction))
 
 
-def _pixel_offsets(pixel: Any, sample: Any, seed: int) -> Any:
+@dataclass(frozen=True)
+class _PartTable:
+    """Labels of parts, each indexed by the number that Dr.Jit knows a shape by; inputs of kernels.
+
+    textured: whose albedo varies over them, None where no part's does.
+    """
+
+    objects: Any
+    parts: Any
+    albedos: Any
+    textured: Any
+
+    @classmethod
+    def of(cls, scene: Scene, loaded: Any) -> "_PartTable":
+        mi = backend.mitsuba()
+        shapes: dict[str, int] = {}
+        for shape in loaded.shapes():
+            number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+            shapes[shape.id()] = int(number[0])
+        size = max(shapes.values()) + 1
+        objects, parts = np.zeros((2, size), np.uint32)
+        albedos, textured = np.zeros((size, 3), np.float32), np.zeros(size, bool)
+        for placed in scene.parts:
+            index, material = shapes[placed.shape_id], placed.part.material
+            objects[index], parts[index] = placed.object_id, placed.part_id
+            albedos[index], textured[index] = material.albedo, _has_color_image(material.bsdf)
+        varied = mi.Bool(textured) if textured.any() else None
+        return cls(mi.UInt32(objects), mi.UInt32(parts), mi.Float(albedos.ravel()), varied)
+
+    def ids(self, shape: Any, active: Any) -> tuple[Any, Any]:
+        """(object id, part id) of shape pointers, 0 where not `active`."""
+        mi = backend.mitsuba()
+        index: Any = dr.reinterpret_array(mi.UInt32, shape)
+        return dr.gather(mi.UInt32, self.objects, index, active), dr.gather(mi.UInt32, self.parts, index, active)
+
+    def albedo(self, surface: Any, active: Any) -> Any:
+        """RGB where rays met the scene, 0 where not `active`."""
+        mi = backend.mitsuba()
+        index: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
+        albedo = dr.gather(mi.Color3f, self.albedos, index, active)
+        if self.textured is None:
+            return albedo
+        varied = dr.gather(mi.Bool, self.textured, index, active)
+        return dr.select(varied, surface.bsdf().eval_diffuse_reflectance(surface, varied), albedo)
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """Of one pass, inputs of kernels. sampler, shift: seeds; first: number of the pass's first sample."""
+
+    sampler: Any
+    shift: Any
+    first: Any
+
+
+def _pixel_offsets(pixel: Any, sample: Any, seed: Any) -> Any:
     """Where in its pixel a sample lies, in [0, 1)^2: the R2 sequence, shifted at random for each pixel, so
     that few samples cover it evenly."""
     mi = backend.mitsuba()
-    shift = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, seed))
+    shift = mi.sample_tea_32(pixel, seed)
     fractions = [(sample * step + start) >> 8 for step, start in zip(_R2_STEPS, shift, strict=True)]
     return mi.Point2f(*(mi.Float(fraction) * 2.0**-24 for fraction in fractions))
 
@@ -189,20 +259,6 @@ def _gathered(vectors: Array, index: Any) -> Any:
     return dr.gather(vector, vector(np.ascontiguousarray(np.asarray(vectors, np.float32).T)), index)
 
 
-def _vector(values: Array) -> Any:
-    """[3] numbers as an input of kernels, so that other numbers reuse the compiled kernel."""
-    vector = backend.mitsuba().Vector3f(values.tolist())
-    dr.make_opaque(vector)
-    return vector
-
-
-def _textured(labels_of_shape: tuple[Any, Any, Any], scene: Scene) -> Any:
-    """Which shapes, by number, have an albedo that varies over them; None where none has."""
-    mi = backend.mitsuba()
-    varied = [False, *(_has_color_image(p.part.material.bsdf) for p in scene.parts)]
-    return dr.gather(mi.Bool, mi.Bool(varied), labels_of_shape[1]) if any(varied) else None
-
-
 def _has_color_image(bsdf: Mapping[str, Any]) -> bool:
     """Conductors have no diffuse reflectance to look up."""
     if bsdf.get("type") in ("bitmap", "roughconductor", "conductor"):
@@ -210,25 +266,9 @@ def _has_color_image(bsdf: Mapping[str, Any]) -> bool:
     return any(_has_color_image(value) for value in bsdf.values() if isinstance(value, Mapping))
 
 
-def _labels_of_shape(scene: Scene, loaded: Any) -> tuple[Any, Any, Any]:
-    """Object ids, part ids and albedos, each indexed by the number that Dr.Jit knows a shape by."""
-    mi = backend.mitsuba()
-    shapes: dict[str, int] = {}
-    for shape in loaded.shapes():
-        number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
-        shapes[shape.id()] = int(number[0])
-    size = max(shapes.values()) + 1
-    objects, parts = np.zeros((2, size), np.uint32)
-    albedos = np.zeros((size, 3), np.float32)
-    for placed in scene.parts:
-        index = shapes[placed.shape_id]
-        objects[index], parts[index] = placed.object_id, placed.part_id
-        albedos[index] = placed.part.material.albedo
-    return mi.UInt32(objects), mi.UInt32(parts), mi.Float(albedos.ravel())
-
-
 def _image(values: Any, camera: Camera) -> np.ndarray:
-    """One value or vector a pixel as [H, W] or [H, W, 3]: uint8 of integers, float32 of the rest."""
-    array = np.moveaxis(values.numpy().reshape(-1, camera.height, camera.width), 0, -1)
-    array = array[..., 0] if array.shape[-1] == 1 else array
-    return np.ascontiguousarray(array, np.uint8 if array.dtype.kind in "iu" else np.float32)
+    """A flat array as [H, W] or [H, W, 3]: uint8 of integers, float32 of the rest."""
+    array = values.numpy()
+    array = array.astype(np.uint8) if array.dtype.kind in "iu" else array
+    shape = camera.height, camera.width
+    return array.reshape(shape if array.size == math.prod(shape) else (*shape, 3))

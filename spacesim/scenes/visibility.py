@@ -11,9 +11,8 @@ import drjit as dr
 import numpy as np
 
 from spacesim import backend
-from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
-from spacesim.scenes.emitters import Limb, opaque
+from spacesim.scenes.emitters import Limb
 from spacesim.scenes.shapes import frame
 from spacesim.scenes.sun import SunConfig
 
@@ -35,46 +34,48 @@ class SunVisibility:
         self._coarse = sine * np.vstack([np.zeros((1, 2)), rim if sine else np.empty((0, 2))])
         self._fine = sine * fine
 
-    def __call__(self, surface: Any, normal: Any, active: Any, sun: Sun) -> tuple[Any, Any]:
+    def inputs(self, sun: Sun) -> tuple[Any, Any]:
+        """(unit directions to points of the disc [3, N], first the coarse ones; the limb): inputs of kernels."""
+        points = np.vstack([self._coarse, self._fine])
+        height = np.sqrt(1 - (points**2).sum(axis=1))
+        rotated = np.column_stack([points, height]) @ frame([0, 0, 0], sun.direction)[:3, :3].T
+        return backend.mitsuba().Vector3f(np.ascontiguousarray(rotated.T, np.float32)), self._limb
+
+    def __call__(self, surface: Any, normal: Any, active: Any, inputs: tuple[Any, Any]) -> tuple[Any, Any]:
         """(visibility, shape pointer of what hides the Sun, null where nothing does) of surface points.
 
         surface: where rays met the scene; normal: on the lit side; active: which lanes face the Sun's centre.
         """
         mi = backend.mitsuba()
-        directions = self._directions(self._coarse, sun)
+        directions, limb = inputs
         origin = surface.spawn_ray(normal).o
         seen, blocker = mi.Float(0.0), dr.zeros(mi.ShapePtr, dr.width(normal))
-        for direction in directions:
-            towards = mi.Vector3f(opaque(direction))
+        for i in range(len(self._coarse)):
+            towards = dr.gather(mi.Vector3f, directions, i)
             hit = self._scene.ray_intersect_preliminary(mi.Ray3f(origin, towards), active=active)
             blocker = dr.select((blocker == None) & hit.is_valid(), hit.shape, blocker)  # noqa: E711  (lane by lane)
-            seen += dr.select(active & ~hit.is_valid() & self._in_sky(normal, towards), 1.0, 0.0)
-        visibility = seen / len(directions)
-        mixed = active & (seen > 0) & (seen < len(directions))
-        dr.eval(visibility, blocker, mixed, origin, normal)
-        lanes = dr.compress(mixed)
-        if dr.width(lanes) > 0:
-            dr.scatter(visibility, self._refined(origin, normal, lanes, sun), lanes)
-        return visibility, blocker
+            seen += dr.select(active & ~hit.is_valid() & _in_sky(normal, towards, limb), 1.0, 0.0)
+        mixed = active & (seen > 0) & (seen < len(self._coarse))
+        fine = self._count_fine(origin, normal, mixed, *inputs)
+        return dr.select(mixed, fine / FINE, seen / len(self._coarse)), blocker
 
-    def _refined(self, origin: Any, normal: Any, lanes: Any, sun: Sun) -> Any:
-        """Visibility from the points in `lanes`: a shadow ray for each of them and each fine direction."""
+    def _count_fine(self, origin: Any, normal: Any, active: Any, directions: Any, limb: Any) -> Any:
+        """How many of the fine directions are free, one after another: lanes that are not `active` take no part."""
         mi = backend.mitsuba()
-        table = mi.Vector3f(np.ascontiguousarray(self._directions(self._fine, sun).T, np.float32))
-        index = dr.arange(mi.UInt32, FINE * dr.width(lanes))
-        lane = dr.gather(mi.UInt32, lanes, index // FINE)
-        start, axis, direction = (
-            mi.Vector3f(*(dr.gather(mi.Float, x, i) for x in vector))
-            for vector, i in ((origin, lane), (normal, lane), (table, index % FINE))
-        )
-        free = ~self._scene.ray_test(mi.Ray3f(mi.Point3f(start), direction)) & self._in_sky(axis, direction)
-        return dr.block_sum(dr.select(free, mi.Float(1.0), 0.0), FINE) / FINE
 
-    def _in_sky(self, normal: Any, direction: Any) -> Any:
-        above = dr.dot(normal, direction) > 0
-        return above if self._limb is None else above & ~self._limb.hides(direction)
+        def waiting(i: Any, seen: Any) -> Any:
+            return active & (i < FINE)
 
-    def _directions(self, points: Array, sun: Sun) -> Array:
-        """[N, 3] unit directions to `points` [N, 2] of the disc, in units of the unit sphere about its centre."""
-        height = np.sqrt(1 - (points**2).sum(axis=1))
-        return np.column_stack([points, height]) @ frame([0, 0, 0], sun.direction)[:3, :3].T
+        def cast(i: Any, seen: Any) -> tuple[Any, Any]:
+            towards = dr.gather(mi.Vector3f, directions, len(self._coarse) + i)
+            free = ~self._scene.ray_test(mi.Ray3f(origin, towards)) & _in_sky(normal, towards, limb)
+            return i + 1, seen + dr.select(free, 1.0, 0.0)
+
+        start = dr.zeros(mi.UInt32, dr.width(normal)), dr.zeros(mi.Float, dr.width(normal))
+        _, seen = dr.while_loop(start, waiting, cast, labels=("i", "seen"))
+        return seen
+
+
+def _in_sky(normal: Any, direction: Any, limb: Limb | None) -> Any:
+    above = dr.dot(normal, direction) > 0
+    return above if limb is None else above & ~limb.hides(direction)
