@@ -24,6 +24,8 @@ Color = tuple[float, float, float]
 
 TABLE = Path(__file__).parents[1] / "assets" / "materials.toml"
 
+SOLAR_CELL = (0.08, 0.04)  #: width and height of a cell of the preset solar-cell, metres: 2 x 4 in its tile
+
 SMOOTHEST = 0.05  #: least `roughness` of `principled`, chosen: smoother facets would hardly ever meet the Sun
 
 

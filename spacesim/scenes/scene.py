@@ -189,7 +189,8 @@ def _mitsuba_mesh(placed: PlacedPart, bsdf: Any) -> Any:
     if material.images:
         uv = None if material.tile else getattr(placed.part.mesh.visual, "uv", None)
         if uv is None:  # corners of faces stand alone, so that each face has its own projection
-            uv = box_projection(placed.part.mesh) / (material.tile or 1.0)
+            flat = box_projection(placed.part.mesh) if placed.part.flat is None else placed.part.flat
+            uv = flat / (material.tile or 1.0)
             vertices, faces = vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3)
     properties = mi.Properties()
     properties["bsdf"] = bsdf

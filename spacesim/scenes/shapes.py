@@ -188,3 +188,22 @@ def moved(mesh: trimesh.Trimesh, offset: ArrayLike) -> trimesh.Trimesh:
 def joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """Several solids as one mesh."""
     return trimesh.util.concatenate(list(meshes))
+
+
+def whole_cells(boxes: trimesh.Trimesh, cell: tuple[float, float]) -> Array:
+    """[3 F, 2] metres: the faces of `boxes`, made by `box` and joined or moved, laid flat so that each begins and ends
+    at a border of a pattern of cells.
+
+    cell: the cells' width and height, which run along the first and the second of a face's two axes, in the order x,
+    y, z of its box before it was moved. As many cells as fit best lie side by side, stretched to fill the face; a side
+    of less than half a cell keeps its length.
+    """
+    corners = boxes.vertices.reshape(-1, 8, 3)
+    lengths = np.linalg.norm(corners[:, [4, 2, 1]] - corners[:, :1], axis=2)  # [B, 3] along x, y and z
+    corner_of_box = trimesh.creation.box().vertices + 0.5  # [8, 3], each 0 or 1
+    places = corner_of_box[boxes.faces % 8]  # [F, 3, 3]
+    across = np.array([[1, 2], [0, 2], [0, 1]])[np.ptp(places, axis=1).argmin(axis=1)]  # [F, 2]
+    sides = np.take_along_axis(lengths[boxes.faces[:, 0] // 8], across, axis=1)
+    whole = np.round(sides / cell) * cell
+    sides = np.where(whole > 0, whole, sides)
+    return (np.take_along_axis(places, across[:, None, :], axis=2) * sides[:, None, :]).reshape(-1, 2)

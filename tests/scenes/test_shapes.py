@@ -76,3 +76,17 @@ def test_joined_keeps_every_solid():
     both = shapes.joined((shapes.box([1, 1, 1]), shapes.box([1, 1, 1], [3, 0, 0])))
     assert isinstance(both, trimesh.Trimesh)
     assert both.volume == pytest.approx(2.0)
+
+
+def test_whole_cells_begin_and_end_at_borders():
+    """Of boxes turned and moved: broad faces are whole numbers of cells, in the proportions of the face."""
+    boxes = [shapes.box([0.5, 0.01, 0.33], [1, 2, 3]), shapes.box([0.19, 0.11, 0.02])]
+    mesh = shapes.turned(shapes.joined(boxes), 40.0, [1, 2, 3], [5, 6, 7])
+    flat = shapes.whole_cells(mesh, (0.08, 0.04)).reshape(2, 12, 3, 2)
+    broad = np.sort(mesh.area_faces.reshape(2, 12).argsort(axis=1)[:, -4:])  # the two largest sides, two facets each
+    for corners, faces, (columns, rows) in zip(flat, broad, [(6, 8), (2, 3)], strict=True):
+        found = corners[faces].reshape(-1, 2) / (0.08, 0.04)
+        assert {tuple(corner) for corner in np.round(found, 9)} == {(i, j) for i in (0, columns) for j in (0, rows)}
+    for corners, extent in zip(flat, ([0.48, 0.01, 0.32], [0.16, 0.12, 0.02]), strict=True):
+        assert np.ptp(corners, axis=(0, 1)).max() <= max(extent) + 1e-9
+        assert (np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) > 1e-5).all(), "no face is laid edge-on"

@@ -9,10 +9,10 @@ from trimesh.ray.ray_triangle import RayMeshIntersector
 
 from spacesim.data.errors import InputError
 from spacesim.scenes import build, read_scene
-from spacesim.scenes.materials import material
-from spacesim.scenes.scene import Scene, SceneObject
+from spacesim.scenes.materials import SOLAR_CELL, material
+from spacesim.scenes.scene import Scene, SceneObject, box_projection
 from spacesim.scenes.spacecraft import SPACECRAFT, boxsat, spacecraft
-from spacesim.scenes.spacecraft.cubesat import CELL, SIZE
+from spacesim.scenes.spacecraft.cubesat import SIZE
 from spacesim.scenes.spacecraft.small_body import crater_profile, noise, power_law
 
 CRAFT = {name: spacecraft(name) for name in SPACECRAFT}
@@ -159,8 +159,8 @@ def test_cubesat_has_the_size_of_the_standard_and_whole_cells():
     assert _size(_mesh("cubesat", "structure", "end_frames")) == pytest.approx(SIZE, abs=0.01)
     for side in ("left", "right"):
         for board in _part("cubesat", f"wing_cells_{side}").split():
-            assert (board.bounds[:, 0] / CELL[1]) % 1.0 == pytest.approx([0, 0], abs=1e-9)
-            rows = board.bounds[:, 1] / CELL[0]
+            assert (board.bounds[:, 0] / SOLAR_CELL[0]) % 1.0 == pytest.approx([0, 0], abs=1e-9)
+            rows = board.bounds[:, 1] / SOLAR_CELL[1]
             assert rows == pytest.approx(np.round(rows), abs=1e-9)
 
 
@@ -256,3 +256,21 @@ def _overlap(first, second, margin):
         if (np.minimum(a.max(0), b.max(0)) - np.maximum(a.min(0), b.min(0)) <= margin).any():
             return False
     return True
+
+
+@pytest.mark.parametrize("name", ["boxsat", "telescope", "cubesat"])
+def test_panels_begin_and_end_at_the_border_of_a_cell(name):
+    """Every broad face of cells, laid flat, spans whole cells of the pattern, up to 10 % stretched."""
+    found = 0
+    for part in spacecraft(name).parts:
+        if part.material.name != "solar-cell":
+            continue
+        flat = box_projection(part.mesh) if part.flat is None else part.flat
+        broad = part.mesh.area_faces > 0.2 * part.mesh.area_faces.max()
+        corners = flat.reshape(-1, 3, 2)[broad]
+        cells = corners / SOLAR_CELL
+        np.testing.assert_allclose(cells, np.round(cells), atol=1e-6)
+        drawn = 0.5 * np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+        np.testing.assert_allclose(drawn, part.mesh.area_faces[broad], rtol=0.1)
+        found += len(corners)
+    assert found >= 16

@@ -8,7 +8,7 @@ import trimesh
 
 from spacesim.data.geometry import normalize
 from spacesim.scenes import shapes as s
-from spacesim.scenes.materials import material
+from spacesim.scenes.materials import SOLAR_CELL, material
 from spacesim.scenes.spacecraft.part import Part, Spacecraft
 
 BUS = np.array([1.4, 1.2, 1.5])
@@ -78,7 +78,8 @@ def _panel(name: str, side: float) -> list[Part]:
     ]
     for _, mesh, _ in solids:
         mesh.apply_transform(turn)
-    return [Part(f"{part}_{name}", mesh, surface) for part, mesh, surface in solids]
+    flat = {"cells": s.whole_cells(solids[1][1], SOLAR_CELL)}
+    return [Part(f"{part}_{name}", mesh, surface, flat.get(part)) for part, mesh, surface in solids]
 
 
 def _camera() -> list[Part]:

@@ -11,13 +11,11 @@ import numpy as np
 
 from spacesim.data.geometry import normalize
 from spacesim.scenes import shapes as s
-from spacesim.scenes.materials import material
+from spacesim.scenes.materials import SOLAR_CELL, material
 from spacesim.scenes.spacecraft.part import Part, Spacecraft
 
 SIZE = np.array([0.366, 0.2263, 0.1])
 """Edge lengths of the body, metres."""
-
-CELL = (0.040, 0.080)  #: edge lengths of a solar cell, metres
 
 _RAIL = 0.0085
 _X, _Y, _Z = 0.5 * SIZE
@@ -72,12 +70,12 @@ def _wing(name: str, side: float) -> list[Part]:
     """
     length, margin, thick, z = 0.336, 0.011, 0.0024, _Z - 0.006
     rows, columns = 5, 4
-    width = rows * CELL[0]
+    width = rows * SOLAR_CELL[1]
     boards, cells, diodes, hinges = [], [], [], []
     for first in (0.16, 0.40):
         y = first + 0.5 * width
         boards.append(s.box([length, width + 2 * margin, thick], [0, side * y, z]))
-        cells.append(s.box([columns * CELL[1], width, 0.001], [0, side * y, z + 0.5 * thick + 0.0003]))
+        cells.append(s.box([columns * SOLAR_CELL[0], width, 0.001], [0, side * y, z + 0.5 * thick + 0.0003]))
         diodes += [
             s.box([0.012, 0.02, 0.003], [x, side * (y + 0.05), z - 0.5 * thick - 0.0012]) for x in (-0.12, 0, 0.12)
         ]
@@ -139,7 +137,7 @@ def _back() -> list[Part]:
 def _top() -> list[Part]:
     """+z: body cells, a star tracker with its baffle, a GNSS antenna, sun sensors."""
     plate = s.box([0.17, 0.172, 0.0025], [-0.08, 0, _Z - 0.0025])
-    cells = s.box([2 * CELL[1], 4 * CELL[0], 0.001], [-0.08, 0, _Z - 0.0009])
+    cells = s.box([2 * SOLAR_CELL[0], 4 * SOLAR_CELL[1], 0.001], [-0.08, 0, _Z - 0.0009])
     baffle = s.revolved([(0, 0), (0.02, 0), (0.034, 0.06), (0.0325, 0.06), (0.018, 0.012), (0, 0.012)])
     block = s.box([0.055, 0.055, 0.026], [0.10, 0.05, _Z + 0.008])
     tracker = s.placed(baffle, [0.10, 0.054, _Z + 0.016], [0.25, 0.45, 1.0])

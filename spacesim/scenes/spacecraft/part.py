@@ -4,17 +4,20 @@ from dataclasses import dataclass
 
 import trimesh
 
+from spacesim.data.geometry import Array
 from spacesim.scenes.materials import Material
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
     """A named solid. mesh: body frame, metres, faces outward, watertight in all that is built in; it may carry
-    texture coordinates `mesh.visual.uv` [V, 2]."""
+    texture coordinates `mesh.visual.uv` [V, 2]. flat: [3 F, 2] metres, the corners of its faces laid out in the plane
+    where materials with a `tile` repeat; None: each face as seen along the axis that it is nearest to."""
 
     name: str
     mesh: trimesh.Trimesh
     material: Material
+    flat: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

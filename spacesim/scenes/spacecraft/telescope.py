@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 
 from spacesim.scenes import shapes as s
-from spacesim.scenes.materials import Material, lambertian, material
+from spacesim.scenes.materials import SOLAR_CELL, Material, lambertian, material
 from spacesim.scenes.spacecraft.part import Part, Spacecraft
 
 LENGTH, DIAMETER = 13.2, 4.2  #: of the tube; of the aft shroud, metres
@@ -51,8 +51,14 @@ def telescope() -> Spacecraft:
         *_fittings(),
         ("handrails", _handrails(), HANDRAIL),
     ]
-    parts = [Part(name, mesh.copy().apply_transform(_V1_FROM_Z), surface) for name, mesh, surface in solids]
-    return Spacecraft("telescope", tuple(parts))
+    flat = {name: s.whole_cells(mesh, SOLAR_CELL) for name, mesh, _ in solids if name.startswith("array_cells")}
+    return Spacecraft(
+        "telescope",
+        tuple(
+            Part(name, mesh.copy().apply_transform(_V1_FROM_Z), surface, flat.get(name))
+            for name, mesh, surface in solids
+        ),
+    )
 
 
 def _tube() -> Solids:
