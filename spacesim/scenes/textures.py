@@ -1,5 +1,5 @@
 """Procedural images of surfaces: creased foil, solar cells, grains. Each repeats without a seam in both
-directions, is [SIZE, SIZE, 3] uint8 and comes out the same on every call.
+directions, is square, uint8 RGB and comes out the same on every call.
 
 Row 0 is the top of the image, where v = 1. Normal maps hold (n + 1) / 2 of tangent-space normals, x along u (to the
 right), y along v (up), as in glTF. All shapes and strengths are chosen.
@@ -14,7 +14,8 @@ from scipy.ndimage import gaussian_filter
 from spacesim.data.geometry import Array
 from spacesim.data.images import srgb_from_linear
 
-SIZE = 512  #: pixels of a side
+SIZE = 512  #: pixels of a side of cells and grains
+FOIL_SIZE = 1024  #: of foil, which covers larger parts
 
 Color = tuple[float, float, float]
 
@@ -22,9 +23,9 @@ Color = tuple[float, float, float]
 @cache
 def crinkle() -> np.ndarray:
     """Normal map of crinkled foil: flat facets of several sizes that meet in sharp creases, RMS slope 0.22."""
-    height = np.zeros((SIZE, SIZE))
-    for seed, (cells, strength) in enumerate([(14, 1.0), (60, 0.45), (260, 0.2)]):
-        height += strength * _facets(cells, seed) / np.sqrt(cells)
+    height = np.zeros((FOIL_SIZE, FOIL_SIZE))
+    for seed, (count, strength) in enumerate([(126, 1.0), (540, 0.45), (2340, 0.2)]):
+        height += strength * _facets(count, seed, FOIL_SIZE) / np.sqrt(count)
     return _normals(gaussian_filter(height, 0.7, mode="wrap"), rms_slope=0.22)
 
 
@@ -72,24 +73,29 @@ def _encoded(color: Array, seed: int) -> np.ndarray:
     return np.minimum(encoded + noise, 255.0).astype(np.uint8)
 
 
-def _facets(count: int, seed: int) -> Array:
-    """Height [SIZE, SIZE] of a periodic surface of flat facets: over each of `count` random points stands a plane
+def _facets(count: int, seed: int, size: int) -> Array:
+    """Height [size, size] of a periodic surface of flat facets: over each of `count` random points stands a plane
     of random tilt, and the highest plane near a point is the surface, so that creases are straight and sharp."""
     random = np.random.default_rng(seed)
     points = random.uniform(0.0, 1.0, (count, 2))
     slopes = random.normal(0.0, 1.0, (count, 2))
     lifts = random.uniform(0.0, 0.5, count) / np.sqrt(count)
     reach = 2.2 * np.sqrt(count)  # a paraboloid below each plane keeps it to its neighbourhood
-    half = min(SIZE // 2, int(3.5 * SIZE / np.sqrt(count)))
+    half = min(size // 2, int(2.5 * size / np.sqrt(count)))  # farther away no plane is the highest
     near = np.arange(-half, half)
-    result = np.full((SIZE, SIZE), -np.inf)
+    wide = np.full((size + 2 * half, size + 2 * half), -np.inf)
     for (px, py), (sx, sy), lift in zip(points, slopes, lifts, strict=True):
-        column, row = int(px * SIZE), int(py * SIZE)
-        dx, dy = (column + near + 0.5) / SIZE - px, (row + near + 0.5)[:, None] / SIZE - py
-        plane = lift + sx * dx + sy * dy - reach * np.maximum(np.abs(dx), np.abs(dy)) ** 2
-        window = np.ix_((row + near) % SIZE, (column + near) % SIZE)
-        result[window] = np.maximum(result[window], plane)
-    return result * np.sqrt(count)
+        column, row = int(px * size), int(py * size)
+        dx, dy = (column + near + 0.5) / size - px, ((row + near + 0.5) / size - py)[:, None]
+        plane = (lift + sx * dx) + sy * dy - reach * np.maximum(dx**2, dy**2)
+        window = wide[row : row + 2 * half, column : column + 2 * half]
+        np.maximum(window, plane, out=window)
+    for _ in range(2):  # what lies beyond an edge comes in at the opposite one
+        inside = wide[half : half + size]
+        np.maximum(inside[:half], wide[half + size :], out=inside[:half])
+        np.maximum(inside[size - half :], wide[:half], out=inside[size - half :])
+        wide = inside.T
+    return wide * np.sqrt(count)
 
 
 def _noise(exponent: float, seed: int) -> Array:
@@ -116,7 +122,7 @@ def _pits(count: int, seed: int) -> Array:
 
 
 def _normals(height: Array, rms_slope: float) -> np.ndarray:
-    """Normal map of a periodic `height` field [SIZE, SIZE] scaled to the RMS of its slope."""
+    """Normal map of a periodic `height` field [N, N] scaled to the RMS of its slope."""
     along_u = 0.5 * (np.roll(height, -1, axis=1) - np.roll(height, 1, axis=1))
     along_v = 0.5 * (np.roll(height, 1, axis=0) - np.roll(height, -1, axis=0))  # v points up
     scale = rms_slope / np.sqrt(np.mean(along_u**2 + along_v**2))

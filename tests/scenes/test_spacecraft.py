@@ -13,7 +13,7 @@ from spacesim.scenes.materials import SOLAR_CELL, material
 from spacesim.scenes.scene import Scene, SceneObject, box_projection
 from spacesim.scenes.spacecraft import SPACECRAFT, boxsat, spacecraft
 from spacesim.scenes.spacecraft.cubesat import SIZE
-from spacesim.scenes.spacecraft.small_body import crater_profile, noise, power_law
+from spacesim.scenes.spacecraft.small_body import DIAMETER, crater_profile, noise, power_law
 
 CRAFT = {name: spacecraft(name) for name in SPACECRAFT}
 PARTS = [(name, part) for name, craft in CRAFT.items() for part in craft.parts]
@@ -68,7 +68,10 @@ def test_materials_name_their_source_and_reflect_less_than_they_get(name):
     for key, surface in surfaces.items():
         assert surface.source
         assert all(0 <= channel < 1 for channel in surface.albedo)
-        if key not in ("foam-insulation", "handrail-yellow"):
+        if key == "coarse-regolith":
+            assert (surface.source, surface.albedo) == (material("regolith").source, material("regolith").albedo)
+            assert 30 < surface.tile < 0.5 * DIAMETER, "neither as fine as a pixel nor as large as the body"
+        elif key not in ("foam-insulation", "handrail-yellow"):
             assert surface is material(key), "a preset of the table"
 
 

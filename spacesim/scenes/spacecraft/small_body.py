@@ -9,6 +9,8 @@ cratering on the lunar surface"). Boulders follow N(>D) ~ D^-3, as counted on It
 Form, roughness, numbers and seed are chosen. One facet is about 5 m wide, so nothing smaller is there.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import trimesh
 
@@ -23,6 +25,7 @@ _SUBDIVISIONS = 6  # 81,920 facets
 _AXES = np.array([1.16, 1.0, 0.87])
 _CRATERS, _CRATER_DIAMETERS = 190, (34.0, 210.0)
 _BOULDERS, _BOULDER_DIAMETERS = 240, (6.0, 40.0)
+_GROUND = 120.0  # metres that the pattern of pits and grains covers: pits of 3 to 17 m, below the least crater, chosen
 _DEPTH, _RIM = 0.196, 0.036  # of a fresh simple crater, in diameters (Pike 1977)
 _SHARPNESS = 100.0  # of the rim, chosen
 
@@ -31,11 +34,12 @@ def small_body() -> Spacecraft:
     """An asteroid of 500 m: one closed surface, and the boulders that lie on it."""
     random = np.random.default_rng(_SEED)
     body = _body(random)
+    soil = replace(material("regolith"), name="coarse-regolith", tile=_GROUND)
     return Spacecraft(
         "small-body",
         (
-            Part("surface", body, material("regolith")),
-            Part("boulders", _boulders(body, random), material("regolith")),
+            Part("surface", body, soil),
+            Part("boulders", _boulders(body, random), soil),
         ),
     )
 
