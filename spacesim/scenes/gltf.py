@@ -15,7 +15,7 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.scenes.gltfsurface import UV_SET, Surfaces
 from spacesim.scenes.meshpart import RawPart
-from spacesim.scenes.meshtexture import LARGEST_FILE, NORMALS, Folder, Notes, embedded
+from spacesim.scenes.meshtexture import LARGEST_FILE, Folder, Notes, embedded
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -225,8 +225,6 @@ def _part(
     attributes = primitive["attributes"]
     if primitive.get("targets"):
         notes.drop("morph targets are not used, the base shape is taken")
-    if "NORMAL" in attributes:
-        notes.drop(NORMALS)
     if "JOINTS_0" in attributes:
         notes.drop("skins are not used, the mesh is taken as it is modelled")
     positions = file.accessor(attributes["POSITION"], (3,)).astype(np.float64)
@@ -235,6 +233,7 @@ def _part(
     else:
         corners = np.arange(len(positions))
     faces = _triangles(corners, mode)
+    normals = _normals(file, attributes, transform, faces) if "NORMAL" in attributes else None
     with np.errstate(all="ignore"):
         vertices = positions @ transform[:3, :3].T + transform[:3, 3]
         mirrored = np.linalg.det(transform[:3, :3]) < 0
@@ -252,7 +251,19 @@ def _part(
         else:
             notes.drop("textures of parts without texture coordinates are not used", surface.name)
             surface = surface.bare()
-    return RawPart("", vertices, faces[:, ::-1] if mirrored else faces, uv, surface)
+    if mirrored:
+        faces, normals = faces[:, ::-1], None if normals is None else normals[:, ::-1]
+    return RawPart("", vertices, faces, uv, surface, normals)
+
+
+def _normals(file: _File, attributes: dict[str, Any], transform: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+    """[F, 3, 3] normals at the corners of faces in the scene's axes, None where not every vertex has one."""
+    stored = file.accessor(attributes["NORMAL"], (3,)).astype(np.float64)
+    if faces.max(initial=-1) >= len(stored):
+        return None
+    with np.errstate(all="ignore"):
+        cofactor = np.cross(np.roll(transform[:3, :3], -1, 0), np.roll(transform[:3, :3], -2, 0))
+        return (stored @ (cofactor * np.sign(np.linalg.det(transform[:3, :3]))).T)[faces]
 
 
 def _triangles(corners: np.ndarray, mode: int) -> np.ndarray:

@@ -89,7 +89,7 @@ def read_mesh(
     try:
         with np.errstate(all="ignore"):
             raw = reader(path, notes)
-            raw = [replace(part, vertices=factor * part.vertices @ _TURNS[axis].T) for part in raw]
+            raw = [_turned(part, factor, _TURNS[axis]) for part in raw]
             parts = _sound_parts(path, raw, notes, two_sided)
             return _spacecraft(path, parts, notes, two_sided is True)
     except InputError as error:
@@ -124,6 +124,11 @@ def _reader(path: Path) -> Callable[[Path, Notes], list[RawPart]]:
     if size > LARGEST_FILE:
         raise InputError(f"{path}: expected at most {LARGEST_FILE:,} bytes, found {size:,}")
     return reader
+
+
+def _turned(part: RawPart, factor: float, turn: np.ndarray) -> RawPart:
+    normals = None if part.normals is None else part.normals @ turn.T
+    return replace(part, vertices=factor * part.vertices @ turn.T, normals=normals)
 
 
 def _factor(units: str, scale: float) -> float:
@@ -196,7 +201,8 @@ def _spacecraft(path: Path, raw: list[RawPart], notes: Notes, both_sides: bool) 
         key = (id(surface), wrap)
         if key not in made:
             made[key] = _two_sided(material_of(surface, name, path.name, notes), wrap)
-        parts.append(Part(part.name, _trimesh(part), made[key]))
+        normals = None if part.normals is None else part.normals.reshape(-1, 3)
+        parts.append(Part(part.name, _trimesh(part), made[key], normals=normals))
     vertices = np.concatenate([part.vertices for part in raw])
     whole = merged([replace(part, uv=None) for part in raw])
     report = MeshReport(

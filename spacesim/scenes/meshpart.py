@@ -1,5 +1,6 @@
 """Parts as mesh files give them, and what makes them sound: broken faces out, shared corners joined, faces outward."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,23 +10,30 @@ from scipy.sparse.csgraph import connected_components
 from spacesim.scenes.meshtexture import Notes, Surface
 
 FARTHEST = 1e9  #: metres; vertices beyond it are taken for damage, chosen (the Moon is at 3.8e8)
+FLAT = math.radians(0.5)  #: normals of vertices this near to their faces' are theirs, chosen
 MOST_ANGLES = 20_000_000  #: solid angles worth computing to tell cavities from inverted surfaces, chosen
 
 
 @dataclass(frozen=True, eq=False)
 class RawPart:
     """vertices: [V, 3]; faces: [F, 3] int; uv: [V, 2], v down from the picture's top row, or None; surface: None where
-    the file says nothing of it."""
+    the file says nothing of it; normals: [F, 3, 3] at the corners of each face, of any length, or None."""
 
     name: str
     vertices: np.ndarray
     faces: np.ndarray
     uv: np.ndarray | None = None
     surface: Surface | None = None
+    normals: np.ndarray | None = None
 
     def named(self, name: str) -> "RawPart":
         """The same under another name."""
         return replace(self, name=name)
+
+    def with_faces(self, chosen: np.ndarray) -> "RawPart":
+        """The faces that are `chosen`: [F] bool, or numbers."""
+        normals = None if self.normals is None else self.normals[chosen]
+        return replace(self, faces=self.faces[chosen], normals=normals)
 
 
 def sound(part: RawPart, notes: Notes, open_too: bool = False) -> RawPart | None:
@@ -36,18 +44,20 @@ def sound(part: RawPart, notes: Notes, open_too: bool = False) -> RawPart | None
         return None
     part = _joined(part)
     part = _without_repeated_faces(part, notes)
-    return _wound(part, notes, open_too)
+    return _smooth(_wound(part, notes, open_too))
 
 
 def merged(parts: list[RawPart]) -> RawPart:
     """Parts of one surface as one part, under the first one's name."""
     shifts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     uvs = [part.uv for part in parts if part.uv is not None]
+    normals = [_facets(part) if part.normals is None else part.normals for part in parts]
     return replace(
         parts[0],
         vertices=np.concatenate([part.vertices for part in parts]),
         faces=np.concatenate([part.faces + shift for part, shift in zip(parts, shifts, strict=False)]),
         uv=np.concatenate(uvs) if uvs else None,
+        normals=np.concatenate(normals) if any(part.normals is not None for part in parts) else None,
     )
 
 
@@ -72,26 +82,26 @@ def _without_broken_faces(part: RawPart, notes: Notes) -> RawPart:
     known = ((faces >= 0) & (faces < len(part.vertices))).all(axis=1)
     if not known.all():
         notes.drop("faces that name vertices which are not there are dropped", f"{(~known).sum():,} of {part.name}")
-        faces = faces[known]
+        part = part.with_faces(known)
     with np.errstate(invalid="ignore"):
         fine = (np.abs(part.vertices) <= FARTHEST).all(axis=1)
     uv = part.uv
     if uv is not None:
         with np.errstate(invalid="ignore"):
             uv = np.where(np.abs(uv) <= 1e6, uv, 0.0)
-    whole = fine[faces].all(axis=1)
+    whole = fine[part.faces].all(axis=1)
     if not whole.all():
         kind = f"faces with a vertex that is not finite or beyond {FARTHEST:g} m are dropped"
         notes.drop(kind, f"{(~whole).sum():,} of {part.name}")
-        faces = faces[whole]
-    corners = np.where(fine[:, None], part.vertices, 0.0)[faces]
+        part = part.with_faces(whole)
+    corners = np.where(fine[:, None], part.vertices, 0.0)[part.faces]
     sides = corners - np.roll(corners, 1, axis=1)
     doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     flat = doubled <= 1e-12 * (sides**2).sum(axis=-1).max(axis=1, initial=0.0)
     if flat.any():
         notes.drop("faces without area are dropped", f"{flat.sum():,} of {part.name}")
-        faces = faces[~flat]
-    return replace(part, faces=faces, uv=uv)
+        part = part.with_faces(np.flatnonzero(~flat))
+    return replace(part, uv=uv)
 
 
 def _joined(part: RawPart) -> RawPart:
@@ -118,7 +128,7 @@ def _without_repeated_faces(part: RawPart, notes: Notes) -> RawPart:
     notes.drop(
         "faces that lie on others of the same part are dropped", f"{len(part.faces) - len(first):,} of {part.name}"
     )
-    return replace(part, faces=part.faces[first])
+    return part.with_faces(first)
 
 
 def _wound(part: RawPart, notes: Notes, open_too: bool) -> RawPart:
@@ -143,7 +153,34 @@ def _wound(part: RawPart, notes: Notes, open_too: bool) -> RawPart:
             "closed surfaces that were inside out are turned", f"{inverted[piece].sum():,} faces of {part.name}"
         )
     flip = flip ^ inverted[piece]
-    return replace(part, faces=np.where(flip[:, None], part.faces[:, ::-1], part.faces))
+    normals = part.normals
+    if normals is not None:
+        normals = np.where(flip[:, None, None], normals[:, ::-1], normals)
+    return replace(part, faces=np.where(flip[:, None], part.faces[:, ::-1], part.faces), normals=normals)
+
+
+def _facets(part: RawPart) -> np.ndarray:
+    """[F, 3, 3] the unit normal of each face, once for each of its corners."""
+    a, b, c = np.moveaxis(part.vertices[part.faces], 1, 0)
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.repeat((normal / np.maximum(length, 1e-300))[:, None], 3, axis=1)
+
+
+def _smooth(part: RawPart) -> RawPart:
+    """`part` with unit normals on the side that its faces face; those that cannot be had, or are more than 90 degrees
+    off, are the face's own. None at all where all are within FLAT of their faces."""
+    if part.normals is None:
+        return part
+    facets = _facets(part)
+    with np.errstate(all="ignore"):
+        normals = part.normals / np.linalg.norm(part.normals, axis=-1, keepdims=True)
+        along = np.einsum("fci,fci->fc", normals, facets)
+        side = np.where(np.nansum(along, axis=1) < 0, -1.0, 1.0)[:, None]
+        fine = side * along > 0
+    if not (fine & (side * along < math.cos(FLAT))).any():
+        return replace(part, normals=None)
+    return replace(part, normals=np.where(fine[..., None], side[..., None] * normals, facets))
 
 
 def _agreement(faces: np.ndarray, edge_of: np.ndarray, uses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ import trimesh
 
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, normalize
 from spacesim.data.records import Sun
 from spacesim.scenes.earth import EarthConfig
 from spacesim.scenes.emitters import earthshine, solar_disc
@@ -32,12 +32,14 @@ class SceneObject:
 
 @dataclass(frozen=True, eq=False)
 class PlacedPart:
-    """A part in the world. object_id and part_id count from 1 over the scene; mesh: world frame, metres."""
+    """A part in the world. object_id and part_id count from 1 over the scene; mesh: world frame, metres; normals: as of
+    the part, world frame."""
 
     object_id: int
     part_id: int
     part: Part
     mesh: trimesh.Trimesh
+    normals: Array | None = None
 
     @property
     def shape_id(self) -> str:
@@ -70,8 +72,9 @@ class Scene:
         for object_id, item in enumerate(self.objects, start=1):
             for part in item.spacecraft.parts:
                 mesh = part.mesh.copy().apply_transform(item.world_from_object)
+                normals = None if part.normals is None else normalize(part.normals @ item.world_from_object[:3, :3].T)
                 named = replace(part, material=materials[part.material])
-                placed.append(PlacedPart(object_id, len(placed) + 1, named, mesh))
+                placed.append(PlacedPart(object_id, len(placed) + 1, named, mesh, normals))
         return tuple(placed)
 
     @property
@@ -169,7 +172,7 @@ class Loaded:
 
 
 def load(scene: Scene) -> Loaded:
-    """`scene` in Mitsuba: one flat-shaded mesh a part."""
+    """`scene` in Mitsuba: one mesh a part, flat-shaded unless it has normals of its own."""
     mi = backend.mitsuba()
     keys = {p.shape_id: (p.part.material, not p.mesh.is_watertight) for p in scene.parts}
     bsdfs = {key: _mitsuba_bsdf(*key) for key in dict.fromkeys(keys.values())}
@@ -184,24 +187,36 @@ def load(scene: Scene) -> Loaded:
 
 def _mitsuba_mesh(placed: PlacedPart, bsdf: Any) -> Any:
     mi = backend.mitsuba()
-    mesh, material = placed.mesh, placed.part.material
-    vertices, faces, uv = mesh.vertices, mesh.faces, None
-    if material.images:
-        uv = None if material.tile else getattr(placed.part.mesh.visual, "uv", None)
-        if uv is None:  # corners of faces stand alone, so that each face has its own projection
-            flat = box_projection(placed.part.mesh) if placed.part.flat is None else placed.part.flat
-            uv = flat / (material.tile or 1.0)
-            vertices, faces = vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3)
+    vertices, faces, normals = placed.mesh.vertices, placed.mesh.faces, placed.normals
+    uv, at_corners = _texture_coordinates(placed)
+    if at_corners or normals is not None:  # corners of faces stand alone
+        uv = uv if at_corners or uv is None else uv[faces.ravel()]
+        vertices, faces = vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3)
     properties = mi.Properties()
     properties["bsdf"] = bsdf
-    result = mi.Mesh(placed.shape_id, len(vertices), len(faces), props=properties, has_vertex_texcoords=uv is not None)
+    has = {"has_vertex_normals": normals is not None, "has_vertex_texcoords": uv is not None}
+    result = mi.Mesh(placed.shape_id, len(vertices), len(faces), props=properties, **has)
     parameters = mi.traverse(result)
     parameters["vertex_positions"] = mi.Float(np.asarray(vertices, dtype=np.float32).ravel())
     parameters["faces"] = mi.UInt32(np.asarray(faces, dtype=np.uint32).ravel())
     if uv is not None:
         parameters["vertex_texcoords"] = mi.Float(np.asarray(uv, dtype=np.float32).ravel())
     parameters.update()
+    if normals is not None:  # only now: with new positions Mitsuba makes normals of its own
+        parameters["vertex_normals"] = mi.Float(np.asarray(normals, dtype=np.float32).ravel())
+        parameters.update()
     return result
+
+
+def _texture_coordinates(placed: PlacedPart) -> tuple[Array | None, bool]:
+    """([V, 2] of vertices or [3 F, 2] of the corners of faces, None where the material has no images; which it is)."""
+    part, material = placed.part, placed.part.material
+    if not material.images:
+        return None, False
+    own = None if material.tile else getattr(part.mesh.visual, "uv", None)
+    if own is not None:
+        return np.asarray(own), False
+    return (box_projection(part.mesh) if part.flat is None else part.flat) / (material.tile or 1.0), True
 
 
 def box_projection(mesh: trimesh.Trimesh) -> Array:

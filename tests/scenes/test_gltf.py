@@ -78,6 +78,16 @@ def textured(tmp_path: Path, picture: np.ndarray, more=None, **pbr) -> Path:
     return document.mesh(document.square(material=0)).write(tmp_path / "plate.gltf")
 
 
+def ball(tmp_path: Path, normals=None, **node) -> Path:
+    """An icosphere about the origin with a normal at each vertex: its position, unless said otherwise."""
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    stored = sphere.vertices if normals is None else normals(np.array(sphere.vertices))
+    document = Document()
+    attributes = {"POSITION": document.add(sphere.vertices.astype("<f4")), "NORMAL": document.add(stored.astype("<f4"))}
+    primitive = {"attributes": attributes, "indices": document.add(sphere.faces.astype("<u2").ravel())}
+    return document.mesh(primitive, **node).write(tmp_path / "ball.gltf")
+
+
 CORNERS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], dtype=np.uint8)
 
 
@@ -414,3 +424,60 @@ def test_no_surface_gives_out_more_light_than_an_even_sky_brings(metallic, rough
 
 def test_without_the_limit_there_would_be_more():
     assert reflected(dict(principled("white", (1.0, 1.0, 1.0), 0.0, 1.0).bsdf)).mean() > 1.02
+
+
+@pytest.mark.parametrize("scale", [[1, 1, 1], [1.0, 2.0, 0.5], [-1.0, 2.0, 0.5]])
+def test_normals_of_vertices_follow_their_node(tmp_path, scale):
+    """Of an ellipsoid x^T A x = 1 the normal is along A x, whatever stretched, mirrored or turned the sphere."""
+    path = ball(tmp_path, scale=scale, rotation=[0.5, 0.5, 0.5, 0.5])  # x to y, y to z, z to x
+    craft, report = read_mesh(path, up="z", scale=3.0)
+    part = craft.parts[0]
+    corners = part.mesh.triangles.reshape(-1, 3)
+    expected = corners / np.roll(scale, 1) ** 2
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(part.normals, expected, atol=2e-6)
+    assert part.mesh.is_watertight
+    assert part.mesh.volume > 0
+    assert not report.dropped
+
+
+def test_smooth_surfaces_shade_as_if_round_and_their_truth_stays_flat(tmp_path):
+    mi = backend.mitsuba()
+    craft, _ = read_mesh(ball(tmp_path), up="z")
+    turn = trimesh.transformations.rotation_matrix(1.0, [1, 2, 3]) @ np.diag([2.0, 2.0, 2.0, 1.0])
+    scene = Scene("ball", (SceneObject(craft, turn),))
+    x, y = np.random.default_rng(0).uniform(-1.2, 1.2, (2, 500)).astype(np.float32)
+    ray = mi.Ray3f(mi.Point3f(mi.Float(x), mi.Float(y), 5.0), mi.Vector3f(0, 0, -1))
+    hit = load(scene).sunlit.ray_intersect(ray)
+    point = np.array(hit.p).T
+    outward = point / np.linalg.norm(point, axis=1, keepdims=True)
+    shading, geometric = np.array(hit.sh_frame.n).T, np.array(hit.n).T
+    assert np.degrees(np.arccos(np.clip((shading * outward).sum(axis=1), -1, 1))).max() < 0.2
+    assert np.degrees(np.arccos(np.clip((geometric * outward).sum(axis=1), -1, 1))).max() > 3
+    facets = scene.mesh.face_normals[np.array(hit.prim_index)]
+    np.testing.assert_allclose(geometric, facets, atol=1e-5)
+
+
+def test_normals_that_cannot_be_are_the_facets_own(tmp_path):
+    def damaged(normals):
+        normals[:40] = 0.0
+        normals[40:80] = np.nan
+        normals[80] = -normals[80]
+        return normals
+
+    part = read_mesh(ball(tmp_path, damaged), up="z")[0].parts[0]
+    facets = np.repeat(part.mesh.face_normals, 3, axis=0)
+    unit = part.mesh.triangles.reshape(-1, 3)
+    broken = np.isin(part.mesh.faces.ravel(), np.arange(81))
+    np.testing.assert_allclose(part.normals[broken], facets[broken], atol=1e-6)
+    np.testing.assert_allclose(part.normals[~broken], unit[~broken], atol=1e-6)
+    inward = read_mesh(ball(tmp_path, lambda normals: -normals), up="z")[0].parts[0]
+    np.testing.assert_allclose(inward.normals, unit, atol=1e-6)
+
+
+def test_normals_of_flat_faces_are_not_kept(tmp_path):
+    document = Document()
+    square = document.square()
+    square["attributes"]["NORMAL"] = document.add(np.tile([0, 0, 1], (4, 1)).astype("<f4"))
+    craft, _ = read_mesh(document.mesh(square).write(tmp_path / "plate.gltf"), up="z")
+    assert craft.parts[0].normals is None

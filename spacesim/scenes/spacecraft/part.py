@@ -12,12 +12,15 @@ from spacesim.scenes.materials import Material
 class Part:
     """A named solid. mesh: body frame, metres, faces outward, watertight in all that is built in; it may carry
     texture coordinates `mesh.visual.uv` [V, 2]. flat: [3 F, 2] metres, the corners of its faces laid out in the plane
-    where materials with a `tile` repeat; None: each face as seen along the axis that it is nearest to."""
+    where materials with a `tile` repeat; None: each face as seen along the axis that it is nearest to. normals:
+    [3 F, 3] unit, body frame, at the same corners: of the smooth surface that facets stand for in shading; None: facets
+    are flat."""
 
     name: str
     mesh: trimesh.Trimesh
     material: Material
     flat: Array | None = None
+    normals: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
