@@ -82,7 +82,7 @@ def _without_broken_faces(part: RawPart, notes: Notes) -> RawPart:
     known = ((faces >= 0) & (faces < len(part.vertices))).all(axis=1)
     if not known.all():
         notes.drop("faces that name vertices which are not there are dropped", f"{(~known).sum():,} of {part.name}")
-        part = part.with_faces(known)
+        part = part.with_faces(np.flatnonzero(known))
     with np.errstate(invalid="ignore"):
         fine = (np.abs(part.vertices) <= FARTHEST).all(axis=1)
     uv = part.uv
@@ -100,7 +100,7 @@ def _without_broken_faces(part: RawPart, notes: Notes) -> RawPart:
     flat = doubled <= 1e-12 * (sides**2).sum(axis=-1).max(axis=1, initial=0.0)
     if flat.any():
         notes.drop("faces without area are dropped", f"{flat.sum():,} of {part.name}")
-        part = part.with_faces(np.flatnonzero(~flat))
+        part = part.with_faces(~flat)
     return replace(part, uv=uv)
 
 
