@@ -24,8 +24,7 @@ def read_table(path: Path, notes: Notes) -> list[RawPart]:
     kind = path.suffix.lower().lstrip(".")
     data = path.read_bytes()
     _check_promise(kind, data)
-    if (kind == "obj" and b"\nvn " in data) or (kind == "ply" and b" nx" in data[: data.find(b"end_header")]):
-        notes.drop(NORMALS)
+    smooth = (kind == "obj" and b"\nvn " in data) or (kind == "ply" and b" nx" in data[: data.find(b"end_header")])
     if not data.isascii():
         data = _as_utf8(kind, data)
     if kind == "obj":
@@ -45,7 +44,8 @@ def read_table(path: Path, notes: Notes) -> list[RawPart]:
             if surface is not None and surface.pictures and uv is None:
                 notes.drop("textures of parts without texture coordinates are not used", surface.name)
                 surface = surface.bare()
-            parts.append(RawPart(own, np.array(mesh.vertices), np.array(mesh.faces), uv, surface))
+            normals = _normals(mesh, notes) if smooth else None
+            parts.append(RawPart(own, np.array(mesh.vertices), np.array(mesh.faces), uv, surface, normals))
     return parts
 
 
@@ -147,6 +147,16 @@ def _uv(mesh: trimesh.Trimesh) -> np.ndarray | None:
     if uv is None or np.shape(uv) != (len(mesh.vertices), 2):
         return None
     return np.array(uv, dtype=np.float64) * [1.0, -1.0] + [0.0, 1.0]
+
+
+def _normals(mesh: trimesh.Trimesh, notes: Notes) -> np.ndarray | None:
+    """[F, 3, 3] normals at the corners of faces, as the file has them; None (and a note) where trimesh did not keep
+    them. Its `vertex_normals` would make up others."""
+    found = mesh._cache["vertex_normals"]  # None where there is nothing
+    if np.shape(found) != np.shape(mesh.vertices):
+        notes.drop(NORMALS)
+        return None
+    return np.asarray(found, dtype=np.float64)[mesh.faces]
 
 
 def _surface(mesh: trimesh.Trimesh, files: _Files, notes: Notes) -> Surface | None:

@@ -366,3 +366,34 @@ def test_real_files_agree_with_trimesh(name):
     assert all(part.name.isascii() for part in craft.parts)
     assert len({part.name for part in craft.parts}) == len(craft.parts)
     assert all(line.isascii() for line in report.lines())
+
+
+def test_normals_of_obj_and_ply_files_shade_smoothly(tmp_path):
+    """A ball whose normals are its positions, beside a box with its faces' own in the obj; an ascii ply."""
+    ball, box = trimesh.creation.icosphere(subdivisions=2), trimesh.creation.box()
+
+    def rows(word, values):
+        return [f"{word} {x!r} {y!r} {z!r}" for x, y, z in values.tolist()]
+
+    count = len(ball.vertices)
+    lines = ["o Ball", *rows("v", ball.vertices), *rows("vn", ball.vertices)]
+    lines += ["f " + " ".join(f"{corner + 1}//{corner + 1}" for corner in face) for face in ball.faces]
+    lines += ["o Box", *rows("v", np.add(box.vertices, [3, 0, 0])), *rows("vn", box.face_normals)]
+    for i, face in enumerate(box.faces + count + 1, start=count + 1):
+        lines.append("f " + " ".join(f"{corner}//{i}" for corner in face))
+    (tmp_path / "pair.obj").write_text("\n".join(lines) + "\n")
+    craft, report = read_mesh(tmp_path / "pair.obj", up="y")
+    parts = {part.name: part for part in craft.parts}
+    assert parts["Box"].normals is None
+    np.testing.assert_allclose(parts["Ball"].normals, parts["Ball"].mesh.triangles.reshape(-1, 3), atol=1e-9)
+    assert parts["Ball"].mesh.is_watertight
+    assert not report.dropped
+
+    head = ["ply", "format ascii 1.0", f"element vertex {count}"]
+    head += [f"property double {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+    head += [f"element face {len(ball.faces)}", "property list uchar int vertex_indices", "end_header"]
+    body = [" ".join(map(repr, [*point, *point])) for point in ball.vertices.tolist()]
+    body += [f"3 {a} {b} {c}" for a, b, c in ball.faces.tolist()]
+    (tmp_path / "ball.ply").write_text("\n".join([*head, *body]) + "\n")
+    part = read_mesh(tmp_path / "ball.ply")[0].parts[0]
+    np.testing.assert_allclose(part.normals, part.mesh.triangles.reshape(-1, 3), atol=1e-6)
