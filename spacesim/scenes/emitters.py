@@ -56,6 +56,7 @@ def _classes() -> tuple[type, type]:
         def __init__(self) -> None:
             mi.Emitter.__init__(self, mi.Properties())
             self.m_flags = mi.EmitterFlags.Infinite
+            self.reach = opaque(1e7)  # metres: beyond any scene, so that every part between casts a shadow
 
         def eval(self, si: Any, active: Any = True) -> Any:
             return dr.select(active, self.shines(-si.wi), 0)
@@ -63,8 +64,8 @@ def _classes() -> tuple[type, type]:
         def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
             ds = dr.zeros(mi.DirectionSample3f, dr.width(it.p))
             ds.d = self.draw(sample)
-            ds.dist = opaque(1e7)  # metres: beyond any scene, so that every part between casts a shadow
-            ds.p, ds.n, ds.uv, ds.time = it.p + ds.d * ds.dist, -ds.d, sample, it.time
+            ds.dist, ds.n, ds.uv, ds.time = self.reach, -ds.d, sample, it.time
+            ds.p = it.p + ds.d * ds.dist
             ds.pdf, ds.delta, ds.emitter = self.density, False, mi.EmitterPtr(self)
             return ds, dr.select(active, self.shines(ds.d, drawn=True) / self.density, 0)
 

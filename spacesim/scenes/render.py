@@ -22,7 +22,7 @@ from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_NONE, SHADOW_SELF_CAST
 from spacesim.scenes.emitters import opaque
 from spacesim.scenes.scene import Scene, load
-from spacesim.scenes.visibility import SunVisibility
+from spacesim.scenes.visibility import Disc, SunVisibility
 
 MAX_WAVEFRONT = 1 << 24
 """Most samples in flight at once, 16 bytes each: more are rendered in several passes."""
@@ -56,35 +56,42 @@ class Renderer:
         self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
         self._sampler = mi.load_dict({"type": "independent"})
         self._parts = _PartTable.of(scene, self._scene)
-        self._visibility = SunVisibility(self._scene, scene.sun, self._loaded.sun.limb)
+        self._visibility = SunVisibility(scene.sun, self._loaded.sun.limb)
         self._sums = dr.freeze(self._trace_paths, warn_after=RECORDINGS, limit=RECORDINGS)
         self._centres = dr.freeze(self._trace_centres, warn_after=RECORDINGS, limit=RECORDINGS)
+        self._penumbrae = dr.freeze(self._trace_penumbrae, warn_after=RECORDINGS, limit=RECORDINGS)
 
     def render(self, camera: Camera, sun: Sun, seed: Sequence[int]) -> Truth:
         """What `camera` sees under `sun`; `seed` makes the noise."""
         self._loaded.point(sun)
-        radiance, alpha = self._radiance(self._scene, camera, seed)
-        earth = None
-        if self._loaded.earthlit is not None:
-            earth, _ = self._radiance(self._loaded.earthlit, camera, (*seed, _EARTH))
-            radiance = radiance + earth
-        return Truth(radiance=radiance, alpha=alpha, **self._labels(camera, sun), radiance_earth=earth)
+        sunlight = self._launched(self._loaded.sunlit, camera, seed)
+        earthlight = self._launched(self._loaded.earthlit, camera, (*seed, _EARTH)) if self._loaded.earthlit else None
+        labels = self._labels(camera, sun)  # while the device traces paths
+        radiance, alpha = self._means(sunlight, camera)
+        if earthlight is None:
+            return Truth(radiance=radiance, alpha=alpha, **labels)
+        earth, _ = self._means(earthlight, camera)
+        return Truth(radiance=radiance + earth, alpha=alpha, **labels, radiance_earth=earth)
 
-    def _radiance(self, scene: Any, camera: Camera, seed: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Radiance from one source [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
+    def _launched(self, scene: Any, camera: Camera, seed: Sequence[int]) -> list[Any]:
+        """Sums over samples, as `_trace_paths` returns them, of each pass; the device may still be at work on them."""
         uint, view = backend.mitsuba().UInt32, _View.of(camera)
-        pixels = view.width * view.height
-        passes = min(self.spp, -(-self.spp * pixels // MAX_WAVEFRONT))
+        passes = min(self.spp, -(-self.spp * view.width * view.height // MAX_WAVEFRONT))
         seeds = [dr.opaque(uint, int(state)) for state in np.random.SeedSequence(seed).generate_state(passes)]
-        sums = np.zeros((view.height, view.width, 4), np.float32)
-        for i in range(passes):
-            first, last = self.spp * i // passes, self.spp * (i + 1) // passes
-            state = _Noise(seeds[i], seeds[0], dr.opaque(uint, first))
-            sums += self._sums(scene, view, state, last - first).numpy().reshape(sums.shape)
-        return sums[..., :3] / np.float32(self.spp), sums[..., 3] / np.float32(self.spp)
+        firsts = [self.spp * i // passes for i in range(passes + 1)]
+        return [
+            self._sums(scene, view, _Noise(seeds[i], seeds[0], dr.opaque(uint, firsts[i])), firsts[i + 1] - firsts[i])
+            for i in range(passes)
+        ]
+
+    def _means(self, sums: Sequence[Any], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Radiance from one source [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
+        total: np.ndarray = sum(values.numpy() for values in sums) / np.float32(self.spp)
+        shape = camera.height, camera.width
+        return total[: -math.prod(shape)].reshape(*shape, 3), total[-math.prod(shape) :].reshape(shape)
 
     def _trace_paths(self, scene: Any, view: "_View", noise: "_Noise", spp: int) -> Any:
-        """Sums of RGB and of alpha over `spp` samples a pixel, [4 H W]."""
+        """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]."""
         mi = backend.mitsuba()
         samples = spp * view.width * view.height
         self._sampler.seed(noise.sampler, samples)
@@ -94,43 +101,75 @@ class Renderer:
         radiance, hit, _ = self._integrator.sample(scene, self._sampler, ray)
         channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
         dr.eval(channels)
-        return dr.ravel(mi.Vector4f(*(dr.block_sum(x, spp, mode="evaluated") for x in channels)))
+        *rgb, alpha = (dr.block_sum(x, spp, mode="evaluated") for x in channels)
+        return dr.concat([dr.ravel(mi.Color3f(rgb)), alpha])
 
     def _labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
         """All fields of Truth but radiance and alpha, from the ray through each pixel's centre."""
-        inputs = _View.of(camera), opaque(sun.direction), self._visibility.inputs(sun)
-        labels = self._centres(self._scene, self._parts, *inputs)
-        return {name: _image(values, camera) for name, values in labels.items()}
+        mi = backend.mitsuba()
+        disc = self._visibility.inputs(sun)
+        numbers, ids, points, mixed = self._centres(self._scene, self._parts, _View.of(camera), disc)
+        lanes = dr.compress(mixed)
+        labels = _images(numbers, ids, camera)
+        count = dr.width(lanes)
+        if count:
+            capacity = max(1024, 1 << (count - 1).bit_length())
+            inputs = disc, points, lanes, dr.opaque(mi.UInt32, count), capacity
+            refined: Any = self._penumbrae(self._scene, *inputs)
+            seen, shadow = (np.asarray(values.numpy()[:count]) for values in refined)
+            labels["sun_visibility"].reshape(-1)[lanes.numpy()] = seen
+            labels["shadow"].reshape(-1)[lanes.numpy()] = shadow
+        return labels
 
-    def _trace_centres(self, scene: Any, parts: "_PartTable", view: "_View", sun: Any, disc: Any) -> dict[str, Any]:
-        """The labels as flat arrays, [H W] or [H W 3]. disc: inputs of SunVisibility."""
+    def _trace_centres(self, scene: Any, parts: "_PartTable", view: "_View", disc: Disc) -> tuple[Any, ...]:
+        """(the labels that are numbers, one after another; those that are ids, packed; points; which of them see some
+        of the Sun's disc and not all)."""
         mi = backend.mitsuba()
         ray = view.rays(dr.arange(mi.UInt32, view.width * view.height), mi.Point2f(0.5), self._distortion)
         surface = scene.ray_intersect(ray)
         hit = surface.is_valid()
         normal = dr.select(dr.dot(surface.n, ray.d) > 0, -surface.n, surface.n)
         object_id, part_id = parts.ids(surface.shape, hit)
-        albedo = parts.albedo(surface, hit)
-        cosine = dr.dot(normal, sun)
+        cosine = dr.dot(normal, disc.direction)
         faces_sun = hit & (cosine > 0)
-        visibility, blocker = self._visibility(surface, normal, faces_sun, disc)
+        origin = surface.spawn_ray(normal).o
+        visibility, blocker = self._visibility.coarse(scene, disc, origin, normal, faces_sun)
         blocker_id, _ = parts.ids(blocker, faces_sun)
         cast = SHADOW_SELF_CAST + dr.select((blocker_id == 0) | (blocker_id == object_id), 0, blocker_id)
-        shadow = dr.select(visibility < 0.5, cast, SHADOW_LIT)
-        shadow = dr.select(hit, dr.select(faces_sun, shadow, SHADOW_ATTACHED), SHADOW_NONE)
-
+        shadow = dr.select(hit, dr.select(faces_sun, _shadow(visibility, cast), SHADOW_ATTACHED), SHADOW_NONE)
         distance = dr.select(hit, surface.t, 0.0)
-        return {
+        numbers: dict[str, Any] = {
             "depth": distance * dr.dot(ray.d, view.forward),
             "distance": distance,
-            "normal": dr.ravel(dr.select(hit, normal, 0.0)),
-            "albedo": dr.ravel(albedo),
-            "object_id": object_id,
-            "part_id": part_id,
             "sun_visibility": dr.select(faces_sun, visibility, 0.0),
             "sun_cosine": dr.select(hit, cosine, 0.0),
-            "shadow": shadow,
+            "normal": dr.select(hit, normal, 0.0),
+            "albedo": parts.albedo(surface, hit),
         }
+        dr.eval(numbers, object_id, part_id, shadow, origin, normal, cast, visibility, faces_sun)  # one kernel
+        flat: list[Any] = [dr.ravel(values) for values in numbers.values()]
+        return (
+            dr.concat(flat),
+            object_id | (part_id << 8) | (shadow << 16),
+            _Points(origin, normal, cast),
+            faces_sun & (visibility > 0) & (visibility < 1),
+        )
+
+    def _trace_penumbrae(
+        self, scene: Any, disc: Disc, points: "_Points", lanes: Any, count: Any, capacity: int
+    ) -> tuple[Any, Any]:
+        """(visibility, shadow class) of the points `lanes`, the first `count` of `capacity`."""
+        mi = backend.mitsuba()
+        index = dr.arange(mi.UInt32, capacity)
+        active = index < count
+        lane = dr.gather(mi.UInt32, lanes, index, active)
+        origin, normal = (
+            mi.Vector3f(*(dr.gather(mi.Float, x, lane, active) for x in vector))
+            for vector in (points.origin, points.normal)
+        )
+        cast = dr.gather(mi.UInt32, points.cast, lane, active)
+        visibility = self._visibility.fine(scene, disc, origin, normal, active)
+        return visibility, _shadow(visibility, cast)
 
     def inside(self, positions: Array) -> np.ndarray:
         """[N] bool: which of the `positions` [N, 3] are within a part.
@@ -187,6 +226,15 @@ class _View:
             x, y = undistorted(x, y, distortion)
         direction = dr.normalize(x * self.right + y * self.down + self.forward)
         return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(self.origin), direction))
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Surface points [3, N], their normals on the camera's side, and the shadow class where the Sun is hidden."""
+
+    origin: Any
+    normal: Any
+    cast: Any
 
 
 @dataclass(frozen=True)
@@ -266,9 +314,20 @@ def _has_color_image(bsdf: Mapping[str, Any]) -> bool:
     return any(_has_color_image(value) for value in bsdf.values() if isinstance(value, Mapping))
 
 
-def _image(values: Any, camera: Camera) -> np.ndarray:
-    """A flat array as [H, W] or [H, W, 3]: uint8 of integers, float32 of the rest."""
-    array = values.numpy()
-    array = array.astype(np.uint8) if array.dtype.kind in "iu" else array
+def _shadow(visibility: Any, cast: Any) -> Any:
+    return dr.select(visibility < 0.5, cast, SHADOW_LIT)
+
+
+def _images(numbers: Any, ids: Any, camera: Camera) -> dict[str, np.ndarray]:
+    """Labels as [H, W] or [H, W, 3], float32 or uint8, from what `Renderer._trace_centres` returns."""
     shape = camera.height, camera.width
-    return array.reshape(shape if array.size == math.prod(shape) else (*shape, 3))
+    planes = np.split(numbers.numpy().reshape(-1, camera.height * camera.width), [1, 2, 3, 4, 7])
+    names = "depth", "distance", "sun_visibility", "sun_cosine", "normal", "albedo"
+    labels = {
+        name: plane.reshape(shape if len(plane) == 1 else (*shape, 3))
+        for name, plane in zip(names, planes, strict=True)
+    }
+    packed = ids.numpy().view(np.uint8).reshape(*shape, 4)
+    for i, name in enumerate(("object_id", "part_id", "shadow")):
+        labels[name] = np.ascontiguousarray(packed[..., i])
+    return labels

@@ -5,6 +5,7 @@ for FINE ones, spread evenly over the disc. The same directions for every pixel,
 """
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -12,7 +13,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.records import Sun
-from spacesim.scenes.emitters import Limb
+from spacesim.scenes.emitters import Limb, opaque
 from spacesim.scenes.shapes import frame
 from spacesim.scenes.sun import SunConfig
 
@@ -21,10 +22,10 @@ FINE = 256  #: directions in penumbrae: steps of 0.4 %
 
 
 class SunVisibility:
-    """Asks a loaded scene. limb: of the Earth, which can hide the Sun too."""
+    """Asks scenes. limb: of the Earth, which can hide the Sun too."""
 
-    def __init__(self, scene: Any, sun: SunConfig, limb: Limb | None) -> None:
-        self._scene, self._limb = scene, limb
+    def __init__(self, sun: SunConfig, limb: Limb | None) -> None:
+        self._limb = limb
         angle = 2 * math.pi * np.arange(RIM) / RIM
         rim = 0.999 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         k = np.arange(FINE)
@@ -34,48 +35,54 @@ class SunVisibility:
         self._coarse = sine * np.vstack([np.zeros((1, 2)), rim if sine else np.empty((0, 2))])
         self._fine = sine * fine
 
-    def inputs(self, sun: Sun) -> tuple[Any, Any]:
-        """(unit directions to points of the disc [3, N], first the coarse ones; the limb): inputs of kernels."""
+    def inputs(self, sun: Sun) -> "Disc":
+        """What the kernels need of `sun`."""
         points = np.vstack([self._coarse, self._fine])
         height = np.sqrt(1 - (points**2).sum(axis=1))
         rotated = np.column_stack([points, height]) @ frame([0, 0, 0], sun.direction)[:3, :3].T
-        return backend.mitsuba().Vector3f(np.ascontiguousarray(rotated.T, np.float32)), self._limb
+        directions = backend.mitsuba().Vector3f(np.ascontiguousarray(rotated.T, np.float32))
+        return Disc(opaque(sun.direction), directions, self._limb)
 
-    def __call__(self, surface: Any, normal: Any, active: Any, inputs: tuple[Any, Any]) -> tuple[Any, Any]:
-        """(visibility, shape pointer of what hides the Sun, null where nothing does) of surface points.
+    def coarse(self, scene: Any, disc: "Disc", origin: Any, normal: Any, active: Any) -> tuple[Any, Any]:
+        """(visibility, shape pointer of what hides the Sun, null where nothing does) by the few directions.
 
-        surface: where rays met the scene; normal: on the lit side; active: which lanes face the Sun's centre.
+        origin, normal: surface points and their normals on the lit side; active: which lanes face the Sun's centre.
         """
         mi = backend.mitsuba()
-        directions, limb = inputs
-        origin = surface.spawn_ray(normal).o
         seen, blocker = mi.Float(0.0), dr.zeros(mi.ShapePtr, dr.width(normal))
         for i in range(len(self._coarse)):
-            towards = dr.gather(mi.Vector3f, directions, i)
-            hit = self._scene.ray_intersect_preliminary(mi.Ray3f(origin, towards), active=active)
+            towards = dr.gather(mi.Vector3f, disc.directions, i)
+            hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, towards), active=active)
             blocker = dr.select((blocker == None) & hit.is_valid(), hit.shape, blocker)  # noqa: E711  (lane by lane)
-            seen += dr.select(active & ~hit.is_valid() & _in_sky(normal, towards, limb), 1.0, 0.0)
-        mixed = active & (seen > 0) & (seen < len(self._coarse))
-        fine = self._count_fine(origin, normal, mixed, *inputs)
-        return dr.select(mixed, fine / FINE, seen / len(self._coarse)), blocker
+            seen += dr.select(active & ~hit.is_valid() & disc.in_sky(normal, towards), 1.0, 0.0)
+        return seen / len(self._coarse), blocker
 
-    def _count_fine(self, origin: Any, normal: Any, active: Any, directions: Any, limb: Any) -> Any:
-        """How many of the fine directions are free, one after another: lanes that are not `active` take no part."""
+    def fine(self, scene: Any, disc: "Disc", origin: Any, normal: Any, active: Any) -> Any:
+        """Visibility by the many directions, neighbouring lanes taking the same point's. Lanes that are not `active`
+        take no part."""
         mi = backend.mitsuba()
-
-        def waiting(i: Any, seen: Any) -> Any:
-            return active & (i < FINE)
-
-        def cast(i: Any, seen: Any) -> tuple[Any, Any]:
-            towards = dr.gather(mi.Vector3f, directions, len(self._coarse) + i)
-            free = ~self._scene.ray_test(mi.Ray3f(origin, towards)) & _in_sky(normal, towards, limb)
-            return i + 1, seen + dr.select(free, 1.0, 0.0)
-
-        start = dr.zeros(mi.UInt32, dr.width(normal)), dr.zeros(mi.Float, dr.width(normal))
-        _, seen = dr.while_loop(start, waiting, cast, labels=("i", "seen"))
-        return seen
+        index = dr.arange(mi.UInt32, FINE * dr.width(active))
+        lane = index // FINE
+        live = dr.gather(mi.Bool, active, lane)
+        towards = dr.gather(mi.Vector3f, disc.directions, len(self._coarse) + index % FINE)
+        start, axis = (
+            mi.Vector3f(*(dr.gather(mi.Float, x, lane, live) for x in vector)) for vector in (origin, normal)
+        )
+        blocked = scene.ray_test(mi.Ray3f(mi.Point3f(start), towards), active=live)
+        free = live & ~blocked & disc.in_sky(axis, towards)
+        return dr.block_sum(dr.select(free, mi.Float(1.0), 0.0), FINE, mode="evaluated") / FINE
 
 
-def _in_sky(normal: Any, direction: Any, limb: Limb | None) -> Any:
-    above = dr.dot(normal, direction) > 0
-    return above if limb is None else above & ~limb.hides(direction)
+@dataclass(frozen=True)
+class Disc:
+    """The Sun as inputs of kernels. direction: of its centre; directions: [3, N] unit vectors to points of the disc,
+    the few, then the many; limb: of the Earth, or None."""
+
+    direction: Any
+    directions: Any
+    limb: Limb | None
+
+    def in_sky(self, normal: Any, direction: Any) -> Any:
+        """Is `direction` above the surface's horizon and beside the Earth?"""
+        above = dr.dot(normal, direction) > 0
+        return above if self.limb is None else above & ~self.limb.hides(direction)
