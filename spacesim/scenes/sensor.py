@@ -1,4 +1,4 @@
-"""What becomes of the light: a sensor's electrons, noise and digital numbers, and the tone curve of the 8-bit image.
+"""What becomes of the light: a sensor's electrons, noise and digital numbers, and the 8-bit image.
 
 The sensor follows the linear camera model of EMVA standard 1288 (release 4.0 Linear, 2021, chapter 2): electrons are
 counted with Poisson statistics, dark ones among them; the amplifier adds normal noise; the system gain turns electrons
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from spacesim.data.errors import expect
-from spacesim.data.images import srgb_from_linear
+from spacesim.data.tone import TONES, as_bytes, displayed, filmic
 
 if TYPE_CHECKING:
     from spacesim.scenes.camera import CameraConfig
 
-TONES = ("srgb", "filmic")
+__all__ = ["TONES", "Recording", "SensorConfig", "filmic", "record"]
 
 _NOISE = 2  # stream of random numbers
 _MOST_ELECTRONS = 1e12  # far above any full well; Poisson numbers end at 2^63
@@ -105,29 +105,11 @@ def record(radiance: np.ndarray, alpha: np.ndarray, camera: "CameraConfig", seed
     if camera.sensor is None:
         straight = radiance / np.where(alpha > 0, alpha, 1)[..., None]
         colours = displayed(camera.exposure * straight, camera.tone)
-        return Recording(_as_bytes(np.concatenate([colours, np.clip(alpha, 0, 1)[..., None]], axis=-1)))
+        return Recording(as_bytes(np.concatenate([colours, np.clip(alpha, 0, 1)[..., None]], axis=-1)))
     sensor = camera.sensor
     light = camera.exposure * radiance.astype(np.float64)
     random = np.random.Generator(np.random.PCG64(np.random.SeedSequence([*seed, _NOISE])))
     raw = sensor.expose(light.mean(axis=-1) if sensor.monochrome else light, random)
     signal = (raw.astype(np.float64) - sensor.black_level_dn) / (sensor.highest - sensor.black_level_dn)
-    image = _as_bytes(displayed(signal, camera.tone))
+    image = as_bytes(displayed(signal, camera.tone))
     return Recording(image, raw if sensor.monochrome else np.ascontiguousarray(np.moveaxis(raw, -1, 0)))
-
-
-def displayed(linear: np.ndarray, tone: str) -> np.ndarray:
-    """sRGB values in [0, 1] of linear display values, of which 1 is white, by one of TONES."""
-    return srgb_from_linear(filmic(linear) if tone == "filmic" else linear)
-
-
-def filmic(linear: np.ndarray) -> np.ndarray:
-    """Linear values of a film-like curve that keeps highlights up to 7.2 apart: 0.8 for 1, clipped to [0, 1].
-
-    K. Narkowicz, "ACES Filmic Tone Mapping Curve", 2016: a rational fit to the ACES reference and output transforms.
-    """
-    x = np.maximum(linear, 0)
-    return np.minimum(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1).astype(np.asarray(linear).dtype)
-
-
-def _as_bytes(values: np.ndarray) -> NDArray[np.uint8]:
-    return np.round(255 * values).astype(np.uint8)

@@ -15,10 +15,12 @@ from spacesim.data.errors import InputError
 from spacesim.data.exporters import Target, targets_of, write_bop, write_speedplus
 from spacesim.data.exporters.speedplus import _label
 from spacesim.data.files import read_json, write_json
+from spacesim.data.images import read_exr
 from spacesim.data.records import Camera, Frame
 from spacesim.data.store import load_truth, read_dataset
 from spacesim.scenes import generate, read_scene
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
+from spacesim.scenes.sensor import SensorConfig
 from spacesim.scenes.silhouette import outline
 
 TURN = (0.8, 0.1, -0.5, 0.3)  # of the second object, not normalised
@@ -102,12 +104,53 @@ def test_speedplus_pose_by_hand():
     np.testing.assert_allclose(label["r_Vo2To_vbs_true"], [0, 0, 10], atol=1e-12)
 
 
-def test_speedplus_pictures_are_over_black(data, tmp_path):
-    write_speedplus(read_dataset(data), tmp_path / "out")
-    for path in sorted((tmp_path / "out/synthetic/images").iterdir()):
-        found = np.asarray(PillowImage.open(path)).astype(float)
-        straight = np.asarray(PillowImage.open(data / "images" / path.name)).astype(float)
-        np.testing.assert_allclose(found, straight[..., :3] * straight[..., 3:] / 255, atol=0.5)
+def srgb(linear: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1, values 0 to 255."""
+    x = np.clip(linear.astype(np.float64), 0, 1)
+    return 255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def ace(linear: np.ndarray) -> np.ndarray:
+    """The curve of docs/cameras.md."""
+    return linear * (2.51 * linear + 0.03) / (linear * (2.43 * linear + 0.59) + 0.14)
+
+
+@pytest.mark.parametrize("tone", ["srgb", "filmic"])
+def test_pictures_are_what_a_camera_records_over_black(tmp_path, tone):
+    """From the radiance, where light is mixed at edges, not from the 8-bit picture, which has lost its highlights."""
+    lens = (-0.2, 0.05, 0.001, -0.002, 0.0) if tone == "srgb" else ()
+    small = {"views": 4, "test_views": 0, "resolution": (48, 32), "spp": 8, "points": 10}
+    generate(read_scene("boxsat", **small, exposure=0.008, tone=tone, distortion=lens), tmp_path / "data")
+    dataset = read_dataset(tmp_path / "data")
+    write_speedplus(dataset, tmp_path / "speedplus")
+    if not lens:
+        write_bop(dataset, tmp_path / "bop", outline)
+    apart = 0.0
+    for image, frame in enumerate(dataset.train):
+        layers = read_exr(dataset.root / frame.gt_path)  # as the lens shows them
+        light = 0.008 * layers["radiance"].astype(np.float64)
+        expected = srgb(ace(light) if tone == "filmic" else light)
+        name = Path(frame.file_path).name
+        found = np.asarray(PillowImage.open(tmp_path / "speedplus/synthetic/images" / name))
+        np.testing.assert_allclose(found, expected, atol=0.502)
+        if not lens:
+            other = np.asarray(PillowImage.open(tmp_path / f"bop/train/000000/rgb/{image:06d}.png"))
+            np.testing.assert_array_equal(other, found)
+        straight = np.asarray(PillowImage.open(dataset.root / frame.file_path)).astype(float)
+        inside = layers["alpha"] == 1
+        np.testing.assert_array_equal(found[inside], straight[inside][:, :3])
+        apart = max(apart, np.abs(found - straight[..., :3] * straight[..., 3:] / 255).max())
+    assert apart > 40, "pixels are missing in which mixing sRGB values would be wrong"
+
+
+def test_a_sensors_pictures_stay_as_they_are(tmp_path):
+    small = {"views": 1, "test_views": 0, "resolution": 16, "spp": 1, "points": 10}
+    generate(read_scene("boxsat", **small, sensor=SensorConfig(monochrome=True)), tmp_path / "data")
+    write_speedplus(read_dataset(tmp_path / "data"), tmp_path / "out")
+    pictures = [tmp_path / folder / "train_00000.png" for folder in ("data/images", "out/synthetic/images")]
+    first, second = (np.asarray(PillowImage.open(path)) for path in pictures)
+    assert first.ndim == 2
+    np.testing.assert_array_equal(first, second)
 
 
 def test_bop_models_and_poses_project_into_masks(data, bop):
@@ -221,6 +264,11 @@ def test_what_cannot_be_exported_is_refused_in_a_sentence(data, tmp_path):
     write_json(tmp_path / "old/scene.json", scene)
     with pytest.raises(InputError, match=r"scene\.json: expected objects, their poses"):
         targets_of(read_dataset(tmp_path / "old"))
+    scene = read_json(data / "scene.json")
+    del scene["exposure"]
+    write_json(tmp_path / "old/scene.json", scene)
+    with pytest.raises(InputError, match=r"scene\.json: expected the exposure and the tone, found none"):
+        write_speedplus(read_dataset(tmp_path / "old"), tmp_path / "d")
 
 
 def test_commands(spacesim, data, tmp_path):

@@ -86,7 +86,7 @@ def _write_frame(
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Write the pictures of a frame; returns its entries of scene_camera.json and scene_gt_info.json."""
     truth = load_truth(dataset, frame)
-    picture = opaque(dataset.root / frame.file_path)
+    picture = opaque(dataset, frame)
     write_png(scene / ("rgb" if picture.ndim == 3 else "gray") / f"{image:06d}.png", picture, durable=False)
     depth = np.where(truth.object_id > 0, truth.depth, 0) * MM
     scale = _depth_scale(float(depth.max()))

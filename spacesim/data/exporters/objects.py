@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, expect
 from spacesim.data.files import holds_files
 from spacesim.data.geometry import Array
-from spacesim.data.images import read_png
-from spacesim.data.records import Camera, Dataset
+from spacesim.data.images import read_exr, read_png
+from spacesim.data.records import Camera, Dataset, Frame
+from spacesim.data.tone import TONES, as_bytes, displayed
 
 Progress = Callable[[int, int, str], None]  #: frames done, frames in all, name of the frame
 
@@ -68,12 +69,34 @@ def chosen(targets: list[Target], wanted: str | None) -> Target:
     raise InputError(f"--object: expected one of {known}, found {wanted!r}")
 
 
-def opaque(path: Path) -> np.ndarray:
-    """[H, W] or [H, W, 3] uint8: a picture over black, as a camera in space records it."""
-    pixels = read_png(path)
+def opaque(dataset: Dataset, frame: Frame) -> np.ndarray:
+    """[H, W] or [H, W, 3] uint8: the picture of `frame` over black, as its camera records it in space.
+
+    A sensor's picture is that already. One with alpha is made anew from the radiance in gt/, by the exposure and the
+    tone curve in scene.json: where the target covers a part of a pixel, light is mixed, not sRGB values, and it is
+    clipped after that. Stored as the lens shows it. Raises InputError where one of these is missing.
+    """
+    pixels = read_png(dataset.root / frame.file_path)
     if pixels.ndim == 2 or pixels.shape[2] == 3:
         return pixels
-    return np.round(pixels[..., :3] * (pixels[..., 3:] / 255)).astype(np.uint8)
+    exposure, tone = _development(dataset)
+    if frame.gt_path is None:
+        raise InputError(f"{dataset.root}: expected the radiance of {frame.file_path}, found no gt_path")
+    path = dataset.root / frame.gt_path
+    radiance = read_exr(path).get("radiance")
+    if radiance is None or radiance.shape != (*pixels.shape[:2], 3):
+        raise InputError(f"{path}: expected radiance of {pixels.shape[1]}x{pixels.shape[0]} pixels, found none")
+    return as_bytes(displayed(exposure * radiance, tone))
+
+
+def _development(dataset: Dataset) -> tuple[float, str]:
+    """Exposure and tone curve of the dataset's pictures."""
+    try:
+        exposure, tone = float(dataset.scene["exposure"]), str(dataset.scene["config"]["camera"]["tone"])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{dataset.root / 'scene.json'}: expected the exposure and the tone, found none") from None
+    expect(tone in TONES, f"{dataset.root / 'scene.json'}: tone", f"one of {', '.join(TONES)}", tone)
+    return exposure, tone
 
 
 def new_folder(out: Path) -> Path:

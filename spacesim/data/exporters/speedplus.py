@@ -35,7 +35,7 @@ def write_speedplus(dataset: Dataset, out: Path, wanted: str | None = None, prog
     out = new_folder(out)
     frames = dataset.frames
     for number, frame in enumerate(frames, start=1):
-        write_png(out / "synthetic/images" / _filename(frame), opaque(dataset.root / frame.file_path), durable=False)
+        write_png(out / "synthetic/images" / _filename(frame), opaque(dataset, frame), durable=False)
         if progress is not None:
             progress(number, len(frames), frame.file_path)
     write_json(out / "synthetic/train.json", [_label(frame, target) for frame in dataset.train])
