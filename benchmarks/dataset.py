@@ -79,7 +79,7 @@ def speed(scene: str, size: int, spp: int, views: int, counts: list[int]) -> dic
 
         times["radiance"].append(milliseconds(radiance))
         times["radiance and labels"].append(milliseconds(lambda: renderer.render(shot.camera, shot.sun, seed)))  # noqa: B023
-        times["labels"].append(milliseconds(lambda: renderer._labels(shot.camera, shot.sun)))  # noqa: B023
+        times["labels"].append(milliseconds(lambda: renderer._labeller.labels(shot.camera, shot.sun)))  # noqa: B023
     mean = {key: float(np.mean(values[WARM:])) for key, values in times.items()}
     for count in counts:
         with tempfile.TemporaryDirectory() as folder:

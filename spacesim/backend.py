@@ -6,10 +6,12 @@ whole process: so the package, when it is imported, has `name_llvm` put a good o
 """
 
 import ctypes
+import gc
 import importlib
 import os
 import re
 import sys
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -161,6 +163,28 @@ def mitsuba() -> ModuleType:
     elif variant != f"{name}_ad_rgb":
         raise BackendError(f"mitsuba's variant is {variant}, expected {name}_ad_rgb or none set")
     return mi
+
+
+def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
+    """`function` by `dr.freeze`: traced at its first call with arguments of a kind, replayed at the others.
+
+    At most `limit` recordings are kept. Python's garbage collector waits during a call: arrays that it frees in the
+    middle of a recording end the process.
+    """
+    import drjit as dr
+
+    frozen = dr.freeze(function, limit=limit, warn_after=limit)
+
+    def call(*arguments: Any) -> Any:
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            return frozen(*arguments)
+        finally:
+            if collecting:
+                gc.enable()
+
+    return call
 
 
 class _Arrays:

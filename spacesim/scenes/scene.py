@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.spatial import QhullError
 
 from spacesim import backend
 from spacesim.data.errors import InputError
@@ -18,6 +19,7 @@ from spacesim.scenes.emitters import earthshine, solar_disc
 from spacesim.scenes.materials import Material
 from spacesim.scenes.spacecraft import Part, Spacecraft
 from spacesim.scenes.sun import SunConfig
+from spacesim.scenes.view import Units
 
 MOST_OBJECTS, MOST_PARTS = 84, 255  #: 170 + object id is a shadow class below 255, part ids are bytes
 
@@ -95,7 +97,10 @@ class Scene:
 
         Badoiu and Clarkson, "Smaller core-sets for balls", 2003: step ever less towards the farthest point.
         """
-        points = self.mesh.convex_hull.vertices
+        try:
+            points = self.mesh.convex_hull.vertices
+        except QhullError:  # all in a plane
+            points = self.mesh.vertices
         centre = points.mean(axis=0)
         for i in range(1, 1000):
             centre = centre + (points[np.linalg.norm(points - centre, axis=1).argmax()] - centre) / (i + 1)
@@ -157,8 +162,13 @@ def _describe_material(material: Material) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """A scene in Mitsuba. sunlit and earthlit (None without an Earth) hold the same shapes, and one emitter each."""
+    """A scene in Mitsuba. sunlit and earthlit (None without an Earth) hold the same shapes, and one emitter each.
 
+    labelled: the shapes without light, and no ray slips between two triangles of them; units: of all three.
+    """
+
+    units: Units
+    labelled: Any
     sunlit: Any
     sun: Any
     earthlit: Any = None
@@ -176,18 +186,21 @@ def load(scene: Scene) -> Loaded:
     mi = backend.mitsuba()
     keys = {p.shape_id: (p.part.material, not p.mesh.is_watertight) for p in scene.parts}
     bsdfs = {key: _mitsuba_bsdf(*key) for key in dict.fromkeys(keys.values())}
-    shapes = {p.shape_id: _mitsuba_mesh(p, bsdfs[keys[p.shape_id]]) for p in scene.parts}
+    units = Units.of(scene.bounding_sphere)
+    shapes = {p.shape_id: _mitsuba_mesh(p, units, bsdfs[keys[p.shape_id]]) for p in scene.parts}
+    watertight = {"embree_use_robust_intersections": True} if backend.select() == "llvm" else {}  # OptiX always is
+    labelled = mi.load_dict({"type": "scene", **watertight, **shapes})
     sun = solar_disc(scene.sun, scene.earth)
     sunlit = mi.load_dict({"type": "scene", "sun": sun, **shapes})
     if scene.earth is None:
-        return Loaded(sunlit, sun)
+        return Loaded(units, labelled, sunlit, sun)
     earth = earthshine(scene.earth, scene.sun)
-    return Loaded(sunlit, sun, mi.load_dict({"type": "scene", "earth": earth, **shapes}), earth)
+    return Loaded(units, labelled, sunlit, sun, mi.load_dict({"type": "scene", "earth": earth, **shapes}), earth)
 
 
-def _mitsuba_mesh(placed: PlacedPart, bsdf: Any) -> Any:
+def _mitsuba_mesh(placed: PlacedPart, units: Units, bsdf: Any) -> Any:
     mi = backend.mitsuba()
-    vertices, faces, normals = placed.mesh.vertices, placed.mesh.faces, placed.normals
+    vertices, faces, normals = units.points(placed.mesh.vertices), placed.mesh.faces, placed.normals
     uv, at_corners = _texture_coordinates(placed)
     if at_corners or normals is not None:  # corners of faces stand alone
         uv = uv if at_corners or uv is None else uv[faces.ravel()]

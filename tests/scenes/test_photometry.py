@@ -1,14 +1,18 @@
 """Radiance and alpha against closed-form photometry."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 
 from spacesim.data.geometry import direction_from_angles, look_at
 from spacesim.data.records import Camera, Sun
+from spacesim.data.store import SHADOW_SELF_CAST
 from spacesim.scenes import Part, Renderer, Scene, SceneObject, Spacecraft, build, read_scene, render
 from spacesim.scenes.generate import plan_views
 from spacesim.scenes.materials import Material, material
+from spacesim.scenes.spacecraft import spacecraft
 from spacesim.scenes.sun import EXPOSURE, SOLAR_IRRADIANCE, SunConfig
 
 PARALLEL = SunConfig("directional")
@@ -112,3 +116,25 @@ def test_inside_and_exposed():
     points = np.array([[0.5, 0, 0.2], [0.5, 0, 1.2], [1, 0, 0]], float)
     normals = np.array([[1, 0, 0], [1, 0, 0], [1, 0, 0]], float)
     np.testing.assert_array_equal(renderer.exposed(points, normals), [False, True, True])
+
+
+@pytest.mark.parametrize(
+    ("position", "size"), [((10_000.0, -3.0, 7.0), 1.0), ((0.0, 0.0, 0.0), 1e-3), ((5.0, 0.0, 0.0), 400.0)]
+)
+def test_neither_place_nor_size_changes_a_picture(position, size):
+    craft = spacecraft("cubesat")
+    home = Scene("home", (SceneObject(craft),))
+    moved = np.diag([size, size, size, 1.0])
+    moved[:3, 3] = position
+    away = Scene("away", (SceneObject(craft, moved),))
+    camera = Camera.from_fov(look_at([0.6, -0.9, 0.5], [0, 0, 0]), 64, 64, 35.0)
+    there = replace(camera, world_from_camera=look_at(size * np.array([0.6, -0.9, 0.5]) + position, position))
+    sun = Sun.from_angles(20, 35)
+    expected = Renderer(home, spp=4).render(camera, sun, seed=(1,))
+    found = Renderer(away, spp=4).render(there, sun, seed=(1,))
+    np.testing.assert_array_equal(found.object_id, expected.object_id)
+    np.testing.assert_array_equal(found.shadow, expected.shadow)
+    assert (expected.shadow == SHADOW_SELF_CAST).sum() > 20
+    np.testing.assert_allclose(found.distance, size * expected.distance, rtol=1e-5)
+    np.testing.assert_allclose(found.sun_visibility, expected.sun_visibility, atol=0.02)
+    assert found.radiance.mean() == pytest.approx(expected.radiance.mean(), rel=1e-3)

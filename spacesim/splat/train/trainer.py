@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from spacesim.backend import ad
+from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Dataset
 from spacesim.splat.gaussians import Gaussians
@@ -57,9 +57,9 @@ class Trainer:
         self.optimizer = Adam(self.gaussians.rows())
         self.strategy = DefaultStrategy(config.refinement, self.scene_scale, self.gaussians.count)
         self.history: list[dict[str, float]] = []
-        self._project: Any = _recorded(_project)
-        self._loss: Any = _recorded(_loss)
-        self._update: Any = _recorded(_update)
+        self._project = recorded(_project, RECORDINGS)
+        self._loss = recorded(_loss, RECORDINGS)
+        self._update = recorded(_update, RECORDINGS)
 
     def run(self, on_progress: Callable[[Progress], None], on_checkpoint: Callable[[], None]) -> None:
         """Train from `self.iteration` to the end."""
@@ -151,10 +151,6 @@ class Trainer:
         if not np.isfinite(loss):
             raise WorkError(f"training: the loss is {loss} at iteration {self.iteration}; the last checkpoint is kept")
         self.history.append({"iteration": self.iteration, "loss": loss, "gaussians": self.gaussians.count})
-
-
-def _recorded(stage: Callable[..., Any]) -> Any:
-    return dr.freeze(stage, limit=RECORDINGS, warn_after=RECORDINGS)
 
 
 def _valid(view: View) -> Any:

@@ -1,0 +1,211 @@
+"""The labels of a frame: what the ray through each pixel's centre meets, and how much of the Sun is seen from there.
+
+All surface points that face the Sun are asked for a few directions to its disc. Where these disagree, in penumbrae, and
+on the pixels next to these, many directions are; as long as that finds more of a penumbra, next to it too.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim import backend
+from spacesim.data.records import Camera, Sun
+from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_NONE, SHADOW_SELF_CAST
+from spacesim.scenes.emitters import opaque
+from spacesim.scenes.scene import Loaded, Scene
+from spacesim.scenes.view import RADIUS, View
+from spacesim.scenes.visibility import Disc, SolarDirections
+
+OFFSET = 1e-5 * RADIUS
+"""From the surface to where shadow rays start: a hundred steps of single precision at the bounding sphere."""
+
+LANES = 1 << 24
+"""Most shadow rays at once."""
+
+RECORDINGS = 64
+"""Of a kernel that are kept: one for each size of picture and, of shadow rays, for each power of two of points."""
+
+
+class Labeller:
+    """Labels of a loaded scene. distortion: of the lens, as `Renderer` takes it."""
+
+    def __init__(self, scene: Scene, loaded: Loaded, distortion: Sequence[float]) -> None:
+        self._scene = loaded.labelled
+        self._distortion = tuple(distortion)
+        self._units = loaded.units
+        self._parts = PartTable.of(scene, self._scene)
+        self._directions = SolarDirections(scene.sun, loaded.sun.limb)
+        self._centres = backend.recorded(self._trace_centres, RECORDINGS)
+        self._seen = backend.recorded(self._trace_disc, RECORDINGS)
+
+    def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
+        """All fields of Truth but radiance and alpha."""
+        inputs = View.of(camera, self._units), opaque(sun.direction)
+        numbers, ids, points = self._centres(self._scene, self._parts, *inputs)
+        labels = _images(numbers, ids, camera)
+        labels["sun_visibility"], labels["shadow"] = self._sun(points, sun, labels)
+        return labels
+
+    def _trace_centres(self, scene: Any, parts: "PartTable", view: View, sun: Any) -> tuple[Any, ...]:
+        """(labels that are numbers, one after another; ids, packed; surface points)."""
+        mi = backend.mitsuba()
+        pixel = dr.arange(mi.UInt32, view.width * view.height)
+        ray, before = view.rays(pixel, mi.Point2f(0.5), self._distortion)
+        surface = scene.ray_intersect(ray)
+        hit = surface.is_valid()
+        normal = dr.select(dr.dot(surface.n, ray.d) > 0, -surface.n, surface.n)
+        object_id, part_id = parts.ids(surface.shape, hit)
+        distance = dr.select(hit, (before + surface.t) * view.metre, 0.0)
+        numbers: list[Any] = [
+            distance * dr.dot(ray.d, view.forward),
+            distance,
+            dr.select(hit, dr.dot(normal, sun), 0.0),
+            dr.select(hit, normal, 0.0),
+            parts.albedo(surface, hit),
+        ]
+        points = _Points(surface.p + OFFSET * normal, normal, object_id)
+        dr.eval(numbers, part_id, points)  # in one kernel
+        flat: list[Any] = [dr.ravel(values) for values in numbers]
+        return dr.concat(flat), object_id | (part_id << 8), points
+
+    def _sun(self, points: "_Points", sun: Sun, labels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """(visibility, shadow classes), [H, W], of all pixels."""
+        surface, facing = labels["object_id"] > 0, labels["sun_cosine"] > 0
+        visibility = np.zeros(facing.shape, np.float32)
+        shadow = np.where(surface, SHADOW_ATTACHED, SHADOW_NONE).astype(np.uint8)
+        few, many = self._directions.few(sun), self._directions.many(sun)
+
+        def ask(disc: Disc, where: np.ndarray) -> np.ndarray:
+            """Fill in what is seen `where` it is; returns on which pixels that is a part of the Sun."""
+            visibility[where], shadow[where] = self._ask(disc, points, np.flatnonzero(where))
+            return where & (visibility > 0) & (visibility < 1)
+
+        settled = np.zeros_like(facing)
+        mixed = ask(few, facing)
+        while mixed.any():
+            todo = _grown(mixed) & facing & ~settled
+            mixed = ask(many, todo)
+            settled |= todo
+        return visibility, shadow
+
+    def _ask(self, disc: Disc, points: "_Points", lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(visibility, shadow classes), [N], of the points `lanes` [N]."""
+        uint = backend.mitsuba().UInt32
+        most = max(1, LANES // disc.count)
+        pieces = [np.empty((2, 0), np.float32)]
+        for first in range(0, len(lanes), most):
+            piece = lanes[first : first + most]
+            capacity = min(most, max(1024, 1 << (len(piece) - 1).bit_length()))
+            padded = np.zeros(capacity, np.uint32)
+            padded[: len(piece)] = piece
+            inputs = disc, points, uint(padded), dr.opaque(uint, len(piece))
+            found = self._seen(self._scene, self._parts, *inputs, capacity)
+            pieces.append(found.numpy().reshape(2, -1)[:, : len(piece)])
+        visibility, shadow = np.concatenate(pieces, axis=1)
+        return visibility, shadow.astype(np.uint8)
+
+    def _trace_disc(
+        self, scene: Any, parts: "PartTable", disc: Disc, points: "_Points", lanes: Any, count: Any, capacity: int
+    ) -> Any:
+        """Visibility, then shadow classes, of the points `lanes` [capacity]; those from `count` on are not asked."""
+        mi = backend.mitsuba()
+        active = dr.arange(mi.UInt32, capacity) < count
+        origin, normal = (
+            mi.Vector3f(*(dr.gather(mi.Float, x, lanes) for x in vector)) for vector in (points.origin, points.normal)
+        )
+        visibility, shape, hidden = disc.seen(scene, origin, normal, active)
+        blocker, _ = parts.ids(shape, hidden)
+        order = disc.count - dr.arange(mi.UInt32, dr.width(shape)) % disc.count  # the first that is hidden says by what
+        first = dr.block_reduce(dr.ReduceOp.Max, dr.select(hidden, (order << 8) | blocker, 0), disc.count, "evaluated")
+        blocker, own = first & 255, dr.gather(mi.UInt32, points.object_id, lanes)
+        cast = SHADOW_SELF_CAST + dr.select((blocker == 0) | (blocker == own), 0, blocker)
+        return dr.concat([visibility, mi.Float(dr.select(visibility < 0.5, cast, SHADOW_LIT))])
+
+
+def _grown(mask: np.ndarray) -> np.ndarray:
+    """`mask` [H, W] and the eight pixels next to each of its own."""
+    for axis in (0, 1):
+        near, far = (np.swapaxes(mask, 0, axis)[cut] for cut in (np.s_[:-1], np.s_[1:]))
+        mask = mask.copy()
+        turned = np.swapaxes(mask, 0, axis)
+        turned[1:] |= near
+        turned[:-1] |= far
+    return mask
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Surface points: where their shadow rays start, their normals on the camera's side [3, N], and object ids [N]."""
+
+    origin: Any
+    normal: Any
+    object_id: Any
+
+
+@dataclass(frozen=True)
+class PartTable:
+    """Labels of parts, each indexed by the number that Dr.Jit knows a shape by; inputs of kernels.
+
+    textured: whose albedo varies over them, None where no part's does.
+    """
+
+    objects: Any
+    parts: Any
+    albedos: Any
+    textured: Any
+
+    @classmethod
+    def of(cls, scene: Scene, loaded: Any) -> "PartTable":
+        mi = backend.mitsuba()
+        shapes: dict[str, int] = {}
+        for shape in loaded.shapes():
+            number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+            shapes[shape.id()] = int(number[0])
+        size = max(shapes.values()) + 1
+        objects, parts = np.zeros((2, size), np.uint32)
+        albedos, textured = np.zeros((size, 3), np.float32), np.zeros(size, bool)
+        for placed in scene.parts:
+            index, material = shapes[placed.shape_id], placed.part.material
+            objects[index], parts[index] = placed.object_id, placed.part_id
+            albedos[index], textured[index] = material.albedo, _has_color_image(material.bsdf)
+        varied = mi.Bool(textured) if textured.any() else None
+        return cls(mi.UInt32(objects), mi.UInt32(parts), mi.Float(albedos.ravel()), varied)
+
+    def ids(self, shape: Any, active: Any) -> tuple[Any, Any]:
+        """(object id, part id) of shape pointers, 0 where not `active`."""
+        mi = backend.mitsuba()
+        index: Any = dr.reinterpret_array(mi.UInt32, shape)
+        return dr.gather(mi.UInt32, self.objects, index, active), dr.gather(mi.UInt32, self.parts, index, active)
+
+    def albedo(self, surface: Any, active: Any) -> Any:
+        """RGB where rays met the scene, 0 where not `active`."""
+        mi = backend.mitsuba()
+        index: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
+        albedo = dr.gather(mi.Color3f, self.albedos, index, active)
+        if self.textured is None:
+            return albedo
+        varied = dr.gather(mi.Bool, self.textured, index, active)
+        return dr.select(varied, surface.bsdf().eval_diffuse_reflectance(surface, varied), albedo)
+
+
+def _has_color_image(bsdf: Mapping[str, Any]) -> bool:
+    """Conductors have no diffuse reflectance to look up."""
+    if bsdf.get("type") in ("bitmap", "roughconductor", "conductor"):
+        return bsdf["type"] == "bitmap" and not bsdf.get("raw", False)
+    return any(_has_color_image(value) for value in bsdf.values() if isinstance(value, Mapping))
+
+
+def _images(numbers: Any, ids: Any, camera: Camera) -> dict[str, np.ndarray]:
+    """Labels as [H, W] or [H, W, 3], float32 or uint8, from what `Labeller._trace_centres` returns."""
+    shape = camera.height, camera.width
+    planes = np.split(numbers.numpy().reshape(-1, camera.height * camera.width), [1, 2, 3, 6])
+    names = "depth", "distance", "sun_cosine", "normal", "albedo"
+    labels = {
+        name: plane.reshape(shape if len(plane) == 1 else (*shape, 3))
+        for name, plane in zip(names, planes, strict=True)
+    }
+    packed = ids.numpy().reshape(shape)
+    return {**labels, "object_id": packed.astype(np.uint8), "part_id": (packed >> 8).astype(np.uint8)}
