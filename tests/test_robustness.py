@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -180,6 +181,31 @@ def test_a_full_disk_while_training(spacesim, tiny_data, uninterrupted, small_di
     assert (place / "run/model.safetensors").read_bytes() == (uninterrupted / "model.safetensors").read_bytes()
 
 
+# --- two runs at once ------------------------------------------------------------------------------------------------
+
+
+def test_a_second_run_in_the_same_folder_is_refused_and_harms_nothing(spacesim, tiny_data, tmp_path):
+    """The first is stopped amid its frames, then killed: its lock goes with it."""
+    out = tmp_path / "data"
+    arguments = ["generate", "boxsat", "--out", str(out), *GENERATE]
+    first = subprocess.Popen([sys.executable, "-m", "spacesim.cli", *arguments], stderr=subprocess.DEVNULL)
+    try:
+        while not list(out.glob("gt/*.exr")):
+            assert first.poll() is None, "it should have been stopped before its end"
+            time.sleep(0.002)
+        first.send_signal(signal.SIGSTOP)
+        found = set(contents(out))
+        who = f"(process {first.pid})" if Path("/proc/locks").exists() else "found one"
+        for more in ([], ["--resume"], ["--resume", "--workers", "2"]):
+            assert spacesim(*arguments, *more).is_refusal(f"{out}: expected no other run at work", who)
+        assert set(contents(out)) == found
+    finally:
+        first.kill()
+        first.wait()
+    assert spacesim(*arguments, "--resume").code == 0
+    assert contents(out) == contents(tiny_data)
+
+
 # --- the same seed ---------------------------------------------------------------------------------------------------
 
 
@@ -275,6 +301,42 @@ def test_a_truncated_exr_is_found(broken, fraction):
         load_truth(dataset, dataset.test[0])
     (problem,) = verify_dataset(broken)
     assert str(path) in problem
+
+
+@pytest.mark.parametrize("name", ["scene.json", "transforms.json"])
+def test_a_cut_description_is_told_with_the_way_out(spacesim, broken, tiny_data, name):
+    """`verify` and `--resume` say: delete it, resume. That works, and gives the same bytes."""
+    cut(broken / name)
+    arguments = ("generate", "boxsat", "--out", broken, *GENERATE, "--resume")
+    assert spacesim("verify", broken).is_refusal(broken / name, "delete", "resume")
+    if name == "scene.json":
+        assert spacesim(*arguments).is_refusal(broken / name, "delete this file and resume again")
+    (broken / name).unlink()
+    (broken / "gt/train_00001.exr").unlink()
+    done = spacesim(*arguments)
+    assert done.code == 0, done.errors
+    assert contents(broken) == contents(tiny_data)
+
+
+def test_frames_of_unknown_origin_are_not_resumed(spacesim, broken):
+    """Without scene.json, frames that the scene asked for does not have make the folder a foreign one."""
+    (broken / "scene.json").unlink()
+    fewer = ("--views", 5, *GENERATE[2:])
+    before = contents(broken)
+    assert spacesim("generate", "boxsat", "--out", broken, *fewer, "--resume").is_refusal(broken, "new or empty folder")
+    assert spacesim("generate", "boxsat", "--out", broken, *GENERATE).is_refusal(broken, "new or empty folder")
+    assert contents(broken) == before
+
+
+@pytest.mark.parametrize("name", ["contact_sheet.png", "camera_density.png"])
+def test_verify_looks_at_overviews(spacesim, broken, name):
+    cut(broken / name)
+    found = spacesim("verify", broken)
+    assert found.code == 1
+    assert len(found.errors) == 2
+    assert str(broken / name) in found.errors[0]
+    (broken / name).unlink()  # other tools' datasets have none
+    assert spacesim("verify", broken).code == 0
 
 
 def test_evaluating_on_broken_data_ends_in_a_sentence(spacesim, broken, tiny_run, tmp_path):

@@ -11,7 +11,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from spacesim.data.images import walk_exr_header
+from spacesim.data.errors import InputError
+from spacesim.data.images import read_png, walk_exr_header
 
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _EXR_START = b"\x76\x2f\x31\x01"
@@ -27,6 +28,18 @@ def is_whole(path: Path) -> bool:
             return _png_is_whole(file, size) if Path(path).suffix == ".png" else _exr_is_whole(file, size)
     except OSError:
         return False
+
+
+def faulty_pictures(root: Path) -> list[str]:
+    """Sentences about pictures of a dataset that transforms.json does not name and that cannot be decoded: a sensor's
+    in raw/, and the overviews beside it. [] where all that are there are whole."""
+    problems = []
+    for path in sorted([*Path(root).glob("*.png"), *Path(root).glob("raw/*.png")]):
+        try:
+            read_png(path)
+        except InputError as error:
+            problems.append(str(error))
+    return problems
 
 
 def _png_is_whole(file: BinaryIO, size: int) -> bool:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,8 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.errors import InputError, expect
+from spacesim.data.files import read_json, write_json
+from spacesim.data.lock import locked
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import DatasetWriter
 from spacesim.scenes.build import build
@@ -47,28 +49,49 @@ def generate(
     resume: complete a folder that an interrupted run of the same scene has left; progress: called with (frames done,
     frames in all, name of the frame last done); workers: processes of this machine; ray: address of a Ray cluster that
     shares the folder, "local" for one of this machine alone. The bytes depend on none of these. Raises InputError for a
-    scene that cannot be built, a camera within an object or a folder that cannot be used, WorkError where disk, memory
-    or processes fail.
+    scene that cannot be built, a camera within an object or a folder that cannot be used or that another run works on,
+    WorkError where disk, memory or processes fail.
     """
     expect(workers >= 1, "workers", "at least 1", workers)
     expect(ray is None or workers == 1, "workers", "none beside ray, which counts for itself", workers)
     sweep = _Sweep(config)
     job = replace(sweep.job, root=Path(out).absolute())
-    with _crew(sweep.renderer, workers, ray) as make:
-        described = describe(sweep.scene, config, sweep.train, sweep.test)
-        writer = DatasetWriter(Path(out), described, resume, raw_suffixes(config.camera))
-        left = [shot for shot in sweep.shots if not writer.has(shot.name)]
-        total, whole = len(sweep.shots), len(sweep.shots) - len(left)
-        if progress is not None and whole:
-            progress(whole, total, "")
-        for done, name in enumerate(_made(make, job, left, sweep.renderer), start=whole + 1):
-            if progress is not None:
-                progress(done, total, name)
-    points, colors = surface_points(sweep.renderer, config.quality.points, config.seed)
-    listed = _listed(sweep.train), _listed(sweep.test)
-    dataset = writer.finish(*listed, points, colors, sweep.scene.mesh, config.camera.distortion)
-    write_overview(dataset.root, dataset)
+    described = describe(sweep.scene, config, sweep.train, sweep.test)
+    with ExitStack() as alone:
+        with _crew(sweep.renderer, workers, ray) as make:
+            alone.enter_context(locked(job.root))
+            writer = _open(Path(out), described, resume, sweep)
+            left = [shot for shot in sweep.shots if not writer.has(shot.name)]
+            total, whole = len(sweep.shots), len(sweep.shots) - len(left)
+            if progress is not None and whole:
+                progress(whole, total, "")
+            for done, name in enumerate(_made(make, job, left, sweep.renderer), start=whole + 1):
+                if progress is not None:
+                    progress(done, total, name)
+        points, colors = surface_points(sweep.renderer, config.quality.points, config.seed)
+        listed = _listed(sweep.train), _listed(sweep.test)
+        dataset = writer.finish(*listed, points, colors, sweep.scene.mesh, config.camera.distortion)
+        write_overview(dataset.root, dataset)
     return dataset
+
+
+def _open(root: Path, described: dict[str, Any], resume: bool, sweep: "_Sweep") -> DatasetWriter:
+    """The writer of the folder. Only scene.json tells which scene frames are of. Where it is broken, nothing is
+    resumed; where it is gone, resuming says that they are of the scene asked for, and it is written again."""
+    path = root / "scene.json"
+    if resume and path.exists():
+        try:
+            read_json(path)
+        except InputError as error:
+            raise InputError(
+                f"{error}; if the frames there are of the scene asked for, delete this file and resume again, "
+                "else choose another folder"
+            ) from None
+    frames = {found.stem for found in root.glob("gt/*.exr")} if resume and not path.exists() else set()
+    if frames and frames <= {shot.name for shot in sweep.shots}:
+        _log.warning("%s is missing: the frames there are taken to be of the scene asked for", path)
+        write_json(path, described)
+    return DatasetWriter(root, described, resume, raw_suffixes(sweep.job.camera))
 
 
 def estimate(config: SceneConfig, out: Path) -> Estimate:
