@@ -39,57 +39,53 @@ class Labeller:
         self._parts = PartTable.of(scene, self._scene)
         self._directions = SolarDirections(scene.sun, loaded.sun.limb)
         self._centres = backend.recorded(self._trace_centres, RECORDINGS)
-        self._seen = backend.recorded(self._trace_disc, RECORDINGS)
+        self._penumbrae = backend.recorded(self._trace_penumbrae, RECORDINGS)
 
     def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
         """All fields of Truth but radiance and alpha."""
-        inputs = View.of(camera, self._units), opaque(sun.direction)
+        inputs = View.of(camera, self._units), opaque(sun.direction), self._directions.few(sun)
         numbers, ids, points = self._centres(self._scene, self._parts, *inputs)
         labels = _images(numbers, ids, camera)
-        labels["sun_visibility"], labels["shadow"] = self._sun(points, sun, labels)
+        self._refine(points, sun, labels)
         return labels
 
-    def _trace_centres(self, scene: Any, parts: "PartTable", view: View, sun: Any) -> tuple[Any, ...]:
-        """(labels that are numbers, one after another; ids, packed; surface points)."""
+    def _trace_centres(self, scene: Any, parts: "PartTable", view: View, sun: Any, disc: Disc) -> tuple[Any, ...]:
+        """(labels that are numbers, one after another; labels that are bytes, packed; surface points)."""
         mi = backend.mitsuba()
         pixel = dr.arange(mi.UInt32, view.width * view.height)
         ray, before = view.rays(pixel, mi.Point2f(0.5), self._distortion)
         surface = scene.ray_intersect(ray)
         hit = surface.is_valid()
         normal = dr.select(dr.dot(surface.n, ray.d) > 0, -surface.n, surface.n)
+        cosine = dr.select(hit, dr.dot(normal, sun), 0.0)
         object_id, part_id = parts.ids(surface.shape, hit)
         distance = dr.select(hit, (before + surface.t) * view.metre, 0.0)
         numbers: list[Any] = [
             distance * dr.dot(ray.d, view.forward),
             distance,
-            dr.select(hit, dr.dot(normal, sun), 0.0),
+            cosine,
             dr.select(hit, normal, 0.0),
             parts.albedo(surface, hit),
         ]
         points = _Points(surface.p + OFFSET * normal, normal, object_id)
         dr.eval(numbers, part_id, points)  # in one kernel
-        flat: list[Any] = [dr.ravel(values) for values in numbers]
-        return dr.concat(flat), object_id | (part_id << 8), points
+        faces_sun = cosine > 0
+        visibility, shadow = _seen(scene, parts, disc, points, faces_sun)
+        shadow = dr.select(hit, dr.select(faces_sun, shadow, SHADOW_ATTACHED), SHADOW_NONE)
+        flat: list[Any] = [dr.ravel(values) for values in (*numbers, visibility)]
+        return dr.concat(flat), object_id | (part_id << 8) | (shadow << 16), points
 
-    def _sun(self, points: "_Points", sun: Sun, labels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """(visibility, shadow classes), [H, W], of all pixels."""
-        surface, facing = labels["object_id"] > 0, labels["sun_cosine"] > 0
-        visibility = np.zeros(facing.shape, np.float32)
-        shadow = np.where(surface, SHADOW_ATTACHED, SHADOW_NONE).astype(np.uint8)
-        few, many = self._directions.few(sun), self._directions.many(sun)
-
-        def ask(disc: Disc, where: np.ndarray) -> np.ndarray:
-            """Fill in what is seen `where` it is; returns on which pixels that is a part of the Sun."""
-            visibility[where], shadow[where] = self._ask(disc, points, np.flatnonzero(where))
-            return where & (visibility > 0) & (visibility < 1)
-
+    def _refine(self, points: "_Points", sun: Sun, labels: Mapping[str, np.ndarray]) -> None:
+        """Settle penumbrae in the labels sun_visibility and shadow."""
+        visibility, shadow, facing = labels["sun_visibility"], labels["shadow"], labels["sun_cosine"] > 0
+        mixed = (visibility > 0) & (visibility < 1)
         settled = np.zeros_like(facing)
-        mixed = ask(few, facing)
-        while mixed.any():
+        disc = self._directions.many(sun) if mixed.any() else None
+        while disc is not None and mixed.any():
             todo = _grown(mixed) & facing & ~settled
-            mixed = ask(many, todo)
+            visibility[todo], shadow[todo] = self._ask(disc, points, np.flatnonzero(todo))
             settled |= todo
-        return visibility, shadow
+            mixed = todo & (visibility > 0) & (visibility < 1)
 
     def _ask(self, disc: Disc, points: "_Points", lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(visibility, shadow classes), [N], of the points `lanes` [N]."""
@@ -102,27 +98,34 @@ class Labeller:
             padded = np.zeros(capacity, np.uint32)
             padded[: len(piece)] = piece
             inputs = disc, points, uint(padded), dr.opaque(uint, len(piece))
-            found = self._seen(self._scene, self._parts, *inputs, capacity)
+            found = self._penumbrae(self._scene, self._parts, *inputs, capacity)
             pieces.append(found.numpy().reshape(2, -1)[:, : len(piece)])
         visibility, shadow = np.concatenate(pieces, axis=1)
         return visibility, shadow.astype(np.uint8)
 
-    def _trace_disc(
+    def _trace_penumbrae(
         self, scene: Any, parts: "PartTable", disc: Disc, points: "_Points", lanes: Any, count: Any, capacity: int
     ) -> Any:
         """Visibility, then shadow classes, of the points `lanes` [capacity]; those from `count` on are not asked."""
         mi = backend.mitsuba()
-        active = dr.arange(mi.UInt32, capacity) < count
         origin, normal = (
             mi.Vector3f(*(dr.gather(mi.Float, x, lanes) for x in vector)) for vector in (points.origin, points.normal)
         )
-        visibility, shape, hidden = disc.seen(scene, origin, normal, active)
-        blocker, _ = parts.ids(shape, hidden)
-        order = disc.count - dr.arange(mi.UInt32, dr.width(shape)) % disc.count  # the first that is hidden says by what
-        first = dr.block_reduce(dr.ReduceOp.Max, dr.select(hidden, (order << 8) | blocker, 0), disc.count, "evaluated")
-        blocker, own = first & 255, dr.gather(mi.UInt32, points.object_id, lanes)
-        cast = SHADOW_SELF_CAST + dr.select((blocker == 0) | (blocker == own), 0, blocker)
-        return dr.concat([visibility, mi.Float(dr.select(visibility < 0.5, cast, SHADOW_LIT))])
+        chosen = _Points(origin, normal, dr.gather(mi.UInt32, points.object_id, lanes))
+        visibility, shadow = _seen(scene, parts, disc, chosen, dr.arange(mi.UInt32, capacity) < count)
+        return dr.concat([visibility, mi.Float(shadow)])
+
+
+def _seen(scene: Any, parts: "PartTable", disc: Disc, points: "_Points", active: Any) -> tuple[Any, Any]:
+    """(visibility, shadow classes), [N], of points; 0 and a cast shadow where not `active`."""
+    mi = backend.mitsuba()
+    visibility, shape, hidden = disc.seen(scene, points.origin, points.normal, active)
+    blocker, _ = parts.ids(shape, hidden)
+    order = disc.count - dr.arange(mi.UInt32, dr.width(shape)) % disc.count  # the first that is hidden says by what
+    first = dr.block_reduce(dr.ReduceOp.Max, dr.select(hidden, (order << 8) | blocker, 0), disc.count, "evaluated")
+    blocker = first & 255
+    cast = SHADOW_SELF_CAST + dr.select((blocker == 0) | (blocker == points.object_id), 0, blocker)
+    return visibility, dr.select(visibility < 0.5, cast, SHADOW_LIT)
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:
@@ -201,11 +204,12 @@ def _has_color_image(bsdf: Mapping[str, Any]) -> bool:
 def _images(numbers: Any, ids: Any, camera: Camera) -> dict[str, np.ndarray]:
     """Labels as [H, W] or [H, W, 3], float32 or uint8, from what `Labeller._trace_centres` returns."""
     shape = camera.height, camera.width
-    planes = np.split(numbers.numpy().reshape(-1, camera.height * camera.width), [1, 2, 3, 6])
-    names = "depth", "distance", "sun_cosine", "normal", "albedo"
+    planes = np.split(numbers.numpy().reshape(-1, camera.height * camera.width), [1, 2, 3, 6, 9])
+    names = "depth", "distance", "sun_cosine", "normal", "albedo", "sun_visibility"
     labels = {
         name: plane.reshape(shape if len(plane) == 1 else (*shape, 3))
         for name, plane in zip(names, planes, strict=True)
     }
     packed = ids.numpy().reshape(shape)
-    return {**labels, "object_id": packed.astype(np.uint8), "part_id": (packed >> 8).astype(np.uint8)}
+    ids_of = {"object_id": packed, "part_id": packed >> 8, "shadow": packed >> 16}
+    return {**labels, **{name: values.astype(np.uint8) for name, values in ids_of.items()}}

@@ -95,10 +95,10 @@ def looked_up(path: Path, points: np.ndarray) -> np.ndarray:
     """[N, 3] diffuse reflectance that rays along -z hit at x, y = points [N, 2], through the scene's own loader."""
     mi = backend.mitsuba()
     craft, _ = read_mesh(path, up="z")
-    scene = load(Scene("plate", (SceneObject(craft),))).sunlit
-    x, y = np.asarray(points, dtype=np.float32).T
-    rays = mi.Ray3f(mi.Point3f(mi.Float(x), mi.Float(y), 5.0), mi.Vector3f(0, 0, -1))
-    hit = scene.ray_intersect(rays)
+    loaded = load(Scene("plate", (SceneObject(craft),)))
+    starts = loaded.units.points(np.column_stack([points, np.full(len(points), 5.0)]))
+    rays = mi.Ray3f(mi.Point3f(np.ascontiguousarray(starts.T, np.float32)), mi.Vector3f(0, 0, -1))
+    hit = loaded.sunlit.ray_intersect(rays)
     return np.array(hit.bsdf().eval_diffuse_reflectance(hit)).T
 
 
@@ -446,9 +446,10 @@ def test_smooth_surfaces_shade_as_if_round_and_their_truth_stays_flat(tmp_path):
     craft, _ = read_mesh(ball(tmp_path), up="z")
     turn = trimesh.transformations.rotation_matrix(1.0, [1, 2, 3]) @ np.diag([2.0, 2.0, 2.0, 1.0])
     scene = Scene("ball", (SceneObject(craft, turn),))
-    x, y = np.random.default_rng(0).uniform(-1.2, 1.2, (2, 500)).astype(np.float32)
-    ray = mi.Ray3f(mi.Point3f(mi.Float(x), mi.Float(y), 5.0), mi.Vector3f(0, 0, -1))
-    hit = load(scene).sunlit.ray_intersect(ray)
+    loaded = load(scene)
+    starts = loaded.units.points(np.random.default_rng(0).uniform([-1.2, -1.2, 5], [1.2, 1.2, 5], (500, 3)))
+    ray = mi.Ray3f(mi.Point3f(np.ascontiguousarray(starts.T, np.float32)), mi.Vector3f(0, 0, -1))
+    hit = loaded.sunlit.ray_intersect(ray)
     point = np.array(hit.p).T
     outward = point / np.linalg.norm(point, axis=1, keepdims=True)
     shading, geometric = np.array(hit.sh_frame.n).T, np.array(hit.n).T
