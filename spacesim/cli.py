@@ -1,10 +1,13 @@
 """The command line: parse, call one function, print. Exit codes: 0 done, 1 the work failed, 2 bad usage or input."""
 
+from spacesim import ending  # first: from here on Ctrl-C is told in a sentence
+
+# isort: split
+
 import argparse
 import json
 import logging
 import math
-import os
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -25,47 +28,52 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(*arguments, **options)
         self._negative_number_matcher = re.compile(r"^-\.?\d")
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """argparse itself would not say that its help could not be written."""
+        if file is sys.stdout:
+            ending.say(message, end="")
+        else:
+            super()._print_message(message, file)
+
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
+    try:
+        with ending.working():
+            _run(sys.argv[1:] if arguments is None else arguments)
+    except (InputError, WorkError, backend.BackendError) as error:
+        ending.tell(str(error))
+        return 2 if isinstance(error, InputError) else 1
+    except MemoryError as error:
+        ending.tell(f"the memory is short ({error})")
+        return 1
+    except BrokenPipeError:
+        return 1
+    except (KeyboardInterrupt, Exception) as error:
+        if ending.is_interrupt(error):
+            ending.tell(ending.STOPPED)
+            return ending.STOPPED_CODE
+        if not isinstance(error, RuntimeError | OSError):
+            raise
+        logging.getLogger("spacesim").debug("traceback", exc_info=error)
+        reason = " ".join(str(error).split())
+        ending.tell(f"the computation failed ({reason}); --debug shows where")
+        return 1
+    return 0
+
+
+def _run(arguments: Sequence[str]) -> None:
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
-    arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
     options.command = ("spacesim", *arguments)
     if options.debug:
         logging.getLogger("spacesim").setLevel(logging.DEBUG)
-    try:
-        if options.needs_backend:
-            backend.select(options.backend)
-        options.run(options)
-    except (InputError, WorkError, backend.BackendError) as error:
-        print(f"spacesim: {error}", file=sys.stderr)
-        return 2 if isinstance(error, InputError) else 1
-    except MemoryError as error:
-        print(f"spacesim: the memory is short ({error})", file=sys.stderr)
-        return 1
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except (KeyboardInterrupt, RuntimeError) as error:
-        if not _is_interrupt(error):
-            logging.getLogger("spacesim").debug("traceback", exc_info=error)
-            reason = " ".join(str(error).split())
-            print(f"spacesim: the computation failed ({reason}); --debug shows where", file=sys.stderr)
-            return 1
-        print("spacesim: stopped; what was finished is kept, --resume goes on from there", file=sys.stderr)
-        return 130
-    return 0
-
-
-def _is_interrupt(error: BaseException | None) -> bool:
-    """Ctrl-C; Dr.Jit turns one that comes while it traces into the cause of a RuntimeError."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
+    if options.needs_backend:
+        backend.select(options.backend)
+    options.run(options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -195,7 +203,7 @@ def _doctor(options: argparse.Namespace) -> None:
     from spacesim import doctor
 
     findings = doctor.report()
-    print(json.dumps(findings, indent=1) if options.json else doctor.describe(findings))
+    ending.say(json.dumps(findings, indent=1) if options.json else doctor.describe(findings))
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -205,7 +213,7 @@ def _demo(options: argparse.Namespace) -> None:
     done = demo(options.out, reporting)
     _print_headline(done["metrics"])
     parts = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in done["seconds"].items())
-    print(f"{parts}\nreport: {done['report'].resolve()}")
+    ending.say(f"{parts}\nreport: {done['report'].resolve()}")
 
 
 _SCENE_OPTIONS = (
@@ -223,18 +231,18 @@ def _generate(options: argparse.Namespace) -> None:
     changes = {name: getattr(options, name) for name in _SCENE_OPTIONS}
     scene = read_scene(options.scene, **changes, fov_deg=options.fov)
     if options.print:
-        print(scene_text(scene), end="")
+        ending.say(scene_text(scene), end="")
         return
     if options.estimate:
         backend.select(options.backend)
-        print(estimate(scene, options.out or Path()))
+        ending.say(estimate(scene, options.out or Path()))
         return
     if options.out is None:
         raise InputError("--out: expected a folder for the dataset, found none")
     backend.select(options.backend)
     with reporting("generate", "frames") as report:
         dataset = generate(scene, options.out, options.resume, report, options.workers, options.ray)
-    print(f"{options.out}: {len(dataset.train)} training and {len(dataset.test)} test frames of {scene.name}")
+    ending.say(f"{options.out}: {len(dataset.train)} training and {len(dataset.test)} test frames of {scene.name}")
 
 
 def _train(options: argparse.Namespace) -> None:
@@ -251,7 +259,7 @@ def _train(options: argparse.Namespace) -> None:
     with reporting("train", "iterations") as report:
         run = train(dataset, options.out, config, options.resume, tell_training(report), options.command)
     history = run.training["history"]
-    print(
+    ending.say(
         f"{options.out}: {run.gaussians} Gaussians after {config.iterations} iterations in "
         f"{run.training['seconds']:.0f} s on {run.training['backend']}, final loss {history[-1]['loss']:.4f}"
     )
@@ -270,17 +278,17 @@ def _eval(options: argparse.Namespace) -> None:
         metrics = evaluate(run, dataset, options.out, config, report)
     write_report([options.out], options.out / "report.html")
     if options.json:
-        print(json.dumps(metrics, indent=1))
+        ending.say(json.dumps(metrics, indent=1))
     else:
         _print_headline(metrics)
-        print(f"report: {(options.out / 'report.html').resolve()}")
+        ending.say(f"report: {(options.out / 'report.html').resolve()}")
 
 
 def _report(options: argparse.Namespace) -> None:
     from spacesim.eval.report import write_report
 
     write_report(options.evals, options.out)
-    print(f"report: {options.out.resolve()}")
+    ending.say(f"report: {options.out.resolve()}")
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -305,7 +313,7 @@ def _render(options: argparse.Namespace) -> None:
             raise InputError(f"--frame: expected 0 to {len(frames) - 1}, found {index}")
         camera, sun = frames[index].camera, sun or frames[index].sun
     write_picture(run.predict(camera, sun), options.kind, options.out)
-    print(options.out)
+    ending.say(options.out)
 
 
 def _data_of(config: dict[str, Any]) -> Path:
@@ -330,7 +338,7 @@ def _verify(options: argparse.Namespace) -> None:
         raise WorkError(
             f"{options.data}: {len(problems)} faulty files; delete them, generate --resume makes them again"
         )
-    print(f"{options.data}: {len(dataset.frames)} frames, every file is there and whole")
+    ending.say(f"{options.data}: {len(dataset.frames)} frames, every file is there and whole")
 
 
 def _way_out(root: Path, error: InputError) -> str:
@@ -359,7 +367,7 @@ def _export_ply(options: argparse.Namespace) -> None:
     backend.select(options.backend)
     run = load_run(options.path)
     write_ply(run.model, options.ply)
-    print(f"{options.ply}: {run.gaussians} Gaussians")
+    ending.say(f"{options.ply}: {run.gaussians} Gaussians")
 
 
 def _export_speedplus(options: argparse.Namespace) -> None:
@@ -370,7 +378,7 @@ def _export_speedplus(options: argparse.Namespace) -> None:
     dataset = read_dataset(options.path)
     with reporting("export", "frames") as report:
         target = write_speedplus(dataset, options.speedplus, options.object, report)
-    print(f"{options.speedplus}: {len(dataset.frames)} images with the pose of {target.name}")
+    ending.say(f"{options.speedplus}: {len(dataset.frames)} images with the pose of {target.name}")
 
 
 def _export_bop(options: argparse.Namespace) -> None:
@@ -383,17 +391,17 @@ def _export_bop(options: argparse.Namespace) -> None:
     dataset = read_dataset(options.path)
     with reporting("export", "frames") as report:
         targets = write_bop(dataset, options.bop, outline, report)
-    print(f"{options.bop}: {len(dataset.frames)} images with the poses of {', '.join(t.name for t in targets)}")
+    ending.say(f"{options.bop}: {len(dataset.frames)} images with the poses of {', '.join(t.name for t in targets)}")
 
 
 def _print_headline(metrics: dict[str, Any]) -> None:
     """PSNR, SSIM and shadow errors in a line each."""
     show = partial(_mean, metrics)
-    print(f"silhouette: PSNR {show('image', 'psnr', 2)} dB, SSIM {show('image', 'ssim', 4)}", end="")
-    print(f", FLIP {show('image', 'flip', 4)}; full frame: PSNR {show('image_full', 'psnr', 2)} dB")
-    print(f"shadows: BER {show('shadow', 'ber', 4)}, boundary MAE {show('shadow', 'boundary_mae', 4)}")
+    ending.say(f"silhouette: PSNR {show('image', 'psnr', 2)} dB, SSIM {show('image', 'ssim', 4)}", end="")
+    ending.say(f", FLIP {show('image', 'flip', 4)}; full frame: PSNR {show('image_full', 'psnr', 2)} dB")
+    ending.say(f"shadows: BER {show('shadow', 'ber', 4)}, boundary MAE {show('shadow', 'boundary_mae', 4)}")
     for note in metrics.get("notes", []):
-        print(f"note: {note}")
+        ending.say(f"note: {note}")
 
 
 def _mean(metrics: dict[str, Any], group: str, name: str, digits: int) -> str:

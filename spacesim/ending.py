@@ -1,0 +1,95 @@
+"""How a command ends early: Ctrl-C at any moment, and a standard output that is full or that nobody reads any more.
+
+`spacesim.cli` imports this first. Where the process is the command itself, Ctrl-C is told in a sentence from then on:
+while modules are being imported the process ends at once (Python's exception would come out of compiled modules as some
+other error, or leave them half made), else KeyboardInterrupt is raised as ever.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+
+from spacesim.data.errors import WorkError
+
+STOPPED = "stopped; what was finished is kept, --resume goes on from there"
+STOPPED_CODE = 130  #: of a process that Ctrl-C ended, as shells have it: 128 + SIGINT
+
+_SHOW_CURSOR = "\x1b[?25h\n"  # which a bar of progress hides (ECMA-48 private mode 25)
+_OWN = os.path.join(os.path.dirname(os.path.abspath(__file__)), "cli.py")
+
+_is_command = os.path.basename(sys.argv[0]) in ("spacesim", "spacesim.exe") or os.path.abspath(sys.argv[0]) == _OWN
+_at_work = False
+
+
+@contextmanager
+def working() -> Iterator[None]:
+    """Around the work of a command: KeyboardInterrupt is raised within and Ctrl-C, where the process is the command,
+    ignored afterwards, as what is left is to say how it went.
+
+    Standard output is flushed. Raises BrokenPipeError where nobody reads it, WorkError where it is full; what has not
+    been printed is lost then, so that the interpreter's own end does not stumble over it.
+    """
+    global _at_work
+    _at_work = True
+    try:
+        yield
+    finally:
+        if _is_command:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        say("", end="")
+
+
+def say(text: object, end: str = "\n") -> None:
+    """Print to standard output now. Raises as `working`."""
+    try:
+        print(text, end=end, flush=True)
+    except BrokenPipeError:
+        _drop_output()
+        raise
+    except OSError as error:
+        _drop_output()
+        raise WorkError(f"standard output: cannot be written ({error.strerror or error})") from None
+
+
+def tell(sentence: str) -> None:
+    """Print to standard error, where there is one."""
+    with suppress(OSError):
+        print(f"spacesim: {sentence}", file=sys.stderr, flush=True)
+
+
+def is_interrupt(error: BaseException | None) -> bool:
+    """Ctrl-C; Dr.Jit turns one that comes while it traces into the cause of another error."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _drop_output() -> None:
+    """What is still to be written goes nowhere."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _interrupted(_signal: int, frame: FrameType | None) -> None:
+    if _at_work and not _imports(frame):
+        raise KeyboardInterrupt
+    with suppress(OSError):
+        cursor = _SHOW_CURSOR if os.isatty(2) else ""
+        os.write(2, f"{cursor}spacesim: {STOPPED}\n".encode())
+    os._exit(STOPPED_CODE)
+
+
+def _imports(frame: FrameType | None) -> bool:
+    """A module is being imported: the import system's own frames are on the stack."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+if _is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, _interrupted)
