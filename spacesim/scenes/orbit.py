@@ -15,12 +15,10 @@ import math
 import numpy as np
 
 from spacesim.data.geometry import Array
+from spacesim.scenes.earth import EARTH_RADIUS_KM
 
 EARTH_GM = 3.986004418e14
 """Gravitational parameter of the Earth, m^3 s^-2 (IERS Conventions 2010, table 1.1)."""
-
-EARTH_EQUATORIAL_RADIUS = 6_378_137.0
-"""Metres (WGS 84)."""
 
 WORLD_FROM_LVLH: Array = np.diag([1.0, -1.0, -1.0])
 """[3, 3] LVLH to world axes: V-bar is +x, the zenith +z and the orbit's angular momentum +y; its own inverse."""
@@ -31,7 +29,7 @@ ORBIT_NORMAL: Array = np.array([0.0, 1.0, 0.0])
 
 def mean_motion(altitude_km: float) -> float:
     """Radians per second of a circular orbit at an altitude above the equator: n = sqrt(GM / R^3)."""
-    return math.sqrt(EARTH_GM / (EARTH_EQUATORIAL_RADIUS + 1e3 * altitude_km) ** 3)
+    return math.sqrt(EARTH_GM / (1e3 * (EARTH_RADIUS_KM + altitude_km)) ** 3)
 
 
 def transition(n: float, seconds: float) -> Array:

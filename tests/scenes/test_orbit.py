@@ -5,7 +5,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from spacesim.scenes.orbit import (
-    EARTH_EQUATORIAL_RADIUS,
     EARTH_GM,
     ORBIT_NORMAL,
     WORLD_FROM_LVLH,
@@ -15,7 +14,7 @@ from spacesim.scenes.orbit import (
     transition,
 )
 
-RADIUS = EARTH_EQUATORIAL_RADIUS + 500e3
+RADIUS = 6_378_137.0 + 500e3  # WGS 84
 N = mean_motion(500)
 PERIOD = 2 * np.pi / N
 
