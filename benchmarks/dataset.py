@@ -28,6 +28,7 @@ from spacesim.scenes import read_scene
 from spacesim.scenes.frames import FrameMaker, cores
 from spacesim.scenes.generate import _Sweep
 from spacesim.scenes.scene import load
+from spacesim.scenes.view import Units
 from spacesim.scenes.workers import make_in_processes
 
 WARM = 3  #: frames before the clock starts
@@ -62,7 +63,7 @@ def speed(scene: str, size: int, spp: int, views: int, counts: list[int]) -> dic
     loaded = load(sweep.scene)
     mi = backend.mitsuba()
     integrator = mi.load_dict({"type": "path", "max_depth": sweep.job.quality.max_depth, "hide_emitters": True})
-    sensors = [sensor(shot.camera) for shot in shots]
+    sensors = [sensor(shot.camera, loaded.units) for shot in shots]
     times: dict[str, list[float]] = {"mi.render": [], "radiance": [], "radiance and labels": [], "labels": []}
     for shot, view in zip(shots, sensors, strict=True):
         for held in (loaded, renderer._loaded):
@@ -96,11 +97,13 @@ def speed(scene: str, size: int, spp: int, views: int, counts: list[int]) -> dic
     }
 
 
-def sensor(camera: Camera) -> Any:
+def sensor(camera: Camera, units: Units) -> Any:
     """`camera` in Mitsuba. With its default filter, a Gaussian, `mi.render` takes a quarter longer on two cores."""
     mi = backend.mitsuba()
+    placed = camera.world_from_camera.copy()
+    placed[:3, 3] = units.points(placed[:3, 3])
     fov = float(np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx)))
-    pose = mi.ScalarTransform4f((camera.world_from_camera @ OPENCV_FROM_MITSUBA).tolist())
+    pose = mi.ScalarTransform4f((placed @ OPENCV_FROM_MITSUBA).tolist())
     film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
     return mi.load_dict({"type": "perspective", "fov": fov, "fov_axis": "x", "to_world": pose, "film": film})
 
