@@ -331,7 +331,7 @@ def _verify(options: argparse.Namespace) -> None:
         dataset = read_dataset(options.data)
     except InputError as error:
         raise InputError(f"{error}{_way_out(options.data, error)}") from None
-    problems = verify_dataset(options.data) + faulty_pictures(options.data)
+    problems = verify_dataset(options.data) + faulty_pictures(dataset, _raw_suffixes(dataset.scene))
     for problem in problems:
         print(problem, file=sys.stderr)
     if problems:
@@ -339,6 +339,16 @@ def _verify(options: argparse.Namespace) -> None:
             f"{options.data}: {len(problems)} faulty files; delete them, generate --resume makes them again"
         )
     ending.say(f"{options.data}: {len(dataset.frames)} frames, every file is there and whole")
+
+
+def _raw_suffixes(scene: Any) -> tuple[str, ...]:
+    """Of the names of a sensor's pictures, by scene.json; () where it knows of no sensor."""
+    from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME
+
+    try:
+        return RAW_MONOCHROME if scene["config"]["camera"]["sensor"]["monochrome"] else RAW_COLOR
+    except (KeyError, TypeError):
+        return ()
 
 
 def _way_out(root: Path, error: InputError) -> str:

@@ -339,6 +339,24 @@ def test_verify_looks_at_overviews(spacesim, broken, name):
     assert spacesim("verify", broken).code == 0
 
 
+@pytest.mark.parametrize("monochrome", ["true", "false"])
+def test_verify_looks_at_a_sensors_pictures(spacesim, tmp_path, monochrome):
+    scene = tmp_path / "noisy.toml"
+    scene.write_text(f"[[objects]]\nspacecraft = 'boxsat'\n[camera.sensor]\nmonochrome = {monochrome}\n")
+    small = ("--views", "2", "--test-views", "0", "--resolution", "16", "--spp", "1", "--out", tmp_path / "data")
+    assert spacesim("generate", scene, *small).code == 0
+    assert spacesim("verify", tmp_path / "data").code == 0
+    first, *_, last = sorted((tmp_path / "data/raw").iterdir())
+    first.unlink()
+    cut(last)
+    found = spacesim("verify", tmp_path / "data")
+    assert found.code == 1
+    assert [str(first) in found.errors[0], str(last) in found.errors[1], "2 faulty" in found.errors[2]] == [True] * 3
+    last.unlink()
+    assert spacesim("generate", scene, *small, "--resume").code == 0
+    assert spacesim("verify", tmp_path / "data").code == 0
+
+
 def test_evaluating_on_broken_data_ends_in_a_sentence(spacesim, broken, tiny_run, tmp_path):
     cut(broken / "images/test_00001.png")
     refused = spacesim("eval", tiny_run, "--data", broken, "--out", tmp_path / "eval")
