@@ -5,6 +5,7 @@ meets first is, among the triangles that hold its point, the one with the least 
 it with trimesh's ray caster.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -21,8 +22,8 @@ from spacesim.scenes.sun import SunConfig
 NEAR_EDGE = 0.02
 """Pixels, chosen: an edge that is nearer to a pixel's centre may fall on either side of it."""
 
-LIFT = 9e-5
-"""Mitsuba begins shadow rays LIFT (1 + |p|) metres above a surface point p (|p|: its largest coordinate), so that a
+LIFT = 1.1e-5
+"""The renderer begins shadow rays so far above a surface, in parts of the radius of the scene's bounding sphere, that a
 surface in float32 does not shadow itself. Under grazing light, shadows begin that much later."""
 
 OFF_PLANE = 1e-6
@@ -110,6 +111,7 @@ class RayCaster:
         edges = self.triangles[:, 1:] - self.triangles[:, :1]
         normals = np.cross(edges[:, 0], edges[:, 1])
         self.normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        self.radius = scene.bounding_sphere[1]
         self.size = np.abs(self.triangles).max()
 
     def seen(self, camera: Camera, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -136,7 +138,7 @@ class RayCaster:
         """Labels under parallel light at the image positions `at` [N, 2] (x, y).
 
         pixel: [2] an image position; lengths are where its ray meets the planes that are seen `at` places about it.
-        lift: how far above the surface shadow rays begin, in parts of 1 + |p| metres.
+        lift: how far above the surface shadow rays begin, in parts of the bounding sphere's radius.
         """
         face, depth, ray = self.seen(camera, at)
         hit = face >= 0
@@ -146,7 +148,7 @@ class RayCaster:
         shadow = np.where(hit, np.where(cosine > 0, 255, 85), 0)
         lit = np.flatnonzero(cosine > 0)
         points = camera.position + depth[lit, None] * ray[lit]
-        points += lift * (1 + np.abs(points).max(axis=1, keepdims=True, initial=0)) * normals[lit]
+        points += lift * self.radius * normals[lit]
         blocker = self.towards(sun.direction, points) if len(lit) else lit
         if pixel is not None:
             x, y = (pixel - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
@@ -167,13 +169,51 @@ class RayCaster:
             "shadow": shadow,
         }
 
+    def sun_seen(self, points: np.ndarray, normals: np.ndarray, sun: Sun, radius: float, strata: int) -> np.ndarray:
+        """[N] fraction of the solar disc (angular `radius`, radians) that `points` [N, 3] see, by strata^2 directions.
+        What is below the horizon of `normals` [N, 3] is hidden."""
+        rng = np.random.default_rng(1)
+        i, j = np.divmod(np.arange(strata**2), strata)
+        r = math.sin(radius) * np.sqrt((i + rng.random(i.size)) / strata)
+        turn = 2 * math.pi * (j + rng.random(i.size)) / strata
+        axes = across(sun.direction)
+        offsets = r[:, None] * (np.cos(turn)[:, None] * axes[:, 0] + np.sin(turn)[:, None] * axes[:, 1])
+        directions = offsets + np.sqrt(1 - r**2)[:, None] * sun.direction
+        seen = normals @ directions.T > 0
+        point, triangle = self._beneath(points @ axes, self.triangles @ axes, 4 * self.size * math.tan(radius))
+        for k in np.unique(point):
+            seen[k] &= ~self._hidden(points[k], directions, triangle[point == k])
+        return seen.mean(axis=1)
+
+    def _beneath(self, points: np.ndarray, corners: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers of points and of triangles whose box, made wider by `margin`, holds them."""
+        low, high = corners.min(axis=1) - margin, corners.max(axis=1) + margin
+        pairs = [np.stack(pair) for pair in _pairs(points, np.stack([low, high], axis=1))]
+        point, triangle = np.concatenate(pairs, axis=1)
+        inside = ((points[point] >= low[triangle]) & (points[point] <= high[triangle])).all(axis=1)
+        return point[inside], triangle[inside]
+
+    def _hidden(self, start: np.ndarray, directions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """[N] bool: rays from `start` [3] in `directions` [N, 3] that meet one of the `faces` [K].
+
+        Moeller and Trumbore 1997: distance and barycentric coordinates as ratios of triple products.
+        """
+        corner, one, other = np.moveaxis(self.triangles[faces], 1, 0)
+        one, other, to = one - corner, other - corner, start - corner
+        normal, moment = np.cross(one, other), np.cross(to, directions[:, None])  # [K, 3], [N, K, 3]
+        volume = -directions @ normal.T  # [N, K]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = (moment * other).sum(-1) / volume, -(moment * one).sum(-1) / volume
+            t = (to * normal).sum(-1) / volume
+        return ((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-6 * self.size)).any(axis=1)
+
 
 @dataclass(frozen=True)
 class Agreement:
     """Of labels in one or several images: pixels of the images, of a surface, those that differ from the ray caster's.
 
     edge: of these, pixels with that answer within NEAR_EDGE; lifted: others with it where shadow rays begin as high as
-    Mitsuba's; wrong: all others, counted for each label; classes: shadow classes and how many pixels have them;
+    the renderer's; wrong: all others, counted for each label; classes: shadow classes and how many pixels have them;
     off_plane: largest of the pixels that agree, see OFF_PLANE.
     """
 
@@ -262,3 +302,55 @@ def labels_agree(
         truth = renderer.render(view.camera, view.sun, seed=(0,))
         found.append(compare(truth, caster, view.camera, view.sun))
     return sum(found[1:], found[0])
+
+
+@dataclass(frozen=True)
+class Penumbra:
+    """visibility, expected: [N] of points beside cast shadows; pixel: [N, 3] view, row and column of each."""
+
+    visibility: np.ndarray
+    expected: np.ndarray
+    pixel: np.ndarray
+
+    @property
+    def error(self) -> np.ndarray:
+        return np.abs(self.visibility - self.expected)
+
+
+def penumbra(
+    source: str | Path, count: int = 2000, views: int = 8, resolution: int = 256, strata: int = 32
+) -> Penumbra:
+    """The label sun_visibility at `count` points in or within a pixel of penumbrae and edges of cast shadows, and the
+    fraction of strata^2 directions, at random in equal parts of the solar disc, that the ray caster finds free."""
+    config = read_scene(source, sun=((45.0, 35.0),), test_views=8, resolution=resolution)
+    scene = build(config)
+    renderer, caster = Renderer(scene, spp=1), RayCaster(scene)
+    rng = np.random.default_rng(0)
+    found = []
+    for i, (_, view) in enumerate(plan_views(scene, config)[1][:views]):
+        truth = renderer.render(view.camera, view.sun, seed=(0,))
+        at = np.concatenate([rng.permutation(np.argwhere(mask))[: count // views // 2] for mask in _penumbrae(truth)])
+        if len(at) == 0:
+            continue
+        face, depth, ray = caster.seen(view.camera, at[:, ::-1] + 0.5)
+        hit = face >= 0
+        hit[hit] = caster.part_of_face[face[hit]] == truth.part_id[tuple(at[hit].T)]  # else the pixel is on an edge
+        at, face, points = at[hit], face[hit], (view.camera.position + depth[:, None] * ray)[hit]
+        normals = caster.normals[face] * np.where((caster.normals[face] * ray[hit]).sum(axis=1) > 0, -1, 1)[:, None]
+        expected = caster.sun_seen(points, normals, view.sun, scene.sun.angular_radius, strata)
+        pixel = np.column_stack([np.full(len(at), i), at])
+        found.append((truth.sun_visibility[tuple(at.T)], expected, pixel))
+    return Penumbra(*(np.concatenate(values) for values in zip(*found, strict=True)))
+
+
+def _penumbrae(truth: Truth) -> tuple[np.ndarray, np.ndarray]:
+    """[H, W] bool, of sides that face the Sun: penumbrae, and what is within a pixel of one or of a shadow's edge."""
+    faces = truth.sun_cosine > 0
+    full, none = faces & (truth.sun_visibility == 1), faces & (truth.sun_visibility == 0)
+    part = faces & ~full & ~none
+
+    def grown(mask: np.ndarray) -> np.ndarray:
+        padded = np.pad(mask, 1)
+        return np.any([np.roll(padded, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)[1:-1, 1:-1]
+
+    return part, faces & ~part & (grown(part) | (grown(full) & grown(none)))

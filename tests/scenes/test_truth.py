@@ -4,7 +4,10 @@ import math
 
 import numpy as np
 import pytest
+import raycast
+import trimesh
 import truth
+import whole
 
 
 @pytest.mark.parametrize("elevation_deg", [90.0, 30.0, 5.0])
@@ -41,3 +44,35 @@ def test_light_in_a_hollow_sphere_is_conserved():
 @pytest.mark.parametrize(("phase_deg", "altitude_km"), [(0.0, 500.0), (90.0, 500.0), (0.0, 36_000.0)])
 def test_earth_gives_the_irradiance_of_a_lambertian_sphere(phase_deg, altitude_km):
     assert abs(truth.earth_error(phase_deg, altitude_km)) < 0.02
+
+
+def test_sun_only_plus_earth_only_equals_both_within_noise():
+    """On each part of boxsat; a tenth of the Earth's light missing would be seen."""
+    difference, error, share = whole.sources_apart(spp=64)
+    assert (np.abs(difference) < 5 * error + 1e-4).all()
+    assert np.sqrt(np.mean((difference / error) ** 2)) < 2
+    assert (share > 50 * error).any(), "the Earth matters"
+
+
+def test_wavelengths_add_up_to_white():
+    np.testing.assert_allclose(whole.band_weights().sum(axis=0), 1.0, atol=1e-6)
+
+
+def test_visibility_in_penumbrae_of_a_spacecraft():
+    """Against 1,024 rays to the disc from each of some points beside the cast shadows of boxsat."""
+    found = raycast.penumbra("boxsat", count=80, views=8)
+    part = (found.expected > 0) & (found.expected < 1)
+    assert part.sum() > 15
+    assert found.error[part].mean() < 0.015
+    assert np.quantile(found.error, 0.95) < 0.04
+    assert ((found.visibility == 0) == (found.expected == 0)).mean() > 0.9
+
+
+def test_rays_to_the_disc_by_hand():
+    """Half of the Sun is behind the edge of a wall; a point that is turned away sees none of it."""
+    scene = truth.scene_of(trimesh.creation.box((1, 1, 1)))
+    caster = raycast.RayCaster(scene)
+    up, points = truth.OVERHEAD, np.array([[0.5, 0.0, -3.0], [0.2, 0.0, -3.0], [2.0, 0.0, -3.0], [2.0, 0.0, -3.0]])
+    normals = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, -1]], float)
+    seen = caster.sun_seen(points, normals, up, truth.SOLAR_RADIUS, 32)
+    np.testing.assert_allclose(seen, [0.5, 0.0, 1.0, 0.0], atol=0.01)

@@ -1,19 +1,29 @@
 """What the renderer is checked against in closed form, as numbers: `test_truth.py` bounds them, and
 
-python tests/scenes/truth.py        prints them (the figures of docs/truth.md; a minute on two cores)
+python tests/scenes/truth.py                                    prints them (a minute on two cores)
+python tests/scenes/truth.py --labels boxsat FILE.glb           labels of scenes and mesh files, against `raycast.py`
+python tests/scenes/truth.py --penumbrae boxsat telescope       visibility of the solar disc, against the same
+python tests/scenes/truth.py --whole boxsat                     whole renders, `whole.py`
+
+These are the figures of docs/truth.md.
 """
 
+import argparse
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
+import raycast
 import trimesh
+import whole
 
 from spacesim.data.geometry import direction_from_angles, look_at
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes import Part, Renderer, Scene, SceneObject, Spacecraft
 from spacesim.scenes.earth import EARTH_RADIUS_KM, EarthConfig
 from spacesim.scenes.materials import lambertian
+from spacesim.scenes.scenefile import BUILT_IN_SCENES
 from spacesim.scenes.sun import SOLAR_IRRADIANCE, SunConfig
 
 SOLAR_RADIUS = math.asin(695_700.0 / 149_597_870.7)  # radians
@@ -139,7 +149,56 @@ def earth_error(phase_deg: float = 0.0, altitude_km: float = 500.0) -> float:
     return float(truth.radiance_earth.mean() / (0.5 * irradiance / np.pi) - 1)
 
 
+def labels(sources: list[str], units: str, views: int = 4) -> None:
+    """Labels of scenes and mesh files against the other ray caster."""
+    for source in sources:
+        options = {} if source in BUILT_IN_SCENES or source.endswith(".toml") else {"units": units}
+        found = raycast.labels_agree(source, views=views, **options)
+        same = 1 - (found.edge + found.lifted + sum(found.wrong.values())) / found.surface
+        print(
+            f"{Path(source).name:20} {found.surface:7,} pixels of surface, {100 * same:.3f} % the same, on edges "
+            f"{found.edge}, by the height of shadow rays {found.lifted}, wrong {dict(found.wrong) or 'none'}; "
+            f"points off their plane by {found.off_plane:.1e} of the distance",
+            flush=True,
+        )
+
+
+def penumbrae(sources: list[str]) -> None:
+    """The fraction of the solar disc that points beside cast shadows see, against the other ray caster."""
+    for source in sources:
+        found = raycast.penumbra(source, count=1000)
+        part = found.error[(found.expected > 0) & (found.expected < 1)]
+        over = (found.error > 0.02).sum()
+        print(f"{source:20} {len(found.error)} points beside shadows, {len(part)} in penumbrae", end=", ")
+        print(f"there {part.mean():.4f} off; {over} beyond 0.02, worst {found.error.max():.3f}", flush=True)
+
+
+def wholes(sources: list[str]) -> None:
+    """Whole renders: RGB against spectral, both sources against each alone."""
+    for source in sources:
+        for part, difference in whole.rgb_against_spectral(source).items():
+            print(f"{source:20} {part:40} RGB against spectral {100 * difference:.2f} %", flush=True)
+        difference, error, share = whole.sources_apart(source)
+        worst, noise = 100 * np.abs(difference).max(), np.abs(difference / error).max()
+        print(f"{source:20} Sun and Earth against both: {worst:.2f} % at most, {noise:.1f} standard errors", end=", ")
+        print(f"the Earth's share {100 * share.min():.0f} to {100 * share.max():.0f} %", flush=True)
+
+
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--labels", nargs="+", metavar="SCENE", help="built-in scenes, scene files or mesh files")
+    parser.add_argument("--units", default="m", help="of mesh files")
+    parser.add_argument("--penumbrae", nargs="+", metavar="SCENE", help="visibility beside shadows of built-in scenes")
+    parser.add_argument("--whole", nargs="+", metavar="SCENE", help="sources apart, RGB against spectral rendering")
+    options = parser.parse_args()
+    if not (options.labels or options.penumbrae or options.whole):
+        closed_forms()
+    labels(options.labels or [], options.units)
+    penumbrae(options.penumbrae or [])
+    wholes(options.whole or [])
+
+
+def closed_forms() -> None:
     rows: list[tuple[str, Callable[[], float], str]] = [
         ("plate that faces the Sun, radiance", plate_error, "%"),
         ("plate at 30 degrees", lambda: plate_error(30.0), "%"),
