@@ -1,7 +1,8 @@
 """Stage 2: which splats each screen tile blends, front to back.
 
 Splats are sorted by depth once, expanded to (tile, splat) pairs, and the pairs are sorted by tile; both sorts are
-stable, so each tile's list is in depth order, ties in index order: the result does not depend on scheduling.
+stable, so each tile's list is in depth order, ties in index order: the result does not depend on scheduling. Pairs come
+from the box around a splat's ellipse; those whose tile the ellipse misses are sorted behind all tiles.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import drjit as dr
 
 from spacesim.backend import ad, select
 from spacesim.data.errors import WorkError
-from spacesim.splat.project import Footprints, Splats
+from spacesim.splat.project import ALPHA_MIN, Footprints, Splats
 
 _LARGEST_PAIRS = 2**31 - 1
 
@@ -33,7 +34,7 @@ class TileShape:
 def tile_shape() -> TileShape:
     """The fastest shape measured for the backend (docs/performance.md). One tile is one warp on CUDA, one
     AVX-512 packet on LLVM: a tile's gradients meet in a single reduction, whose order is fixed."""
-    return TileShape(16, 8, 32) if select() == "cuda" else TileShape(16, 8, 16)
+    return TileShape(8, 8, 32) if select() == "cuda" else TileShape(16, 8, 16)
 
 
 @dataclass
@@ -94,16 +95,54 @@ def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) 
     within = slot - dr.gather(ad.UInt32, sorted_first, rank)
     left = dr.gather(ad.UInt32, x0, splat)
     columns = dr.maximum(dr.gather(ad.UInt32, x1, splat) - left, 1)
-    tile = (dr.gather(ad.UInt32, y0, splat) + within // columns) * tiles_x + left + within % columns
-    dr.eval(tile, splat)
-
-    slot = dr.argsort(tile)
+    column, row = left + within % columns, dr.gather(ad.UInt32, y0, splat) + within // columns
+    touched = _touches(splats, splat, column, row, shape)
+    tile = dr.select(touched, row * tiles_x + column, tiles_x * tiles_y)
+    slot = _stable_order(tile, (tiles_x * tiles_y).bit_length())
     tile = dr.gather(ad.UInt32, tile, slot)
     splat = dr.gather(ad.UInt32, splat, slot)
     dr.eval(tile, splat)
     start, end = _runs(tile, pairs, tiles_x * tiles_y)
     dr.eval(splat, slot, start, end, first_slot)
     return TileLists(splat, slot, start, end, first_slot, count, pairs, tiles_x, tiles_y, shape)
+
+
+def _touches(splats: Splats, splat: Any, column: Any, row: Any, shape: TileShape) -> Any:
+    """Does the ellipse {alpha >= ALPHA_MIN} of a splat reach a pixel centre's rectangle of a tile? [P] each.
+
+    Outside its centre a convex quadratic is least, over a rectangle, on an edge that faces the centre.
+    """
+    x, y, a, b, c, opacity = (
+        dr.gather(ad.Float, dr.detach(v), splat)
+        for v in (splats.x, splats.y, splats.a, splats.b, splats.c, splats.opacity)
+    )
+    left, top = ad.Float(column * shape.width) + 0.5 - x, ad.Float(row * shape.height) + 0.5 - y
+    right, bottom = left + (shape.width - 1), top + (shape.height - 1)
+    near_x, near_y = dr.clip(0, left, right), dr.clip(0, top, bottom)
+    on_column = dr.clip(-b * near_x * dr.rcp(c), top, bottom)  # least along the facing vertical edge
+    on_row = dr.clip(-b * near_y * dr.rcp(a), left, right)
+
+    def form(dx: Any, dy: Any) -> Any:
+        return a * dx * dx + 2 * b * dx * dy + c * dy * dy
+
+    least = dr.minimum(form(near_x, on_column), form(on_row, near_y))
+    return least <= 2 * dr.log(dr.maximum(opacity / ALPHA_MIN, 1)) * (1 + 1e-4) + 1e-4
+
+
+def _stable_order(keys: Any, bits: int) -> Any:
+    """Indices that sort `keys` [N] of so many bits: a radix sort that knows how few digits there are, where dr.argsort
+    goes through all 32 bits."""
+    digit_bits = 8 if select() == "cuda" else 11
+    passes = -(-bits // digit_bits)
+    digit_bits = -(-bits // passes)
+    order = dr.arange(ad.UInt32, dr.width(keys))
+    for i in range(passes):
+        digit = (keys >> (i * digit_bits)) & ((1 << digit_bits) - 1)
+        dr.eval(digit, keys, order)
+        moved = dr.detail.block_mkperm(dr.detach(digit), dr.width(keys), 1 << digit_bits)
+        order = dr.gather(ad.UInt32, order, moved)
+        keys = dr.gather(ad.UInt32, keys, moved)
+    return order
 
 
 def _tile_range(center: Any, half: Any, size: int, tiles: int) -> tuple[Any, Any]:
@@ -114,12 +153,14 @@ def _tile_range(center: Any, half: Any, size: int, tiles: int) -> tuple[Any, Any
 
 
 def _runs(tile: Any, pairs: int, tiles: int) -> tuple[Any, Any]:
-    """First and one-past-last position of each tile's run in the sorted array `tile` [P]; 0, 0 where it has none."""
+    """First and one-past-last position of each tile's run in the sorted array `tile` [P]; 0, 0 where it has none.
+    Entries of `tiles` and above are in no tile."""
     position = dr.arange(ad.UInt32, pairs)
     previous = dr.gather(ad.UInt32, tile, dr.select(position > 0, position - 1, 0))
     final = dr.opaque(ad.UInt32, pairs - 1)  # a literal would be another kernel every time
     following = dr.gather(ad.UInt32, tile, dr.minimum(position + 1, final))
     start, end = dr.zeros(ad.UInt32, tiles), dr.zeros(ad.UInt32, tiles)
-    dr.scatter(start, position, tile, active=(position == 0) | (previous != tile))
-    dr.scatter(end, position + 1, tile, active=(position == final) | (following != tile))
+    listed = tile < tiles
+    dr.scatter(start, position, tile, active=listed & ((position == 0) | (previous != tile)))
+    dr.scatter(end, position + 1, tile, active=listed & ((position == final) | (following != tile)))
     return start, end
