@@ -594,14 +594,12 @@ def test_resuming_on_other_data_is_refused(tiny_data, tmp_path):
 
 
 def test_more_than_fits_into_memory(spacesim, tiny_data, tmp_path):
-    for arguments in (
-        ("generate", "boxsat", "--out", tmp_path / "data", "--resolution", 8, "--views", 10**17),
-        ("train", tiny_data, "--out", tmp_path / "run", "--init", "random", "--init-count", 10**15),
-    ):
-        failed = spacesim(*arguments)
-        assert failed.code == 1
-        assert len(failed.errors) == 1
-        assert "memory" in failed.errors[0]
+    many = ("--resolution", 8, "--views", 10**17)
+    assert spacesim("generate", "boxsat", "--out", tmp_path / "data", *many).is_refusal("views: expected at most")
+    failed = spacesim("train", tiny_data, "--out", tmp_path / "run", "--init", "random", "--init-count", 10**15)
+    assert failed.code == 1
+    assert len(failed.errors) == 1
+    assert "memory" in failed.errors[0]
 
 
 def test_a_model_that_is_not_finite_is_refused(spacesim, tiny_run, tmp_path):
