@@ -77,15 +77,16 @@ class Labeller:
 
     def _refine(self, points: "_Points", sun: Sun, labels: Mapping[str, np.ndarray]) -> None:
         """Settle penumbrae in the labels sun_visibility and shadow."""
-        visibility, shadow, facing = labels["sun_visibility"], labels["shadow"], labels["sun_cosine"] > 0
-        mixed = (visibility > 0) & (visibility < 1)
-        settled = np.zeros_like(facing)
-        disc = self._directions.many(sun) if mixed.any() else None
-        while disc is not None and mixed.any():
-            todo = _grown(mixed) & facing & ~settled
-            visibility[todo], shadow[todo] = self._ask(disc, points, np.flatnonzero(todo))
-            settled |= todo
-            mixed = todo & (visibility > 0) & (visibility < 1)
+        visibility, shadow, cosine = (labels[name].reshape(-1) for name in ("sun_visibility", "shadow", "sun_cosine"))
+        mixed = np.flatnonzero((visibility > 0) & (visibility < 1))
+        disc = self._directions.many(sun) if len(mixed) else None
+        settled = np.zeros(len(cosine), bool)
+        while disc is not None and len(mixed):
+            todo = _grown(mixed, labels["shadow"].shape)
+            todo = todo[(cosine[todo] > 0) & ~settled[todo]]
+            visibility[todo], shadow[todo] = self._ask(disc, points, todo)
+            settled[todo] = True
+            mixed = todo[(visibility[todo] > 0) & (visibility[todo] < 1)]
 
     def _ask(self, disc: Disc, points: "_Points", lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(visibility, shadow classes), [N], of the points `lanes` [N]."""
@@ -119,24 +120,22 @@ class Labeller:
 def _seen(scene: Any, parts: "PartTable", disc: Disc, points: "_Points", active: Any) -> tuple[Any, Any]:
     """(visibility, shadow classes), [N], of points; 0 and a cast shadow where not `active`."""
     mi = backend.mitsuba()
-    visibility, shape, hidden = disc.seen(scene, points.origin, points.normal, active)
+    free, hidden, shape = disc.seen(scene, points.origin, points.normal, active)
     blocker, _ = parts.ids(shape, hidden)
-    order = disc.count - dr.arange(mi.UInt32, dr.width(shape)) % disc.count  # the first that is hidden says by what
-    first = dr.block_reduce(dr.ReduceOp.Max, dr.select(hidden, (order << 8) | blocker, 0), disc.count, "evaluated")
-    blocker = first & 255
+    order = disc.count - dr.arange(mi.UInt32, dr.width(free)) % disc.count  # the first that is hidden says by what
+    share, by = dr.select(free, mi.Float(1.0), 0.0), dr.select(hidden, (order << 8) | blocker, 0)
+    dr.eval(share, by)  # one kernel
+    visibility = dr.block_sum(share, disc.count, mode="evaluated") / disc.count
+    blocker = dr.block_reduce(dr.ReduceOp.Max, by, disc.count, mode="evaluated") & 255
     cast = SHADOW_SELF_CAST + dr.select((blocker == 0) | (blocker == points.object_id), 0, blocker)
     return visibility, dr.select(visibility < 0.5, cast, SHADOW_LIT)
 
 
-def _grown(mask: np.ndarray) -> np.ndarray:
-    """`mask` [H, W] and the eight pixels next to each of its own."""
-    for axis in (0, 1):
-        near, far = (np.swapaxes(mask, 0, axis)[cut] for cut in (np.s_[:-1], np.s_[1:]))
-        mask = mask.copy()
-        turned = np.swapaxes(mask, 0, axis)
-        turned[1:] |= near
-        turned[:-1] |= far
-    return mask
+def _grown(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Indices [M] of `pixels` [N] of an image (row by row) and of the eight next to each."""
+    row, column = (pixels[:, None] // shape[1], pixels[:, None] % shape[1])
+    down, right = (step.ravel() - 1 for step in np.indices((3, 3)))
+    return np.unique(np.clip(row + down, 0, shape[0] - 1) * shape[1] + np.clip(column + right, 0, shape[1] - 1))
 
 
 @dataclass(frozen=True)
@@ -210,6 +209,5 @@ def _images(numbers: Any, ids: Any, camera: Camera) -> dict[str, np.ndarray]:
         name: plane.reshape(shape if len(plane) == 1 else (*shape, 3))
         for name, plane in zip(names, planes, strict=True)
     }
-    packed = ids.numpy().reshape(shape)
-    ids_of = {"object_id": packed, "part_id": packed >> 8, "shadow": packed >> 16}
-    return {**labels, **{name: values.astype(np.uint8) for name, values in ids_of.items()}}
+    packed = ids.numpy().view(np.uint8).reshape(*shape, 4)
+    return {**labels, **{name: packed[..., i].copy() for i, name in enumerate(("object_id", "part_id", "shadow"))}}

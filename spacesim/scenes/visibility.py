@@ -33,8 +33,8 @@ class Disc:
     def seen(self, scene: Any, origin: Any, normal: Any, active: Any) -> tuple[Any, Any, Any]:
         """From points [3, N] with their `normal` on the lit side; `active` says which of them are asked.
 
-        Returns the fraction of the directions that is free, [N]; for each point and direction, [N count], the shape
-        pointer of what hides it; and where there is something.
+        Returns for each point and direction, [N count], neighbouring lanes taking the same point: whether the Sun is
+        seen there, whether a shape hides it, and the pointer of that shape.
         """
         mi = backend.mitsuba()
         lane = dr.arange(mi.UInt32, self.count * dr.width(active))
@@ -46,8 +46,7 @@ class Disc:
         free = asked & ~hit.is_valid() & (dr.dot(axis, direction) > 0)
         if self.limb is not None:
             free &= ~self.limb.hides(direction)
-        fraction = dr.block_sum(dr.select(free, mi.Float(1.0), 0.0), self.count, mode="evaluated") / self.count
-        return fraction, hit.shape, asked & hit.is_valid()
+        return free, asked & hit.is_valid(), hit.shape
 
 
 class SolarDirections:
