@@ -324,14 +324,9 @@ def _data_of(config: dict[str, Any]) -> Path:
 
 
 def _verify(options: argparse.Namespace) -> None:
-    from spacesim.data.integrity import faulty_pictures
-    from spacesim.data.store import read_dataset, verify_dataset
+    from spacesim.data.verify import verify
 
-    try:
-        dataset = read_dataset(options.data)
-    except InputError as error:
-        raise InputError(f"{error}{_way_out(options.data, error)}") from None
-    problems = verify_dataset(options.data) + faulty_pictures(dataset, _raw_suffixes(dataset.scene))
+    dataset, problems = verify(options.data)
     for problem in problems:
         print(problem, file=sys.stderr)
     if problems:
@@ -339,24 +334,6 @@ def _verify(options: argparse.Namespace) -> None:
             f"{options.data}: {len(problems)} faulty files; delete them, generate --resume makes them again"
         )
     ending.say(f"{options.data}: {len(dataset.frames)} frames, every file is there and whole")
-
-
-def _raw_suffixes(scene: Any) -> tuple[str, ...]:
-    """Of the names of a sensor's pictures, by scene.json; () where it knows of no sensor."""
-    from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME
-
-    try:
-        return RAW_MONOCHROME if scene["config"]["camera"]["sensor"]["monochrome"] else RAW_COLOR
-    except (KeyError, TypeError):
-        return ()
-
-
-def _way_out(root: Path, error: InputError) -> str:
-    """What to do about a broken scene.json or transforms.json of a dataset that `generate` has made."""
-    broken = (path for path in (root / "scene.json", root / "transforms.json") if str(path) in str(error))
-    if (root / "scene.json").is_file() and any(path.is_file() for path in broken):
-        return "; delete it, generate of the same scene with --resume makes it again"
-    return ""
 
 
 def _export(options: argparse.Namespace) -> None:

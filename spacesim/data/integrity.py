@@ -6,15 +6,12 @@ power cuts leave behind. A byte that has changed within is found by `spacesim.da
 
 import os
 import struct
-from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
-from spacesim.data.errors import InputError
-from spacesim.data.images import read_png, walk_exr_header
-from spacesim.data.records import Dataset
+from spacesim.data.images import walk_exr_header
 
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _EXR_START = b"\x76\x2f\x31\x01"
@@ -30,20 +27,6 @@ def is_whole(path: Path) -> bool:
             return _png_is_whole(file, size) if Path(path).suffix == ".png" else _exr_is_whole(file, size)
     except OSError:
         return False
-
-
-def faulty_pictures(dataset: Dataset, raw: Sequence[str] = ()) -> list[str]:
-    """Sentences about pictures that transforms.json does not name and that are missing or cannot be decoded: a sensor's
-    in raw/, whose names end in `raw` (see `spacesim.data.store.FrameWriter`), and the overviews where there are any."""
-    names = [Path(frame.file_path).stem for frame in dataset.frames]
-    paths = [dataset.root / "raw" / f"{name}{suffix}.png" for name in names for suffix in raw]
-    problems = []
-    for path in [*paths, *sorted(dataset.root.glob("*.png"))]:
-        try:
-            read_png(path)
-        except InputError as error:
-            problems.append(str(error))
-    return problems
 
 
 def _png_is_whole(file: BinaryIO, size: int) -> bool:

@@ -1,0 +1,51 @@
+"""Every file of a dataset, decoded: what `spacesim verify` looks at."""
+
+from pathlib import Path
+from typing import Any
+
+from spacesim.data.errors import InputError
+from spacesim.data.images import read_png
+from spacesim.data.records import Dataset
+from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, read_dataset, verify_dataset
+
+
+def verify(path: Path) -> tuple[Dataset, list[str]]:
+    """A dataset and sentences about its faulty files, [] where each one is there and whole.
+
+    Raises InputError where it cannot be read at all; where deleting a file is the way out, the sentence says so.
+    """
+    try:
+        dataset = read_dataset(path)
+    except InputError as error:
+        raise InputError(f"{error}{_way_out(Path(path), error)}") from None
+    return dataset, verify_dataset(path) + _faulty_pictures(dataset)
+
+
+def _way_out(root: Path, error: InputError) -> str:
+    """What to do about a broken scene.json or transforms.json of a dataset that `generate` has made."""
+    broken = (path for path in (root / "scene.json", root / "transforms.json") if str(path) in str(error))
+    if (root / "scene.json").is_file() and any(path.is_file() for path in broken):
+        return "; delete it, generate of the same scene with --resume makes it again"
+    return ""
+
+
+def _faulty_pictures(dataset: Dataset) -> list[str]:
+    """Sentences about pictures that transforms.json does not name and that are missing or cannot be decoded: a sensor's
+    in raw/, and the overviews where there are any."""
+    names = [Path(frame.file_path).stem for frame in dataset.frames]
+    raw = [dataset.root / "raw" / f"{name}{suffix}.png" for name in names for suffix in _raw_suffixes(dataset.scene)]
+    problems = []
+    for path in [*raw, *sorted(dataset.root.glob("*.png"))]:
+        try:
+            read_png(path)
+        except InputError as error:
+            problems.append(str(error))
+    return problems
+
+
+def _raw_suffixes(scene: Any) -> tuple[str, ...]:
+    """Of the names of a sensor's pictures, by scene.json; () where it knows of no sensor."""
+    try:
+        return RAW_MONOCHROME if scene["config"]["camera"]["sensor"]["monochrome"] else RAW_COLOR
+    except (KeyError, TypeError):
+        return ()
