@@ -7,7 +7,8 @@ from scipy.ndimage import gaussian_filter1d
 from skimage.metrics import structural_similarity
 
 from spacesim.backend import ad
-from spacesim.splat.train.losses import gaussian_blur, photometric_loss, ssim
+from spacesim.splat.train.losses import photometric_loss
+from spacesim.splat.train.ssim import gaussian_blur, ssim
 
 WIDTH, HEIGHT = 31, 23
 
@@ -42,7 +43,7 @@ def reference_ssim(x: np.ndarray, y: np.ndarray) -> float:
 
 def test_blur_is_a_gaussian_of_eleven_pixels_with_a_black_border():
     values = picture(0)[0]
-    blurred = np.array(gaussian_blur([ad.Float(values.ravel())], WIDTH, HEIGHT)[0]).reshape(HEIGHT, WIDTH)
+    blurred = np.array(gaussian_blur(ad.Float(values.ravel()), WIDTH, HEIGHT)).reshape(HEIGHT, WIDTH)
     expected = values.astype(np.float64)
     for axis in (0, 1):
         expected = gaussian_filter1d(expected, 1.5, axis=axis, mode="constant", radius=5)
