@@ -184,8 +184,14 @@ def _work(connection: Connection) -> None:
             except (EOFError, OSError):
                 os._exit(0)
 
+    def tell(message: Any) -> None:
+        try:
+            connection.send(message)
+        except OSError:  # the parent has gone
+            os._exit(0)
+
     def ask() -> Any:
-        connection.send(None)
+        tell(None)
         return inbox.get()
 
     threading.Thread(target=listen, daemon=True).start()
@@ -200,9 +206,9 @@ def _work(connection: Connection) -> None:
         maker = FrameMaker(job)
         while True:
             for done in maker.make(ask()):
-                connection.send(done)
+                tell(done)
     except Exception as error:
-        connection.send(_told(error))
+        tell(_told(error))
         threading.Event().wait()  # for the parent to close the connection
 
 
