@@ -1,7 +1,7 @@
 """From what a scene file says to the scene that is rendered."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -12,17 +12,27 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, rotation_from_quaternion
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, SceneConfig
 from spacesim.scenes.materials import Material, customised, material
-from spacesim.scenes.meshfile import read_mesh
+from spacesim.scenes.meshfile import both_sided, read_mesh
+from spacesim.scenes.meshpart import is_closed
 from spacesim.scenes.scene import Scene, SceneObject
 from spacesim.scenes.spacecraft import Spacecraft, spacecraft
 from spacesim.scenes.spectra import sun_rgb
+
+SIZES = (1e-6, 1e10)
+"""Metres that the longest side of an object's box may have, chosen."""
+
+FINEST = 1e-5
+"""Least size of an object, over the distance of any object's farthest corner from the world's origin. Chosen: the
+coordinates of meshes are written in single precision, whose steps are 6e-8 of them."""
 
 _log = logging.getLogger(__name__)
 
 
 def build(config: SceneConfig) -> Scene:
-    """The scene of a configuration. Raises InputError where a spacecraft, mesh, part or material cannot be had."""
+    """The scene of a configuration. Raises InputError where a spacecraft, mesh, part or material cannot be had, or an
+    object's size is out of range."""
     objects = tuple(_object(item, config) for item in config.objects)
+    _check_sizes(objects)
     red, green, blue = sun_rgb(config.camera.white_balance, total=1.0).tolist()
     return Scene(config.name, objects, replace(config.sun, color=(red, green, blue)), config.earth)
 
@@ -35,7 +45,8 @@ def _object(item: ObjectConfig, config: SceneConfig) -> SceneObject:
 
 def _from_file(item: ObjectConfig, config: SceneConfig) -> Spacecraft:
     """The object's mesh file, what was dropped or changed in it told in the log."""
-    craft, report = read_mesh((config.folder or Path()) / item.mesh, item.units, item.up)
+    path = (config.folder or Path()) / item.mesh
+    craft, report = read_mesh(path, item.units, item.up, two_sided=item.two_sided, replaced=tuple(item.materials))
     for line in report.lines():
         _log.info("%s", line)
     return craft
@@ -43,9 +54,31 @@ def _from_file(item: ObjectConfig, config: SceneConfig) -> Spacecraft:
 
 def _pose(item: ObjectConfig) -> Array:
     pose = np.eye(4)
-    pose[:3, :3] = item.scale * rotation_from_quaternion(item.rotation_wxyz)
+    turn = np.array(item.rotation_wxyz)
+    pose[:3, :3] = item.scale * rotation_from_quaternion(turn / np.abs(turn).max())  # squares of any length are finite
     pose[:3, 3] = item.position
     return pose
+
+
+def _check_sizes(objects: Sequence[SceneObject]) -> None:
+    """Raises InputError for an object that is smaller or larger than single precision can hold beside the others."""
+    corners = [_corners(one) for one in objects]
+    reach = max(float(np.abs(box).max()) for box in corners)
+    least, most = SIZES
+    for one, box in zip(objects, corners, strict=True):
+        size, name = float(np.ptp(box, axis=0).max()), one.spacecraft.name
+        if not least <= size <= most:
+            raise InputError(f"object {name}: expected a size from {least:g} to {most:g} m, found {size:.3g} m")
+        if size < FINEST * reach:
+            found = f"{size:.3g} m in a scene that reaches {reach:.3g} m from the origin"
+            raise InputError(f"object {name}: expected a size of at least {FINEST:g} of the scene's, found {found}")
+
+
+def _corners(one: SceneObject) -> Array:
+    """[2 P, 3] least and greatest coordinates of its parts, world frame, metres."""
+    turn, place = one.world_from_object[:3, :3], one.world_from_object[:3, 3]
+    boxes = [np.asarray(part.mesh.vertices) @ turn.T for part in one.spacecraft.parts]
+    return np.concatenate([[box.min(axis=0), box.max(axis=0)] for box in boxes]) + place
 
 
 def _with_materials(craft: Spacecraft, item: ObjectConfig, custom: Mapping[str, MaterialConfig]) -> Spacecraft:
@@ -57,7 +90,8 @@ def _with_materials(craft: Spacecraft, item: ObjectConfig, custom: Mapping[str, 
             raise InputError(f"materials: expected a part of {craft.name}, found none that fits {pattern!r}")
         chosen = _material(name, custom)
         for i in fitting:
-            parts[i] = replace(parts[i], material=chosen)
+            wrap = item.two_sided is True and is_closed(parts[i].mesh.faces)
+            parts[i] = replace(parts[i], material=both_sided(chosen) if wrap else chosen)
     return replace(craft, parts=tuple(parts))
 
 

@@ -13,6 +13,12 @@ from spacesim.scenes.sensor import TONES, SensorConfig
 from spacesim.scenes.spectra import WHITE_BALANCES
 from spacesim.scenes.sun import EXPOSURE
 
+SMALLEST_FOV = 1e-3
+"""Degrees, chosen."""
+
+EXPOSURES = (1e-12, 1e12)
+"""Least and greatest exposure, chosen."""
+
 
 @dataclass(frozen=True)
 class CameraConfig:
@@ -35,11 +41,14 @@ class CameraConfig:
     def __post_init__(self) -> None:
         width, height = self.resolution
         expect(min(width, height) >= 8, "resolution", "at least 8 pixels", min(width, height))
-        expect(width * height <= MOST_PIXELS, "resolution", f"at most {MOST_PIXELS} pixels", f"{width}x{height}")
-        expect(0 < self.fov_deg <= 120, "fov_deg", "an angle up to 120 degrees", self.fov_deg)
+        if width * height > MOST_PIXELS:
+            raise InputError(f"resolution: expected at most {MOST_PIXELS:,} pixels, found {width} x {height}")
+        fits = SMALLEST_FOV <= self.fov_deg <= 120
+        expect(fits, "fov_deg", f"an angle from {SMALLEST_FOV:g} to 120 degrees", self.fov_deg)
         expect(len(self.distortion) in (0, 5), "distortion", "k1, k2, p1, p2, k3", list(self.distortion))
         expect(all(map(math.isfinite, self.distortion)), "distortion", "finite numbers", list(self.distortion))
-        expect(0 < self.exposure < math.inf, "exposure", "a number above 0", self.exposure)
+        least, most = EXPOSURES
+        expect(least <= self.exposure <= most, "exposure", f"a number from {least:g} to {most:g}", self.exposure)
         expect(self.tone in TONES, "tone", f"one of {', '.join(TONES)}", self.tone)
         expect(self.white_balance in WHITE_BALANCES, "white_balance", " or ".join(WHITE_BALANCES), self.white_balance)
 

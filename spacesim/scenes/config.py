@@ -1,7 +1,7 @@
 """What a scene file says: spacecraft and poses, materials, sources, rig, camera, quality."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from typing import Any
 from spacesim.data.errors import InputError, expect
 from spacesim.scenes.camera import CameraConfig
 from spacesim.scenes.earth import EarthConfig
-from spacesim.scenes.rig import RIGS, FibonacciRig, RigConfig
+from spacesim.scenes.rig import FibonacciRig, RigConfig, kinds_with, rig_kind
 from spacesim.scenes.sun import SunConfig
 
 Vector = tuple[float, float, float]
@@ -19,14 +19,25 @@ UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "in": 0.0254, "ft": 0.3048
 UP_AXES = ("x", "y", "z")
 """Axes of a mesh file that may become z."""
 
+SCALES = (1e-9, 1e9)
+"""Least and greatest factor on the size of an object, chosen."""
+
+FARTHEST = 1e9
+"""Metres of a position in each coordinate, chosen (the Moon is at 3.8e8)."""
+
+
+MOST_SEED = 2**63 - 1
+"""Largest whole number that every TOML reader knows."""
+
 
 @dataclass(frozen=True)
 class ObjectConfig:
     """An object and its pose. Raises InputError unless it names one of spacecraft and mesh.
 
     spacecraft: a built-in one; mesh: a mesh file, relative to the scene file; name: "" the spacecraft's or the file's;
-    position: metres, world frame; rotation_wxyz: quaternion that turns body axes into world axes, of any length;
-    scale: factor on its size; units, up: of the mesh file, "" the format's own axis (z where it has none);
+    position: metres, world frame; rotation_wxyz: quaternion that turns body axes into world axes, of any length but 0;
+    scale: factor on its size; units, up, two_sided: of the mesh file and only with one, see `read_mesh`; "" and None
+    are the format's own axis (z where it has none) and sides as `read_mesh` finds them;
     materials: a material's name for each part or pattern of parts ("panel_*"), the last that fits counts.
     """
 
@@ -38,17 +49,25 @@ class ObjectConfig:
     scale: float = 1.0
     units: str = "m"
     up: str = ""
+    two_sided: bool | None = None
     materials: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        one = bool(self.spacecraft) != bool(self.mesh)
-        expect(one, "objects", "either spacecraft or mesh", "both" if self.mesh else "neither")
-        expect(all(map(math.isfinite, self.position)), "position", "finite metres", list(self.position))
+        if bool(self.spacecraft) == bool(self.mesh):
+            found = "both" if self.mesh else "neither"
+            raise InputError(f"objects: expected either spacecraft or mesh, found {found}")
+        near = all(abs(x) <= FARTHEST for x in self.position)  # which nan is not
+        expect(near, "position", f"metres from {-FARTHEST:g} to {FARTHEST:g}", list(self.position))
         turns = all(map(math.isfinite, self.rotation_wxyz)) and any(self.rotation_wxyz)
         expect(turns, "rotation_wxyz", "four finite numbers, not all 0", list(self.rotation_wxyz))
-        expect(0 < self.scale < math.inf, "scale", "a factor above 0", self.scale)
+        least, most = SCALES
+        expect(least <= self.scale <= most, "scale", f"a factor from {least:g} to {most:g}", self.scale)
         expect(self.units in UNITS, "units", f"one of {', '.join(UNITS)}", self.units)
         expect(self.up in ("", *UP_AXES), "up", f"one of {', '.join(UP_AXES)}", self.up)
+        for name in ("units", "up", "two_sided"):
+            value = getattr(self, name)
+            if not self.mesh and value != getattr(type(self), name):
+                raise InputError(f"{name}: expected beside a mesh only, found {value!r} beside a spacecraft")
 
 
 @dataclass(frozen=True)
@@ -99,14 +118,14 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         expect(bool(self.name), "name", "a name", self.name)
-        expect(len(self.objects) > 0, "objects", "at least one object", "none")
-        expect(self.seed >= 0, "seed", "at least 0", self.seed)
+        if not self.objects:
+            raise InputError("objects: expected at least one object, found none")
+        expect(0 <= self.seed <= MOST_SEED, "seed", f"0 to {MOST_SEED}", self.seed)
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values, without the folder: a dataset does not depend on where its scene file lay."""
         values = {key: value for key, value in asdict(replace(self, folder=None)).items() if key != "folder"}
-        kind = next(name for name, rig in RIGS.items() if type(self.rig) is rig)
-        return {**values, "rig": {"kind": kind, **values["rig"]}}
+        return {**values, "rig": {"kind": rig_kind(self.rig), **values["rig"]}}
 
 
 def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
@@ -121,7 +140,7 @@ def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
     for name, value in options.items():
         part = next((part for part, known in owners.items() if name in known), None)
         if part is None:
-            raise InputError(f"{name}: expected an option that {scene.name}'s {type(scene.rig).__name__} knows")
+            raise InputError(f"{name}: expected {_options_of(scene, name, owners)}")
         if value is not None:
             changes[part][name] = (value, value) if name == "resolution" and isinstance(value, int) else value
     rig = changes["rig"]
@@ -132,3 +151,12 @@ def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
         rig["sun"] = ()
     parts = {part: replace(getattr(scene, part), **changed) for part, changed in changes.items() if part}
     return replace(scene, **changes[""], **parts)
+
+
+def _options_of(scene: SceneConfig, name: str, owners: Mapping[str, Iterable[str]]) -> str:
+    """What is expected of an option that `scene` does not know: those of its rig, where another kind knows it."""
+    kinds = kinds_with(name)
+    known = owners["rig"] if kinds else set().union(*owners.values())
+    whose = f"{scene.name}, whose rig is of kind {rig_kind(scene.rig)}"
+    others = f" ({' and '.join(kinds)} know{'s' * (len(kinds) == 1)} {name})" if kinds else ""
+    return f"one of the options {', '.join(sorted(known))} of {whose}{others}"

@@ -26,6 +26,11 @@ TABLE = Path(__file__).parents[1] / "assets" / "materials.toml"
 
 SOLAR_CELL = (0.08, 0.04)  #: width and height of a cell of the preset solar-cell, metres: 2 x 4 in its tile
 
+WHITEST = 0.9
+"""Most base colour of a coated surface and of a dielectric, chosen: above it Mitsuba's principled BSDF, which adds its
+gloss to an undiminished diffuse base, can reflect more of an even sky than it gets (index 1.7, GGX alpha 0.1: from
+0.903)."""
+
 SMOOTHEST = 0.05  #: least `roughness` of `principled`, chosen: smoother facets would hardly ever meet the Sun
 
 
@@ -222,27 +227,45 @@ def customised(
 ) -> Material:
     """The preset `base` under another name and with other numbers, those that are not None.
 
-    albedo: linear camera RGB in [0, 1]; roughness: GGX alpha in (0, 1]; ior: refractive index of the coat;
-    tile: metres. Raises InputError for an unknown preset, a number out of range or one that the preset has not.
+    albedo: linear camera RGB in [0, 1], of coated presets at most WHITEST; roughness: GGX alpha from 0.01 to 1; ior:
+    refractive index of the coat; tile: metres. Raises InputError for an unknown preset, a number out of range or one
+    that the preset has not.
     """
+    row = changed(name, base, albedo, roughness, ior, tile)
+    return replace(material(base), name=name) if row is preset(base) else row.material(name)
+
+
+def changed(
+    name: str,
+    base: str,
+    albedo: Color | None = None,
+    roughness: float | None = None,
+    ior: float | None = None,
+    tile: float | None = None,
+) -> Preset:
+    """The row `base` with other numbers, as `customised` takes them, for a material called `name`; itself where all are
+    None. Raises InputError as `customised` does."""
     row = preset(base)
     changes: dict[str, Any] = {}
     if albedo is not None:
         _check_unit(f"material {name}: albedo", albedo)
+        if row.kind == "coated" and max(albedo) > WHITEST:
+            why = f"for {base}, whose coat adds its gloss"
+            raise InputError(f"material {name}: albedo: expected at most {WHITEST:g} {why}, found {max(albedo):g}")
         changes.update(albedo=_color(albedo), spectrum=())
-    limits = {"roughness": (roughness, 0.01, 1.0), "ior": (ior, 1.0, 4.0), "tile": (tile, 0.0, 1e6)}
+    limits = {"roughness": (roughness, 0.01, 1.0), "ior": (ior, 1.001, 4.0), "tile": (tile, 1e-6, 1e6)}
     for key, (value, low, high) in limits.items():
         if value is None:
             continue
         if getattr(row, key) is None:
-            raise InputError(f"material {name}: expected no {key}, which {base} does not have, found {value}")
-        if not low < value <= high:
-            raise InputError(f"material {name}: {key}: expected a number above {low} up to {high}, found {value}")
+            raise InputError(f"material {name}: {key}: expected none, as {base} has none, found {value}")
+        if not low <= value <= high:
+            raise InputError(f"material {name}: {key}: expected a number from {low:g} to {high:g}, found {value}")
         changes[key] = float(value)
     if not changes:
-        return replace(material(base), name=name)
+        return row
     source = f"{base} with {', '.join(key for key in changes if key != 'spectrum')} of the scene file; {row.source}"
-    return replace(row, source=source, **changes).material(name)
+    return replace(row, source=source, **changes)
 
 
 def _check_unit(what: str, values: Any) -> None:

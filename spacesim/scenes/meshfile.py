@@ -1,8 +1,9 @@
 """Any mesh file as a spacecraft: glb, gltf, obj, stl, ply and off, with a report of what was left out or changed."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,7 @@ def read_mesh(
     up: str | None = None,
     scale: float = 1.0,
     two_sided: bool | None = None,
+    replaced: Sequence[str] = (),
 ) -> tuple[Spacecraft, MeshReport]:
     """The parts of a mesh file in metres, z up, and a report.
 
@@ -77,6 +79,8 @@ def read_mesh(
     their standard says, else z), (x, y, z) becomes (-z, y, x) or (x, -z, y); scale: a factor on top.
     two_sided: closed parts show their outside alone and open ones both sides; True shows both sides of all, False also
     makes the winding of open parts consistent.
+    replaced: patterns of the parts ("panel_*") whose materials the caller replaces: here they get UNTOLD, and the
+    report does not speak of the materials that they would have had.
     Raises InputError, one sentence, for whatever is wrong with the file or an option.
     """
     path = Path(path)
@@ -91,7 +95,10 @@ def read_mesh(
             raw = reader(path, notes)
             raw = [_turned(part, factor, _TURNS[axis]) for part in raw]
             parts = _sound_parts(path, raw, notes, two_sided)
-            return _spacecraft(path, parts, notes, two_sided is True)
+            keep = [None if _is_replaced(part, replaced) else part.surface for part in parts]
+            if any(part.surface is None and not _is_replaced(part, replaced) for part in parts):
+                notes.change(f"parts without a material get the preset {UNTOLD}")
+            return _spacecraft(path, parts, keep, notes, two_sided is True)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except MemoryError:
@@ -189,18 +196,23 @@ def _free_name(name: str, taken: set[str]) -> str:
     return free
 
 
-def _spacecraft(path: Path, raw: list[RawPart], notes: Notes, both_sides: bool) -> tuple[Spacecraft, MeshReport]:
+def _is_replaced(part: RawPart, patterns: Sequence[str]) -> bool:
+    return any(fnmatchcase(part.name, pattern) for pattern in patterns)
+
+
+def _spacecraft(
+    path: Path, raw: list[RawPart], surfaces: list[Surface | None], notes: Notes, both_sides: bool
+) -> tuple[Spacecraft, MeshReport]:
+    """The parts `raw` with the materials of `surfaces`, one each, None UNTOLD."""
     name = plain_name(path.stem) or "mesh"
-    if any(part.surface is None for part in raw):
-        notes.change(f"parts without a material get the preset {UNTOLD}")
     made: dict[tuple[int, bool], Material] = {}
-    keep: list[Surface | None] = [part.surface for part in raw]  # ids stay those of living objects
     parts = []
-    for part, surface in zip(raw, keep, strict=True):
+    for part, surface in zip(raw, surfaces, strict=True):
         wrap = both_sides and is_closed(part.faces)
         key = (id(surface), wrap)
         if key not in made:
-            made[key] = _two_sided(material_of(surface, name, path.name, notes), wrap)
+            found = material_of(surface, name, path.name, notes)
+            made[key] = both_sided(found) if wrap else found
         normals = None if part.normals is None else part.normals.reshape(-1, 3)
         parts.append(Part(part.name, _trimesh(part), made[key], normals=normals))
     vertices = np.concatenate([part.vertices for part in raw])
@@ -212,15 +224,16 @@ def _spacecraft(path: Path, raw: list[RawPart], notes: Notes, both_sides: bool) 
         watertight=is_closed(corner_ids(whole.vertices)[whole.faces]),
         bounds=np.stack([vertices.min(axis=0), vertices.max(axis=0)]),
         materials=tuple(dict.fromkeys(part.material.name for part in parts)),
-        textures=len({id(picture) for surface in keep if surface for picture in surface.pictures.values()}),
+        textures=len({id(picture) for surface in surfaces if surface for picture in surface.pictures.values()}),
         dropped=notes.sentences("dropped"),
         changed=notes.sentences("changed"),
     )
     return Spacecraft(name, tuple(parts)), report
 
 
-def _two_sided(material: Material, wrap: bool) -> Material:
-    if not wrap:
+def both_sided(material: Material) -> Material:
+    """`material` that is the same from behind."""
+    if material.bsdf["type"] == "twosided":
         return material
     return replace(material, name=f"{material.name}/two-sided", bsdf={"type": "twosided", "bsdf": dict(material.bsdf)})
 

@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from spacesim.scenes.meshtexture import Notes, Surface
 
 FARTHEST = 1e9  #: metres; vertices beyond it are taken for damage, chosen (the Moon is at 3.8e8)
+ABSENT = "faces that name vertices which are not there are dropped"
 FLAT = math.radians(0.5)  #: normals of vertices this near to their faces' are theirs, chosen
 MOST_ANGLES = 20_000_000  #: solid angles worth computing to tell cavities from inverted surfaces, chosen
 
@@ -81,7 +82,7 @@ def _without_broken_faces(part: RawPart, notes: Notes) -> RawPart:
     faces = part.faces
     known = ((faces >= 0) & (faces < len(part.vertices))).all(axis=1)
     if not known.all():
-        notes.drop("faces that name vertices which are not there are dropped", f"{(~known).sum():,} of {part.name}")
+        notes.drop(ABSENT, f"{(~known).sum():,} of {part.name}")
         part = part.with_faces(np.flatnonzero(known))
     with np.errstate(invalid="ignore"):
         fine = (np.abs(part.vertices) <= FARTHEST).all(axis=1)

@@ -13,7 +13,7 @@ import trimesh
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb
 from spacesim.scenes.materials import Color
-from spacesim.scenes.meshpart import RawPart
+from spacesim.scenes.meshpart import ABSENT, RawPart
 from spacesim.scenes.meshtexture import NORMALS, Folder, Notes, Surface, check_picture, decoded, unit
 
 _UNUSED = ("ke", "map_ke", "map_ks", "map_ka", "map_bump", "bump", "map_d", "disp", "norm", "map_ns", "refl")
@@ -27,12 +27,15 @@ def read_table(path: Path, notes: Notes) -> list[RawPart]:
     smooth = (kind == "obj" and b"\nvn " in data) or (kind == "ply" and b" nx" in data[: data.find(b"end_header")])
     if not data.isascii():
         data = _as_utf8(kind, data)
-    if kind == "obj":
-        data = _with_positive_indices(data)
+    if kind == "obj" and _ODD_INDEX.search(data):
+        data = _with_plain_indices(data, path.stem, notes)
     resolver = _Files(path, notes)
-    options = {"split_objects": True} if kind == "obj" else {}
-    # `load` with force="scene": its successor load_scene is not in trimesh 4.5
-    scene = trimesh.load(io.BytesIO(data), kind, resolver=resolver, force="scene", process=False, **options)
+    try:
+        scene = _loaded(data, kind, resolver)
+    except IndexError:
+        if kind != "obj":
+            raise
+        scene = _loaded(_with_plain_indices(data, path.stem, notes), kind, resolver)
     parts = []
     for name, mesh in scene.geometry.items():
         if not isinstance(mesh, trimesh.Trimesh):
@@ -47,6 +50,12 @@ def read_table(path: Path, notes: Notes) -> list[RawPart]:
             normals = _normals(mesh, notes) if smooth else None
             parts.append(RawPart(own, np.array(mesh.vertices), np.array(mesh.faces), uv, surface, normals))
     return parts
+
+
+def _loaded(data: bytes, kind: str, resolver: "_Files") -> trimesh.Scene:
+    options = {"split_objects": True} if kind == "obj" else {}
+    # `load` with force="scene": its successor load_scene is not in trimesh 4.5
+    return trimesh.load(io.BytesIO(data), kind, resolver=resolver, force="scene", process=False, **options)
 
 
 class _Files(trimesh.resolvers.Resolver):
@@ -116,29 +125,50 @@ def _as_utf8(kind: str, data: bytes) -> bytes:
         return data.decode("latin-1").encode("utf-8")
 
 
-def _with_positive_indices(data: bytes) -> bytes:
-    """An obj file whose negative indices, which count from the last vertex so far, are turned into plain ones."""
-    if not re.search(rb"^f[^\n]*[ /\t]-\d", data, re.MULTILINE):
-        return data
+_ODD_INDEX = re.compile(rb"^[ \t]*f[^\n]*[ /\t](?:-\d|0+(?:[ /\t\r\n]|\Z))", re.MULTILINE)
+"""A face of an obj file with a negative index or with 0, which counts nothing."""
+
+
+def _with_plain_indices(data: bytes, name: str, notes: Notes) -> bytes:
+    """An obj file whose negative indices, which count from the last vertex so far, are turned into plain ones, without
+    the faces whose vertices are not there (`name` stands in their note); where texture coordinates or normals are not
+    there, the face has none."""
     counts = {b"v": 0, b"vt": 0, b"vn": 0}
     lines = data.replace(b"\\\n", b" ").splitlines()
+    faces: dict[int, list[list[int | None]]] = {}  # corners by line
     for i, line in enumerate(lines):
-        words = line.split()
-        if not words:
-            continue
-        if words[0] in counts:
+        words = line.split(b"#", 1)[0].split()
+        if words and words[0] in counts:
             counts[words[0]] += 1
-        elif words[0] == b"f":
-            totals = (counts[b"v"], counts[b"vt"], counts[b"vn"])
-            corners = [_positive(word, totals) for word in words[1:] if not word.startswith(b"#")]
-            lines[i] = b"f " + b" ".join(corners)
+        elif words and words[0] == b"f":
+            faces[i] = [_plain(corner, tuple(counts.values())) for corner in words[1:]]
+    totals = tuple(counts.values())
+    missing = 0
+    for i, corners in faces.items():
+        columns = list(zip(*corners, strict=False))  # of vertices, texture coordinates, normals
+        there = [
+            all(index is not None and 1 <= index <= total for index in column)
+            for column, total in zip(columns, totals, strict=False)
+        ]
+        texts = (
+            b"/".join(b"%d" % index if known and index else b"" for index, known in zip(corner, there, strict=False))
+            for corner in corners
+        )
+        kept = any(there[:1])
+        missing += not kept
+        lines[i] = b"f " + b" ".join(text.rstrip(b"/") for text in texts) if kept else b""
+    if missing:
+        notes.drop(ABSENT, f"{missing:,} of {name}")
     return b"\n".join(lines) + b"\n"
 
 
-def _positive(corner: bytes, totals: tuple[int, int, int]) -> bytes:
-    indices = [(int(text), total) if text else (0, 0) for text, total in zip(corner.split(b"/"), totals, strict=False)]
-    plain = [index if index >= 0 else total + 1 + index for index, total in indices]
-    return b"/".join(str(index).encode() if index else b"" for index in plain)
+def _plain(corner: bytes, counts: tuple[int, ...]) -> list[int | None]:
+    """Indices of the vertex, the texture coordinate and the normal in "1/-2/3", counted from 1; None where left out."""
+    indices = [int(text) if text else None for text in corner.split(b"/")]
+    return [
+        index if index is None or index >= 0 else count + 1 + index
+        for index, count in zip(indices, counts, strict=False)
+    ]
 
 
 def _uv(mesh: trimesh.Trimesh) -> np.ndarray | None:

@@ -17,14 +17,11 @@ from PIL import Image
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
-from spacesim.scenes.materials import SMOOTHEST, Color, Material, lambertian, material, principled
+from spacesim.scenes.materials import SMOOTHEST, WHITEST, Color, Material, lambertian, material, principled
 
 LARGEST_FILE = 2 << 30  #: bytes of a file that is read, chosen
 LARGEST_PICTURE = 1 << 26  #: pixels of a texture that is read (8192 x 8192), chosen
 WIDEST_PICTURE = 4096  #: pixels; wider or higher textures are reduced to it, chosen
-WHITEST = 0.9
-"""Most base colour of a dielectric, chosen: above it Mitsuba's principled BSDF, which adds its gloss to an
-undiminished diffuse base, reflects more of an even sky than it gets."""
 
 NORMALS = "normals of vertices are not used, facets are flat"
 

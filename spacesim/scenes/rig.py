@@ -3,12 +3,12 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from spacesim.data.errors import expect
+from spacesim.data.errors import InputError, expect
 from spacesim.data.geometry import Array, fibonacci_sphere, look_at, rotation_from_quaternion
 from spacesim.data.records import Camera, Sun
 from spacesim.scenes.camera import CameraConfig
@@ -34,6 +34,9 @@ APPROACHES = {
     "-r-bar": ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
 }
 """Where the camera comes from, and what is up in its image, world frame (see orbit.py for V-bar and R-bar)."""
+
+NEAREST, FARTHEST = 1e-9, 1e12
+"""Metres of distances, chosen."""
 
 MOST_FRAMES = 10_000_000
 """Of a dataset, chosen: the plan of all frames is held in memory."""
@@ -176,9 +179,9 @@ class RandomRig(RigConfig):
         if self.near is not None and self.far is not None:
             expect(self.near <= self.far, "far", f"at least near, {self.near:g} m", self.far)
         expect(not (self.random_suns and self.sun), "random_suns", "false where sun names the Suns", True)
-        one = self.suns == 1 and self.test_suns == 0
-        many = f"{self.suns} suns, {self.test_suns} test_suns"
-        expect(one or not self.random_suns, "random_suns", "suns 1 and test_suns 0, as every frame has its own", many)
+        if self.random_suns and (self.suns, self.test_suns) != (1, 0):
+            found = f"{self.suns} suns and {self.test_suns} test_suns"
+            raise InputError(f"random_suns: expected 1 suns and 0 test_suns, as every frame has its own, found {found}")
 
     def views_of(self, target: Target, camera: CameraConfig, seed: int) -> Views:
         near = self.near or min(fitting_distance(target.radius, camera), self.far or math.inf)
@@ -233,7 +236,7 @@ class ApproachRig(RigConfig):
         super().__post_init__()
         expect(self.axis in APPROACHES, "axis", f"one of {', '.join(APPROACHES)}", self.axis)
         _expect_metres(start=self.start, end=self.end)
-        expect(0 <= self.jitter < math.inf, "jitter", "metres of at least 0", self.jitter)
+        _expect_metres(0, jitter=self.jitter)
         if self.start is not None and self.end is not None:
             expect(self.end < self.start, "end", f"less than start, {self.start:g} m", self.end)
 
@@ -277,7 +280,7 @@ class FlyAroundRig(RigConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _expect_metres(size=self.size)
-        expect(0 <= self.across < math.inf, "across", "metres of at least 0", self.across)
+        _expect_metres(0, across=self.across)
         for name in ("across_phase_deg", "phase_deg"):
             expect(math.isfinite(getattr(self, name)), name, "a finite angle", getattr(self, name))
         expect(100 <= self.altitude_km <= 1e5, "altitude_km", "an altitude from 100 to 100,000 km", self.altitude_km)
@@ -312,6 +315,16 @@ RIGS: dict[str, type[RigConfig]] = {
     "fly-around": FlyAroundRig,
 }
 """The kinds of rig, as scene files name them."""
+
+
+def rig_kind(rig: RigConfig) -> str:
+    """The name of a rig's kind."""
+    return next(name for name, cls in RIGS.items() if type(rig) is cls)
+
+
+def kinds_with(option: str) -> list[str]:
+    """The kinds of rig that know an option."""
+    return [name for name, cls in RIGS.items() if option in {f.name for f in fields(cls)}]
 
 
 def plan(rig: RigConfig, target: Target, camera: CameraConfig, seed: int) -> Views:
@@ -384,9 +397,10 @@ def _along(
     )
 
 
-def _expect_metres(**lengths: float | None) -> None:
+def _expect_metres(least: float = NEAREST, **lengths: float | None) -> None:
     for name, metres in lengths.items():
-        expect(metres is None or 0 < metres < math.inf, name, "metres above 0", metres)
+        fits = metres is None or least <= metres <= FARTHEST
+        expect(fits, name, f"metres from {least:g} to {FARTHEST:g}", metres)
 
 
 def _stream(seed: int, stream: int, index: int) -> int:

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 from spacesim.data.errors import InputError
 from spacesim.scenes import toml
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
-from spacesim.scenes.materials import material_names
+from spacesim.scenes.materials import changed, material_names
 from spacesim.scenes.rig import RIGS, RigConfig
 from spacesim.scenes.spacecraft import SPACECRAFT, spacecraft
 from spacesim.scenes.structure import Rules, keys_of, near, structure
@@ -32,13 +32,14 @@ def read_scene(source: str | Path, **options: Any) -> SceneConfig:
 
     options: fields of the scene, its rig, camera or quality by name (see `with_options`), e.g. views=40,
     sun=[(azimuth, elevation), ...] degrees, resolution=256 or (width, height); None changes nothing. For a mesh file
-    also units and up (see `ObjectConfig`). Raises InputError where there is no such scene, or for what it cannot be.
+    also units, up and two_sided (see `ObjectConfig`). Raises InputError where there is no such scene, or for what it
+    cannot be.
     """
     path = Path(source)
     given = {name: value for name, value in options.items() if value is not None}
     if str(source) in BUILT_IN_SCENES:
         path = SCENES / f"{source}.toml"
-    reading: dict[str, Any] = {name: given.pop(name) for name in ("units", "up") if name in given}
+    reading: dict[str, Any] = {name: given.pop(name) for name in ("units", "up", "two_sided") if name in given}
     if path.suffix.lower() != ".toml":
         return with_options(_mesh_scene(path, str(source), reading), **given)
     for name in reading:
@@ -85,7 +86,14 @@ def _check_names(scene: SceneConfig, document: toml.Document) -> None:
             refuse(f"one of {', '.join(known)}", f"{name!r}{near(name, known)}", *keys)
 
     for name, custom in scene.materials.items():
+        if name in presets:
+            refuse("a name that no preset has", repr(name), "materials", name)
         check(custom.preset, presets, "materials", name, "preset")
+        try:
+            changed(name, custom.preset, custom.albedo, custom.roughness)
+        except InputError as error:
+            key, _, rest = str(error).removeprefix(f"material {name}: ").partition(": ")
+            raise InputError(f"{document.label(('materials', name, key))}: {rest}") from None
     for index, one in enumerate(scene.objects):
         for pattern, name in one.materials.items():
             check(name, (*scene.materials, *presets), "objects", index, "materials", pattern)

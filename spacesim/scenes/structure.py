@@ -75,7 +75,7 @@ class _Reader:
         known = keys_of(cls, self._rules)
         for key in values:
             if key not in known:
-                self._unknown(key, at, [*(["kind"] if kinds else []), *known])
+                self._unknown(key, at, [*(["kind"] if kinds else []), *known], kinds)
         given = {key: self.value(known[key], value, (*at, key)) for key, value in values.items()}
         given = {**(defaults or {}), **given}
         for f in fields(cls):
@@ -126,9 +126,12 @@ class _Reader:
             where = (*at, name) if any(name == f.name for f in fields(cls)) else at
             raise InputError(f"{self._document.label(where)}: {rest}") from None
 
-    def _unknown(self, key: str, at: Keys, known: Sequence[str]) -> NoReturn:
-        elsewhere = [dotted(place) for place in places_of(self._root, self._rules) if place[-1] == key]
-        hint = f"; did you mean {elsewhere[0]}?" if elsewhere else near(key, known)
+    def _unknown(self, key: str, at: Keys, known: Sequence[str], kinds: Mapping[str, type]) -> NoReturn:
+        places = [place for place in places_of(self._root, self._rules) if place[-1] == key]
+        others = [kind for kind, cls in kinds.items() if key in keys_of(cls, self._rules)]
+        hint = f"; did you mean {dotted(places[0])}?" if places else near(key, known)
+        if others:
+            hint = f"; kind {' and '.join(others)} know{'s' * (len(others) == 1)} it"
         self._refuse((*at, key), f"one of {', '.join(known)}", key, hint)
 
     def _refuse(self, at: Keys, expected: str, found: Any, hint: str = "") -> NoReturn:

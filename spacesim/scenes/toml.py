@@ -59,6 +59,8 @@ def read_document(path: Path) -> Document:
         if path.stat().st_size > LARGEST_FILE:
             raise InputError(f"{path}: expected a scene file of at most 1 MiB, found {path.stat().st_size} bytes")
         text = path.read_bytes().decode("utf-8-sig")
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{path}: expected a scene file, found none that can be read ({error.strerror})") from None
     except UnicodeDecodeError as error:

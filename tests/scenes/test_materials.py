@@ -93,6 +93,18 @@ def test_white_furnace(angle_deg):
             np.testing.assert_allclose(seen[name], coat + np.array(m.material(name).albedo), atol=0.015, err_msg=name)
 
 
+def test_the_whitest_coats_conserve_energy():
+    """Under an even sky a coated plate of the whitest base reflects less than it gets, over all directions together."""
+    chosen = [m.coated(f"{n} {alpha}", (m.WHITEST,) * 3, alpha, "", n) for n in (1.5, 1.7) for alpha in (0.1, 0.4, 1.0)]
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    cosines, weights = 0.5 * (nodes + 1), 0.5 * weights
+    constant = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}
+    seen = np.stack([plates_seen(chosen, constant, np.degrees(np.arccos(c)), 8000) for c in cosines])  # [A, M, 3]
+    total = np.einsum("a,amc->mc", 2 * weights * cosines, seen)
+    assert total.max() < 1.0
+    assert total.min() > 0.9
+
+
 @pytest.mark.parametrize("name", LAMBERTIAN)
 def test_lambertian_plates_that_face_the_sun(name):
     sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": 1361.0}}
@@ -260,9 +272,10 @@ def test_customised_presets():
     assert white.albedo[0] > 0.4
     for bad, message in (
         ({"albedo": (1.2, 0, 0)}, "material x: albedo: expected numbers from 0 to 1, found 1.2, 0, 0"),
-        ({"roughness": 0.0}, "material x: roughness: expected a number above 0.01 up to 1.0, found 0.0"),
-        ({"tile": 1.0}, "material x: expected no tile, which white-paint does not have, found 1.0"),
-        ({"ior": float("nan")}, "ior: expected a number above 1.0"),
+        ({"roughness": 0.0}, "material x: roughness: expected a number from 0.01 to 1, found 0.0"),
+        ({"tile": 1.0}, "material x: tile: expected none, as white-paint has none, found 1.0"),
+        ({"ior": float("nan")}, "ior: expected a number from 1.001 to 4, found nan"),
+        ({"albedo": (0.5, 0.91, 0.5)}, "material x: albedo: expected at most 0.9 for white-paint, .*, found 0.91"),
     ):
         with pytest.raises(InputError, match=message):
             m.customised("x", "white-paint", **bad)

@@ -1,5 +1,6 @@
 """Mesh files of all formats: units, axes, winding, what is dropped and said, and that nothing ends in a traceback."""
 
+import re
 import struct
 from pathlib import Path
 
@@ -10,8 +11,11 @@ from PIL import Image
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb
+from spacesim.scenes.build import build
 from spacesim.scenes.config import UNITS
+from spacesim.scenes.generate import plan_views
 from spacesim.scenes.meshfile import read_mesh
+from spacesim.scenes.scenefile import read_scene
 
 SHARED = Path(__file__).parents[3] / "shared" / "meshes"
 FACES = {"hubble.glb": 19503, "milani.glb": 6018, "bennu.ply": 49152}
@@ -134,6 +138,84 @@ def test_broken_faces_are_dropped_and_counted(tmp_path):
     assert "3 of broken" in text  # not finite or far away
     assert "2 of broken" in text  # no area
     assert text.count("1 of broken") == 2  # lies on another; names a vertex that is not there
+
+
+OBJ_CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\n"
+
+
+@pytest.mark.parametrize("broken", ["1 2 99", "0 1 2", "-4 -1 -2", "1/1/1 2/1/1 4/1/1"])
+def test_faces_of_an_obj_that_name_what_is_not_there_are_dropped(tmp_path, broken):
+    path = tmp_path / "idx.obj"
+    for lines in (f"f {broken}\nf 1 2 3\n", f"f 1 2 3\nf {broken}\n", f"f -3 -2 -1\nf {broken}\n"):
+        path.write_text(OBJ_CORNERS + lines)
+        craft, report = read_mesh(path)
+        np.testing.assert_array_equal(craft.parts[0].mesh.triangles, [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]])
+        assert "faces that name vertices which are not there are dropped: 1 of idx" in report.dropped
+    path.write_text(OBJ_CORNERS + f"f {broken}\n")
+    with pytest.raises(InputError, match="expected faces"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("broken", ["1/1 2/9 3/1", "1//1 2//7 3//1", "1/0/1 2/1/1 3/1/1", "1/1/-9 2/1/1 3/1/1"])
+def test_texture_coordinates_and_normals_of_an_obj_that_are_not_there_cost_no_face(tmp_path, broken):
+    path = tmp_path / "idx.obj"
+    sound = "v 0 0 1\nf 1/1/1 2/1/1 4/1/1\n"
+    for lines in (f"f {broken}\n", f"{sound}f {broken}\n", f"f {broken}\n{sound}"):
+        path.write_text(OBJ_CORNERS + lines)
+        assert read_mesh(path)[1].faces == lines.count("f")
+
+
+@pytest.mark.parametrize("corners", [OBJ_CORNERS + "f 1 2 3\n", OBJ_CORNERS + "v 1 1 0\nf 1 2 4 3\n"])
+def test_a_single_triangle_and_a_flat_plate_are_scenes(tmp_path, corners):
+    path = tmp_path / "flat.obj"
+    path.write_text(corners)
+    config = read_scene(path, views=2, test_views=0)
+    scene = build(config)
+    centre, radius = scene.bounding_sphere
+    np.testing.assert_allclose(centre, [0.5, 0.5, 0.0], atol=0.01)
+    assert radius == pytest.approx(0.5**0.5, rel=0.01)
+    assert len(plan_views(scene, config)[0]) == 2
+
+
+def test_a_mesh_too_small_for_single_precision_is_named(tmp_path):
+    path = saved(box(1e-12, 1e-12, 1e-12), tmp_path / "tiny.ply")
+    with pytest.raises(InputError, match=r"^object tiny: expected a size from 1e-06 to 1e\+10 m, found 1e-12 m$"):
+        build(read_scene(path))
+
+
+def test_sides_and_materials_of_a_scene_file(tmp_path, caplog):
+    """two_sided is a key of objects, and the report is silent about materials that the file replaces."""
+    saved(box(), tmp_path / "crate.stl")
+    (tmp_path / "sat.obj").write_text(OBJ)
+    (tmp_path / "paint.mtl").write_text("newmtl cells\nKd 1 1 1\nKs 1 1 1\nnewmtl paint\nKd 1 1 1\nKs 1 1 1\nNs 20\n")
+
+    def built(text):
+        (tmp_path / "my.toml").write_text(f"[[objects]]\n{text}\n")
+        caplog.clear()
+        with caplog.at_level("INFO"):
+            parts = build(read_scene(tmp_path / "my.toml")).objects[0].spacecraft.parts
+        return [part.material for part in parts], caplog.text
+
+    (plain,), said = built("mesh = 'crate.stl'")
+    assert (plain.name, plain.bsdf["type"]) == ("grey-paint", "diffuse")
+    assert "parts without a material get the preset grey-paint" in said
+    (gold,), said = built("mesh = 'crate.stl'\nmaterials = { '*' = 'gold-mli' }\ntwo_sided = true")
+    assert (gold.name, gold.bsdf["type"]) == ("gold-mli/two-sided", "twosided")
+    assert "crate.stl" in said
+    assert "grey-paint" not in said
+    assert built("mesh = 'crate.stl'\ntwo_sided = true")[0][0].bsdf["type"] == "twosided"
+    assert built("mesh = 'crate.stl'\ntwo_sided = false")[0][0].bsdf["type"] == "diffuse"
+    names = [part.name for part in read_mesh(tmp_path / "sat.obj")[0].parts]
+    both, said = built("mesh = 'sat.obj'")
+    assert len(both) == len(names) == 2
+    assert "2 materials" in said
+    assert {"cells", "paint"} <= set(re.split(r"\W+", said.split("base colours")[1].split("\n")[0]))
+    some, said = built(f"mesh = 'sat.obj'\nmaterials = {{ '{names[0]}' = 'kapton' }}")
+    assert (some[0].name, some[1].name) == ("kapton", both[1].name)
+    judged = said.split("base colours")[1].split("\n")[0]
+    assert both[1].name.split("/")[1] in judged
+    assert both[0].name.split("/")[1] not in judged
+    assert "base colours" not in built("mesh = 'sat.obj'\nmaterials = { '*' = 'kapton' }")[1]
 
 
 def test_colours_of_a_ply_become_their_mean(tmp_path):

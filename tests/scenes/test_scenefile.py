@@ -2,16 +2,22 @@
 
 import random
 import re
-from dataclasses import MISSING, fields
+import warnings
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
+from types import NoneType
+from typing import get_args, get_origin, get_type_hints
 
+import numpy as np
 import pytest
 
 from spacesim.data.errors import InputError
 from spacesim.scenes import toml
+from spacesim.scenes.build import build
 from spacesim.scenes.camera import CameraConfig
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, QualityConfig, SceneConfig
 from spacesim.scenes.earth import EarthConfig
+from spacesim.scenes.generate import plan_views
 from spacesim.scenes.rig import RIGS, RigConfig
 from spacesim.scenes.scenefile import BUILT_IN_SCENES, RULES, SCENES, read_scene, scene_text
 from spacesim.scenes.sensor import SensorConfig
@@ -246,8 +252,11 @@ def test_options():
     for name, value in {"views": 0, "resolution": 0, "sun": [(0, 91)], "teapots": 1, "suns": 0, "seed": -1}.items():
         with pytest.raises(InputError, match=f"^{name}: expected"):
             read_scene("boxsat", **{name: value})
-    with pytest.raises(InputError, match=r"^distance: expected"):
+    with pytest.raises(InputError, match=r"^distance: expected one of the options .*") as refused:
         read_scene("upper-stage", distance=1.0)
+    rig = "across, across_phase_deg, altitude_km, duration_s, phase_deg, size, sun, sun_moves, suns, test_suns, "
+    rig += "test_views, views of upper-stage, whose rig is of kind fly-around"
+    assert str(refused.value).endswith(f"options {rig} (fibonacci and polar-arc know distance)")
 
 
 @pytest.mark.parametrize(
@@ -283,10 +292,10 @@ BOXSAT = '[[objects]]\nspacecraft = "boxsat"\n'
     [
         ("", ": objects: expected tables in double brackets, found none"),
         ("# nothing\n", ": objects: expected"),
-        ("objects = []", ", line 1: objects: expected at least one object"),
+        ("objects = []", ", line 1: objects: expected at least one object, found none"),
         ("[objects]\nspacecraft='boxsat'", ", line 1: objects: expected tables in double brackets, found a table"),
-        ("[[objects]]", ", line 1: objects[0]: expected either spacecraft or mesh, found 'neither'"),
-        (BOXSAT + "mesh='a.glb'", ", line 1: objects[0]: expected either spacecraft or mesh, found 'both'"),
+        ("[[objects]]", ", line 1: objects[0]: expected either spacecraft or mesh, found neither"),
+        (BOXSAT + "mesh='a.glb'", ", line 1: objects[0]: expected either spacecraft or mesh, found both"),
         (BOXSAT + "\n[rig]\nveiws = 3", ", line 5: rig.veiws: expected one of kind, suns, views"),
         (BOXSAT + "\n[rig]\nveiws = 3", "found 'veiws'; did you mean views?"),
         ("veiws = 3\n" + BOXSAT, ", line 1: veiws: expected one of name, objects"),
@@ -298,6 +307,31 @@ BOXSAT = '[[objects]]\nspacecraft = "boxsat"\n'
         (BOXSAT + "[rig]\nviews = 1000000000000", ", line 4: rig.views: expected at most 10,000,000, found 10"),
         (BOXSAT + "[rig]\nsuns = 9999\nviews = 9999", ", line 5: rig.views: expected at most 10,000,000 frames of all"),
         (BOXSAT + "[rig]\ntest_suns = 10000000", ", line 3: rig.views: expected at most 10,000,000 frames of all Suns"),
+        (BOXSAT + "[rig]\nnear = 3", "distance, found 'near'; kind random knows it"),
+        (BOXSAT + "[rig]\nkind = 'approach'\ndistance = 3", "'distance'; kind fibonacci and polar-arc know it"),
+        ("near = 3\n" + BOXSAT, "found 'near'; did you mean rig.near?"),
+        (
+            BOXSAT + "[rig]\nkind = 'random'\nrandom_suns = true\nsuns = 2",
+            ", line 5: rig.random_suns: expected 1 suns and 0 test_suns, as every frame has its own, "
+            "found 2 suns and 0 test_suns",
+        ),
+        (BOXSAT + "[camera]\nresolution = 20000", "expected at most 268,435,456 pixels, found 20000 x 20000"),
+        (BOXSAT + "scale = 1e300", ", line 3: objects[0].scale: expected a factor from 1e-09 to 1e+09, found 1e+300"),
+        (BOXSAT + "position = [1e30, 0, 0]", ", line 3: objects[0].position: expected metres from -1e+09 to 1e+09"),
+        (BOXSAT + "units = 'mm'", ", line 3: objects[0].units: expected beside a mesh only, found 'mm'"),
+        (BOXSAT + "two_sided = false", ", line 3: objects[0].two_sided: expected beside a mesh only, found False"),
+        (
+            BOXSAT + "[materials.glass]\npreset = 'glass'",
+            ", line 3: materials.glass: expected a name that no preset has, found 'glass'",
+        ),
+        (
+            BOXSAT + "[materials.x]\npreset = 'grey-paint'\nroughness = 0.5",
+            ", line 5: materials.x.roughness: expected none, as grey-paint has none, found 0.5",
+        ),
+        (
+            BOXSAT + "[materials.x]\npreset = 'white-paint'\nalbedo = 0.95",
+            ", line 5: materials.x.albedo: expected at most 0.9 for white-paint, whose coat adds its gloss, found 0.95",
+        ),
         (BOXSAT + "[quality]\nspp = 9999999", ", line 4: quality.spp: expected at most 1,000,000, found 9999999"),
         (BOXSAT + "[quality]\nmax_depth = 2000", ", line 4: quality.max_depth: expected at most 1,000, found 2000"),
         (BOXSAT + "[rig]\nviews = 3.0", ", line 4: rig.views: expected a whole number, found 3.0"),
@@ -314,7 +348,10 @@ BOXSAT = '[[objects]]\nspacecraft = "boxsat"\n'
             ", line 4: camera.fov_deg: expected a finite number, found 100",
         ),
         (BOXSAT + f"[camera]\nfov_deg = 1{'0' * 9999}", ": expected TOML"),
-        (BOXSAT + "[camera]\nfov_deg = 0", ", line 4: camera.fov_deg: expected an angle up to 120 degrees, found 0"),
+        (
+            BOXSAT + "[camera]\nfov_deg = 0",
+            ", line 4: camera.fov_deg: expected an angle from 0.001 to 120 degrees, found 0",
+        ),
         (BOXSAT + "[camera]\nfov_deg = 1979-05-27", ", line 4: camera.fov_deg: expected a finite number"),
         (BOXSAT + "[camera]\nresolution = 3", ", line 4: camera.resolution: expected at least 8 pixels, found 3"),
         (BOXSAT + "[camera]\nresolution = 64.0", ", line 4: camera.resolution[0]: expected a whole number, found 64.0"),
@@ -326,7 +363,7 @@ BOXSAT = '[[objects]]\nspacecraft = "boxsat"\n'
         ("earth = true\n" + BOXSAT, ", line 1: earth: expected a table, found True"),
         (BOXSAT + "position = 0", ", line 3: objects[0].position: expected a list of 3 numbers, found 0"),
         (BOXSAT + "rotation_wxyz = [0,0,0,0]", ", line 3: objects[0].rotation_wxyz: expected four finite numbers"),
-        (BOXSAT + BOXSAT + "scale = -1", ", line 5: objects[1].scale: expected a factor above 0, found -1"),
+        (BOXSAT + BOXSAT + "scale = -1", ", line 5: objects[1].scale: expected a factor from 1e-09 to 1e+09, found -1"),
         (BOXSAT + "color = [1,1,1]", ", line 3: objects[0].color: expected"),
         (BOXSAT + "[sun]\ncolor = [1,1,1]", ", line 4: sun.color: expected one of shape, distance_au, found"),
         ("folder = '/'\n" + BOXSAT, ", line 1: folder: expected"),
@@ -367,8 +404,9 @@ def test_a_huge_file_is_not_read(tmp_path):
     path = tmp_path / "big.toml"
     with path.open("wb") as file:
         file.truncate(10 << 30)
-    with pytest.raises(InputError, match="at most 1 MiB, found 10737418240 bytes"):
+    with pytest.raises(InputError) as refused:
         read_scene(path)
+    assert str(refused.value) == f"{path}: expected a scene file of at most 1 MiB, found 10737418240 bytes"
 
 
 @pytest.mark.parametrize("part", ["a", "'a'", '"a"'])
@@ -396,6 +434,86 @@ def test_damaged_files_are_read_or_refused(tmp_path):
         except InputError as error:
             told += ", line " in str(error)
     assert told > 300
+
+
+def numeric_keys(cls, table=""):
+    """(`table`, a line with X for a number) of each field of `cls` that is a number or a list of them."""
+    for key, hint in get_type_hints(cls).items():
+        inner = [one for one in get_args(hint) if one is not NoneType] or [hint]
+        if inner == [int] or inner == [float] or (hint in (int, float)):
+            yield table, f"{key} = X"
+        elif get_origin(hint) is tuple and set(inner) <= {int, float, Ellipsis}:
+            count = 5 if Ellipsis in inner else len(inner)
+            yield table, f"{key} = [X{', 1' * (count - 1)}]"
+            yield table, f"{key} = [{'X, ' * count}]"
+
+
+PLACES = [
+    *((table, line) for table, line in numeric_keys(SceneConfig)),
+    *((BOXSAT + table, line) for table, line in numeric_keys(ObjectConfig)),
+    *numeric_keys(MaterialConfig, "[materials.x]\npreset = 'white-paint'\n"),
+    *((table, line) for table, line in numeric_keys(SunConfig, "[sun]\n") if not line.startswith("color")),
+    *numeric_keys(EarthConfig, "[earth]\n"),
+    *numeric_keys(CameraConfig, "[camera]\n"),
+    *numeric_keys(SensorConfig, "[camera.sensor]\n"),
+    *numeric_keys(QualityConfig, "[quality]\n"),
+    *((t, line) for kind, rig in RIGS.items() for t, line in numeric_keys(rig, f"[rig]\nkind = '{kind}'\n")),
+    *(("[rig]\n", line) for line in ("sun = [[X, 1]]", "sun = [[1, X]]")),
+]
+VALUES = ["0", "-1", "nan", "inf", "-inf", "1e300", "-1e300", "1e-300", str(10**20), "true", '"x"', "[]"]
+
+
+@pytest.mark.parametrize(("table", "line"), PLACES)
+def test_impossible_numbers_of_every_key(table, line, tmp_path):
+    """Each is refused with its line, or the scene can be built, its views planned, and it can be written down."""
+    path = tmp_path / "my.toml"
+    refused = set()
+    for value in VALUES:
+        text = table + line.replace("X", value) + "\n"
+        at = text.count("\n")
+        path.write_text(text if BOXSAT in text else text + BOXSAT)
+        try:
+            scene = read_scene(path)
+        except InputError as error:
+            sentence = str(error)
+            assert sentence.startswith(f"{path}, line "), sentence
+            assert "\n" not in sentence
+            assert sentence.count(": expected ") == 1, sentence
+            refused.add(value)
+            if value in ("nan", "inf", "true", '"x"'):
+                assert f"line {at}: " in sentence, sentence
+        else:
+            with warnings.catch_warnings(), np.errstate(all="raise", under="ignore"):
+                warnings.simplefilter("error")
+                small = replace(scene, rig=replace(scene.rig, views=min(scene.rig.views, 2), test_views=1))
+                train, test = plan_views(build(small), small)
+                assert all(np.isfinite(view.camera.world_from_camera).all() for _, view in train + test)
+            scene_text(scene)
+    assert refused >= {"nan", "inf", "-inf", "true", '"x"'}
+
+
+@pytest.mark.parametrize("turn", ["[1e-200, 0, 0, 0]", "[5e-324, 0, 0, 0]", "[1e300, 0, 0, 0]", "[-3, 0, 0, 0]"])
+def test_quaternions_of_any_length(turn, tmp_path):
+    path = tmp_path / "turned.toml"
+    path.write_text(BOXSAT + f"rotation_wxyz = {turn}\n")
+    np.testing.assert_allclose(build(read_scene(path)).objects[0].world_from_object, np.eye(4), atol=1e-15)
+
+
+def test_objects_that_single_precision_cannot_hold_are_named():
+    def sized(*objects):
+        return build(SceneConfig("x", objects))
+
+    for name, scale, said in (("cubesat", 1e-8, r"\de-\d\d m"), ("small-body", 1e9, r"[\d.]+e\+1\d m")):
+        with pytest.raises(
+            InputError, match=rf"^object {name}: expected a size from 1e-06 to 1e\+10 m, found .*{said}$"
+        ):
+            sized(ObjectConfig(spacecraft=name, scale=scale))
+    far = ObjectConfig(spacecraft="boxsat", name="far", position=(1e9, 0, 0))
+    with pytest.raises(InputError, match=r"^object far: expected a size of at least 1e-05 of the scene's, found"):
+        sized(far)
+    with pytest.raises(InputError, match=r"^object cubesat: expected a size of at least"):
+        sized(ObjectConfig(spacecraft="cubesat"), ObjectConfig(spacecraft="boxsat", scale=1e6))
+    assert sized(ObjectConfig(spacecraft="boxsat", scale=1e6)).bounding_sphere[1] > 1e6
 
 
 ROW = re.compile(r"^\| `(\w+)` \|[^|]*\| ([^|]*?) \|", re.MULTILINE)
