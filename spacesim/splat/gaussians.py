@@ -95,3 +95,19 @@ class Gaussians:
 def opacities(logit_opacities: Any) -> Any:
     """o = sigmoid(logit) [N], in (0, 1)."""
     return dr.rcp(1 + dr.exp(-logit_opacities))
+
+
+def principal_axes(quaternions: Any) -> list[Any]:
+    """The principal axes in world axes: three columns (Array3f [3, N]) of the rotations of quaternions Array4f [4, N].
+
+    Quaternions that have no direction (0, not finite, beyond 1e12) count as no rotation and get no gradients.
+    """
+    length2 = dr.squared_norm(quaternions)
+    sane = dr.detach((length2 > 1e-24) & (length2 < 1e24))
+    q = dr.select(sane, quaternions, ad.Array4f(1, 0, 0, 0)) * dr.rsqrt(dr.select(sane, length2, 1))
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return [
+        ad.Array3f(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        ad.Array3f(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        ad.Array3f(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    ]

@@ -1,24 +1,36 @@
-"""project -> bin -> rasterize -> RenderOutput: one differentiable picture of Gaussians (thesis 2.2)."""
+"""project -> bin -> rasterize -> RenderOutput: one differentiable picture of Gaussians (thesis 2.2).
 
-from dataclasses import dataclass
+What a picture shows beside colour is blended as features of the Gaussians: `blend` takes any number of them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
+from spacesim.splat.cameras import Projection
 from spacesim.splat.gaussians import SH_C0, Gaussians
-from spacesim.splat.project import Pinhole, project
+from spacesim.splat.project import Footprints, Splats, project
 from spacesim.splat.rasterize import rasterize
-from spacesim.splat.tiles import bin_splats
+from spacesim.splat.surface import median_splat, normals, picked, unit
+from spacesim.splat.tiles import TileLists, bin_splats
+
+OUTPUTS = ("colour", "alpha", "depth", "median_depth", "normal")
+CHANNELS = 8  #: features blended in one pass; chosen: each is a register for each pixel of a lane
 
 
 @dataclass
 class RenderOutput:
-    """Planes are [height * width], row by row; `to_numpy` gives them their shape.
+    """What was asked for; the rest is None. Planes are [height * width], row by row; `image` gives them their shape.
 
     colour: Array3f, premultiplied (over black), sRGB values;  alpha: Float in [0, 1]
     depth: Float, expected depth: z of the centres averaged with the blending weights, metres; 0 where alpha is 0
+    median_depth: Float, z of the Gaussian at which the transmittance falls below 1/2, metres; 0 where it does not
+    normal: Array3f, world axes: direction of the blended normals, unit length; 0 where there are none
+    features: the user's channels, blended like colour: sum of weight x value, so 0 where alpha is 0
     """
 
     colour: Any
@@ -26,51 +38,165 @@ class RenderOutput:
     depth: Any
     width: int
     height: int
+    median_depth: Any = None
+    normal: Any = None
+    features: Any = None
+
+    def image(self, name: str) -> np.ndarray:
+        """One output by name: [H, W], or [H, W, C] of colour, normal and features; float32.
+
+        Raises ValueError for what was not asked for.
+        """
+        planes = getattr(self, name) if name in (*OUTPUTS, "features") else None
+        if planes is None:
+            had = [field.name for field in fields(self) if getattr(self, field.name) is not None]
+            raise ValueError(f"name: expected one of the outputs asked for ({', '.join(had)}), found {name!r}")
+        shape = (self.height, self.width)
+        if name in ("alpha", "depth", "median_depth"):
+            return np.array(planes, dtype=np.float32).reshape(shape)
+        stacked = [np.array(plane, dtype=np.float32).reshape(shape) for plane in planes]
+        return np.stack(stacked, axis=-1) if stacked else np.zeros((*shape, 0), np.float32)
 
     def to_numpy(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(colour [H, W, 3], alpha [H, W], depth [H, W]), float32."""
-        shape = (self.height, self.width)
-        colour = np.stack([np.array(plane).reshape(shape) for plane in self.colour], axis=-1)
-        return colour, np.array(self.alpha).reshape(shape), np.array(self.depth).reshape(shape)
+        return self.image("colour"), self.image("alpha"), self.image("depth")
 
     def over(self, background: Any) -> Any:
         """Array3f: the picture over a background colour (Array3f) or picture."""
         return self.colour + (1 - self.alpha) * background
 
 
-def render(gaussians: Gaussians, camera: Pinhole, sh_degree: int | None = None) -> RenderOutput:
-    """Render; differentiable with respect to every parameter of `gaussians` that has gradients enabled.
+def render(
+    gaussians: Gaussians,
+    camera: Projection,
+    sh_degree: int | None = None,
+    outputs: Sequence[str] = ("colour", "alpha", "depth"),
+    features: Any = None,
+    antialiased: bool = False,
+) -> RenderOutput:
+    """Render; differentiable with respect to every parameter of `gaussians`, `camera.values` (or `camera.moved`) and
+    `features` that has gradients enabled.
 
-    sh_degree: highest degree of spherical harmonics used, all that are stored by default.
+    sh_degree: highest degree of spherical harmonics used, all that are stored by default
+    outputs: of `OUTPUTS`, what to compute; alpha is always there
+    features: C arrays [N] (a list, or an ArrayXf [C, N]) to blend beside them; values not finite count as 0
+    antialiased: see `project`
+    Raises ValueError for another output, or features of another length.
     """
+    unknown = [name for name in outputs if name not in OUTPUTS]
+    if unknown:
+        raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
+    own = [] if features is None else [_finite(ad.Float(feature)) for feature in features]
+    if any(dr.width(feature) not in (1, gaussians.count) for feature in own):
+        raise ValueError(f"features: expected arrays of {gaussians.count}, found one of {max(map(dr.width, own))}")
     if gaussians.count == 0:
-        zero = dr.zeros(ad.Float, camera.width * camera.height)
-        return RenderOutput(ad.Array3f(zero, zero, zero), zero, zero, camera.width, camera.height)
-    splats, footprints = project(gaussians, camera)
-    colour = view_colours(gaussians, camera, sh_degree)
-    lists = bin_splats(splats, footprints, camera.width, camera.height)
-    planes, transmittance = rasterize(splats, [*colour, splats.depth], lists, camera.width, camera.height)
-    return compose_output(planes, transmittance, camera)
+        return _nothing(camera, outputs, None if features is None else len(own))
+
+    splats, footprints = project(gaussians, camera, antialiased)
+    wanted: dict[str, list[Any]] = {}
+    if "colour" in outputs:
+        wanted["colour"] = list(view_colours(gaussians, camera, sh_degree))
+    if "depth" in outputs:
+        wanted["depth"] = [splats.depth]
+    if "normal" in outputs:
+        wanted["normal"] = list(normals(gaussians, camera))
+    if features is not None:
+        wanted["features"] = [feature + dr.zeros(ad.Float, gaussians.count) for feature in own]
+
+    blended = blend(splats, footprints, [f for group in wanted.values() for f in group], camera)
+    planes, found = iter(blended.planes), dict[str, list[Any]]()
+    for name, group in wanted.items():
+        found[name] = [next(planes) for _ in group]
+    return RenderOutput(
+        colour=ad.Array3f(found["colour"]) if "colour" in found else None,
+        alpha=1 - blended.transmittance,
+        depth=_expected(found["depth"][0], blended.transmittance) if "depth" in found else None,
+        width=camera.width,
+        height=camera.height,
+        median_depth=median_depth(splats, blended.lists, camera) if "median_depth" in outputs else None,
+        normal=unit(ad.Array3f(found["normal"])) if "normal" in found else None,
+        features=found.get("features"),
+    )
 
 
-def compose_output(planes: list[Any], transmittance: Any, camera: Pinhole) -> RenderOutput:
-    """Name the rasterizer's planes (r, g, b, depth) and normalise the depth."""
+@dataclass
+class Blend:
+    """planes: of each feature, sum of weight x value, [height * width];  transmittance: plane;  lists: of the tiles"""
+
+    planes: list[Any]
+    transmittance: Any
+    lists: TileLists
+
+
+def blend(splats: Splats, footprints: Footprints, features: Sequence[Any], camera: Projection) -> Blend:
+    """Stages 2 and 3 for any number of features (Floats [N]) and any sign of depth. Differentiable."""
+    # The sort takes depths by their bits, as if positive. It gets stand-ins in the same order.
+    sorting = replace(splats, depth=_positive_in_order(dr.detach(splats.depth)))
+    lists = bin_splats(sorting, footprints, camera.width, camera.height)
+    passes = [list(features[i : i + CHANNELS]) for i in range(0, len(features), CHANNELS)] or [[]]
+    planes: list[Any] = []
+    transmittance: Any = None
+    for group in passes:
+        more, passed = rasterize(splats, group, lists, camera.width, camera.height)
+        planes += more
+        transmittance = passed if transmittance is None else transmittance
+    return Blend(planes, transmittance, lists)
+
+
+def median_depth(splats: Splats, lists: TileLists, camera: Projection) -> Any:
+    """Float [height * width], metres: depth of the splat at which less than half of the light passes, 0 where it
+    always does. Differentiable by the depths; which splat it is, is taken as given."""
+    return picked(splats.depth, median_splat(splats, lists, camera.width, camera.height))
+
+
+def _nothing(camera: Projection, outputs: Sequence[str], channels: int | None) -> RenderOutput:
+    """The picture of no Gaussians."""
+    zero = dr.zeros(ad.Float, camera.width * camera.height)
+    found: dict[str, Any] = {name: zero for name in ("depth", "median_depth") if name in outputs}
+    found |= {name: ad.Array3f(zero, zero, zero) for name in ("colour", "normal") if name in outputs}
+    features = None if channels is None else [zero] * channels
+    return RenderOutput(
+        colour=found.get("colour"),
+        alpha=zero,
+        depth=found.get("depth"),
+        width=camera.width,
+        height=camera.height,
+        median_depth=found.get("median_depth"),
+        normal=found.get("normal"),
+        features=features,
+    )
+
+
+def _expected(weighted: Any, transmittance: Any) -> Any:
+    """Blended values divided by the alpha; 0 where that is 0."""
     alpha = 1 - transmittance
     covered = alpha > 0
-    depth = dr.select(covered, planes[3] / dr.select(covered, alpha, 1), 0)
-    return RenderOutput(ad.Array3f(planes[:3]), alpha, depth, camera.width, camera.height)
+    return dr.select(covered, weighted / dr.select(covered, alpha, 1), 0)
 
 
-def view_colours(gaussians: Gaussians, camera: Pinhole, sh_degree: int | None = None) -> Any:
+def _finite(values: Any) -> Any:
+    """`values` with 0, and no gradient, in place of what is not finite: 0 times infinity would reach other pixels."""
+    return dr.select(dr.detach(dr.isfinite(values)), values, 0)
+
+
+def _positive_in_order(depth: Any) -> Any:
+    """Positive floats in the order of `depth` [N], |depth| < 1e9; depths that differ in the last bit alone may tie."""
+    bits: Any = dr.reinterpret_array(ad.UInt32, depth)
+    ordered: Any = dr.select(bits >> 31 == 0, bits | 0x80000000, ~bits)
+    return dr.reinterpret_array(ad.Float, ordered >> 1)
+
+
+def view_colours(gaussians: Gaussians, camera: Projection, sh_degree: int | None = None) -> Any:
     """Array3f [3, N]: colour of each Gaussian seen from the camera, sRGB values >= 0 (thesis 2.17).
 
-    c(d) = max(sum_lm a_lm Y_lm(d) + 1/2, 0), d from the camera towards the Gaussian; the offset is INRIA's.
+    c(d) = max(sum_lm a_lm Y_lm(d) + 1/2, 0), d from the camera towards the Gaussian (along the axis of an
+    orthographic camera); the offset is INRIA's.
     """
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
     sh = gaussians.sh
     colour = ad.Array3f(*(SH_C0 * sh[c] + 0.5 for c in range(3)))
     if degree > 0:
-        offset = gaussians.means - camera.position
+        offset = camera.rays_to(gaussians.means)
         length2 = dr.squared_norm(offset)
         far = dr.detach((length2 > 1e-20) & (length2 < 1e20))
         direction = dr.select(far, offset * dr.rsqrt(dr.select(far, length2, 1)), ad.Array3f(0, 0, 1))
