@@ -9,7 +9,7 @@ from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes import Renderer, Scene, build, read_scene, spectra
 from spacesim.scenes.earth import EarthConfig
 from spacesim.scenes.generate import plan_views
-from spacesim.scenes.materials import Material, customised, material_names
+from spacesim.scenes.materials import Material, customised, lambertian
 from spacesim.scenes.sun import SunConfig
 
 EARTH = EarthConfig(azimuth_deg=200.0, elevation_deg=-40.0, altitude_km=500.0)
@@ -67,22 +67,23 @@ def band_weights() -> np.ndarray:
     return hats @ (sunlight[:, None] * response) / spectra.SOLAR_IRRADIANCE
 
 
-def at_wavelengths(scene: Scene, wavelengths: np.ndarray) -> Scene:
-    """The scene with each material's reflectance at three wavelengths in place of its albedo; without a spectrum it is
-    that of the albedo's mean at all of them."""
+def at_wavelengths(scene: Scene, wavelengths: np.ndarray | None) -> Scene:
+    """The scene with each material's reflectance at three wavelengths in place of its albedo; None: with the albedo.
+    Materials without a spectrum become diffuse and grey in either."""
     made: dict[str, Material] = {}
 
     def changed(material: Material) -> Material:
-        if material.name not in made:
-            if material.name not in material_names():  # of the craft's own, grey enough
-                made[material.name] = material
-                return material
-            if material.reflectance:
-                values = spectra.reflectance_at(material.reflectance, wavelengths)
-            else:
-                values = np.full(3, np.mean(material.albedo))
-            made[material.name] = customised(material.name, material.name, albedo=tuple(values))
-        return made[material.name]
+        name = material.name
+        if name in made:
+            return made[name]
+        if not material.reflectance:
+            made[name] = lambertian(name, (float(np.mean(material.albedo)),) * 3, "grey")
+        elif wavelengths is None:
+            made[name] = material
+        else:
+            red, green, blue = spectra.reflectance_at(material.reflectance, wavelengths).tolist()
+            made[name] = customised(name, name, albedo=(red, green, blue))
+        return made[name]
 
     objects = [
         replace(
@@ -101,7 +102,7 @@ def rgb_against_spectral(source: str = "boxsat", spp: int = 64) -> dict[str, flo
     """For each large part of a whole render, all bounces: largest difference of a channel of its mean, RGB against 39
     wavelengths, relative to the spectral render's brightest channel. Both have the same seed."""
     scene, camera, sun = one_view(source)
-    rgb = Renderer(scene, spp).render(camera, sun, (1,))
+    rgb = Renderer(at_wavelengths(scene, None), spp).render(camera, sun, (1,))
     weights, spectral = band_weights(), np.zeros_like(rgb.radiance, np.float64)
     for k in range(0, len(GRID), 3):  # three wavelengths a render, one in each channel
         found = Renderer(at_wavelengths(scene, GRID[k : k + 3]), spp).render(camera, sun, (1,))
