@@ -1,7 +1,7 @@
 """From what a scene file says to the scene that is rendered."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -22,8 +22,8 @@ SIZES = (1e-6, 1e10)
 """Metres that the longest side of an object's box may have, chosen."""
 
 FINEST = 1e-5
-"""Least size of an object, over the distance of any object's farthest corner from the world's origin. Chosen: the
-coordinates of meshes are written in single precision, whose steps are 6e-8 of them."""
+"""Least size of an object, over how far the scene reaches from the world's origin. Chosen: the coordinates of meshes
+are written in single precision, whose steps are 6e-8 of them."""
 
 _log = logging.getLogger(__name__)
 
@@ -32,9 +32,10 @@ def build(config: SceneConfig) -> Scene:
     """The scene of a configuration. Raises InputError where a spacecraft, mesh, part or material cannot be had, or an
     object's size is out of range."""
     objects = tuple(_object(item, config) for item in config.objects)
-    _check_sizes(objects)
     red, green, blue = sun_rgb(config.camera.white_balance, total=1.0).tolist()
-    return Scene(config.name, objects, replace(config.sun, color=(red, green, blue)), config.earth)
+    scene = Scene(config.name, objects, replace(config.sun, color=(red, green, blue)), config.earth)
+    _check_sizes(scene)
+    return scene
 
 
 def _object(item: ObjectConfig, config: SceneConfig) -> SceneObject:
@@ -60,25 +61,27 @@ def _pose(item: ObjectConfig) -> Array:
     return pose
 
 
-def _check_sizes(objects: Sequence[SceneObject]) -> None:
+def _check_sizes(scene: Scene) -> None:
     """Raises InputError for an object that is smaller or larger than single precision can hold beside the others."""
-    corners = [_corners(one) for one in objects]
-    reach = max(float(np.abs(box).max()) for box in corners)
     least, most = SIZES
-    for one, box in zip(objects, corners, strict=True):
-        size, name = float(np.ptp(box, axis=0).max()), one.spacecraft.name
+    sizes = [(one.spacecraft.name, _size(one)) for one in scene.objects]
+    for name, size in sizes:
         if not least <= size <= most:
             raise InputError(f"object {name}: expected a size from {least:g} to {most:g} m, found {size:.3g} m")
+    with np.errstate(all="ignore"):  # trimesh divides by the volume of a flat hull
+        centre, radius = scene.bounding_sphere
+    reach = float(np.linalg.norm(centre)) + radius
+    for name, size in sizes:
         if size < FINEST * reach:
             found = f"{size:.3g} m in a scene that reaches {reach:.3g} m from the origin"
             raise InputError(f"object {name}: expected a size of at least {FINEST:g} of the scene's, found {found}")
 
 
-def _corners(one: SceneObject) -> Array:
-    """[2 P, 3] least and greatest coordinates of its parts, world frame, metres."""
-    turn, place = one.world_from_object[:3, :3], one.world_from_object[:3, 3]
-    boxes = [np.asarray(part.mesh.vertices) @ turn.T for part in one.spacecraft.parts]
-    return np.concatenate([[box.min(axis=0), box.max(axis=0)] for box in boxes]) + place
+def _size(one: SceneObject) -> float:
+    """The longest side of the box around an object in world axes, metres."""
+    turned = [np.asarray(part.mesh.vertices) @ one.world_from_object[:3, :3].T for part in one.spacecraft.parts]
+    lowest, highest = (np.stack([ends(part, axis=0) for part in turned]) for ends in (np.min, np.max))
+    return float((highest.max(axis=0) - lowest.min(axis=0)).max())
 
 
 def _with_materials(craft: Spacecraft, item: ObjectConfig, custom: Mapping[str, MaterialConfig]) -> Spacecraft:

@@ -2,6 +2,7 @@
 
 import re
 import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -170,7 +171,9 @@ def test_a_single_triangle_and_a_flat_plate_are_scenes(tmp_path, corners):
     path = tmp_path / "flat.obj"
     path.write_text(corners)
     config = read_scene(path, views=2, test_views=0)
-    scene = build(config)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = build(config)
     centre, radius = scene.bounding_sphere
     np.testing.assert_allclose(centre, [0.5, 0.5, 0.0], atol=0.01)
     assert radius == pytest.approx(0.5**0.5, rel=0.01)
