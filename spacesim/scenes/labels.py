@@ -201,9 +201,12 @@ def _has_color_image(bsdf: Mapping[str, Any]) -> bool:
 
 
 def _images(numbers: Any, ids: Any, camera: Camera) -> dict[str, np.ndarray]:
-    """Labels as [H, W] or [H, W, 3], float32 or uint8, from what `Labeller._trace_centres` returns."""
+    """Labels as [H, W] or [H, W, 3], float32 or uint8, from what `Labeller._trace_centres` returns.
+
+    Copies: arrays over Dr.Jit's memory that another thread lets go of can stop the whole process for good.
+    """
     shape = camera.height, camera.width
-    planes = np.split(numbers.numpy().reshape(-1, camera.height * camera.width), [1, 2, 3, 6, 9])
+    planes = np.split(numbers.numpy().copy().reshape(-1, camera.height * camera.width), [1, 2, 3, 6, 9])
     names = "depth", "distance", "sun_cosine", "normal", "albedo", "sun_visibility"
     labels = {
         name: plane.reshape(shape if len(plane) == 1 else (*shape, 3))
