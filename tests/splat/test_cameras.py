@@ -8,10 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from spacesim.backend import ad
+from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.splat.cameras import Orthographic, OrthographicCamera, Pinhole
 from spacesim.splat.gaussians import NAMES, Gaussians
+from spacesim.splat.project import project
 from spacesim.splat.reference import render_reference
 from spacesim.splat.render import render
 
@@ -168,3 +170,168 @@ def test_pose_gradients_match_central_differences(kind, start):
         )
 
     assert_close(np.array(dr.grad(twist)), slope(loss, start), "twist")
+
+
+def picture(arrays, camera, names=("colour", "alpha", "depth"), **options) -> dict[str, np.ndarray]:
+    output = render(Gaussians.from_numpy(arrays), camera, outputs=names, **options)
+    return {name: output.image(name) for name in names}
+
+
+def one_splat(center, sigma: float, opacity_logit: float = 0.0) -> dict[str, np.ndarray]:
+    return {
+        "means": np.array([center], dtype=float),
+        "log_scales": np.full((1, 3), np.log(sigma)),
+        "quaternions": np.array([[1.0, 0, 0, 0]]),
+        "logit_opacities": np.array([opacity_logit]),
+        "sh": np.zeros((1, 1, 3)),
+    }
+
+
+@pytest.mark.parametrize("depth", [-7.0, 0.0, 3.0, 500.0])
+def test_orthographic_splat_has_its_size_at_any_depth(depth):
+    """A ball of sigma metres is exp(-r^2 / 2 (s^2 sigma^2 + 0.3)) / 2, s pixels per metre, also behind the origin."""
+    view = OrthographicCamera(np.eye(4), 48, 32, 20.0, 10.0, 20.0, 14.0)
+    found = picture(one_splat([0.4, 0.3, depth], 0.25), Orthographic.of(view))
+    columns, rows = np.meshgrid(np.arange(48) + 0.5, np.arange(32) + 0.5)
+    squared = (columns - 28) ** 2 / (5.0**2 + 0.3) + (rows - 17) ** 2 / (2.5**2 + 0.3)
+    expected = 0.5 * np.exp(-0.5 * squared)
+    expected[expected < 1 / 255] = 0
+    np.testing.assert_allclose(found["alpha"], expected, atol=1e-5)
+    np.testing.assert_allclose(found["depth"], np.where(expected > 0, depth, 0), rtol=1e-5)
+
+
+def test_orthographic_order_runs_through_the_origin():
+    """Splats in a row along the axis, the first behind the camera: the one farthest behind hides the others."""
+    depths = np.array([2.0, -3.0, 0.0, -0.5, 1.0, -1e-7, 1e-7])
+    arrays = {name: np.repeat(value, 7, axis=0) for name, value in one_splat([0, 0, 0], 5.0, 0.0).items()}
+    arrays["means"][:, 2] = depths
+    view = OrthographicCamera(np.eye(4), 8, 8, 1.0, 1.0, 4.0, 4.0)
+    output = render(Gaussians.from_numpy(arrays), Orthographic.of(view), features=list(np.eye(7, dtype=np.float32)))
+    shares = output.image("features")[4, 4]
+    np.testing.assert_array_equal(np.argsort(-shares), np.argsort(depths))
+    np.testing.assert_allclose(shares[np.argsort(depths)], 0.49 * 0.51 ** np.arange(7), atol=0.02)
+
+
+def test_perspective_far_away_is_orthographic():
+    arrays = random_splats(80, seed=3, degree=0)
+    direction = np.array([0.8, -0.5, 0.33])
+    far, scale = 4000.0, 20.0
+    flat_view = OrthographicCamera(look_at(direction, [0, 0, 0]), 40, 32, scale, scale, 20, 16)
+    distance = far * np.linalg.norm(direction)
+    view = Camera(look_at(far * direction, [0, 0, 0]), 40, 32, scale * distance, scale * distance, 20, 16)
+    near, parallel = picture(arrays, Pinhole.of(view)), picture(arrays, Orthographic.of(flat_view))
+    np.testing.assert_allclose(near["alpha"], parallel["alpha"], atol=2e-2)
+    assert np.abs(near["alpha"] - parallel["alpha"]).mean() < 1e-3
+    assert parallel["alpha"].max() > 0.5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rigid_motion_of_scene_and_camera_changes_nothing(kind):
+    arrays, view = random_splats(100, seed=8, degree=0), record(kind)
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = Rotation.from_rotvec([0.4, -1.1, 0.6]).as_matrix(), [0.4, -0.9, 0.2]
+    turned = Rotation.from_matrix(motion[:3, :3]) * Rotation.from_quat(arrays["quaternions"][:, [1, 2, 3, 0]])
+    moved = {
+        **arrays,
+        "means": arrays["means"] @ motion[:3, :3].T + motion[:3, 3],
+        "quaternions": turned.as_quat()[:, [3, 0, 1, 2]],
+    }
+    moved_view = replace(view, world_from_camera=motion @ view.world_from_camera)
+    first, second = picture(arrays, upload(view)), picture(moved, upload(moved_view))
+    solid = first["alpha"] > 0.01
+    for name, plane in first.items():
+        np.testing.assert_allclose(plane[solid], second[name][solid], atol=3e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_crop_is_the_part_of_the_whole_picture(kind):
+    arrays, camera = random_splats(3000, seed=12, degree=1), upload(record(kind, 150, 110))
+    arrays["log_scales"][:20] = -0.5  # wide ones, linearized outside of every crop
+    arrays["means"] *= 2.5
+    names = ("colour", "alpha", "depth", "median_depth", "normal")
+    whole = picture(arrays, camera, names)
+    for x, y, width, height in ((0, 0, 150, 110), (0, 0, 37, 21), (51, 33, 64, 48), (113, 89, 37, 21), (77, 50, 1, 1)):
+        part = picture(arrays, camera.cropped(x, y, width, height), names)
+        for name, plane in part.items():
+            expected = whole[name][y : y + height, x : x + width]
+            tolerance = 2e-5 if name == "normal" else 1e-6  # unit length divides by the blend's own
+            np.testing.assert_allclose(plane, expected, atol=tolerance, rtol=1e-6, err_msg=name)
+    assert whole["alpha"].mean() > 0.3
+
+
+def test_crops_of_crops_add_up():
+    arrays, camera = random_splats(300, seed=13, degree=0), upload(record("perspective", 90, 70))
+    once = picture(arrays, camera.cropped(30, 25, 20, 15))
+    twice = picture(arrays, camera.cropped(10, 20, 60, 40).cropped(20, 5, 20, 15))
+    for name, plane in once.items():
+        np.testing.assert_array_equal(plane, twice[name])
+    for x, y, width, height in ((-1, 0, 5, 5), (0, 0, 91, 5), (85, 0, 6, 5), (0, 0, 0, 5), (0, 66, 5, 5)):
+        with pytest.raises(InputError, match="crop: expected a part of the 90x70 pixels"):
+            camera.cropped(x, y, width, height)
+
+
+@pytest.mark.parametrize("vector", [np.zeros(3), [1e-4, 2e-4, -1e-4], [0.3, -0.2, 0.9], [2.0, -1.5, 1.7]])
+@pytest.mark.parametrize("kind", KINDS)
+def test_moved_is_the_rigid_motion(kind, vector):
+    view = record(kind)
+    twist = [*vector, 0.4, -0.2, 0.7]
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = Rotation.from_rotvec(vector).as_matrix(), twist[3:]
+    camera = upload(view).moved(ad.Float(np.array(twist, dtype=np.float32)))
+    expected = (motion @ view.camera_from_world)[:3].ravel()
+    np.testing.assert_allclose(np.array(camera.values)[:12], expected, atol=1e-6)
+    np.testing.assert_array_equal(np.array(camera.values)[12:], np.array(upload(view).values)[12:])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_of_focal_length_and_principal_point(kind):
+    arrays, view, features = wide_splats(), record(kind, 16, 12), own_features(5)
+    camera = upload(view)
+    dr.enable_grad(camera.values)
+    dr.backward(our_loss(Gaussians.from_numpy(arrays), camera, columns_of(features)))
+    names = ["fx", "fy"] if kind == "perspective" else ["scale_x", "scale_y"]
+    names += ["cx", "cy"]
+
+    def loss(values):
+        return twin_loss(arrays, replace(view, **dict(zip(names, values, strict=True))), features)
+
+    start = np.array([getattr(view, name) for name in names])
+    assert_close(np.array(dr.grad(camera.values))[12:16], slope(loss, start), "intrinsics")
+
+
+def test_another_camera_compiles_nothing():
+    gaussians = Gaussians.from_numpy(random_splats(50))
+    for kind in KINDS:
+        dr.eval(project(gaussians, upload(record(kind))))
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.eval(project(gaussians, upload(record(kind, pose=look_at([-1.5, 2.0, 0.9], [0.1, 0.0, 0.0])))))
+            kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
+        assert kernels
+        assert all(kernel["cache_hit"] for kernel in kernels)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("place", [[1e30, 0, 0], [1e38, 1e38, 1e38], [-1e12, 5.0, 1e12]])
+def test_cameras_beyond_reach_show_nothing(kind, place):
+    pose = look_at([2.5, 0.8, 0.6], [0, 0, 0])
+    pose[:3, 3] = place
+    found = picture(random_splats(40), upload(record(kind, pose=pose)))
+    for plane in found.values():
+        assert np.isfinite(plane).all()
+        assert not plane.any()
+
+
+def test_orthographic_camera_says_what_is_wrong():
+    good = {"world_from_camera": np.eye(4), "width": 4, "height": 4, "scale_x": 1, "scale_y": 1, "cx": 2, "cy": 2}
+    OrthographicCamera(**good)
+    for change, message in (
+        ({"scale_x": 0.0}, "pixels per metre"),
+        ({"scale_y": np.nan}, "pixels per metre"),
+        ({"width": 0}, "at least 1x1 pixels"),
+        ({"world_from_camera": 2 * np.eye(4)}, "a rotation"),
+    ):
+        with pytest.raises(InputError, match=message):
+            OrthographicCamera(**{**good, **change})
+    view = OrthographicCamera.from_extent(np.eye(4), 64, 32, 4.0)
+    assert (view.scale_x, view.scale_y, view.cx, view.cy) == (16, 16, 32, 16)
