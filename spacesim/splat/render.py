@@ -86,7 +86,7 @@ def render(
     unknown = [name for name in outputs if name not in OUTPUTS]
     if unknown:
         raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
-    own = [] if features is None else [_finite(ad.Float(feature)) for feature in features]
+    own = [] if features is None else [ad.Float(feature) for feature in features]
     if any(dr.width(feature) not in (1, gaussians.count) for feature in own):
         raise ValueError(f"features: expected arrays of {gaussians.count}, found one of {max(map(dr.width, own))}")
     if gaussians.count == 0:
@@ -101,7 +101,7 @@ def render(
     if "normal" in outputs:
         wanted["normal"] = list(normals(gaussians, camera))
     if features is not None:
-        wanted["features"] = [feature + dr.zeros(ad.Float, gaussians.count) for feature in own]
+        wanted["features"] = [_finite(feature + dr.zeros(ad.Float, gaussians.count)) for feature in own]
 
     blended = blend(splats, footprints, [f for group in wanted.values() for f in group], camera)
     planes, found = iter(blended.planes), dict[str, list[Any]]()
