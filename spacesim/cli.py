@@ -67,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> None:
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
+    logging.getLogger("trimesh").setLevel(logging.WARNING)
     options = _parser().parse_args(arguments)
     options.command = ("spacesim", *arguments)
     if options.debug:

@@ -19,8 +19,8 @@ from spacesim.scenes.scene import Loaded, Scene
 from spacesim.scenes.view import RADIUS, View
 from spacesim.scenes.visibility import Disc, SolarDirections
 
-OFFSET = 1e-5 * RADIUS
-"""From the surface to where shadow rays start: a hundred steps of single precision at the bounding sphere."""
+OFFSET = 2e-6 * RADIUS
+"""From the surface to where shadow rays start: 26 steps of single precision at the bounding sphere."""
 
 LANES = 1 << 24
 """Most shadow rays at once."""
