@@ -34,11 +34,12 @@ class Splats:
 
 @dataclass
 class Footprints:
-    """Which splats can be seen, and where. Not differentiable."""
+    """Which splats can be seen, where, and in which order. Not differentiable."""
 
     half_width: Any  #: [N] of the box around {alpha >= ALPHA_MIN}, pixels
     half_height: Any
     visible: Any  #: [N] bool
+    order: Any  #: [N] UInt32 below 2^31, grows with depth; whatever its sign, and however far away the camera is
 
 
 def project(gaussians: Gaussians, camera: Projection, antialiased: bool = False) -> tuple[Splats, Footprints]:
@@ -96,7 +97,9 @@ def project(gaussians: Gaussians, camera: Projection, antialiased: bool = False)
         opacity=opacity,
         depth=center.z,
     )
-    return splats, _footprints(splats, xx, yy, sane, camera)
+    # The camera's own distance is the same for all: without it, single precision still tells near from far.
+    order = _sortable(dr.detach(dr.dot(camera.row(2), means)))
+    return splats, _footprints(splats, xx, yy, order, sane, camera)
 
 
 def _compensation(ratio: Any) -> Any:
@@ -105,7 +108,14 @@ def _compensation(ratio: Any) -> Any:
     return dr.select(positive, dr.sqrt(dr.select(positive, ratio, 1)), 0)
 
 
-def _footprints(splats: Splats, xx: Any, yy: Any, sane: Any, camera: Projection) -> Footprints:
+def _sortable(depth: Any) -> Any:
+    """UInt32 [N] below 2^31 in the order of finite floats `depth` [N]; equal where only the last bit differs."""
+    bits: Any = dr.reinterpret_array(ad.UInt32, depth)
+    ordered: Any = dr.select(bits >> 31 == 0, bits | 0x80000000, ~bits)
+    return ordered >> 1
+
+
+def _footprints(splats: Splats, xx: Any, yy: Any, order: Any, sane: Any, camera: Projection) -> Footprints:
     """Box of the ellipse where alpha reaches ALPHA_MIN: |d|^2 = 2 ln(o / ALPHA_MIN) in units of the covariance."""
     opacity, x, y = dr.detach(splats.opacity), dr.detach(splats.x), dr.detach(splats.y)
     reach2 = 2 * dr.log(dr.maximum(opacity / ALPHA_MIN, 1))
@@ -114,4 +124,4 @@ def _footprints(splats: Splats, xx: Any, yy: Any, sane: Any, camera: Projection)
     visible = sane & (opacity >= ALPHA_MIN)
     visible &= (x + half_width > 0) & (x - half_width < camera.width)
     visible &= (y + half_height > 0) & (y - half_height < camera.height)
-    return Footprints(half_width, half_height, visible)
+    return Footprints(half_width, half_height, visible, order)

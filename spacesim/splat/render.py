@@ -130,8 +130,8 @@ class Blend:
 
 def blend(splats: Splats, footprints: Footprints, features: Sequence[Any], camera: Projection) -> Blend:
     """Stages 2 and 3 for any number of features (Floats [N]) and any sign of depth. Differentiable."""
-    # The sort takes depths by their bits, as if positive. It gets stand-ins in the same order.
-    sorting = replace(splats, depth=_positive_in_order(dr.detach(splats.depth)))
+    # Tiles sort the bits of positive depths: they get positive stand-ins, in the order of the footprints.
+    sorting = replace(splats, depth=dr.reinterpret_array(ad.Float, footprints.order))
     lists = bin_splats(sorting, footprints, camera.width, camera.height)
     passes = [list(features[i : i + CHANNELS]) for i in range(0, len(features), CHANNELS)] or [[]]
     planes: list[Any] = []
@@ -177,13 +177,6 @@ def _expected(weighted: Any, transmittance: Any) -> Any:
 def _finite(values: Any) -> Any:
     """`values` with 0, and no gradient, in place of what is not finite: 0 times infinity would reach other pixels."""
     return dr.select(dr.detach(dr.isfinite(values)), values, 0)
-
-
-def _positive_in_order(depth: Any) -> Any:
-    """Positive floats in the order of `depth` [N], |depth| < 1e9; depths that differ in the last bit alone may tie."""
-    bits: Any = dr.reinterpret_array(ad.UInt32, depth)
-    ordered: Any = dr.select(bits >> 31 == 0, bits | 0x80000000, ~bits)
-    return dr.reinterpret_array(ad.Float, ordered >> 1)
 
 
 def view_colours(gaussians: Gaussians, camera: Projection, sh_degree: int | None = None) -> Any:

@@ -335,3 +335,15 @@ def test_orthographic_camera_says_what_is_wrong():
             OrthographicCamera(**{**good, **change})
     view = OrthographicCamera.from_extent(np.eye(4), 64, 32, 4.0)
     assert (view.scale_x, view.scale_y, view.cx, view.cy) == (16, 16, 32, 16)
+
+
+@pytest.mark.parametrize("distance", [3.0, 3e4, 3e6])
+def test_order_holds_however_far_the_camera_is(distance):
+    """Discs a centimetre apart behind each other; at 3,000 km single precision has a quarter of a metre for a depth."""
+    arrays = {name: np.repeat(value, 8, axis=0) for name, value in one_splat([0, 0, 0], 1.0, 0.0).items()}
+    arrays["means"][:, 1] = 0.01 * np.array([3, 0, 6, 1, 7, 2, 5, 4])
+    focal = 4.0 * distance
+    view = Camera(look_at([0, -distance, 0], [0, 0, 0]), 8, 8, focal, focal, 4.0, 4.0)
+    output = render(Gaussians.from_numpy(arrays), Pinhole.of(view), features=list(np.eye(8, dtype=np.float32)))
+    shares = output.image("features")[4, 4]
+    np.testing.assert_array_equal(np.argsort(-shares), np.argsort(arrays["means"][:, 1]))
