@@ -21,6 +21,7 @@ import drjit as dr
 import gsplat
 import numpy as np
 import torch
+from peer_gsplat import rasterize, similarity_of
 
 from spacesim import backend
 from spacesim.backend import ad
@@ -48,8 +49,6 @@ GSPLAT_DEFAULTS = DefaultStrategyConfig(
     screen_size_stop=0,
 )
 """The values of gsplat's DefaultStrategy, with the threshold that its documentation gives for absolute gradients."""
-
-Tensors = dict[str, torch.Tensor]
 
 
 def main() -> None:
@@ -94,7 +93,7 @@ def compare_pictures(count: int, size: int) -> dict[str, Any]:
     theirs = {
         name: torch.tensor(a, dtype=torch.float32, device="cuda", requires_grad=True) for name, a in arrays.items()
     }
-    image, alpha, _ = rasterize_gsplat(theirs, camera, 3, "RGB+ED")
+    image, alpha, _ = rasterize(theirs, camera, 3, "RGB+ED")
     (torch.cat([image[..., :3], alpha], -1) * torch.tensor(weights, device="cuda")).sum().backward()
 
     image_np, alpha_np = image.detach().cpu().numpy(), alpha.detach().cpu().numpy()[..., 0]
@@ -115,28 +114,6 @@ def compare_pictures(count: int, size: int) -> dict[str, Any]:
         difference = np.linalg.norm(gradient.reshape(reference.shape) - reference)
         result[f"gradient of {name}"] = float(difference / np.linalg.norm(reference))
     return result
-
-
-def rasterize_gsplat(splats: Tensors, camera: Camera, degree: int, mode: str, **more: Any) -> tuple:
-    """(image [H, W, C], alpha [H, W, 1], info) of gsplat's rasterizer with our parameters."""
-    view = torch.tensor(camera.camera_from_world, dtype=torch.float32, device="cuda")[None]
-    K = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    image, alpha, info = gsplat.rasterization(
-        splats["means"],
-        splats["quaternions"],
-        torch.exp(splats["log_scales"]),
-        torch.sigmoid(splats["logit_opacities"]),
-        torch.cat([splats["sh"]], dim=1) if "sh" in splats else torch.cat([splats["sh0"], splats["shN"]], dim=1),
-        view,
-        torch.tensor(K, dtype=torch.float32, device="cuda")[None],
-        camera.width,
-        camera.height,
-        sh_degree=degree,
-        render_mode=mode,
-        packed=False,
-        **more,
-    )
-    return image[0], alpha[0], info
 
 
 def compare_training(data: Path, iterations: int) -> dict[str, Any]:
@@ -162,7 +139,7 @@ def compare_training(data: Path, iterations: int) -> dict[str, Any]:
     torch.cuda.synchronize()
     theirs = {"seconds": time.monotonic() - began, "gaussians": len(splats["means"])}
     with torch.no_grad():
-        pictures = [rasterize_gsplat(splats, camera, config.sh_degree, "RGB")[0].cpu().numpy() for camera, _ in truth]
+        pictures = [rasterize(splats, camera, config.sh_degree, "RGB")[0].cpu().numpy() for camera, _ in truth]
     theirs["psnr"] = psnr(pictures, [image for _, image in truth])
     return {"iterations": iterations, "test views": len(truth), "spacesim": ours, "gsplat": theirs}
 
@@ -183,7 +160,7 @@ def psnr(pictures: list[np.ndarray], truth: list[np.ndarray]) -> float:
     return float(np.mean(-10 * np.log10(errors)))
 
 
-def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainConfig) -> Tensors:
+def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainConfig) -> dict[str, torch.Tensor]:
     """gsplat's rasterizer, strategy and torch's Adam, on the views, backgrounds and rates of `schedule`."""
     arrays = {**start, "sh0": start["sh"][:, :1], "shN": start["sh"][:, 1:]}
     del arrays["sh"]
@@ -228,7 +205,7 @@ def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainC
             "shN": splats["shN"],
         }
         degree = min(config.sh_degree, index // config.sh_every)
-        image, alpha, info = rasterize_gsplat(renamed, view.camera, degree, "RGB", absgrad=True)
+        image, alpha, info = rasterize(renamed, view.camera, degree, "RGB", absgrad=True)
         strategy.step_pre_backward(splats, optimizers, state, index, info)
         rgba = torch.tensor(view.rgba.view(np.uint8).reshape(view.camera.height, view.camera.width, 4), device="cuda")
         rgba = rgba.float() / 255
@@ -236,7 +213,7 @@ def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainC
         target = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:]) * below
         picture = image + (1 - alpha) * below
         l1 = (picture - target).abs().mean()
-        loss = (1 - config.ssim_weight) * l1 + config.ssim_weight * (1 - ssim_torch(picture, target))
+        loss = (1 - config.ssim_weight) * l1 + config.ssim_weight * (1 - similarity_of(picture, target))
         loss.backward()
         for optimizer in optimizers.values():
             optimizer.step()
@@ -246,23 +223,6 @@ def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainC
             tell(Progress(index + 1, config.iterations, loss.item(), len(splats["means"])))
     names = {"scales": "log_scales", "quats": "quaternions", "opacities": "logit_opacities"}
     return {names.get(name, name): value.detach() for name, value in splats.items()}
-
-
-def ssim_torch(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Mean SSIM with an 11 x 11 Gaussian window, sigma 1.5, zero beyond the border."""
-    offsets = torch.arange(-5, 6, device="cuda", dtype=torch.float32)
-    window = torch.exp(-0.5 * (offsets / 1.5) ** 2)
-    window = (window / window.sum())[None, None]
-    x, y = picture.permute(2, 0, 1)[:, None], target.permute(2, 0, 1)[:, None]
-
-    def blur(planes: torch.Tensor) -> torch.Tensor:
-        rows = torch.nn.functional.conv2d(planes, window[:, :, None, :], padding=(0, 5))
-        return torch.nn.functional.conv2d(rows, window[:, :, :, None], padding=(5, 0))
-
-    mx, my = blur(x), blur(y)
-    vx, vy, vxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
-    value = (2 * mx * my + 1e-4) * (2 * vxy + 9e-4) / ((mx * mx + my * my + 1e-4) * (vx + vy + 9e-4))
-    return value.mean()
 
 
 if __name__ == "__main__":

@@ -1,0 +1,204 @@
+"""What the benchmarks share: the splats that are measured, clocks, tables, and a record of where they ran."""
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim import backend
+from spacesim.data.geometry import fibonacci_sphere, look_at
+from spacesim.data.records import Camera
+
+WARM_UP = 5  #: calls that do not count
+PACKAGES = ("spacesim", "drjit", "mitsuba", "numpy", "torch", "gsplat", "fused_ssim")
+FIELD_OF_VIEW = 35  #: degrees
+DISTANCE = float(np.sqrt(18))  #: of the cameras from the centre of a sphere of radius 1: it fills most of the picture
+
+Work = Callable[[], Any]
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Milliseconds of a call: median and quartiles."""
+
+    median: float
+    low: float
+    high: float
+
+    @staticmethod
+    def of(seconds: Iterable[float]) -> "Timing":
+        low, median, high = 1e3 * np.percentile(np.array(list(seconds)), [25, 50, 75])
+        return Timing(float(median), float(low), float(high))
+
+    def __str__(self) -> str:
+        return f"{self.median:.2f} ({self.low:.2f} to {self.high:.2f})"
+
+
+def arguments(text: str, sizes: str | None = None) -> argparse.ArgumentParser:
+    """A parser with the options that every benchmark has. text: the script's docstring."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--backend", choices=backend.NAMES, default="auto")
+    parser.add_argument("--sizes", default=sizes, help="GAUSSIANSxPIXELS,... (pictures are square)")
+    parser.add_argument("--repeats", type=int, default=30, help="timed calls of each (default 30)")
+    parser.add_argument("--json", nargs="?", const=Path("-"), type=Path, metavar="FILE", help="to FILE or the screen")
+    parser.add_argument("--markdown", action="store_true", help="tables in Markdown")
+    return parser
+
+
+def parse_sizes(text: str) -> list[tuple[int, int]]:
+    """[(Gaussians, pixels of a side)] of "31622x1024,...". Ends the program with a sentence where it is malformed."""
+    try:
+        sizes = [(int(count), int(pixels)) for count, pixels in (item.split("x") for item in text.split(","))]
+    except ValueError:
+        raise SystemExit(f"--sizes: expected GAUSSIANSxPIXELS,..., found {text!r}") from None
+    if min(min(size) for size in sizes) < 1:
+        raise SystemExit(f"--sizes: expected numbers of at least 1, found {text!r}")
+    return sizes
+
+
+def sphere_arrays(count: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Splats on the unit sphere, a little narrower than their spacing, turned and coloured at random, SH degree 3."""
+    rng, spacing = np.random.default_rng(seed), np.sqrt(4 * np.pi / count)
+    return {
+        "means": fibonacci_sphere(count),
+        "log_scales": np.log(spacing * rng.uniform(0.3, 1.0, (count, 3))),
+        "quaternions": rng.normal(size=(count, 4)),
+        "logit_opacities": rng.normal(size=count),
+        "sh": 0.3 * rng.normal(size=(count, 16, 3)),
+    }
+
+
+def camera_from(direction: Sequence[float], pixels: int) -> Camera:
+    """A camera that looks at the sphere from a direction [3]."""
+    place = DISTANCE * np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    return Camera.from_fov(look_at(place, np.zeros(3)), pixels, pixels, FIELD_OF_VIEW)
+
+
+def synchronise() -> None:
+    """Wait for everything that Dr.Jit and torch have under way."""
+    dr.sync_thread()
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def interleaved(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP) -> dict[str, Timing]:
+    """Time of each work, device synchronised before and after; they take turns, so that all see the same machine."""
+    seconds: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(warm_up + repeats):
+        for name, work in works.items():
+            synchronise()
+            start = time.perf_counter()
+            work()
+            synchronise()
+            seconds[name].append(time.perf_counter() - start)
+    return {name: Timing.of(values[warm_up:]) for name, values in seconds.items()}
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """What Dr.Jit's kernel history says of a call: number of launches, milliseconds on the device."""
+
+    launches: int
+    milliseconds: float
+
+
+def kernels(work: Work, repeats: int = 7) -> Kernels:
+    """Of one call, warm: the median over `repeats` of the sum of the times of its kernels, copies and fills."""
+    for _ in range(WARM_UP):
+        work()
+    sums, launches = [], 0
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for _ in range(repeats):
+            dr.sync_thread()
+            dr.kernel_history_clear()
+            work()
+            dr.sync_thread()
+            history = dr.kernel_history()
+            launches = len(history)
+            sums.append(sum(entry["execution_time"] for entry in history))
+    return Kernels(launches, float(np.median(sums)))
+
+
+def machine() -> dict[str, str]:
+    """The device and the versions of all that takes part."""
+    name = backend.select()
+    facts = {"backend": name, "device": _gpu() if name == "cuda" else _cpu(), "python": platform.python_version()}
+    if name == "cuda":
+        facts["cuda"] = ".".join(map(str, dr.detail.cuda_version()))
+    else:
+        facts["llvm"] = ".".join(map(str, dr.detail.llvm_version()))
+    for package in PACKAGES:
+        try:
+            facts[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return facts
+
+
+def _gpu() -> str:
+    query = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
+    try:
+        told = subprocess.run(query, capture_output=True, text=True, check=True).stdout.splitlines()
+    except (OSError, subprocess.CalledProcessError):
+        return "an NVIDIA GPU"
+    return told[0].replace(", ", ", driver ")
+
+
+def _cpu() -> str:
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.processor()}, {dr.thread_count()} threads"
+
+
+def resident() -> float:
+    """Bytes of memory that this process holds (Linux)."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * next(float(line.split()[1]) for line in lines if line.startswith("VmRSS"))
+
+
+def table(rows: Sequence[Row], markdown: bool) -> str:
+    """Rows with the same keys as a table; numbers to the right."""
+    if not rows:
+        return ""
+    head = list(dict.fromkeys(key for row in rows for key in row))
+    cells = [head, *([_cell(row.get(key, "")) for key in head] for row in rows)]
+    widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
+    lines = [[cell.rjust(width) for cell, width in zip(line, widths, strict=True)] for line in cells]
+    if not markdown:
+        return "\n".join("  ".join(line) for line in lines)
+    dashes = ["-" * (width - 1) + ":" for width in widths]
+    return "\n".join("| " + " | ".join(line) + " |" for line in [lines[0], dashes, *lines[1:]])
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.2f}" if abs(value) >= 0.095 or value == 0 else f"{value:.2g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def emit(report: dict[str, Any], tables: Mapping[str, Sequence[Row]], options: argparse.Namespace) -> None:
+    """Print the tables under their titles, or the report as JSON, or both where the JSON goes to a file."""
+    report = {"command": " ".join(["python", *sys.argv]), "machine": machine(), **report}
+    text = json.dumps(report, indent=1, default=lambda value: asdict(value))
+    if options.json is not None and str(options.json) == "-":
+        print(text)
+        return
+    if options.json is not None:
+        options.json.write_text(text + "\n")
+    facts = ", ".join(f"{key} {value}" for key, value in report["machine"].items())
+    print(f"`{report['command']}`\n\n{facts}" if options.markdown else f"{report['command']}\n{facts}")
+    for title, rows in tables.items():
+        if rows:
+            print(f"\n{title}\n\n{table(rows, options.markdown)}")

@@ -1,0 +1,140 @@
+"""How fast one frame is binned, blended and differentiated, and how that grows.
+
+    python benchmarks/rasterizer.py [--sizes 31622x1024,165495x1024] [--peers gsplat] [--markdown] [--json FILE]
+    python benchmarks/rasterizer.py --growth [--plot growth.svg]
+
+The scene is a sphere of random splats that fills most of the picture, spherical harmonics of degree 3. Two times are
+given. "On the clock": synchronised calls from Python, tracing and launching included; median and quartiles after
+warm-up, ours and the peer's in turn. "Kernels": what the device alone needs, by Dr.Jit's kernel history and torch's
+profiler. "frame" is parameters to picture without gradients; forward and backward are blending and its adjoint.
+`--growth` measures 10,000 to 1,000,000 Gaussians and 128 to 2048 pixels (a tenth of that on a CPU), prints the slope
+of time against pairs of tile and splat, and draws it with `--plot`.
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import common
+import growth
+from pipeline import Pipeline, arguments_of
+
+from spacesim import backend
+
+STAGES = ("project", "bin", "forward", "backward", "frame")
+SHARED = ("bin", "forward", "backward")  #: what is compared with gsplat's kernels
+SIZES = {"cuda": "31622x1024,101958x1024,165495x1024,1000000x1024", "llvm": "10000x256,30000x256,30000x512"}
+
+
+def main() -> None:
+    parser = common.arguments(__doc__)
+    parser.add_argument("--peers", choices=["gsplat"], help="measured in turn with ours; needs CUDA, torch, gsplat")
+    parser.add_argument("--growth", action="store_true", help="sizes that show how the time grows")
+    parser.add_argument("--plot", type=Path, metavar="FILE.svg", help="draw time against pairs")
+    options = parser.parse_args()
+    name = backend.select(options.backend)
+    sizes = common.parse_sizes(options.sizes or (growth.SIZES if options.growth else SIZES)[name])
+    peer = load_peer(options.peers, name)
+    results = [measure(count, pixels, options.repeats, peer) for count, pixels in sizes]
+    report: dict[str, Any] = {"rows": results}
+    tables = {
+        "On the clock, ms: median": [clock_row(r) for r in results],
+        "Kernels, ms": [kernel_row(r) for r in results],
+        "Beside gsplat, ms (ratio: ours / gsplat's)": [peer_row(r) for r in results if "gsplat" in r],
+    }
+    if options.growth or options.plot:
+        points = [growth.Point(r["gaussians"], r["pixels"], r["pairs"], r["kernels"]["sum"]) for r in results]
+        report["growth"] = growth.summary(points)
+        tables["Growth of the kernels' sum (project + bin + forward + backward)"] = [report["growth"]]
+        if options.plot:
+            options.plot.write_text(growth.plot("bin + forward + backward, kernels", points))
+    common.emit(report, tables, options)
+
+
+def load_peer(wanted: str | None, name: str) -> Any:
+    """The module `peer_gsplat`, or None with a line that says why it is not measured."""
+    if wanted is None:
+        return None
+    try:
+        if name != "cuda":
+            raise ImportError("gsplat runs on CUDA alone")
+        import peer_gsplat
+    except ImportError as error:
+        print(f"gsplat: not measured here ({error})", file=sys.stderr)
+        return None
+    return peer_gsplat
+
+
+def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:
+    """Times of the stages for `count` Gaussians on pixels x pixels, and of the peer's in turn with them."""
+    arrays, camera = common.sphere_arrays(count), common.camera_from((4, 1, 1), pixels)
+    ours = Pipeline(arrays, camera)
+    works = {stage: getattr(ours, stage) for stage in STAGES}
+    theirs: dict[str, Any] = {}
+    if peer is not None:
+        frame = peer.Frame(arrays, camera)
+        theirs = {"frame": frame.whole} | {stage: getattr(frame, stage) for stage in SHARED}
+    times: dict[str, common.Timing] = {}
+    for stage, work in works.items():  # a stage of ours in turn with the same stage of the peer's
+        turn = {stage: work} | ({f"gsplat {stage}": theirs[stage]} if stage in theirs else {})
+        times |= common.interleaved(turn, repeats)
+    kernels = {stage: common.kernels(work) for stage, work in works.items()}
+    sums = {stage: found.milliseconds for stage, found in kernels.items()}
+    result: dict[str, Any] = {"gaussians": count, "pixels": pixels, **arguments_of(ours)}
+    result["clock"] = {stage: times[stage] for stage in STAGES}
+    result["kernels"] = sums | {"sum": sum(sums[stage] for stage in STAGES if stage != "frame")}
+    result["launches"] = {stage: found.launches for stage, found in kernels.items()}
+    if theirs:
+        device = {stage: peer.device_milliseconds(work) for stage, work in theirs.items()}
+        clock = {stage: times[f"gsplat {stage}"] for stage in theirs}
+        result["gsplat"] = {"pairs": frame.pairs, "clock": clock, "kernels": device}
+        result["ratios"] = ratios(result)
+    return result
+
+
+def ratios(result: dict[str, Any]) -> dict[str, float | None]:
+    """Ours over gsplat's: a frame on the clock and by kernels; binning, forward and backward likewise."""
+    ours, theirs = result, result["gsplat"]
+    found: dict[str, float | None] = {
+        "frame, clock": ours["clock"]["frame"].median / theirs["clock"]["frame"].median,
+        "bin + forward + backward, clock": sum(ours["clock"][s].median for s in SHARED)
+        / sum(theirs["clock"][s].median for s in SHARED),
+    }
+    device = theirs["kernels"]
+    if None not in device.values():
+        found["frame, kernels"] = ours["kernels"]["frame"] / device["frame"]
+        sums = sum(ours["kernels"][s] for s in SHARED), sum(device[s] for s in SHARED)
+        found["bin + forward + backward, kernels"] = sums[0] / sums[1]
+    return found
+
+
+def clock_row(result: dict[str, Any]) -> common.Row:
+    row: common.Row = {"Gaussians": result["gaussians"], "pixels": result["pixels"], "pairs": result["pairs"]}
+    row |= {stage: result["clock"][stage].median for stage in STAGES[:-1]}
+    return row | {"frame (quartiles)": result["clock"]["frame"]}
+
+
+def kernel_row(result: dict[str, Any]) -> common.Row:
+    row: common.Row = {"Gaussians": result["gaussians"], "pixels": result["pixels"], "pairs": result["pairs"]}
+    row |= {stage: result["kernels"][stage] for stage in STAGES[:-1]}
+    row |= {"sum": result["kernels"]["sum"], "ns a pair": 1e6 * result["kernels"]["sum"] / result["pairs"]}
+    return row | {"frame": result["kernels"]["frame"]}
+
+
+def peer_row(result: dict[str, Any]) -> common.Row:
+    """A frame on the clock, then the kernels of the stages, each ours / gsplat's."""
+    theirs = result["gsplat"]
+    row: common.Row = {"Gaussians": result["gaussians"], "pixels": result["pixels"]}
+    row["frame"] = f"{result['clock']['frame']} / {theirs['clock']['frame']}"
+    row["frame, ratio"] = result["ratios"]["frame, clock"]
+    for stage in (*SHARED, "frame"):
+        other = theirs["kernels"][stage]
+        told = "-" if other is None else f"{other:.2f}"
+        row[f"{stage}, kernels"] = f"{result['kernels'][stage]:.2f} / {told}"
+    row["b + f + b, kernels, ratio"] = result["ratios"].get("bin + forward + backward, kernels", "-")
+    row["b + f + b, clock, ratio"] = result["ratios"]["bin + forward + backward, clock"]
+    return row
+
+
+if __name__ == "__main__":
+    main()
