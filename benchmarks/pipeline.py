@@ -5,10 +5,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from spacesim.backend import ad
+from spacesim.backend import ad, recorded
 from spacesim.data.records import Camera
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.project import Pinhole, project
+from spacesim.splat.project import Footprints, Pinhole, Splats, project
 from spacesim.splat.rasterize import backward, forward
 from spacesim.splat.render import render, view_colours
 from spacesim.splat.tiles import bin_splats
@@ -19,24 +19,26 @@ SSIM_WEIGHT = 0.2
 
 
 class Pipeline:
-    """Gaussians before a camera. Each method is a stage: it evaluates its results and leaves them for the next."""
+    """Gaussians before a camera. Each method is a stage: it evaluates its results and leaves them for the next.
+
+    Stages of fixed shape (project, loss, update) are recorded and replayed, as the trainer does.
+    """
 
     def __init__(self, arrays: dict[str, np.ndarray], camera: Camera) -> None:
         self.gaussians, self.camera = Gaussians.from_numpy(arrays), Pinhole.of(camera)
         self.size = camera.width, camera.height
         self.optimizer = Adam(self.gaussians.rows())
         noise = np.random.default_rng(0).uniform(size=(3, camera.width * camera.height)).astype(np.float32)
-        self.truth = ad.Array3f(noise)
+        self.truth = list(ad.Array3f(noise))
         self.factors = ad.Float([1.0, 1.0, *[0.0] * len(self.gaussians.rows())])
         dr.eval(self.gaussians.rows(), self.truth, self.factors)
+        self._project, self._loss, self._update = recorded(_project, 2), recorded(_loss, 2), recorded(_update, 2)
         for stage in (self.project, self.bin, self.forward, self.loss, self.backward, self.update):
             stage()
 
     def project(self) -> None:
         """Gaussians to ellipses on the screen and colours."""
-        self.splats, self.footprints = project(self.gaussians, self.camera)
-        self.colour = list(view_colours(self.gaussians, self.camera))
-        dr.eval(self.splats, self.footprints, self.colour)
+        self.splats, self.footprints, self.colour = self._project(self.gaussians.rows(), self.camera)
 
     def bin(self) -> None:
         """Ellipses to lists of tiles."""
@@ -49,11 +51,7 @@ class Pipeline:
 
     def loss(self) -> None:
         """L1 + D-SSIM and the gradients of the pixels."""
-        colour, transmittance = ad.Array3f(self.blended.features), ad.Float(self.blended.transmittance)
-        dr.enable_grad(colour, transmittance)
-        dr.backward(photometric_loss(colour + 0.5 * transmittance, self.truth, *self.size, SSIM_WEIGHT))
-        self.by_pixel = list(dr.grad(colour)), dr.grad(transmittance)
-        dr.eval(self.by_pixel)
+        self.by_pixel = self._loss(self.blended.features, self.blended.transmittance, self.truth, self.size)
 
     def backward(self) -> None:
         """Gradients of the pixels to gradients of the ellipses and colours."""
@@ -61,18 +59,9 @@ class Pipeline:
 
     def update(self) -> None:
         """Gradients of the ellipses to those of the parameters, and an Adam step whose rates are 0."""
-        rows = [ad.Float(row) for row in self.gaussians.rows()]
-        dr.enable_grad(rows)
-        gaussians = Gaussians.from_rows(rows)
-        splats, _ = project(gaussians, self.camera)
-        pairs = [(getattr(splats, name), getattr(self.by_splat.splats, name)) for name in ("x", "y", "a", "b", "c")]
-        pairs += [(splats.opacity, self.by_splat.splats.opacity)]
-        pairs += list(zip(view_colours(gaussians, self.camera), self.by_splat.features, strict=True))
-        dr.backward(sum((value * gradient for value, gradient in pairs[1:]), pairs[0][0] * pairs[0][1]))
-        numbers = [dr.gather(ad.Float, self.factors, ad.UInt32(i)) for i in range(2 + len(rows))]
-        moments, gradients = (self.optimizer.first, self.optimizer.second), [dr.grad(row) for row in rows]
-        moved, first, second = adam_step(dr.detach(rows), gradients, moments, numbers[2:], (numbers[0], numbers[1]))
-        dr.eval(moved, first, second)
+        gradients = self.by_splat.splats, self.by_splat.features
+        moments = self.optimizer.first, self.optimizer.second
+        self._update(self.gaussians.rows(), moments, self.camera, gradients, self.factors)
 
     def frame(self) -> None:
         """Parameters to picture, as a user asks for it: colour and alpha, without gradients."""
@@ -94,3 +83,33 @@ def arguments_of(pipeline: Pipeline) -> dict[str, Any]:
         "blended pairs": pipeline.blended_pairs,
         "tile": f"{lists.shape.width}x{lists.shape.height}, {lists.shape.lanes} lanes",
     }
+
+
+def _project(rows: list[Any], camera: Pinhole) -> tuple[Splats, Footprints, list[Any]]:
+    gaussians = Gaussians.from_rows(rows)
+    return *project(gaussians, camera), list(view_colours(gaussians, camera))
+
+
+def _loss(colour: list[Any], transmittance: Any, truth: list[Any], size: tuple[int, int]) -> tuple[list[Any], Any]:
+    """Gradients of the loss over a grey background, by colour and transmittance."""
+    planes, passed = ad.Array3f(colour), ad.Float(transmittance)
+    dr.enable_grad(planes, passed)
+    dr.backward(photometric_loss(planes + 0.5 * passed, ad.Array3f(truth), *size, SSIM_WEIGHT))
+    return list(dr.grad(planes)), dr.grad(passed)
+
+
+def _update(rows: list[Any], moments: Any, camera: Pinhole, gradients: tuple[Splats, list[Any]], factors: Any) -> Any:
+    rows = [ad.Float(row) for row in rows]
+    dr.enable_grad(rows)
+    gaussians = Gaussians.from_rows(rows)
+    splats, _ = project(gaussians, camera)
+    by_splat, by_colour = gradients
+    along = splats.opacity * by_splat.opacity
+    for name in ("x", "y", "a", "b", "c"):
+        along += getattr(splats, name) * getattr(by_splat, name)
+    for value, gradient in zip(view_colours(gaussians, camera), by_colour, strict=True):
+        along += value * gradient
+    dr.backward(along)
+    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(2 + len(rows))]
+    by_row = [dr.grad(row) for row in rows]
+    return adam_step(dr.detach(rows), by_row, moments, numbers[2:], (numbers[0], numbers[1]))

@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from weakref import WeakSet
 
 NAMES = ("auto", "cuda", "llvm")
 MINIMUM_LLVM = 19
@@ -34,6 +35,7 @@ _LIBRARY_PLACES = (
 )
 
 _selected: str | None = None
+_recorded: WeakSet[Any] = WeakSet()
 
 
 class BackendError(RuntimeError):
@@ -174,6 +176,7 @@ def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
     import drjit as dr
 
     frozen = dr.freeze(function, limit=limit, warn_after=limit)
+    _recorded.add(frozen)
 
     def call(*arguments: Any) -> Any:
         collecting = gc.isenabled()
@@ -185,6 +188,11 @@ def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
                 gc.enable()
 
     return call
+
+
+def recordings() -> int:
+    """How many recordings the functions of `recorded` that are alive have made: once warm, it stands still."""
+    return sum(frozen.n_recordings for frozen in _recorded)
 
 
 class _Arrays:

@@ -1,0 +1,38 @@
+"""OpenSplat's CPU mode as a peer: its binary on a data set of ours, in Nerfstudio's layout, refinement off."""
+
+import os
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+from spacesim.data.records import Dataset
+
+STEPS = 40, 120  #: of the short and the long run; their difference is free of start-up and of writing the result
+OFF = "1000000000"
+
+
+def milliseconds_a_step(binary: Path, dataset: Dataset, repeats: int = 3) -> list[float]:
+    """Of `repeats` pairs of runs: the time that the long one takes more, over its steps more.
+
+    Ends the program with a sentence where the binary fails.
+    """
+    short, long = STEPS
+    return [
+        1e3 * (_seconds(binary, dataset, long) - _seconds(binary, dataset, short)) / (long - short)
+        for _ in range(repeats)
+    ]
+
+
+def _seconds(binary: Path, dataset: Dataset, steps: int) -> float:
+    with tempfile.TemporaryDirectory() as folder:
+        command = [str(binary), str(dataset.root), "-o", str(Path(folder) / "splat.ply"), "-n", str(steps)]
+        command += ["-d", "1", "--num-downscales", "0", "--sh-degree", "3", "--sh-degree-interval", "1"]
+        command += ["--refine-every", OFF, "--warmup-length", OFF]
+        start = time.perf_counter()
+        environment = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        seconds = time.perf_counter() - start
+    if done.returncode != 0:
+        raise SystemExit(f"--opensplat: {binary} ended with code {done.returncode}: {done.stderr.strip()[-300:]}")
+    return seconds

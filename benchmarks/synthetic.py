@@ -1,0 +1,61 @@
+"""A data set for the benchmarks: pictures of a sphere of splats by our own rasterizer, and a trainer on it."""
+
+from pathlib import Path
+
+import numpy as np
+from common import camera_from, sphere_arrays
+
+from spacesim.data.files import write_json
+from spacesim.data.geometry import fibonacci_sphere
+from spacesim.data.images import write_png
+from spacesim.data.records import Dataset
+from spacesim.data.store import read_dataset, write_points
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.project import Pinhole
+from spacesim.splat.render import render
+from spacesim.splat.train.config import LearningRates, TrainConfig
+from spacesim.splat.train.strategies.default import DefaultStrategyConfig
+from spacesim.splat.train.trainer import Trainer
+
+VIEWS = 8
+NEVER = 10**9  #: iterations
+STILL = LearningRates(**dict.fromkeys(LearningRates.__dataclass_fields__, 1e-12))
+"""Step sizes that move nothing: every step has the same work, and the splats stay those of the sphere."""
+
+
+def write_dataset(root: Path, count: int, pixels: int, views: int = VIEWS) -> Dataset:
+    """Opaque pictures, over black, of a sphere of `count` splats, from all sides; `count` points to start from.
+
+    The pictures show other splats than `sphere_arrays(count)`, so that there is something to learn.
+    """
+    arrays = sphere_arrays(count)
+    model = Gaussians.from_numpy({**arrays, "sh": sphere_arrays(count, seed=1)["sh"]})
+    frames = []
+    (root / "images").mkdir(parents=True)
+    for index, direction in enumerate(fibonacci_sphere(views)):
+        camera = camera_from(direction, pixels)
+        picture = render(model, Pinhole.of(camera), outputs=("colour",)).image("colour")
+        name = f"images/train_{index:02d}.png"
+        write_png(root / name, np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8), durable=False)
+        frames.append({"file_path": name, "transform_matrix": camera.opengl.tolist()})
+    write_points(root / "points.ply", arrays["means"], np.full((count, 3), 128, np.uint8))
+    meta = {"camera_model": "OPENCV", "w": pixels, "h": pixels, "cx": camera.cx, "cy": camera.cy}
+    meta |= {"fl_x": camera.fx, "fl_y": camera.fy, "ply_file_path": "points.ply", "frames": frames}
+    meta |= {"train_filenames": [frame["file_path"] for frame in frames], "test_filenames": []}
+    write_json(root / "transforms.json", meta)
+    return read_dataset(root)
+
+
+def still_trainer(dataset: Dataset, arrays: dict[str, np.ndarray]) -> Trainer:
+    """A trainer whose steps are whole but move nothing and refine nothing, all harmonics from its fourth step on."""
+    config = TrainConfig(
+        iterations=NEVER,
+        init="points",
+        init_count=len(arrays["means"]),
+        sh_every=1,
+        rates=STILL,
+        refinement=DefaultStrategyConfig(refine_start=NEVER, refine_stop=NEVER),
+    )
+    trainer = Trainer(dataset, config)
+    trainer.gaussians = Gaussians.from_numpy(arrays)
+    return trainer

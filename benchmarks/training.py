@@ -1,0 +1,148 @@
+"""How long a training step takes, beside gsplat or OpenSplat; where its time goes; what it holds and records.
+
+    python benchmarks/training.py [--sizes 31622x1024] [--peers gsplat] [--opensplat PATH] [--markdown] [--json FILE]
+    python benchmarks/training.py --growth [--plot step.svg]
+    python benchmarks/training.py --profile [--sizes ...]
+    python benchmarks/training.py --memory
+    python benchmarks/training.py --steps 10000
+
+A step is the trainer's own: picture upload, rasterization with spherical harmonics of degree 3, L1 + D-SSIM, gradients,
+Adam over all parameters, statistics; refinement is off and step sizes are 1e-12, so that every step has the same work.
+Ours and the peer's take turns; medians and quartiles after warm-up. gsplat's step is its rasterizer, SSIM by torch's
+conv2d (and by fused_ssim where that is installed), torch's Adam (plain and fused), its pictures on the device already.
+OpenSplat is a binary given by path, run on the same pictures from the same points, as ours in that row.
+
+`--profile`: time of each stage's kernels beside the physical floor. `--memory`: bytes a Gaussian, by Dr.Jit's own
+count of what it has allocated at most. `--steps N`: training with refinement; recordings, kernels, memory at ten marks.
+"""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import common
+import counters
+import floors
+import growth
+import numpy as np
+import peer_opensplat
+from pipeline import SSIM_WEIGHT, Pipeline
+from rasterizer import load_peer
+from synthetic import NEVER, STILL, still_trainer, write_dataset
+
+from spacesim import backend
+from spacesim.data.images import load_image
+from spacesim.splat.train.trainer import Trainer
+
+SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "30000x256"}
+WARM_UP = 20  #: steps: all degrees of harmonics are recorded, all pictures decoded
+RATES = dict.fromkeys(("means", "log_scales", "quaternions", "logit_opacities", "sh0", "shN"), STILL.means)
+
+
+def main() -> None:
+    parser = common.arguments(__doc__)
+    parser.add_argument("--peers", choices=["gsplat"], help="measured in turn with ours; needs CUDA, torch, gsplat")
+    parser.add_argument("--opensplat", type=Path, metavar="PATH", help="OpenSplat's binary, run on the CPU")
+    parser.add_argument("--growth", action="store_true", help="sizes that show how the time grows")
+    parser.add_argument("--plot", type=Path, metavar="FILE.svg", help="draw time against pairs")
+    parser.add_argument("--profile", action="store_true", help="stages beside the physical floor")
+    parser.add_argument("--memory", action="store_true", help="bytes a Gaussian")
+    parser.add_argument("--steps", type=int, metavar="N", help="counters over N steps with refinement")
+    options = parser.parse_args()
+    name = backend.select(options.backend)
+    sizes = common.parse_sizes(options.sizes or (growth.SIZES if options.growth else SIZES)[name])
+    if options.steps is not None:
+        rows = counters.over_steps(options.steps)
+        return common.emit({"steps": rows}, {"Training with refinement, 64 x 64 pixels": rows}, options)
+    if options.memory:
+        rows = [counters.memory(count, pixels) for count, pixels in sizes]
+        return common.emit({"memory": rows}, {"Memory of training at SH 3": rows}, options)
+    if options.profile:
+        report, tables = floors.profiles(sizes)
+        return common.emit(report, tables, options)
+    peer = load_peer(options.peers, name)
+    results = [measure(count, pixels, options.repeats, peer) for count, pixels in sizes]
+    report = {"rows": results}
+    tables = {"A training step, ms: median (quartiles)": [row for result in results for row in describe(result)]}
+    if name == "llvm" or options.opensplat:
+        rows = [beside_opensplat(*size, options.repeats, options.opensplat) for size in sizes[:1]]
+        report["opensplat"] = rows
+        tables["Beside OpenSplat's CPU mode, from the same points, ms a step"] = rows
+    if options.growth or options.plot:
+        points = [growth.Point(r["gaussians"], r["pixels"], r["pairs"], r["clock"]["spacesim"].median) for r in results]
+        report["growth"] = growth.summary(points)
+        tables["Growth of the step"] = [report["growth"]]
+        if options.plot:
+            options.plot.write_text(growth.plot("training step on the clock", points))
+    common.emit(report, tables, options)
+
+
+def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:
+    """Times of a step of ours and of the peer's ways to make one."""
+    arrays = common.sphere_arrays(count)
+    with tempfile.TemporaryDirectory() as folder:
+        dataset = write_dataset(Path(folder) / "data", count, pixels)
+        trainer = still_trainer(dataset, arrays)
+        works: dict[str, Callable[[], Any]] = {"spacesim": trainer.step}
+        if peer is not None:
+            views = [(frame.camera, load_image(dataset, frame).rgb) for frame in dataset.train]
+            for ssim, fused in [
+                ("torch", False),
+                ("torch", True),
+                *([("fused_ssim", True)] if has_fused_ssim() else []),
+            ]:
+                label = f"gsplat, SSIM by {ssim}, Adam {'fused' if fused else 'plain'}"
+                works[label] = peer.Step(arrays, views, RATES, SSIM_WEIGHT, ssim, fused)
+        times = common.interleaved(works, repeats, WARM_UP)
+        found = common.kernels(trainer.step)
+    if trainer.gaussians.count != count or trainer.iteration >= NEVER:
+        raise AssertionError("a step of the benchmark has refined")
+    pairs = Pipeline(arrays, dataset.train[0].camera).lists.pairs
+    result: dict[str, Any] = {"gaussians": count, "pixels": pixels, "pairs": pairs, "clock": times}
+    result |= {"kernels": found.milliseconds, "launches": found.launches}
+    result["ratios"] = {k: times["spacesim"].median / t.median for k, t in times.items() if k != "spacesim"}
+    return result
+
+
+def describe(result: dict[str, Any]) -> list[common.Row]:
+    """A line for each program."""
+    rows: list[common.Row] = []
+    for program, timing in result["clock"].items():
+        row: common.Row = {"Gaussians": result["gaussians"], "pixels": result["pixels"], "program": program}
+        row["a step"] = timing
+        row["kernels"] = result["kernels"] if program == "spacesim" else ""
+        row["ours / theirs"] = result["ratios"].get(program, "")
+        rows.append(row)
+    return rows
+
+
+def beside_opensplat(count: int, pixels: int, repeats: int, binary: Path | None) -> common.Row:
+    """Our step from points, as OpenSplat starts, and OpenSplat's, where its binary is given."""
+    with tempfile.TemporaryDirectory() as folder:
+        dataset = write_dataset(Path(folder) / "data", count, pixels)
+        trainer = from_points(dataset, count)
+        ours = common.interleaved({"spacesim": trainer.step}, repeats, WARM_UP)["spacesim"]
+        row: common.Row = {"Gaussians": count, "pixels": pixels, "spacesim": ours}
+        if binary is None:
+            return row | {"OpenSplat": "not measured here: needs the binary", "ours / theirs": "-"}
+        theirs = common.Timing.of(1e-3 * np.array(peer_opensplat.milliseconds_a_step(binary, dataset)))
+    return row | {"OpenSplat": theirs, "ours / theirs": ours.median / theirs.median}
+
+
+def from_points(dataset: Any, count: int) -> Trainer:
+    """A trainer whose Gaussians start at the data set's points: opacity 0.1, as wide as their spacing."""
+    probe = still_trainer(dataset, common.sphere_arrays(count))
+    return Trainer(dataset, probe.config)
+
+
+def has_fused_ssim() -> bool:
+    try:
+        import fused_ssim  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+if __name__ == "__main__":
+    main()
