@@ -126,11 +126,11 @@ class Projection(ABC):
         """
         wx, wy, wz, *translation = (dr.gather(ad.Float, twist, ad.UInt32(i)) for i in range(6))
         square = wx * wx + wy * wy + wz * wz
-        tiny = dr.detach(square) < 1e-6  # there the series is exact to single precision
+        tiny = dr.detach(square) < 1e-6  # there the limits at 0 are exact to single precision
         angle = dr.sqrt(dr.select(tiny, 1, square))
         half = dr.sin(0.5 * angle) / angle
-        first = dr.select(tiny, 1 - square / 6, dr.sin(angle) / angle)
-        second = dr.select(tiny, 0.5 - square / 24, 2 * half * half)
+        first = dr.select(tiny, 1, dr.sin(angle) / angle)
+        second = dr.select(tiny, 0.5, 2 * half * half)
         turn = (
             (1 - second * (wy * wy + wz * wz), second * wx * wy - first * wz, second * wx * wz + first * wy),
             (second * wx * wy + first * wz, 1 - second * (wx * wx + wz * wz), second * wy * wz - first * wx),

@@ -84,10 +84,11 @@ class _Pick(dr.CustomOp):
         gradient = ad.Float64(self.grad_out())
         gradient = dr.select(dr.isfinite(gradient), gradient, 0)
         unit_of_sum = dr.maximum(dr.max(dr.abs(gradient)), 1e-300) * (dr.width(self.index) / 2.0**61)
-        total = dr.zeros(ad.Int64, self.count)
-        active = self.index < self.count
-        dr.scatter_reduce(dr.ReduceOp.Add, total, ad.Int64(dr.round(gradient / unit_of_sum)), self.index, active)
-        self.set_grad_in("values", ad.Float(ad.Float64(total) * unit_of_sum))
+        parts = dr.reinterpret_array(ad.UInt64, ad.Int64(dr.round(gradient / unit_of_sum)))  # CUDA adds unsigned ones
+        total = dr.zeros(ad.UInt64, self.count)
+        dr.scatter_reduce(dr.ReduceOp.Add, total, parts, self.index, self.index < self.count)
+        total = ad.Float64(dr.reinterpret_array(ad.Int64, total))
+        self.set_grad_in("values", ad.Float(total * unit_of_sum))
 
     def name(self) -> str:
         return "pick"

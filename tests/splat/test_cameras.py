@@ -133,6 +133,17 @@ def test_picture_matches_the_twin(kind, antialiased, count, size):
     np.testing.assert_allclose(ours.image("normal")[steady], twin.normal[steady], atol=2e-3)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_splats_beyond_the_border_match_the_twin(kind):
+    """Large ones all around a small picture: in perspective, most are linearized at its border."""
+    arrays, view = random_splats(40, seed=31, degree=0), record(kind, 36, 20)
+    arrays["means"] *= 2.5
+    arrays["log_scales"] += 1.2
+    twin, ours = render_reference(arrays, view), picture(arrays, upload(view), ("colour", "alpha"))
+    for name, plane in ours.items():
+        np.testing.assert_allclose(plane, getattr(twin, name), atol=1e-5, err_msg=name)
+
+
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_of_every_parameter_match_central_differences(kind, antialiased):

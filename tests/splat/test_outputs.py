@@ -157,6 +157,13 @@ def test_normals_of_a_sphere_point_outwards(view, axes):
     np.testing.assert_allclose(np.linalg.norm(found[hit], axis=-1), 1, atol=1e-5)
 
 
+def test_normals_of_quaternions_without_direction_are_finite():
+    arrays = random_splats(4)
+    arrays["quaternions"][:3] = [[0, 0, 0, 0], [np.nan, 0, 0, 1], [1e30, 0, 0, 0]]
+    found = np.array(normals(Gaussians.from_numpy(arrays), upload(perspective())))
+    np.testing.assert_allclose(np.linalg.norm(found, axis=0), 1, atol=1e-6)
+
+
 def test_normal_axes_by_name_only():
     gaussians = Gaussians.from_numpy(random_splats(3))
     with pytest.raises(ValueError, match='axes: expected "world" or "camera"'):
