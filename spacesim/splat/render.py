@@ -19,7 +19,7 @@ from spacesim.splat.surface import median_splat, normals, picked, unit
 from spacesim.splat.tiles import TileLists, bin_splats
 
 OUTPUTS = ("colour", "alpha", "depth", "median_depth", "normal")
-CHANNELS = 16  #: features blended in one pass: fewer repeat the blending, more take registers and gain little (docs/rasterizer.md)
+CHANNELS = 16  #: features in one pass: fewer repeat the blending, more gain little (docs/rasterizer.md)
 
 
 @dataclass
