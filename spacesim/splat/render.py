@@ -87,8 +87,9 @@ def render(
     if unknown:
         raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
     own = [] if features is None else [ad.Float(feature) for feature in features]
-    if any(dr.width(feature) not in (1, gaussians.count) for feature in own):
-        raise ValueError(f"features: expected arrays of {gaussians.count}, found one of {max(map(dr.width, own))}")
+    strange = [dr.width(feature) for feature in own if dr.width(feature) not in (1, gaussians.count)]
+    if strange:
+        raise ValueError(f"features: expected arrays of {gaussians.count}, found one of {strange[0]}")
     if gaussians.count == 0:
         return _nothing(camera, outputs, None if features is None else len(own))
 

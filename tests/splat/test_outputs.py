@@ -234,7 +234,7 @@ def test_wrong_requests_are_told():
     with pytest.raises(ValueError, match=r"outputs: expected some of colour, alpha, .* found 'color'"):
         render(gaussians, camera, outputs=("color",))
     with pytest.raises(ValueError, match="features: expected arrays of 30, found one of 29"):
-        render(gaussians, camera, features=[dr.zeros(ad.Float, 29)])
+        render(gaussians, camera, features=[dr.zeros(ad.Float, 30), dr.zeros(ad.Float, 29)])
     with pytest.raises(ValueError, match=r"name: expected one of the outputs asked for .* found 'normal'"):
         render(gaussians, camera).image("normal")
 
