@@ -2,8 +2,8 @@
 
 The floor of a stage is the larger of two times: the bytes that must move over the bandwidth of a large copy, and the
 operations that must be done over the rate of a loop of multiply-adds (exponentials over their own), all measured in
-the same run, the best of several. Bytes are compulsory ones: every input read once, every output written once, nothing
-in between. Operations are counted for the method as it is: every pixel of a tile looks at each pair that the tile walks.
+the same run, the best of several. Bytes are compulsory ones: every input read once, every output written once.
+Operations are counted for the method as it is: every pixel of a tile looks at each pair that the tile walks.
 """
 
 import tempfile

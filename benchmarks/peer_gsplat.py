@@ -158,10 +158,13 @@ def device_milliseconds(work: Any, repeats: int = 7) -> float | None:
     for _ in range(3):
         work()
     torch.cuda.synchronize()
-    with profile(activities=[ProfilerActivity.CUDA]) as found:
-        for _ in range(repeats):
-            work()
-        torch.cuda.synchronize()
+    try:
+        with profile(activities=[ProfilerActivity.CUDA]) as found:
+            for _ in range(repeats):
+                work()
+            torch.cuda.synchronize()
+    except (RuntimeError, AssertionError):
+        return None
     microseconds = sum(getattr(event, "self_device_time_total", 0) for event in found.key_averages())
     return 1e-3 * microseconds / repeats if microseconds > 0 else None
 
