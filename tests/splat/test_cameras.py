@@ -163,6 +163,28 @@ def test_gradients_of_every_parameter_match_central_differences(kind, antialiase
     assert_close(ours, twin, "features")
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradients_of_small_orthographic_splats(antialiased):
+    """Splats of a pixel or two, which end at their cut: the step is too small to move it across a pixel."""
+    arrays, view = random_splats(14, seed=41, degree=1), record("orthographic", 20, 14)
+    gaussians = Gaussians.from_numpy(arrays)
+    dr.enable_grad(*gaussians.parameters().values())
+    output = render(gaussians, upload(view), outputs=("colour",), antialiased=antialiased)
+    weight = np.random.default_rng(5).normal(size=(14, 20, 4))
+    planes = [*output.colour, output.alpha]
+    columns = [ad.Float(weight[..., c].ravel().astype(np.float32)) for c in range(4)]
+    dr.backward(sum((dr.sum(w * plane) for w, plane in zip(columns, planes, strict=True)), ad.Float(0)))
+    for name in NAMES:
+
+        def loss(values, name=name):
+            twin = render_reference({**arrays, name: values}, view, antialiased=antialiased)
+            return float((weight[..., :3] * twin.colour).sum() + (weight[..., 3] * twin.alpha).sum())
+
+        ours = np.array(dr.grad(getattr(gaussians, name))).T.reshape(arrays[name].shape)
+        expected = slope(loss, arrays[name], 1e-7)
+        assert np.linalg.norm(ours - expected) < 1e-3 * np.linalg.norm(expected), name
+
+
 @pytest.mark.parametrize("start", [np.zeros(6), np.array([0.02, -0.3, 0.1, 0.05, -0.1, 0.2])])
 @pytest.mark.parametrize("kind", KINDS)
 def test_pose_gradients_match_central_differences(kind, start):
