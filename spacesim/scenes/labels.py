@@ -16,7 +16,7 @@ from spacesim.data.records import Camera, Sun
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_NONE, SHADOW_SELF_CAST
 from spacesim.scenes.emitters import opaque
 from spacesim.scenes.scene import Loaded, Scene
-from spacesim.scenes.view import RADIUS, View
+from spacesim.scenes.view import RADIUS, View, replayed
 from spacesim.scenes.visibility import Disc, SolarDirections
 
 OFFSET = 2e-6 * RADIUS
@@ -24,9 +24,6 @@ OFFSET = 2e-6 * RADIUS
 
 LANES = 1 << 24
 """Most shadow rays at once."""
-
-RECORDINGS = 64
-"""Of a kernel that are kept: one for each size of picture and, of shadow rays, for each power of two of points."""
 
 
 class Labeller:
@@ -38,8 +35,8 @@ class Labeller:
         self._units = loaded.units
         self._parts = PartTable.of(scene, self._scene)
         self._directions = SolarDirections(scene.sun, loaded.sun.limb)
-        self._centres = backend.recorded(self._trace_centres, RECORDINGS)
-        self._penumbrae = backend.recorded(self._trace_penumbrae, RECORDINGS)
+        self._centres = replayed(self._trace_centres)
+        self._penumbrae = replayed(self._trace_penumbrae)
 
     def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
         """All fields of Truth but radiance and alpha."""

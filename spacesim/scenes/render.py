@@ -4,7 +4,8 @@ Radiance and alpha are means over samples spread evenly over the pixel (a box fi
 in a fixed order: splatting into a film adds floats in whatever order threads arrive. Labels (labels.py) come from one
 ray through the pixel's centre, so that none is ever averaged. Same seed, same backend: same bits.
 
-The kernels are recorded once for each size of picture and replayed: tracing the integrator anew takes 10 ms a frame.
+On a GPU the kernels are recorded once for each size of picture and replayed: tracing the integrator anew takes 10 ms a
+frame.
 """
 
 import math
@@ -18,9 +19,9 @@ import numpy as np
 from spacesim import backend
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.records import Camera, Sun, Truth
-from spacesim.scenes.labels import OFFSET, RECORDINGS, Labeller
+from spacesim.scenes.labels import OFFSET, Labeller
 from spacesim.scenes.scene import Scene, load
-from spacesim.scenes.view import View
+from spacesim.scenes.view import View, replayed
 
 MAX_WAVEFRONT = 1 << 24
 """Most samples in flight at once, 16 bytes each: more are rendered in several passes."""
@@ -50,7 +51,7 @@ class Renderer:
         self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
         self._sampler = mi.load_dict({"type": "independent"})
         self._labeller = Labeller(scene, self._loaded, distortion)
-        self._sums = backend.recorded(self._trace_paths, RECORDINGS)
+        self._sums = replayed(self._trace_paths)
 
     def render(self, camera: Camera, sun: Sun, seed: Sequence[int]) -> Truth:
         """What `camera` sees under `sun`; `seed` makes the noise."""
@@ -85,12 +86,13 @@ class Renderer:
         """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]."""
         mi = backend.mitsuba()
         samples = spp * view.width * view.height
-        self._sampler.seed(noise.sampler, samples)
+        sampler = self._sampler.fork()  # a state that was there before must not be let go of in a recording
+        sampler.seed(noise.sampler, samples)
         lane = dr.arange(mi.UInt32, samples)
         pixel = lane // spp
         offset = _pixel_offsets(pixel, lane - pixel * spp + noise.first, noise.shift)
         ray, _ = view.rays(pixel, offset, self._distortion)
-        radiance, hit, _ = self._integrator.sample(scene, self._sampler, ray)
+        radiance, hit, _ = self._integrator.sample(scene, sampler, ray)
         channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
         dr.eval(channels)
         *rgb, alpha = (dr.block_sum(x, spp, mode="evaluated") for x in channels)

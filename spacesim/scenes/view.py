@@ -1,6 +1,6 @@
 """A camera as inputs of kernels, in the coordinates that Mitsuba works in."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,9 @@ from spacesim.scenes.emitters import opaque
 RADIUS = 100.0
 """Of the bounding sphere in Mitsuba's coordinates. Mitsuba starts rays 9e-5 (1 + |p|) from the surface point p, so at
 this size 9e-5 of the radius, and hardly less at a larger one."""
+
+RECORDINGS = 64
+"""Of a kernel that are kept: one for each size of picture and, of shadow rays, for each power of two of points."""
 
 
 @dataclass(frozen=True)
@@ -78,3 +81,9 @@ class View:
         length = dr.sqrt(1 + x * x + y * y)
         start = mi.Point3f(self.start + self.near * aside)
         return mi.RayDifferential3f(mi.Ray3f(start, (aside + self.forward) / length)), self.near * length
+
+
+def replayed(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, recorded once and replayed on CUDA. On LLVM it is traced anew, which takes 5 % of a frame there:
+    whatever Embree scene or numpy array somebody lets go of in the middle of a recording would end the process."""
+    return backend.recorded(function, RECORDINGS) if backend.select() == "cuda" else function
