@@ -116,20 +116,28 @@ class Kernels:
 
 
 def kernels(work: Work, repeats: int = 7) -> Kernels:
-    """Of one call, warm: the median over `repeats` of the sum of the times of its kernels, copies and fills."""
+    """Of one call, warm: the sum of the times of its kernels, copies and fills."""
+    return kernels_in_turn({"work": work}, repeats)["work"]
+
+
+def kernels_in_turn(works: Mapping[str, Work], repeats: int = 7) -> dict[str, Kernels]:
+    """The same of works that follow each other, so that each finds the caches as the one before has left them."""
+    sums: dict[str, list[float]] = {name: [] for name in works}
+    launches = dict.fromkeys(works, 0)
     for _ in range(WARM_UP):
-        work()
-    sums, launches = [], 0
+        for work in works.values():
+            work()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         for _ in range(repeats):
-            dr.sync_thread()
-            dr.kernel_history_clear()
-            work()
-            dr.sync_thread()
-            history = dr.kernel_history()
-            launches = len(history)
-            sums.append(sum(entry["execution_time"] for entry in history))
-    return Kernels(launches, float(np.median(sums)), min(sums))
+            for name, work in works.items():
+                dr.sync_thread()
+                dr.kernel_history_clear()
+                work()
+                dr.sync_thread()
+                history = dr.kernel_history()
+                launches[name] = len(history)
+                sums[name].append(sum(entry["execution_time"] for entry in history))
+    return {name: Kernels(launches[name], float(np.median(sums[name])), min(sums[name])) for name in works}
 
 
 def machine() -> dict[str, str]:

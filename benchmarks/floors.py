@@ -1,8 +1,8 @@
 """Where a step's time goes: the kernels of each stage beside what no program could undercut on this device.
 
 The floor of a stage is the larger of two times: the bytes that must move over the bandwidth of a large copy, and the
-operations that must be done over the rate of a loop of multiply-adds (exponentials over their own), all measured in
-the same run, the best of several. Bytes are compulsory ones: every input read once, every output written once.
+operations that must be done over the rate of a loop of multiply-adds (exponentials over their own). All are measured
+in turn, and the least of several counts. Bytes are compulsory ones: every input read once, every output written once.
 Operations are counted for the method as it is: every pixel of a tile looks at each pair that the tile walks.
 """
 
@@ -36,22 +36,33 @@ class Device:
     operations: float
     specials: float
 
-    @staticmethod
-    def measured() -> "Device":
-        cuda = select() == "cuda"
-        count = 2**28 if cuda else 2**26
-        source = dr.opaque(ad.Float, 1, count)
-        copy = common.kernels(lambda: dr.eval(source + 1), REPEATS).least
-        lanes = 2**21 if cuda else 2**16
-        done = lanes * CHAINS * TURNS
-        fma = common.kernels(lambda: _turns(lanes, lambda x: dr.fma(x, 0.999, 0.001)), REPEATS).least
-        exp = common.kernels(lambda: _turns(lanes, lambda x: dr.exp2(x - 1)), REPEATS).least
-        return Device(2e3 * FLOAT * count / copy, 1e3 * done / fma, 1e3 * done / exp)
-
     def floor(self, bytes_: float, operations: float, specials: float) -> tuple[float, float]:
         """(ms by bytes, ms by operations). A GPU does the special ones beside the others, a CPU among them."""
         one, other = 1e3 * operations / self.operations, 1e3 * specials / self.specials
         return 1e3 * bytes_ / self.bandwidth, max(one, other) if select() == "cuda" else one + other
+
+
+class Yardsticks:
+    """Work whose amount is known."""
+
+    def __init__(self) -> None:
+        cuda = select() == "cuda"
+        self.count, self.lanes = (2**28, 2**21) if cuda else (2**26, 2**16)
+        self.source = dr.opaque(ad.Float, 1, self.count)
+
+    def works(self) -> dict[str, common.Work]:
+        """What to measure."""
+        return {
+            "copy": lambda: dr.eval(self.source + 1),
+            "operations": lambda: _turns(self.lanes, lambda x: dr.fma(x, 0.999, 0.001)),
+            "specials": lambda: _turns(self.lanes, lambda x: dr.exp2(x - 1)),
+        }
+
+    def device(self, measured: dict[str, common.Kernels]) -> Device:
+        """Rates from the times of `works`."""
+        done = 1e3 * self.lanes * CHAINS * TURNS
+        bandwidth = 2e3 * FLOAT * self.count / measured["copy"].least
+        return Device(bandwidth, done / measured["operations"].least, done / measured["specials"].least)
 
 
 def _turns(lanes: int, function: Callable[[Any], Any]) -> None:
@@ -89,48 +100,45 @@ def work(pipeline: Pipeline, count: int, pixels: int) -> dict[str, tuple[float, 
 
 def profiles(sizes: list[tuple[int, int]]) -> tuple[dict[str, Any], dict[str, list[common.Row]]]:
     """(report, tables): one table for each size."""
-    device = Device.measured()
-    told = f"{device.bandwidth / 1e9:.0f} GB/s, {device.operations / 1e9:.0f} G multiply-adds/s"
-    told += f", {device.specials / 1e9:.0f} G exponentials/s"
-    tables, rows = {}, {}
+    report, tables = [], {}
     for count, pixels in sizes:
-        found = profile(count, pixels, device)
-        rows[f"{count}x{pixels}"] = found
-        tables[f"{count:,} Gaussians, {pixels} x {pixels} pixels ({told})"] = found
-    return {"device": device, "profiles": rows}, tables
+        device, rows = profile(count, pixels)
+        report.append({"gaussians": count, "pixels": pixels, "device": device, "rows": rows})
+        told = f"{device.bandwidth / 1e9:.0f} GB/s, {device.operations / 1e9:.0f} G multiply-adds/s"
+        told += f", {device.specials / 1e9:.0f} G exponentials/s"
+        tables[f"{count:,} Gaussians, {pixels} x {pixels} pixels ({told})"] = rows
+    return {"profiles": report}, tables
 
 
-def profile(count: int, pixels: int, device: Device) -> list[common.Row]:
-    """A row for each stage, the rest of the trainer's step, and the whole."""
-    arrays = common.sphere_arrays(count)
+def profile(count: int, pixels: int) -> tuple[Device, list[common.Row]]:
+    """Rates of the device; a row for each stage, one for the rest of the trainer's step, and the whole."""
+    arrays, yardsticks = common.sphere_arrays(count), Yardsticks()
     with tempfile.TemporaryDirectory() as folder:
         dataset = write_dataset(Path(folder) / "data", count, pixels)
-        trainer = still_trainer(dataset, arrays)
+        trainer, pipeline = still_trainer(dataset, arrays), Pipeline(arrays, dataset.train[0].camera)
         for _ in range(20):
             trainer.step()
-        whole = common.kernels(trainer.step)
-        clock = common.interleaved({"step": trainer.step}, 15)["step"]
-    pipeline = Pipeline(arrays, dataset.train[0].camera)
-    needs = work(pipeline, count, pixels)
-    rows, launches, total, floors = [], 0, 0.0, 0.0
-    for stage in STAGES:
-        found = common.kernels(getattr(pipeline, stage))
-        by_bytes, by_operations = device.floor(*needs[stage])
-        floor = max(by_bytes, by_operations)
-        launches, total, floors = launches + found.launches, total + found.milliseconds, floors + floor
-        rows.append(
-            {
-                "stage": stage,
-                "launches": found.launches,
-                "ms": found.milliseconds,
-                "of the step": f"{found.milliseconds / whole.milliseconds:.0%}",
-                "floor by bytes, ms": by_bytes,
-                "floor by operations, ms": by_operations,
-                "floor / time": f"{floor / found.milliseconds:.0%}",
-            }
-        )
+        works = yardsticks.works() | {"step": trainer.step} | {stage: getattr(pipeline, stage) for stage in STAGES}
+        measured = common.kernels_in_turn(works, REPEATS)
+        clock = common.interleaved({"step": trainer.step}, REPEATS)["step"]
+    device, whole, needs = yardsticks.device(measured), measured["step"], work(pipeline, count, pixels)
+    stages = [_row(stage, measured[stage], whole, *device.floor(*needs[stage])) for stage in STAGES]
+    launches, total = (sum(row[key] for row in stages) for key in ("launches", "ms"))
+    floor = sum(max(row["floor by bytes, ms"], row["floor by operations, ms"]) for row in stages)
     rest = {"stage": "rest (upload, statistics)", "launches": whole.launches - launches}
-    rest |= {"ms": whole.milliseconds - total, "of the step": f"{1 - total / whole.milliseconds:.0%}"}
-    step = {"stage": "trainer's step, kernels", "launches": whole.launches, "ms": whole.milliseconds}
-    step |= {"of the step": "100%", "floor / time": f"{floors / whole.milliseconds:.0%}"}
-    return [*rows, rest, step, {"stage": "trainer's step, on the clock", "ms": clock.median}]
+    rest |= {"ms": whole.least - total, "of the step": f"{1 - total / whole.least:.0%}"}
+    step = {"stage": "trainer's step, kernels", "launches": whole.launches, "ms": whole.least}
+    step |= {"of the step": "100%", "floor / time": f"{floor / whole.least:.0%}"}
+    return device, [*stages, rest, step, {"stage": "trainer's step, on the clock (median)", "ms": clock.median}]
+
+
+def _row(stage: str, found: common.Kernels, whole: common.Kernels, by_bytes: float, by_operations: float) -> common.Row:
+    return {
+        "stage": stage,
+        "launches": found.launches,
+        "ms": found.least,
+        "of the step": f"{found.least / whole.least:.0%}",
+        "floor by bytes, ms": by_bytes,
+        "floor by operations, ms": by_operations,
+        "floor / time": f"{max(by_bytes, by_operations) / found.least:.0%}",
+    }

@@ -82,7 +82,7 @@ def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:
     for stage, work in works.items():  # a stage of ours in turn with the same stage of the peer's
         turn = {stage: work} | ({f"gsplat {stage}": theirs[stage]} if stage in theirs else {})
         times |= common.interleaved(turn, repeats)
-    kernels = {stage: common.kernels(work) for stage, work in works.items()}
+    kernels = common.kernels_in_turn(works)
     sums = {stage: found.milliseconds for stage, found in kernels.items()}
     result: dict[str, Any] = {"gaussians": count, "pixels": pixels, **arguments_of(ours)}
     result["clock"] = {stage: times[stage] for stage in STAGES}

@@ -65,7 +65,7 @@ def main() -> None:
     results = [measure(count, pixels, options.repeats, peer) for count, pixels in sizes]
     report = {"rows": results}
     tables = {"A training step, ms: median (quartiles)": [row for result in results for row in describe(result)]}
-    if name == "llvm" or options.opensplat:
+    if options.opensplat or (name == "llvm" and not options.growth):
         rows = [beside_opensplat(*size, options.repeats, options.opensplat) for size in sizes[:1]]
         report["opensplat"] = rows
         tables["Beside OpenSplat's CPU mode, from the same points, ms a step"] = rows
