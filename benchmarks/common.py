@@ -30,16 +30,17 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Timing:
-    """Milliseconds of a call: median and quartiles."""
+    """Milliseconds of a call: median, quartiles, least."""
 
     median: float
     low: float
     high: float
+    least: float
 
     @staticmethod
     def of(seconds: Iterable[float]) -> "Timing":
-        low, median, high = 1e3 * np.percentile(np.array(list(seconds)), [25, 50, 75])
-        return Timing(float(median), float(low), float(high))
+        least, low, median, high = (1e3 * np.percentile(np.array(list(seconds)), [0, 25, 50, 75])).tolist()
+        return Timing(median, low, high, least)
 
     def __str__(self) -> str:
         return f"{self.median:.2f} ({self.low:.2f} to {self.high:.2f})"

@@ -50,7 +50,9 @@ def summary(points: list[Point]) -> dict[str, float]:
     """Slopes of the whole and of the larger half, and the linear model, in ms."""
     ordered = sorted(points, key=lambda p: p.pairs)
     parts, worst = model(points)
-    result = {"slope": slope(points), "slope, larger half": slope(ordered[len(ordered) // 2 :])}
+    result = {"slope": slope(points)}
+    if len(points) > 3:
+        result["slope, larger half"] = slope(ordered[len(ordered) // 2 :])
     return (
         result | {f"ms {name}": value for name, value in parts.items()} | {"largest error of the fit, %": 100 * worst}
     )

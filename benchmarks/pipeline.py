@@ -16,6 +16,7 @@ from spacesim.splat.train.losses import photometric_loss
 from spacesim.splat.train.optimizer import Adam, adam_step
 
 SSIM_WEIGHT = 0.2
+RECORDINGS = 8  #: kept of a stage
 
 
 class Pipeline:
@@ -31,8 +32,8 @@ class Pipeline:
         noise = np.random.default_rng(0).uniform(size=(3, camera.width * camera.height)).astype(np.float32)
         self.truth = list(ad.Array3f(noise))
         self.factors = ad.Float([1.0, 1.0, *[0.0] * len(self.gaussians.rows())])
-        dr.eval(self.gaussians.rows(), self.truth, self.factors)
-        self._project, self._loss, self._update = recorded(_project, 2), recorded(_loss, 2), recorded(_update, 2)
+        dr.eval(self.gaussians.rows(), self.optimizer.first, self.optimizer.second, self.truth, self.factors)
+        self._project, self._loss, self._update = (recorded(stage, RECORDINGS) for stage in (_project, _loss, _update))
         for stage in (self.project, self.bin, self.forward, self.loss, self.backward, self.update):
             stage()
 
@@ -61,7 +62,8 @@ class Pipeline:
         """Gradients of the ellipses to those of the parameters, and an Adam step whose rates are 0."""
         gradients = self.by_splat.splats, self.by_splat.features
         moments = self.optimizer.first, self.optimizer.second
-        self._update(self.gaussians.rows(), moments, self.camera, gradients, self.factors)
+        rows, first, second = self._update(self.gaussians.rows(), moments, self.camera, gradients, self.factors)
+        self.gaussians, self.optimizer.first, self.optimizer.second = Gaussians.from_rows(rows), first, second
 
     def frame(self) -> None:
         """Parameters to picture, as a user asks for it: colour and alpha, without gradients."""
