@@ -54,6 +54,11 @@ def _watermark(seen: int, unseen: int, pixels: int) -> int:
         for _ in range(3):
             trainer.step()
         dr.sync_thread()
+    return _peak()
+
+
+def _peak() -> int:
+    """Most bytes that Dr.Jit has held at a moment since its statistics were cleared."""
     kind = dr.JitBackend.CUDA if backend.select() == "cuda" else dr.JitBackend.LLVM
     return int(dr.detail.malloc_watermark(kind))
 
@@ -73,6 +78,7 @@ def over_steps(steps: int, marks: int = 10) -> list[Row]:
         trainer = Trainer(write_dataset(Path(folder) / "data", count, pixels), replace(config, refinement=refinement))
         for mark in range(1, marks + 1):
             start, first = time.perf_counter(), trainer.iteration
+            dr.detail.malloc_clear_statistics()
             before = _new_kernels()
             while trainer.iteration < steps * mark // marks - 10:
                 trainer.step()
@@ -101,4 +107,4 @@ def _row(trainer: Trainer, milliseconds: float, compiled: int) -> Row:
     row: dict[str, Any] = {"step": trainer.iteration, "Gaussians": trainer.gaussians.count, "ms a step": milliseconds}
     row |= {"recordings so far": backend.recordings(), "new kernels since": compiled}
     row |= {"kernels a step": len(history) / 10, "traced a step": traced / 10}
-    return row | {"memory, MB": round(resident() / 1e6, 1)}
+    return row | {"arrays' peak, MB": _peak() / 1e6, "process, MB": resident() / 1e6}

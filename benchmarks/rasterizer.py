@@ -7,8 +7,8 @@ The scene is a sphere of random splats that fills most of the picture, spherical
 given. "On the clock": synchronised calls from Python, tracing and launching included; median and quartiles after
 warm-up, ours and the peer's in turn. "Kernels": what the device alone needs, by Dr.Jit's kernel history and torch's
 profiler. "frame" is parameters to picture without gradients; forward and backward are blending and its adjoint.
-`--growth` measures 10,000 to 1,000,000 Gaussians and 128 to 2048 pixels (a tenth of that on a CPU), prints the slope
-of time against pairs of tile and splat, and draws it with `--plot`.
+`--growth` measures 10,000 to 1,000,000 Gaussians and 128 to 2048 pixels, prints the slope of time against pairs of tile
+and splat, and draws it with `--plot`.
 """
 
 import sys
