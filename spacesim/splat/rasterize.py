@@ -13,9 +13,9 @@ from typing import Any
 
 import drjit as dr
 
-from spacesim.backend import ad, select
+from spacesim.backend import ad, recorded, select
 from spacesim.splat.project import ALPHA_MIN, Splats
-from spacesim.splat.tiles import TileLists
+from spacesim.splat.tiles import RECORDINGS, TileLists, room
 
 ALPHA_MAX = 0.999  #: a splat never hides everything behind it
 TRANSMITTANCE_MIN = 1e-4  #: a pixel is finished once less than this passes
@@ -51,9 +51,16 @@ class SplatGradients:
 
 def forward(splats: Splats, features: list[Any], lists: TileLists, width: int, height: int) -> Blended:
     """Blend `features` (C arrays [N]) over the pixels of a width x height image. Detached inputs."""
+    blended: Blended = _forward(splats, features, lists, width, height, room(dr.width(splats.x)))
+    return blended
+
+
+def _trace_forward(
+    splats: Splats, features: list[Any], lists: TileLists, width: int, height: int, capacity: int
+) -> Blended:
     shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
     channels, rows = len(features), lists.shape.rows
-    records = _list_records(splats, features, lists)
+    records = _list_records(splats, features, lists, capacity)
     lane = dr.arange(ad.UInt32, tiles * shape.lanes)
     tile = lane // shape.lanes
     px, py, _, _ = _lane_pixels(lane, lists)
@@ -85,12 +92,13 @@ def forward(splats: Splats, features: list[Any], lists: TileLists, width: int, h
         [[ad.Float(0) for _ in range(channels)] for _ in range(rows)],
         [ad.UInt32(0) for _ in range(rows)],
     )
-    if lists.pairs > 0:
+    if lists.capacity > 0:
         state = dr.while_loop(state, alive, blend, mode="symbolic", label="blend")
     _, _, transmittance, sums, last = state
 
-    tiled = [_store([sums[p][c] for p in range(rows)], lane) for c in range(channels)]
-    tiled_transmittance, tiled_last = _store(transmittance, lane), _store(last, lane)
+    lanes = tiles * shape.lanes
+    tiled = [_store([sums[p][c] for p in range(rows)], lane, lanes) for c in range(channels)]
+    tiled_transmittance, tiled_last = _store(transmittance, lane, lanes), _store(last, lane, lanes)
     dr.eval(tiled, tiled_transmittance, tiled_last)
     pixel = _tiled_index(lists, width, height)
     return Blended(
@@ -116,11 +124,25 @@ def backward(
     image_size: (width, height). With w_i = alpha_i T_i and d_i = <dL/dC, f_i>:
     dL/d alpha_i = T_i d_i - (sum_{j > i} w_j d_j + T_end dL/dT_end) / (1 - alpha_i).
     """
-    channels, rows, lanes = len(feature_gradients), lists.shape.rows, lists.shape.lanes
-    count, pairs = dr.width(splats.x), lists.pairs
-    if pairs == 0:
+    count, channels = dr.width(splats.x), len(feature_gradients)
+    if lists.capacity == 0:
         zeros = [dr.opaque(ad.Float, 0, count) for _ in range(9 + channels)]  # no literals: they fold gradients away
         return SplatGradients(Splats(*zeros[:7]), zeros[9:], zeros[7], zeros[8])
+    inputs = image_size, feature_gradients, transmittance_gradient
+    gradients: SplatGradients = _backward(splats, blended, lists, *inputs)
+    gradients.splats.depth = dr.opaque(ad.Float, 0, count)
+    return gradients
+
+
+def _trace_backward(
+    splats: Splats,
+    blended: Blended,
+    lists: TileLists,
+    image_size: tuple[int, int],
+    feature_gradients: list[Any],
+    transmittance_gradient: Any,
+) -> SplatGradients:
+    channels, rows, lanes = len(feature_gradients), lists.shape.rows, lists.shape.lanes
     lane = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * lanes)
     tile = lane // lanes
     px, py, column, row = _lane_pixels(lane, lists)
@@ -137,7 +159,7 @@ def backward(
         last.append(dr.select(inside, dr.gather(ad.UInt32, blended.last, lane * rows + p), 0))
 
     mode = dr.ReduceMode.Local if select() == "cuda" else dr.ReduceMode.Auto
-    slots = [dr.zeros(ad.Float, 4 * _capacity(pairs)) for _ in range(2 + -(-channels // 4))]
+    slots = [dr.zeros(ad.Float, 4 * lists.capacity) for _ in range(2 + -(-channels // 4))]
     records, start = blended.records, dr.gather(ad.UInt32, lists.start, tile)
 
     def remaining(k: Any, _transmittance: Any, _behind: Any) -> Any:
@@ -215,36 +237,30 @@ def rasterize(splats: Splats, features: list[Any], lists: TileLists, width: int,
     return outputs[:-1], outputs[-1]
 
 
-def _capacity(pairs: int) -> int:
-    """`pairs` rounded up by at most an eighth. On LLVM the size of what is scattered into is part of the kernel's
-    text: few sizes are few kernels to compile, where every step has another number of pairs."""
-    step = max(1024, 1 << max(0, pairs.bit_length() - 4))
-    return -(-pairs // step) * step
-
-
-def _list_records(splats: Splats, features: list[Any], lists: TileLists) -> list[Any]:
+def _list_records(splats: Splats, features: list[Any], lists: TileLists, capacity: int) -> list[Any]:
     """The splats' numbers in list order, so that a tile reads memory in one run.
 
     Record: x, y, -a/2 log2 e, -b log2 e, -c/2 log2 e, log2 o, features; padded to fours, one array [4 P] a four.
+    capacity: room for the N splats.
     """
-    if lists.pairs == 0:
+    if lists.capacity == 0:
         return []
     numbers = [splats.x, splats.y, -0.5 * _LOG2_E * splats.a, -_LOG2_E * splats.b, -0.5 * _LOG2_E * splats.c]
     numbers += [dr.log2(dr.maximum(splats.opacity, 1e-30)), *features]
     numbers += [ad.Float(0)] * (-len(numbers) % 4)
-    count = dr.width(splats.x)
-    packed = [_store(numbers[i : i + 4], dr.arange(ad.UInt32, count)) for i in range(0, len(numbers), 4)]
+    index = dr.arange(ad.UInt32, dr.width(splats.x))
+    packed = [_store(numbers[i : i + 4], index, capacity) for i in range(0, len(numbers), 4)]
     dr.eval(packed)
-    position = dr.arange(ad.UInt32, lists.pairs)
-    records = [_store(list(dr.gather(ad.Array4f, array, lists.splat)), position) for array in packed]
+    position = dr.arange(ad.UInt32, lists.capacity)
+    records = [_store(list(dr.gather(ad.Array4f, array, lists.splat)), position, lists.capacity) for array in packed]
     dr.eval(records)
     return records
 
 
-def _store(values: list[Any], index: Any) -> Any:
-    """A flat array in which `values` of lane i stand at i * len(values), written by one packet scatter."""
+def _store(values: list[Any], index: Any, size: int) -> Any:
+    """A flat array [size * len(values)] in which `values` of lane i stand at index i, by one packet scatter."""
     array_type = type(values[0])
-    target = dr.empty(array_type, len(values) * dr.width(index))
+    target = dr.empty(array_type, len(values) * size)
     dr.scatter(target, (ad.ArrayXu if array_type is ad.UInt32 else ad.ArrayXf)(values), index)
     return target
 
@@ -283,9 +299,9 @@ def _tiled_index(lists: TileLists, width: int, height: int) -> Any:
 
 def _gather_slots(slots: list[Any], splats: Splats, lists: TileLists, channels: int) -> SplatGradients:
     """Add up each splat's slots, in order, and turn the sums into gradients of the splat's own numbers."""
-    count = dr.width(splats.x)
-    position = lists.first_slot
-    end = position + lists.slot_count
+    splat = dr.arange(ad.UInt32, dr.width(splats.x))
+    position = dr.gather(ad.UInt32, lists.first_slot, splat)
+    end = position + dr.gather(ad.UInt32, lists.slot_count, splat)
     sums = [ad.Array4f(0) for _ in slots]
 
     def remaining(position: Any, _sums: Any) -> Any:
@@ -305,8 +321,12 @@ def _gather_slots(slots: list[Any], splats: Splats, lists: TileLists, channels: 
         b=-sxy,
         c=-0.5 * syy,
         opacity=s0 * dr.rcp(dr.maximum(splats.opacity, 1e-30)),
-        depth=dr.zeros(ad.Float, count),
+        depth=None,
     )
     result = SplatGradients(by_splat, by_feature[:channels], absolute_x / _LOG2_E, absolute_y / _LOG2_E)
     dr.eval(result)
     return result
+
+
+_forward = recorded(_trace_forward, RECORDINGS)
+_backward = recorded(_trace_backward, RECORDINGS)

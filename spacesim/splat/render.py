@@ -4,7 +4,7 @@ What a picture shows beside colour is blended as features of the Gaussians: `ble
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import drjit as dr
@@ -131,9 +131,7 @@ class Blend:
 
 def blend(splats: Splats, footprints: Footprints, features: Sequence[Any], camera: Projection) -> Blend:
     """Stages 2 and 3 for any number of features (Floats [N]) and any sign of depth. Differentiable."""
-    # Tiles sort the bits of positive depths: they get positive stand-ins, in the order of the footprints.
-    sorting = replace(splats, depth=dr.reinterpret_array(ad.Float, footprints.order))
-    lists = bin_splats(sorting, footprints, camera.width, camera.height)
+    lists = bin_splats(splats, footprints, camera.width, camera.height)
     passes = [list(features[i : i + CHANNELS]) for i in range(0, len(features), CHANNELS)] or [[]]
     planes: list[Any] = []
     transmittance: Any = None

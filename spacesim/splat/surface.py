@@ -44,7 +44,7 @@ def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> A
     pixel = dr.arange(ad.UInt32, width * height)
     column, row = pixel % width, pixel // width
     nothing = dr.opaque(ad.UInt32, count, width * height)
-    if lists.pairs == 0:
+    if lists.capacity == 0:
         return nothing
     tile = (row // lists.shape.height) * lists.tiles_x + column // lists.shape.width
     px, py = ad.Float(column) + 0.5, ad.Float(row) + 0.5

@@ -10,9 +10,11 @@ from typing import Any
 
 import drjit as dr
 
-from spacesim.backend import ad, select
+from spacesim.backend import ad, recorded, select
 from spacesim.data.errors import WorkError
 from spacesim.splat.project import ALPHA_MIN, Footprints, Splats
+
+RECORDINGS = 256  #: of a function that are kept: one for each size of picture, of the lists, and of the model
 
 _LARGEST_PAIRS = 2**31 - 1
 
@@ -39,9 +41,10 @@ def tile_shape() -> TileShape:
 
 @dataclass
 class TileLists:
-    """P (tile, splat) pairs. `splat`, `slot` [P] are in blending order; `start`, `end` [T] delimit each tile.
+    """(tile, splat) pairs. `splat`, `slot` [P] are in blending order; `start`, `end` [T] delimit each tile.
 
-    Slots number the pairs splat by splat: those of splat i are `first_slot[i]` .. + `slot_count[i]`.
+    Slots number the pairs splat by splat: those of splat i are `first_slot[i]` .. + `slot_count[i]`, [M]. Arrays have
+    room for more pairs and splats than there are, so that few sizes occur: P is `capacity`, M at least N.
     """
 
     splat: Any
@@ -50,61 +53,115 @@ class TileLists:
     end: Any
     first_slot: Any
     slot_count: Any
-    pairs: int
+    capacity: int
     tiles_x: int
     tiles_y: int
     shape: TileShape
 
+    @property
+    def pairs(self) -> int:
+        """How many pairs the tiles list. Waits for the device."""
+        return int(dr.sum(self.end - self.start)[0])
+
+
+@dataclass
+class _Ranked:
+    """Splats [M] with their boxes in tiles, and their order by depth [M] with the pairs before each and of each."""
+
+    left: Any
+    top: Any
+    columns: Any
+    count: Any
+    order: Any
+    first: Any
+    pairs: Any  #: Float64 [1], of all
+
 
 def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) -> TileLists:
-    """Sort splats [N] into the tiles of a width x height image. Raises WorkError past 2^31 pairs."""
-    shape = tile_shape()
-    tiles_x, tiles_y = -(-width // shape.width), -(-height // shape.height)
-    x0, x1 = _tile_range(dr.detach(splats.x), footprints.half_width, shape.width, tiles_x)
-    y0, y1 = _tile_range(dr.detach(splats.y), footprints.half_height, shape.height, tiles_y)
-    count = dr.select(footprints.visible, (x1 - x0) * (y1 - y0), ad.UInt32(0))
+    """Sort splats [N] into the tiles of a width x height image. Raises WorkError past 2^31 pairs.
 
-    # Positive floats sort as their bits. Invisible splats have no pairs, so their place does not matter.
-    key = dr.select(footprints.visible, dr.reinterpret_array(ad.UInt32, dr.detach(splats.depth)), ad.UInt32(0xFFFFFFFF))
-    dr.eval(x0, x1, y0, y1, count, key)
-    order = dr.argsort(key)
-    sorted_count = dr.gather(ad.UInt32, count, order)
-    sorted_first = dr.prefix_sum(sorted_count)
-    splat_count = dr.width(key)
+    Two recorded functions; between them the host waits for the number of pairs, which says how large arrays must be.
+    """
+    shape, count = tile_shape(), dr.width(splats.x)
+    tiles = -(-width // shape.width), -(-height // shape.height)
+    splats, footprints = dr.detach(splats), dr.detach(footprints)
     pairs = 0
-    if splat_count > 0:
-        total = dr.sum(ad.Float64(sorted_count))
-        last = dr.opaque(ad.UInt32, splat_count - 1)
-        tail = dr.gather(ad.UInt32, sorted_first, last) + dr.gather(ad.UInt32, sorted_count, last)
-        dr.eval(total, tail)
-        if total[0] > _LARGEST_PAIRS:
-            raise WorkError(f"rasterizer: {total[0]:.3g} pairs of tile and splat, more than 2^31 - 1 can be sorted")
-        pairs = int(tail[0])
-    first_slot = dr.zeros(ad.UInt32, splat_count)
-    dr.scatter(first_slot, sorted_first, order)
+    if count > 0:
+        ranked: _Ranked = _rank(splats, footprints, dr.opaque(ad.UInt32, count), room(count), tiles, shape)
+        if ranked.pairs[0] > _LARGEST_PAIRS:
+            raise WorkError(
+                f"rasterizer: {ranked.pairs[0]:.3g} pairs of tile and splat, more than 2^31 - 1 can be sorted"
+            )
+        pairs = int(ranked.pairs[0])
     if pairs == 0:
-        none = dr.zeros(ad.UInt32, tiles_x * tiles_y)
-        return TileLists(none, none, none, none, first_slot, count, 0, tiles_x, tiles_y, shape)
+        none, of_splats = dr.zeros(ad.UInt32, tiles[0] * tiles[1]), dr.zeros(ad.UInt32, max(count, 1))
+        return TileLists(none, none, none, none, of_splats, of_splats, 0, *tiles, shape)
+    lists: TileLists = _expand(splats, ranked, dr.opaque(ad.UInt32, pairs), room(pairs), room(count), tiles, shape)
+    return lists
 
-    # Expand: mark each splat's first pair with its rank, then a running maximum fills in the rest.
-    rank = dr.zeros(ad.UInt32, pairs)
-    dr.scatter(rank, dr.arange(ad.UInt32, splat_count), sorted_first, active=sorted_count > 0)
+
+def room(count: int) -> int:
+    """`count` rounded up by at most an eighth: few sizes are few recordings and, on LLVM, where the size of what is
+    scattered into is part of a kernel's text, few kernels to compile."""
+    step = max(1024, 1 << max(0, count.bit_length() - 4))
+    return -(-count // step) * step
+
+
+def _trace_rank(
+    splats: Splats, footprints: Footprints, count: Any, capacity: int, tiles: tuple[int, int], shape: TileShape
+) -> _Ranked:
+    lane = dr.arange(ad.UInt32, capacity)
+    live = lane < count
+    live &= dr.gather(ad.Bool, footprints.visible, lane, live)
+    x, y, half_width, half_height = (
+        dr.gather(ad.Float, v, lane, live) for v in (splats.x, splats.y, footprints.half_width, footprints.half_height)
+    )
+    x0, x1 = _tile_range(x, half_width, shape.width, tiles[0])
+    y0, y1 = _tile_range(y, half_height, shape.height, tiles[1])
+    pairs = dr.select(live, (x1 - x0) * (y1 - y0), ad.UInt32(0))
+    # Splats that cannot be seen have no pairs, so their place does not matter.
+    key = dr.select(live, dr.gather(ad.UInt32, footprints.order, lane, live), ad.UInt32(0xFFFFFFFF))
+    columns = dr.maximum(x1 - x0, 1)
+    dr.eval(x0, y0, columns, pairs, key)
+    order = _stable_order(key, 32)
+    in_order = dr.gather(ad.UInt32, pairs, order)
+    return _Ranked(x0, y0, columns, pairs, order, dr.prefix_sum(in_order), dr.sum(ad.Float64(in_order)))
+
+
+def _trace_expand(
+    splats: Splats,
+    ranked: _Ranked,
+    pairs: Any,
+    capacity: int,
+    splat_capacity: int,
+    tiles: tuple[int, int],
+    shape: TileShape,
+) -> TileLists:
+    # Mark each splat's first pair with its rank, then a running maximum fills in the rest.
+    splat_rank = dr.arange(ad.UInt32, splat_capacity)
+    has_pairs = dr.gather(ad.UInt32, ranked.count, ranked.order) > 0
+    rank = dr.zeros(ad.UInt32, capacity)
+    dr.scatter(rank, splat_rank, ranked.first, active=has_pairs)
     rank = dr.prefix_reduce(dr.ReduceOp.Max, rank, exclusive=False)
-    slot = dr.arange(ad.UInt32, pairs)
-    splat = dr.gather(ad.UInt32, order, rank)
-    within = slot - dr.gather(ad.UInt32, sorted_first, rank)
-    left = dr.gather(ad.UInt32, x0, splat)
-    columns = dr.maximum(dr.gather(ad.UInt32, x1, splat) - left, 1)
-    column, row = left + within % columns, dr.gather(ad.UInt32, y0, splat) + within // columns
-    touched = _touches(splats, splat, column, row, shape)
-    tile = dr.select(touched, row * tiles_x + column, tiles_x * tiles_y)
-    slot = _stable_order(tile, (tiles_x * tiles_y).bit_length())
+    first_slot = dr.zeros(ad.UInt32, splat_capacity)
+    dr.scatter(first_slot, ranked.first, ranked.order)
+
+    slot = dr.arange(ad.UInt32, capacity)
+    splat = dr.gather(ad.UInt32, ranked.order, rank)
+    within = slot - dr.gather(ad.UInt32, ranked.first, rank)
+    columns = dr.maximum(dr.gather(ad.UInt32, ranked.columns, splat), 1)
+    column = dr.gather(ad.UInt32, ranked.left, splat) + within % columns
+    row = dr.gather(ad.UInt32, ranked.top, splat) + within // columns
+    listed = (slot < pairs) & _touches(splats, splat, column, row, shape)
+    count = tiles[0] * tiles[1]
+    tile = dr.select(listed, row * tiles[0] + column, count)
+    slot = _stable_order(tile, count.bit_length())
     tile = dr.gather(ad.UInt32, tile, slot)
     splat = dr.gather(ad.UInt32, splat, slot)
     dr.eval(tile, splat)
-    start, end = _runs(tile, pairs, tiles_x * tiles_y)
+    start, end = _runs(tile, count, capacity)
     dr.eval(splat, slot, start, end, first_slot)
-    return TileLists(splat, slot, start, end, first_slot, count, pairs, tiles_x, tiles_y, shape)
+    return TileLists(splat, slot, start, end, first_slot, ranked.count, capacity, *tiles, shape)
 
 
 def _touches(splats: Splats, splat: Any, column: Any, row: Any, shape: TileShape) -> Any:
@@ -113,8 +170,7 @@ def _touches(splats: Splats, splat: Any, column: Any, row: Any, shape: TileShape
     Outside its centre a convex quadratic is least, over a rectangle, on an edge that faces the centre.
     """
     x, y, a, b, c, opacity = (
-        dr.gather(ad.Float, dr.detach(v), splat)
-        for v in (splats.x, splats.y, splats.a, splats.b, splats.c, splats.opacity)
+        dr.gather(ad.Float, v, splat) for v in (splats.x, splats.y, splats.a, splats.b, splats.c, splats.opacity)
     )
     left, top = ad.Float(column * shape.width) + 0.5 - x, ad.Float(row * shape.height) + 0.5 - y
     right, bottom = left + (shape.width - 1), top + (shape.height - 1)
@@ -152,15 +208,18 @@ def _tile_range(center: Any, half: Any, size: int, tiles: int) -> tuple[Any, Any
     return ad.UInt32(low), ad.UInt32(high)
 
 
-def _runs(tile: Any, pairs: int, tiles: int) -> tuple[Any, Any]:
-    """First and one-past-last position of each tile's run in the sorted array `tile` [P]; 0, 0 where it has none.
-    Entries of `tiles` and above are in no tile."""
-    position = dr.arange(ad.UInt32, pairs)
+def _runs(tile: Any, tiles: int, capacity: int) -> tuple[Any, Any]:
+    """First and one-past-last position of each tile's run in the sorted array `tile` [capacity]; 0, 0 where it has
+    none. Entries of `tiles` and above are in no tile."""
+    position = dr.arange(ad.UInt32, capacity)
     previous = dr.gather(ad.UInt32, tile, dr.select(position > 0, position - 1, 0))
-    final = dr.opaque(ad.UInt32, pairs - 1)  # a literal would be another kernel every time
-    following = dr.gather(ad.UInt32, tile, dr.minimum(position + 1, final))
+    following = dr.gather(ad.UInt32, tile, dr.minimum(position + 1, capacity - 1))
     start, end = dr.zeros(ad.UInt32, tiles), dr.zeros(ad.UInt32, tiles)
     listed = tile < tiles
     dr.scatter(start, position, tile, active=listed & ((position == 0) | (previous != tile)))
-    dr.scatter(end, position + 1, tile, active=listed & ((position == final) | (following != tile)))
+    dr.scatter(end, position + 1, tile, active=listed & ((position == capacity - 1) | (following != tile)))
     return start, end
+
+
+_rank = recorded(_trace_rank, RECORDINGS)
+_expand = recorded(_trace_expand, RECORDINGS)

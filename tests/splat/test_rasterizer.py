@@ -218,3 +218,13 @@ def test_the_twin_knows_its_spherical_harmonics():
     basis = real_spherical_harmonics(directions, 1)
     c0, c1 = 0.28209479177387814, 0.4886025119029199
     np.testing.assert_allclose(basis, [[c0, 0, c1, 0], [c0, 0, 0, -c1], [c0, -c1, 0, 0]], atol=1e-12)
+
+
+def test_recordings_serve_models_of_any_size():
+    """Recorded for one number of splats and pairs, replayed for others, larger and smaller, back and forth."""
+    view = camera(48, 40)
+    for count in (1000, 40, 1020, 7, 1, 961, 1000):
+        arrays = random_splats(count, seed=count, degree=0)
+        ours, twin = picture(arrays, view), render_reference(arrays, view)
+        np.testing.assert_allclose(ours["colour"], twin.colour, atol=2e-5)
+        np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=2e-5)
