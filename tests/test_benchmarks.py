@@ -1,0 +1,121 @@
+"""The benchmarks: what they compute of their measurements, and that they run and tell what they say they do."""
+
+import json
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _importable():
+    sys.path.insert(0, str(FOLDER))
+    yield
+    sys.path.remove(str(FOLDER))
+
+
+def call(script: str, *arguments: str) -> str:
+    command = [sys.executable, str(FOLDER / script), "--backend", "llvm", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def points_of(time):
+    import growth
+
+    sizes = [(1_000, 64, 3_000), (10_000, 64, 20_000), (100_000, 64, 150_000), (10_000, 256, 60_000)]
+    return [growth.Point(n, side, pairs, time(n, side, pairs)) for n, side, pairs in sizes]
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
+def test_slope_is_the_exponent(power):
+    import growth
+
+    assert growth.slope(points_of(lambda n, side, pairs: 3 * pairs**power)) == pytest.approx(power)
+
+
+def test_linear_model_finds_the_parts_it_is_made_of_and_its_own_failure():
+    import growth
+
+    linear = points_of(lambda n, side, pairs: 0.5 + 40e-6 * pairs + 7e-6 * n + 2e-6 * side**2)
+    parts, worst = growth.model(linear)
+    assert list(parts.values()) == pytest.approx([0.5, 40, 7, 2], rel=1e-6)
+    assert worst < 1e-9
+    assert growth.model(points_of(lambda n, side, pairs: 1e-9 * pairs**2))[1] > 0.3
+
+
+def test_plot_has_a_mark_for_each_measurement():
+    import growth
+
+    points = points_of(lambda n, side, pairs: 1e-4 * pairs)
+    root = ElementTree.fromstring(growth.plot("time <&>", points))
+    circles = [(float(c.get("cx")), float(c.get("cy"))) for c in root.iter("{http://www.w3.org/2000/svg}circle")]
+    assert len(circles) == 3 + 2  # three on 64 pixels, two of 10,000 Gaussians; one is both
+    rise = [(y1 - y0) / (x1 - x0) for (x0, y0), (x1, y1) in pairwise(circles[:3])]
+    assert max(rise) == pytest.approx(min(rise), abs=0.01)  # a power is a straight line
+
+
+def test_quartiles_and_tables():
+    import common
+
+    timing = common.Timing.of(np.arange(1, 10) * 1e-3)
+    assert (timing.low, timing.median, timing.high, timing.least) == pytest.approx((3, 5, 7, 1))
+    table = common.table([{"a": 1_000, "b": 0.5}, {"a": 2, "b": "x"}], markdown=True)
+    assert [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()] == [
+        ["a", "b"], ["----:", "---:"], ["1,000", "0.50"], ["2", "x"]
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ["12", "axb", "100x0", "1x2x3", ""])
+def test_sizes_that_are_none_are_refused(text):
+    import common
+
+    with pytest.raises(SystemExit, match="--sizes: expected"):
+        common.parse_sizes(text)
+
+
+def test_opensplat_is_timed_without_its_start(tmp_path):
+    """A program that needs half a second to start and 5 ms a step."""
+    import peer_opensplat
+    import synthetic
+
+    binary = tmp_path / "opensplat"
+    script = "import sys, time\nn = int(sys.argv[sys.argv.index('-n') + 1])\ntime.sleep(0.5 + 0.005 * n)\n"
+    binary.write_text(f"#!{sys.executable} -IS\n{script}")
+    binary.chmod(0o755)
+    dataset = synthetic.write_dataset(tmp_path / "data", 50, 16, views=2)
+    assert peer_opensplat.milliseconds_a_step(binary, dataset, repeats=1)[0] == pytest.approx(5, rel=0.4)
+    binary.write_text("#!/bin/sh\necho no such thing >&2\nexit 3\n")
+    with pytest.raises(SystemExit, match="code 3: no such thing"):
+        peer_opensplat.milliseconds_a_step(binary, dataset, repeats=1)
+
+
+def test_rasterizer_tells_every_stage():
+    report = json.loads(call("rasterizer.py", "--sizes", "300x32", "--repeats", "2", "--json"))
+    (row,) = report["rows"]
+    stages = {"project", "bin", "forward", "backward", "frame"}
+    assert set(row["clock"]) == stages < set(row["kernels"])
+    assert all(row["kernels"][stage] > 0 for stage in stages)
+    assert row["kernels"]["sum"] == pytest.approx(sum(row["kernels"][s] for s in stages - {"frame"}))
+    assert {"device", "drjit", "spacesim", "backend"} <= set(report["machine"])
+    assert row["pairs"] > 300  # every splat touches a tile, nearly every one of this sphere's front
+
+
+def test_training_tells_a_step_and_what_was_not_measured():
+    output = call("training.py", "--sizes", "300x32", "--repeats", "2", "--markdown")
+    assert "| spacesim |" in output
+    assert "not measured here: needs the binary" in output
+
+
+def test_memory_counts_the_parameters_and_their_moments():
+    report = json.loads(call("training.py", "--sizes", "512x32", "--memory", "--json"))
+    parameters = 59 * 4
+    # values and two moments are there before and after an update; gradients and statistics beside them
+    assert 3 * parameters < report["memory"][0]["bytes a Gaussian"] < 12 * parameters
