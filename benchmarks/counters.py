@@ -41,10 +41,12 @@ def memory(count: int, pixels: int) -> Row:
 def _watermark(seen: int, unseen: int, pixels: int) -> int:
     """Most bytes that Dr.Jit had allocated at any moment of a few warm training steps."""
     arrays = sphere_arrays(seen + unseen)
-    arrays["means"][:seen], arrays["log_scales"][:seen] = _sphere_part(seen)
+    drawn = sphere_arrays(seen)
+    arrays["means"][:seen], arrays["log_scales"][:seen] = drawn["means"], drawn["log_scales"]
     arrays["logit_opacities"] = np.where(np.arange(seen + unseen) < seen, 1.0, UNSEEN)
     with tempfile.TemporaryDirectory() as folder:
-        trainer = still_trainer(write_dataset(Path(folder) / "data", seen + unseen, pixels), arrays)
+        dataset = write_dataset(Path(folder) / "data", seen + unseen, pixels)
+        trainer = still_trainer(dataset, seen + unseen, arrays)
         for _ in range(12):
             trainer.step()
         dr.sync_thread()
@@ -61,11 +63,6 @@ def _peak() -> int:
     """Most bytes that Dr.Jit has held at a moment since its statistics were cleared."""
     kind = dr.JitBackend.CUDA if backend.select() == "cuda" else dr.JitBackend.LLVM
     return int(dr.detail.malloc_watermark(kind))
-
-
-def _sphere_part(count: int) -> tuple[np.ndarray, np.ndarray]:
-    arrays = sphere_arrays(count)
-    return arrays["means"], arrays["log_scales"]
 
 
 def over_steps(steps: int, marks: int = 10) -> list[Row]:

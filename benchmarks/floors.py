@@ -115,7 +115,7 @@ def profile(count: int, pixels: int) -> tuple[Device, list[common.Row]]:
     arrays, yardsticks = common.sphere_arrays(count), Yardsticks()
     with tempfile.TemporaryDirectory() as folder:
         dataset = write_dataset(Path(folder) / "data", count, pixels)
-        trainer, pipeline = still_trainer(dataset, arrays), Pipeline(arrays, dataset.train[0].camera)
+        trainer, pipeline = still_trainer(dataset, count, arrays), Pipeline(arrays, dataset.train[0].camera)
         for _ in range(20):
             trainer.step()
         works = yardsticks.works() | {"step": trainer.step} | {stage: getattr(pipeline, stage) for stage in STAGES}

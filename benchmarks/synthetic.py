@@ -46,16 +46,20 @@ def write_dataset(root: Path, count: int, pixels: int, views: int = VIEWS) -> Da
     return read_dataset(root)
 
 
-def still_trainer(dataset: Dataset, arrays: dict[str, np.ndarray]) -> Trainer:
-    """A trainer whose steps are whole but move nothing and refine nothing, all harmonics from its fourth step on."""
+def still_trainer(dataset: Dataset, count: int, arrays: dict[str, np.ndarray] | None = None) -> Trainer:
+    """A trainer whose steps are whole but move nothing and refine nothing, all harmonics from its fourth step on.
+
+    It holds the splats in `arrays`, or starts from the `count` points: opacity 0.1, as wide as their spacing.
+    """
     config = TrainConfig(
         iterations=NEVER,
         init="points",
-        init_count=len(arrays["means"]),
+        init_count=count,
         sh_every=1,
         rates=STILL,
         refinement=DefaultStrategyConfig(refine_start=NEVER, refine_stop=NEVER),
     )
     trainer = Trainer(dataset, config)
-    trainer.gaussians = Gaussians.from_numpy(arrays)
+    if arrays is not None:
+        trainer.gaussians = Gaussians.from_numpy(arrays)
     return trainer

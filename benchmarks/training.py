@@ -33,7 +33,6 @@ from synthetic import NEVER, STILL, still_trainer, write_dataset
 
 from spacesim import backend
 from spacesim.data.images import load_image
-from spacesim.splat.train.trainer import Trainer
 
 SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "30000x256"}
 WARM_UP = 20  #: steps: all degrees of harmonics are recorded, all pictures decoded
@@ -83,7 +82,7 @@ def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:
     arrays = common.sphere_arrays(count)
     with tempfile.TemporaryDirectory() as folder:
         dataset = write_dataset(Path(folder) / "data", count, pixels)
-        trainer = still_trainer(dataset, arrays)
+        trainer = still_trainer(dataset, count, arrays)
         works: dict[str, Callable[[], Any]] = {"spacesim": trainer.step}
         if peer is not None:
             views = [(frame.camera, load_image(dataset, frame).rgb) for frame in dataset.train]
@@ -121,19 +120,13 @@ def beside_opensplat(count: int, pixels: int, repeats: int, binary: Path | None)
     """Our step from points, as OpenSplat starts, and OpenSplat's, where its binary is given."""
     with tempfile.TemporaryDirectory() as folder:
         dataset = write_dataset(Path(folder) / "data", count, pixels)
-        trainer = from_points(dataset, count)
+        trainer = still_trainer(dataset, count)
         ours = common.interleaved({"spacesim": trainer.step}, repeats, WARM_UP)["spacesim"]
         row: common.Row = {"Gaussians": count, "pixels": pixels, "spacesim": ours}
         if binary is None:
             return row | {"OpenSplat": "not measured here: needs the binary", "ours / theirs": "-"}
         theirs = common.Timing.of(1e-3 * np.array(peer_opensplat.milliseconds_a_step(binary, dataset)))
     return row | {"OpenSplat": theirs, "ours / theirs": ours.median / theirs.median}
-
-
-def from_points(dataset: Any, count: int) -> Trainer:
-    """A trainer whose Gaussians start at the data set's points: opacity 0.1, as wide as their spacing."""
-    probe = still_trainer(dataset, common.sphere_arrays(count))
-    return Trainer(dataset, probe.config)
 
 
 def has_fused_ssim() -> bool:
