@@ -80,14 +80,16 @@ class _Ranked:
 def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) -> TileLists:
     """Sort splats [N] into the tiles of a width x height image. Raises WorkError past 2^31 pairs.
 
-    Two recorded functions; between them the host waits for the number of pairs, which says how large arrays must be.
+    Between its two parts the host waits for the number of pairs, which says how large arrays must be. On LLVM both are
+    recorded; on CUDA Dr.Jit 1.5 cannot replay its own sort.
     """
+    rank, expand = (_rank, _expand) if select() == "llvm" else (_trace_rank, _trace_expand)
     shape, count = tile_shape(), dr.width(splats.x)
     tiles = -(-width // shape.width), -(-height // shape.height)
     splats, footprints = dr.detach(splats), dr.detach(footprints)
     pairs = 0
     if count > 0:
-        ranked: _Ranked = _rank(splats, footprints, dr.opaque(ad.UInt32, count), room(count), tiles, shape)
+        ranked: _Ranked = rank(splats, footprints, dr.opaque(ad.UInt32, count), room(count), tiles, shape)
         if ranked.pairs[0] > _LARGEST_PAIRS:
             raise WorkError(
                 f"rasterizer: {ranked.pairs[0]:.3g} pairs of tile and splat, more than 2^31 - 1 can be sorted"
@@ -96,7 +98,7 @@ def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) 
     if pairs == 0:
         none, of_splats = dr.zeros(ad.UInt32, tiles[0] * tiles[1]), dr.zeros(ad.UInt32, max(count, 1))
         return TileLists(none, none, none, none, of_splats, of_splats, 0, *tiles, shape)
-    lists: TileLists = _expand(splats, ranked, dr.opaque(ad.UInt32, pairs), room(pairs), room(count), tiles, shape)
+    lists: TileLists = expand(splats, ranked, dr.opaque(ad.UInt32, pairs), room(pairs), room(count), tiles, shape)
     return lists
 
 
