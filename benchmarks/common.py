@@ -94,17 +94,22 @@ def synchronise() -> None:
         torch.cuda.synchronize()
 
 
-def interleaved(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP) -> dict[str, Timing]:
-    """Time of each work, device synchronised before and after; they take turns, so that all see the same machine."""
-    seconds: dict[str, list[float]] = {name: [] for name in works}
+def seconds(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP) -> dict[str, list[float]]:
+    """Of each work, device synchronised before and after; they take turns, so that all see the same machine."""
+    found: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(warm_up + repeats):
         for name, work in works.items():
             synchronise()
             start = time.perf_counter()
             work()
             synchronise()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: Timing.of(values[warm_up:]) for name, values in seconds.items()}
+            found[name].append(time.perf_counter() - start)
+    return {name: values[warm_up:] for name, values in found.items()}
+
+
+def interleaved(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP) -> dict[str, Timing]:
+    """The same as timings."""
+    return {name: Timing.of(values) for name, values in seconds(works, repeats, warm_up).items()}
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,11 @@ STEPS = 40, 120  #: of the short and the long run; their difference is free of s
 OFF = "1000000000"
 
 
-def milliseconds_a_step(binary: Path, dataset: Dataset, repeats: int = 3) -> list[float]:
-    """Of `repeats` pairs of runs: the time that the long one takes more, over its steps more.
-
-    Ends the program with a sentence where the binary fails.
-    """
+def seconds_a_step(binary: Path, dataset: Dataset) -> float:
+    """What the long run takes more than the short one, over its steps more. Ends the program with a sentence where the
+    binary fails."""
     short, long = STEPS
-    return [
-        1e3 * (_seconds(binary, dataset, long) - _seconds(binary, dataset, short)) / (long - short)
-        for _ in range(repeats)
-    ]
+    return (_seconds(binary, dataset, long) - _seconds(binary, dataset, short)) / (long - short)
 
 
 def _seconds(binary: Path, dataset: Dataset, steps: int) -> float:

@@ -25,7 +25,6 @@ import common
 import counters
 import floors
 import growth
-import numpy as np
 import peer_opensplat
 from pipeline import SSIM_WEIGHT, Pipeline
 from rasterizer import load_peer
@@ -35,6 +34,7 @@ from spacesim import backend
 from spacesim.data.images import load_image
 
 SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "30000x256"}
+ROUNDS = 3  #: of ours and OpenSplat in turn
 WARM_UP = 20  #: steps: all degrees of harmonics are recorded, all pictures decoded
 RATES = dict.fromkeys(("means", "log_scales", "quaternions", "logit_opacities", "sh0", "shN"), STILL.means)
 
@@ -117,16 +117,20 @@ def describe(result: dict[str, Any]) -> list[common.Row]:
 
 
 def beside_opensplat(count: int, pixels: int, repeats: int, binary: Path | None) -> common.Row:
-    """Our step from points, as OpenSplat starts, and OpenSplat's, where its binary is given."""
+    """Our step from points, as OpenSplat starts, and OpenSplat's in turn with it, where its binary is given."""
     with tempfile.TemporaryDirectory() as folder:
         dataset = write_dataset(Path(folder) / "data", count, pixels)
         trainer = still_trainer(dataset, count)
-        ours = common.interleaved({"spacesim": trainer.step}, repeats, WARM_UP)["spacesim"]
-        row: common.Row = {"Gaussians": count, "pixels": pixels, "spacesim": ours}
-        if binary is None:
-            return row | {"OpenSplat": "not measured here: needs the binary", "ours / theirs": "-"}
-        theirs = common.Timing.of(1e-3 * np.array(peer_opensplat.milliseconds_a_step(binary, dataset)))
-    return row | {"OpenSplat": theirs, "ours / theirs": ours.median / theirs.median}
+        ours, theirs = list[float](), list[float]()
+        for _ in range(ROUNDS):
+            ours += common.seconds({"spacesim": trainer.step}, -(-repeats // ROUNDS), WARM_UP)["spacesim"]
+            if binary is not None:
+                theirs.append(peer_opensplat.seconds_a_step(binary, dataset))
+    row: common.Row = {"Gaussians": count, "pixels": pixels, "spacesim": common.Timing.of(ours)}
+    if binary is None:
+        return row | {"OpenSplat": "not measured here: needs the binary", "ours / theirs": "-"}
+    peer = common.Timing.of(theirs)
+    return row | {"OpenSplat": peer, "ours / theirs": row["spacesim"].median / peer.median}
 
 
 def has_fused_ssim() -> bool:

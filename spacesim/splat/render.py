@@ -10,13 +10,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from spacesim.backend import ad
+from spacesim.backend import ad, recorded
 from spacesim.splat.cameras import Projection
 from spacesim.splat.gaussians import SH_C0, Gaussians
 from spacesim.splat.project import Footprints, Splats, project
 from spacesim.splat.rasterize import rasterize
 from spacesim.splat.surface import median_splat, normals, picked, unit
-from spacesim.splat.tiles import TileLists, bin_splats
+from spacesim.splat.tiles import RECORDINGS, TileLists, bin_splats
 
 OUTPUTS = ("colour", "alpha", "depth", "median_depth", "normal")
 CHANNELS = 16  #: features in one pass: fewer repeat the blending, more gain little (docs/rasterizer.md)
@@ -93,14 +93,9 @@ def render(
     if gaussians.count == 0:
         return _nothing(camera, outputs, None if features is None else len(own))
 
-    splats, footprints = project(gaussians, camera, antialiased)
-    wanted: dict[str, list[Any]] = {}
-    if "colour" in outputs:
-        wanted["colour"] = list(view_colours(gaussians, camera, sh_degree))
-    if "depth" in outputs:
-        wanted["depth"] = [splats.depth]
-    if "normal" in outputs:
-        wanted["normal"] = list(normals(gaussians, camera))
+    rows = gaussians.rows()
+    prepare = _trace_prepare if dr.grad_enabled(rows, camera.values) else _prepare
+    splats, footprints, wanted = prepare(rows, camera, sh_degree, tuple(outputs), antialiased)
     if features is not None:
         wanted["features"] = [_finite(feature + dr.zeros(ad.Float, gaussians.count)) for feature in own]
 
@@ -118,6 +113,22 @@ def render(
         normal=unit(ad.Array3f(found["normal"])) if "normal" in found else None,
         features=found.get("features"),
     )
+
+
+def _trace_prepare(
+    rows: list[Any], camera: Projection, sh_degree: int | None, outputs: tuple[str, ...], antialiased: bool
+) -> tuple[Splats, Footprints, dict[str, list[Any]]]:
+    """(splats, footprints, features to blend by output) of the Gaussians with these `rows`."""
+    gaussians = Gaussians.from_rows(rows)
+    splats, footprints = project(gaussians, camera, antialiased)
+    wanted: dict[str, list[Any]] = {}
+    if "colour" in outputs:
+        wanted["colour"] = list(view_colours(gaussians, camera, sh_degree))
+    if "depth" in outputs:
+        wanted["depth"] = [splats.depth]
+    if "normal" in outputs:
+        wanted["normal"] = list(normals(gaussians, camera))
+    return splats, footprints, wanted
 
 
 @dataclass
@@ -197,3 +208,6 @@ def view_colours(gaussians: Gaussians, camera: Projection, sh_degree: int | None
             colour += basis[k] * ad.Array3f(*(sh[3 * k + c] for c in range(3)))
     finite = dr.detach(dr.abs(colour) < 1e9)
     return dr.maximum(dr.select(finite, colour, 0), 0)
+
+
+_prepare = recorded(_trace_prepare, RECORDINGS)

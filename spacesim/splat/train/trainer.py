@@ -85,7 +85,8 @@ class Trainer:
         splats, footprints, colour = self._project(rows, camera, degree)
         lists = bin_splats(splats, footprints, width, height)
         blended = forward(splats, colour, lists, width, height)
-        target = ad.UInt32(view.rgba), ad.Float(self.background(index, view)), _valid(view)
+        rgba, valid = self.views.pixels(view)
+        target = rgba, ad.Float(self.background(index, view)), valid
         loss, by_colour, by_transmittance = self._loss(
             blended.features, blended.transmittance, target, (width, height), config.ssim_weight
         )
@@ -151,10 +152,6 @@ class Trainer:
         if not np.isfinite(loss):
             raise WorkError(f"training: the loss is {loss} at iteration {self.iteration}; the last checkpoint is kept")
         self.history.append({"iteration": self.iteration, "loss": loss, "gaussians": self.gaussians.count})
-
-
-def _valid(view: View) -> Any:
-    return ad.Bool(True) if view.valid is None else ad.Bool(view.valid)
 
 
 def _project(rows: list[Any], camera: Pinhole, degree: int) -> tuple[Splats, Footprints, list[Any]]:
