@@ -6,17 +6,23 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+
 from spacesim.data.records import Dataset
 
 STEPS = 40, 120  #: of the short and the long run; their difference is free of start-up and of writing the result
 OFF = "1000000000"
 
 
-def seconds_a_step(binary: Path, dataset: Dataset) -> float:
-    """What the long run takes more than the short one, over its steps more. Ends the program with a sentence where the
-    binary fails."""
-    short, long = STEPS
-    return (_seconds(binary, dataset, long) - _seconds(binary, dataset, short)) / (long - short)
+def run_pair(binary: Path, dataset: Dataset) -> tuple[float, float]:
+    """Seconds of a short and of a long run. Ends the program with a sentence where the binary fails."""
+    return _seconds(binary, dataset, STEPS[0]), _seconds(binary, dataset, STEPS[1])
+
+
+def seconds_a_step(pairs: list[tuple[float, float]]) -> list[float]:
+    """What each long run takes more than the median of the short ones, over its steps more."""
+    start = float(np.median([short for short, _ in pairs]))
+    return [(long - start) / (STEPS[1] - STEPS[0]) for _, long in pairs]
 
 
 def _seconds(binary: Path, dataset: Dataset, steps: int) -> float:

@@ -121,15 +121,15 @@ def beside_opensplat(count: int, pixels: int, repeats: int, binary: Path | None)
     with tempfile.TemporaryDirectory() as folder:
         dataset = write_dataset(Path(folder) / "data", count, pixels)
         trainer = still_trainer(dataset, count)
-        ours, theirs = list[float](), list[float]()
+        ours, pairs = list[float](), list[tuple[float, float]]()
         for _ in range(ROUNDS):
             ours += common.seconds({"spacesim": trainer.step}, -(-repeats // ROUNDS), WARM_UP)["spacesim"]
             if binary is not None:
-                theirs.append(peer_opensplat.seconds_a_step(binary, dataset))
+                pairs.append(peer_opensplat.run_pair(binary, dataset))
     row: common.Row = {"Gaussians": count, "pixels": pixels, "spacesim": common.Timing.of(ours)}
     if binary is None:
         return row | {"OpenSplat": "not measured here: needs the binary", "ours / theirs": "-"}
-    peer = common.Timing.of(theirs)
+    peer = common.Timing.of(peer_opensplat.seconds_a_step(pairs))
     return row | {"OpenSplat": peer, "ours / theirs": row["spacesim"].median / peer.median}
 
 

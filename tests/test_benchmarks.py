@@ -91,10 +91,11 @@ def test_opensplat_is_timed_without_its_start(tmp_path):
     binary.write_text(f"#!{sys.executable} -IS\n{script}")
     binary.chmod(0o755)
     dataset = synthetic.write_dataset(tmp_path / "data", 50, 16, views=2)
-    assert peer_opensplat.seconds_a_step(binary, dataset) == pytest.approx(5e-3, rel=0.4)
+    pairs = [peer_opensplat.run_pair(binary, dataset)]
+    assert peer_opensplat.seconds_a_step(pairs) == pytest.approx([5e-3], rel=0.4)
     binary.write_text("#!/bin/sh\necho no such thing >&2\nexit 3\n")
     with pytest.raises(SystemExit, match="code 3: no such thing"):
-        peer_opensplat.seconds_a_step(binary, dataset)
+        peer_opensplat.run_pair(binary, dataset)
 
 
 def test_rasterizer_tells_every_stage():
