@@ -125,7 +125,7 @@ def profile(count: int, pixels: int) -> tuple[Device, list[common.Row]]:
     stages = [_row(stage, measured[stage], whole, *device.floor(*needs[stage])) for stage in STAGES]
     launches, total = (sum(row[key] for row in stages) for key in ("launches", "ms"))
     floor = sum(max(row["floor by bytes, ms"], row["floor by operations, ms"]) for row in stages)
-    rest = {"stage": "rest (upload, statistics)", "launches": whole.launches - launches}
+    rest = {"stage": "rest", "launches": whole.launches - launches}
     rest |= {"ms": whole.least - total, "of the step": f"{1 - total / whole.least:.0%}"}
     step = {"stage": "trainer's step, kernels", "launches": whole.launches, "ms": whole.least}
     step |= {"of the step": "100%", "floor / time": f"{floor / whole.least:.0%}"}

@@ -98,7 +98,7 @@ class Step:
     """One training step: rasterization, L1 + D-SSIM, gradients, Adam over all parameters; no refinement.
 
     ssim: "torch" (five separable blurs by conv2d) or "fused_ssim";  fused: torch's one-kernel Adam.
-    The pictures wait on the device, opaque: there is no upload and no background, which ours has in its step.
+    The pictures wait on the device as floats; ours unpacks 8-bit values and composites them over a background.
     """
 
     def __init__(

@@ -6,7 +6,7 @@
     python benchmarks/training.py --memory
     python benchmarks/training.py --steps 10000
 
-A step is the trainer's own: picture upload, rasterization with spherical harmonics of degree 3, L1 + D-SSIM, gradients,
+A step is the trainer's own: rasterization with spherical harmonics of degree 3, L1 + D-SSIM, gradients,
 Adam over all parameters, statistics; refinement is off and step sizes are 1e-12, so that every step has the same work.
 Ours and the peer's take turns; medians and quartiles after warm-up. gsplat's step is its rasterizer, SSIM by torch's
 conv2d (and by fused_ssim where that is installed), torch's Adam (plain and fused), its pictures on the device already.
