@@ -167,6 +167,17 @@ def mitsuba() -> ModuleType:
     return mi
 
 
+def free_memory() -> int | None:
+    """Bytes that arrays may still take on the chosen backend; None where the system does not say (CUDA, not Linux)."""
+    if select() != "llvm":
+        return None
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
+
+
 def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
     """`function` by `dr.freeze`: traced at its first call with arguments of a kind, replayed at the others.
 

@@ -10,13 +10,14 @@ from typing import Any
 
 import drjit as dr
 
-from spacesim.backend import ad, recorded, select
+from spacesim.backend import ad, free_memory, recorded, select
 from spacesim.data.errors import WorkError
 from spacesim.splat.project import ALPHA_MIN, Footprints, Splats
 
 RECORDINGS = 256  #: of a function that are kept: one for each size of picture, of the lists, and of the model
 
-_LARGEST_PAIRS = 2**31 - 1
+LARGEST_PAIRS = 0.9 * 2**30  #: lists hold four numbers a pair, and Dr.Jit's arrays at most 2^32
+BYTES_A_PAIR = 150  #: of lists, sorting, and gradients of three channels, at most at once
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,8 @@ class _Ranked:
 
 
 def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) -> TileLists:
-    """Sort splats [N] into the tiles of a width x height image. Raises WorkError past 2^31 pairs.
+    """Sort splats [N] into the tiles of a width x height image. Raises WorkError for more pairs than can be
+    sorted or held in memory.
 
     Between its two parts the host waits for the number of pairs, which says how large arrays must be. On LLVM both are
     recorded; on CUDA Dr.Jit 1.5 cannot replay its own sort.
@@ -90,16 +92,25 @@ def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) 
     pairs = 0
     if count > 0:
         ranked: _Ranked = rank(splats, footprints, dr.opaque(ad.UInt32, count), room(count), tiles, shape)
-        if ranked.pairs[0] > _LARGEST_PAIRS:
-            raise WorkError(
-                f"rasterizer: {ranked.pairs[0]:.3g} pairs of tile and splat, more than 2^31 - 1 can be sorted"
-            )
+        _check_room(float(ranked.pairs[0]))
         pairs = int(ranked.pairs[0])
     if pairs == 0:
         none, of_splats = dr.zeros(ad.UInt32, tiles[0] * tiles[1]), dr.zeros(ad.UInt32, max(count, 1))
         return TileLists(none, none, none, none, of_splats, of_splats, 0, *tiles, shape)
     lists: TileLists = expand(splats, ranked, dr.opaque(ad.UInt32, pairs), room(pairs), room(count), tiles, shape)
     return lists
+
+
+def _check_room(pairs: float) -> None:
+    needed = pairs * BYTES_A_PAIR
+    if pairs > LARGEST_PAIRS:
+        raise WorkError(f"rasterizer: {pairs:.3g} pairs of tile and splat, at most {LARGEST_PAIRS:.3g} can be sorted")
+    free = free_memory() if needed > 2**28 else None
+    if free is not None and needed > free:
+        raise WorkError(
+            f"rasterizer: {pairs:.3g} pairs of tile and splat need about {needed / 1e9:.3g} GB of memory, "
+            f"{free / 1e9:.3g} GB are free"
+        )
 
 
 def room(count: int) -> int:

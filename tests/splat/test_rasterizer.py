@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 
 from spacesim.backend import ad
+from spacesim.data.errors import WorkError
 from spacesim.data.geometry import look_at, quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
+from spacesim.splat import tiles
 from spacesim.splat.gaussians import NAMES, Gaussians
 from spacesim.splat.project import Pinhole
 from spacesim.splat.reference import real_spherical_harmonics, render_reference
@@ -106,7 +108,7 @@ def test_picture_matches_the_twin(count, size):
     np.testing.assert_allclose(ours["colour"], twin.colour, atol=1e-5)
     np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=1e-5)
     solid = twin.alpha > 0.01  # below, depth divides by next to nothing
-    np.testing.assert_allclose(ours["depth"][solid], twin.depth[solid], atol=1e-5)
+    np.testing.assert_allclose(ours["depth"][solid], twin.depth[solid], atol=2e-5)
 
 
 def test_gradients_match_central_differences_on_placed_splats():
@@ -228,3 +230,14 @@ def test_recordings_serve_models_of_any_size():
         ours, twin = picture(arrays, view), render_reference(arrays, view)
         np.testing.assert_allclose(ours["colour"], twin.colour, atol=2e-5)
         np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=2e-5)
+
+
+@pytest.mark.parametrize(("count", "sentence"), [(60_000, "GB are free"), (150_000, "can be sorted")])
+def test_more_pairs_than_memory_holds_are_a_sentence(count, sentence, monkeypatch):
+    """Splats that cover all tiles of a large picture."""
+    monkeypatch.setattr(tiles, "free_memory", lambda: 10**9)
+    arrays = random_splats(count, degree=0)
+    arrays["log_scales"][:] = 3.0
+    arrays["logit_opacities"][:] = 5.0
+    with pytest.raises(WorkError, match=sentence):
+        render(Gaussians.from_numpy(arrays), Pinhole.of(camera(1024, 1024)))
