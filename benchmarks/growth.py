@@ -15,6 +15,7 @@ SIZES = {
 }
 WIDTH, HEIGHT = 640, 400
 LEFT, RIGHT, TOP, BOTTOM = 62, 18, 44, 52
+SLOPE_ONE = "#5a6472"
 COLOURS = {"gaussians": "#2a66ad", "pixels": "#b9560f"}
 
 
@@ -85,8 +86,8 @@ def plot(title: str, points: list[Point]) -> str:
     start = max(left, low / top.milliseconds * top.pairs)
     ends = place(start, top.milliseconds * start / top.pairs), place(top.pairs, top.milliseconds)
     (x0, y0), (x1, y1) = ends
-    marks.append(f'<path d="M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" stroke="#5a6472" stroke-dasharray="5 4"/>')
-    legend = [("#5a6472", "slope 1")]
+    marks.append(f'<path d="M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" stroke="{SLOPE_ONE}" stroke-dasharray="5 4"/>')
+    legend = [(SLOPE_ONE, "slope 1")]
     for name, chosen in series.items():
         if len(chosen) < 2:
             continue
@@ -97,7 +98,8 @@ def plot(title: str, points: list[Point]) -> str:
         legend.append((COLOURS[name], f"{describe(name, chosen)}: slope {slope(chosen):.2f}"))
     for row, (colour, words) in enumerate(reversed(legend)):
         at = TOP + 16 + 18 * row
-        marks.append(f'<path d="M{LEFT + 12} {at - 4}h22" stroke="{colour}" stroke-width="2"/>')
+        dashes = ' stroke-dasharray="5 4"' if colour == SLOPE_ONE else ' stroke-width="2"'
+        marks.append(f'<path d="M{LEFT + 12} {at - 4}h22" stroke="{colour}"{dashes}/>')
         marks.append(text(LEFT + 42, at, words, "start"))
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}"'
     return f'{head} role="img" aria-label="{escape(title)}" font-family="sans-serif">{"".join(marks)}</svg>\n'
