@@ -51,7 +51,7 @@ def summary(points: list[Point]) -> dict[str, float]:
     """Slopes of the whole and of the larger half, and the linear model, in ms."""
     ordered = sorted(points, key=lambda p: p.pairs)
     parts, worst = model(points)
-    result = {"slope": slope(points)}
+    result = {"slope": slope(points)} if len(points) > 1 else {}
     if len(points) > 3:
         result["slope, larger half"] = slope(ordered[len(ordered) // 2 :])
     return (
