@@ -19,6 +19,7 @@ from spacesim.splat.tiles import RECORDINGS, TileLists, room
 
 ALPHA_MAX = 0.999  #: a splat never hides everything behind it
 TRANSMITTANCE_MIN = 1e-4  #: a pixel is finished once less than this passes
+COPIES_BYTES = 2**30  #: that threads' copies of gradient slots may take on a CPU, chosen
 _LOG2_E = 1.4426950408889634
 
 
@@ -158,8 +159,9 @@ def _trace_backward(
         behind.append(end * dr.gather(ad.Float, transmittance_gradient, pixel, inside))
         last.append(dr.select(inside, dr.gather(ad.UInt32, blended.last, lane * rows + p), 0))
 
-    mode = dr.ReduceMode.Local if select() == "cuda" else dr.ReduceMode.Auto
-    slots = [dr.zeros(ad.Float, 4 * lists.capacity) for _ in range(2 + -(-channels // 4))]
+    arrays = 2 + -(-channels // 4)
+    mode = _reduce_mode(16 * lists.capacity * arrays)
+    slots = [dr.zeros(ad.Float, 4 * lists.capacity) for _ in range(arrays)]
     records, start = blended.records, dr.gather(ad.UInt32, lists.start, tile)
 
     def remaining(k: Any, _transmittance: Any, _behind: Any) -> Any:
@@ -235,6 +237,14 @@ def rasterize(splats: Splats, features: list[Any], lists: TileLists, width: int,
     """Differentiable blending. Returns (C feature planes, transmittance plane), [height * width] each."""
     outputs: list[Any] = dr.custom(_Rasterize, splats, features, lists, width, height)
     return outputs[:-1], outputs[-1]
+
+
+def _reduce_mode(bytes_: int) -> Any:
+    """How a tile's lanes add to the slots, `bytes_` large. On CUDA a warp sums first. On LLVM every thread has a copy of the
+    slots, unless the copies are too large. One tile alone adds to a slot: the sums depend on none of this."""
+    if select() == "cuda":
+        return dr.ReduceMode.Local
+    return dr.ReduceMode.Expand if dr.thread_count() * bytes_ < COPIES_BYTES else dr.ReduceMode.Local
 
 
 def _list_records(splats: Splats, features: list[Any], lists: TileLists, capacity: int) -> list[Any]:
