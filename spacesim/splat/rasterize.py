@@ -240,8 +240,8 @@ def rasterize(splats: Splats, features: list[Any], lists: TileLists, width: int,
 
 
 def _reduce_mode(bytes_: int) -> Any:
-    """How a tile's lanes add to the slots, `bytes_` large. On CUDA a warp sums first. On LLVM every thread has a copy of the
-    slots, unless the copies are too large. One tile alone adds to a slot: the sums depend on none of this."""
+    """How a tile's lanes add to the slots, `bytes_` large. On CUDA a warp sums first. On LLVM every thread has a copy
+    of the slots, unless that is too much. One tile alone adds to a slot: the sums depend on none of this."""
     if select() == "cuda":
         return dr.ReduceMode.Local
     return dr.ReduceMode.Expand if dr.thread_count() * bytes_ < COPIES_BYTES else dr.ReduceMode.Local
