@@ -132,6 +132,7 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--strategy", help="default")
     one.add_argument("--init", help="mesh, points or random (default: points, else mesh, else random)")
     one.add_argument("--init-count", type=int, metavar="N", help="Gaussians at the start, at most")
+    one.add_argument("--views-per-step", type=int, metavar="N", help="views whose mean gradient a step follows (1)")
     one.add_argument("--preset", default="fast", help="demo, fast (default) or thesis")
     one.add_argument("--iterations", type=int, metavar="N")
     one.add_argument("--seed", type=int, metavar="N")
@@ -252,7 +253,7 @@ def _train(options: argparse.Namespace) -> None:
     from spacesim.splat.train.config import preset, with_options
     from spacesim.splat.train.train import train
 
-    names = ("method", "strategy", "init", "init_count", "iterations", "seed")
+    names = ("method", "strategy", "init", "init_count", "views_per_step", "iterations", "seed")
     config = with_options(preset(options.preset), **{name: getattr(options, name) for name in names})
     if options.black_background:
         config = with_options(config, random_background=False)

@@ -260,3 +260,30 @@ train(read_dataset(Path({str(small_dataset.root)!r})), Path({str(tmp_path / "alo
     together = train(small_dataset, tmp_path / "together", config)
     name = "model.safetensors"
     assert (tmp_path / "alone" / name).read_bytes() == (together.path / name).read_bytes()
+
+
+def test_several_views_a_step_follow_their_mean_gradient(small_dataset):
+    """Adam's first moment after a first step is a tenth of the gradient."""
+    config = replace(CONFIG, sh_every=10)
+
+    def moments(views_per_step: int, iteration: int) -> np.ndarray:
+        trainer = Trainer(small_dataset, replace(config, views_per_step=views_per_step))
+        trainer.iteration = iteration
+        trainer.step()
+        return np.stack([np.array(row) for row in trainer.optimizer.first])
+
+    first, second, both = moments(1, 0), moments(1, 1), moments(2, 0)
+    assert np.abs(first - second).max() > 0.1 * np.abs(first).max()
+    np.testing.assert_allclose(both, (first + second) / 2, rtol=1e-4, atol=1e-6 * np.abs(first).max())
+
+
+def test_training_on_several_views_a_step_learns_and_resumes(small_dataset, tmp_path):
+    config = replace(CONFIG, views_per_step=3, iterations=40, checkpoint_every=20)
+    whole = Trainer(small_dataset, config)
+    whole.run(lambda progress: None, lambda: whole.save(tmp_path / "half"))
+    resumed = Trainer(small_dataset, config)
+    resumed.restore(tmp_path / "half")
+    resumed.run(lambda progress: None, lambda: None)
+    for name, values in whole.gaussians.to_numpy().items():
+        np.testing.assert_array_equal(resumed.gaussians.to_numpy()[name], values, err_msg=name)
+    assert psnr(whole.gaussians, small_dataset) > psnr(Trainer(small_dataset, config).gaussians, small_dataset) + 1

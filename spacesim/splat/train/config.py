@@ -35,6 +35,7 @@ class TrainConfig:
     preset: str | None = None  #: the preset that this started from
     iterations: int = 7_000
     seed: int = 0
+    views_per_step: int = 1  #: whose mean gradient a step follows; the thesis takes one
     init_count: int = 20_000  #: Gaussians at the start, at most
     sh_degree: int = 3
     sh_every: int = 1_000  #: iterations after which one more degree of spherical harmonics joins
@@ -54,6 +55,8 @@ class TrainConfig:
             raise InputError(f"--init: expected one of {', '.join(INITS)}, found {self.init!r}")
         if self.iterations < 1:
             raise InputError(f"--iterations: expected at least 1, found {self.iterations}")
+        if self.views_per_step < 1:
+            raise InputError(f"--views-per-step: expected at least 1, found {self.views_per_step}")
         if self.init_count < 1:
             raise InputError(f"--init-count: expected at least 1, found {self.init_count}")
         if not 0 <= self.sh_degree <= 3:

@@ -17,7 +17,7 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Dataset
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import Footprints, Pinhole, Splats, project
-from spacesim.splat.rasterize import backward, forward
+from spacesim.splat.rasterize import SplatGradients, backward, forward
 from spacesim.splat.render import view_colours
 from spacesim.splat.tiles import bin_splats
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
@@ -74,38 +74,44 @@ class Trainer:
                 on_checkpoint()
 
     def step(self) -> Any:
-        """One view, one update, refinement if it is time. Returns the loss, Float of width 1."""
-        config, index = self.config, self.iteration
-        view = self.views.at_step(index)
-        camera = Pinhole.of(view.camera)
-        width, height = camera.width, camera.height
+        """One update from one view or several, refinement if it is time. Returns the mean loss, Float of width 1."""
+        config, index, count = self.config, self.iteration, self.config.views_per_step
         degree = min(config.sh_degree, index // config.sh_every)
         rows = self.gaussians.rows()
+        looks = [self._look(rows, degree, index * count + i) for i in range(count)]
+        moments = self.optimizer.first, self.optimizer.second
+        factors = ad.Float([*self.optimizer.corrections(), *self.rates(index)])
+        gradients = [(camera, by_splat.splats, by_splat.features) for camera, by_splat, _ in looks]
+        rows, first, second = self._update(rows, moments, degree, gradients, factors)
+        self.gaussians = Gaussians.from_rows(rows)
+        self.optimizer.first, self.optimizer.second = first, second
 
+        self.iteration += 1
+        rng = np.random.default_rng([config.seed, 2, self.iteration])
+        self.strategy.refine(self.iteration, self.gaussians, self.optimizer, rng)
+        losses = [loss for _, _, loss in looks]
+        return losses[0] if count == 1 else sum(losses, ad.Float(0)) / count
+
+    def _look(self, rows: list[Any], degree: int, number: int) -> tuple[Pinhole, SplatGradients, Any]:
+        """Blend view `number` of the training, compare, and go back: (camera, gradients of its splats, loss)."""
+        view = self.views.at_step(number)
+        camera = Pinhole.of(view.camera)
+        size = width, height = camera.width, camera.height
         splats, footprints, colour = self._project(rows, camera, degree)
         lists = bin_splats(splats, footprints, width, height)
         blended = forward(splats, colour, lists, width, height)
         rgba, valid = self.views.pixels(view)
-        target = rgba, ad.Float(self.background(index, view)), valid
+        target = rgba, ad.Float(self.background(number, view)), valid
         loss, by_colour, by_transmittance = self._loss(
-            blended.features, blended.transmittance, target, (width, height), config.ssim_weight
+            blended.features, blended.transmittance, target, size, self.config.ssim_weight
         )
-        by_splat = backward(splats, blended, lists, (width, height), by_colour, by_transmittance)
-        moments = self.optimizer.first, self.optimizer.second
-        factors = ad.Float([*self.optimizer.corrections(), *self.rates(index)])
-        rows, first, second = self._update(rows, moments, camera, degree, (by_splat.splats, by_splat.features), factors)
-        self.gaussians = Gaussians.from_rows(rows)
-        self.optimizer.first, self.optimizer.second = first, second
-
+        by_splat = backward(splats, blended, lists, size, by_colour, by_transmittance)
         gradient = dr.sqrt(
             dr.square(by_splat.absolute_x * (0.5 * width)) + dr.square(by_splat.absolute_y * (0.5 * height))
         )
         radius = dr.maximum(footprints.half_width, footprints.half_height) / max(width, height)
         self.strategy.observe(gradient, radius, footprints.visible)
-        self.iteration += 1
-        rng = np.random.default_rng([config.seed, 2, self.iteration])
-        self.strategy.refine(self.iteration, self.gaussians, self.optimizer, rng)
-        return loss
+        return camera, by_splat, loss
 
     def save(self, path: Path) -> None:
         """Write everything that the next step depends on."""
@@ -184,27 +190,26 @@ def _loss(
 def _update(
     rows: list[Any],
     moments: tuple[list[Any], list[Any]],
-    camera: Pinhole,
     degree: int,
-    gradients: tuple[Splats, list[Any]],
+    gradients: list[tuple[Pinhole, Splats, list[Any]]],
     factors: Any,
 ) -> tuple[list[Any], list[Any], list[Any]]:
-    """Gradients of the splats to gradients of the parameters, and an Adam step.
+    """Gradients of the splats and colours in each view to the mean gradient of the parameters, and an Adam step.
 
     factors: Float [2 + R], Adam's two corrections and the step size of each row.
     """
     rows = [ad.Float(row) for row in rows]
     dr.enable_grad(rows)
     gaussians = Gaussians.from_rows(rows)
-    splats, _ = project(gaussians, camera)
-    colour = view_colours(gaussians, camera, degree)
-    by_splat, by_colour = gradients
-    along = splats.opacity * by_splat.opacity
-    for name in ("x", "y", "a", "b", "c"):
-        along += getattr(splats, name) * getattr(by_splat, name)
-    for value, gradient in zip(colour, by_colour, strict=True):
-        along += value * gradient
-    dr.backward(along)
+    along: Any = ad.Float(0)
+    for camera, by_splat, by_colour in gradients:
+        splats, _ = project(gaussians, camera)
+        colour = view_colours(gaussians, camera, degree)
+        for name in ("opacity", "x", "y", "a", "b", "c"):
+            along += getattr(splats, name) * getattr(by_splat, name)
+        for value, gradient in zip(colour, by_colour, strict=True):
+            along += value * gradient
+    dr.backward(along if len(gradients) == 1 else along / len(gradients))
     numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(2 + len(rows))]
     by_row = [dr.grad(row) for row in rows]
     return adam_step(dr.detach(rows), by_row, moments, numbers[2:], (numbers[0], numbers[1]))
