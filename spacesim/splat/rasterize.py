@@ -52,7 +52,8 @@ class SplatGradients:
 
 def forward(splats: Splats, features: list[Any], lists: TileLists, width: int, height: int) -> Blended:
     """Blend `features` (C arrays [N]) over the pixels of a width x height image. Detached inputs."""
-    blended: Blended = _forward(splats, features, lists, width, height, room(dr.width(splats.x)))
+    run = _forward if width * height > 1 else _trace_forward  # a recording gives a plane of one pixel another size
+    blended: Blended = run(splats, features, lists, width, height, room(dr.width(splats.x)))
     return blended
 
 

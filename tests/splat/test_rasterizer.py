@@ -241,3 +241,11 @@ def test_more_pairs_than_memory_holds_are_a_sentence(count, sentence, monkeypatc
     arrays["logit_opacities"][:] = 5.0
     with pytest.raises(WorkError, match=sentence):
         render(Gaussians.from_numpy(arrays), Pinhole.of(camera(1024, 1024)))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (16, 8), (17, 9)])
+def test_pictures_of_few_pixels(size):
+    arrays, view = random_splats(60, seed=4, degree=0), camera(*size)
+    ours, twin = picture(arrays, view), render_reference(arrays, view)
+    np.testing.assert_allclose(ours["colour"], twin.colour, atol=2e-5)
+    np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=2e-5)
