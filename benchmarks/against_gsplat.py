@@ -134,6 +134,7 @@ def compare_training(data: Path, iterations: int) -> dict[str, Any]:
         pictures.append(render(trainer.gaussians, Pinhole.of(camera)).to_numpy()[0])
     ours["psnr"] = psnr(pictures, [image for _, image in truth])
 
+    compare_pictures(1_000, 64)  # gsplat compiles itself at its first call
     began = time.monotonic()
     splats = train_gsplat(Trainer(dataset, config), start, config)
     torch.cuda.synchronize()
