@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 from spacesim import __version__, backend
 from spacesim.data.errors import InputError, WorkError
 
-KINDS = ("rgb", "depth", "alpha")
+KINDS = ("rgb", "depth", "alpha", "normal")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -314,7 +314,7 @@ def _render(options: argparse.Namespace) -> None:
         if not 0 <= index < len(frames):
             raise InputError(f"--frame: expected 0 to {len(frames) - 1}, found {index}")
         camera, sun = frames[index].camera, sun or frames[index].sun
-    write_picture(run.predict(camera, sun), options.kind, options.out)
+    write_picture(run.predict(camera, sun, normals=options.kind == "normal"), options.kind, options.out)
     ending.say(options.out)
 
 

@@ -178,7 +178,7 @@ def test_report_shows_runs_side_by_side(spacesim, tiny_eval, tmp_path):
     assert not re.search(r"""(src|href)=["']?(https?:|//|file:)""", page)
 
 
-@pytest.mark.parametrize("kind", ["rgb", "depth", "alpha"])
+@pytest.mark.parametrize("kind", ["rgb", "depth", "alpha", "normal"])
 def test_render_a_frame(spacesim, tiny_run, tiny_data, tmp_path, kind):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -188,9 +188,9 @@ def test_render_a_frame(spacesim, tiny_run, tiny_data, tmp_path, kind):
             assert (done.code, done.output) == (0, f"{out}\n"), done.errors
     layer = read_exr(tmp_path / f"{kind}.exr")[kind]
     picture = read_png(tmp_path / f"{kind}.png")
-    assert picture.shape == ((40, 40, 4) if kind == "rgb" else (40, 40))
-    assert layer.shape == ((40, 40, 3) if kind == "rgb" else (40, 40))
-    predicted = load_run(tiny_run).predict(read_dataset(tiny_data).frames[3].camera, None)
+    assert picture.shape == {"rgb": (40, 40, 4), "normal": (40, 40, 3)}.get(kind, (40, 40))
+    assert layer.shape == ((40, 40, 3) if kind in ("rgb", "normal") else (40, 40))
+    predicted = load_run(tiny_run).predict(read_dataset(tiny_data).frames[3].camera, None, normals=True)
     assert np.array_equal(layer, getattr(predicted, kind))
 
 

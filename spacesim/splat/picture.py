@@ -10,8 +10,11 @@ from spacesim.splat.run import Prediction
 
 
 def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
-    """kind: "rgb" (PNG: straight alpha; EXR: sRGB values over black), "alpha", or "depth" (PNG: near is bright;
-    EXR: metres). Raises InputError for another suffix than .png or .exr."""
+    """kind: "rgb" (PNG: straight alpha; EXR: sRGB values over black), "alpha", "depth" (PNG: near is bright; EXR: metres)
+    or "normal" (PNG: world x, y, z from -1 to 1 as red, green, blue; EXR: the vectors).
+
+    Raises InputError for another suffix than .png or .exr.
+    """
     path, plane = Path(path), getattr(prediction, kind)
     if path.suffix == ".exr":
         write_exr(path, {kind: plane.astype(np.float32)})
@@ -23,6 +26,9 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
         write_png(path, _bytes(np.concatenate([straight, alpha], axis=-1)))
     elif kind == "depth":
         write_png(path, _bytes(_near_is_bright(plane)))
+    elif kind == "normal":
+        surface = np.any(plane != 0, axis=-1, keepdims=True)
+        write_png(path, _bytes(np.where(surface, 0.5 + 0.5 * plane, 0)))
     else:
         write_png(path, _bytes(plane))
 

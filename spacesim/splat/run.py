@@ -25,12 +25,14 @@ from spacesim.splat.train.checkpoint import read_tensors
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """A rendered view, float32. rgb: [H, W, 3] sRGB values over black; alpha: [H, W];
-    depth: [H, W] expected depth in metres, 0 where alpha is 0; visibility: [H, W], or None from a method without."""
+    depth: [H, W] expected depth in metres, 0 where alpha is 0; visibility: [H, W], or None from a method without;
+    normal: [H, W, 3] unit vectors in world axes, 0 where there is no surface, or None where not asked for."""
 
     rgb: np.ndarray
     alpha: np.ndarray
     depth: np.ndarray
     visibility: np.ndarray | None
+    normal: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +55,12 @@ class Run:
         """The backend that renders now."""
         return backend.select()
 
-    def predict(self, camera: Camera, sun: Sun | None = None) -> Prediction:
+    def predict(self, camera: Camera, sun: Sun | None = None, normals: bool = False) -> Prediction:
         """Render one view. The method `vanilla` knows one light: `sun` changes nothing."""
-        colour, alpha, depth = render(self.model, Pinhole.of(camera)).to_numpy()
-        return Prediction(rgb=colour, alpha=alpha, depth=depth, visibility=None)
+        names = ("colour", "alpha", "depth", *(("normal",) if normals else ()))
+        output = render(self.model, Pinhole.of(camera), outputs=names)
+        colour, alpha, depth, *normal = (output.image(name) for name in names)
+        return Prediction(rgb=colour, alpha=alpha, depth=depth, visibility=None, normal=normal[0] if normal else None)
 
 
 def load_run(path: Path) -> Run:
