@@ -10,7 +10,7 @@ from spacesim.splat.run import Prediction
 
 
 def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
-    """kind: "rgb" (PNG: straight alpha; EXR: sRGB values over black), "alpha", "depth" (PNG: near is bright; EXR: metres)
+    """kind: "rgb" (PNG: straight alpha; EXR: sRGB over black), "alpha", "depth" (PNG: near is bright; EXR: metres)
     or "normal" (PNG: world x, y, z from -1 to 1 as red, green, blue; EXR: the vectors).
 
     Raises InputError for another suffix than .png or .exr.
