@@ -194,6 +194,7 @@ def test_a_second_run_in_the_same_folder_is_refused_and_harms_nothing(spacesim, 
             assert first.poll() is None, "it should have been stopped before its end"
             time.sleep(0.002)
         first.send_signal(signal.SIGSTOP)
+        os.waitpid(first.pid, os.WUNTRACED)  # until all its threads stand still
         found = set(contents(out))
         who = f"(process {first.pid})" if Path("/proc/locks").exists() else "found one"
         for more in ([], ["--resume"], ["--resume", "--workers", "2"]):
