@@ -8,14 +8,16 @@ import numpy as np
 from spacesim.backend import ad, recorded
 from spacesim.data.records import Camera
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.project import Footprints, Pinhole, Splats, project
+from spacesim.splat.project import Pinhole
 from spacesim.splat.rasterize import backward, forward
-from spacesim.splat.render import render, view_colours
+from spacesim.splat.render import render
 from spacesim.splat.tiles import bin_splats
 from spacesim.splat.train.losses import photometric_loss
-from spacesim.splat.train.optimizer import Adam, adam_step
+from spacesim.splat.train.optimizer import Adam
+from spacesim.splat.train.trainer import _project, _update
 
 SSIM_WEIGHT = 0.2
+DEGREE = 3  #: of spherical harmonics
 RECORDINGS = 8  #: kept of a stage
 
 
@@ -39,7 +41,7 @@ class Pipeline:
 
     def project(self) -> None:
         """Gaussians to ellipses on the screen and colours."""
-        self.splats, self.footprints, self.colour = self._project(self.gaussians.rows(), self.camera)
+        self.splats, self.footprints, self.colour = self._project(self.gaussians.rows(), self.camera, DEGREE)
 
     def bin(self) -> None:
         """Ellipses to lists of tiles."""
@@ -60,9 +62,9 @@ class Pipeline:
 
     def update(self) -> None:
         """Gradients of the ellipses to those of the parameters, and an Adam step whose rates are 0."""
-        gradients = self.by_splat.splats, self.by_splat.features
+        gradients = [(self.camera, self.by_splat.splats, self.by_splat.features)]
         moments = self.optimizer.first, self.optimizer.second
-        rows, first, second = self._update(self.gaussians.rows(), moments, self.camera, gradients, self.factors)
+        rows, first, second = self._update(self.gaussians.rows(), moments, DEGREE, gradients, self.factors)
         self.gaussians, self.optimizer.first, self.optimizer.second = Gaussians.from_rows(rows), first, second
 
     def frame(self) -> None:
@@ -87,31 +89,9 @@ def arguments_of(pipeline: Pipeline) -> dict[str, Any]:
     }
 
 
-def _project(rows: list[Any], camera: Pinhole) -> tuple[Splats, Footprints, list[Any]]:
-    gaussians = Gaussians.from_rows(rows)
-    return *project(gaussians, camera), list(view_colours(gaussians, camera))
-
-
 def _loss(colour: list[Any], transmittance: Any, truth: list[Any], size: tuple[int, int]) -> tuple[list[Any], Any]:
     """Gradients of the loss over a grey background, by colour and transmittance."""
     planes, passed = ad.Array3f(colour), ad.Float(transmittance)
     dr.enable_grad(planes, passed)
     dr.backward(photometric_loss(planes + 0.5 * passed, ad.Array3f(truth), *size, SSIM_WEIGHT))
     return list(dr.grad(planes)), dr.grad(passed)
-
-
-def _update(rows: list[Any], moments: Any, camera: Pinhole, gradients: tuple[Splats, list[Any]], factors: Any) -> Any:
-    rows = [ad.Float(row) for row in rows]
-    dr.enable_grad(rows)
-    gaussians = Gaussians.from_rows(rows)
-    splats, _ = project(gaussians, camera)
-    by_splat, by_colour = gradients
-    along = splats.opacity * by_splat.opacity
-    for name in ("x", "y", "a", "b", "c"):
-        along += getattr(splats, name) * getattr(by_splat, name)
-    for value, gradient in zip(view_colours(gaussians, camera), by_colour, strict=True):
-        along += value * gradient
-    dr.backward(along)
-    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(2 + len(rows))]
-    by_row = [dr.grad(row) for row in rows]
-    return adam_step(dr.detach(rows), by_row, moments, numbers[2:], (numbers[0], numbers[1]))

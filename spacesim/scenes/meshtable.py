@@ -200,7 +200,7 @@ def _surface(mesh: trimesh.Trimesh, files: _Files, notes: Notes) -> Surface | No
     if found is None or type(found).__name__ != "SimpleMaterial":
         return None
     values = {str(key).lower(): value for key, value in (found.kwargs or {}).items()}
-    image = found.image if getattr(found.image, "fp", None) is not None else None  # else trimesh's own placeholder
+    image = found.image if getattr(found.image, "fp", None) is not None else None  # else trimesh's own stand-in
     if image is None and not values:
         return None  # texture coordinates alone
     name = str(values.get("name") or getattr(found, "name", None) or "texture")[:80]

@@ -42,7 +42,7 @@ class Blended:
 
 @dataclass
 class SplatGradients:
-    """Gradients of a scalar with respect to the splats, [N] each, and the statistic that refinement asks for."""
+    """Gradients of a scalar with respect to the splats, [N] each (depths have none), and what refinement asks for."""
 
     splats: Splats
     features: list[Any]
@@ -132,7 +132,6 @@ def backward(
         return SplatGradients(Splats(*zeros[:7]), zeros[9:], zeros[7], zeros[8])
     inputs = image_size, feature_gradients, transmittance_gradient
     gradients: SplatGradients = _backward(splats, blended, lists, *inputs)
-    gradients.splats.depth = dr.opaque(ad.Float, 0, count)
     return gradients
 
 
@@ -227,6 +226,7 @@ class _Rasterize(dr.CustomOp):
         gradients: Any = self.grad_out()
         *by_feature, by_transmittance = gradients
         result = backward(self.splats, self.blended, self.lists, self.size, by_feature, by_transmittance)
+        result.splats.depth = dr.opaque(ad.Float, 0, dr.width(self.splats.x))
         self.set_grad_in("splats", result.splats)
         self.set_grad_in("features", result.features)
 

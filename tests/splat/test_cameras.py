@@ -6,6 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from splats import random_splats
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
@@ -30,17 +31,6 @@ def record(kind: str, width: int = 40, height: int = 28, pose=POSE) -> Camera | 
 
 def upload(view: Camera | OrthographicCamera) -> Pinhole | Orthographic:
     return Pinhole.of(view) if isinstance(view, Camera) else Orthographic.of(view)
-
-
-def random_splats(count: int, seed: int = 0, degree: int = 3) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return {
-        "means": rng.uniform(-0.6, 0.6, (count, 3)),
-        "log_scales": rng.uniform(-3.2, -1.4, (count, 3)),
-        "quaternions": rng.normal(size=(count, 4)),
-        "logit_opacities": rng.uniform(-2.5, 2.0, count),
-        "sh": rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.25,
-    }
 
 
 def wide_splats() -> dict[str, np.ndarray]:

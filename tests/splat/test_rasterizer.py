@@ -3,6 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
+from splats import random_splats
 
 from spacesim.backend import ad
 from spacesim.data.errors import WorkError
@@ -20,17 +21,6 @@ SIZE = (40, 28)
 def camera(width: int = SIZE[0], height: int = SIZE[1]) -> Camera:
     pose = look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0])
     return Camera(pose, width, height, 1.3 * width, 1.2 * width, 0.52 * width, 0.47 * height)
-
-
-def random_splats(count: int, seed: int = 0, degree: int = 3) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return {
-        "means": rng.uniform(-0.6, 0.6, (count, 3)),
-        "log_scales": rng.uniform(-3.2, -1.4, (count, 3)),
-        "quaternions": rng.normal(size=(count, 4)),
-        "logit_opacities": rng.uniform(-2.5, 2.0, count),
-        "sh": rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.25,
-    }
 
 
 def placed_splats() -> dict[str, np.ndarray]:
