@@ -66,8 +66,9 @@ def make_in_processes(job: Job, shots: Sequence[Shot], count: int) -> Iterator[s
     workers: list[_Worker] = []
     try:
         while tasks or any(worker.task for worker in workers):
-            for worker in [worker for worker in workers if worker.task is None and tasks]:
-                _give(worker, tasks.popleft())
+            for worker in workers:
+                if worker.task is None and tasks:
+                    _give(worker, tasks.popleft())
             while tasks and len(workers) < count:
                 workers.append(_start(job, tasks.popleft(), len(workers), count))
             for name in _hear(workers, tasks):

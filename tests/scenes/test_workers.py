@@ -8,11 +8,12 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.scenes import generate, read_scene
+from spacesim.scenes import generate, read_scene, workers
 from spacesim.scenes.frames import FrameMaker, Job, Shot, writing_threads
 from spacesim.scenes.generate import _Sweep
 from spacesim.scenes.workers import make_in_processes
@@ -127,6 +128,36 @@ def test_frames_that_are_whole_are_not_rendered_again(job, monkeypatch):
     assert list(maker.make(shots)) == [shot.name for shot in shots]
     monkeypatch.setattr(maker, "_renderer", None)
     assert list(maker.make(shots)) == [shot.name for shot in shots]
+
+
+class _Obliging:
+    """A connection to a worker that makes all that it is given at once."""
+
+    def __init__(self) -> None:
+        self.answers: list[str | None] = [None]
+
+    def send(self, shots: list[Shot]) -> None:
+        self.answers += [*(shot.name for shot in shots), None]
+
+    def recv(self) -> str | None:
+        return self.answers.pop(0)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_several_processes_may_ask_at_once_when_few_tasks_are_left(job, monkeypatch, count):
+    def start(_job: Job, task: Any, *_: int) -> workers._Worker:
+        return workers._Worker(None, _Obliging(), task, [task.shots])
+
+    def all_that_spoke(connections: list[_Obliging]) -> list[_Obliging]:
+        spoke = [connection for connection in connections if connection.answers]
+        assert spoke, "nobody is asked and nobody answers: it would wait for ever"
+        return spoke
+
+    monkeypatch.setattr(workers, "_start", start)
+    monkeypatch.setattr(workers, "_stop", lambda _workers: None)
+    monkeypatch.setattr(workers, "wait", all_that_spoke)
+    work, shots = job
+    assert sorted(make_in_processes(work, shots, count)) == sorted(shot.name for shot in shots)
 
 
 def test_threads_are_shared_among_processes(monkeypatch):
