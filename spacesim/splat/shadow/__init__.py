@@ -1,0 +1,1 @@
+"""What the Sun sees: light cameras and the raw occlusion of every Gaussian (thesis 4.3)."""
