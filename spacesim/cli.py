@@ -105,6 +105,10 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--views", type=int, metavar="N", help="training views for each Sun")
     one.add_argument("--test-suns", type=int, metavar="N", help="Suns kept for testing (0: those of training)")
     one.add_argument("--test-views", type=int, metavar="N", help="test views for each test Sun")
+    one.add_argument("--known-test-views", type=int, metavar="N", help="test views for each training Sun beside them")
+    one.add_argument(
+        "--shared-test-views", action="store_true", default=None, help="the same test cameras under every Sun"
+    )
     one.add_argument(
         "--sun", type=_angles, action="append", metavar="AZ,EL", help="a training Sun, degrees; repeatable"
     )
@@ -219,7 +223,7 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 _SCENE_OPTIONS = (
-    *("suns", "views", "test_suns", "test_views", "sun", "distance"),
+    *("suns", "views", "test_suns", "test_views", "known_test_views", "shared_test_views", "sun", "distance"),
     *("resolution", "exposure", "spp", "seed", "units", "up"),
 )
 

@@ -26,6 +26,8 @@ FARTHEST = 1e9
 """Metres of a position in each coordinate, chosen (the Moon is at 3.8e8)."""
 
 
+_UNLESS_ASKED_FOR = ("known_test_views", "shared_test_views")  # in scene.json: datasets without them stay as they were
+
 MOST_SEED = 2**63 - 1
 """Largest whole number that every TOML reader knows."""
 
@@ -125,7 +127,8 @@ class SceneConfig:
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values, without the folder: a dataset does not depend on where its scene file lay."""
         values = {key: value for key, value in asdict(replace(self, folder=None)).items() if key != "folder"}
-        return {**values, "rig": {"kind": rig_kind(self.rig), **values["rig"]}}
+        rig = {key: value for key, value in values["rig"].items() if value or key not in _UNLESS_ASKED_FOR}
+        return {**values, "rig": {"kind": rig_kind(self.rig), **rig}}
 
 
 def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:

@@ -41,7 +41,7 @@ NEAREST, FARTHEST = 1e-9, 1e12
 MOST_FRAMES = 10_000_000
 """Of a dataset, chosen: the plan of all frames is held in memory."""
 
-_TRAIN, _TEST, _HELD_OUT = range(3)  # streams of random numbers
+_TRAIN, _TEST, _HELD_OUT, _KNOWN = range(4)  # streams of random numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +61,8 @@ class Target:
 
 
 Views = tuple[list[View], list[View]]  #: of training and of testing
+Stream = tuple[int, int]  #: of random numbers: purpose, number of the Sun
+ViewsOf = Callable[[Sun, int, Stream], Sequence[View]]  #: so many views of a Sun
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,8 @@ class RigConfig(ABC):
 
     Every training Sun has `views` training views. Every test Sun has `test_views` test views; the test Suns
     are `test_suns` directions that training never sees or, where that is 0, the training Suns.
+    known_test_views: with test Suns of their own, test views of every training Sun beside these, listed after them;
+    shared_test_views: every Sun has the same test cameras, so that pictures differ by their light alone;
     sun: training Suns as (azimuth, elevation), degrees; () the rig's own arrangement of `suns`.
     """
 
@@ -76,10 +80,12 @@ class RigConfig(ABC):
     views: int = 100
     test_suns: int = 0
     test_views: int = 20
+    known_test_views: int = 0
+    shared_test_views: bool = False
     sun: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
-        for name, lowest in {"suns": 1, "views": 1, "test_suns": 0, "test_views": 0}.items():
+        for name, lowest in {"suns": 1, "views": 1, "test_suns": 0, "test_views": 0, "known_test_views": 0}.items():
             expect(getattr(self, name) >= lowest, name, f"at least {lowest}", getattr(self, name))
             expect(getattr(self, name) <= MOST_FRAMES, name, f"at most {MOST_FRAMES:,}", getattr(self, name))
         for azimuth, elevation in self.sun:
@@ -89,8 +95,11 @@ class RigConfig(ABC):
         if self.sun:
             fits = self.suns in (type(self).suns, len(self.sun))
             expect(fits, "suns", f"{len(self.sun)} as in sun", self.suns)
+        if self.known_test_views and not self.test_suns:
+            wanted = "0 without test_suns, where test_views are of the training Suns"
+            expect(False, "known_test_views", wanted, self.known_test_views)
         suns = len(self.sun) or self.suns
-        frames = suns * self.views + (self.test_suns or suns) * self.test_views
+        frames = suns * (self.views + self.known_test_views) + (self.test_suns or suns) * self.test_views
         expect(frames <= MOST_FRAMES, "views", f"at most {MOST_FRAMES:,} frames of all Suns", frames)
 
     @abstractmethod
@@ -101,6 +110,23 @@ class RigConfig(ABC):
         """The training and the test Suns: lattices, unless the rig arranges them."""
         suns = training_suns(self.suns, self.sun)
         return suns, held_out_suns(self.test_suns, seed) if self.test_suns else suns
+
+    def all_views(self, suns: tuple[list[Sun], list[Sun]], views: ViewsOf) -> Views:
+        """The training and the test views; views: (Sun, views of it, stream of random numbers), whichever set it is.
+
+        suns: of training and of testing. Views of known Suns stand last, so that asking for them changes no other.
+        """
+        sets = [
+            (_TRAIN, suns[0], self.views),
+            (_TEST, suns[1], self.test_views),
+            (_KNOWN, suns[0], self.known_test_views),
+        ]
+        made = []
+        for purpose, some, count in sets:
+            shared = self.shared_test_views and purpose != _TRAIN
+            streams = [(_TEST, 0) if shared else (purpose, i) for i in range(len(some))]
+            made.append([view for sun, stream in zip(some, streams, strict=True) for view in views(sun, count, stream)])
+        return made[0], made[1] + made[2]
 
 
 @dataclass(frozen=True)
@@ -186,19 +212,17 @@ class RandomRig(RigConfig):
     def views_of(self, target: Target, camera: CameraConfig, seed: int) -> Views:
         near = self.near or min(fitting_distance(target.radius, camera), self.far or math.inf)
         far = self.far or FAR * near
-        suns, test_suns = self.sun_directions(seed)
 
-        def some(suns: Sequence[Sun], count: int, stream: int) -> list[View]:
+        def some(sun: Sun, count: int, stream: Stream) -> list[View]:
             views = []
-            for i, sun in enumerate(suns):
-                for k in range(count):
-                    random = np.random.default_rng([seed, stream, i, k])
-                    pose = self._pose(random, target, camera, (near, far))
-                    own = Sun(random.normal(size=3)) if self.random_suns else sun
-                    views.append(View(camera.at(pose), own))
+            for k in range(count):
+                random = np.random.default_rng([seed, *stream, k])
+                pose = self._pose(random, target, camera, (near, far))
+                own = Sun(random.normal(size=3)) if self.random_suns else sun
+                views.append(View(camera.at(pose), own))
             return views
 
-        return some(suns, self.views, _TRAIN), some(test_suns, self.test_views, _TEST)
+        return self.all_views(self.sun_directions(seed), some)
 
     def _pose(self, random: np.random.Generator, target: Target, camera: CameraConfig, depths: Array | tuple) -> Array:
         """[4, 4] world_from_camera. In camera axes the centre is at z (u, v, 1), z between the two `depths`."""
@@ -345,7 +369,7 @@ def training_suns(count: int, angles: Sequence[tuple[float, float]] = ()) -> lis
 def held_out_suns(count: int, seed: int) -> list[Sun]:
     """`count` Suns on a Fibonacci lattice that is turned at random, so that they are none of the training
     Suns."""
-    return [Sun(direction) for direction in fibonacci_sphere(count, seed=_stream(seed, _HELD_OUT, 0))]
+    return [Sun(direction) for direction in fibonacci_sphere(count, seed=_seed_of(seed, _HELD_OUT, 0))]
 
 
 def fitting_distance(radius: float, camera: CameraConfig) -> float:
@@ -373,14 +397,13 @@ def _all_around(
     """Cameras on a Fibonacci lattice, turned at random for each Sun, so that no two sets coincide."""
     metres = distance or fitting_distance(target.radius, camera)
 
-    def around(suns: Sequence[Sun], count: int, stream: int) -> list[View]:
+    def around(sun: Sun, count: int, stream: Stream) -> list[View]:
         return [
             View(camera.at(look_at(target.centre + metres * direction, target.centre)), sun)
-            for i, sun in enumerate(suns)
-            for direction in fibonacci_sphere(count, seed=_stream(seed, stream, i))
+            for direction in fibonacci_sphere(count, seed=_seed_of(seed, *stream))
         ]
 
-    return around(suns[0], rig.views, _TRAIN), around(suns[1], rig.test_views, _TEST)
+    return rig.all_views(suns, around)
 
 
 def _along(
@@ -390,11 +413,12 @@ def _along(
     closed: bool,
 ) -> Views:
     """Views at the steps of a trajectory, for each Sun; at: (step, Sun, random stream) to a view."""
-    train, test = range(rig.views), between(rig.views, rig.test_views, closed).tolist()
-    return (
-        [at(step, sun, (_TRAIN, i, k)) for i, sun in enumerate(suns[0]) for k, step in enumerate(train)],
-        [at(step, sun, (_TEST, i, k)) for i, sun in enumerate(suns[1]) for k, step in enumerate(test)],
-    )
+
+    def along(sun: Sun, count: int, stream: Stream) -> list[View]:
+        steps = range(rig.views) if stream[0] == _TRAIN else between(rig.views, count, closed).tolist()
+        return [at(step, sun, (*stream, k)) for k, step in enumerate(steps)]
+
+    return rig.all_views(suns, along)
 
 
 def _expect_metres(least: float = NEAREST, **lengths: float | None) -> None:
@@ -403,5 +427,5 @@ def _expect_metres(least: float = NEAREST, **lengths: float | None) -> None:
         expect(fits, name, f"metres from {least:g} to {FARTHEST:g}", metres)
 
 
-def _stream(seed: int, stream: int, index: int) -> int:
-    return int(np.random.SeedSequence([seed, stream, index]).generate_state(1)[0])
+def _seed_of(seed: int, purpose: int, index: int) -> int:
+    return int(np.random.SeedSequence([seed, purpose, index]).generate_state(1)[0])

@@ -111,6 +111,45 @@ def test_test_views_are_of_the_training_suns_unless_others_are_asked_for(kind):
 
 
 @pytest.mark.parametrize("kind", RIGS)
+def test_test_views_of_known_suns_beside_those_of_others(kind):
+    options = {"suns": 4, "views": 2, "test_suns": 5, "test_views": 3}
+    before = plan(RIGS[kind](**options), TARGET, CAMERA, 0)
+    train, test = plan(RIGS[kind](**options, known_test_views=2), TARGET, CAMERA, 0)
+    known = {view.sun.angles for view in train}
+    assert len(test) == 5 * 3 + 4 * 2
+    assert [view.sun.angles in known for view in test] == [False] * 15 + [True] * 8
+    assert {view.sun.angles for view in test[15:]} == known
+    assert nearest(train, test) > 1e-3
+    for now, then in zip((train, test), before, strict=True):
+        np.testing.assert_array_equal(positions(now[: len(then)]), positions(then))
+        np.testing.assert_array_equal(sun_directions(now[: len(then)]), sun_directions(then))
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [FibonacciRig, RandomRig, lambda **options: ApproachRig(jitter=0.3, **options)],
+    ids=["fibonacci", "random", "approach"],
+)
+def test_shared_test_views_differ_by_their_light_alone(rig):
+    options = {"suns": 2, "views": 4, "test_suns": 3, "test_views": 4, "known_test_views": 4}
+    apart, (train, test) = (plan(rig(**options, shared_test_views=on), TARGET, CAMERA, 1) for on in (False, True))
+    poses = np.array([view.camera.world_from_camera for view in test]).reshape(5, 4, 4, 4)
+    np.testing.assert_array_equal(poses, np.broadcast_to(poses[:1], poses.shape))
+    assert len({view.sun.angles for view in test}) == 5
+    assert len(np.unique(positions(apart[1]).round(9), axis=0)) == 20
+    np.testing.assert_array_equal(positions(train), positions(apart[0]))
+    assert nearest(train, test) > 1e-3
+
+
+def test_scene_json_names_such_views_only_where_asked_for():
+    plain = read_scene("boxsat").to_json()["rig"]
+    asked = read_scene("boxsat", test_suns=2, known_test_views=3, shared_test_views=True).to_json()["rig"]
+    assert set(asked) - set(plain) == {"known_test_views", "shared_test_views"}
+    with pytest.raises(InputError, match=r"^known_test_views: expected 0 without test_suns, .*, found 3$"):
+        FibonacciRig(known_test_views=3)
+
+
+@pytest.mark.parametrize("kind", RIGS)
 def test_given_suns_take_the_place_of_the_rigs_own(kind):
     rig = RIGS[kind](sun=((10.0, 20.0), (200.0, -60.0)), views=3, test_views=2)
     train, _ = plan(rig, TARGET, CAMERA, 0)

@@ -254,8 +254,8 @@ def test_options():
             read_scene("boxsat", **{name: value})
     with pytest.raises(InputError, match=r"^distance: expected one of the options .*") as refused:
         read_scene("upper-stage", distance=1.0)
-    rig = "across, across_phase_deg, altitude_km, duration_s, phase_deg, size, sun, sun_moves, suns, test_suns, "
-    rig += "test_views, views of upper-stage, whose rig is of kind fly-around"
+    rig = "across, across_phase_deg, altitude_km, duration_s, known_test_views, phase_deg, shared_test_views, size, "
+    rig += "sun, sun_moves, suns, test_suns, test_views, views of upper-stage, whose rig is of kind fly-around"
     assert str(refused.value).endswith(f"options {rig} (fibonacci and polar-arc know distance)")
 
 
