@@ -17,18 +17,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spacesim.data.errors import InputError, WorkError
+from spacesim.data.errors import InputError
 from spacesim.data.files import write_json
-from spacesim.data.images import load_image, luminance, read_png, write_png
+from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset, Frame
-from spacesim.data.store import SHADOW_SELF_CAST, load_truth
-from spacesim.eval import image, lpips, pictures, shadow
-from spacesim.eval.image import Mask
+from spacesim.eval import grazing, lpips
+from spacesim.eval.judge import judge_picture, judge_visibility, light_of, tally_grazing, view_of, write_pictures
 from spacesim.eval.labels import GROUPS
-from spacesim.eval.notes import explain
+from spacesim.eval.notes import explain, explain_light
+from spacesim.eval.relight import write_sweep
+from spacesim.eval.suns import count_suns, known_suns, rounded_angles
 
 if TYPE_CHECKING:
-    from spacesim.splat.run import Prediction, Run
+    from spacesim.splat.run import Run
 
 SCHEMA = 1
 _PACKAGES = ("spacesim", "mitsuba", "drjit", "numpy", "scipy", "flip-evaluator", "torch")
@@ -46,18 +47,6 @@ class EvaluateConfig:
     def __post_init__(self) -> None:
         if self.split not in ("test", "train", "all"):
             raise InputError(f"split: expected test, train or all, found {self.split!r}")
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A frame's pictures. prediction, truth: [H, W, 3] sRGB values in [0, 1] over black
-    valid: [H, W] bool, pixels that are not to be ignored;  silhouette: [H, W] bool, the object's among them
-    """
-
-    prediction: np.ndarray
-    truth: np.ndarray
-    silhouette: Mask
-    valid: Mask
 
 
 def evaluate(
@@ -80,26 +69,17 @@ def evaluate(
     network, lpips_sentence = lpips.load(config.lpips_weights)
     _prepare(out)
     run.predict(frames[0].camera, frames[0].sun)  # compiles the kernels
-    seconds: list[float] = []
-    records: list[dict[str, Any]] = []
-    sources: list[str] = []
-    for name, frame in zip(frame_names(frames), frames, strict=True):
+    judged: list[Judgement] = []
+    for name, frame, known in zip(frame_names(frames), frames, known_suns(frames, dataset.train), strict=True):
         if progress:
-            progress(len(records), len(frames), frame.file_path)
-        start = time.perf_counter()
-        prediction = run.predict(frame.camera, frame.sun)
-        seconds.append(time.perf_counter() - start)
-        view, source = _view(dataset, frame, prediction)
-        sources.append(source)
-        records.append(
-            {"file_path": frame.file_path, "name": name, "sun": _rounded_angles(frame)}
-            | _judge(view, network)
-            | {"shadow_mask": _judge_visibility(dataset, frame, prediction, view)}
-        )
-        _write_pictures(out / "frames" / name, view)
+            progress(len(judged), len(frames), frame.file_path)
+        judged.append(_judge(run, dataset, frame, known, network, out / "frames" / name))
+    sweep, no_sweep = write_sweep(run, dataset, frames, out)
     if progress:
         progress(len(frames), len(frames), "")
 
+    method = str(run.config.get("method"))
+    records = [one.record for one in judged]
     metrics = {
         "schema": SCHEMA,
         "run": str(run.path),
@@ -108,12 +88,18 @@ def evaluate(
         "model": {
             "gaussians": run.gaussians,
             "bytes": run.bytes,
-            "render_ms": 1e3 * statistics.median(seconds),
+            "render_ms": 1e3 * statistics.median(one.seconds for one in judged),
             "backend": run.backend,
         },
-        **{group: summary(record[group] for record in records) for group in GROUPS},
+        **_summaries(judged),
         "geometry": None,
-        "notes": explain(records, sources, None if network else lpips_sentence, str(run.config.get("method"))),
+        "known_suns": _over([one for one in judged if one.known is True]),
+        "unseen_suns": _over([one for one in judged if one.known is False]),
+        "relight": sweep,
+        "notes": [
+            *explain(records, [one.source for one in judged], None if network else lpips_sentence, method),
+            *explain_light([one.known for one in judged], any(one.grazing is not None for one in judged), no_sweep),
+        ],
         "dataset": _describe(dataset, frames),
         "config": dict(run.config),
         "training": dict(run.training),
@@ -122,6 +108,47 @@ def evaluate(
     }
     write_json(out / "metrics.json", metrics := _finite(metrics))
     return metrics
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """A frame's numbers. record: its values by group, and what it is; source: where its silhouette is from;
+    known: whether training has seen its Sun; grazing: sums by grazing angle; seconds: that its prediction took"""
+
+    frame: Frame
+    record: dict[str, Any]
+    source: str
+    known: bool | None
+    grazing: Array | None
+    seconds: float
+
+
+def _judge(
+    run: "Run", dataset: Dataset, frame: Frame, known: bool | None, network: lpips.Lpips | None, folder: Path
+) -> Judgement:
+    """Predict a frame, judge it, write its pictures into `folder`."""
+    start = time.perf_counter()
+    prediction = run.predict(frame.camera, frame.sun)
+    seconds = time.perf_counter() - start
+    view, source = view_of(dataset, frame, prediction)
+    light = light_of(dataset, frame, prediction)
+    write_pictures(folder, view, light)
+    named = {"file_path": frame.file_path, "name": folder.name, "sun": rounded_angles(frame), "known_sun": known}
+    record = named | judge_picture(view, network) | judge_visibility(light, view)
+    return Judgement(frame, record, source, known, tally_grazing(light, view), seconds)
+
+
+def _summaries(judged: Sequence[Judgement]) -> dict[str, Any]:
+    """The groups over some frames."""
+    groups = {group: summary(one.record[group] for one in judged) for group in GROUPS}
+    return {**groups, "by_grazing_angle": grazing.summary(one.grazing for one in judged)}
+
+
+def _over(judged: Sequence[Judgement]) -> dict[str, Any] | None:
+    """How many frames and Suns there are, and the groups over them; None where there is no frame."""
+    if not judged:
+        return None
+    return {"frames": len(judged), "suns": count_suns([one.frame for one in judged]), **_summaries(judged)}
 
 
 def _prepare(out: Path) -> None:
@@ -164,79 +191,12 @@ def summary(records: Iterable[Mapping[str, float | None] | None]) -> dict[str, A
     return result
 
 
-def _view(dataset: Dataset, frame: Frame, prediction: "Prediction") -> tuple[View, str]:
-    """The pictures to compare, and where the silhouette is from: "truth", "alpha" or "frame"."""
-    if not all(np.all(np.isfinite(p)) for p in (prediction.rgb, prediction.alpha)):
-        raise WorkError(f"{frame.file_path}: the prediction has values that are not finite; train the run again")
-    loaded = load_image(dataset, frame)
-    if frame.silhouette_path is not None and not any(frame.distortion):
-        silhouette, source = read_png(dataset.root / frame.silhouette_path) > 0, "truth"
-        if silhouette.shape != loaded.alpha.shape:
-            raise InputError(
-                f"{dataset.root / frame.silhouette_path}: expected {loaded.alpha.shape} pixels, "
-                f"found {silhouette.shape}"
-            )
-    else:
-        silhouette = loaded.alpha >= 0.5
-        source = "frame" if np.all(loaded.alpha == 1) else "alpha"
-    shown = np.clip(prediction.rgb, 0, 1), loaded.over(np.zeros(3))
-    return View(*shown, silhouette & loaded.valid, loaded.valid), source
-
-
-def _judge(view: View, network: lpips.Lpips | None) -> dict[str, dict[str, float | None]]:
-    """The frame's values of all groups but "shadow_mask"."""
-    inside = image.interior(view.valid.shape)
-    levels = luminance(view.prediction), luminance(view.truth)
-    return {
-        "image": _image_metrics(view, view.silhouette, view.silhouette, network),
-        "image_full": _image_metrics(view, view.valid, view.valid & inside, network),
-        "shadow": shadow.luminance_metrics(*levels, view.silhouette),
-        "shadow_full": shadow.luminance_metrics(*levels, view.valid),
-    }
-
-
-def _image_metrics(view: View, mask: Mask, windows: Mask, network: lpips.Lpips | None) -> shadow.Metrics:
-    """Metrics over `mask`; SSIM over `windows`, the centres of its windows."""
-    pair = view.prediction, view.truth
-    crops = [image.cropped(picture, mask) for picture in pair] if network and mask.any() else []
-    return {
-        "psnr": image.psnr(*pair, mask),
-        "ssim": image.ssim(*pair, windows),
-        "lpips": network(*crops) if network and crops else None,
-        "mae": image.mae(*pair, mask),
-        "rmse": image.rmse(*pair, mask),
-        "flip": image.flip(*pair, mask),
-    }
-
-
-def _judge_visibility(dataset: Dataset, frame: Frame, prediction: "Prediction", view: View) -> shadow.Metrics | None:
-    """Predicted sun visibility (already divided by alpha) against the truth; None where either is missing."""
-    if prediction.visibility is None or frame.gt_path is None:
-        return None
-    truth = load_truth(dataset, frame)
-    sees_the_sun_or_a_caster = truth.shadow >= SHADOW_SELF_CAST
-    return shadow.visibility_metrics(prediction.visibility, truth.sun_visibility, view.valid & sees_the_sun_or_a_caster)
-
-
-def _write_pictures(folder: Path, view: View) -> None:
-    dark, truly_dark = (shadow.is_shadowed(luminance(p)) for p in (view.prediction, view.truth))
-    for name, picture in {
-        "truth": pictures.as_bytes(view.truth),
-        "prediction": pictures.as_bytes(view.prediction),
-        "error": pictures.error_picture(view.prediction, view.truth, view.valid),
-        "shadow_truth": pictures.shadow_picture(truly_dark, truly_dark, view.silhouette),
-        "shadow_prediction": pictures.shadow_picture(dark, truly_dark, view.silhouette),
-    }.items():
-        write_png(folder / f"{name}.png", picture)
-
-
 def _describe(dataset: Dataset, frames: Sequence[Frame]) -> dict[str, Any]:
     """What the report says about the data: its size, and from scene.json how it was made."""
-    suns = {tuple(angles) for frame in frames if (angles := _rounded_angles(frame)) is not None}
     return {
         "frames": len(frames),
         "train_frames": len(dataset.train),
-        "suns": len(suns),
+        "suns": count_suns(frames),
         "resolution": [frames[0].camera.width, frames[0].camera.height],
         **{key: dataset.scene.get(key) for key in ("scene", "config", "versions")},
     }
@@ -246,11 +206,6 @@ def _flattened(record: dict[str, Any]) -> dict[str, Any]:
     """A frame as the contract has it: values over the silhouette beside the name, others in their groups."""
     rest = {key: value for key, value in record.items() if key not in ("image", "shadow")}
     return {**rest, **record["image"], **record["shadow"]}
-
-
-def _rounded_angles(frame: Frame) -> list[float] | None:
-    """[azimuth, elevation] of the Sun, degrees, to 1e-4."""
-    return None if frame.sun is None else [round(angle, 4) for angle in frame.sun.angles]
 
 
 def _versions() -> dict[str, str]:

@@ -8,7 +8,7 @@ from typing import Any
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_json
 from spacesim.eval.evaluate import SCHEMA
-from spacesim.eval.labels import GROUPS
+from spacesim.eval.labels import ALWAYS
 from spacesim.eval.page import escape, swatch
 
 _NEEDED = (
@@ -22,7 +22,7 @@ _NEEDED = (
     "training",
     "versions",
     "frames",
-    *GROUPS,
+    *ALWAYS,
 )
 
 
@@ -52,8 +52,14 @@ class Judged:
 
     def mean(self, group: str, metric: str) -> float | None:
         """Mean of a metric over the frames; None where it is null."""
-        value = (self.metrics[group] or {}).get(metric)
+        value = self.summary(group, metric)
         return None if value is None else value["mean"]
+
+    def summary(self, group: str, metric: str, suns: str = "") -> dict[str, Any] | None:
+        """Mean, spread and count of a metric; None where it is null. suns: "" all frames, or "known_suns" or
+        "unseen_suns": those frames alone."""
+        where = self.metrics.get(suns) if suns else self.metrics
+        return ((where or {}).get(group) or {}).get(metric)
 
 
 def read_evals(folders: Sequence[Path]) -> list[Judged]:

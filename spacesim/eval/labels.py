@@ -90,11 +90,21 @@ SHADOW_MASK = (
     ),
 )  # fmt: skip
 
+RECALL = Metric("recall", "Recall", "", HIGHER, 4, "Share of the pixels of that kind of shadow that is predicted dark.")
+
+SHADOW_KIND = (RECALL, *SHADOW_MASK)
+
 GROUPS = {
     "image": ("over the silhouette", IMAGE),
     "image_full": ("over whole frames", IMAGE),
     "shadow": ("over the silhouette", SHADOW),
     "shadow_full": ("over whole frames", SHADOW),
     "shadow_mask": ("over lit and cast-shadow pixels", SHADOW_MASK),
+    "shadow_attached": ("over lit pixels and those that face away from the Sun", SHADOW_KIND),
+    "shadow_self_cast": ("over lit pixels and shadow that an object casts on itself", SHADOW_KIND),
+    "shadow_other_cast": ("over lit pixels and shadow that another object casts", SHADOW_KIND),
 }
 """metrics.json's groups: where each is taken and what is in it."""
+
+ALWAYS = ("image", "image_full", "shadow", "shadow_full", "shadow_mask")
+"""Groups that every evaluation of this schema has, the oldest, too."""

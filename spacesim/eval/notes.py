@@ -30,7 +30,51 @@ def explain(records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips:
         notes.append(f"{unseen} of {total} frames show no object: what is taken over its silhouette is null there.")
     for group in GROUPS:
         notes += _explain_group(records, group, bool(no_lpips))
+    return notes + _explain_kinds(records)
+
+
+def explain_light(known: Sequence[bool | None], by_grazing_angle: bool, no_sweep: str) -> list[str]:
+    """Sentences where what is said of the light is null.
+
+    known: of each frame, whether training has seen its Sun, or None; by_grazing_angle: whether there are numbers;
+    no_sweep: why one view under many Suns is null, "" where it is not
+    """
+    notes = _explain_suns(known)
+    if not by_grazing_angle:
+        notes.append("by_grazing_angle is null: the data has no path-traced truth.")
+    return [*notes, no_sweep] if no_sweep else notes
+
+
+def _explain_suns(known: Sequence[bool | None]) -> list[str]:
+    told = [one for one in known if one is not None]
+    if not told:
+        reason = "no judged frame or no training frame says where its Sun is"
+        return [f"known_suns and unseen_suns are null: {reason}."]
+    notes = []
+    if len(told) < len(known):
+        missing = len(known) - len(told)
+        notes.append(f"{missing} of {len(known)} frames say nothing of their Sun and are in neither split.")
+    if not any(told):
+        notes.append("known_suns is null: no judged frame is lit by a Sun of a training frame.")
+    if all(told):
+        notes.append("unseen_suns is null: every judged frame is lit by a Sun of a training frame.")
     return notes
+
+
+def _explain_kinds(records: Sequence[dict[str, Any]]) -> list[str]:
+    """A sentence for each kind of shadow that no frame shows, where visibility is judged at all."""
+    if all(record["shadow_mask"] is None for record in records):
+        return []
+    kinds = {
+        "shadow_attached": "faces away from the Sun",
+        "shadow_self_cast": "lies in a shadow that the object casts on itself",
+        "shadow_other_cast": "lies in another object's shadow",
+    }
+    return [
+        f"{kind} is null: no pixel of the judged frames {what}."
+        for kind, what in kinds.items()
+        if all(record[kind] is None for record in records)
+    ]
 
 
 def _explain_group(records: Sequence[dict[str, Any]], group: str, no_lpips: bool) -> list[str]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from spacesim.data.images import srgb_from_linear
 from spacesim.eval.image import Mask
+from spacesim.eval.shadow import KINDS
 
 ERROR_SCALE = 0.25
 """Mean absolute error of the channels at the bright end of the colour map; more is drawn as that."""
@@ -13,6 +14,9 @@ ERROR_SCALE = 0.25
 LIT, SHADOWED = (222, 222, 216), (58, 64, 82)
 WRONGLY_SHADOWED, WRONGLY_LIT = (213, 94, 0), (86, 180, 233)
 """sRGB colours of shadow masks; the mistakes' are Okabe and Ito's, which colour-blind readers tell apart."""
+
+ATTACHED, SELF_CAST, OTHER_CAST = (124, 130, 142), SHADOWED, (122, 78, 132)
+"""sRGB colours of the kinds of true shadow."""
 
 
 def as_bytes(picture: np.ndarray) -> np.ndarray:
@@ -40,6 +44,23 @@ def shadow_picture(predicted: Mask, shadowed: Mask, mask: Mask) -> np.ndarray:
     picture[mask & predicted & ~shadowed] = WRONGLY_SHADOWED
     picture[mask & ~predicted & shadowed] = WRONGLY_LIT
     return picture
+
+
+def kinds_picture(classes: np.ndarray, mask: Mask) -> np.ndarray:
+    """[H, W, 3] uint8: what each pixel of `mask` truly is, by its shadow class [H, W]; the rest black."""
+    picture = np.zeros((*mask.shape, 3), np.uint8)
+    picture[mask] = LIT
+    for (first, last), colour in zip(KINDS.values(), (ATTACHED, SELF_CAST, OTHER_CAST), strict=True):
+        picture[mask & (classes >= first) & (classes <= last)] = colour
+    return picture
+
+
+def visibility_picture(visibility: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint8: predicted visibility [H, W] in [0, 1], from the colour of shadow to that of light in even steps,
+    over black by `alpha` [H, W]."""
+    seen = np.clip(visibility, 0, 1)[..., None]
+    colours = (np.array(SHADOWED) * (1 - seen) + np.array(LIT) * seen) / 255
+    return as_bytes(colours * np.clip(alpha, 0, 1)[..., None])
 
 
 @cache

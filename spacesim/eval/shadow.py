@@ -7,6 +7,7 @@ Masks are [H, W] bool. A measure over no pixel at all is None.
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_SELF_CAST
 from spacesim.eval.image import Mask
 
 THRESHOLD = 0.1
@@ -14,6 +15,13 @@ THRESHOLD = 0.1
 
 BAND = 2
 """Pixels to each side of the shadow boundary that make its band (the thesis gives no width)."""
+
+KINDS = {
+    "shadow_attached": (SHADOW_ATTACHED, SHADOW_ATTACHED),
+    "shadow_self_cast": (SHADOW_SELF_CAST, SHADOW_SELF_CAST),
+    "shadow_other_cast": (SHADOW_SELF_CAST + 1, SHADOW_LIT - 1),
+}
+"""First and last class (`spacesim.data.store.SHADOW_*`) of each kind of shadow, by its group in metrics.json."""
 
 Metrics = dict[str, float | None]
 
@@ -66,6 +74,25 @@ def visibility_metrics(prediction: np.ndarray, truth: np.ndarray, mask: Mask) ->
         "balanced_error_rate": None if missed is None or invented is None else 0.5 * (missed + invented),
         "iou": _mean(predicted & shadowed, mask & (predicted | shadowed)),
         "visibility_mae": _mean(np.abs(np.asarray(prediction, np.float64) - truth), mask),
+    }
+
+
+def kind_metrics(
+    prediction: np.ndarray, truth: np.ndarray, classes: np.ndarray, kind: str, valid: Mask
+) -> Metrics | None:
+    """`visibility_metrics` over lit pixels and those of one of `KINDS`, with recall: the share of the latter that is
+    predicted dark. None where the frame shows no shadow of that kind.
+
+    classes: [H, W] shadow classes;  valid: [H, W] pixels that count
+    """
+    first, last = KINDS[kind]
+    of_kind = valid & (classes >= first) & (classes <= last)
+    if not of_kind.any():
+        return None
+    lit = valid & (classes == SHADOW_LIT)
+    return {
+        "recall": _mean(prediction < 0.5, of_kind),
+        **visibility_metrics(prediction, truth, of_kind | lit),
     }
 
 

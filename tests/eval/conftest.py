@@ -1,6 +1,6 @@
 """A tiny dataset of shaded spheres, written by hand, and runs that predict what a test wants."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -65,7 +65,7 @@ def truth_layers(inside):
 
 @dataclass
 class FakeRun:
-    """Predicts `change(true rgb)` of each test frame in its order, after one call to warm up."""
+    """Predicts `change(true rgb)` of the test frame with the same camera, whatever the Sun."""
 
     dataset: Dataset
     change: object = staticmethod(lambda rgb: rgb)
@@ -84,14 +84,37 @@ class FakeRun:
             "command": "spacesim train data --out runs/fake",
         }
     )
-    calls: int = 0
 
     def predict(self, camera, sun):
-        frame = self.dataset.test[max(self.calls - 1, 0) % len(self.dataset.test)]
-        self.calls += 1
+        frame = next(frame for frame in self.dataset.test if frame.camera is camera)
         rgb = load_image(self.dataset, frame).over(np.zeros(3))
         alpha = np.ones(rgb.shape[:2], np.float32)
         return SimpleNamespace(rgb=self.change(rgb), alpha=alpha, depth=alpha, visibility=self.visibility)
+
+
+@dataclass
+class RelightableRun(FakeRun):
+    """Predicts the sphere under any Sun, and that its columns from `edge` on see the Sun."""
+
+    edge: int = SIZE // 2
+    config: dict = field(default_factory=lambda: {"method": "shadow-map", "preset": "demo", "seed": 7})
+
+    def predict(self, camera, sun):
+        rgb, inside = sphere(sun.angles)
+        columns = np.arange(SIZE) >= self.edge
+        return SimpleNamespace(
+            rgb=self.change(rgb),
+            alpha=inside.astype(np.float32),
+            depth=inside,
+            visibility=inside * columns.astype(float),
+        )
+
+
+@pytest.fixture
+def relightable(dataset):
+    """relightable(edge=..., ...) -> RelightableRun and its dataset, trained under the first test frame's Sun alone."""
+    trained = replace(dataset, train=(dataset.test[0],))
+    return lambda **options: (RelightableRun(trained, **options), trained)
 
 
 @pytest.fixture

@@ -10,8 +10,9 @@ import pytest
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image, luminance, read_png, write_png
 from spacesim.data.records import Camera, Frame
-from spacesim.eval import image, lpips, shadow
+from spacesim.eval import image, lpips, pictures, shadow
 from spacesim.eval.evaluate import EvaluateConfig, evaluate, frame_names, summary
+from spacesim.eval.labels import GROUPS
 
 
 @pytest.fixture(autouse=True)
@@ -126,6 +127,72 @@ def test_predicted_visibility(make_run, dataset, tmp_path):
     wrong = silhouette[:, 20:25].sum()
     assert off["shadow_mask"]["error_rate"]["mean"] == pytest.approx(wrong / silhouette.sum())
     assert off["shadow_mask"]["visibility_mae"]["mean"] == pytest.approx(wrong / silhouette.sum())
+
+
+def test_known_and_unseen_suns_are_kept_apart(relightable, tmp_path):
+    run, dataset = relightable(edge=25)
+    metrics = evaluate(run, dataset, tmp_path / "eval")
+    assert [frame["known_sun"] for frame in metrics["frames"]] == [True, False, True, False]
+    for split, first in (("known_suns", 0), ("unseen_suns", 1)):
+        part = metrics[split]
+        alone = evaluate(run, replace(dataset, test=dataset.test[first::2]), tmp_path / split)
+        assert (part["frames"], part["suns"]) == (2, 1)
+        for group in (*GROUPS, "by_grazing_angle"):
+            assert part[group] == alone[group]
+        assert part["shadow_mask"] is not None
+        assert alone[split] is not None
+        assert alone["known_suns" if split == "unseen_suns" else "unseen_suns"] is None
+        other = "known_suns" if split == "unseen_suns" else "unseen_suns"
+        assert sum(note.startswith(f"{other} is null") for note in alone["notes"]) == 1
+
+
+def test_suns_of_no_training_frame_are_neither(make_run, dataset, tmp_path):
+    metrics = evaluate(make_run(), dataset, tmp_path / "eval")
+    assert metrics["known_suns"] is metrics["unseen_suns"] is None
+    assert {frame["known_sun"] for frame in metrics["frames"]} == {None}
+    assert any(note.startswith("known_suns and unseen_suns are null") for note in metrics["notes"])
+
+
+def test_light_of_a_relightable_run(relightable, tmp_path):
+    run, dataset = relightable(edge=25)
+    metrics = evaluate(run, dataset, tmp_path / "eval")
+    silhouette = read_png(dataset.root / dataset.test[0].silhouette_path) == 255
+    wrong, lit, cast = (silhouette[:, part].sum() for part in (slice(20, 25), slice(20, 40), slice(20)))
+    own = metrics["shadow_self_cast"]
+    assert own["recall"] == {"mean": 1, "std": 0, "count": 4}
+    assert own["error_rate"] == metrics["shadow_mask"]["error_rate"]
+    assert metrics["shadow_attached"] is metrics["shadow_other_cast"] is None
+    for kind in ("shadow_attached", "shadow_other_cast"):
+        assert sum(note.startswith(f"{kind} is null") for note in metrics["notes"]) == 1
+    *grazing, steep = metrics["by_grazing_angle"]  # the truth says that the Sun stands upright over all of it
+    assert {one["pixels"] for one in grazing} == {0}
+    assert steep["pixels"] == 4 * (lit + cast)
+    assert steep["false_shadow"] == pytest.approx(wrong / lit)
+    assert steep["missed_shadow"] == 0
+    assert steep["luminance_mae"] == pytest.approx(0, abs=0.01)
+    assert len(metrics["relight"]["suns"]) == 2
+    folder = tmp_path / "eval" / "frames" / "test_00000"
+    shown = {name: read_png(folder / f"{name}.png") for name in ("mask_truth", "mask_prediction", "visibility")}
+    assert np.all(shown["mask_truth"][20, 21] == pictures.LIT)
+    assert np.all(shown["mask_truth"][20, 19] == pictures.SELF_CAST)
+    assert np.all(shown["mask_prediction"][20, 21] == pictures.WRONGLY_SHADOWED)
+    assert np.all(shown["visibility"][20, 21] == pictures.SHADOWED)
+
+
+def test_methods_without_visibility_have_errors_by_grazing_angle(make_run, dataset, tmp_path):
+    metrics = evaluate(make_run(lambda rgb: rgb * 0.5), dataset, tmp_path / "eval")
+    steep = metrics["by_grazing_angle"][-1]
+    assert steep["luminance_mae"] > 0.1
+    assert steep["visibility_mae"] is None
+    assert metrics["relight"] is None
+    poorer = evaluate(make_run(), elsewhere(dataset, gt_path=None), tmp_path / "poorer")
+    assert poorer["by_grazing_angle"] is None
+    assert any(note.startswith("by_grazing_angle is null") for note in poorer["notes"])
+
+
+def test_visibility_that_is_not_finite_names_the_frame(make_run, dataset, tmp_path):
+    with pytest.raises(WorkError, match=r"images/test_00000\.png: the prediction"):
+        evaluate(make_run(visibility=np.full((40, 40), np.nan)), dataset, tmp_path / "eval")
 
 
 def test_nan_names_the_frame(make_run, dataset, tmp_path):

@@ -35,3 +35,18 @@ def test_shadow_picture_tells_mistakes():
 
 def test_bytes_are_rounded_and_clipped():
     assert pictures.as_bytes(np.array([-1, 0.4999 / 255, 0.5001 / 255, 1, 2])).tolist() == [0, 0, 1, 255, 255]
+
+
+def test_kinds_picture_tells_kinds():
+    classes = np.array([[0, 85, 170, 171, 254, 255, 255]], np.uint8)
+    mask = np.array([[False, True, True, True, True, True, False]])
+    black, attached, own, other = (0, 0, 0), pictures.ATTACHED, pictures.SELF_CAST, pictures.OTHER_CAST
+    expected = [black, attached, own, other, other, pictures.LIT, black]
+    assert pictures.kinds_picture(classes, mask)[0].tolist() == [list(colour) for colour in expected]
+
+
+def test_visibility_picture_goes_from_shadow_to_light():
+    picture = pictures.visibility_picture(np.array([[0.0, 1.0, 0.5, 1.0, 3.0]]), np.array([[1.0, 1.0, 1.0, 0.0, 1.0]]))
+    assert picture[0, :2].tolist() == [list(pictures.SHADOWED), list(pictures.LIT)]
+    assert np.abs(picture[0, 2] - (np.add(pictures.SHADOWED, pictures.LIT)) / 2).max() <= 0.5
+    assert picture[0, 3:].tolist() == [[0, 0, 0], list(pictures.LIT)]

@@ -102,3 +102,31 @@ def test_visibility_without_shadows():
     lit = np.ones((6, 10))
     metrics = shadow.visibility_metrics(lit, lit, EVERYWHERE)
     assert metrics == {"error_rate": 0, "balanced_error_rate": None, "iou": None, "visibility_mae": 0}
+
+
+def test_kinds_of_shadow_are_judged_apart():
+    classes = np.array([[0, 85, 85, 85, 170, 170, 171, 254, 255, 255, 255, 255, 255, 255]], np.uint8)
+    truth = (classes == 255).astype(float)
+    dark = np.array([[1, 1, 1, 0, 1, 0, 1, 1, 1, 0, 0, 0, 0, 0]], bool)
+    valid = np.ones_like(dark)
+    valid[0, -1] = False  # five lit pixels are left, of which one is predicted dark
+    kinds = {kind: shadow.kind_metrics(1.0 - dark, truth, classes, kind, valid) for kind in shadow.KINDS}
+    assert kinds["shadow_attached"] == {
+        "recall": pytest.approx(2 / 3),
+        "error_rate": pytest.approx(2 / 8),
+        "balanced_error_rate": pytest.approx(0.5 * (1 / 3 + 1 / 5)),
+        "iou": pytest.approx(2 / 4),
+        "visibility_mae": pytest.approx(2 / 8),
+    }
+    assert kinds["shadow_self_cast"]["recall"] == pytest.approx(1 / 2)
+    assert kinds["shadow_self_cast"]["error_rate"] == pytest.approx(2 / 7)
+    assert kinds["shadow_other_cast"]["recall"] == 1
+    assert kinds["shadow_other_cast"]["iou"] == pytest.approx(2 / 3)
+
+
+def test_a_kind_that_is_not_there_is_none():
+    classes = np.full((6, 10), 255, np.uint8)
+    lit = np.ones((6, 10))
+    assert {shadow.kind_metrics(lit, lit, classes, kind, EVERYWHERE) for kind in shadow.KINDS} == {None}
+    classes[:, :5] = 170
+    assert shadow.kind_metrics(lit, lit, classes, "shadow_self_cast", classes == 255) is None

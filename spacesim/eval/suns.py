@@ -1,0 +1,35 @@
+"""Which judged frames are lit by a Sun that training has seen."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from spacesim.data.records import Frame
+
+SAME_SUN_DEG = 0.01
+"""Degrees between two directions that still count as one Sun (chosen: files keep directions far better than that, and
+the Suns of a dataset stand degrees apart)."""
+
+
+def known_suns(frames: Sequence[Frame], training: Sequence[Frame]) -> list[bool | None]:
+    """For each frame whether its Sun stands within `SAME_SUN_DEG` of that of a training frame.
+
+    None for a frame without a Sun, and for all frames where no training frame has one.
+    """
+    trained = [frame.sun.direction for frame in training if frame.sun is not None]
+    if not trained:
+        return [None] * len(frames)
+    tree = KDTree(np.unique(trained, axis=0))
+    chord = 2 * np.sin(0.5 * np.radians(SAME_SUN_DEG))
+    return [None if frame.sun is None else bool(tree.query(frame.sun.direction)[0] <= chord) for frame in frames]
+
+
+def rounded_angles(frame: Frame) -> list[float] | None:
+    """[azimuth, elevation] of the Sun, degrees, to 1e-4."""
+    return None if frame.sun is None else [round(angle, 4) for angle in frame.sun.angles]
+
+
+def count_suns(frames: Sequence[Frame]) -> int:
+    """How many Suns light the frames, by their rounded angles."""
+    return len({tuple(angles) for frame in frames if (angles := rounded_angles(frame)) is not None})
