@@ -42,7 +42,7 @@ def light_axes(direction: ArrayLike) -> Array:
 
 def light_rows(direction: ArrayLike) -> Any:
     """`light_axes` for the kernels: Float [9], the light camera's x, y and z axes one after another."""
-    return ad.Float(light_axes(direction).T.astype(np.float32).ravel())
+    return ad.Float(light_axes(direction).T.ravel().tolist())
 
 
 def towards_sun(light: Any) -> Any:

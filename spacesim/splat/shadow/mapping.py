@@ -1,0 +1,238 @@
+"""Shadow mapping: is a Gaussian behind what the Sun sees first (thesis 4.3.1)? And filters that carry a penumbra.
+
+The Sun's picture is the rasterizer's: the expected depth of every light pixel (4.4). Looking it up costs one lane a
+Gaussian. Everything is detached.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from spacesim.backend import ad, recorded
+from spacesim.splat.cameras import Orthographic
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.project import Footprints, Splats, project
+from spacesim.splat.rasterize import forward
+from spacesim.splat.tiles import RECORDINGS, bin_splats
+
+FILTERS = ("bilinear", "percentage-closer", "variance")
+SUN_RADIUS_DEG = 0.2666  #: angular radius of the Sun's disc at 1 au
+LARGEST_WINDOW = 16  #: pixels to either side that a filter may read; chosen
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """How the light's picture is read.
+
+    filter: "bilinear" is the thesis: one depth, interpolated, then one test (4.5). "percentage-closer" tests every
+        pixel of a window, then averages (Reeves et al. 1987). "variance" averages depth and its square over the window
+        and bounds the lit share by Chebyshev's inequality (Donnelly and Lauritzen 2006).
+    radius: pixels, half the window's width, at least 1/2; chosen
+    sun_radius_deg: with "percentage-closer", widens the window to the penumbra that a disc of this angular radius
+        throws across the mean gap to the blockers (Fernando 2005); 0 does not; `SUN_RADIUS_DEG` is the Sun's
+    widest: pixels, half the width of the widest such window, and of that in which blockers are looked for; chosen
+    bleeding: with "variance", lit shares below it count as none (Lauritzen 2007): what passes two blockers; chosen
+    """
+
+    filter: str = "bilinear"
+    radius: float = 1.0
+    sun_radius_deg: float = 0.0
+    widest: float = 8.0
+    bleeding: float = 0.2
+
+    def __post_init__(self) -> None:
+        if self.filter not in FILTERS:
+            raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, found {self.filter!r}")
+        for name in ("radius", "widest"):
+            if not 0.5 <= getattr(self, name) <= LARGEST_WINDOW:
+                raise ValueError(f"{name}: expected 0.5 to {LARGEST_WINDOW} pixels, found {getattr(self, name)}")
+        if not 0 <= self.sun_radius_deg < 45:
+            raise ValueError(f"sun_radius_deg: expected 0 to 45 degrees, found {self.sun_radius_deg}")
+        if not 0 <= self.bleeding < 1:
+            raise ValueError(f"bleeding: expected a share from 0 to below 1, found {self.bleeding}")
+
+
+@dataclass
+class LightMap:
+    """What the Sun sees, planes [height * width], row by row.
+
+    alpha: 1 - transmittance;  depth: sum of weight x z, metres;  square: of weight x z^2, metres^2, or None
+    """
+
+    alpha: Any
+    depth: Any
+    square: Any
+    width: int
+    height: int
+
+
+def occlusion_by_mapping(
+    gaussians: Gaussians, camera: Orthographic, bias: Any, softness: float, config: MappingConfig | None = None
+) -> Any:
+    """Float [N] in [0, 1]: raw occlusion by the depth test (thesis 4.4 to 4.6), 0 = sees the Sun. Detached.
+
+    camera: of `sunlight.fit_camera`;  bias: Float [N], metres (4.26; zeros for none);  softness: epsilon_s, metres
+    A Gaussian whose centre is outside of the image, that cannot be drawn, or around whose centre the image is empty
+    counts as lit. Raises ValueError for a softness that is not positive.
+    """
+    config = config or MappingConfig()
+    if not softness > 0:
+        raise ValueError(f"softness: expected a positive number of metres, found {softness}")
+    if gaussians.count == 0:
+        return dr.zeros(ad.Float, 0)
+    splats, footprints, light = light_map(gaussians, camera, squares=config.filter == "variance")
+    softness = dr.opaque(ad.Float, max(softness, 1e-20))
+    return _look_up(splats, footprints.visible, dr.detach(bias), light, camera.values, softness, config)
+
+
+def light_map(gaussians: Gaussians, camera: Orthographic, squares: bool = False) -> tuple[Splats, Footprints, LightMap]:
+    """The Gaussians as the Sun sees them, and its picture; with the second moments of depth if `squares`. Detached."""
+    shape = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
+    splats, footprints, moments = _prepare(*dr.detach(shape), camera, squares)
+    lists = bin_splats(splats, footprints, camera.width, camera.height)
+    blended = forward(splats, moments, lists, camera.width, camera.height)
+    depth, *square = blended.features
+    light = LightMap(1 - blended.transmittance, depth, square[0] if squares else None, camera.width, camera.height)
+    return splats, footprints, light
+
+
+def _trace_prepare(
+    means: Any, log_scales: Any, quaternions: Any, logits: Any, camera: Orthographic, squares: bool
+) -> tuple[Splats, Footprints, list[Any]]:
+    """Splats, footprints, and the moments of depth to blend."""
+    splats, footprints = project(Gaussians(means, log_scales, quaternions, logits, None), camera)
+    return splats, footprints, [splats.depth, splats.depth * splats.depth] if squares else [splats.depth]
+
+
+def _trace_look_up(
+    splats: Splats, visible: Any, bias: Any, light: LightMap, camera: Any, softness: Any, config: MappingConfig
+) -> Any:
+    x, y = splats.x, splats.y
+    seen = visible & (x >= 0) & (x < light.width) & (y >= 0) & (y < light.height)
+    window = _Window(dr.select(seen, x, 0), dr.select(seen, y, 0), light, seen)
+    depth = splats.depth - dr.select(dr.isfinite(bias), bias, 0)
+    if config.filter == "bilinear":
+        occlusion = _interpolated(window, depth, softness)
+    elif config.filter == "variance":
+        occlusion = _by_variance(window, depth, softness, config)
+    else:
+        occlusion = _percentage_closer(window, depth, softness, camera, config)
+    return dr.select(seen, occlusion, 0)
+
+
+def _interpolated(window: "_Window", depth: Any, softness: Any) -> Any:
+    """Thesis 4.4 to 4.6: bilinear over covered pixels alone, whose depths are known; of none, lit."""
+
+    def terms(alpha: Any, pixel: Any, active: Any) -> list[Any]:
+        known = dr.select(alpha > 0, ad.Float(1), 0)
+        return [known, known * _mean_depth(window.light, alpha, pixel, active)]
+
+    share, sums = window.sums(0.5, 0.5, 0.5, terms)
+    known = share > 0
+    return dr.select(known, _shadowed(sums * dr.rcp(dr.select(known, share, 1)) - depth, softness), 0)
+
+
+def _percentage_closer(window: "_Window", depth: Any, softness: Any, camera: Any, config: MappingConfig) -> Any:
+    """Every pixel's own test, averaged over the window; what is uncovered lets light pass."""
+
+    def terms(alpha: Any, pixel: Any, active: Any) -> list[Any]:
+        gap = _mean_depth(window.light, alpha, pixel, active) - depth
+        blocked = alpha * _shadowed(gap, softness)
+        return [blocked, -blocked * gap]
+
+    half_x = half_y = ad.Float(config.radius)
+    widest = config.radius
+    if config.sun_radius_deg > 0:
+        widest = max(config.radius, config.widest)
+        blocked, gaps = window.sums(widest, widest, widest, terms)
+        some = blocked > 1e-6
+        gap = dr.maximum(dr.select(some, gaps * dr.rcp(dr.select(some, blocked, 1)), 0), 0)
+        penumbra = gap * math.tan(math.radians(config.sun_radius_deg))  # metres, half its width
+        half_x, half_y = (
+            dr.clip(penumbra * dr.gather(ad.Float, camera, ad.UInt32(i)), config.radius, widest) for i in (12, 13)
+        )
+    blocked, _ = window.sums(half_x, half_y, widest, terms)
+    return dr.clip(blocked * dr.rcp(4 * half_x * half_y), 0, 1)
+
+
+def _by_variance(window: "_Window", depth: Any, softness: Any, config: MappingConfig) -> Any:
+    """At least 1 - p of the covered share blocks, p = var / (var + (z - mean)^2) where the mean is nearer."""
+    light = window.light
+
+    def terms(alpha: Any, pixel: Any, active: Any) -> list[Any]:
+        return [alpha, *(dr.gather(ad.Float, plane, pixel, active) for plane in (light.depth, light.square))]
+
+    alpha, first, second = window.sums(config.radius, config.radius, config.radius, terms)
+    known = alpha > 0
+    inverse = dr.rcp(dr.select(known, alpha, 1))
+    mean = first * inverse
+    variance = dr.maximum(second * inverse - mean * mean, softness * softness)
+    behind = dr.maximum(depth - mean, 0)
+    passes = variance * dr.rcp(dr.fma(behind, behind, variance))
+    passes = dr.clip((passes - config.bleeding) / (1 - config.bleeding), 0, 1)
+    covered = dr.clip(alpha / (4 * config.radius * config.radius), 0, 1)
+    return dr.select(known, (1 - passes) * covered, 0)
+
+
+def _shadowed(gap: Any, softness: Any) -> Any:
+    """1 - v of thesis 4.5 and 4.6: gap = z_ref - (z - b), metres."""
+    return dr.rcp(1 + dr.exp(dr.clip(gap / softness, -60, 60)))
+
+
+def _mean_depth(light: LightMap, alpha: Any, pixel: Any, active: Any) -> Any:
+    """D of thesis 4.4, metres; 0 where nothing covers the pixel."""
+    covered = alpha > 0
+    depth = dr.gather(ad.Float, light.depth, pixel, active)
+    return dr.select(covered, depth * dr.rcp(dr.select(covered, alpha, 1)), 0)
+
+
+@dataclass
+class _Window:
+    """Pixels of the light's picture around the receivers' centres (x, y), Floats [N], pixels."""
+
+    x: Any
+    y: Any
+    light: LightMap
+    active: Any
+
+    def sums(self, half_x: Any, half_y: Any, widest: float, terms: Callable[..., list[Any]]) -> list[Any]:
+        """Sums of share x term over the pixels that the box (x +- half_x, y +- half_y) touches; the share is how much
+        of a pixel the box covers, so the sums are continuous in x and y. half_x, half_y: pixels, at most `widest`.
+
+        terms: (alpha, flat index of a pixel, Bool: is it in the image and the box) to Floats [N]; only there they
+        count.
+        """
+        side = math.ceil(2 * widest) + 1  # pixels that such a box can touch
+        left, top = dr.floor(self.x - half_x), dr.floor(self.y - half_y)
+        light = self.light
+
+        def more(k: Any, _sums: Any) -> Any:
+            return k < side * side
+
+        def add(k: Any, sums: list[Any]) -> Any:
+            column, row = left + ad.Float(k % side), top + ad.Float(k // side)
+            share = _overlap(column, self.x, half_x) * _overlap(row, self.y, half_y)
+            active = self.active & (share > 0)
+            active &= (column >= 0) & (column < light.width) & (row >= 0) & (row < light.height)
+            pixel = ad.UInt32(dr.select(active, row, 0)) * light.width + ad.UInt32(dr.select(active, column, 0))
+            alpha = dr.gather(ad.Float, light.alpha, pixel, active)
+            weight = dr.select(active, share, 0)
+            values = terms(alpha, pixel, active)
+            return k + 1, [dr.fma(weight, v, s) for v, s in zip(values, sums, strict=True)]
+
+        count = len(terms(ad.Float(0), ad.UInt32(0), ad.Bool(False)))
+        state = ad.UInt32(0), [ad.Float(0) for _ in range(count)]
+        _, sums = dr.while_loop(state, more, add, mode="symbolic", label="window")
+        return list(sums)
+
+
+def _overlap(pixel: Any, centre: Any, half: Any) -> Any:
+    """Length of [pixel, pixel + 1] within [centre - half, centre + half]."""
+    return dr.maximum(dr.minimum(pixel + 1, centre + half) - dr.maximum(pixel, centre - half), 0)
+
+
+_prepare = recorded(_trace_prepare, RECORDINGS)
+_look_up = recorded(_trace_look_up, RECORDINGS)
