@@ -1,0 +1,310 @@
+"""Shadow splatting: how much of the Sun's light each Gaussian loses on its way (thesis 4.3.2, 4.7 to 4.10; 4.28).
+
+A Gaussian stands in the light image's lists twice: as a receiver at z - b, its depth less its bias, and as a blocker
+at its depth z. In that order each tile walks its list once: a blocker takes its share of the pixels' light, a receiver
+notes what has been taken so far, weighted by its footprint. Each (tile, receiver) pair sums into a slot of its own, and
+a second pass adds up each receiver's slots in order: the same input gives the same bits.
+
+The adjoint is by hand: it replays the lists from their ends, as `rasterize.backward` does.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from spacesim.backend import ad, recorded
+from spacesim.splat.cameras import LARGEST, Orthographic
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.project import ALPHA_MIN, Footprints, Splats, _sortable, project
+from spacesim.splat.rasterize import (
+    ALPHA_MAX,
+    TRANSMITTANCE_MIN,
+    _exponents,
+    _gather_slots,
+    _lane_pixels,
+    _list_records,
+    _load,
+    _reduce_mode,
+    _store,
+)
+from spacesim.splat.tiles import RECORDINGS, TileLists, bin_splats, room
+
+BETA_MIN = 0.05  #: a receiver's footprint ends there: 95 % of its weight on 54 % of the area of a cut at 1/255; chosen
+_RECEIVER = ALPHA_MIN / BETA_MIN  # opacity with which a receiver stands in the lists
+
+
+def occlusion_by_splatting(gaussians: Gaussians, camera: Orthographic, bias: Any, antialiased: bool = False) -> Any:
+    """Float [N] in [0, 1], detached: the share of sunlight that is blocked before it reaches each Gaussian.
+
+    For receiver i, the mean over the pixels of its footprint of 1 - T_i, weighted by beta_i (4.7, 4.9, 4.10), with T_i
+    the product of 1 - alpha_j over the blockers with z_i - z_j - b_i > 0 (4.8, 4.28). alpha_j is cut off as in pictures
+    (docs/rasterizer.md), beta_i below `BETA_MIN`. beta has no opacity in it: faint Gaussians have an occlusion too.
+
+    camera: looks from the Sun at the scene
+    bias: Float [N] metres, of each receiver, or one for all; below 0, from 1e9 on or not a number counts as 0
+    antialiased: blockers thinner than a pixel of the light image fade, see `project`
+    0 for what cannot be projected and where no pixel of a footprint is inside of the image. Raises ValueError for a
+    bias of another length, WorkError where memory is short.
+    """
+    rows = [dr.detach(row) for row in _rows(gaussians)]
+    return differentiable_occlusion(Gaussians.from_rows(rows), camera, bias, antialiased)
+
+
+def differentiable_occlusion(gaussians: Gaussians, camera: Orthographic, bias: Any, antialiased: bool = False) -> Any:
+    """`occlusion_by_splatting` with gradients (reverse mode) by means, log scales, quaternions and opacities, of the
+    blockers' alpha and the receivers' beta. Who is before whom, and the bias, are taken as given."""
+    count = gaussians.count
+    if dr.width(bias) not in (1, count):
+        raise ValueError(f"bias: expected {count} numbers or one, found {dr.width(bias)}")
+    if count == 0:
+        return dr.zeros(ad.Float, 0)
+    bias = dr.detach(bias) + dr.zeros(ad.Float, count)
+    dr.make_opaque(bias)
+    rows = _rows(gaussians)
+    prepare = _trace_prepare if dr.grad_enabled(rows) else _prepare
+    splats, blockers, receivers = prepare(rows, camera, bias, antialiased)
+    return dr.custom(_Occlusion, splats, blockers, receivers, (camera.width, camera.height))
+
+
+def _rows(gaussians: Gaussians) -> list[Any]:
+    """What places Gaussians and makes them opaque, rows [N]; their looks do not matter."""
+    return [*gaussians.means, *gaussians.log_scales, *gaussians.quaternions, gaussians.logit_opacities]
+
+
+def _trace_prepare(
+    rows: list[Any], camera: Orthographic, bias: Any, antialiased: bool
+) -> tuple[Splats, Footprints, Footprints]:
+    """(splats, their footprints as blockers, as receivers), [N], of the Gaussians with these `_rows`.
+
+    A receiver's opacity is such that the cut at ALPHA_MIN falls where beta is BETA_MIN.
+    """
+    *geometry, logit = rows
+    splats, blockers = project(Gaussians.from_rows(rows), camera, antialiased)
+    usual = dr.log(ad.Float(_RECEIVER / (1 - _RECEIVER)))
+    logit = dr.select(dr.abs(logit) < LARGEST, usual, logit)
+    _, receivers = project(Gaussians.from_rows([dr.detach(row) for row in (*geometry, logit)]), camera)
+    means = ad.Array3f([dr.detach(row) for row in geometry[:3]])
+    means = dr.select(dr.max(dr.abs(means)) < LARGEST, means, ad.Array3f(0))
+    depth = dr.detach(dr.dot(camera.row(2), means))
+    depth = dr.select(depth == 0, 0, depth)  # of both signs: equal depths are equal keys
+    blockers.order = _sortable(depth)
+    receivers.order = _sortable(depth - dr.select((bias > 0) & (bias < LARGEST), bias, 0))
+    return splats, blockers, receivers
+
+
+def _trace_events(
+    splats: Splats, blockers: Footprints, receivers: Footprints, count: Any, capacity: int
+) -> tuple[Splats, Footprints]:
+    """Events [2 capacity]: receivers, then blockers, of `count` Gaussians; the rest are invisible.
+
+    Receivers come first, so that stable sorting puts them before blockers of the same key: nothing blocks itself, or
+    what is equally deep.
+    """
+    event = dr.arange(ad.UInt32, 2 * capacity)
+    receives = event < capacity
+    index = dr.select(receives, event, event - capacity)
+    live = index < count
+
+    def both(array_type: Any, of_receivers: Any, of_blockers: Any) -> Any:
+        receiver = dr.gather(array_type, of_receivers, index, live & receives)
+        return dr.select(receives, receiver, dr.gather(array_type, of_blockers, index, live & ~receives))
+
+    x, y, a, b, c, opacity, depth = (
+        dr.gather(ad.Float, v, index, live)
+        for v in (splats.x, splats.y, splats.a, splats.b, splats.c, splats.opacity, splats.depth)
+    )
+    events = Splats(x, y, a, b, c, dr.select(receives, _RECEIVER, opacity), depth)
+    footprints = Footprints(
+        half_width=both(ad.Float, receivers.half_width, blockers.half_width),
+        half_height=both(ad.Float, receivers.half_height, blockers.half_height),
+        visible=live & both(ad.Bool, receivers.visible, blockers.visible),
+        order=both(ad.UInt32, receivers.order, blockers.order),
+    )
+    return events, footprints
+
+
+@dataclass
+class _Walked:
+    """What `_walk` leaves behind. occlusion, weight (sum of beta): [capacity]
+
+    Tile-major, for the adjoint: transmittance and one past the last blocker of each pixel [T * lanes * rows]; the
+    events' records in list order, see `rasterize.Blended`.
+    """
+
+    occlusion: Any
+    weight: Any
+    transmittance: Any
+    last: Any
+    records: list[Any]
+
+
+def _trace_walk(events: Splats, lists: TileLists, image_size: tuple[Any, Any]) -> _Walked:
+    """What each receiver has lost; one lane holds a column of a tile's pixels."""
+    shape, rows, capacity = lists.shape, lists.shape.rows, dr.width(events.x) // 2
+    receives = dr.select(dr.arange(ad.UInt32, 2 * capacity) < capacity, ad.Float(1), ad.Float(0))
+    records = _list_records(events, [receives], lists, room(2 * capacity))
+    lanes = lists.tiles_x * lists.tiles_y * shape.lanes
+    lane = dr.arange(ad.UInt32, lanes)
+    px, py, column, row = _lane_pixels(lane, lists)
+    inside = [(column < image_size[0]) & (row + p < image_size[1]) for p in range(rows)]
+    slots = dr.zeros(ad.Float, 2 * lists.capacity)
+    mode = _reduce_mode(8 * lists.capacity)
+    end = dr.gather(ad.UInt32, lists.end, lane // shape.lanes)
+
+    def remaining(k: Any, _transmittance: Any, _last: Any) -> Any:
+        return k < end
+
+    def take(k: Any, transmittance: list[Any], last: list[Any]) -> Any:
+        record = _load(records, k)
+        exponents = _exponents(record, px, py, rows)
+        receiver = record[6] > 0
+        transmittance, last = list(transmittance), list(last)
+        lost, weight = ad.Float(0), ad.Float(0)
+        for p in range(rows):
+            alpha = dr.minimum(dr.exp2(exponents[p]), ALPHA_MAX)
+            reached = alpha >= ALPHA_MIN
+            beta = dr.select(reached & inside[p], alpha, 0)
+            lost, weight = dr.fma(beta, 1 - transmittance[p], lost), weight + beta
+            blocks = reached & ~receiver & (transmittance[p] > TRANSMITTANCE_MIN)
+            transmittance[p] = dr.select(blocks, transmittance[p] * (1 - alpha), transmittance[p])
+            last[p] = dr.select(blocks, k + 1, last[p])
+        slot = dr.gather(ad.UInt32, lists.slot, k)
+        noted = receiver & (weight > 0)
+        dr.scatter_reduce(dr.ReduceOp.Add, slots, ad.Array2f(lost, weight), slot, active=noted, mode=mode)
+        return k + 1, transmittance, last
+
+    state = (
+        dr.gather(ad.UInt32, lists.start, lane // shape.lanes),
+        [ad.Float(1) for _ in range(rows)],
+        [ad.UInt32(0) for _ in range(rows)],
+    )
+    _, transmittance, last = dr.while_loop(state, remaining, take, mode="symbolic", label="shadow")
+    transmittance, last = _store(transmittance, lane, lanes), _store(last, lane, lanes)
+    dr.eval(slots, transmittance, last)
+    lost, weight = _sum_slots(slots, lists, capacity)
+    seen = weight > 0
+    occlusion = dr.select(seen, dr.clip(lost / dr.select(seen, weight, 1), 0, 1), 0)
+    return _Walked(occlusion, weight, transmittance, last, records)
+
+
+def _sum_slots(slots: Any, lists: TileLists, capacity: int) -> Any:
+    """Array2f [capacity]: the sums over each receiver's slots, in order."""
+    index = dr.arange(ad.UInt32, capacity)
+    position = dr.gather(ad.UInt32, lists.first_slot, index)
+    end = position + dr.gather(ad.UInt32, lists.slot_count, index)
+
+    def remaining(position: Any, _total: Any) -> Any:
+        return position < end
+
+    def add(position: Any, total: Any) -> Any:
+        return position + 1, total + dr.gather(ad.Array2f, slots, position)
+
+    state = position, ad.Array2f(0)
+    _, total = dr.while_loop(state, remaining, add, mode="symbolic", label="sum shadow slots")
+    return total
+
+
+def _trace_replay(
+    events: Splats, walked: _Walked, lists: TileLists, image_size: tuple[Any, Any], gradient: Any
+) -> Splats:
+    """Adjoint of `_walk`: from gradients of the occlusions [capacity] to gradients of the events.
+
+    With u_i = dL/d occ_i / sum of beta_i: dL/d beta_i = u_i (1 - T_i - occ_i), and
+    dL/d alpha_j = (sum over receivers i behind j of u_i beta_i T_i) / (1 - alpha_j).
+    """
+    rows, lanes = lists.shape.rows, lists.shape.lanes
+    lane = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * lanes)
+    px, py, column, row = _lane_pixels(lane, lists)
+    inside = [(column < image_size[0]) & (row + p < image_size[1]) for p in range(rows)]
+    transmittance = [dr.gather(ad.Float, walked.transmittance, lane * rows + p) for p in range(rows)]
+    last = [dr.gather(ad.UInt32, walked.last, lane * rows + p) for p in range(rows)]
+    shares = dr.select(walked.weight > 0, gradient / dr.maximum(walked.weight, 1e-30), 0)
+    dr.eval(shares)
+    slots = [dr.zeros(ad.Float, 4 * lists.capacity) for _ in range(2)]
+    mode = _reduce_mode(32 * lists.capacity)
+    start = dr.gather(ad.UInt32, lists.start, lane // lanes)
+
+    def remaining(k: Any, _transmittance: Any, _behind: Any) -> Any:
+        return k > start
+
+    def replay(k: Any, transmittance: list[Any], behind: list[Any]) -> Any:
+        k = k - 1
+        record = _load(walked.records, k)
+        dx, dy0 = px - record[0], py - record[1]
+        exponents = _exponents(record, px, py, rows)
+        receiver = record[6] > 0
+        event = dr.gather(ad.UInt32, lists.splat, k)
+        share = dr.gather(ad.Float, shares, event, receiver)
+        occlusion = dr.gather(ad.Float, walked.occlusion, event, receiver)
+        transmittance, behind = list(transmittance), list(behind)
+        g0, g1, g2 = ad.Float(0), ad.Float(0), ad.Float(0)
+        touched = ad.Bool(False)
+        for p in range(rows):
+            unclamped = dr.exp2(exponents[p])
+            alpha = dr.minimum(unclamped, ALPHA_MAX)
+            reached = alpha >= ALPHA_MIN
+            receives, blocks = reached & receiver & inside[p], reached & ~receiver & (k < last[p])
+            weight = dr.select(receives, alpha * share, 0)
+            inverse = dr.rcp(1 - dr.select(blocks, alpha, 0))
+            by_beta = weight * (1 - transmittance[p] - occlusion)  # dL / d ln beta
+            by_alpha = dr.select(blocks & (unclamped < ALPHA_MAX), behind[p] * inverse * alpha, 0)  # dL / d ln alpha
+            behind[p] = dr.fma(weight, transmittance[p], behind[p])
+            transmittance[p] *= inverse
+            g, dy = by_beta + by_alpha, dy0 + p
+            g0, g1, g2 = g0 + g, dr.fma(g, dy, g1), dr.fma(g * dy, dy, g2)
+            touched |= receives | blocks
+        sums = [g0, g0 * dx, g1, g0 * dx * dx, g1 * dx, g2, ad.Float(0), ad.Float(0)]
+        slot = dr.gather(ad.UInt32, lists.slot, k)
+        for i, target in enumerate(slots):
+            value = ad.Array4f(sums[4 * i : 4 * i + 4])
+            dr.scatter_reduce(dr.ReduceOp.Add, target, value, slot, active=touched, mode=mode)
+        return k, transmittance, behind
+
+    state = dr.gather(ad.UInt32, lists.end, lane // lanes), transmittance, [ad.Float(0) for _ in range(rows)]
+    dr.while_loop(state, remaining, replay, mode="symbolic", label="replay shadow")
+    dr.eval(slots)
+    gradients: Splats = _gather_slots(slots, events, lists, 0).splats
+    return gradients
+
+
+class _Occlusion(dr.CustomOp):
+    """From splats [N] to occlusions [N], as one node of Dr.Jit's graph. Differentiable in reverse mode."""
+
+    def eval(self, splats: Splats, blockers: Footprints, receivers: Footprints, image_size: tuple[int, int]) -> Any:
+        # Sizes in arrays: dr.freeze (1.5) takes one number for another where both have occurred among the arguments.
+        self.size = dr.opaque(ad.UInt32, image_size[0]), dr.opaque(ad.UInt32, image_size[1])
+        self.count = dr.width(splats.x)
+        capacity = room(self.count)
+        arguments = dr.detach(splats), blockers, receivers, dr.opaque(ad.UInt32, self.count), capacity
+        self.events, footprints = _events(*arguments)
+        self.lists = bin_splats(self.events, footprints, *image_size)
+        if self.lists.capacity == 0:
+            return dr.opaque(ad.Float, 0, self.count)
+        self.walked = _walk(self.events, self.lists, self.size)
+        return dr.gather(ad.Float, self.walked.occlusion, dr.arange(ad.UInt32, self.count))
+
+    def backward(self) -> None:
+        index, none = dr.arange(ad.UInt32, self.count), dr.opaque(ad.Float, 0, self.count)
+        if self.lists.capacity == 0:
+            self.set_grad_in("splats", Splats(*[none] * 7))
+            return
+        capacity = dr.width(self.events.x) // 2
+        receiver = dr.arange(ad.UInt32, capacity)
+        padded = dr.gather(ad.Float, self.grad_out(), receiver, receiver < dr.opaque(ad.UInt32, self.count))
+        by_event = _replay(self.events, self.walked, self.lists, self.size, padded)
+        x, y, a, b, c = (
+            dr.gather(ad.Float, v, index) + dr.gather(ad.Float, v, index + capacity)
+            for v in (by_event.x, by_event.y, by_event.a, by_event.b, by_event.c)
+        )
+        opacity = dr.gather(ad.Float, by_event.opacity, index + capacity)
+        self.set_grad_in("splats", Splats(x, y, a, b, c, opacity, none))
+
+    def name(self) -> str:
+        return "occlusion by splatting"
+
+
+_prepare = recorded(_trace_prepare, RECORDINGS)
+_events = recorded(_trace_events, RECORDINGS)
+_walk = recorded(_trace_walk, RECORDINGS)
+_replay = recorded(_trace_replay, RECORDINGS)
