@@ -13,10 +13,13 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from spacesim import __version__, backend
 from spacesim.data.errors import InputError, WorkError
+
+if TYPE_CHECKING:
+    from spacesim.data.records import Camera
 
 KINDS = ("rgb", "depth", "alpha", "normal")
 
@@ -132,7 +135,7 @@ def _parser() -> argparse.ArgumentParser:
     one = command("train", _train, "reconstruct a dataset with Gaussian splatting")
     one.add_argument("data", type=Path, metavar="DATA")
     one.add_argument("--out", type=Path, required=True, metavar="RUN")
-    one.add_argument("--method", help="vanilla")
+    one.add_argument("--method", default="vanilla", help="vanilla (default), relight, shadow-map, shadow-splat or park")
     one.add_argument("--strategy", help="default")
     one.add_argument("--init", help="mesh, points or random (default: points, else mesh, else random)")
     one.add_argument("--init-count", type=int, metavar="N", help="Gaussians at the start, at most")
@@ -168,6 +171,21 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--data", type=Path, metavar="DATA", help="the dataset, where it has moved since training")
     one.add_argument("--sun", type=_angles, metavar="AZ,EL", help="degrees; a vanilla run knows one light only")
     one.add_argument("--kind", choices=KINDS, default="rgb")
+
+    one = command("sweep", _sweep, "the Sun goes round a run: a contact sheet and a video")
+    one.add_argument("path", type=Path, metavar="RUN")
+    one.add_argument("--out", type=Path, required=True, metavar="DIR")
+    where = one.add_mutually_exclusive_group()
+    where.add_argument("--camera", type=Path, metavar="FILE", help="JSON with transform_matrix, w, h, fl_x, ...")
+    where.add_argument("--frame", type=int, metavar="K", help="frame K of the dataset, training frames first (0)")
+    one.add_argument("--data", type=Path, metavar="DATA", help="the dataset, where it has moved since training")
+    path = one.add_mutually_exclusive_group()
+    path.add_argument("--elevation", type=float, metavar="DEG", help="the Sun goes round at this elevation (30)")
+    path.add_argument("--azimuth", type=float, metavar="DEG", help="the Sun rises at this azimuth and goes overhead")
+    one.add_argument("--frames", type=int, metavar="N", help="Suns, evenly around the circle (72)")
+    one.add_argument("--kind", choices=("rgb", "shadow"), default="rgb")
+    one.add_argument("--size", type=_resolution, metavar="PX", help="pixels of the longer side, or WIDTHxHEIGHT")
+    one.add_argument("--keep-frames", action="store_true", help="write every picture into DIR/frames, too")
 
     one = command("verify", _verify, "whether every file of a dataset is there and can be read", needs_backend=False)
     one.add_argument("data", type=Path, metavar="DATA")
@@ -257,8 +275,9 @@ def _train(options: argparse.Namespace) -> None:
     from spacesim.splat.train.config import preset, with_options
     from spacesim.splat.train.train import train
 
-    names = ("method", "strategy", "init", "init_count", "views_per_step", "iterations", "seed")
-    config = with_options(preset(options.preset), **{name: getattr(options, name) for name in names})
+    names = ("strategy", "init", "init_count", "views_per_step", "iterations", "seed")
+    config = preset(options.preset, options.method)
+    config = with_options(config, **{name: getattr(options, name) for name in names})
     if options.black_background:
         config = with_options(config, random_background=False)
     dataset = read_dataset(options.data)
@@ -305,11 +324,8 @@ def _render(options: argparse.Namespace) -> None:
 
     run = load_run(options.path)
     sun = Sun.from_angles(*options.sun) if options.sun else None
-    if sun is not None:
-        print(
-            "a vanilla run knows the light that it was trained under only; --sun changes nothing",
-            file=sys.stderr,
-        )
+    if sun is not None and not run.relightable:
+        print("a vanilla run knows the light that it was trained under only; --sun changes nothing", file=sys.stderr)
     if options.camera:
         camera = read_camera(options.camera)
     else:
@@ -320,6 +336,36 @@ def _render(options: argparse.Namespace) -> None:
         camera, sun = frames[index].camera, sun or frames[index].sun
     write_picture(run.predict(camera, sun, normals=options.kind == "normal"), options.kind, options.out)
     ending.say(options.out)
+
+
+def _sweep(options: argparse.Namespace) -> None:
+    from spacesim.progress import reporting
+    from spacesim.splat.run import load_run
+    from spacesim.splat.sweep import FRAMES, resized, suns_around, sweep
+
+    suns = suns_around(FRAMES if options.frames is None else options.frames, options.elevation, options.azimuth)
+    run = load_run(options.path)
+    camera = _view_of(options, run.config)
+    if options.size is not None:
+        camera = resized(camera, options.size)
+    with reporting("sweep", "frames") as report:
+        done = sweep(run, camera, suns, options.out, options.kind, options.keep_frames, report)
+    if done.note is not None:
+        print(done.note, file=sys.stderr)
+    ending.say(" ".join(str(path) for path in (done.sheet, done.video) if path is not None))
+
+
+def _view_of(options: argparse.Namespace, config: dict[str, Any]) -> "Camera":
+    """The camera that --camera or --frame names."""
+    from spacesim.data.transforms import read_camera, read_dataset
+
+    if options.camera:
+        return read_camera(options.camera)
+    frames = read_dataset(options.data or _data_of(config)).frames
+    index = options.frame or 0
+    if not 0 <= index < len(frames):
+        raise InputError(f"--frame: expected 0 to {len(frames) - 1}, found {index}")
+    return frames[index].camera
 
 
 def _data_of(config: dict[str, Any]) -> Path:

@@ -93,6 +93,13 @@ class Projection(ABC):
     def rays_to(self, points: Any) -> Any:
         """Array3f [3, N], world axes, not normalised: directions in which the camera sees `points` [3, N]."""
 
+    def directions_to(self, points: Any) -> Any:
+        """Array3f [3, N]: unit vectors along `rays_to`; (0, 0, 1), without gradient, where there is no direction."""
+        offset = self.rays_to(points)
+        length2 = dr.squared_norm(offset)
+        far = dr.detach((length2 > 1e-20) & (length2 < 1e20))
+        return dr.select(far, offset * dr.rsqrt(dr.select(far, length2, 1)), ad.Array3f(0, 0, 1))
+
     def __getitem__(self, index: int) -> Any:
         return dr.gather(ad.Float, self.values, ad.UInt32(index))
 

@@ -1,7 +1,8 @@
 """The model: N anisotropic 3D Gaussians (thesis 2.7) as named tensors, and their activations.
 
 Stored parameters are unconstrained: log scales, logit opacities, quaternions of any length. Arrays are kept
-component by component ([3, N] in memory), the layout in which a Dr.Jit kernel reads them without gathers.
+component by component ([3, N] in memory), the layout in which a Dr.Jit kernel reads them without gathers. What a
+network reads of each Gaussian, its features, is one packed array: hundreds of rows would be hundreds of pointers.
 """
 
 from collections.abc import Mapping
@@ -24,15 +25,20 @@ class Gaussians:
     log_scales: Array3f [3, N] natural logarithm of the standard deviations in metres
     quaternions: Array4f [4, N] (w, x, y, z), world from principal axes; need not be of unit length
     logit_opacities: Float [N]
-    sh: ArrayXf [3 K, N] spherical-harmonic coefficients, row 3 k + channel; K = 1, 4, 9 or 16
+    sh: ArrayXf [3 K, N] spherical-harmonic coefficients, row 3 k + channel; K = 1, 4, 9 or 16, or 0 where colours come
+        from an appearance field
+    features: Float [F * N], row by row, or None for F = 0: what networks know of each Gaussian (thesis 4.2, 4.11)
     """
 
-    def __init__(self, means: Any, log_scales: Any, quaternions: Any, logit_opacities: Any, sh: Any) -> None:
+    def __init__(
+        self, means: Any, log_scales: Any, quaternions: Any, logit_opacities: Any, sh: Any, features: Any = None
+    ) -> None:
         self.means = means
         self.log_scales = log_scales
         self.quaternions = quaternions
         self.logit_opacities = logit_opacities
         self.sh = sh
+        self.features = features
 
     @property
     def count(self) -> int:
@@ -44,26 +50,38 @@ class Gaussians:
         """Degree L of the coefficients, K = (L + 1)^2."""
         return round((len(self.sh) // 3) ** 0.5) - 1
 
+    @property
+    def feature_count(self) -> int:
+        """F."""
+        return 0 if self.features is None else int(dr.width(self.features)) // self.count
+
     def parameters(self) -> dict[str, Any]:
-        """{name: array} of all parameters, in a fixed order."""
+        """{name: array} of what a Gaussian is drawn by, in a fixed order; features are not among them."""
         return {name: getattr(self, name) for name in NAMES}
 
     def rows(self) -> list[Any]:
-        """The parameters as a list of Floats [N], row after row in the order of `ROWS`."""
-        return [*self.means, *self.log_scales, *self.quaternions, self.logit_opacities, *self.sh]
+        """The parameters as a list of Floats [N], row after row in the order of `ROWS`; features, if any, are the last,
+        [F * N]."""
+        drawn = [*self.means, *self.log_scales, *self.quaternions, self.logit_opacities, *self.sh]
+        return drawn if self.features is None else [*drawn, self.features]
 
     @staticmethod
     def from_rows(rows: list[Any]) -> "Gaussians":
         """The inverse of `rows`; shares the arrays."""
         means, log_scales, quaternions = (rows[ROWS[name]] for name in NAMES[:3])
-        sh = ad.ArrayXf(rows[ROWS["sh"]])
-        return Gaussians(ad.Array3f(means), ad.Array3f(log_scales), ad.Array4f(quaternions), rows[10], sh)
+        sh = rows[ROWS["sh"]]
+        features = sh.pop() if len(sh) % 3 == 1 else None  # harmonics come in threes
+        return Gaussians(
+            ad.Array3f(means), ad.Array3f(log_scales), ad.Array4f(quaternions), rows[10], ad.ArrayXf(sh), features
+        )
 
     def to_numpy(self) -> dict[str, np.ndarray]:
         """{name: float32 array with N first}: means [N, 3], log_scales [N, 3], quaternions [N, 4],
-        logit_opacities [N], sh [N, K, 3]."""
+        logit_opacities [N], sh [N, K, 3]; features [N, F] where there are any."""
         arrays = {name: np.array(value, dtype=np.float32).T for name, value in self.parameters().items()}
         arrays["sh"] = arrays["sh"].reshape(self.count, len(self.sh) // 3, 3)
+        if self.features is not None:
+            arrays["features"] = np.array(self.features).reshape(-1, self.count).T
         return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
 
     @staticmethod
@@ -80,16 +98,29 @@ class Gaussians:
             if np.shape(arrays[name]) != shape:
                 raise ValueError(f"{name}: expected shape {shape}, found {np.shape(arrays[name])}")
         sh = np.asarray(arrays["sh"], dtype=np.float32)
-        if sh.ndim != 3 or sh.shape[0] != count or sh.shape[1] not in (1, 4, 9, 16) or sh.shape[2] != 3:
-            raise ValueError(f"sh: expected shape ({count}, 1 | 4 | 9 | 16, 3), found {sh.shape}")
+        if sh.ndim != 3 or sh.shape[0] != count or sh.shape[1] not in (0, 1, 4, 9, 16) or sh.shape[2] != 3:
+            raise ValueError(f"sh: expected shape ({count}, 0 | 1 | 4 | 9 | 16, 3), found {sh.shape}")
+        features = arrays.get("features")
+        if features is not None and (np.ndim(features) != 2 or len(features) != count or features.shape[1] == 0):
+            raise ValueError(f"features: expected shape ({count}, F), found {np.shape(features)}")
         rows = {name: np.asarray(arrays[name], dtype=np.float32).T for name in expected}
         return Gaussians(
             means=ad.Array3f(rows["means"]),
             log_scales=ad.Array3f(rows["log_scales"]),
             quaternions=ad.Array4f(rows["quaternions"]),
             logit_opacities=ad.Float(np.ascontiguousarray(rows["logit_opacities"])),
-            sh=ad.ArrayXf(np.ascontiguousarray(sh.reshape(count, sh.shape[1] * 3).T)),
+            sh=ad.ArrayXf(np.ascontiguousarray(sh.reshape(count, sh.shape[1] * 3).T)) if sh.size else ad.ArrayXf([]),
+            features=None if features is None else ad.Float(np.ascontiguousarray(features.T, np.float32).ravel()),
         )
+
+
+def entries(row: Any, index: Any, count: int) -> Any:
+    """Entries index [M] of a row [count], or of each of the C rows of a packed one: [C * count] to [C * M]."""
+    copies, chosen = dr.width(row) // count, dr.width(index)
+    if copies == 1:
+        return dr.gather(type(row), row, index)
+    place = dr.arange(ad.UInt32, copies * chosen)
+    return dr.gather(type(row), row, place // chosen * count + dr.gather(ad.UInt32, index, place % chosen))
 
 
 def opacities(logit_opacities: Any) -> Any:

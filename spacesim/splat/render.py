@@ -199,11 +199,7 @@ def view_colours(gaussians: Gaussians, camera: Projection, sh_degree: int | None
     sh = gaussians.sh
     colour = ad.Array3f(*(SH_C0 * sh[c] + 0.5 for c in range(3)))
     if degree > 0:
-        offset = camera.rays_to(gaussians.means)
-        length2 = dr.squared_norm(offset)
-        far = dr.detach((length2 > 1e-20) & (length2 < 1e20))
-        direction = dr.select(far, offset * dr.rsqrt(dr.select(far, length2, 1)), ad.Array3f(0, 0, 1))
-        basis = dr.sh_eval(direction, degree)
+        basis = dr.sh_eval(camera.directions_to(gaussians.means), degree)
         for k in range(1, (degree + 1) ** 2):
             colour += basis[k] * ad.Array3f(*(sh[3 * k + c] for c in range(3)))
     finite = dr.detach(dr.abs(colour) < 1e9)

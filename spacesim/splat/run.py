@@ -17,9 +17,11 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.light import LightModel
 from spacesim.splat.project import Pinhole
-from spacesim.splat.render import render
+from spacesim.splat.render import RenderOutput, render
 from spacesim.splat.train.checkpoint import read_tensors
+from spacesim.splat.train.config import TrainConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +46,7 @@ class Run:
     training: dict[str, Any]
     model: Gaussians
     bytes: int
+    light: LightModel | None = None
 
     @property
     def gaussians(self) -> int:
@@ -55,12 +58,35 @@ class Run:
         """The backend that renders now."""
         return backend.select()
 
+    @property
+    def relightable(self) -> bool:
+        """Whether the Sun's direction changes what is predicted."""
+        return self.light is not None
+
     def predict(self, camera: Camera, sun: Sun | None = None, normals: bool = False) -> Prediction:
-        """Render one view. The method `vanilla` knows one light: `sun` changes nothing."""
-        names = ("colour", "alpha", "depth", *(("normal",) if normals else ()))
-        output = render(self.model, Pinhole.of(camera), outputs=names)
-        colour, alpha, depth, *normal = (output.image(name) for name in names)
-        return Prediction(rgb=colour, alpha=alpha, depth=depth, visibility=None, normal=normal[0] if normal else None)
+        """Render one view. The method `vanilla` knows one light: `sun` changes nothing. Raises InputError where another
+        method is not told the Sun."""
+        names = ("alpha", "depth", *(("normal",) if normals else ()))
+        if self.light is None:
+            output = render(self.model, Pinhole.of(camera), outputs=(*names, "colour"))
+            return _prediction(output, output.image("colour"), None, normals)
+        if sun is None:
+            raise InputError(
+                f"{self.path}: expected the Sun's direction for a run of {self.config['method']}, found none"
+            )
+        eye = Pinhole.of(camera)
+        shading = self.light.shade(self.model, eye, sun.direction)
+        lit = [] if shading.visibility is None else [shading.visibility]
+        output = render(self.model, eye, outputs=names, features=[*shading.colours, *lit])
+        drawn = output.image("features")
+        alpha = output.image("alpha")
+        visibility = np.divide(drawn[..., 3], alpha, out=np.zeros_like(alpha), where=alpha > 0) if lit else None
+        return _prediction(output, drawn[..., :3], visibility, normals)
+
+
+def _prediction(output: RenderOutput, rgb: np.ndarray, visibility: np.ndarray | None, normals: bool) -> Prediction:
+    alpha, depth = output.image("alpha"), output.image("depth")
+    return Prediction(np.ascontiguousarray(rgb), alpha, depth, visibility, output.image("normal") if normals else None)
 
 
 def load_run(path: Path) -> Run:
@@ -75,11 +101,13 @@ def load_run(path: Path) -> Run:
     tensors, _ = read_tensors(model_path)
     try:
         model = Gaussians.from_numpy(tensors)
+        light_config = TrainConfig.from_json(config).light
+        light = LightModel.from_tensors(light_config, tensors) if light_config else None
     except (KeyError, ValueError) as error:
         raise InputError(f"{model_path}: expected the tensors of a model, found none or others ({error})") from None
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise InputError(f"{model_path}: expected finite numbers, found others; train the run again")
-    return Run(path, config, training, model, model_path.stat().st_size)
+    return Run(path, config, training, model, model_path.stat().st_size, light)
 
 
 def _read_keys(path: Path, key: str) -> dict[str, Any]:

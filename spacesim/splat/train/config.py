@@ -1,20 +1,27 @@
 """How to train: one frozen record and its presets."""
 
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from typing import Any, get_args, get_type_hints
 
 from spacesim.data.errors import InputError
+from spacesim.splat.appearance import FieldConfig
+from spacesim.splat.encoding import Encoding
+from spacesim.splat.light import LightConfig
+from spacesim.splat.shadow.cast import ShadowConfig
+from spacesim.splat.shadow.refine import RefineConfig
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 
-METHODS = ("vanilla",)
+METHODS = ("vanilla", "relight", "shadow-map", "shadow-splat", "park")
 STRATEGIES = ("default",)
 INITS = ("mesh", "points", "random")
 PRESETS = ("demo", "fast", "thesis")
+ISOTROPY = 1e-2  #: weight of the isotropy term of `park`, chosen
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes, splatfacto's values. That of the means falls exponentially; it is per metre of scene scale."""
+    """Adam's step sizes, splatfacto's values; those of light are chosen. Those of the means and the networks fall
+    exponentially; that of the means is per metre of scene scale."""
 
     means: float = 1.6e-4
     means_final: float = 1.6e-6
@@ -23,6 +30,9 @@ class LearningRates:
     logit_opacities: float = 5e-2
     sh_constant: float = 2.5e-3
     sh_rest: float = 1.25e-4
+    features: float = 5e-3
+    networks: float = 1e-3
+    networks_final: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,9 @@ class TrainConfig:
     sh_every: int = 1_000  #: iterations after which one more degree of spherical harmonics joins
     ssim_weight: float = 0.2  #: lambda of thesis 2.8
     random_background: bool = True  #: train against alpha; False: over black, as the thesis
+    light: LightConfig | None = None  #: how the Sun makes colours; None for `vanilla`, whose colours are fixed
+    visibility_weight: float = 0.0  #: of the mean error of blended visibility against the path-traced one
+    isotropy_weight: float = 0.0  #: of the scales' mean distance from a Gaussian's mean scale, per scene scale (`park`)
     checkpoint_every: int = 1_000  #: iterations
     rates: LearningRates = field(default_factory=LearningRates)
     refinement: DefaultStrategyConfig = field(default_factory=DefaultStrategyConfig)
@@ -63,6 +76,13 @@ class TrainConfig:
             raise InputError(f"--sh-degree: expected 0 to 3, found {self.sh_degree}")
         if self.seed < 0:
             raise InputError(f"--seed: expected 0 or more, found {self.seed}")
+        if (self.light is None) != (self.method == "vanilla"):
+            raise InputError(f"--method {self.method}: expected a configuration of light for all but vanilla")
+        for name in ("visibility_weight", "isotropy_weight"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise InputError(f"{name}: expected 0 or more, found {getattr(self, name)}")
+        if self.visibility_weight > 0 and not (self.light and self.light.shadow):
+            raise InputError(f"--visibility-weight: expected a method with shadows, found {self.method}")
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for config.json."""
@@ -70,23 +90,42 @@ class TrainConfig:
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> "TrainConfig":
-        """The inverse of `to_json`; other keys are passed over. Raises InputError where one is missing or broken."""
+        """The inverse of `to_json`; other keys are passed over, and missing ones have their defaults. Raises InputError
+        where one is broken."""
         try:
-            values = {field.name: values[field.name] for field in fields(TrainConfig)}
-            rates, refinement = LearningRates(**values["rates"]), DefaultStrategyConfig(**values["refinement"])
-            return TrainConfig(**{**values, "rates": rates, "refinement": refinement})
-        except (KeyError, TypeError) as error:
+            config: TrainConfig = _record(TrainConfig, values)
+            return config
+        except (KeyError, TypeError, AttributeError) as error:
             raise InputError(f"config.json: expected the keys of this version's TrainConfig ({error})") from None
 
 
-def preset(name: str) -> TrainConfig:
-    """`thesis`: the schedule of section 4.3.6 and table 5.1 as it stands; `fast`: half a minute on a GPU, minutes on
-    two CPU cores; `demo`: a minute on two CPU cores.
+def _record(kind: Any, values: dict[str, Any]) -> Any:
+    """A frozen record from plain values, records within it too."""
+    hints = get_type_hints(kind)
+    known = {f.name: values[f.name] for f in fields(kind) if f.name in values}
+    for name, value in known.items():
+        inner = next((t for t in (hints[name], *get_args(hints[name])) if is_dataclass(t)), None)
+        if inner is not None and value is not None:
+            known[name] = _record(inner, value)
+    return kind(**known)
+
+
+def preset(name: str, method: str = "vanilla") -> TrainConfig:
+    """`thesis`: the schedule of section 4.3.6 and tables 4.1 to 5.1 as they stand; `fast`: half a minute on a GPU,
+    minutes on two CPU cores; `demo`: a minute on two CPU cores.
 
     The last two are for pictures of some hundred pixels. Table 5.1 splits what is wider than a hundredth of the
     picture: at 256 pixels that is every splat, and the maximum of 250,000 is reached for nothing (docs/performance.md).
-    Raises InputError for another name.
+    Raises InputError for another name or method.
     """
+    if method not in METHODS:
+        raise InputError(f"--method: expected one of {', '.join(METHODS)}, found {method!r}")
+    light = None if method == "vanilla" else _light(name, method)
+    isotropy = ISOTROPY if method == "park" else 0.0
+    return replace(_schedule(name), method=method, light=light, isotropy_weight=isotropy)
+
+
+def _schedule(name: str) -> TrainConfig:
     if name == "thesis":
         return TrainConfig(
             preset=name,
@@ -107,6 +146,24 @@ def preset(name: str) -> TrainConfig:
             refinement=replace(gentle, refine_start=300, refine_stop=2_000, pause_after_reset=0),
         )
     raise InputError(f"--preset: expected one of {', '.join(PRESETS)}, found {name!r}")
+
+
+def _light(name: str, method: str) -> LightConfig:
+    """Networks and shadows of a preset (tables 4.1 to 4.3); `fast` and `demo` have smaller ones, chosen."""
+    features, width, image = {"thesis": (128, 256, 1024), "fast": (32, 64, 512)}.get(name, (16, 32, 256))
+    degree = 2 if name == "demo" else 4
+    if method == "park":
+        encoding = Encoding("positional", 4)
+        field = FieldConfig(72 if name == "thesis" else features, width, 3, encoding, encoding)
+        refine = RefineConfig(width=32, sun=encoding, positions="world", positional=4, bias_info=False)
+        return LightConfig(field, ShadowConfig("splatting", image, bias=0.0, refine=refine))
+    encoding = Encoding("harmonics", degree)
+    field = FieldConfig(features, width, 3, encoding, encoding)
+    if method == "relight":
+        return LightConfig(field)
+    refine = RefineConfig(width=64 if name == "thesis" else 32, sun=encoding)
+    kind = "mapping" if method == "shadow-map" else "splatting"
+    return LightConfig(field, ShadowConfig(kind, image, refine=refine))
 
 
 def with_options(config: TrainConfig, **options: Any) -> TrainConfig:

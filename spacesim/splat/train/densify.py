@@ -8,7 +8,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import rotation_from_quaternion
-from spacesim.splat.gaussians import ROWS, Gaussians
+from spacesim.splat.gaussians import NAMES, ROWS, Gaussians, entries
 from spacesim.splat.train.optimizer import Adam
 
 SPLIT_SHRINK = 1.6  #: halves of a split are this much smaller (Kerbl et al. 2023, section 5.2)
@@ -27,9 +27,11 @@ class Refinement:
 def rearrange(gaussians: Gaussians, optimizer: Adam, index: np.ndarray, fresh: np.ndarray) -> None:
     """Gaussian i becomes a copy of Gaussian index[i]; its moments come along unless fresh[i]. index, fresh: [M]."""
     device_index = ad.UInt32(index.astype(np.uint32))
-    rows = [dr.gather(ad.Float, row, device_index) for row in gaussians.rows()]
+    rows = [entries(row, device_index, gaussians.count) for row in gaussians.rows()]
     dr.eval(rows)
-    _assign(gaussians, rows)
+    moved = Gaussians.from_rows(rows)
+    for name in (*NAMES, "features"):
+        setattr(gaussians, name, getattr(moved, name))
     optimizer.select(device_index, ad.Bool(fresh))
 
 
@@ -79,8 +81,3 @@ def limit_opacities(gaussians: Gaussians, optimizer: Adam, highest: float) -> No
     gaussians.logit_opacities = dr.minimum(gaussians.logit_opacities, float(np.log(highest / (1 - highest))))
     dr.eval(gaussians.logit_opacities)
     optimizer.forget(ROWS["logit_opacities"])
-
-
-def _assign(gaussians: Gaussians, rows: list) -> None:
-    for name, value in Gaussians.from_rows(rows).parameters().items():
-        setattr(gaussians, name, value)

@@ -4,17 +4,22 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
+from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_points
 from spacesim.splat.gaussians import SH_C0, Gaussians
 
 OPACITY = 0.1  #: of every Gaussian at the start (Kerbl et al. 2023)
+FEATURES = 0.3  #: standard deviation of the features at the start, chosen
 
 
-def initial_gaussians(dataset: Dataset, init: str | None, count: int, sh_degree: int, seed: int) -> Gaussians:
+def initial_gaussians(
+    dataset: Dataset, init: str | None, count: int, sh_degree: int, seed: int, features: int = 0
+) -> Gaussians:
     """At most `count` Gaussians: isotropic, as wide as the mean distance to their three nearest neighbours.
 
+    With `features` > 0 they have that many, normally distributed, and no harmonics.
     init: "mesh" samples the ground-truth mesh evenly, "points" takes the dataset's points, "random" fills the cube
     around the scene; None takes points, else the mesh, else random. Raises InputError where `init` is not to be had.
     """
@@ -27,17 +32,20 @@ def initial_gaussians(dataset: Dataset, init: str | None, count: int, sh_degree:
         means, colours = _from_mesh(dataset, count, rng)
     else:
         means, colours = _at_random(dataset, count, rng)
-    return gaussians_at(means, colours, sh_degree)
+    gaussians = gaussians_at(means, colours, -1 if features else sh_degree)
+    if features:
+        gaussians.features = ad.Float((FEATURES * rng.standard_normal(features * gaussians.count)).astype(np.float32))
+    return gaussians
 
 
 def gaussians_at(means: np.ndarray, colours: np.ndarray, sh_degree: int) -> Gaussians:
-    """Gaussians at means [N, 3] metres with sRGB colours [N, 3] in [0, 1]."""
+    """Gaussians at means [N, 3] metres with sRGB colours [N, 3] in [0, 1]; sh_degree -1: without harmonics."""
     count = len(means)
     neighbours = min(4, count)
     distances = cKDTree(means).query(means, k=neighbours)[0].reshape(count, neighbours)[:, 1:]
     spacing = distances.mean(axis=1) if neighbours > 1 else np.full(count, 0.01)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
-    sh[:, 0] = (colours - 0.5) / SH_C0
+    sh[:, :1] = ((colours - 0.5) / SH_C0)[:, None]
     return Gaussians.from_numpy(
         {
             "means": means,
@@ -81,6 +89,11 @@ def _at_random(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[
     center = focus_point(dataset)
     half = 0.5 * min(np.linalg.norm(f.camera.position - center) for f in dataset.train)
     return center + rng.uniform(-half, half, (count, 3)), rng.uniform(0, 1, (count, 3))
+
+
+def farthest_camera(dataset: Dataset, center: np.ndarray) -> float:
+    """Metres from `center` [3] to the farthest training camera (dist_max of thesis 4.5)."""
+    return float(max(np.linalg.norm(frame.camera.position - center) for frame in dataset.train))
 
 
 def focus_point(dataset: Dataset) -> np.ndarray:

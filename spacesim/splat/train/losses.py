@@ -17,3 +17,18 @@ def photometric_loss(prediction: Any, target: Any, width: int, height: int, ssim
     if ssim_weight == 0:
         return l1
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(prediction, target, width, height))
+
+
+def visibility_loss(prediction: Any, truth: Any, valid: Any) -> Any:
+    """Mean |blended visibility - path-traced visibility| over the object's pixels, planes [height * width], as a share
+    of all pixels. truth: below 0 where there is no surface;  valid: Bool, pixels that count."""
+    counts = valid & (truth >= 0)
+    return dr.sum(dr.select(counts, dr.abs(prediction - truth), 0)) / dr.width(truth)
+
+
+def anisotropy(log_scales: Any) -> Any:
+    """[N] metres: mean distance of a Gaussian's three scales, Array3f [3, N], from their mean (Matsuki et al. 2024,
+    section 3.3.3; the weight of the sum is the caller's)."""
+    scales = dr.exp(log_scales)
+    mean = dr.mean(scales)
+    return (dr.abs(scales[0] - mean) + dr.abs(scales[1] - mean) + dr.abs(scales[2] - mean)) / 3

@@ -5,12 +5,13 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
+from spacesim.splat.gaussians import entries
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 
 class Adam:
-    """First and second moments of R rows of N parameters each (`Gaussians.rows` gives the rows)."""
+    """First and second moments of rows of parameters (`Gaussians.rows`, or the weights of networks)."""
 
     def __init__(self, rows: list[Any]) -> None:
         self.first = [dr.zeros(ad.Float, dr.width(row)) for row in rows]
@@ -23,8 +24,13 @@ class Adam:
         return 1 / (1 - BETA1**self.steps), 1 / (1 - BETA2**self.steps)
 
     def select(self, index: Any, fresh: Any) -> None:
-        """Entry i of each moment becomes entry index[i], or zero where `fresh[i]`. index, fresh: [M]."""
-        keep = [dr.select(fresh, 0, dr.gather(ad.Float, m, index)) for m in (*self.first, *self.second)]
+        """Entry i of each moment becomes entry index[i], or zero where `fresh[i]`. index, fresh: [M]. The first row is
+        of length N; longer ones are packed rows."""
+        count, chosen = dr.width(self.first[0]), dr.width(index)
+        keep = []
+        for moment in (*self.first, *self.second):
+            place = dr.arange(ad.UInt32, dr.width(moment) // count * chosen)
+            keep.append(dr.select(dr.gather(ad.Bool, fresh, place % chosen), 0, entries(moment, index, count)))
         dr.eval(keep)
         self.first, self.second = keep[: len(self.first)], keep[len(self.first) :]
 

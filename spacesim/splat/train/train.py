@@ -78,7 +78,7 @@ def train(
         },
     )
     header = {"iteration": trainer.iteration, "config": config.to_json()}
-    write_tensors(out / "model.safetensors", trainer.gaussians.to_numpy(), header)
+    write_tensors(out / "model.safetensors", trainer.model_tensors(), header)
     return load_run(out)
 
 
@@ -108,8 +108,11 @@ def _identity(dataset: Dataset) -> dict[str, Any]:
 
 
 def _digest(dataset: Dataset) -> str:
-    """Of the training frames: names and sizes of the files, poses, intrinsics."""
-    told = [(f.file_path, (dataset.root / f.file_path).stat().st_size, _numbers(f.camera)) for f in dataset.train]
+    """Of the training frames: names and sizes of the files, poses, intrinsics, Suns."""
+    told = [
+        (f.file_path, (dataset.root / f.file_path).stat().st_size, _numbers(f.camera), f.sun and f.sun.angles)
+        for f in dataset.train
+    ]
     return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
 

@@ -4,7 +4,7 @@ A step is five stages. Those of fixed shape (project, loss, update) are recorded
 binning and blending, whose lists change length from step to step, stand between them.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,15 @@ from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Dataset
 from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.light import LightModel, TrainingFrame
 from spacesim.splat.project import Footprints, Pinhole, Splats, project
-from spacesim.splat.rasterize import SplatGradients, backward, forward
+from spacesim.splat.rasterize import backward, forward
 from spacesim.splat.render import view_colours
 from spacesim.splat.tiles import bin_splats
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.initialise import initial_gaussians, scene_scale
-from spacesim.splat.train.losses import photometric_loss
+from spacesim.splat.train.initialise import farthest_camera, initial_gaussians, scene_scale
+from spacesim.splat.train.losses import anisotropy, photometric_loss, visibility_loss
 from spacesim.splat.train.optimizer import Adam, adam_step
 from spacesim.splat.train.strategies.default import DefaultStrategy
 from spacesim.splat.train.views import TrainingViews, View
@@ -43,23 +44,28 @@ class Progress:
 
 
 class Trainer:
-    """Gaussians, their optimizer and their strategy, one step after another.
+    """Gaussians, their optimizer and their strategy, and the networks of light where the method has some, one step
+    after another.
 
     The same dataset, configuration and backend give bitwise the same model, also across `save` and `restore`.
     """
 
     def __init__(self, dataset: Dataset, config: TrainConfig) -> None:
         self.config, self.iteration = config, 0
-        self.views = TrainingViews(dataset, config.seed)
+        self.views = TrainingViews(dataset, config.seed, config.light is not None, config.visibility_weight > 0)
         self.scene_scale = scene_scale(dataset)
-        count, degree = config.init_count, config.sh_degree
-        self.gaussians = initial_gaussians(dataset, config.init, count, degree, config.seed)
+        features = config.light.features if config.light else 0
+        start = config.init_count, config.sh_degree, config.seed, features
+        self.gaussians = initial_gaussians(dataset, config.init, *start)
         self.optimizer = Adam(self.gaussians.rows())
+        self.light = self._initial_light(dataset)
+        self.light_optimizer = Adam(self.light.weights if self.light else [])
         self.strategy = DefaultStrategy(config.refinement, self.scene_scale, self.gaussians.count)
         self.history: list[dict[str, float]] = []
         self._project = recorded(_project, RECORDINGS)
         self._loss = recorded(_loss, RECORDINGS)
         self._update = recorded(_update, RECORDINGS)
+        self._update_light = recorded(_update_light, RECORDINGS)
 
     def run(self, on_progress: Callable[[Progress], None], on_checkpoint: Callable[[], None]) -> None:
         """Train from `self.iteration` to the end."""
@@ -79,66 +85,99 @@ class Trainer:
         degree = min(config.sh_degree, index // config.sh_every)
         rows = self.gaussians.rows()
         looks = [self._look(rows, degree, index * count + i) for i in range(count)]
-        moments = self.optimizer.first, self.optimizer.second
-        factors = ad.Float([*self.optimizer.corrections(), *self.rates(index)])
-        gradients = [(camera, by_splat.splats, by_splat.features) for camera, by_splat, _ in looks]
-        rows, first, second = self._update(rows, moments, degree, gradients, factors)
-        self.gaussians = Gaussians.from_rows(rows)
-        self.optimizer.first, self.optimizer.second = first, second
+        self._move_gaussians(rows, degree, looks)
+        if self.light:
+            self._move_light(self.light, looks)
 
         self.iteration += 1
         rng = np.random.default_rng([config.seed, 2, self.iteration])
         self.strategy.refine(self.iteration, self.gaussians, self.optimizer, rng)
-        losses = [loss for _, _, loss in looks]
+        losses = [look.loss for look in looks]
         return losses[0] if count == 1 else sum(losses, ad.Float(0)) / count
 
-    def _look(self, rows: list[Any], degree: int, number: int) -> tuple[Pinhole, SplatGradients, Any]:
-        """Blend view `number` of the training, compare, and go back: (camera, gradients of its splats, loss)."""
+    def _look(self, rows: list[Any], degree: int, number: int) -> "_Look":
+        """Blend view `number` of the training, compare, and go back."""
         view = self.views.at_step(number)
         camera = Pinhole.of(view.camera)
         size = width, height = camera.width, camera.height
         splats, footprints, colour = self._project(rows, camera, degree)
+        shading = self.light.shade(self.gaussians, camera, view.sun) if self.light and view.sun is not None else None
+        supervised = shading is not None and self.config.visibility_weight > 0
+        if shading:
+            colour = [*shading.colours, shading.visibility] if supervised else shading.colours
         lists = bin_splats(splats, footprints, width, height)
         blended = forward(splats, colour, lists, width, height)
-        rgba, valid = self.views.pixels(view)
-        target = rgba, ad.Float(self.background(number, view)), valid
-        loss, by_colour, by_transmittance = self._loss(
-            blended.features, blended.transmittance, target, size, self.config.ssim_weight
-        )
+        rgba, valid, visibility = self.views.pixels(view)
+        target = rgba, ad.Float(self.background(number, view)), valid, visibility
+        weights = self.config.ssim_weight, self.config.visibility_weight
+        loss, by_colour, by_transmittance = self._loss(blended.features, blended.transmittance, target, size, *weights)
         by_splat = backward(splats, blended, lists, size, by_colour, by_transmittance)
         gradient = dr.sqrt(
             dr.square(by_splat.absolute_x * (0.5 * width)) + dr.square(by_splat.absolute_y * (0.5 * height))
         )
         radius = dr.maximum(footprints.half_width, footprints.half_height) / max(width, height)
         self.strategy.observe(gradient, radius, footprints.visible)
-        return camera, by_splat, loss
+        if not shading or not self.light:
+            return _Look(camera, by_splat.splats, by_splat.features, loss)
+        of_visibility = by_splat.features[3] if supervised else None
+        by_light = self.light.adjoint(shading, by_splat.features[:3], of_visibility)
+        return _Look(camera, by_splat.splats, [], loss, *by_light)
+
+    def _move_gaussians(self, rows: list[Any], degree: int, looks: list["_Look"]) -> None:
+        moments = self.optimizer.first, self.optimizer.second
+        factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
+        gradients = [(look.camera, look.by_splats, look.by_colour, look.by_features) for look in looks]
+        weight = self.config.isotropy_weight / (self.scene_scale * self.gaussians.count)
+        isotropy = [ad.Float(weight)] if weight > 0 else []
+        rows, first, second = self._update(rows, moments, degree, gradients, factors, isotropy)
+        self.gaussians = Gaussians.from_rows(rows)
+        self.optimizer.first, self.optimizer.second = first, second
+
+    def _move_light(self, light: LightModel, looks: list["_Look"]) -> None:
+        optimizer, rates, done = self.light_optimizer, self.config.rates, self.iteration / self.config.iterations
+        rate = rates.networks ** (1 - done) * rates.networks_final**done
+        factors = ad.Float([*optimizer.corrections(), rate])
+        gradients = [look.by_weights for look in looks]
+        moments = optimizer.first, optimizer.second
+        light.weights, optimizer.first, optimizer.second = self._update_light(
+            light.weights, moments, gradients, factors
+        )
 
     def save(self, path: Path) -> None:
         """Write everything that the next step depends on."""
-        tensors = dict(self.gaussians.to_numpy())
-        for name, rows in (("first", self.optimizer.first), ("second", self.optimizer.second)):
-            tensors[f"adam.{name}"] = np.stack([np.array(row) for row in rows])
+        tensors = self.model_tensors()
+        for name, optimizer in (("adam", self.optimizer), ("adam.light", self.light_optimizer)):
+            for order in ("first", "second"):
+                moments = getattr(optimizer, order)
+                tensors |= {f"{name}.{order}.{i:02d}": np.array(moment) for i, moment in enumerate(moments)}
         tensors |= {f"strategy.{name}": np.array(value) for name, value in self.strategy.state.items()}
         header = {"iteration": self.iteration, "adam_steps": self.optimizer.steps, "history": self.history}
         write_tensors(path, tensors, header)
+
+    def model_tensors(self) -> dict[str, np.ndarray]:
+        """The trained model by name: the Gaussians, and the networks where there are any."""
+        return {**self.gaussians.to_numpy(), **(self.light.tensors() if self.light else {})}
 
     def restore(self, path: Path) -> None:
         """Continue from what `save` wrote. Raises InputError where the file does not fit."""
         tensors, header = read_tensors(path)
         try:
             gaussians = Gaussians.from_numpy(tensors)
-            first, second = ([ad.Float(row) for row in tensors[f"adam.{name}"]] for name in ("first", "second"))
+            light = LightModel.from_tensors(self.config.light, tensors) if self.config.light else None
+            optimizer, light_optimizer = Adam(gaussians.rows()), Adam(light.weights if light else [])
+            _restore_moments(optimizer, tensors, "adam")
+            _restore_moments(light_optimizer, tensors, "adam.light")
             state = {name: ad.Float(tensors[f"strategy.{name}"]) for name in self.strategy.state}
             iteration, steps, history = int(header["iteration"]), int(header["adam_steps"]), list(header["history"])
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {error}") from None
-        lengths = {dr.width(row) for row in (*first, *second, *state.values())}
-        if lengths != {gaussians.count} or not len(first) == len(second) == len(gaussians.rows()):
-            raise InputError(f"{path}: expected moments and statistics of {gaussians.count} Gaussians, found others")
+        if {dr.width(row) for row in state.values()} != {gaussians.count}:
+            raise InputError(f"{path}: expected statistics of {gaussians.count} Gaussians, found others")
         if not 0 <= iteration <= self.config.iterations:
             raise InputError(f"{path}: expected an iteration up to {self.config.iterations}, found {iteration}")
-        self.gaussians, self.strategy.state = gaussians, state
-        self.optimizer.first, self.optimizer.second, self.optimizer.steps = first, second, steps
+        self.gaussians, self.light, self.strategy.state = gaussians, light, state
+        self.optimizer, self.light_optimizer = optimizer, light_optimizer
+        optimizer.steps = light_optimizer.steps = steps
         self.iteration, self.history = iteration, history
 
     def background(self, index: int, view: View) -> np.ndarray:
@@ -152,7 +191,18 @@ class Trainer:
         rates, done = self.config.rates, index / self.config.iterations
         means = self.scene_scale * rates.means ** (1 - done) * rates.means_final**done
         yield from [means] * 3 + [rates.log_scales] * 3 + [rates.quaternions] * 4 + [rates.logit_opacities]
-        yield from [rates.sh_constant] * 3 + [rates.sh_rest] * (len(self.gaussians.sh) - 3)
+        if self.gaussians.features is not None:
+            yield rates.features
+        else:
+            yield from [rates.sh_constant] * 3 + [rates.sh_rest] * (len(self.gaussians.sh) - 3)
+
+    def _initial_light(self, dataset: Dataset) -> LightModel | None:
+        """Networks in the frame of the Gaussians that training starts from."""
+        if self.config.light is None:
+            return None
+        centre = self.gaussians.to_numpy()["means"].astype(np.float64).mean(axis=0)
+        frame = TrainingFrame(centre, self.scene_scale, farthest_camera(dataset, centre))
+        return LightModel.initial(self.config.light, frame, self.config.seed)
 
     def _note(self, loss: float) -> None:
         if not np.isfinite(loss):
@@ -160,56 +210,103 @@ class Trainer:
         self.history.append({"iteration": self.iteration, "loss": loss, "gaussians": self.gaussians.count})
 
 
+@dataclass
+class _Look:
+    """What a step has learned from one view: gradients of its splats and of the colours (3 arrays [N]), or, of a method
+    of light, of features [F * N] and weights."""
+
+    camera: Pinhole
+    by_splats: Splats
+    by_colour: list[Any]
+    loss: Any
+    by_features: Any = None
+    by_weights: Any = None
+
+
+def _restore_moments(optimizer: Adam, tensors: Mapping[str, np.ndarray], name: str) -> None:
+    """Put moments from a checkpoint in place of fresh ones. Raises KeyError, or ValueError for another size."""
+    for order in ("first", "second"):
+        moments = getattr(optimizer, order)
+        for i, fresh in enumerate(moments):
+            key = f"{name}.{order}.{i:02d}"
+            if tensors[key].shape != (dr.width(fresh),):
+                raise ValueError(f"{key}: expected {dr.width(fresh)} numbers, found {tensors[key].shape}")
+            moments[i] = ad.Float(tensors[key])
+
+
 def _project(rows: list[Any], camera: Pinhole, degree: int) -> tuple[Splats, Footprints, list[Any]]:
-    """Splats, footprints and colours (3 x [N]), without gradients."""
+    """Splats, footprints and colours (3 x [N], or none where they come from a field), without gradients."""
     gaussians = Gaussians.from_rows(rows)
     splats, footprints = project(gaussians, camera)
-    return splats, footprints, list(view_colours(gaussians, camera, degree))
+    return splats, footprints, [] if gaussians.features is not None else list(view_colours(gaussians, camera, degree))
 
 
 def _loss(
-    colour: list[Any],
+    planes: list[Any],
     transmittance: Any,
-    target: tuple[Any, Any, Any],
+    target: tuple[Any, Any, Any, list[Any]],
     size: tuple[int, int],
     ssim_weight: float,
+    visibility_weight: float,
 ) -> tuple[Any, list[Any], Any]:
-    """Loss of a picture over the target's background, and its gradients by colour (3 planes) and transmittance."""
-    rgba, background, valid = target
+    """Loss of a picture over the target's background, and its gradients by its planes (colour, and visibility where it
+    is supervised) and transmittance."""
+    rgba, background, valid, visibility = target
     channels = [ad.Float((rgba >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24)]
     below = ad.Array3f([dr.gather(ad.Float, background, ad.UInt32(c)) for c in range(3)])
     truth = ad.Array3f(channels[:3]) * channels[3] + (1 - channels[3]) * below
-    colour, transmittance = ad.Array3f(colour), ad.Float(transmittance)
-    dr.enable_grad(colour, transmittance)
-    picture = dr.select(valid, colour + transmittance * below, truth)
+    planes, transmittance = [ad.Float(plane) for plane in planes], ad.Float(transmittance)
+    dr.enable_grad(planes, transmittance)
+    picture = dr.select(valid, ad.Array3f(planes[:3]) + transmittance * below, truth)
     loss = photometric_loss(picture, truth, *size, ssim_weight=ssim_weight)
+    if visibility:
+        loss += visibility_weight * visibility_loss(planes[3], visibility[0], valid)
     dr.backward(loss)
-    return dr.detach(loss), list(dr.grad(colour)), dr.grad(transmittance)
+    return dr.detach(loss), [dr.grad(plane) for plane in planes], dr.grad(transmittance)
 
 
 def _update(
     rows: list[Any],
     moments: tuple[list[Any], list[Any]],
     degree: int,
-    gradients: list[tuple[Pinhole, Splats, list[Any]]],
+    gradients: list[tuple[Pinhole, Splats, list[Any], Any]],
     factors: Any,
+    isotropy: Sequence[Any] = (),
 ) -> tuple[list[Any], list[Any], list[Any]]:
-    """Gradients of the splats and colours in each view to the mean gradient of the parameters, and an Adam step.
+    """Gradients of the splats, and of the colours or features, in each view to the mean gradient of the parameters, and
+    an Adam step.
 
-    factors: Float [2 + R], Adam's two corrections and the step size of each row.
+    factors: Float [2 + R], Adam's two corrections and the step size of each row;  isotropy: the weight, or nothing.
     """
     rows = [ad.Float(row) for row in rows]
     dr.enable_grad(rows)
     gaussians = Gaussians.from_rows(rows)
     along: Any = ad.Float(0)
-    for camera, by_splat, by_colour in gradients:
+    for camera, by_splat, by_colour, by_features in gradients:
         splats, _ = project(gaussians, camera)
-        colour = view_colours(gaussians, camera, degree)
         for name in ("opacity", "x", "y", "a", "b", "c"):
             along += getattr(splats, name) * getattr(by_splat, name)
-        for value, gradient in zip(colour, by_colour, strict=True):
-            along += value * gradient
+        if by_features is None:
+            for value, gradient in zip(view_colours(gaussians, camera, degree), by_colour, strict=True):
+                along += value * gradient
+    for weight in isotropy:
+        along += len(gradients) * weight * anisotropy(gaussians.log_scales)
     dr.backward(along if len(gradients) == 1 else along / len(gradients))
     numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(2 + len(rows))]
     by_row = [dr.grad(row) for row in rows]
+    if gaussians.features is not None:
+        by_row[-1] = _mean([by_features for *_, by_features in gradients])
     return adam_step(dr.detach(rows), by_row, moments, numbers[2:], (numbers[0], numbers[1]))
+
+
+def _update_light(
+    weights: list[Any], moments: tuple[list[Any], list[Any]], gradients: list[list[Any]], factors: Any
+) -> tuple[list[Any], list[Any], list[Any]]:
+    """An Adam step of the networks by their mean gradient. factors: Float [3], two corrections and the step size."""
+    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(3)]
+    means = [_mean(list(of_views)) for of_views in zip(*gradients, strict=True)]
+    return adam_step(weights, means, moments, [numbers[2]] * len(weights), (numbers[0], numbers[1]))
+
+
+def _mean(values: list[Any]) -> Any:
+    return values[0] if len(values) == 1 else sum(values[1:], values[0]) / len(values)

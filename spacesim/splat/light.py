@@ -1,0 +1,249 @@
+"""Sun direction in, colours and visibility of the Gaussians out: the appearance field (thesis 4.2) and the shadows
+(4.3), and the adjoint of both.
+
+`LightModel.shade` is the forward pass, `LightModel.adjoint` the way back to features and weights. Geometry gets no
+gradients from here: view directions and shadows count as given, as in the thesis.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim.backend import ad, recorded
+from spacesim.data.geometry import Array
+from spacesim.splat import mlp
+from spacesim.splat.appearance import FieldConfig, field_items
+from spacesim.splat.cameras import Projection
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.lanes import Lanes
+from spacesim.splat.shadow.cast import ShadowConfig, Shadows, cast_shadows
+from spacesim.splat.shadow.refine import RefineConfig, refine_inputs, refined
+from spacesim.splat.shadow.sunlight import light_rows
+from spacesim.splat.tiles import RECORDINGS
+
+SUNS = 4096  #: whose encodings are kept
+
+
+@dataclass(frozen=True)
+class LightConfig:
+    """How light becomes colour. shadow: None leaves shadows to the field (the method `relight`)."""
+
+    field: FieldConfig = field(default_factory=FieldConfig)
+    shadow: ShadowConfig | None = None
+
+    @property
+    def refine(self) -> RefineConfig | None:
+        """The refinement of shadows, if there is one."""
+        return self.shadow.refine if self.shadow else None
+
+    @property
+    def features(self) -> int:
+        """F: numbers that each Gaussian has for the field, then for the refinement of shadows."""
+        return self.field.features + (self.refine.features if self.refine else 0)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingFrame:
+    """Where a model was when it was trained, metres. centre: [3], mu_model of 4.12;  scale: the unit of length of its
+    networks;  distance: of the farthest training camera from the centre, dist_max of 4.5"""
+
+    centre: Array
+    scale: float
+    distance: float
+
+
+@dataclass
+class SunTerms:
+    """A Sun as the kernels read it, Floats. light: [9], `light_rows`;  field, refine: what each network is told"""
+
+    light: Any
+    field: Any
+    refine: Any
+
+
+@dataclass
+class _Inputs:
+    """What shading depends on beside weights and camera. raw: occlusion, normal alignment, light extent and bias, [N]
+    each, or nothing;  place: Float [4], centre and scale of the training frame"""
+
+    features: Any
+    means: Any
+    raw: list[Any]
+    sun: SunTerms
+    place: Any
+
+
+@dataclass
+class _Tape:
+    """What the adjoint needs of the forward pass. colours: 3 arrays [M] before they are dimmed;  occlusion: the refined
+    one [M] in a list, or nothing"""
+
+    field: list[Any]
+    refine: list[Any]
+    colours: list[Any]
+    occlusion: list[Any]
+
+
+@dataclass
+class Shading:
+    """colours: 3 arrays [N], sRGB values that visibility has dimmed (4.17);  visibility: Float [N] in [0, 1], or None;
+    inputs, lanes, tape: what `LightModel.adjoint` wants"""
+
+    colours: list[Any]
+    visibility: Any
+    inputs: _Inputs
+    lanes: Lanes
+    tape: _Tape
+
+
+class LightModel:
+    """The networks of a relightable model.
+
+    weights: Floats, the field's and then the refinement's, each as `mlp.initial_weights` orders them
+    frame: of its training
+    """
+
+    def __init__(self, config: LightConfig, weights: list[Any], frame: TrainingFrame) -> None:
+        self.config, self.weights, self.frame = config, weights, frame
+        self._place = ad.Float([*np.asarray(frame.centre, np.float32), frame.scale])
+        self._terms = lru_cache(maxsize=SUNS)(self._sun_terms)
+
+    @staticmethod
+    def initial(config: LightConfig, frame: TrainingFrame, seed: int) -> "LightModel":
+        """Fresh networks; the refinement's last layer starts at 0, so that raw shadows are where training starts."""
+        rng = np.random.default_rng([seed, 4])
+        weights = mlp.initial_weights(config.field.shape, rng)
+        if config.refine:
+            weights += mlp.initial_weights(config.refine.shape, rng, last=0.0)
+        return LightModel(config, [ad.Float(weight) for weight in weights], frame)
+
+    def sun_terms(self, sun: np.ndarray) -> SunTerms:
+        """What kernels read of a Sun in the direction `sun` [3], unit, world axes."""
+        terms: SunTerms = self._terms(*(float(value) for value in sun))
+        return terms
+
+    def shadows(self, gaussians: Gaussians, sun: np.ndarray) -> Shadows | None:
+        """Raw occlusion of each Gaussian; None for a model without shadows."""
+        config = self.config.shadow
+        return cast_shadows(gaussians, self.sun_terms(sun).light, config, self.frame.distance) if config else None
+
+    def shade(self, gaussians: Gaussians, camera: Projection, sun: np.ndarray) -> Shading:
+        """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes."""
+        shadows = self.shadows(gaussians, sun)
+        raw = [shadows.occlusion, *shadows.info] if shadows else []
+        inputs = _Inputs(gaussians.features, gaussians.means, raw, self.sun_terms(sun), self._place)
+        lanes = Lanes.of(gaussians.count)
+        colours, visibility, tape = _shade(self.config, self.weights, inputs, camera, lanes)
+        return Shading(colours, visibility[0] if visibility else None, inputs, lanes, tape)
+
+    def adjoint(self, shading: Shading, by_colour: list[Any], by_visibility: Any = None) -> tuple[Any, list[Any]]:
+        """(gradient of the features [F * N], gradients of the weights) from those of the dimmed colours (3 arrays [N])
+        and, where visibility is seen on its own, of the visibility [N]."""
+        more = [] if by_visibility is None else [by_visibility]
+        arguments = self.config, self.weights, shading.inputs, shading.lanes, shading.tape, by_colour, more
+        by_features, by_weights = _adjoint(*arguments)
+        return by_features, by_weights
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """For a file: the weights, and the training frame."""
+        weights = {f"light.weight.{i:02d}": np.array(weight) for i, weight in enumerate(self.weights)}
+        frame = [*self.frame.centre, self.frame.scale, self.frame.distance]
+        return {**weights, "light.frame": np.array(frame, dtype=np.float64)}
+
+    @staticmethod
+    def from_tensors(config: LightConfig, tensors: Mapping[str, np.ndarray]) -> "LightModel":
+        """The inverse of `tensors`. Raises KeyError where one is missing, ValueError where its length does not fit."""
+        *centre, scale, distance = tensors["light.frame"].tolist()
+        model = LightModel.initial(config, TrainingFrame(np.array(centre), scale, distance), 0)
+        for i, like in enumerate(model.weights):
+            weight = tensors[f"light.weight.{i:02d}"]
+            if np.shape(weight) != (dr.width(like),):
+                raise ValueError(f"light.weight.{i:02d}: expected {dr.width(like)} numbers, found {np.shape(weight)}")
+            model.weights[i] = ad.Float(weight.astype(np.float32))
+        return model
+
+    def _sun_terms(self, *sun: float) -> SunTerms:
+        refine = self.config.refine or self.config.field
+        terms = SunTerms(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun))
+        dr.eval(terms)
+        return terms
+
+
+def _trace_shade(
+    config: LightConfig, weights: list[Any], inputs: _Inputs, camera: Projection, lanes: Lanes
+) -> tuple[list[Any], list[Any], _Tape]:
+    """(dimmed colours, [visibility] or [], tape)."""
+    of_field, of_refine = _split(config, weights)
+    items = field_items(config.field, inputs.features, inputs.means, camera, lanes)
+    output, field_tape = mlp.forward(config.field.shape, of_field, items, inputs.sun.field)
+    colours = [_sigmoid(lanes.row(output, i)) for i in range(3)]
+    occlusion = [lanes.padded(row) for row in inputs.raw[:1]]
+    refine_tape: list[Any] = []
+    if config.refine:
+        items = _refine_items(config, config.refine, inputs, lanes)
+        output, refine_tape = mlp.forward(config.refine.shape, of_refine, items, inputs.sun.refine)
+        occlusion = [refined(occlusion[0], lanes.row(output, 0))]
+    visibility = [1 - value for value in occlusion]
+    shown = [colour * visibility[0] if visibility else colour for colour in colours] + visibility
+    dr.eval(shown, colours, occlusion)
+    *shown, last = lanes.narrowed(shown, inputs.means.x)
+    tape = _Tape(field_tape, refine_tape, colours, occlusion)
+    return (shown, [last], tape) if visibility else ([*shown, last], [], tape)
+
+
+def _trace_adjoint(
+    config: LightConfig,
+    weights: list[Any],
+    inputs: _Inputs,
+    lanes: Lanes,
+    tape: _Tape,
+    by_colour: list[Any],
+    by_visibility: list[Any],
+) -> tuple[Any, list[Any]]:
+    """(gradient of the features, gradients of the weights)."""
+    of_field, of_refine = _split(config, weights)
+    visibility = 1 - tape.occlusion[0] if tape.occlusion else 1
+    pairs = [(lanes.padded(gradient), colour) for gradient, colour in zip(by_colour, tape.colours, strict=True)]
+    by_output = lanes.matrix([g * visibility * c * (1 - c) for g, c in pairs])
+    by_weights, by_items = mlp.backward(config.field.shape, of_field, tape.field, inputs.sun.field, by_output)
+    parts = [(by_items, 0, config.field.features)]
+    if config.refine:
+        occlusion = tape.occlusion[0]
+        by_occlusion = -sum((g * c for g, c in pairs), sum(map(lanes.padded, by_visibility), ad.Float(0)))
+        by_output = lanes.matrix([by_occlusion * occlusion * (1 - occlusion)])
+        more, by_items = mlp.backward(config.refine.shape, of_refine, tape.refine, inputs.sun.refine, by_output)
+        by_weights += more
+        parts.append((by_items, 1, config.refine.features))  # the raw occlusion stands before them
+    return lanes.packed(parts, inputs.features), by_weights
+
+
+def _refine_items(config: LightConfig, refine: RefineConfig, inputs: _Inputs, lanes: Lanes) -> Any:
+    """TensorXf [inputs, M] of the refinement: 4.11, lengths in training scale."""
+    x, y, z, scale = (dr.gather(ad.Float, inputs.place, ad.UInt32(i)) for i in range(4))
+    per_metre = dr.rcp(scale)
+    positions = (lanes.spread(inputs.means) - ad.Array3f(x, y, z)) * per_metre
+    if refine.positions == "light":
+        axes = [[dr.gather(ad.Float, inputs.sun.light, ad.UInt32(3 * i + j)) for j in range(3)] for i in range(3)]
+        positions = ad.Array3f([dr.dot(ad.Array3f(axis), positions) for axis in axes])
+    occlusion, alignment, thickness, bias = (lanes.spread(value) for value in inputs.raw)
+    features = lanes.block(inputs.features, config.field.features, refine.features)
+    info = [alignment, thickness * per_metre, bias * per_metre]
+    return lanes.matrix(refine_inputs(refine, occlusion, features, positions, info))
+
+
+def _split(config: LightConfig, weights: list[Any]) -> tuple[list[Any], list[Any]]:
+    """Weights of the field, of the refinement."""
+    count = 1 + 2 * config.field.layers
+    return weights[:count], weights[count:]
+
+
+def _sigmoid(value: Any) -> Any:
+    return dr.rcp(1 + dr.exp(-value))
+
+
+_shade = recorded(_trace_shade, RECORDINGS)
+_adjoint = recorded(_trace_adjoint, RECORDINGS)

@@ -1,0 +1,77 @@
+"""Raw shadows of a set of Gaussians under one Sun: light camera, bias and one of the two methods, in one call."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+
+from spacesim.backend import ad, recorded
+from spacesim.data.errors import InputError
+from spacesim.splat.cameras import Orthographic
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.shadow.bias import Bias, receiver_bias
+from spacesim.splat.shadow.mapping import MappingConfig, occlusion_by_mapping
+from spacesim.splat.shadow.refine import RefineConfig
+from spacesim.splat.shadow.splatting import occlusion_by_splatting
+from spacesim.splat.shadow.sunlight import fit_camera, towards_sun
+from spacesim.splat.tiles import RECORDINGS
+
+METHODS = ("mapping", "splatting")
+
+
+@dataclass(frozen=True)
+class ShadowConfig:
+    """method: "mapping" (4.3.1) or "splatting" (4.3.2);  size: pixels of each side of the light image, of which the
+    thesis names none;  bias: lambda_b of 4.26, 0 for none;  softness: epsilon_s of 4.5 as a
+    share of the farthest training camera's distance;  mapping: what the test of 4.5 is given;  refine: the network of
+    4.3.3, or None."""
+
+    method: str = "mapping"
+    size: int = 512
+    bias: float = 10.0
+    softness: float = 1e-6
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    refine: RefineConfig | None = field(default_factory=RefineConfig)
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InputError(f"shadow method: expected {' or '.join(METHODS)}, found {self.method!r}")
+        if self.size < 4:
+            raise InputError(f"light image: expected at least 4 pixels, found {self.size}")
+        if not (self.bias >= 0 and self.softness > 0):
+            raise InputError(
+                f"shadows: expected a bias of 0 or more and a softness above 0, found {self.bias} and {self.softness}"
+            )
+
+
+@dataclass
+class Shadows:
+    """occlusion: Float [N] in [0, 1], detached;  bias: what it was computed with, [N]"""
+
+    occlusion: Any
+    bias: Bias
+
+    @property
+    def info(self) -> list[Any]:
+        """Normal alignment, light extent (metres), bias (metres): three arrays [N]."""
+        return [self.bias.alignment, self.bias.thickness, self.bias.bias]
+
+
+def cast_shadows(gaussians: Gaussians, light: Any, config: ShadowConfig, distance: float) -> Shadows:
+    """Raw occlusion (4.6, 4.10) of N Gaussians by each other. light: Float [9] of `light_rows`;  distance: metres, of
+    the farthest training camera."""
+    rows = [*gaussians.means, *gaussians.log_scales, *gaussians.quaternions, gaussians.logit_opacities]
+    camera, bias = _prepare(rows, light, config.size, dr.opaque(ad.Float, config.bias))
+    if config.method == "mapping":
+        occlusion = occlusion_by_mapping(gaussians, camera, bias.bias, config.softness * distance, config.mapping)
+    else:
+        occlusion = occlusion_by_splatting(gaussians, camera, bias.bias)
+    return Shadows(occlusion, bias)
+
+
+def _trace_prepare(rows: list[Any], light: Any, size: int, strength: Any) -> tuple[Orthographic, Bias]:
+    gaussians = Gaussians.from_rows(rows)
+    return fit_camera(gaussians, light, size), receiver_bias(gaussians, towards_sun(light), strength)
+
+
+_prepare = recorded(_trace_prepare, RECORDINGS)
