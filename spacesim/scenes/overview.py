@@ -7,12 +7,14 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from scipy.spatial import cKDTree
 
+from spacesim.data import sheet
 from spacesim.data.geometry import Array, angles_from_direction, direction_from_angles, fibonacci_sphere
 from spacesim.data.images import read_png, write_png
 from spacesim.data.records import Dataset, Frame
+from spacesim.data.sheet import Tile, font
 from spacesim.data.store import read_points
 
 BANDWIDTH_DEG = 5.0
@@ -28,7 +30,7 @@ _STEP_DEG = 2.0
 _VIRIDIS = ("440154", "482878", "3e4a89", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725")
 """Ten even steps of matplotlib's viridis (S. van der Walt, N. Smith 2015, CC0), whose lightness rises evenly."""
 
-_BLACK, _GREY, _WHITE = (0, 0, 0), (110, 110, 110), (255, 255, 255)
+_BLACK, _WHITE = (0, 0, 0), (255, 255, 255)
 _RED = (220, 30, 30)
 _TRAIN_SUN, _TEST_SUN = (255, 150, 30), (255, 255, 255)
 
@@ -102,26 +104,14 @@ def contact_sheet(dataset: Dataset) -> np.ndarray:
     """
     frames = dataset.frames
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, MOST_TILES).round().astype(int))]
-    columns = min(10, max(1, math.ceil(math.sqrt(1.6 * len(chosen)))))
-    side, text, gap, head = 176, 40, 8, 52
     aspect = max(frame.camera.height / frame.camera.width for frame in chosen)
-    wide, high = (side, max(1, round(side * aspect))) if aspect <= 1 else (max(1, round(side / aspect)), side)
-    wide = max(wide, 110)  # room for the names
-    rows = math.ceil(len(chosen) / columns)
-    size = max(gap + columns * (wide + gap), 560), head + rows * (high + text + gap)
-    picture = Image.new("RGB", size, _WHITE)
-    draw = ImageDraw.Draw(picture)
-    draw.text((gap, head / 2), _title(dataset, len(chosen)), _BLACK, _font(20), anchor="lm")
-    for k, frame in enumerate(chosen):
-        x, y = gap + k % columns * (wide + gap), head + k // columns * (high + text + gap)
-        draw.rectangle((x, y, x + wide - 1, y + high - 1), _BLACK)
-        tile = _thumbnail(dataset.root / frame.file_path, wide, high)
-        picture.paste(tile, (x + (wide - tile.width) // 2, y + (high - tile.height) // 2))
-        draw.text((x, y + high + 4), Path(frame.file_path).stem, _BLACK, _font(14))
-        if frame.sun is not None:
-            azimuth, elevation = frame.sun.angles
-            draw.text((x, y + high + 21), f"Sun {azimuth:.0f}°, {elevation:.0f}°", _GREY, _font(13))
-    return np.asarray(picture)
+    tiles = (_tile(dataset.root, frame) for frame in chosen)
+    return sheet.contact_sheet(_title(dataset, len(chosen)), tiles, len(chosen), aspect)
+
+
+def _tile(root: Path, frame: Frame) -> Tile:
+    angles = "" if frame.sun is None else "Sun {:.0f}°, {:.0f}°".format(*frame.sun.angles)
+    return Tile(read_png(root / frame.file_path), Path(frame.file_path).stem, angles)
 
 
 @dataclass
@@ -152,7 +142,7 @@ class _Map:
         self._draw_axes()
         self._draw_bar()
         title = f"Camera density, {self.cameras:,} view{'s' if self.cameras > 1 else ''}"
-        self.draw.text((self.LEFT, self.TOP - 14), title, _BLACK, _font(20), anchor="ls")
+        self.draw.text((self.LEFT, self.TOP - 14), title, _BLACK, font(20), anchor="ls")
 
     def place(self, azimuth: float, elevation: float) -> tuple[float, float]:
         """Pixels of a direction, degrees."""
@@ -167,8 +157,8 @@ class _Map:
         for sun in suns:
             self._disc(*self.place(*angles_from_direction(sun)), r, colour)
         label = f"{len(suns)} {name if len(suns) > 1 else name[:-1]}"
-        self.draw.text((self.legend, self.TOP - 14), label, _BLACK, _font(18), anchor="rs")
-        self.legend -= self.draw.textlength(label, _font(18)) + 16
+        self.draw.text((self.legend, self.TOP - 14), label, _BLACK, font(18), anchor="rs")
+        self.legend -= self.draw.textlength(label, font(18)) + 16
         self._disc(self.legend, self.TOP - 20, 7, colour)
         self.legend -= 30
 
@@ -180,15 +170,15 @@ class _Map:
         for east in range(0, 361, 30):
             x = self.LEFT + self.WIDE * east / 360
             self.draw.line((x, bottom, x, bottom + 7), _BLACK, 2)
-            self.draw.text((x, bottom + 11), f"{(east + 180) % 360}°", _BLACK, _font(18), anchor="ma")
+            self.draw.text((x, bottom + 11), f"{(east + 180) % 360}°", _BLACK, font(18), anchor="ma")
         for elevation in range(-90, 91, 30):
             _, y = self.place(0, elevation)
             self.draw.line((self.LEFT - 7, y, self.LEFT, y), _BLACK, 2)
-            self.draw.text((self.LEFT - 11, y), f"{elevation}°", _BLACK, _font(18), anchor="rm")
+            self.draw.text((self.LEFT - 11, y), f"{elevation}°", _BLACK, font(18), anchor="rm")
         self.draw.rectangle((self.LEFT - 1, self.TOP - 1, right, bottom), None, _BLACK, 2)
-        self.draw.text((self.LEFT + self.WIDE / 2, bottom + 40), "azimuth", _BLACK, _font(20), anchor="ma")
+        self.draw.text((self.LEFT + self.WIDE / 2, bottom + 40), "azimuth", _BLACK, font(20), anchor="ma")
         label = Image.new("RGB", (120, 30), _WHITE)
-        ImageDraw.Draw(label).text((60, 15), "elevation", _BLACK, _font(20), anchor="mm")
+        ImageDraw.Draw(label).text((60, 15), "elevation", _BLACK, font(20), anchor="mm")
         self.picture.paste(label.rotate(90, expand=True), (4, self.TOP + self.HIGH // 2 - 60))
 
     def _draw_bar(self) -> None:
@@ -199,11 +189,11 @@ class _Map:
         for value in _ticks(self.top):
             y = bottom - self.HIGH * value / self.top
             self.draw.line((self.BAR + wide, y, self.BAR + wide + 7, y), _BLACK, 2)
-            self.draw.text((self.BAR + wide + 12, y), f"{value:g}", _BLACK, _font(18), anchor="lm")
-        self.draw.text((self.BAR, self.TOP - 14), "views per sr", _BLACK, _font(18), anchor="ls")
+            self.draw.text((self.BAR + wide + 12, y), f"{value:g}", _BLACK, font(18), anchor="lm")
+        self.draw.text((self.BAR, self.TOP - 14), "views per sr", _BLACK, font(18), anchor="ls")
         y = bottom - self.HIGH * self.even / self.top
         self.draw.line((self.BAR - 9, y, self.BAR + wide - 1, y), _RED, 3)
-        self.draw.text((self.BAR, bottom + 11), "red: even\ncoverage", _RED, _font(15), spacing=2)
+        self.draw.text((self.BAR, bottom + 11), "red: even\ncoverage", _RED, font(15), spacing=2)
 
 
 def _ticks(top: float) -> list[float]:
@@ -228,12 +218,6 @@ def _colours(values: np.ndarray) -> np.ndarray:
     return _table()[np.rint(255 * np.clip(values, 0, 1)).astype(np.intp)]
 
 
-@cache
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own font: the same on every machine."""
-    return ImageFont.load_default(size)
-
-
 def _suns(frames: Sequence[Frame]) -> Array:
     """[S, 3] directions of the Suns of frames, each once."""
     directions = {f.sun.direction.tobytes(): f.sun.direction for f in frames if f.sun is not None}
@@ -248,17 +232,3 @@ def _title(dataset: Dataset, shown: int) -> str:
     parts += [f"{suns} Sun{'s' if suns > 1 else ''}"] if suns else []
     parts += [f"{camera.width} x {camera.height} px"]
     return ", ".join(parts) + (f"; {shown} shown" if shown < len(dataset.frames) else "")
-
-
-def _thumbnail(path: Path, wide: int, high: int) -> Image.Image:
-    """The picture over black, as large as fits."""
-    pixels = read_png(path)
-    if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
-    if pixels.ndim == 3 and pixels.shape[2] == 4:
-        alpha = pixels[..., 3:].astype(np.uint16)
-        pixels = ((pixels[..., :3] * alpha + 127) // 255).astype(np.uint8)
-    picture = Image.fromarray(pixels).convert("RGB")
-    scale = min(wide / picture.width, high / picture.height)
-    size = max(1, round(scale * picture.width)), max(1, round(scale * picture.height))
-    return picture.resize(size, Image.Resampling.BOX if scale < 1 else Image.Resampling.NEAREST)

@@ -1,0 +1,41 @@
+"""Contact sheets have every picture where it belongs, whole and over black."""
+
+import numpy as np
+import pytest
+
+from spacesim.data.sheet import DARK_PAGE, GAP, TEXT, Tile, columns_for, contact_sheet, fitted
+
+HEAD = 52
+
+
+@pytest.mark.parametrize(("count", "columns"), [(1, 2), (5, 3), (24, 7), (60, 10), (1000, 10)])
+def test_pages_are_wider_than_high(count, columns):
+    assert columns_for(count) == columns
+
+
+def test_tiles_stand_row_by_row_on_the_page():
+    tiles = [
+        Tile(np.full((50, 100, 3), 40 * k + 10, np.uint8), mark=np.full((30, 20, 3), k, np.uint8)) for k in range(5)
+    ]
+    picture = contact_sheet("five", iter(tiles), 5, aspect=0.5, columns=2, side=200, page=DARK_PAGE)
+    assert picture.shape == (HEAD + 3 * (100 + TEXT + GAP), 560, 3)
+    for k in range(5):
+        x, y = GAP + k % 2 * (200 + GAP), HEAD + k // 2 * (100 + TEXT + GAP)
+        assert (picture[y : y + 100, x : x + 200] == 40 * k + 10).all()
+        assert (picture[y + 104 : y + 134, x + 180 : x + 200] == k).all()
+    assert (picture[-60:, 300:] == DARK_PAGE.paper).all()  # no sixth tile
+
+
+def test_a_label_is_in_its_colours_below_its_picture():
+    picture = contact_sheet("", [Tile(np.zeros((20, 20), np.uint8), "name", "detail")], 1, 1.0, page=DARK_PAGE)
+    name, detail = picture[HEAD + 176 + 2 : HEAD + 176 + 20], picture[HEAD + 176 + 21 : HEAD + 176 + TEXT]
+    assert name.max(axis=(0, 1)).tolist() == list(DARK_PAGE.ink)
+    assert 100 < detail.max() < 180
+
+
+def test_fitted_keeps_shape_and_blends_over_black():
+    assert fitted(np.zeros((100, 400, 3), np.uint8), 200, 200).size == (200, 50)
+    assert fitted(np.zeros((10, 5, 3), np.uint8), 200, 200).size == (100, 200)
+    half = np.full((4, 4, 4), (200, 100, 50, 51), np.uint8)
+    assert np.asarray(fitted(half, 4, 4))[0, 0].tolist() == [40, 20, 10]
+    assert np.asarray(fitted(np.full((4, 4), 0x8070, np.uint16), 4, 4))[0, 0].tolist() == [0x80] * 3
