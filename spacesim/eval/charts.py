@@ -10,6 +10,7 @@ from spacesim.eval.page import SERIES, escape
 Points = Sequence[tuple[float, float]]
 
 WIDTH, HEIGHT = 460, 230
+BAR_WIDTH = 330
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 10, 26, 40
 
 
@@ -98,6 +99,42 @@ def column_histograms(
         x = _LEFT + step_x * (column + 0.5)
         marks.append(f'<text x="{x:.1f}" y="{height - 22}" text-anchor="middle">{escape(columns[column][0])}</text>')
     return _svg(title, width, height, marks)
+
+
+def bar_chart(
+    title: str, x_label: str, labels: Sequence[str], series: Sequence[tuple[int, Sequence[float | None]]]
+) -> str:
+    """SVG of a group of bars at each label, one for each run, from 0 up; None leaves a gap.
+
+    series: (the run's colour, its values at the labels)
+    """
+    values = [value for _, heights in series for value in heights if value is not None]
+    ticks = nice_ticks(0, max(values, default=0), 4)
+    step = (BAR_WIDTH - _LEFT - _RIGHT) / len(labels)
+    width = 0.72 * step / len(series)
+    marks = [f'<text x="0" y="12">{escape(title)}</text>']
+
+    def height_of(value: float) -> float:
+        return value / ticks[-1] * (HEIGHT - _TOP - _BOTTOM)
+
+    for tick in ticks:
+        y = HEIGHT - _BOTTOM - height_of(tick)
+        marks.append(f'<path class="axis" d="M{_LEFT} {y:.1f}H{BAR_WIDTH - _RIGHT}"/>')
+        marks.append(f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{compact(tick)}</text>')
+    for place, label in enumerate(labels):
+        x = _LEFT + step * (place + 0.5)
+        marks.append(f'<text x="{x:.1f}" y="{HEIGHT - 22}" text-anchor="middle">{escape(label)}</text>')
+        for number, (index, heights) in enumerate(series):
+            value = heights[place]
+            if value is None:
+                continue
+            left, tall = x + (number - 0.5 * len(series)) * width, height_of(value)
+            marks.append(
+                f'<g><title>{escape(label)}: {value:.4f}</title><rect class="cell s{index % SERIES}" x="{left:.1f}" '
+                f'y="{HEIGHT - _BOTTOM - tall:.1f}" width="{max(width - 1.5, 0.5):.1f}" height="{tall:.1f}"/></g>'
+            )
+    marks.append(f'<text x="{BAR_WIDTH - _RIGHT}" y="{HEIGHT - 4}" text-anchor="end">{escape(x_label)}</text>')
+    return _svg(f"{title} by {x_label}", BAR_WIDTH, HEIGHT, marks)
 
 
 def shared_edges(values: Sequence[float], bins: int = 12) -> list[float]:

@@ -1,6 +1,6 @@
 """The report's pictures: best, median and worst frames as truth, prediction, error and shadow masks."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,14 +16,17 @@ from spacesim.eval.pictures import (
     error_colours,
 )
 
-_PANELS = {
+Panels = Mapping[str, str]
+"""Captions of a frame's pictures by their names."""
+
+_PANELS: Panels = {
     "truth": "Truth",
     "prediction": "Prediction",
     "error": "Error",
-    "shadow_truth": "Shadow, truth",
-    "shadow_prediction": "Shadow, prediction",
+    "shadow_truth": "Dark pixels, truth",
+    "shadow_prediction": "Dark pixels, prediction",
 }
-_SWATCHES = {
+MISTAKES = {
     "lit": LIT,
     "shadowed": SHADOWED,
     "wrongly shadowed": WRONGLY_SHADOWED,
@@ -32,21 +35,78 @@ _SWATCHES = {
 
 
 def gallery(runs: Sequence[Judged]) -> str:
-    """HTML of the chosen frames: the same ones for all runs where these share frames, else each run's own."""
+    """HTML of the frames chosen by PSNR over the silhouette."""
+
+    def psnr(frame: Mapping[str, Any]) -> float | None:
+        value: float | None = frame["psnr"]
+        return value
+
+    def words(frame: Mapping[str, Any]) -> str:
+        return "" if frame["psnr"] is None else f"PSNR {frame['psnr']:.2f} dB"
+
+    stops = ", ".join(css(colour) for colour in error_colours(np.linspace(0, 1, 17)))
+    bar = f'<span class="bar" style="background: linear-gradient(90deg, {stops})"></span>'
+    keys = (
+        f'<p class="key"><span>Error, mean of the channels: 0 {bar} {ERROR_SCALE} and more</span></p>'
+        f'<p class="key">{swatches(MISTAKES)}</p>'
+    )
+    return keys + strips(runs, _PANELS, "prediction", psnr, words)
+
+
+def strips(
+    runs: Sequence[Judged],
+    panels: Panels,
+    judged_panel: str,
+    score: Callable[[Mapping[str, Any]], float | None],
+    words: Callable[[Mapping[str, Any]], str],
+) -> str:
+    """HTML of the best, the median and the worst frame: the same ones for all runs where these share frames, else each
+    run's own.
+
+    score: of a frame, the higher the better, None where it has none; words: what is said of it, beside the
+    run's name or below the panel `judged_panel`
+    """
     limit = 480 if len(runs) <= 2 else 320  # pixels a side; keeps the page small
-    parts = [_keys()]
+    parts = []
     for group in _comparable(runs):
         shared = set.intersection(*(set(run.frames) for run in group))
-        rank = {
-            name: np.mean(values)
-            for name in group[0].frames
-            if name in shared and None not in (values := [run.frames[name]["psnr"] for run in group])
-        }
+        rank: dict[str, float] = {}
+        for name in (name for name in group[0].frames if name in shared):
+            scores = [value for run in group if (value := score(run.frames[name])) is not None]
+            if len(scores) == len(group):
+                rank[name] = sum(scores) / len(scores)
         for title, name in _chosen(rank or dict.fromkeys(sorted(shared), 0.0)):
             frame = group[0].frames[name]
-            parts.append(f"<h3>{title} <small>{escape(frame['file_path'])}{_sun(frame)}</small></h3>")
-            parts += [_strip(run, name, limit, named=len(runs) > 1) for run in group]
+            parts.append(f"<h3>{title} <small>{escape(frame['file_path'])}{sun_of(frame)}</small></h3>")
+            for run in group:
+                said = words(run.frames[name])
+                if len(runs) > 1:
+                    parts.append(f"<h4>{run.label} <small>{said}</small></h4>")
+                captions = dict(panels)
+                if len(runs) == 1 and said:
+                    captions[judged_panel] += f", {said}"
+                parts.append(_strip(run, name, panels, captions, limit))
     return "".join(parts)
+
+
+def sun_of(frame: Mapping[str, Any]) -> str:
+    """Where a frame's Sun is, and whether training has never seen it; "" where that is not known."""
+    if frame["sun"] is None:
+        return ""
+    azimuth, elevation = frame["sun"]
+    return f" · Sun {azimuth:.1f}°, {elevation:.1f}°{', unseen' * (frame.get('known_sun') is False)}"
+
+
+def swatches(colours: Mapping[str, Sequence[int]]) -> str:
+    """HTML of what each colour means."""
+    return "".join(
+        f'<span><b style="background: {css(colour)}"></b>{escape(label)}</span>' for label, colour in colours.items()
+    )
+
+
+def css(colour: Sequence[int] | np.ndarray) -> str:
+    """A colour of three bytes as style sheets write it."""
+    return "rgb({}, {}, {})".format(*map(int, colour))
 
 
 def _comparable(runs: Sequence[Judged]) -> list[list[Judged]]:
@@ -66,14 +126,9 @@ def _chosen(rank: Mapping[str, float]) -> list[tuple[str, str]]:
     return [(title, titles[title]) for title in ("Best", "Median", "Worst") if title in titles]
 
 
-def _strip(run: Judged, name: str, limit: int, named: bool) -> str:
-    """HTML of one run's five pictures of a frame."""
+def _strip(run: Judged, name: str, panels: Panels, captions: Panels, limit: int) -> str:
+    """HTML of one run's pictures of a frame."""
     frame = run.frames[name]
-    quality = "" if frame["psnr"] is None else f"PSNR {frame['psnr']:.2f} dB"
-    heading = f"<h4>{run.label} <small>{quality}</small></h4>" if named else ""
-    captions = dict(_PANELS)
-    if not named and quality:
-        captions["prediction"] += f", {quality}"
     small = "small " if max(run.metrics["dataset"]["resolution"]) < 200 else ""
     figures = [
         picture(
@@ -82,30 +137,6 @@ def _strip(run: Judged, name: str, limit: int, named: bool) -> str:
             escape(captions[panel]),
             limit,
         )
-        for panel, label in _PANELS.items()
+        for panel, label in panels.items()
     ]
-    return f'{heading}<div class="{small}strip">{"".join(figures)}</div>'
-
-
-def _keys() -> str:
-    """HTML of the error's colour bar and the colours of the shadow masks."""
-    stops = ", ".join(_css(colour) for colour in error_colours(np.linspace(0, 1, 17)))
-    bar = f'<span class="bar" style="background: linear-gradient(90deg, {stops})"></span>'
-    swatches = "".join(
-        f'<span><b style="background: {_css(colour)}"></b>{label}</span>' for label, colour in _SWATCHES.items()
-    )
-    return (
-        f'<p class="key"><span>Error, mean of the channels: 0 {bar} {ERROR_SCALE} and more</span></p>'
-        f'<p class="key">{swatches}</p>'
-    )
-
-
-def _css(colour: Sequence[int] | np.ndarray) -> str:
-    return "rgb({}, {}, {})".format(*map(int, colour))
-
-
-def _sun(frame: Mapping[str, Any]) -> str:
-    if frame["sun"] is None:
-        return ""
-    azimuth, elevation = frame["sun"]
-    return f" · Sun {azimuth:.1f}°, {elevation:.1f}°"
+    return f'<div class="{small}strip">{"".join(figures)}</div>'

@@ -72,6 +72,13 @@ def read_evals(folders: Sequence[Path]) -> list[Judged]:
     return [Judged(Path(folder), index, name, metrics) for index, (folder, name, metrics) in enumerate(together)]
 
 
+def legend(runs: Sequence[Judged]) -> str:
+    """HTML that names the colours of several runs; "" for one."""
+    if len(runs) == 1:
+        return ""
+    return f'<p class="key">{"".join(f"<span>{run.label}</span>" for run in runs)}</p>'
+
+
 def _read_metrics(folder: Path) -> dict[str, Any]:
     path = folder / "metrics.json"
     metrics = read_json(path)

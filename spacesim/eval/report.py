@@ -1,6 +1,7 @@
 """The report: one self-contained HTML page about one or several judged runs, side by side."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +11,17 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import write_bytes
 from spacesim.eval.charts import column_histograms, histogram, line_chart, shared_edges
 from spacesim.eval.gallery import gallery
-from spacesim.eval.judged import Judged, read_evals
-from spacesim.eval.labels import GROUPS, IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric
+from spacesim.eval.judged import Judged, legend, read_evals
+from spacesim.eval.labels import IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric
+from spacesim.eval.lighting import by_grazing_angle, relighting, shadow_masks
 from spacesim.eval.page import escape, page, section, table
+from spacesim.eval.results import Cell, best_in_bold, results, results_by_suns, summary_cell
 
 MANY_SUNS = 12
 """With more Suns than this, histograms become columns of one chart."""
 
-_NONE = '<span class="none" title="null: see the notes">–</span>'
 _GAUSSIANS = Metric("gaussians", "Gaussians", "", LOWER, 0, "")
 _RENDER = Metric("render_ms", "Render time", "ms", LOWER, 1, "")
-
-Cell = tuple[float | None, str, str]
-"""A mean, its HTML, and the HTML of its spread."""
 
 
 def write_report(evals: Sequence[Path], out: Path) -> None:
@@ -45,7 +44,31 @@ def _content(runs: Sequence[Judged]) -> str:
         _header(runs, scenes),
         _headlines(runs),
         section("Frames", gallery(runs), "Best, median and worst by PSNR over the silhouette."),
-        section("Results", _results(runs), "Mean ± population standard deviation over the frames."),
+        _section(
+            "One view, many Suns",
+            relighting(runs),
+            "Each column is a Sun: its azimuth and elevation, and whether training has seen it.",
+        ),
+        _section(
+            "Shadow masks",
+            shadow_masks(runs),
+            "Where the Sun is seen, by the path tracer and by the run: best, median and worst by balanced error rate "
+            "over lit and cast-shadow pixels. Half of the solar disc or more is lit.",
+        ),
+        section("Results", results(runs), "Mean ± population standard deviation over the frames."),
+        _section(
+            "Known and unseen Suns",
+            results_by_suns(runs),
+            "Views of Suns of training and of Suns never seen, apart. Over the silhouette; the mask's error rate over lit "
+            "and cast-shadow pixels.",
+        ),
+        _section(
+            "By grazing angle",
+            by_grazing_angle(runs),
+            "How high the Sun stands over the surface itself: at 0° it brushes it. Pixels of all frames that face the "
+            "Sun, lit or in cast shadow. False shadow: share of lit pixels predicted dark; missed shadow: of cast "
+            "shadow predicted lit.",
+        ),
         section(
             "By Sun",
             _histograms(runs),
@@ -59,6 +82,11 @@ def _content(runs: Sequence[Judged]) -> str:
     return page(f"{scenes} · reconstruction report", "\n".join(body))
 
 
+def _section(title: str, body: str, lead: str) -> str:
+    """A section, "" where there is nothing to show."""
+    return section(title, body, lead) if body else ""
+
+
 def _header(runs: Sequence[Judged], scenes: str) -> str:
     counts = {f"{run.metrics['dataset']['frames']} {run.metrics['split']}" for run in runs}
     frames = counts.pop() if len(counts) == 1 else "their"
@@ -68,7 +96,9 @@ def _header(runs: Sequence[Judged], scenes: str) -> str:
     suns = runs[0].metrics["dataset"]["suns"]
     facts = [f"{width} × {height} pixels"]
     if suns:
-        facts.append("one Sun" if suns == 1 else f"{suns} Suns")
+        unseen = (runs[0].metrics.get("unseen_suns") or {}).get("suns", 0)
+        never = f", {unseen} of them never seen in training" if unseen else ""
+        facts.append(("one Sun" if suns == 1 else f"{suns} Suns") + never)
     return (
         f'<header><p class="eyebrow">Reconstruction report</p><h1>{escape(scenes)}</h1>'
         f'<p class="lead">{escape(lead)} {escape(", ".join(facts))}.</p></header>'
@@ -79,13 +109,16 @@ def _headlines(runs: Sequence[Judged]) -> str:
     """A card for each number that people ask for first."""
     psnr, ssim, lpips, *_, flip = IMAGE
     perceived = lpips if any(run.mean("image", "lpips") is not None for run in runs) else flip
-    cards = [
-        _card(metric, runs, [_summary_cell(run, group, metric) for run in runs])
-        for group, metric in (("image", psnr), ("image", ssim), ("image", perceived), ("shadow", SHADOW[0]))
-    ]
+    chosen = [("image", psnr), ("image", ssim), ("image", perceived), ("shadow", SHADOW[0])]
+    if any(run.metrics["shadow_mask"] is not None for run in runs):
+        chosen.append(("shadow_mask", replace(SHADOW_MASK[0], label="Shadow mask error")))
+    cards = [_card(metric, runs, [summary_cell(run, group, metric) for run in runs]) for group, metric in chosen]
+    if any(run.metrics.get("unseen_suns") for run in runs):
+        unseen = replace(psnr, label="PSNR, unseen Suns")
+        cards.append(_card(unseen, runs, [summary_cell(run, "image", psnr, "unseen_suns") for run in runs]))
     for metric in (_GAUSSIANS, _RENDER):
         cards.append(_card(metric, runs, [_model_cell(run, metric) for run in runs]))
-    many = " many" if len(runs) > 1 else ""
+    many = " many" if len(runs) > 1 else " more" if len(cards) > 6 else ""
     lead = "Image and shadow numbers are means over the frames, taken over the object's silhouette."
     return f'<div class="cards{many}">{"".join(cards)}</div><p class="lead">{lead}</p>'
 
@@ -97,71 +130,19 @@ def _card(metric: Metric, runs: Sequence[Judged], cells: Sequence[Cell]) -> str:
         value, number, spread = cells[0]
         body = f'<p class="big">{number}{"" if value is None else unit}</p><p class="std">{spread}</p>'
         return f'<div class="card"><h2>{escape(metric.label + goal)}</h2>{body}</div>'
-    rows = zip(runs, _best_in_bold(metric, cells), strict=True)
+    rows = zip(runs, _card_numbers(metric, cells), strict=True)
     body = "".join(f'<p class="row"><span>{run.label}</span><span>{number}</span></p>' for run, number in rows)
     return f'<div class="card"><h2>{escape(metric.label + goal)}{unit}</h2>{body}</div>'
 
 
-def _results(runs: Sequence[Judged]) -> str:
-    parts = []
-    for caption, metrics, groups in (
-        ("Image", IMAGE, ("image", "image_full")),
-        ("Shadow by luminance", SHADOW, ("shadow", "shadow_full")),
-        ("Shadow by predicted visibility", SHADOW_MASK, ("shadow_mask",)),
-    ):
-        present = [group for group in groups if any(run.metrics[group] is not None for run in runs)]
-        if not present:
-            continue
-        head = ["", *(_heading(metric) for metric in metrics)]
-        bodies = [(f"{GROUPS[group][0]}".capitalize(), _rows(runs, group, metrics)) for group in present]
-        parts.append(table(caption, head, bodies))
-        parts.append(_meanings(metrics))
-    return "".join(parts)
-
-
-def _rows(runs: Sequence[Judged], group: str, metrics: Sequence[Metric]) -> list[list[str]]:
-    """A row for each run, the best of each column in bold."""
-    columns = []
-    for metric in metrics:
-        cells = [_summary_cell(run, group, metric) for run in runs]
-        numbers = _best_in_bold(metric, cells)
-        columns.append([f"{n} <small>{cell[2]}</small>" for n, cell in zip(numbers, cells, strict=True)])
-    return [[run.label, *row] for run, *row in zip(runs, *columns, strict=True)]
-
-
-def _summary_cell(run: Judged, group: str, metric: Metric) -> Cell:
-    value = (run.metrics[group] or {}).get(metric.key)
-    if value is None:
-        return None, _NONE, ""
-    return value["mean"], f"{value['mean']:.{metric.digits}f}", f"± {value['std']:.{metric.digits}f}"
+def _card_numbers(metric: Metric, cells: Sequence[Cell]) -> list[str]:
+    """As a table has them; more Gaussians are not better, nor fewer."""
+    return [number for _, number, _ in cells] if metric is _GAUSSIANS else best_in_bold(metric, cells)
 
 
 def _model_cell(run: Judged, metric: Metric) -> Cell:
     value = run.metrics["model"][metric.key]
     return value, f"{value:,.{metric.digits}f}", ""
-
-
-def _best_in_bold(metric: Metric, cells: Sequence[Cell]) -> list[str]:
-    """The cells' numbers as HTML, the best in bold where there is something to choose from."""
-    distances = [metric.distance(value) for value, _, _ in cells if value is not None]
-    if len(distances) < 2 or metric is _GAUSSIANS:
-        return [number for _, number, _ in cells]
-    return [
-        f'<span class="best">{number}</span>'
-        if value is not None and metric.distance(value) == min(distances)
-        else number
-        for value, number, _ in cells
-    ]
-
-
-def _heading(metric: Metric) -> str:
-    unit = f" <small>[{escape(metric.unit)}]</small>" if metric.unit else ""
-    return f"{escape(metric.label)}{unit} {escape(metric.goal)}"
-
-
-def _meanings(metrics: Sequence[Metric]) -> str:
-    items = "".join(f"<dt>{escape(m.label)}</dt><dd>{escape(m.meaning)}</dd>" for m in metrics)
-    return f"<dl>{items}</dl>"
 
 
 def _histograms(runs: Sequence[Judged]) -> str:
@@ -172,7 +153,7 @@ def _histograms(runs: Sequence[Judged]) -> str:
     edges = shared_edges(every)
     suns = sorted({sun for groups in by_sun for sun in groups})
     if len(suns) > MANY_SUNS:
-        return _legend(runs) + "".join(
+        return legend(runs) + "".join(
             column_histograms(
                 f"{run.name}: PSNR [dB] of the frames under each Sun, by azimuth",
                 [(_sun_name(sun), groups.get(sun, [])) for sun in suns],
@@ -182,8 +163,14 @@ def _histograms(runs: Sequence[Judged]) -> str:
             for run, groups in zip(runs, by_sun, strict=True)
         )
     tallest = max(int(np.histogram(values, edges)[0].max()) for groups in by_sun for values in groups.values())
-    charts = [histogram(_sun_name(sun), [groups.get(sun, []) for groups in by_sun], edges, tallest) for sun in suns]
-    return _legend(runs) + f'<div class="multiples">{"".join(charts)}</div>'
+    unseen = {_sun_key(frame) for run in runs for frame in run.metrics["frames"] if frame.get("known_sun") is False}
+    charts = [
+        histogram(
+            _sun_name(sun) + " · unseen" * (sun in unseen), [groups.get(sun, []) for groups in by_sun], edges, tallest
+        )
+        for sun in suns
+    ]
+    return legend(runs) + f'<div class="multiples">{"".join(charts)}</div>'
 
 
 def _by_sun(run: Judged) -> dict[tuple[float, ...], list[float]]:
@@ -191,18 +178,16 @@ def _by_sun(run: Judged) -> dict[tuple[float, ...], list[float]]:
     groups: dict[tuple[float, ...], list[float]] = {}
     for frame in run.metrics["frames"]:
         if frame["psnr"] is not None:
-            groups.setdefault(tuple(round(angle, 1) for angle in frame["sun"] or ()), []).append(frame["psnr"])
+            groups.setdefault(_sun_key(frame), []).append(frame["psnr"])
     return groups
+
+
+def _sun_key(frame: Mapping[str, Any]) -> tuple[float, ...]:
+    return tuple(round(angle, 1) for angle in frame["sun"] or ())
 
 
 def _sun_name(sun: tuple[float, ...]) -> str:
     return "{:.0f}°, {:.0f}°".format(*sun) if sun else "Sun not known"
-
-
-def _legend(runs: Sequence[Judged]) -> str:
-    if len(runs) == 1:
-        return ""
-    return f'<p class="key">{"".join(f"<span>{run.label}</span>" for run in runs)}</p>'
 
 
 def _training(runs: Sequence[Judged]) -> str:
@@ -220,7 +205,7 @@ def _training(runs: Sequence[Judged]) -> str:
         line_chart("Loss", "iteration", curves("loss", 0.0), log=True),
         line_chart("Gaussians", "iteration", curves("gaussians", -1.0)),
     ]
-    return section("Training", _legend(runs) + f'<div class="charts">{"".join(charts)}</div>')
+    return section("Training", legend(runs) + f'<div class="charts">{"".join(charts)}</div>')
 
 
 def _making(runs: Sequence[Judged]) -> str:

@@ -24,7 +24,7 @@ h1 { font-size: clamp(1.9rem, 4.5vw, 2.9rem); letter-spacing: -0.01em; margin: 0
 h2 { font-size: 1.6rem; margin: 0 0 0.4rem; }
 h3 { font-size: 1.12rem; margin: 2.2rem 0 0.7rem; overflow-wrap: anywhere; }
 h2 + .key, h2 + .facts { margin-top: 1.4rem; }
-h2 + .charts { margin-top: 1.4rem; }
+h2 + .charts, .key + .charts { margin-top: 1.4rem; }
 header .lead { margin-bottom: 0; max-width: 90ch; }
 .cards + .lead { font-size: 0.88rem; margin: 0.9rem 0 0; max-width: 90ch; }
 h3 small { font: 0.88rem var(--sans); color: var(--muted); margin-left: 0.5rem; }
@@ -42,6 +42,7 @@ section { margin-top: 4.2rem; padding-top: 2.2rem; border-top: 1px solid var(--l
   0.9rem;
 }
 .cards.many { grid-template-columns: repeat(auto-fit, minmax(min(100%, 16rem), 1fr)); }
+.cards.more { grid-template-columns: repeat(auto-fit, minmax(min(100%, 14rem), 1fr)); }
 .card {
   background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 1rem 1.1rem 1.1rem;
 }
@@ -89,6 +90,20 @@ tr.group th { color: var(--muted); font-size: 0.86rem; padding-top: 1rem; }
   vertical-align: -0.08rem; border: 1px solid var(--line); }
 .strip { display: grid; grid-template-columns: repeat(5, 1fr); gap: 0.7rem; margin: 0 0 1.2rem; }
 .strip.small img { image-rendering: pixelated; }
+.sweep { display: grid; grid-template-columns: 5.6rem repeat(var(--suns), minmax(5.2rem, 1fr)); gap: 0.5rem;
+  align-items: center; font-size: 0.82rem; }
+.sweep .side { font-weight: 600; overflow-wrap: anywhere; }
+.sweep .sun { text-align: center; line-height: 1.3; font-variant-numeric: tabular-nums; }
+.sweep .sun small { color: var(--muted); }
+.sweep figure { align-self: start; } .sweep figcaption { text-align: center; margin-top: 0.15rem; }
+.sweep figcaption:empty, .pair figcaption { display: none; }
+.hole { align-self: stretch; min-height: 5.2rem; display: grid; place-items: center; color: var(--muted);
+  border: 1px dashed var(--line); border-radius: 6px; }
+.pairs { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 15rem), 1fr)); gap: 1.2rem 1.4rem; }
+.pair { display: grid; grid-template-columns: 1fr 1fr; gap: 0.35rem; break-inside: avoid; }
+.pair p { grid-column: span 2; margin: 0; color: var(--muted); font-size: 0.78rem; line-height: 1.4;
+  font-variant-numeric: tabular-nums; }
+.pair.small img, .sweep.small img { image-rendering: pixelated; }
 figure { margin: 0; break-inside: avoid; }
 figure img { display: block; width: 100%; height: auto; border-radius: 6px; background: #000; }
 figcaption {
@@ -98,6 +113,7 @@ figcaption {
   display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 21rem), 1fr)); gap: 1.6rem
   2rem;
 }
+.charts.three { grid-template-columns: repeat(auto-fill, minmax(min(100%, 18rem), 1fr)); margin-bottom: 2rem; }
 .multiples {
   display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 12.5rem), 1fr)); gap:
   1.4rem;
@@ -135,6 +151,7 @@ footer { margin-top: 5rem; color: var(--muted); font-size: 0.86rem; }
   dl { grid-template-columns: 1fr; } dd { margin-bottom: 0.5rem; }
   .cards { gap: 0.7rem; }
   .cards.many { grid-template-columns: 1fr; }
+  .cards.more { grid-template-columns: repeat(auto-fit, minmax(min(100%, 9.4rem), 1fr)); }
   .card { padding: 0.8rem 0.9rem 0.9rem; } .card .big { font-size: 1.7rem; }
   .facts tbody th, .facts.pair tbody th { width: 45%; }
 }

@@ -16,6 +16,7 @@ from spacesim.data.images import read_png
 from spacesim.eval import charts
 from spacesim.eval.evaluate import evaluate
 from spacesim.eval.report import write_report
+from spacesim.eval.shadow import KINDS
 
 VOID = {"meta", "img", "path", "rect", "br"}
 
@@ -100,6 +101,127 @@ def test_numbers_are_there(folder):
         assert fact in text
     for note in metrics["notes"]:
         assert note in text
+
+
+@pytest.fixture
+def lit(relightable, tmp_path, monkeypatch):
+    """An EVAL folder of a run that predicts visibility, under a known Sun and one never seen."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "nowhere"))
+    run, dataset = relightable(edge=25)
+    evaluate(run, dataset, tmp_path / "lit")
+    return tmp_path / "lit"
+
+
+def tables(page_text):
+    """{caption: rows of cells' text} of a page's tables."""
+    found = {}
+    for part in re.findall(r"<table>(.*?)</table>", page_text, re.DOTALL):
+        caption = re.search(r"<caption>(.*?)</caption>", part).group(1)
+        rows = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in re.findall(r"<tr[^>]*>(.*?)</tr>", part)]
+        found[caption] = [[re.sub(r"<[^>]*>", "", cell) for cell in row] for row in rows]
+    return found
+
+
+def test_known_and_unseen_suns_have_tables_of_their_own(lit):
+    def harder(metrics):
+        metrics["unseen_suns"]["image"]["ssim"] |= {"mean": 0.4321, "std": 0.0123}
+
+    lit = another(lit, "harder", harder)
+    page_of(lit)
+    metrics = json.loads((lit / "metrics.json").read_text())
+    found = tables((lit.parent / "report.html").read_text())
+    for suns, caption in (
+        ("known_suns", "Known Suns: 2 views, 1 Sun"),
+        ("unseen_suns", "Suns never seen in training: 2 views, 1 Sun"),
+    ):
+        head, row = found[caption]
+        cells = dict(zip(head, row, strict=True))
+        for group, key, label in (("image", "ssim", "SSIM ↑"), ("shadow_mask", "error_rate", "Mask error rate ↓")):
+            value = metrics[suns][group][key]
+            assert cells[label] == f"{value['mean']:.4f} ± {value['std']:.4f}"
+    assert found["Suns never seen in training: 2 views, 1 Sun"][1][2] == "0.4321 ± 0.0123"
+
+
+def test_errors_by_grazing_angle_are_there(lit):
+    def bins(metrics):
+        metrics["by_grazing_angle"][0] |= {"pixels": 1234, "luminance_mae": 0.0625, "false_shadow": 0.5}
+
+    lit = another(lit, "bins", bins)
+    page = page_of(lit)
+    head, first, *_, last = tables((lit.parent / "report.html").read_text())["By grazing angle"]
+    assert dict(zip(head, first, strict=True)) == {
+        "Grazing angle": "0–5°",
+        "Pixels": "1,234",
+        "Luminance MAE ↓": "0.0625",
+        "Visibility MAE ↓": "–",
+        "Error rate ↓": "–",
+        "False shadow ↓": "0.5000",
+        "Missed shadow ↓": "–",
+    }
+    steep = json.loads((lit / "metrics.json").read_text())["by_grazing_angle"][-1]
+    assert last[:2] == ["40–90°", f"{steep['pixels']:,}"]
+    labels = page.values("svg", "aria-label")
+    assert [label for label in labels if "grazing" in label] == [
+        f"{name} ↓ by grazing angle" for name in ("Luminance MAE", "False shadow", "Missed shadow")
+    ]
+
+
+def test_masks_and_the_relit_view_are_the_folders(lit):
+    page = page_of(lit)
+    shown = {
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(value.partition(",")[2])))).tobytes()
+        for value in page.values("img", "src")
+    }
+    names = ("mask_truth", "mask_prediction", "visibility")
+    for index in range(4):
+        assert read_png(lit / "frames" / f"test_{index:05d}" / "mask_prediction.png").tobytes() in shown
+    assert {read_png(lit / "frames" / "test_00000" / f"{name}.png").tobytes() for name in names} <= shown
+    for path in (lit / "relight").iterdir():
+        assert read_png(path).tobytes() in shown
+    text = "".join(page.text)
+    assert "under each of these Suns" in text
+    assert "Every frame" in text
+    assert text.count("unseen") > 3
+    assert "no truth" not in text
+
+
+def test_suns_without_truth_are_said_to_have_none(lit):
+    def forget(metrics):
+        metrics["relight"]["suns"][1] |= {"truth": None, "psnr": None}
+
+    lit = another(lit, "forgotten", forget)
+    (lit / "relight" / "truth_01.png").unlink()
+    text = "".join(page_of(lit).text)
+    assert text.count("no truth") == 1
+    assert "the truth of this very view under 1 of these 2 Suns" in text
+
+
+def test_runs_with_and_without_visibility_side_by_side(lit, folder):
+    def moved(metrics):
+        metrics["run"] = "runs/lit"
+
+    lit = another(lit, "moved", moved)
+    text = "".join(page_of(lit, folder).text)
+    for title in ("One view, many Suns", "Shadow masks", "Known and unseen Suns", "By grazing angle"):
+        assert title in text
+    assert "None" not in text
+    alone = "".join(page_of(folder).text)
+    for title in ("One view, many Suns", "Shadow masks", "Known and unseen Suns"):
+        assert title not in alone
+    assert "By grazing angle" in alone
+
+
+def test_evaluations_from_before_are_still_read(folder):
+    def older(metrics):
+        for key in ("known_suns", "unseen_suns", "relight", "by_grazing_angle", *KINDS):
+            del metrics[key]
+        for frame in metrics["frames"]:
+            for key in ("known_sun", *KINDS):
+                del frame[key]
+
+    text = "".join(page_of(another(folder, "older", older)).text)
+    assert "By grazing angle" not in text
+    assert "Results" in text
 
 
 def test_nothing_from_outside(folder):
@@ -256,6 +378,25 @@ def test_histogram_bars_stand_for_counts():
     assert unit > 0
     assert heights == {"s0": [unit, 2 * unit, 0], "s1": [0, unit, 0]}
     assert 4 * unit < base
+
+
+def test_bars_stand_for_values():
+    svg = charts.bar_chart("a", "x", ["p", "q", "r"], [(0, [1.0, None, 4.0]), (7, [2.0, 3.0, 0.0])])
+    bars = re.findall(r'class="cell (s\d)" x="([\d.]+)" y="([\d.]+)" width="([\d.]+)" height="([\d.]+)"', svg)
+    heights = {"s0": [], "s1": []}
+    spans = []
+    for name, left, top, width, height in bars:
+        heights[name].append(float(height))
+        assert float(top) + float(height) == pytest.approx(charts.HEIGHT - 40, abs=0.11)
+        spans.append((float(left), float(left) + float(width)))
+    unit = heights["s0"][0]
+    assert heights["s0"] == pytest.approx([unit, 4 * unit], abs=0.2)
+    assert heights["s1"] == pytest.approx([2 * unit, 3 * unit, 0], abs=0.2)
+    assert all(one[1] <= two[0] for one, two in zip(sorted(spans), sorted(spans)[1:], strict=False))
+    assert spans == sorted(spans)
+    empty = charts.bar_chart("a", "x", ["p"], [(0, [None])])
+    assert "rect" not in empty
+    assert "nan" not in empty
 
 
 def test_ticks_are_round_and_reach_around():
