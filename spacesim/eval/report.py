@@ -59,8 +59,8 @@ def _content(runs: Sequence[Judged]) -> str:
         _section(
             "Known and unseen Suns",
             results_by_suns(runs),
-            "Views of Suns of training and of Suns never seen, apart. Over the silhouette; the mask's error rate over lit "
-            "and cast-shadow pixels.",
+            "Views of Suns of training and of Suns never seen, apart. Over the silhouette; the mask's error rate over "
+            "lit and cast-shadow pixels.",
         ),
         _section(
             "By grazing angle",
