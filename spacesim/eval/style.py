@@ -100,7 +100,7 @@ tr.group th { color: var(--muted); font-size: 0.86rem; padding-top: 1rem; }
 .hole { align-self: stretch; min-height: 5.2rem; display: grid; place-items: center; color: var(--muted);
   border: 1px dashed var(--line); border-radius: 6px; }
 .pairs { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 15rem), 1fr)); gap: 1.2rem 1.4rem; }
-.pair { display: grid; grid-template-columns: 1fr 1fr; gap: 0.35rem; break-inside: avoid; }
+.pair { display: grid; grid-template-columns: 1fr 1fr; gap: 0.35rem; align-content: start; break-inside: avoid; }
 .pair p { grid-column: span 2; margin: 0; color: var(--muted); font-size: 0.78rem; line-height: 1.4;
   font-variant-numeric: tabular-nums; }
 .pair.small img, .sweep.small img { image-rendering: pixelated; }
