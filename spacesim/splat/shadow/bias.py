@@ -1,12 +1,12 @@
 """Receiver-depth bias: how far behind a blocker a Gaussian may lie before it counts as shadowed (thesis 4.3.4)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.splat.cameras import LARGEST
+from spacesim.splat.cameras import LARGEST, Orthographic
 from spacesim.splat.gaussians import Gaussians, principal_axes
 
 
@@ -18,6 +18,10 @@ class Bias:
     alignment: Any  #: nu in [0, 1]: |n . s| of the shortest axis (4.24)
     confidence: Any  #: gamma in [0, 1]: 1 - shortest / longest axis (4.25)
     bias: Any  #: b, metres (4.26)
+
+    def at_least(self, floor: Any) -> "Bias":
+        """With b no smaller than `floor`, Float [N], metres."""
+        return replace(self, bias=dr.maximum(self.bias, floor))
 
 
 def receiver_bias(gaussians: Gaussians, sun: Any, strength: float = 10.0) -> Bias:
@@ -32,13 +36,49 @@ def receiver_bias(gaussians: Gaussians, sun: Any, strength: float = 10.0) -> Bia
     return Bias(shape.thickness, shape.alignment, shape.confidence, dr.minimum(bias, LARGEST))
 
 
+def grazing_bias(gaussians: Gaussians, camera: Orthographic, reach: float = 2.0, pixels: float = 1.0) -> Any:
+    """Float [N], metres: a bias that does not go to 0 where the Sun grazes a surface, as the thesis's b = 10 sigma^l nu
+    gamma does; for `Bias.at_least`. Ours, no part of the thesis.
+
+    A flat surface that passes through a receiver differs from it in light depth, within what one light pixel blends:
+    by `reach` sigma^l, the distance along the light to neighbours whose footprints still cover the receiver's centre,
+    and by the slope across `pixels` light pixels, gamma (|n_x / n_z| / f_x + |n_y / n_z| / f_y) in light axes, which
+    is held within `reach` times the Gaussian's longest axis. So a shadow that touches its caster recedes along the
+    light by at most 2 `reach` standard deviations of the receiver, however low the Sun.
+    camera: the light camera;  reach, pixels: chosen by measurement (docs/shadows.md). May be part of a recording.
+    """
+    shape = _Shape.of(gaussians, -camera.row(2))
+    x, y, z = (dr.abs(dr.dot(camera.row(i), shape.normal)) for i in range(3))
+    slope = (x * dr.rcp(camera[12]) + y * dr.rcp(camera[13])) * dr.rcp(dr.maximum(z, 1e-6))
+    across = dr.minimum(pixels * slope, reach * shape.longest)
+    return dr.minimum(dr.fma(reach, shape.thickness, shape.confidence * across), LARGEST)
+
+
+def lifted(gaussians: Gaussians, sun: Any, thickness: float = 3.0, width: float = 0.2) -> Any:
+    """Array3f [3, N], world, metres: where to test each Gaussian instead of at its centre, so that a surface that the
+    Sun grazes does not shadow itself (Holbert 2011, normal offset). Ours, no part of the thesis.
+
+    Points are moved along the shortest axis, to the Sun's side, by gamma (thickness sigma_min + width sigma_max): out
+    of the layer of Gaussians that a surface is, the second term for neighbours that are tilted or displaced. At
+    grazing Suns such a layer is deep along the light, however thin it is. Shadows move by that height at most.
+    thickness, width: chosen by measurement (docs/shadows.md). A Gaussian that is not finite stays where it is.
+    """
+    shape = _Shape.of(gaussians, sun)
+    height = shape.confidence * dr.fma(thickness, shape.shortest, width * shape.longest)
+    towards = dr.select(dr.dot(shape.normal, sun) < 0, -height, height)
+    return dr.detach(gaussians.means) + towards * shape.normal
+
+
 @dataclass
 class _Shape:
-    """A Gaussian as the Sun sees it, Floats [N]."""
+    """A Gaussian as the Sun sees it, [N]; zeros where it is not finite."""
 
     thickness: Any  #: standard deviation along the sunlight, metres
     alignment: Any  #: |n . s|
     confidence: Any  #: 1 - shortest / longest
+    longest: Any  #: largest standard deviation, metres
+    shortest: Any  #: least one, metres
+    normal: Any  #: Array3f, world axes: the shortest axis
 
     @staticmethod
     def of(gaussians: Gaussians, sun: Any) -> "_Shape":
@@ -51,10 +91,14 @@ class _Shape:
         columns = principal_axes(quaternions)  # 4.20
         local = ad.Array3f([dr.dot(column, sun) for column in columns])  # 4.21
         first = (scales[0] <= scales[1]) & (scales[0] <= scales[2])
-        alignment = dr.select(first, local[0], dr.select(scales[1] <= scales[2], local[1], local[2]))  # 4.23
-        ratio = dr.min(scales) * dr.rcp(dr.maximum(dr.max(scales), 1e-30))
+        normal = dr.select(first, columns[0], dr.select(scales[1] <= scales[2], columns[1], columns[2]))  # 4.23
+        longest = dr.max(scales)
+        ratio = dr.min(scales) * dr.rcp(dr.maximum(longest, 1e-30))
         return _Shape(
             thickness=dr.norm(scales * local),
-            alignment=dr.select(sane, dr.minimum(dr.abs(alignment), 1), 0),
+            alignment=dr.select(sane, dr.minimum(dr.abs(dr.dot(normal, sun)), 1), 0),
             confidence=dr.select(sane, dr.clip(1 - ratio, 0, 1), 0),
+            longest=longest,
+            shortest=dr.min(scales),
+            normal=normal,
         )

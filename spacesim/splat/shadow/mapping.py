@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, recorded
+from spacesim.data.errors import InputError
 from spacesim.splat.cameras import Orthographic
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import Footprints, Splats, project
@@ -45,14 +46,14 @@ class MappingConfig:
 
     def __post_init__(self) -> None:
         if self.filter not in FILTERS:
-            raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, found {self.filter!r}")
+            raise InputError(f"filter: expected one of {', '.join(FILTERS)}, found {self.filter!r}")
         for name in ("radius", "widest"):
             if not 0.5 <= getattr(self, name) <= LARGEST_WINDOW:
-                raise ValueError(f"{name}: expected 0.5 to {LARGEST_WINDOW} pixels, found {getattr(self, name)}")
+                raise InputError(f"{name}: expected 0.5 to {LARGEST_WINDOW} pixels, found {getattr(self, name)}")
         if not 0 <= self.sun_radius_deg < 45:
-            raise ValueError(f"sun_radius_deg: expected 0 to 45 degrees, found {self.sun_radius_deg}")
+            raise InputError(f"sun_radius_deg: expected 0 to 45 degrees, found {self.sun_radius_deg}")
         if not 0 <= self.bleeding < 1:
-            raise ValueError(f"bleeding: expected a share from 0 to below 1, found {self.bleeding}")
+            raise InputError(f"bleeding: expected a share from 0 to below 1, found {self.bleeding}")
 
 
 @dataclass
@@ -70,12 +71,18 @@ class LightMap:
 
 
 def occlusion_by_mapping(
-    gaussians: Gaussians, camera: Orthographic, bias: Any, softness: float, config: MappingConfig | None = None
+    gaussians: Gaussians,
+    camera: Orthographic,
+    bias: Any,
+    softness: float,
+    config: MappingConfig | None = None,
+    points: Any = None,
 ) -> Any:
     """Float [N] in [0, 1]: raw occlusion by the depth test (thesis 4.4 to 4.6), 0 = sees the Sun. Detached.
 
     camera: of `sunlight.fit_camera`;  bias: Float [N], metres (4.26; zeros for none);  softness: epsilon_s, metres
-    A Gaussian whose centre is outside of the image, that cannot be drawn, or around whose centre the image is empty
+    points: Array3f [3, N], world, metres: where each Gaussian is tested, if not at its centre (`bias.lifted`)
+    A Gaussian whose point is outside of the image, that cannot be drawn, or around whose point the image is empty
     counts as lit. Raises ValueError for a softness that is not positive.
     """
     config = config or MappingConfig()
@@ -83,9 +90,10 @@ def occlusion_by_mapping(
         raise ValueError(f"softness: expected a positive number of metres, found {softness}")
     if gaussians.count == 0:
         return dr.zeros(ad.Float, 0)
-    splats, footprints, light = light_map(gaussians, camera, squares=config.filter == "variance")
+    _, footprints, light = light_map(gaussians, camera, squares=config.filter == "variance")
+    points = dr.detach(gaussians.means if points is None else points)
     softness = dr.opaque(ad.Float, max(softness, 1e-20))
-    return _look_up(splats, footprints.visible, dr.detach(bias), light, camera.values, softness, config)
+    return _look_up(points, footprints.visible, dr.detach(bias), light, camera, softness, config)
 
 
 def light_map(gaussians: Gaussians, camera: Orthographic, squares: bool = False) -> tuple[Splats, Footprints, LightMap]:
@@ -108,12 +116,20 @@ def _trace_prepare(
 
 
 def _trace_look_up(
-    splats: Splats, visible: Any, bias: Any, light: LightMap, camera: Any, softness: Any, config: MappingConfig
+    points: Any,
+    visible: Any,
+    bias: Any,
+    light: LightMap,
+    camera: Orthographic,
+    softness: Any,
+    config: MappingConfig,
 ) -> Any:
-    x, y = splats.x, splats.y
-    seen = visible & (x >= 0) & (x < light.width) & (y >= 0) & (y < light.height)
+    center = camera.transform(points)
+    screen = camera.screen(center)
+    x, y = screen.x, screen.y
+    seen = visible & camera.in_reach(center) & (x >= 0) & (x < light.width) & (y >= 0) & (y < light.height)
     window = _Window(dr.select(seen, x, 0), dr.select(seen, y, 0), light, seen)
-    depth = splats.depth - dr.select(dr.isfinite(bias), bias, 0)
+    depth = dr.select(seen, center.z - dr.select(dr.isfinite(bias), bias, 0), 0)
     if config.filter == "bilinear":
         occlusion = _interpolated(window, depth, softness)
     elif config.filter == "variance":
@@ -135,7 +151,9 @@ def _interpolated(window: "_Window", depth: Any, softness: Any) -> Any:
     return dr.select(known, _shadowed(sums * dr.rcp(dr.select(known, share, 1)) - depth, softness), 0)
 
 
-def _percentage_closer(window: "_Window", depth: Any, softness: Any, camera: Any, config: MappingConfig) -> Any:
+def _percentage_closer(
+    window: "_Window", depth: Any, softness: Any, camera: Orthographic, config: MappingConfig
+) -> Any:
     """Every pixel's own test, averaged over the window; what is uncovered lets light pass."""
 
     def terms(alpha: Any, pixel: Any, active: Any) -> list[Any]:
@@ -151,9 +169,7 @@ def _percentage_closer(window: "_Window", depth: Any, softness: Any, camera: Any
         some = blocked > 1e-6
         gap = dr.maximum(dr.select(some, gaps * dr.rcp(dr.select(some, blocked, 1)), 0), 0)
         penumbra = gap * math.tan(math.radians(config.sun_radius_deg))  # metres, half its width
-        half_x, half_y = (
-            dr.clip(penumbra * dr.gather(ad.Float, camera, ad.UInt32(i)), config.radius, widest) for i in (12, 13)
-        )
+        half_x, half_y = (dr.clip(penumbra * camera[i], config.radius, widest) for i in (12, 13))
     blocked, _ = window.sums(half_x, half_y, widest, terms)
     return dr.clip(blocked * dr.rcp(4 * half_x * half_y), 0, 1)
 
