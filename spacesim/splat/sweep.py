@@ -188,7 +188,7 @@ def _sheet(run: Run, camera: Camera, suns: Sequence[Sun], kind: str, tiles: Sequ
 
 def _degrees(angle: float) -> str:
     """At most one decimal, and none where it is 0."""
-    return f"{round(angle, 1) + 0.0:g}°".replace("-", "\u2212")
+    return f"{round(angle, 1) + 0.0:g}°"
 
 
 class _Film:
