@@ -270,6 +270,23 @@ def test_hostile_names_are_escaped(folder):
         assert attack in "".join(page.text)
 
 
+def test_hostile_views_are_escaped(lit):
+    attack = '"><script>alert(1)</script><b onclick="x">'
+
+    def spoil(metrics):
+        metrics["run"] = attack
+        metrics["relight"]["view"] = attack
+        for frame in metrics["frames"]:
+            frame["file_path"] = attack
+
+    hostile = another(lit, "hostile", spoil)
+    for folders in ((hostile,), (hostile, lit)):
+        page = page_of(*folders)
+        assert "script" not in page.tags
+        assert not any(name.startswith("on") for _, name, _ in page.attributes)
+        assert attack in "".join(page.text)
+
+
 def test_folders_cannot_be_left(folder):
     def climb(metrics):
         metrics["frames"][0]["name"] = "../../data"
