@@ -7,6 +7,7 @@ from spacesim.backend import ad
 from spacesim.data.geometry import direction_from_angles, rotation_from_quaternion
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import project
+from spacesim.splat.shadow.bias import receiver_bias
 from spacesim.splat.shadow.clusters import (
     Supports,
     assign,
@@ -15,7 +16,8 @@ from spacesim.splat.shadow.clusters import (
     light_supports,
     occlusion_in_clusters,
 )
-from spacesim.splat.shadow.sunlight import fit_camera, light_axes, light_rows
+from spacesim.splat.shadow.mapping import occlusion_by_mapping
+from spacesim.splat.shadow.sunlight import fit_camera, light_axes, light_rows, towards_sun
 
 SIZE = 102  # 100 pixels and the margins
 SUN = direction_from_angles(40, 35)
@@ -315,3 +317,72 @@ def test_same_bits_twice():
         found = occlusion_in_clusters(gaussians, SUN, SIZE, 30.0, recorder)
         pairs.append([np.array(found), *(np.array(camera.values) for camera in recorder.cameras)])
     assert all(np.array_equal(a, b) for a, b in zip(*pairs, strict=True))
+
+
+# Shadows.
+
+
+def by_mapping(gaussians, camera):
+    return occlusion_by_mapping(gaussians, camera, receiver_bias(gaussians, towards_sun(light_rows(SUN))).bias, 0.01)
+
+
+def shadows(arrays, occlude, size=128, least_scale=40.0):
+    return np.array(occlusion_in_clusters(Gaussians.from_numpy(arrays), SUN, size, least_scale, occlude))
+
+
+def moved(arrays, offset):
+    return arrays | {"means": arrays["means"] + offset}
+
+
+def grid_blob(count, seed):
+    """A blob whose means, moved by whole metres, stay what they are in single precision."""
+    arrays = blob(count, (0, 0, 0), seed=seed)
+    return arrays | {"means": np.round(4096 * arrays["means"]) / 4096}
+
+
+METHODS = [(by_mapping, 0.02)]
+
+
+@pytest.mark.parametrize(("occlude", "tolerance"), METHODS)
+def test_two_models_a_kilometre_apart_have_the_shadows_of_each_alone(occlude, tolerance):
+    one, other, offset = grid_blob(600, 1), grid_blob(400, 2), np.array([1024, 256, -512])
+    together = join(one, moved(other, offset))
+    found = shadows(together, occlude)
+    alone = np.concatenate([shadows(one, occlude), shadows(other, occlude)])
+    assert alone.std() > 0.3  # there are shadows to keep
+    np.testing.assert_allclose(found, alone, atol=tolerance)
+    gaussians = Gaussians.from_numpy(together)
+    single = np.array(occlude(gaussians, fit_camera(gaussians, light_rows(SUN), 128)))
+    assert np.abs(single - alone).mean() > 0.2  # which one camera for both would not
+
+
+@pytest.mark.parametrize(("occlude", "tolerance"), METHODS)
+def test_scattered_models_have_the_shadows_of_each_alone(occlude, tolerance):
+    models = [grid_blob(150 + 10 * k, k) for k in range(5)]
+    offsets = np.array([[0, 0, 0], [100, 0, 7], [-80, 64, 0], [16, -120, 40], [33, 90, -50]])
+    found = shadows(join(*(moved(model, offset) for model, offset in zip(models, offsets, strict=True))), occlude)
+    np.testing.assert_allclose(found, np.concatenate([shadows(model, occlude) for model in models]), atol=tolerance)
+
+
+@pytest.mark.parametrize(("occlude", "tolerance"), METHODS)
+def test_a_shield_far_towards_the_sun_shades_the_model_behind_it_alone(occlude, tolerance):
+    one, other = grid_blob(600, 1), moved(grid_blob(300, 2), np.array([64, 0, 0]))
+    rng = np.random.default_rng(9)
+    x, y, _ = light_axes(SUN).T
+    spots = rng.uniform(-1.2, 1.2, (3000, 2))
+    shield = blob(3000, (0, 0, 0), sigma=0.05)
+    shield["means"] = spots @ [x, y] + np.array([64, 0, 0]) + 300 * SUN
+    found, without = shadows(join(one, other, shield), occlude), shadows(join(one, other), occlude)
+    assert found[600:900].min() > 0.95
+    assert without[600:900].mean() < 0.8
+    np.testing.assert_allclose(found[:600], without[:600], atol=tolerance)
+
+
+@pytest.mark.parametrize(("occlude", "tolerance"), METHODS)
+def test_shadows_in_clusters_repeat_to_the_bit_and_know_no_order(occlude, tolerance):
+    arrays = join(grid_blob(300, 1), moved(grid_blob(200, 2), np.array([64, 0, 0])))
+    first = shadows(arrays, occlude)
+    assert np.array_equal(first, shadows(arrays, occlude))
+    order = np.random.default_rng(3).permutation(500)
+    again = shadows({name: value[order] for name, value in arrays.items()}, occlude)
+    np.testing.assert_allclose(again, first[order], atol=0.1 * tolerance)
