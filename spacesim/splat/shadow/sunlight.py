@@ -67,21 +67,26 @@ def fit_camera(gaussians: Gaussians, light: Any, size: int) -> Orthographic:
     )
     drawn = _drawn(means, log_scales, quaternions, logits)
     means, log_scales = dr.select(drawn, means, ad.Array3f(0)), dr.select(drawn, log_scales, ad.Array3f(0))
-    share = dr.rcp(dr.maximum(dr.sum(dr.select(drawn, ad.Float(1), 0)), 1))
+    counted = dr.select(drawn, ad.Float(1), 0)
+    dr.eval(means, counted)  # here and below: one kernel for what several reductions read
+    share = dr.rcp(dr.maximum(dr.sum(counted), 1))
     middle = ad.Array3f([dr.sum(means[i]) * share for i in range(3)])
-    offset = dr.select(drawn, means - middle, ad.Array3f(0))
-    columns, scales = principal_axes(quaternions), dr.exp(log_scales)
-    bounds = []
+    offset, columns, scales = means - middle, principal_axes(quaternions), dr.exp(log_scales)
+    extents = []
     for i in range(2):
         axis = _axis(light, i)
         across = dr.dot(axis, offset)
         spread2 = dr.squared_norm(ad.Array3f([dr.dot(axis, columns[k]) * scales[k] for k in range(3)]))  # 4.30
         support = SUPPORT * dr.sqrt(spread2)  # 4.31
-        limit = REACH * dr.sqrt(dr.sum(dr.select(drawn, across * across + spread2, 0)) * share)
-        low = dr.maximum(dr.min(dr.select(drawn, across - support, LARGEST)), -limit)
-        high = dr.minimum(dr.max(dr.select(drawn, across + support, -LARGEST)), limit)
-        some = low < high
-        bounds.append((dr.select(some, low, -0.5), dr.select(some, high, 0.5)))
+        low, high = dr.select(drawn, across - support, LARGEST), dr.select(drawn, across + support, -LARGEST)
+        extents.append((low, high, counted * dr.fma(across, across, spread2)))
+    dr.eval(extents)
+    bounds = []
+    for low, high, square in extents:
+        limit = REACH * dr.sqrt(dr.sum(square) * share)
+        lowest, highest = dr.maximum(dr.min(low), -limit), dr.minimum(dr.max(high), limit)  # 4.32
+        some = lowest < highest
+        bounds.append((dr.select(some, lowest, -0.5), dr.select(some, highest, 0.5)))
     return _camera(light, middle, bounds, size)
 
 
@@ -112,5 +117,8 @@ def _camera(light: Any, middle: Any, bounds: list[tuple[Any, Any]], size: int) -
     for i in range(3):
         axis = _axis(light, i)
         numbers += [*axis, -dr.dot(axis, middle)]
-    zero = ad.Float(0)
-    return Orthographic(dr.concat([*numbers, *scales, *principal, zero, zero]), size, size)
+    numbers += [*scales, *principal, ad.Float(0), ad.Float(0)]
+    place, values = dr.arange(ad.UInt32, len(numbers)), ad.Float(0)
+    for i, number in enumerate(numbers):  # eighteen lanes pick their own: one kernel, where dr.concat is eighteen
+        values = dr.select(place == i, number, values)
+    return Orthographic(values, size, size)

@@ -5,11 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from splats import random_splats
 
-from spacesim.data.geometry import fibonacci_sphere, quaternion_from_rotation
+from spacesim.backend import ad
+from spacesim.data.geometry import fibonacci_sphere, look_at, quaternion_from_rotation
+from spacesim.splat.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.shadow.bias import receiver_bias
+from spacesim.splat.shadow.bias import grazing_bias, lifted, receiver_bias
 from spacesim.splat.shadow.reference import reference_bias
-from spacesim.splat.shadow.sunlight import light_rows, towards_sun
+from spacesim.splat.shadow.sunlight import fit_camera, light_rows, towards_sun
 
 NAMES = ("thickness", "alignment", "confidence", "bias")
 
@@ -65,6 +67,39 @@ def test_turns_with_the_scene():
         assert biases(turned, turn.apply(sun))[name] == pytest.approx(biases(arrays, sun)[name], rel=1e-3, abs=1e-5)
 
 
+@pytest.mark.parametrize("sun", [[0, 0, 1], [0, 0, -1], [0.8, 0, 0.6], [-0.8, 0, -0.6]], ids=str)
+def test_lifted_by_hand(sun):
+    """Along the disc's normal, to the Sun's side; a ball has no normal and stays."""
+    arrays = {name: np.concatenate([disc()[name], disc(flatness=1.0)[name]]) for name in disc()}
+    points = np.array(lifted(Gaussians.from_numpy(arrays), towards_sun(light_rows(sun)), 3.0, 0.25)).T
+    height = 0.99 * (3 * 0.002 + 0.25 * 0.2)
+    assert points[0] == pytest.approx([0, 0, np.sign(sun[2]) * height], abs=1e-6)
+    assert points[1] == pytest.approx([0, 0, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize("azimuth", [0, 90])
+@pytest.mark.parametrize("elevation", [90, 45, 10, 1, 0])
+def test_grazing_bias_by_hand(elevation, azimuth):
+    """The disc's extent along the light, and its slope over one pixel of 4 mm x 8 mm, bounded by its width."""
+    a, b = np.radians(elevation), np.radians(azimuth)
+    sun = np.array([np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)])
+    pose = look_at(sun, [0, 0, 0], up=[0, 0, 1] if elevation < 90 else [1, 0, 0])
+    camera = Orthographic.of(OrthographicCamera(pose, 8, 8, 1 / 0.004, 1 / 0.008, 4, 4))
+    found = np.array(grazing_bias(Gaussians.from_numpy(disc()), camera, 2.0, 1.0))
+    thickness = np.hypot(0.2 * np.cos(a), 0.002 * np.sin(a))
+    # seen from the Sun the plate's depth changes upwards in the picture alone, where pixels are 8 mm high
+    slope = 0.008 / np.tan(a) if elevation else np.inf
+    assert found[0] == pytest.approx(2 * thickness + 0.99 * min(slope, 2 * 0.2), rel=1e-4, abs=1e-6)
+
+
+def test_no_bias_is_below_its_floor():
+    bias = receiver_bias(Gaussians.from_numpy(random_splats(9)), towards_sun(light_rows([0, 0, 1])))
+    floor = ad.Float(np.linspace(0, 1, 9))
+    raised = bias.at_least(floor)
+    assert np.array(raised.bias) == pytest.approx(np.maximum(np.array(bias.bias), np.linspace(0, 1, 9)))
+    assert raised.thickness is bias.thickness
+
+
 def test_hostile_gaussians_get_none():
     arrays = random_splats(8, seed=3)
     arrays["log_scales"][0, 1] = np.nan
@@ -77,3 +112,7 @@ def test_hostile_gaussians_get_none():
     for name in NAMES:
         assert np.all(np.isfinite(found[name]))
         assert np.all(found[name][:5] == 0), name
+    gaussians = Gaussians.from_numpy(arrays)
+    camera = fit_camera(gaussians, light_rows([0, 0, 1]), 16)
+    assert np.all(np.isfinite(np.array(grazing_bias(gaussians, camera))))
+    assert np.all(np.isfinite(np.array(lifted(gaussians, towards_sun(light_rows([0, 0, 1]))))))
