@@ -20,8 +20,10 @@ def occlusion_reference(
     bias: np.ndarray,
     beta_min: float = 0.05,
     antialiased: bool = False,
+    points: np.ndarray | None = None,
 ) -> np.ndarray:
-    """[N] float64 in [0, 1]: `occlusion_by_splatting` of `Gaussians.to_numpy()`-like arrays; bias [N] metres."""
+    """[N] float64 in [0, 1]: `occlusion_by_splatting` of `Gaussians.to_numpy()`-like arrays; bias [N] metres;
+    points [N, 3] where the receivers are, if not at the means."""
     arrays = {name: np.asarray(value, dtype=np.float64) for name, value in gaussians.items() if name != "sh"}
     R, t = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
     centers = arrays["means"] @ R.T + t
@@ -30,9 +32,12 @@ def occlusion_reference(
     opacity = opacity / (1 + np.exp(-arrays["logit_opacities"]))
     alpha = np.minimum(opacity[:, None] * falloff, ALPHA_MAX)
     passed = np.log1p(-np.where(alpha >= ALPHA_MIN, alpha, 0))  # [N, P], ln(1 - alpha)
+    received = centers if points is None else points @ R.T + t
+    if points is not None:
+        falloff, _ = _footprints(arrays, received, R, camera)
     beta = np.where(falloff >= beta_min, falloff, 0)
     occlusion = np.zeros(len(centers))
-    for i, depth in enumerate(centers[:, 2]):
+    for i, depth in enumerate(received[:, 2]):
         before = depth - centers[:, 2] - bias[i] > 0
         if beta[i].any():
             occlusion[i] = (beta[i] * -np.expm1(passed[before].sum(axis=0))).sum() / beta[i].sum()

@@ -8,7 +8,7 @@ a second pass adds up each receiver's slots in order: the same input gives the s
 The adjoint is by hand: it replays the lists from their ends, as `rasterize.backward` does.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import drjit as dr
@@ -34,7 +34,9 @@ BETA_MIN = 0.05  #: a receiver's footprint ends there: 95 % of its weight on 54 
 _RECEIVER = ALPHA_MIN / BETA_MIN  # opacity with which a receiver stands in the lists
 
 
-def occlusion_by_splatting(gaussians: Gaussians, camera: Orthographic, bias: Any, antialiased: bool = False) -> Any:
+def occlusion_by_splatting(
+    gaussians: Gaussians, camera: Orthographic, bias: Any, points: Any = None, antialiased: bool = False
+) -> Any:
     """Float [N] in [0, 1], detached: the share of sunlight that is blocked before it reaches each Gaussian.
 
     For receiver i, the mean over the pixels of its footprint of 1 - T_i, weighted by beta_i (4.7, 4.9, 4.10), with T_i
@@ -43,17 +45,21 @@ def occlusion_by_splatting(gaussians: Gaussians, camera: Orthographic, bias: Any
 
     camera: looks from the Sun at the scene
     bias: Float [N] metres, of each receiver, or one for all; below 0, from 1e9 on or not a number counts as 0
+    points: Array3f [3, N], world, metres: where each Gaussian is tested, if not at its centre (`bias.lifted`)
     antialiased: blockers thinner than a pixel of the light image fade, see `project`
     0 for what cannot be projected and where no pixel of a footprint is inside of the image. Raises ValueError for a
     bias of another length, WorkError where memory is short.
     """
     rows = [dr.detach(row) for row in _rows(gaussians)]
-    return differentiable_occlusion(Gaussians.from_rows(rows), camera, bias, antialiased)
+    return differentiable_occlusion(Gaussians.from_rows(rows), camera, bias, points, antialiased)
 
 
-def differentiable_occlusion(gaussians: Gaussians, camera: Orthographic, bias: Any, antialiased: bool = False) -> Any:
+def differentiable_occlusion(
+    gaussians: Gaussians, camera: Orthographic, bias: Any, points: Any = None, antialiased: bool = False
+) -> Any:
     """`occlusion_by_splatting` with gradients (reverse mode) by means, log scales, quaternions and opacities, of the
-    blockers' alpha and the receivers' beta. Who is before whom, and the bias, are taken as given."""
+    blockers' alpha and the receivers' beta. Who is before whom, the bias, and by how much `points` are off the centres
+    are taken as given."""
     count = gaussians.count
     if dr.width(bias) not in (1, count):
         raise ValueError(f"bias: expected {count} numbers or one, found {dr.width(bias)}")
@@ -61,10 +67,11 @@ def differentiable_occlusion(gaussians: Gaussians, camera: Orthographic, bias: A
         return dr.zeros(ad.Float, 0)
     bias = dr.detach(bias) + dr.zeros(ad.Float, count)
     dr.make_opaque(bias)
-    rows = _rows(gaussians)
+    rows, away = _rows(gaussians), None if points is None else dr.detach(points) - dr.detach(gaussians.means)
     prepare = _trace_prepare if dr.grad_enabled(rows) else _prepare
-    splats, blockers, receivers = prepare(rows, camera, bias, antialiased)
-    return dr.custom(_Occlusion, splats, blockers, receivers, (camera.width, camera.height))
+    blockers, receivers, blocker_boxes, receiver_boxes = prepare(rows, away, camera, bias, antialiased)
+    size = camera.width, camera.height
+    return dr.custom(_Occlusion, blockers, receivers, blocker_boxes, receiver_boxes, size)
 
 
 def _rows(gaussians: Gaussians) -> list[Any]:
@@ -73,28 +80,39 @@ def _rows(gaussians: Gaussians) -> list[Any]:
 
 
 def _trace_prepare(
-    rows: list[Any], camera: Orthographic, bias: Any, antialiased: bool
-) -> tuple[Splats, Footprints, Footprints]:
-    """(splats, their footprints as blockers, as receivers), [N], of the Gaussians with these `_rows`.
+    rows: list[Any], away: Any, camera: Orthographic, bias: Any, antialiased: bool
+) -> tuple[Splats, Splats, Footprints, Footprints]:
+    """(splats of the blockers, of the receivers, footprints of both), [N], of the Gaussians with these `_rows`.
 
-    A receiver's opacity is such that the cut at ALPHA_MIN falls where beta is BETA_MIN.
+    away: Array3f [3, N], metres, from the centres to where the receivers are, or None. Their opacity is such that the
+    cut at ALPHA_MIN falls where beta is BETA_MIN.
     """
-    *geometry, logit = rows
-    splats, blockers = project(Gaussians.from_rows(rows), camera, antialiased)
-    usual = dr.log(ad.Float(_RECEIVER / (1 - _RECEIVER)))
-    logit = dr.select(dr.abs(logit) < LARGEST, usual, logit)
-    _, receivers = project(Gaussians.from_rows([dr.detach(row) for row in (*geometry, logit)]), camera)
-    means = ad.Array3f([dr.detach(row) for row in geometry[:3]])
-    means = dr.select(dr.max(dr.abs(means)) < LARGEST, means, ad.Array3f(0))
-    depth = dr.detach(dr.dot(camera.row(2), means))
-    depth = dr.select(depth == 0, 0, depth)  # of both signs: equal depths are equal keys
-    blockers.order = _sortable(depth)
-    receivers.order = _sortable(depth - dr.select((bias > 0) & (bias < LARGEST), bias, 0))
-    return splats, blockers, receivers
+    blockers, blocker_boxes = project(Gaussians.from_rows(rows), camera, antialiased)
+    means, shape, logit = ad.Array3f(rows[:3]), rows[3:10], rows[10]
+    blocker_boxes.order = _sortable(_depth(means, camera))
+    if away is not None:
+        means += away
+    logit = dr.detach(dr.select(dr.abs(logit) < LARGEST, dr.log(ad.Float(_RECEIVER / (1 - _RECEIVER))), logit))
+    receivers, receiver_boxes = project(Gaussians.from_rows([*means, *shape, logit]), camera)
+    bias = dr.select((bias > 0) & (bias < LARGEST), bias, 0)
+    receiver_boxes.order = _sortable(_depth(means, camera) - bias)
+    return blockers, receivers, blocker_boxes, receiver_boxes
+
+
+def _depth(means: Any, camera: Orthographic) -> Any:
+    """Light depths [N], metres, without the camera's own distance, for sorting: detached, finite, 0 of one sign."""
+    means = dr.detach(means)
+    depth = dr.dot(camera.row(2), dr.select(dr.max(dr.abs(means)) < LARGEST, means, ad.Array3f(0)))
+    return dr.select(depth == 0, 0, depth)
 
 
 def _trace_events(
-    splats: Splats, blockers: Footprints, receivers: Footprints, count: Any, capacity: int
+    blockers: Splats,
+    receivers: Splats,
+    blocker_boxes: Footprints,
+    receiver_boxes: Footprints,
+    count: Any,
+    capacity: int,
 ) -> tuple[Splats, Footprints]:
     """Events [2 capacity]: receivers, then blockers, of `count` Gaussians; the rest are invisible.
 
@@ -106,22 +124,16 @@ def _trace_events(
     index = dr.select(receives, event, event - capacity)
     live = index < count
 
-    def both(array_type: Any, of_receivers: Any, of_blockers: Any) -> Any:
-        receiver = dr.gather(array_type, of_receivers, index, live & receives)
-        return dr.select(receives, receiver, dr.gather(array_type, of_blockers, index, live & ~receives))
+    def joined(of_receivers: Any, of_blockers: Any) -> Any:
+        receiver = dr.gather(type(of_receivers), of_receivers, index, live & receives)
+        return dr.select(receives, receiver, dr.gather(type(of_blockers), of_blockers, index, live & ~receives))
 
-    x, y, a, b, c, opacity, depth = (
-        dr.gather(ad.Float, v, index, live)
-        for v in (splats.x, splats.y, splats.a, splats.b, splats.c, splats.opacity, splats.depth)
+    events = Splats(**{f.name: joined(getattr(receivers, f.name), getattr(blockers, f.name)) for f in fields(Splats)})
+    boxes = Footprints(
+        **{f.name: joined(getattr(receiver_boxes, f.name), getattr(blocker_boxes, f.name)) for f in fields(Footprints)}
     )
-    events = Splats(x, y, a, b, c, dr.select(receives, _RECEIVER, opacity), depth)
-    footprints = Footprints(
-        half_width=both(ad.Float, receivers.half_width, blockers.half_width),
-        half_height=both(ad.Float, receivers.half_height, blockers.half_height),
-        visible=live & both(ad.Bool, receivers.visible, blockers.visible),
-        order=both(ad.UInt32, receivers.order, blockers.order),
-    )
-    return events, footprints
+    boxes.visible &= live
+    return events, boxes
 
 
 @dataclass
@@ -271,34 +283,40 @@ def _trace_replay(
 class _Occlusion(dr.CustomOp):
     """From splats [N] to occlusions [N], as one node of Dr.Jit's graph. Differentiable in reverse mode."""
 
-    def eval(self, splats: Splats, blockers: Footprints, receivers: Footprints, image_size: tuple[int, int]) -> Any:
+    def eval(
+        self,
+        blockers: Splats,
+        receivers: Splats,
+        blocker_boxes: Footprints,
+        receiver_boxes: Footprints,
+        image_size: tuple[int, int],
+    ) -> Any:
         # Sizes in arrays: dr.freeze (1.5) takes one number for another where both have occurred among the arguments.
         self.size = dr.opaque(ad.UInt32, image_size[0]), dr.opaque(ad.UInt32, image_size[1])
-        self.count = dr.width(splats.x)
-        capacity = room(self.count)
-        arguments = dr.detach(splats), blockers, receivers, dr.opaque(ad.UInt32, self.count), capacity
-        self.events, footprints = _events(*arguments)
-        self.lists = bin_splats(self.events, footprints, *image_size)
+        self.count = dr.width(blockers.x)
+        splats = dr.detach(blockers), dr.detach(receivers)
+        count = dr.opaque(ad.UInt32, self.count)
+        self.events, boxes = _events(*splats, blocker_boxes, receiver_boxes, count, room(self.count))
+        self.lists = bin_splats(self.events, boxes, *image_size)
         if self.lists.capacity == 0:
             return dr.opaque(ad.Float, 0, self.count)
         self.walked = _walk(self.events, self.lists, self.size)
         return dr.gather(ad.Float, self.walked.occlusion, dr.arange(ad.UInt32, self.count))
 
     def backward(self) -> None:
-        index, none = dr.arange(ad.UInt32, self.count), dr.opaque(ad.Float, 0, self.count)
-        if self.lists.capacity == 0:
-            self.set_grad_in("splats", Splats(*[none] * 7))
-            return
-        capacity = dr.width(self.events.x) // 2
-        receiver = dr.arange(ad.UInt32, capacity)
-        padded = dr.gather(ad.Float, self.grad_out(), receiver, receiver < dr.opaque(ad.UInt32, self.count))
-        by_event = _replay(self.events, self.walked, self.lists, self.size, padded)
-        x, y, a, b, c = (
-            dr.gather(ad.Float, v, index) + dr.gather(ad.Float, v, index + capacity)
-            for v in (by_event.x, by_event.y, by_event.a, by_event.b, by_event.c)
-        )
-        opacity = dr.gather(ad.Float, by_event.opacity, index + capacity)
-        self.set_grad_in("splats", Splats(x, y, a, b, c, opacity, none))
+        index, capacity = dr.arange(ad.UInt32, self.count), dr.width(self.events.x) // 2
+        none = dr.opaque(ad.Float, 0, self.count)
+        by_event = Splats(*[dr.opaque(ad.Float, 0, 2 * capacity)] * 7)
+        if self.lists.capacity > 0:
+            receiver = dr.arange(ad.UInt32, capacity)
+            padded = dr.gather(ad.Float, self.grad_out(), receiver, receiver < dr.opaque(ad.UInt32, self.count))
+            by_event = _replay(self.events, self.walked, self.lists, self.size, padded)
+        for name, first in (("receivers", 0), ("blockers", capacity)):
+            x, y, a, b, c, opacity = (
+                dr.gather(ad.Float, value, index + first)
+                for value in (by_event.x, by_event.y, by_event.a, by_event.b, by_event.c, by_event.opacity)
+            )
+            self.set_grad_in(name, Splats(x, y, a, b, c, opacity, none))
 
     def name(self) -> str:
         return "occlusion by splatting"

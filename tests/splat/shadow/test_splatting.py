@@ -29,9 +29,10 @@ def overhead(width: int = 64, height: int = 64) -> OrthographicCamera:
     return OrthographicCamera(DOWN, width, height, PIXELS, PIXELS, width / 2, height / 2)
 
 
-def occlusion(arrays, camera, bias=0.0, antialiased=False) -> np.ndarray:
+def occlusion(arrays, camera, bias=0.0, antialiased=False, points=None) -> np.ndarray:
     numbers = ad.Float(np.broadcast_to(np.float32(bias), len(arrays["means"])).copy())
-    result = occlusion_by_splatting(Gaussians.from_numpy(arrays), Orthographic.of(camera), numbers, antialiased)
+    points = None if points is None else ad.Array3f(points.T.astype(np.float32))
+    result = occlusion_by_splatting(Gaussians.from_numpy(arrays), Orthographic.of(camera), numbers, points, antialiased)
     return np.array(result)
 
 
@@ -68,6 +69,15 @@ def test_occlusion_matches_the_twin(count, size, antialiased):
     twin = occlusion_reference(arrays, view, bias, BETA_MIN, antialiased)
     assert count < 60 or (twin.max() > 0.5 and (twin > 0).mean() > 0.5)
     np.testing.assert_allclose(occlusion(arrays, view, bias, antialiased), twin, atol=2e-6)
+
+
+def test_receivers_elsewhere_match_the_twin():
+    arrays, view = random_splats(80, seed=6), light()
+    points = arrays["means"] + np.random.default_rng(0).normal(0, 0.2, (80, 3))
+    ours, twin = occlusion(arrays, view, 0.01, points=points), occlusion_reference(arrays, view, np.full(80, 0.01))
+    assert np.abs(ours - twin).max() > 0.2
+    twin = occlusion_reference(arrays, view, np.full(80, 0.01), points=points)
+    np.testing.assert_allclose(ours, twin, atol=2e-6)
 
 
 def test_a_crowd_that_lets_nothing_pass_matches_the_twin():
@@ -252,13 +262,14 @@ def test_one_bias_serves_all_and_another_length_does_not():
         occlusion_by_splatting(gaussians, camera, ad.Float(0, 0, 0))
 
 
-def gradients(arrays, view, bias, antialiased=False) -> list[np.ndarray]:
-    """[occlusion, gradients of sum(weights x occlusion) by each of `PARAMETERS`, N first]."""
+def gradients(arrays, view, bias, antialiased=False, away=0.0) -> list[np.ndarray]:
+    """[occlusion, gradients of sum(weights x occlusion) by each of `PARAMETERS`, N first]; receivers `away` m in x."""
     gaussians = Gaussians.from_numpy(arrays)
     for name in PARAMETERS:
         dr.enable_grad(getattr(gaussians, name))
     bias = ad.Float(np.asarray(bias, dtype=np.float32))
-    occluded = differentiable_occlusion(gaussians, Orthographic.of(view), bias, antialiased)
+    points = gaussians.means + ad.Array3f(away, 0, 0) if away else None
+    occluded = differentiable_occlusion(gaussians, Orthographic.of(view), bias, points, antialiased)
     dr.backward(dr.sum(occluded * ad.Float(weights(len(bias)).astype(np.float32))))
     return [np.array(dr.detach(occluded)), *(np.array(dr.grad(getattr(gaussians, name))).T for name in PARAMETERS)]
 
@@ -267,11 +278,12 @@ def weights(count: int) -> np.ndarray:
     return np.random.default_rng(3).normal(size=count)
 
 
-def differences(arrays, view, bias, antialiased: bool, step: float = 1e-6) -> list[np.ndarray]:
+def differences(arrays, view, bias, antialiased: bool, away: float, step: float = 1e-6) -> list[np.ndarray]:
     """Central differences of the twin."""
 
     def loss(moved: dict[str, np.ndarray]) -> float:
-        return float(weights(len(bias)) @ occlusion_reference(moved, view, bias, BETA_MIN, antialiased))
+        points = moved["means"] + [away, 0, 0]
+        return float(weights(len(bias)) @ occlusion_reference(moved, view, bias, BETA_MIN, antialiased, points))
 
     slopes = []
     for name in PARAMETERS:
@@ -287,12 +299,12 @@ def differences(arrays, view, bias, antialiased: bool, step: float = 1e-6) -> li
     return slopes
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_gradients_match_central_differences(antialiased):
+@pytest.mark.parametrize(("antialiased", "away"), [(False, 0.0), (True, 0.0), (False, 0.1)])
+def test_gradients_match_central_differences(antialiased, away):
     arrays, view = random_splats(20, seed=1), light(24, 17)
     bias = np.random.default_rng(1).uniform(0, 0.05, 20)
-    _, *ours = gradients(arrays, view, bias, antialiased)
-    for name, slope, twin in zip(PARAMETERS, ours, differences(arrays, view, bias, antialiased), strict=True):
+    _, *ours = gradients(arrays, view, bias, antialiased, away)
+    for name, slope, twin in zip(PARAMETERS, ours, differences(arrays, view, bias, antialiased, away), strict=True):
         error = np.linalg.norm(slope - twin) / np.linalg.norm(twin)
         assert error < 1e-4, (name, error)
 
