@@ -69,3 +69,13 @@ def _write_dataset(root: Path, gaussians: dict[str, np.ndarray]) -> Dataset:
     meta |= {"ply_file_path": "points.ply", "frames": frames, **listed}
     (root / "transforms.json").write_text(json.dumps(meta))
     return read_dataset(root)
+
+
+@pytest.fixture(scope="session")
+def small_lit_dataset(tmp_path_factory) -> Dataset:
+    """Path-traced pictures of the boxsat under two Suns, with truth."""
+    from spacesim.scenes import generate, read_scene
+
+    size = {"resolution": (32, 32), "spp": 8, "points": 400}
+    scene = read_scene("boxsat", suns=2, views=5, test_suns=1, test_views=2, **size)
+    return generate(scene, tmp_path_factory.mktemp("lit") / "data")

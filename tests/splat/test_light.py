@@ -1,0 +1,361 @@
+"""Networks and their adjoints against a float64 twin; what light does to training, checkpoints and predictions."""
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from scipy.special import sph_harm_y
+
+from spacesim.backend import ad
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import look_at
+from spacesim.data.images import load_image
+from spacesim.data.records import Camera, Dataset, Sun
+from spacesim.splat import mlp
+from spacesim.splat.appearance import FieldConfig
+from spacesim.splat.cameras import Pinhole
+from spacesim.splat.encoding import Encoding
+from spacesim.splat.gaussians import Gaussians, entries
+from spacesim.splat.lanes import Lanes
+from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
+from spacesim.splat.mlp import MlpShape
+from spacesim.splat.run import Run, load_run
+from spacesim.splat.shadow.cast import ShadowConfig
+from spacesim.splat.shadow.refine import RefineConfig
+from spacesim.splat.train.checkpoint import read_tensors
+from spacesim.splat.train.config import METHODS, PRESETS, LearningRates, TrainConfig, preset
+from spacesim.splat.train.densify import grow, prune
+from spacesim.splat.train.optimizer import Adam
+from spacesim.splat.train.strategies.default import DefaultStrategyConfig
+from spacesim.splat.train.train import train
+from spacesim.splat.train.trainer import Trainer
+
+SUN = np.array([0.48, -0.36, 0.8])
+FIELD = FieldConfig(features=5, width=12, layers=3, sun=Encoding("harmonics", 2), view=Encoding("positional", 1))
+REFINE = RefineConfig(features=3, width=8, sun=Encoding("harmonics", 1))
+CONFIGS = {
+    "relight": LightConfig(FIELD),
+    "map": LightConfig(FIELD, ShadowConfig("mapping", 32, refine=REFINE)),
+    "splat": LightConfig(FIELD, ShadowConfig("splatting", 32, refine=None)),
+    "park": LightConfig(
+        FIELD,
+        ShadowConfig(
+            "splatting", 32, bias=0.0, refine=replace(REFINE, positions="world", positional=2, bias_info=False)
+        ),
+    ),
+}
+
+
+def numbers(plane) -> np.ndarray:
+    return np.array(plane, dtype=np.float64)
+
+
+def gaussians(count: int, features: int, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    return Gaussians.from_numpy(
+        {
+            "means": rng.normal(size=(count, 3)),
+            "log_scales": rng.uniform(-3, -1, (count, 3)),
+            "quaternions": rng.normal(size=(count, 4)),
+            "logit_opacities": rng.normal(size=count),
+            "sh": np.zeros((count, 0, 3)),
+            "features": rng.normal(size=(count, features)),
+        }
+    )
+
+
+def eye() -> Pinhole:
+    return Pinhole.of(Camera(look_at([0, -6, 1], [0, 0, 0]), 32, 32, 40, 40, 16, 16))
+
+
+def model(name: str, seed: int = 0) -> LightModel:
+    """With a refinement that does something: its last layer starts at 0."""
+    light = LightModel.initial(CONFIGS[name], TrainingFrame(np.array([0.1, 0.2, -0.3]), 2.0, 7.0), seed)
+    rng = np.random.default_rng(seed)
+    light.weights = [ad.Float(numbers(w) + 0.3 * rng.normal(size=dr.width(w))) for w in light.weights]
+    return light
+
+
+# ---- a float64 twin, from the equations ----
+
+
+def encoded(encoding: Encoding, vectors: np.ndarray) -> np.ndarray:
+    """[N, size] by scipy and by numpy."""
+    if encoding.kind == "positional":
+        waves = [f(2**k * np.pi * vectors) for k in range(encoding.degree) for f in (np.sin, np.cos)]
+        # sine and cosine of each coordinate stand side by side
+        pairs = [np.stack(waves[2 * k : 2 * k + 2], axis=-1).reshape(len(vectors), 6) for k in range(encoding.degree)]
+        return np.concatenate([vectors, *pairs], axis=1)
+    polar, azimuth = np.arccos(np.clip(vectors[:, 2], -1, 1)), np.arctan2(vectors[:, 1], vectors[:, 0])
+    terms = []
+    for degree in range(encoding.degree + 1):
+        for order in range(-degree, degree + 1):
+            value = sph_harm_y(degree, abs(order), polar, azimuth) * (1 if order == 0 else np.sqrt(2))
+            terms.append(value.imag if order < 0 else value.real)
+    return np.stack(terms, axis=1)
+
+
+def network(shape: MlpShape, weights: list[np.ndarray], items: np.ndarray, shared: np.ndarray) -> np.ndarray:
+    """[N, outputs]."""
+    value = items
+    for i, (rows, columns) in enumerate(shape.sizes):
+        bias = weights[2 + 2 * i] + (weights[0].reshape(rows, -1) @ shared if i == 0 else 0)
+        value = value @ weights[1 + 2 * i].reshape(rows, columns).T + bias
+        if i < shape.layers - 1:
+            value = np.maximum(value, 0)
+    return value
+
+
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-x))
+
+
+def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray]) -> tuple:
+    """(colours [N, 3], visibility [N]) of 4.2, 4.11 to 4.14 and 4.17; raw: occlusion and bias info as given."""
+    config, field = light.config, light.config.field
+    direction = arrays["means"] - np.array([0, -6, 1.0])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    features, split = arrays["features"].astype(np.float64), 1 + 2 * field.layers
+    items = np.concatenate([features[:, : field.features], encoded(field.view, direction)], axis=1)
+    colour = sigmoid(network(field.shape, weights[:split], items, encoded(field.sun, SUN[None])[0]))
+    if not raw:
+        return colour, np.ones(len(colour))
+    occlusion, alignment, thickness, bias = raw
+    if config.refine:
+        refine = config.refine
+        position = (arrays["means"] - light.frame.centre) / light.frame.scale
+        if refine.positions == "light":
+            axes = numbers(light.sun_terms(SUN).light).reshape(3, 3)
+            np.testing.assert_allclose(axes[2], -SUN, atol=1e-6)
+            position = position @ axes.T
+        told = [occlusion[:, None], features[:, field.features :]]
+        told.append(encoded(Encoding("positional", refine.positional), position))
+        if refine.bias_info:
+            scale = light.frame.scale
+            told += [column[:, None] for column in (1 - occlusion, alignment, thickness / scale, bias / scale)]
+        items = np.concatenate(told, axis=1)
+        correction = network(refine.shape, weights[split:], items, encoded(refine.sun, SUN[None])[0])[:, 0]
+        sure = np.clip(occlusion, 0.02, 0.98)
+        occlusion = sigmoid(np.log(sure / (1 - sure)) + correction)
+    return colour * (1 - occlusion)[:, None], 1 - occlusion
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_shading_and_its_adjoint_match_the_equations_in_float64(name):
+    light, count = model(name), 37
+    splats = gaussians(count, light.config.features)
+    arrays = {key: value.astype(np.float64) for key, value in splats.to_numpy().items()}
+    weights = [numbers(weight) for weight in light.weights]
+    shadows = light.shadows(splats, SUN)
+    raw = [numbers(row) for row in (shadows.occlusion, *shadows.info)] if shadows else []
+    shading = light.shade(splats, eye(), SUN)
+    colour, visibility = twin(light, arrays, weights, raw)
+    np.testing.assert_allclose(np.stack([numbers(c) for c in shading.colours], axis=1), colour, atol=3e-5)
+    assert (shading.visibility is None) == (name == "relight")
+    if shading.visibility is not None:
+        np.testing.assert_allclose(numbers(shading.visibility), visibility, atol=3e-5)
+
+    rng = np.random.default_rng(5)
+    by_colour, by_visibility = rng.normal(size=(count, 3)), rng.normal(size=count) * bool(raw)
+    given = ad.Float(by_visibility) if raw else None
+    by_features, by_weights = light.adjoint(shading, [ad.Float(column) for column in by_colour.T], given)
+
+    def loss(arrays: dict, weights: list[np.ndarray]) -> float:
+        colour, visibility = twin(light, arrays, weights, raw)
+        return float((by_colour * colour).sum() + by_visibility @ visibility)
+
+    for _ in range(6):  # along random directions, all numbers at once
+        step = rng.normal(size=arrays["features"].shape)
+        slope = difference(lambda h, s=step: loss({**arrays, "features": arrays["features"] + h * s}, weights))
+        assert numbers(by_features).reshape(-1, count).T.ravel() @ step.ravel() == pytest.approx(
+            slope, rel=2e-3, abs=2e-3
+        )
+    for i, weight in enumerate(weights):
+        step = rng.normal(size=weight.shape)
+        slope = difference(
+            lambda h, i=i, s=step: loss(arrays, [w + h * s * (j == i) if j == i else w for j, w in enumerate(weights)])
+        )
+        assert numbers(by_weights[i]) @ step == pytest.approx(slope, rel=2e-3, abs=2e-3), i
+
+
+def difference(function) -> float:
+    h = 1e-6
+    return (function(h) - function(-h)) / (2 * h)
+
+
+@pytest.mark.parametrize("kind", [("harmonics", 0), ("harmonics", 4), ("positional", 0), ("positional", 4)])
+def test_encodings_are_those_of_scipy_and_numpy(kind):
+    encoding = Encoding(*kind)
+    rng = np.random.default_rng(1)
+    vectors = rng.normal(size=(50, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    ours = encoding(ad.Array3f(vectors.T.astype(np.float32)))
+    assert len(ours) == encoding.size
+    rows = np.stack([numbers(row) + np.zeros(50) for row in ours], axis=1)
+    expected = encoded(encoding, vectors)
+    signs = np.sign((rows * expected).sum(axis=0))  # conventions differ in the sign of a harmonic
+    np.testing.assert_allclose(rows, expected * (signs if encoding.kind == "harmonics" else 1), atol=2e-5)
+    np.testing.assert_array_equal(numbers(encoding.of_one(vectors[3]))[:1], rows[3, :1].astype(np.float32))
+
+
+def test_columns_beyond_the_gaussians_change_nothing():
+    shape, rng = MlpShape(4, 2, 3, 8, 3), np.random.default_rng(0)
+    weights = [ad.Float(w) for w in mlp.initial_weights(shape, rng)]
+    assert sum(dr.width(w) for w in weights) == shape.parameters
+    rows = rng.normal(size=(4, 1500)).astype(np.float32)
+    lanes = Lanes.of(1500)
+    assert lanes.capacity > 1500
+    wide = lanes.matrix([lanes.padded(ad.Float(row)) for row in rows])
+    by = lanes.matrix([lanes.padded(ad.Float(row)) for row in rows[:3]])
+    output, tape = mlp.forward(shape, weights, wide, ad.Float(1, 2))
+    gradients, _ = mlp.backward(shape, weights, tape, ad.Float(1, 2), by)
+    exact, exact_tape = mlp.forward(shape, weights, ad.TensorXf(rows), ad.Float(1, 2))
+    exact_gradients, _ = mlp.backward(shape, weights, exact_tape, ad.Float(1, 2), ad.TensorXf(rows[:3]))
+    np.testing.assert_allclose(np.array(output)[:, :1500], np.array(exact), atol=1e-6)
+    for one, other in zip(gradients, exact_gradients, strict=True):
+        np.testing.assert_allclose(numbers(one), numbers(other), rtol=1e-4, atol=1e-3)
+
+
+def test_an_untrained_refinement_passes_raw_shadows_on():
+    light = LightModel.initial(CONFIGS["map"], TrainingFrame(np.zeros(3), 1.0, 5.0), 0)
+    splats = gaussians(200, light.config.features)
+    raw = numbers(light.shadows(splats, SUN).occlusion)
+    refined = 1 - numbers(light.shade(splats, eye(), SUN).visibility)
+    np.testing.assert_allclose(refined, np.clip(raw, 0.02, 0.98), atol=1e-5)
+
+
+# ---- features as parameters of Gaussians ----
+
+
+def test_features_follow_their_gaussian_through_refinement():
+    splats = gaussians(6, 4)
+    splats.features = ad.Float(np.arange(24, dtype=np.float32))
+    optimizer = Adam(splats.rows())
+    optimizer.first[-1] = ad.Float(np.arange(24, dtype=np.float32) + 100)
+    before = splats.to_numpy()["features"]
+    duplicate, split = np.eye(6, dtype=bool)[1], np.eye(6, dtype=bool)[4]
+    index = grow(splats, optimizer, duplicate, split, np.random.default_rng(0))
+    np.testing.assert_array_equal(splats.to_numpy()["features"], before[index])
+    moments = np.array(optimizer.first[-1]).reshape(4, -1).T
+    np.testing.assert_array_equal(moments[:5], before[index[:5]] + 100)
+    assert not moments[5:].any(), "what is new starts without moments"
+    kept = prune(splats, optimizer, np.arange(splats.count) % 2 == 0)
+    np.testing.assert_array_equal(splats.to_numpy()["features"], before[index[kept]])
+    assert splats.feature_count == 4
+    assert dr.width(optimizer.second[-1]) == 4 * splats.count
+
+
+def test_entries_of_packed_rows():
+    row = np.arange(12, dtype=np.float32)
+    chosen = entries(ad.Float(row), ad.UInt32([2, 2, 0]), 4)
+    np.testing.assert_array_equal(np.array(chosen).reshape(3, 3), row.reshape(3, 4)[:, [2, 2, 0]])
+
+
+@pytest.mark.parametrize("features", [np.zeros((5, 2)), np.zeros((6, 0)), np.zeros(6)])
+def test_features_of_another_shape_are_refused(features):
+    arrays = gaussians(6, 2).to_numpy()
+    with pytest.raises(ValueError, match="features"):
+        Gaussians.from_numpy({**arrays, "features": features})
+
+
+# ---- training ----
+
+REFINEMENT = DefaultStrategyConfig(
+    refine_start=10, refine_every=20, pause_after_reset=0, reset_every=4, refine_stop=80, screen_size_stop=0
+)
+
+
+def training(name: str, **changes) -> TrainConfig:
+    method = {"map": "shadow-map", "splat": "shadow-splat"}.get(name, name)
+    given = {"method": method, "light": CONFIGS[name], "iterations": 60, "checkpoint_every": 25, "init_count": 40}
+    return TrainConfig(**{**given, "refinement": REFINEMENT, **changes})
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_training_with_light_repeats_to_the_bit_and_resumes(small_lit_dataset, tmp_path, name):
+    config = training(name, visibility_weight=0.0 if name == "relight" else 0.1)
+    run = train(small_lit_dataset, tmp_path / "one", config)
+    again = train(small_lit_dataset, tmp_path / "two", config)
+    model_of = [(folder.path / "model.safetensors").read_bytes() for folder in (run, again)]
+    assert model_of[0] == model_of[1]
+    assert run.training["history"] == again.training["history"]
+
+    resumed = Trainer(small_lit_dataset, config)
+    resumed.restore(tmp_path / "one/checkpoints/step_00000050.safetensors")
+    for _ in range(10):
+        resumed.step()
+    tensors, _ = read_tensors(run.path / "model.safetensors")
+    for key, value in resumed.model_tensors().items():
+        np.testing.assert_array_equal(value, tensors[key], err_msg=key)
+
+
+def psnr(run: Run, dataset: Dataset) -> float:
+    """Of the training pictures over black, dB."""
+    errors = []
+    for frame in dataset.train:
+        truth = load_image(dataset, frame).over(np.zeros(3))
+        errors.append(np.mean((np.clip(run.predict(frame.camera, frame.sun).rgb, 0, 1) - truth) ** 2))
+    return float(-10 * np.log10(np.mean(errors)))
+
+
+def test_light_learns_and_the_sun_changes_the_picture(small_lit_dataset, tmp_path):
+    rates = LearningRates(features=2e-2, networks=5e-3)
+    start, run = (
+        train(small_lit_dataset, tmp_path / str(n), training("map", rates=rates, iterations=n, init_count=400))
+        for n in (1, 400)
+    )
+    assert psnr(run, small_lit_dataset) > psnr(start, small_lit_dataset) + 3
+    loaded, frame = load_run(run.path), small_lit_dataset.test[0]
+    assert loaded.relightable
+    one, other = (loaded.predict(frame.camera, Sun.from_angles(*angles)) for angles in ((0, 40), (180, -40)))
+    assert np.abs(one.rgb - other.rgb).max() > 0.05
+    assert one.visibility.shape == one.alpha.shape
+    assert ((one.visibility >= 0) & (one.visibility <= 1 + 1e-5)).all()
+    with pytest.raises(InputError, match="Sun's direction"):
+        loaded.predict(frame.camera)
+    for direction in (*np.eye(3), *-np.eye(3), frame.camera.world_from_camera[:3, 2]):
+        shown = loaded.predict(frame.camera, Sun(direction))
+        assert np.isfinite(shown.rgb).all()
+        assert np.isfinite(shown.visibility).all()
+
+
+def test_vanilla_ignores_suns_and_light_needs_them(small_lit_dataset):
+    dark = replace(small_lit_dataset, train=tuple(replace(frame, sun=None) for frame in small_lit_dataset.train))
+    Trainer(dark, replace(training("relight"), method="vanilla", light=None))
+    with pytest.raises(InputError, match=r"expected sun_direction in every training frame.*train_"):
+        Trainer(dark, training("relight"))
+
+
+def test_supervised_visibility_needs_truth(small_lit_dataset):
+    blind = replace(small_lit_dataset, train=tuple(replace(f, gt_path=None) for f in small_lit_dataset.train))
+    with pytest.raises(InputError, match=r"path-traced visibility.*train_"):
+        Trainer(blind, training("map", visibility_weight=0.1))
+    with pytest.raises(InputError, match="visibility-weight"):
+        training("relight", visibility_weight=0.1)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_survive_json_and_have_the_thesis_numbers(name, method):
+    config = preset(name, method)
+    assert TrainConfig.from_json(config.to_json()) == config
+    if name != "thesis" or method == "vanilla":
+        return
+    field, shadow = config.light.field, config.light.shadow
+    assert (field.features, field.sun.kind) == ((72, "positional") if method == "park" else (128, "harmonics"))
+    assert (field.width, field.layers) == (256, 3)
+    if method == "relight":
+        assert shadow is None
+    else:
+        assert (shadow.bias, shadow.refine.width) == ((0, 32) if method == "park" else (10, 64))
+        assert shadow.refine.features == 6
+        assert shadow.softness == 1e-6
+    if method != "park":
+        assert field.shape == MlpShape(128 + 25, 25, 3, 256, 3)
+
+
+@pytest.mark.parametrize("change", [{"method": "mystery"}, {"size": 2}, {"bias": -1.0}, {"softness": 0.0}])
+def test_impossible_shadows_are_named(change):
+    with pytest.raises(InputError, match="expected"):
+        ShadowConfig(**change)
