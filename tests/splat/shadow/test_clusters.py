@@ -95,6 +95,10 @@ def test_a_gap_is_one_between_supports():
     centres, radii = points(0, 1, 5, 12, 14)
     radii[3, 0] = 6.5  # reaches over to 5.5: what is left are gaps of 4 and 0.5
     assert parts(clusters(centres, radii, SIZE, least_scale=6, most=2)) == [[2, 3, 4], [0, 1]]
+    centres, radii = points(0, 1, 5, 11, 12, 14)
+    radii[4, 0] = 6.5  # over the place before it, too
+    assert parts(clusters(centres, radii, SIZE, least_scale=6, most=2)) == [[2, 3, 4, 5], [0, 1]]
+    assert parts(clusters(14 - centres[::-1], radii[::-1], SIZE, least_scale=6, most=2)) == [[0, 1, 2, 3], [4, 5]]
 
 
 def test_without_a_meaningful_gap_the_median_splits():
@@ -153,6 +157,13 @@ def test_order_does_not_matter():
         return [sorted(map(tuple, np.hstack([centres[part], radii[part]]))) for part in found]
 
     assert content(centres, radii) == content(centres[order], radii[order])
+
+
+def test_members_at_the_same_place_along_the_axis_are_told_apart_by_the_other():
+    centres = np.array([[0, 0], [5, 3], [5, 1], [5, 2], [5, 0], [10, 0.0]])
+    low, high = [4, 2, 0], [3, 1, 5]
+    found = clusters(centres, np.full((6, 2), 2.6), SIZE, least_scale=8, most=2)
+    assert sorted(parts(found)) == sorted([sorted(low), sorted(high)])
 
 
 def test_one_many_alike_and_none():
@@ -254,6 +265,20 @@ def test_a_few_strays_cost_nothing_and_many_do():
         Gaussians.from_numpy(join(blob(2000, (0, 0, 0)), far)), SUN, SIZE, 10.0, recorder := Recorder()
     )
     assert len(recorder.cameras) == 2
+    # The one camera would have the scale, but not these: then one image has to hold all.
+    gaussians, recorder = Gaussians.from_numpy(join(blob(2000, (0, 0, 0)), far)), Recorder()
+    occlusion_in_clusters(gaussians, SUN, SIZE, 1.0, recorder)
+    assert len(recorder.cameras) == 1
+    place = screen(recorder.cameras[0], gaussians.to_numpy()["means"].astype(float))
+    assert place.min() > 0
+    assert place.max() < SIZE
+
+
+def test_what_is_too_faint_to_be_drawn_does_not_count():
+    faint = blob(10, (1e4, 0, 0)) | {"logit_opacities": np.full(10, -9.0)}
+    recorder = Recorder()
+    occlusion_in_clusters(Gaussians.from_numpy(join(blob(50, (0, 0, 0)), faint)), SUN, SIZE, 30.0, recorder)
+    assert len(recorder.cameras) == 1
 
 
 @pytest.mark.parametrize("sun", [SUN, [0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1, 0]])
