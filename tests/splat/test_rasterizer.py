@@ -222,6 +222,16 @@ def test_recordings_serve_models_of_any_size():
         np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=2e-5)
 
 
+@pytest.mark.parametrize("first", [1024, 2048])
+def test_a_recording_of_as_many_splats_as_its_room_holds_serves_fewer(first):
+    """Where count and room were one, a replay would take the room's size from the next, smaller number of splats."""
+    assert all(tiles.room(count) > count for count in (*range(1, 5000), 2**20, 2**20 - 1))
+    for count in (first, first - 300):
+        arrays = {**random_splats(count), "logit_opacities": np.full(count, -1.0)}
+        twin = render_reference(arrays, camera())
+        np.testing.assert_allclose(picture(arrays, camera())["alpha"], twin.alpha, atol=1e-5)
+
+
 @pytest.mark.parametrize(("count", "sentence"), [(40_000, "GB are free"), (150_000, "can be sorted")])
 def test_more_pairs_than_memory_holds_are_a_sentence(count, sentence, monkeypatch):
     """Splats that cover all tiles of a large picture."""
