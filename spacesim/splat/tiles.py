@@ -114,8 +114,8 @@ def _check_room(pairs: float) -> None:
 
 
 def room(count: int) -> int:
-    """`count` rounded up by about an eighth at most: few sizes are few recordings and, on LLVM, where the size of what is
-    scattered into is part of a kernel's text, few kernels to compile.
+    """`count` rounded up by about an eighth at most: few sizes are few recordings and, on LLVM, where the size of what
+    is scattered into is part of a kernel's text, few kernels to compile.
 
     Never `count` itself: a recording in which the two are one takes the size of the room from the number of splats."""
     step = max(1024, 1 << max(0, count.bit_length() - 4))
