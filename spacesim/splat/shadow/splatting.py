@@ -151,9 +151,9 @@ class _Walked:
     records: list[Any]
 
 
-def _trace_walk(events: Splats, lists: TileLists, image_size: tuple[Any, Any]) -> _Walked:
+def _trace_walk(events: Splats, lists: TileLists, image_size: tuple[Any, Any], capacity: int) -> _Walked:
     """What each receiver has lost; one lane holds a column of a tile's pixels."""
-    shape, rows, capacity = lists.shape, lists.shape.rows, dr.width(events.x) // 2
+    shape, rows = lists.shape, lists.shape.rows
     receives = dr.select(dr.arange(ad.UInt32, 2 * capacity) < capacity, ad.Float(1), ad.Float(0))
     records = _list_records(events, [receives], lists, room(2 * capacity))
     lanes = lists.tiles_x * lists.tiles_y * shape.lanes
@@ -296,15 +296,16 @@ class _Occlusion(dr.CustomOp):
         self.count = dr.width(blockers.x)
         splats = dr.detach(blockers), dr.detach(receivers)
         count = dr.opaque(ad.UInt32, self.count)
-        self.events, boxes = _events(*splats, blocker_boxes, receiver_boxes, count, room(self.count))
+        self.capacity = room(self.count)
+        self.events, boxes = _events(*splats, blocker_boxes, receiver_boxes, count, self.capacity)
         self.lists = bin_splats(self.events, boxes, *image_size)
         if self.lists.capacity == 0:
             return dr.opaque(ad.Float, 0, self.count)
-        self.walked = _walk(self.events, self.lists, self.size)
+        self.walked = _walk(self.events, self.lists, self.size, self.capacity)
         return dr.gather(ad.Float, self.walked.occlusion, dr.arange(ad.UInt32, self.count))
 
     def backward(self) -> None:
-        index, capacity = dr.arange(ad.UInt32, self.count), dr.width(self.events.x) // 2
+        index, capacity = dr.arange(ad.UInt32, self.count), self.capacity
         none = dr.opaque(ad.Float, 0, self.count)
         by_event = Splats(*[dr.opaque(ad.Float, 0, 2 * capacity)] * 7)
         if self.lists.capacity > 0:

@@ -3,6 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
+from acne_splatting import acne, screen_shadow
 from scipy.spatial.transform import Rotation
 from splats import random_splats
 
@@ -173,6 +174,16 @@ def test_bias_frees_a_wall_of_its_own_shadow_and_keeps_a_real_one():
     assert receding.max() < 0.02
 
 
+def test_lifted_receivers_free_a_plate_that_the_sun_grazes():
+    """The Sun 10 degrees above an uneven plate: mean occlusion where nothing is before it, then a screen's shadow."""
+    assert acne(10, "thesis", count=8000) > 0.3
+    assert acne(10, "lifted, 0.6", count=8000) < 0.03
+    recedes, _ = screen_shadow(10, "lifted, 0.6", count=8000)
+    assert recedes < 0.04
+    _, too_far = screen_shadow(30, "lifted, 0.6", count=8000)
+    assert abs(too_far) < 0.04
+
+
 def test_same_input_same_bits():
     arrays, view = random_splats(3000, seed=2), light(200, 150)
     first, second = (gradients(arrays, view, np.full(3000, 0.01)) for _ in range(2))
@@ -246,6 +257,21 @@ def test_recordings_serve_models_of_any_size():
         arrays, view = random_splats(count, seed=count, degree=0), light(32, 24)
         ours, twin = occlusion(arrays, view, 0.01), occlusion_reference(arrays, view, np.full(count, 0.01))
         np.testing.assert_allclose(ours, twin, atol=1e-4)
+
+
+def test_recordings_tell_models_apart_whose_lists_are_equally_long():
+    """Gaussians that cannot be seen add nothing to the lists, but the arrays need more room."""
+    arrays, view = random_splats(1000, seed=1, degree=0), light(32, 24)
+    unseen = random_splats(1500, seed=2, degree=0)
+    unseen["means"][:] += [0.0, 40.0, 0.0]
+    both = joined(arrays, unseen)
+    for _ in range(2):
+        alone, more = (gradients(model, view, np.zeros(len(model["means"]))) for model in (arrays, both))
+        np.testing.assert_array_equal(alone[0], more[0][:1000])
+        assert not more[0][1000:].any()
+        for one, other in zip(alone[1:], more[1:], strict=True):
+            assert not other[1000:].any()
+            assert one.any()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (16, 8), (17, 9)])
