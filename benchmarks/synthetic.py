@@ -1,6 +1,7 @@
 """A data set for the benchmarks: pictures of a sphere of splats by our own rasterizer, and a trainer on it."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from common import camera_from, sphere_arrays
@@ -46,10 +47,11 @@ def write_dataset(root: Path, count: int, pixels: int, views: int = VIEWS) -> Da
     return read_dataset(root)
 
 
-def still_trainer(dataset: Dataset, count: int, arrays: dict[str, np.ndarray] | None = None) -> Trainer:
+def still_trainer(dataset: Dataset, count: int, arrays: dict[str, np.ndarray] | None = None, **options: Any) -> Trainer:
     """A trainer whose steps are whole but move nothing and refine nothing, all harmonics from its fourth step on.
 
     It holds the splats in `arrays`, or starts from the `count` points: opacity 0.1, as wide as their spacing.
+    options: more of `TrainConfig`
     """
     config = TrainConfig(
         iterations=NEVER,
@@ -58,6 +60,7 @@ def still_trainer(dataset: Dataset, count: int, arrays: dict[str, np.ndarray] | 
         sh_every=1,
         rates=STILL,
         refinement=DefaultStrategyConfig(refine_start=NEVER, refine_stop=NEVER),
+        **options,
     )
     trainer = Trainer(dataset, config)
     if arrays is not None:

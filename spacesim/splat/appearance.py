@@ -3,33 +3,94 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import drjit as dr
+
+from spacesim.backend import ad
 from spacesim.splat.cameras import Projection
 from spacesim.splat.encoding import Encoding
 from spacesim.splat.lanes import Lanes
 from spacesim.splat.mlp import MlpShape
 
+COSINES = 4  #: that `surface_cosines` gives
+
 
 @dataclass(frozen=True)
 class FieldConfig:
     """Defaults: table 4.1. `layers` counts matrix products: 3 are two hidden layers of `width` units (the thesis says
-    "depth 3", which can mean either)."""
+    "depth 3", which can mean either).
+
+    surface: each Gaussian learns a normal, too, and the field is told the cosines of a reflectance model about it
+    (`surface_cosines`): what one side of a body has taught then serves the others, and Suns never seen. Ours.
+    """
 
     features: int = 128
     width: int = 256
     layers: int = 3
     sun: Encoding = field(default_factory=Encoding)
     view: Encoding = field(default_factory=Encoding)
+    surface: bool = False
+
+    @property
+    def stored(self) -> int:
+        """Numbers of each Gaussian: its features, then its normal (of any length), if it has one."""
+        return self.features + 3 * self.surface
 
     @property
     def shape(self) -> MlpShape:
-        """The network: features and view of each Gaussian, the Sun in common, three colours out."""
-        return MlpShape(self.features + self.view.size, self.sun.size, 3, self.width, self.layers)
+        """The network: features, view and cosines of each Gaussian, the Sun in common, three colours out."""
+        inputs = self.features + self.view.size + COSINES * self.surface
+        return MlpShape(inputs, self.sun.size, 3, self.width, self.layers)
 
 
-def field_items(config: FieldConfig, features: Any, means: Any, camera: Projection, lanes: Lanes) -> Any:
-    """TensorXf [features + view terms, M]: what the field reads of each Gaussian (4.2).
+@dataclass
+class FieldInputs:
+    """What the field reads of the world. features: Float, packed [F * N], `FieldConfig.stored` of them the field's;
+    means: Array3f [3, N], metres;  sun: Array3f of width 1, unit, towards the Sun"""
 
-    features: Float, packed [F * N] with F >= `config.features`;  means: Array3f [3, N]
+    features: Any
+    means: Any
+    camera: Projection
+    sun: Any
+
+
+def field_items(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:
+    """TensorXf [inputs of the network, M] (4.2)."""
+    direction = inputs.camera.directions_to(lanes.spread(inputs.means))
+    blocks = [lanes.block(inputs.features, 0, config.features), *config.view(direction)]
+    if config.surface:
+        blocks += surface_cosines(_normals(config, inputs, lanes), direction, inputs.sun)
+    return lanes.matrix(blocks)
+
+
+def by_normals(config: FieldConfig, inputs: FieldInputs, by_items: Any, lanes: Lanes) -> Any:
+    """TensorXf [3, M]: gradient of the normals, from that of the network's items."""
+    normals = _normals(config, inputs, lanes)
+    dr.enable_grad(normals)
+    direction = inputs.camera.directions_to(lanes.spread(inputs.means))
+    cosines = surface_cosines(normals, direction, inputs.sun)
+    first = config.features + config.view.size
+    along = sum((cosine * lanes.row(by_items, first + i) for i, cosine in enumerate(cosines)), ad.Float(0))
+    dr.backward(along)
+    return lanes.matrix(list(dr.grad(normals)))
+
+
+def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
+    """n . s, max(n . s, 0), n . v and n . h: what a reflectance model of an isotropic surface depends on, [M] each.
+
+    normals: Array3f [3, M], of any length; the side that is seen counts, n . v >= 0;  direction: Array3f [3, M], unit,
+    from the camera;  sun: Array3f, unit, towards the Sun;  h: halfway between the Sun and the viewer, v = -direction
     """
-    view = config.view(camera.directions_to(lanes.spread(means)))
-    return lanes.matrix([lanes.block(features, 0, config.features), *view])
+    length2 = dr.squared_norm(normals)
+    known = dr.detach(length2) > 1e-12
+    unit = dr.select(known, normals, ad.Array3f(0, 0, 1)) * dr.rsqrt(dr.select(known, length2, 1))
+    seen = dr.select(dr.detach(dr.dot(unit, direction)) > 0, -unit, unit)
+    half = sun - direction
+    half2 = dr.squared_norm(half)
+    half *= dr.select(half2 > 1e-12, dr.rsqrt(dr.maximum(half2, 1e-12)), 0)
+    lambert = dr.dot(seen, sun)
+    return [lambert, dr.maximum(lambert, 0), -dr.dot(seen, direction), dr.dot(seen, half)]
+
+
+def _normals(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:
+    """Array3f [3, M], of any length."""
+    return ad.Array3f([lanes.block(inputs.features, config.features + i, 1) for i in range(3)])

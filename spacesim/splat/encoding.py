@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
@@ -45,5 +46,7 @@ class Encoding:
         return terms
 
     def of_one(self, vector: Any) -> Any:
-        """Float [size] of one vector, three numbers."""
-        return dr.concat([ad.Float(term) for term in self(ad.Array3f(*(ad.Float(float(v)) for v in vector)))])
+        """Float [size] of one vector, three numbers, which are no constants of a kernel: another one compiles nothing."""
+        numbers = ad.Float(np.asarray(vector, dtype=np.float32))
+        point = ad.Array3f([dr.gather(ad.Float, numbers, ad.UInt32(i)) for i in range(3)])
+        return dr.concat([ad.Float(term) for term in self(point)])

@@ -16,13 +16,13 @@ import numpy as np
 from spacesim.backend import ad, recorded
 from spacesim.data.geometry import Array
 from spacesim.splat import mlp
-from spacesim.splat.appearance import FieldConfig, field_items
+from spacesim.splat.appearance import FieldConfig, FieldInputs, by_normals, field_items
 from spacesim.splat.cameras import Projection
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.lanes import Lanes
 from spacesim.splat.shadow.cast import ShadowConfig, Shadows, cast_shadows
 from spacesim.splat.shadow.refine import RefineConfig, refine_inputs, refined
-from spacesim.splat.shadow.sunlight import light_rows
+from spacesim.splat.shadow.sunlight import light_rows, towards_sun
 from spacesim.splat.tiles import RECORDINGS
 
 SUNS = 4096  #: whose encodings are kept
@@ -43,7 +43,7 @@ class LightConfig:
     @property
     def features(self) -> int:
         """F: numbers that each Gaussian has for the field, then for the refinement of shadows."""
-        return self.field.features + (self.refine.features if self.refine else 0)
+        return self.field.stored + (self.refine.features if self.refine else 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +72,7 @@ class _Inputs:
 
     features: Any
     means: Any
+    camera: Projection
     raw: list[Any]
     sun: SunTerms
     place: Any
@@ -135,9 +136,9 @@ class LightModel:
         """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes."""
         shadows = self.shadows(gaussians, sun)
         raw = [shadows.occlusion, *shadows.info] if shadows else []
-        inputs = _Inputs(gaussians.features, gaussians.means, raw, self.sun_terms(sun), self._place)
+        inputs = _Inputs(gaussians.features, gaussians.means, camera, raw, self.sun_terms(sun), self._place)
         lanes = Lanes.of(gaussians.count)
-        colours, visibility, tape = _shade(self.config, self.weights, inputs, camera, lanes)
+        colours, visibility, tape = _shade(self.config, self.weights, inputs, lanes)
         return Shading(colours, visibility[0] if visibility else None, inputs, lanes, tape)
 
     def adjoint(self, shading: Shading, by_colour: list[Any], by_visibility: Any = None) -> tuple[Any, list[Any]]:
@@ -174,11 +175,11 @@ class LightModel:
 
 
 def _trace_shade(
-    config: LightConfig, weights: list[Any], inputs: _Inputs, camera: Projection, lanes: Lanes
+    config: LightConfig, weights: list[Any], inputs: _Inputs, lanes: Lanes
 ) -> tuple[list[Any], list[Any], _Tape]:
     """(dimmed colours, [visibility] or [], tape)."""
     of_field, of_refine = _split(config, weights)
-    items = field_items(config.field, inputs.features, inputs.means, camera, lanes)
+    items = field_items(config.field, _field_inputs(inputs), lanes)
     output, field_tape = mlp.forward(config.field.shape, of_field, items, inputs.sun.field)
     colours = [_sigmoid(lanes.row(output, i)) for i in range(3)]
     occlusion = [lanes.padded(row) for row in inputs.raw[:1]]
@@ -211,6 +212,8 @@ def _trace_adjoint(
     by_output = lanes.matrix([g * visibility * c * (1 - c) for g, c in pairs])
     by_weights, by_items = mlp.backward(config.field.shape, of_field, tape.field, inputs.sun.field, by_output)
     parts = [(by_items, 0, config.field.features)]
+    if config.field.surface:
+        parts.append((by_normals(config.field, _field_inputs(inputs), by_items, lanes), 0, 3))
     if config.refine:
         occlusion = tape.occlusion[0]
         by_occlusion = -sum((g * c for g, c in pairs), sum(map(lanes.padded, by_visibility), ad.Float(0)))
@@ -230,9 +233,13 @@ def _refine_items(config: LightConfig, refine: RefineConfig, inputs: _Inputs, la
         axes = [[dr.gather(ad.Float, inputs.sun.light, ad.UInt32(3 * i + j)) for j in range(3)] for i in range(3)]
         positions = ad.Array3f([dr.dot(ad.Array3f(axis), positions) for axis in axes])
     occlusion, alignment, thickness, bias = (lanes.spread(value) for value in inputs.raw)
-    features = lanes.block(inputs.features, config.field.features, refine.features)
+    features = lanes.block(inputs.features, config.field.stored, refine.features)
     info = [alignment, thickness * per_metre, bias * per_metre]
     return lanes.matrix(refine_inputs(refine, occlusion, features, positions, info))
+
+
+def _field_inputs(inputs: _Inputs) -> FieldInputs:
+    return FieldInputs(inputs.features, inputs.means, inputs.camera, towards_sun(inputs.sun.light))
 
 
 def _split(config: LightConfig, weights: list[Any]) -> tuple[list[Any], list[Any]]:

@@ -6,6 +6,7 @@ RUN/model.safetensors  the trained Gaussians: there once training is done
 RUN/training.json      history, time, backend, versions
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.light import LightModel
-from spacesim.splat.project import Pinhole
+from spacesim.splat.project import Pinhole, Projection
 from spacesim.splat.render import RenderOutput, render
 from spacesim.splat.train.checkpoint import read_tensors
 from spacesim.splat.train.config import TrainConfig
@@ -74,14 +75,21 @@ class Run:
             raise InputError(
                 f"{self.path}: expected the Sun's direction for a run of {self.config['method']}, found none"
             )
-        eye = Pinhole.of(camera)
-        shading = self.light.shade(self.model, eye, sun.direction)
-        lit = [] if shading.visibility is None else [shading.visibility]
-        output = render(self.model, eye, outputs=names, features=[*shading.colours, *lit])
-        drawn = output.image("features")
-        alpha = output.image("alpha")
-        visibility = np.divide(drawn[..., 3], alpha, out=np.zeros_like(alpha), where=alpha > 0) if lit else None
+        output = draw_lit(self.model, self.light, Pinhole.of(camera), sun.direction, names)
+        drawn, alpha = output.image("features"), output.image("alpha")
+        visible = np.zeros_like(alpha)
+        visibility = np.divide(drawn[..., 3], alpha, out=visible, where=alpha > 0) if drawn.shape[2] > 3 else None
         return _prediction(output, drawn[..., :3], visibility, normals)
+
+
+def draw_lit(
+    model: Gaussians, light: LightModel, camera: Projection, sun: np.ndarray, outputs: Sequence[str] = ()
+) -> RenderOutput:
+    """A relit and shadowed frame on the device. features: colour (3 planes), then, of a model with shadows, visibility,
+    all premultiplied. sun: [3], unit, towards the Sun;  outputs: see `render`"""
+    shading = light.shade(model, camera, sun)
+    lit = [] if shading.visibility is None else [shading.visibility]
+    return render(model, camera, outputs=outputs, features=[*shading.colours, *lit])
 
 
 def _prediction(output: RenderOutput, rgb: np.ndarray, visibility: np.ndarray | None, normals: bool) -> Prediction:

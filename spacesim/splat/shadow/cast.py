@@ -9,7 +9,7 @@ from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError
 from spacesim.splat.cameras import Orthographic
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.shadow.bias import Bias, receiver_bias
+from spacesim.splat.shadow.bias import Bias, grazing_bias, lifted, receiver_bias
 from spacesim.splat.shadow.mapping import MappingConfig, occlusion_by_mapping
 from spacesim.splat.shadow.refine import RefineConfig
 from spacesim.splat.shadow.splatting import occlusion_by_splatting
@@ -17,18 +17,21 @@ from spacesim.splat.shadow.sunlight import fit_camera, towards_sun
 from spacesim.splat.tiles import RECORDINGS
 
 METHODS = ("mapping", "splatting")
+GRAZING = ("none", "bias", "lift")
 
 
 @dataclass(frozen=True)
 class ShadowConfig:
     """method: "mapping" (4.3.1) or "splatting" (4.3.2);  size: pixels of each side of the light image, of which the
-    thesis names none;  bias: lambda_b of 4.26, 0 for none;  softness: epsilon_s of 4.5 as a
-    share of the farthest training camera's distance;  mapping: what the test of 4.5 is given;  refine: the network of
-    4.3.3, or None."""
+    thesis names none;  bias: lambda_b of 4.26, 0 for none;  grazing: what holds at a grazing Sun, too, where the
+    thesis's bias goes to 0: "bias" (`grazing_bias`) or, with mapping, "lift" (`lifted`);  softness: epsilon_s of 4.5 as
+    a share of the farthest training camera's distance;  mapping: how the light's picture is read;  refine: the network
+    of 4.3.3, or None."""
 
     method: str = "mapping"
     size: int = 512
     bias: float = 10.0
+    grazing: str = "none"
     softness: float = 1e-6
     mapping: MappingConfig = field(default_factory=MappingConfig)
     refine: RefineConfig | None = field(default_factory=RefineConfig)
@@ -36,6 +39,10 @@ class ShadowConfig:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise InputError(f"shadow method: expected {' or '.join(METHODS)}, found {self.method!r}")
+        if self.grazing not in GRAZING or (self.grazing == "lift" and self.method != "mapping"):
+            raise InputError(
+                f"grazing: expected one of {', '.join(GRAZING)}, the last with mapping only, found {self.grazing!r}"
+            )
         if self.size < 4:
             raise InputError(f"light image: expected at least 4 pixels, found {self.size}")
         if not (self.bias >= 0 and self.softness > 0):
@@ -61,17 +68,24 @@ def cast_shadows(gaussians: Gaussians, light: Any, config: ShadowConfig, distanc
     """Raw occlusion (4.6, 4.10) of N Gaussians by each other. light: Float [9] of `light_rows`;  distance: metres, of
     the farthest training camera."""
     rows = [*gaussians.means, *gaussians.log_scales, *gaussians.quaternions, gaussians.logit_opacities]
-    camera, bias = _prepare(rows, light, config.size, dr.opaque(ad.Float, config.bias))
+    camera, bias, points = _prepare(rows, light, config.size, dr.opaque(ad.Float, config.bias), config.grazing)
     if config.method == "mapping":
-        occlusion = occlusion_by_mapping(gaussians, camera, bias.bias, config.softness * distance, config.mapping)
+        softness = config.softness * distance
+        occlusion = occlusion_by_mapping(gaussians, camera, bias.bias, softness, config.mapping, points)
     else:
         occlusion = occlusion_by_splatting(gaussians, camera, bias.bias)
     return Shadows(occlusion, bias)
 
 
-def _trace_prepare(rows: list[Any], light: Any, size: int, strength: Any) -> tuple[Orthographic, Bias]:
-    gaussians = Gaussians.from_rows(rows)
-    return fit_camera(gaussians, light, size), receiver_bias(gaussians, towards_sun(light), strength)
+def _trace_prepare(
+    rows: list[Any], light: Any, size: int, strength: Any, grazing: str
+) -> tuple[Orthographic, Bias, Any]:
+    """(light camera, bias, points to test or None for the centres)."""
+    gaussians, sun = Gaussians.from_rows(rows), towards_sun(light)
+    camera, bias = fit_camera(gaussians, light, size), receiver_bias(gaussians, sun, strength)
+    if grazing == "bias":
+        bias = bias.at_least(grazing_bias(gaussians, camera))
+    return camera, bias, lifted(gaussians, sun) if grazing == "lift" else None
 
 
 _prepare = recorded(_trace_prepare, RECORDINGS)

@@ -11,6 +11,7 @@ from spacesim.data.store import read_points
 from spacesim.splat.gaussians import SH_C0, Gaussians
 
 OPACITY = 0.1  #: of every Gaussian at the start (Kerbl et al. 2023)
+NEIGHBOURS = 12  #: points that a normal is estimated from, chosen
 FEATURES = 0.3  #: standard deviation of the features at the start, chosen
 
 
@@ -34,8 +35,18 @@ def initial_gaussians(
         means, colours = _at_random(dataset, count, rng)
     gaussians = gaussians_at(means, colours, -1 if features else sh_degree)
     if features:
-        gaussians.features = ad.Float((FEATURES * rng.standard_normal(features * gaussians.count)).astype(np.float32))
+        values = FEATURES * rng.standard_normal((features, gaussians.count))
+        gaussians.features = ad.Float(values.astype(np.float32).ravel())
     return gaussians
+
+
+def surface_normals(means: np.ndarray) -> np.ndarray:
+    """[N, 3] unit normals of the surface on which points [N, 3] lie, of either sign: the direction in which the
+    `NEIGHBOURS` nearest points spread least (Hoppe et al. 1992)."""
+    count = min(NEIGHBOURS, len(means))
+    near = means[cKDTree(means).query(means, k=count)[1].reshape(len(means), count)]
+    centred = near - near.mean(axis=1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][:, :, 0]
 
 
 def gaussians_at(means: np.ndarray, colours: np.ndarray, sh_degree: int) -> Gaussians:

@@ -23,7 +23,7 @@ from spacesim.splat.render import view_colours
 from spacesim.splat.tiles import bin_splats
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.initialise import farthest_camera, initial_gaussians, scene_scale
+from spacesim.splat.train.initialise import farthest_camera, initial_gaussians, scene_scale, surface_normals
 from spacesim.splat.train.losses import anisotropy, photometric_loss, visibility_loss
 from spacesim.splat.train.optimizer import Adam, adam_step
 from spacesim.splat.train.strategies.default import DefaultStrategy
@@ -201,6 +201,11 @@ class Trainer:
         if self.config.light is None:
             return None
         centre = self.gaussians.to_numpy()["means"].astype(np.float64).mean(axis=0)
+        field = self.config.light.field
+        if field.surface:
+            features = self.gaussians.to_numpy()["features"]
+            features[:, field.features : field.stored] = surface_normals(self.gaussians.to_numpy()["means"])
+            self.gaussians.features = ad.Float(np.ascontiguousarray(features.T).ravel())
         frame = TrainingFrame(centre, self.scene_scale, farthest_camera(dataset, centre))
         return LightModel.initial(self.config.light, frame, self.config.seed)
 

@@ -1,0 +1,126 @@
+"""How fast a relit and shadowed frame is, and a training step that learns one.
+
+    python benchmarks/light.py [--methods relight,shadow-map] [--preset fast] [--sizes 31622x1024] [--markdown]
+
+The scene is the sphere of random splats of the other benchmarks, with untrained networks of the preset's size: how
+long they take does not depend on what they have learned. A frame is what `spacesim render RUN --sun AZ,EL` draws, left on the
+device, each time under another Sun. "shadows" casts them, "field" is the networks, "draw" the picture; "kernels" is
+what the device alone needs. The thesis's frames (RTX 5000 Ada) stand beside ours.
+"""
+
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import common
+import drjit as dr
+import numpy as np
+import synthetic
+
+from spacesim import backend
+from spacesim.data.geometry import fibonacci_sphere
+from spacesim.data.records import Sun
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.light import LightModel, TrainingFrame
+from spacesim.splat.project import Pinhole
+from spacesim.splat.run import draw_lit
+from spacesim.splat.train.config import METHODS, preset
+
+LIT = METHODS[1:]
+DIRECTION = 4, 1, 1  #: of the camera from the sphere
+SUNS = fibonacci_sphere(64)
+SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "10000x256,30000x256"}
+STEPS = {"cuda": "100000x512", "llvm": "10000x128"}
+THESIS = {31622: 108, 101958: 77, 165495: 70}  #: frames per second (section 4.3.6, shadow mapping)
+
+
+class Frame:
+    """A relightable sphere and the parts of its picture. Each call has another Sun."""
+
+    def __init__(self, count: int, pixels: int, method: str, size: str) -> None:
+        config = preset(size, method).light
+        assert config is not None
+        arrays = {**common.sphere_arrays(count), "sh": np.zeros((count, 0, 3))}
+        arrays["features"] = np.random.default_rng(0).normal(size=(count, config.features)).astype(np.float32)
+        self.gaussians = Gaussians.from_numpy(arrays)
+        self.light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, common.DISTANCE), 0)
+        self.camera = Pinhole.of(common.camera_from(DIRECTION, pixels))
+        dr.eval(self.gaussians.rows(), self.camera.values)
+        self.calls = 0
+
+    def sun(self) -> np.ndarray:
+        self.calls += 1
+        return np.asarray(SUNS[self.calls % len(SUNS)])
+
+    def shadows(self) -> None:
+        dr.eval(self.light.shadows(self.gaussians, self.sun()))
+
+    def shade(self) -> None:
+        """Shadows and field."""
+        shading = self.light.shade(self.gaussians, self.camera, self.sun())
+        dr.eval(shading.colours, shading.visibility)
+
+    def frame(self) -> None:
+        output = draw_lit(self.gaussians, self.light, self.camera, self.sun())
+        dr.eval(output.features, output.alpha)
+
+
+def main() -> None:
+    parser = common.arguments(__doc__)
+    parser.add_argument("--methods", default="relight,shadow-map,shadow-splat", help=f"of {', '.join(LIT)}")
+    parser.add_argument("--preset", default="thesis", help="whose networks and light images (default thesis)")
+    parser.add_argument("--step-sizes", metavar="SIZES", help="of the training steps; 'none' leaves them out")
+    options = parser.parse_args()
+    name = backend.select(options.backend)
+    methods = options.methods.split(",")
+    unknown = [method for method in methods if method not in LIT]
+    if unknown:
+        sys.exit(f"--methods: expected some of {', '.join(LIT)}, found {unknown[0]!r}")
+    frames = [
+        measure_frame(count, pixels, method, options)
+        for count, pixels in common.parse_sizes(options.sizes or SIZES[name])
+        for method in methods
+    ]
+    steps = []
+    if options.step_sizes != "none":
+        sizes = common.parse_sizes(options.step_sizes or STEPS[name])
+        steps = [measure_step(count, pixels, method, options) for count, pixels in sizes for method in methods]
+    tables = {"Frames": frames, "Training steps, ms on the clock": steps}
+    common.emit({"frames": frames, "steps": steps}, tables, options)
+
+
+def measure_frame(count: int, pixels: int, method: str, options: Any) -> common.Row:
+    frame = Frame(count, pixels, method, options.preset)
+    works = {"frame": frame.frame, "shade": frame.shade}
+    if method != "relight":
+        works["shadows"] = frame.shadows
+    clock = common.interleaved(works, options.repeats)
+    kernels = common.kernels_in_turn(works)
+    shadows = clock["shadows"].median if "shadows" in clock else 0.0
+    row: common.Row = {"Gaussians": count, "pixels": pixels, "method": method, "ms (quartiles)": str(clock["frame"])}
+    row |= {"frames/s": 1e3 / clock["frame"].median}
+    if count in THESIS and pixels == 1024:
+        row["of the thesis's"] = row["frames/s"] / THESIS[count]
+    row |= {"shadows": shadows, "field": clock["shade"].median - shadows}
+    row["draw"] = clock["frame"].median - clock["shade"].median
+    return row | {f"{part}, kernels": found.milliseconds for part, found in kernels.items()}
+
+
+def measure_step(count: int, pixels: int, method: str, options: Any) -> common.Row:
+    with tempfile.TemporaryDirectory() as folder:
+        data = synthetic.write_dataset(Path(folder) / "data", count, pixels)
+        lit = [replace(frame, sun=Sun(SUNS[i])) for i, frame in enumerate(data.train)]
+        light = preset(options.preset, method).light
+        trainer = synthetic.still_trainer(replace(data, train=tuple(lit)), count, method=method, light=light)
+        clock = common.interleaved({"step": lambda: dr.eval(trainer.step())}, options.repeats)["step"]
+        sums = common.kernels(lambda: dr.eval(trainer.step()))
+    return {"Gaussians": count, "pixels": pixels, "method": method, "step (quartiles)": str(clock)} | {
+        "kernels": sums.milliseconds,
+        "launches": sums.launches,
+    }
+
+
+if __name__ == "__main__":
+    main()
