@@ -98,7 +98,7 @@ def test_the_shadow_ends_where_the_umbra_does(method, pixels, elevation):
     visibility, scale = occlude(method, arrays, sun)
     beyond, angle = beyond_umbra(arrays["means"][ball:], sun, scale)
     visibility = visibility[ball:]
-    assert visibility[beyond < -4].max() < 0.12
+    assert visibility[beyond < -4].max() < 0.02
     assert visibility[beyond > 4].min() > 0.9
     for quadrant in range(4):
         part = np.floor(angle / (np.pi / 2)) + 2 == quadrant
