@@ -95,8 +95,8 @@ def sweep(
 
     kind: "rgb", over black, or "shadow": how much of the Sun is seen, from SHADOWED to LIT;  keep_frames: write every
     picture, too;  report: told (pictures done, of all)
-    Raises InputError for another kind, a run that no Sun relights, a run without shadows where these are asked for, and
-    a folder of frames that holds some already.
+    Raises InputError for another kind, a run that no Sun relights, a run without shadows where these are asked for, a
+    folder that cannot be made, and one of frames that holds some already.
     """
     out = Path(out)
     if kind not in KINDS:
@@ -110,6 +110,7 @@ def sweep(
         )
     if keep_frames and holds_files(out / FRAMES_NAME):
         raise InputError(f"{out / FRAMES_NAME}: expected an empty folder for the frames, found files in it")
+    _make_folder(out)
     film = _Film(camera) if encoder() else None
     count = min(MOST_TILES, len(suns))
     shown = {k * len(suns) // count for k in range(count)}
@@ -156,6 +157,14 @@ def sky_mark(sun: Sun, side: int = TEXT - 4) -> np.ndarray:
     box = [x - dot, y - dot, x + dot, y + dot]
     draw.ellipse(box, SUN if elevation >= 0 else DARK_PAGE.paper, SUN, width=10)
     return np.asarray(picture.resize((side, side), Image.Resampling.BOX))
+
+
+def _make_folder(out: Path) -> None:
+    """Before the work, not after it."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: expected a folder that can be written, found none ({error.strerror})") from None
 
 
 def _picture(run: Run, camera: Camera, sun: Sun, kind: str) -> np.ndarray:

@@ -154,6 +154,9 @@ def test_a_run_that_cannot_and_a_folder_that_is_full_are_refused(tmp_path):
         sweep(Lit(), CAMERA, suns, tmp_path, "depth")
     with pytest.raises(InputError, match="suns"):
         sweep(Lit(), CAMERA, [], tmp_path)
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(InputError, match=r"file: expected a folder"):
+        sweep(Lit(), CAMERA, suns, tmp_path / "file", report=lambda *_: pytest.fail("rendered for nothing"))
     (tmp_path / "frames").mkdir()
     (tmp_path / "frames" / "0099.png").write_bytes(b"")
     with pytest.raises(InputError, match="frames"):
