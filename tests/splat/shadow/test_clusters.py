@@ -17,6 +17,7 @@ from spacesim.splat.shadow.clusters import (
     occlusion_in_clusters,
 )
 from spacesim.splat.shadow.mapping import occlusion_by_mapping
+from spacesim.splat.shadow.splatting import occlusion_by_splatting
 from spacesim.splat.shadow.sunlight import fit_camera, light_axes, light_rows, towards_sun
 
 SIZE = 102  # 100 pixels and the margins
@@ -351,6 +352,10 @@ def by_mapping(gaussians, camera):
     return occlusion_by_mapping(gaussians, camera, receiver_bias(gaussians, towards_sun(light_rows(SUN))).bias, 0.01)
 
 
+def by_splatting(gaussians, camera):
+    return occlusion_by_splatting(gaussians, camera, receiver_bias(gaussians, towards_sun(light_rows(SUN))).bias)
+
+
 def shadows(arrays, occlude, size=128, least_scale=40.0):
     return np.array(occlusion_in_clusters(Gaussians.from_numpy(arrays), SUN, size, least_scale, occlude))
 
@@ -365,7 +370,7 @@ def grid_blob(count, seed):
     return arrays | {"means": np.round(4096 * arrays["means"]) / 4096}
 
 
-METHODS = [(by_mapping, 0.02)]
+METHODS = [(by_mapping, 0.02), (by_splatting, 0.005)]
 
 
 @pytest.mark.parametrize(("occlude", "tolerance"), METHODS)
