@@ -12,6 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -19,6 +20,7 @@ from typing import Any
 from weakref import WeakSet
 
 NAMES = ("auto", "cuda", "llvm")
+_PLAIN = (int, float, bool, str, type(None))
 MINIMUM_LLVM = 19
 INSTALL_LLVM = "sudo apt-get install libllvm19"
 INSTALL_ATOMIC = "sudo apt-get install libatomic1"
@@ -182,23 +184,46 @@ def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
     """`function` by `dr.freeze`: traced at its first call with arguments of a kind, replayed at the others.
 
     At most `limit` recordings are kept. Python's garbage collector waits during a call: arrays that it frees in the
-    middle of a recording end the process.
+    middle of a recording end the process. Dr.Jit 1.5 knows an argument that occurs twice in a call by identity, and takes
+    f(1, 2, 1) for f(1, 2, 2): a text of all that is no array tells them apart. No array may stand in two places.
     """
     import drjit as dr
 
-    frozen = dr.freeze(function, limit=limit, warn_after=limit)
+    frozen = dr.freeze(lambda _, arguments: function(*arguments), limit=limit, warn_after=limit)
     _recorded.add(frozen)
 
     def call(*arguments: Any) -> Any:
         collecting = gc.isenabled()
         gc.disable()
         try:
-            return frozen(*arguments)
+            return frozen(_constants(arguments), arguments)
         finally:
             if collecting:
                 gc.enable()
 
     return call
+
+
+def _constants(value: Any) -> str:
+    """All of `value` that is no array, in words. Lists hold arrays alone, or none."""
+    kind = type(value)
+    if kind in _PLAIN:
+        return repr(value)
+    if kind is tuple:
+        return "(" + ",".join(map(_constants, value)) + ")"
+    if kind is list:
+        inner = value[:1] if value and not isinstance(value[0], tuple | list) else value
+        return f"[{len(value)}" + ",".join(map(_constants, inner)) + "]"
+    if kind is dict:
+        return "{" + ",".join(f"{key}:{_constants(inner)}" for key, inner in value.items()) + "}"
+    if is_dataclass(kind):
+        return kind.__name__ + "(" + ",".join(_constants(getattr(value, name)) for name in _names(kind)) + ")"
+    return ""
+
+
+@cache
+def _names(kind: type) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
 
 
 def recordings() -> int:

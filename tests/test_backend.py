@@ -207,3 +207,27 @@ def test_doctor_agrees_with_the_backend():
 def test_select_takes_known_names_alone():
     with pytest.raises(ValueError, match="found 'metal'"):
         backend.select("metal")
+
+
+def test_recordings_tell_constants_apart_that_occur_twice():
+    """Dr.Jit alone replays f(3, 4, 3) for f(3, 4, 4): it knows the last argument as one that it has seen."""
+    ad = backend.ad
+
+    def function(x, sizes, extra, flag):
+        return x * sizes[0] + 10 * sizes[1] * x + 100 * extra * x + (1000 * x if flag else 0)
+
+    recorded = backend.recorded(function, 8)
+    for extra in (3, 4):
+        for flag in (True, False):
+            expected = 3 + 40 + 100 * extra + 1000 * flag
+            assert float(recorded(ad.Float(1.0, 2.0), (3, 4), extra, flag)[0]) == expected
+
+
+def test_constants_are_all_that_is_no_array():
+    x = backend.ad.Float(1.0, 2.0)
+    told = [
+        backend._constants(value)
+        for value in ((1, x), (1.0, x), (True, x), ("1", x), (None, x), ([x], x), ([x, x], x), ({"a": 1}, x))
+    ]
+    assert len(set(told)) == len(told)
+    assert backend._constants((x, 1)) == backend._constants((x + 1, 1))
