@@ -117,6 +117,8 @@ if [ "$WANTED" = test ]; then
     install --no-build-isolation -e '.[dev]'
     install --no-build-isolation -e '.[cluster]' 2>/dev/null ||
         say "ray cannot be had here; the test that needs it is skipped"
+    install --no-build-isolation -e '.[video]' 2>/dev/null ||
+        say "PyAV cannot be had here; the tests that need it (videos) are skipped"
     install torch 2>/dev/null || install --retries 1 --extra-index-url "$TORCH_CPU" torch 2>/dev/null ||
         say "torch's CPU build cannot be had here; the tests that need it (LPIPS) are skipped"
 fi

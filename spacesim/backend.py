@@ -184,8 +184,8 @@ def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
     """`function` by `dr.freeze`: traced at its first call with arguments of a kind, replayed at the others.
 
     At most `limit` recordings are kept. Python's garbage collector waits during a call: arrays that it frees in the
-    middle of a recording end the process. Dr.Jit 1.5 knows an argument that occurs twice in a call by identity, and takes
-    f(1, 2, 1) for f(1, 2, 2): a text of all that is no array tells them apart. No array may stand in two places.
+    middle of a recording end the process. Dr.Jit 1.5 knows an argument that occurs twice in a call by identity, and
+    takes f(1, 2, 1) for f(1, 2, 2): a text of all that is no array tells them apart. No array may stand in two places.
     """
     import drjit as dr
 
