@@ -54,16 +54,16 @@ class FieldInputs:
 
 
 def field_items(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:
-    """TensorXf [inputs of the network, M] (4.2)."""
+    """Items of the network (4.2): TensorXf [B, C, m]."""
     direction = inputs.camera.directions_to(lanes.spread(inputs.means))
-    blocks = [lanes.block(inputs.features, 0, config.features), *config.view(direction)]
+    rows = [*lanes.block(inputs.features, 0, config.features), *config.view(direction)]
     if config.surface:
-        blocks += surface_cosines(_normals(config, inputs, lanes), direction, inputs.sun)
-    return lanes.matrix(blocks)
+        rows += surface_cosines(_normals(config, inputs, lanes), direction, inputs.sun)
+    return lanes.matrix(rows, config.shape.rows)
 
 
 def by_normals(config: FieldConfig, inputs: FieldInputs, by_items: Any, lanes: Lanes) -> Any:
-    """TensorXf [3, M]: gradient of the normals, from that of the network's items."""
+    """TensorXf [B, 3, m]: gradient of the normals, from that of the network's items."""
     normals = _normals(config, inputs, lanes)
     dr.enable_grad(normals)
     direction = inputs.camera.directions_to(lanes.spread(inputs.means))
@@ -93,4 +93,4 @@ def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
 
 def _normals(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:
     """Array3f [3, M], of any length."""
-    return ad.Array3f([lanes.block(inputs.features, config.features + i, 1) for i in range(3)])
+    return ad.Array3f(lanes.block(inputs.features, config.features, 3))

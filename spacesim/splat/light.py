@@ -225,7 +225,7 @@ def _trace_adjoint(
 
 
 def _refine_items(config: LightConfig, refine: RefineConfig, inputs: _Inputs, lanes: Lanes) -> Any:
-    """TensorXf [inputs, M] of the refinement: 4.11, lengths in training scale."""
+    """Items of the refinement, TensorXf [B, C, m]: 4.11, lengths in training scale."""
     x, y, z, scale = (dr.gather(ad.Float, inputs.place, ad.UInt32(i)) for i in range(4))
     per_metre = dr.rcp(scale)
     positions = (lanes.spread(inputs.means) - ad.Array3f(x, y, z)) * per_metre
@@ -235,7 +235,7 @@ def _refine_items(config: LightConfig, refine: RefineConfig, inputs: _Inputs, la
     occlusion, alignment, thickness, bias = (lanes.spread(value) for value in inputs.raw)
     features = lanes.block(inputs.features, config.field.stored, refine.features)
     info = [alignment, thickness * per_metre, bias * per_metre]
-    return lanes.matrix(refine_inputs(refine, occlusion, features, positions, info))
+    return lanes.matrix(refine_inputs(refine, occlusion, features, positions, info), refine.shape.rows)
 
 
 def _field_inputs(inputs: _Inputs) -> FieldInputs:

@@ -12,12 +12,10 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Sun
-from spacesim.splat import mlp
 from spacesim.splat.appearance import FieldConfig
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.encoding import Encoding
 from spacesim.splat.gaussians import Gaussians, entries
-from spacesim.splat.lanes import Lanes
 from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
 from spacesim.splat.mlp import MlpShape
 from spacesim.splat.run import Run, load_run
@@ -197,24 +195,6 @@ def test_encodings_are_those_of_scipy_and_numpy(kind):
     signs = np.sign((rows * expected).sum(axis=0))  # conventions differ in the sign of a harmonic
     np.testing.assert_allclose(rows, expected * (signs if encoding.kind == "harmonics" else 1), atol=2e-5)
     np.testing.assert_array_equal(numbers(encoding.of_one(vectors[3]))[:1], rows[3, :1].astype(np.float32))
-
-
-def test_columns_beyond_the_gaussians_change_nothing():
-    shape, rng = MlpShape(4, 2, 3, 8, 3), np.random.default_rng(0)
-    weights = [ad.Float(w) for w in mlp.initial_weights(shape, rng)]
-    assert sum(dr.width(w) for w in weights) == shape.parameters
-    rows = rng.normal(size=(4, 1500)).astype(np.float32)
-    lanes = Lanes.of(1500)
-    assert lanes.capacity > 1500
-    wide = lanes.matrix([lanes.padded(ad.Float(row)) for row in rows])
-    by = lanes.matrix([lanes.padded(ad.Float(row)) for row in rows[:3]])
-    output, tape = mlp.forward(shape, weights, wide, ad.Float(1, 2))
-    gradients, _ = mlp.backward(shape, weights, tape, ad.Float(1, 2), by)
-    exact, exact_tape = mlp.forward(shape, weights, ad.TensorXf(rows), ad.Float(1, 2))
-    exact_gradients, _ = mlp.backward(shape, weights, exact_tape, ad.Float(1, 2), ad.TensorXf(rows[:3]))
-    np.testing.assert_allclose(np.array(output)[:, :1500], np.array(exact), atol=1e-6)
-    for one, other in zip(gradients, exact_gradients, strict=True):
-        np.testing.assert_allclose(numbers(one), numbers(other), rtol=1e-4, atol=1e-3)
 
 
 def test_an_untrained_refinement_passes_raw_shadows_on():

@@ -38,11 +38,12 @@ class RefineConfig:
         return MlpShape(inputs, self.sun.size, 1, self.width, self.layers)
 
 
-def refine_inputs(config: RefineConfig, occlusion: Any, features: Any, positions: Any, info: list[Any]) -> list[Any]:
-    """The inputs of 4.11 but for the Sun, arrays [M] and one of several rows, `features` [6 * M]. positions: Array3f
-    [3, M], model-centred, in training scale (4.12);  info: normal alignment, light extent and bias, those in training
-    scale."""
-    inputs = [occlusion, features, *Encoding("positional", config.positional)(positions)]
+def refine_inputs(
+    config: RefineConfig, occlusion: Any, features: list[Any], positions: Any, info: list[Any]
+) -> list[Any]:
+    """The inputs of 4.11 but for the Sun, arrays [M]. positions: Array3f [3, M], model-centred, in training scale
+    (4.12);  info: normal alignment, light extent and bias, those in training scale."""
+    inputs = [occlusion, *features, *Encoding("positional", config.positional)(positions)]
     return [*inputs, 1 - occlusion, *info] if config.bias_info else inputs
 
 
