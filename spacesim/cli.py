@@ -11,6 +11,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -19,9 +20,10 @@ from spacesim import __version__, backend
 from spacesim.data.errors import InputError, WorkError
 
 if TYPE_CHECKING:
-    from spacesim.data.records import Camera
+    from spacesim.data.records import Camera, Sun
+    from spacesim.splat.train.config import TrainConfig
 
-KINDS = ("rgb", "depth", "alpha", "normal")
+KINDS = ("rgb", "depth", "alpha", "normal", "shadow")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -147,6 +149,16 @@ def _parser() -> argparse.ArgumentParser:
         "--black-background", action="store_true", help="train over black, as the thesis, not against alpha"
     )
     one.add_argument("--resume", action="store_true", help="go on from the newest checkpoint")
+    lit = one.add_argument_group("light", "of the methods that learn it; see docs/relighting.md")
+    lit.add_argument("--field", choices=("thesis", "surface"), help="what the appearance field is told")
+    lit.add_argument("--shadow-bias", type=float, metavar="X", help="strength of the receiver-depth bias; 0: none")
+    lit.add_argument("--grazing", choices=("none", "bias", "lift"), help="against acne where the Sun grazes")
+    lit.add_argument("--shadow-filter", choices=("bilinear", "percentage-closer", "variance"), help="of shadow maps")
+    lit.add_argument("--light-size", type=int, metavar="PX", help="sides of the Sun's picture")
+    lit.add_argument("--no-refinement", action="store_true", help="raw shadows, without the network")
+    lit.add_argument(
+        "--visibility-weight", type=float, metavar="W", help="learn shadows from path-traced visibility, too (0)"
+    )
 
     one = command("eval", _eval, "judge a run: EVAL/metrics.json, EVAL/report.html, EVAL/frames")
     one.add_argument("path", type=Path, metavar="RUN")
@@ -275,11 +287,12 @@ def _train(options: argparse.Namespace) -> None:
     from spacesim.splat.train.config import preset, with_options
     from spacesim.splat.train.train import train
 
-    names = ("strategy", "init", "init_count", "views_per_step", "iterations", "seed")
+    names = ("strategy", "init", "init_count", "views_per_step", "iterations", "seed", "visibility_weight")
     config = preset(options.preset, options.method)
     config = with_options(config, **{name: getattr(options, name) for name in names})
     if options.black_background:
         config = with_options(config, random_background=False)
+    config = _with_light(config, options)
     dataset = read_dataset(options.data)
     with reporting("train", "iterations") as report:
         run = train(dataset, options.out, config, options.resume, tell_training(report), options.command)
@@ -288,6 +301,28 @@ def _train(options: argparse.Namespace) -> None:
         f"{options.out}: {run.gaussians} Gaussians after {config.iterations} iterations in "
         f"{run.training['seconds']:.0f} s on {run.training['backend']}, final loss {history[-1]['loss']:.4f}"
     )
+
+
+def _with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainConfig":
+    """`config` with what the options say of fields and shadows. Raises InputError where the method has none of them."""
+    names = ("field", "shadow_bias", "grazing", "shadow_filter", "light_size", "no_refinement")
+    named = [name for name in names if getattr(options, name) not in (None, False)]
+    if not named:
+        return config
+    light, option = config.light, "--" + named[0].replace("_", "-")
+    if light is None or (light.shadow is None and named != ["field"]):
+        what = "that learns light" if light is None else "with shadows"
+        raise InputError(f"{option}: expected a method {what}, found {config.method}")
+    if options.field is not None:
+        light = replace(light, field=replace(light.field, surface=options.field == "surface"))
+    shadow = light.shadow
+    if shadow is not None:
+        given = {"bias": options.shadow_bias, "grazing": options.grazing, "size": options.light_size}
+        shadow = replace(shadow, **{name: value for name, value in given.items() if value is not None})
+        if options.shadow_filter is not None:
+            shadow = replace(shadow, mapping=replace(shadow.mapping, filter=options.shadow_filter))
+        shadow = replace(shadow, refine=None) if options.no_refinement else shadow
+    return replace(config, light=replace(light, shadow=shadow))
 
 
 def _eval(options: argparse.Namespace) -> None:
@@ -318,7 +353,6 @@ def _report(options: argparse.Namespace) -> None:
 
 def _render(options: argparse.Namespace) -> None:
     from spacesim.data.records import Sun
-    from spacesim.data.transforms import read_camera, read_dataset
     from spacesim.splat.picture import write_picture
     from spacesim.splat.run import load_run
 
@@ -326,14 +360,10 @@ def _render(options: argparse.Namespace) -> None:
     sun = Sun.from_angles(*options.sun) if options.sun else None
     if sun is not None and not run.relightable:
         print("a vanilla run knows the light that it was trained under only; --sun changes nothing", file=sys.stderr)
-    if options.camera:
-        camera = read_camera(options.camera)
-    else:
-        frames = read_dataset(options.data or _data_of(run.config)).frames
-        index = options.frame or 0
-        if not 0 <= index < len(frames):
-            raise InputError(f"--frame: expected 0 to {len(frames) - 1}, found {index}")
-        camera, sun = frames[index].camera, sun or frames[index].sun
+    camera, sun_of_frame = _view_of(options, run.config)
+    sun = sun or sun_of_frame
+    if sun is None and run.relightable:
+        raise InputError("--sun: expected AZ,EL for a run that can be relit and a camera without a Sun, found none")
     write_picture(run.predict(camera, sun, normals=options.kind == "normal"), options.kind, options.out)
     ending.say(options.out)
 
@@ -345,7 +375,7 @@ def _sweep(options: argparse.Namespace) -> None:
 
     suns = suns_around(FRAMES if options.frames is None else options.frames, options.elevation, options.azimuth)
     run = load_run(options.path)
-    camera = _view_of(options, run.config)
+    camera, _ = _view_of(options, run.config)
     if options.size is not None:
         camera = resized(camera, options.size)
     with reporting("sweep", "frames") as report:
@@ -355,17 +385,17 @@ def _sweep(options: argparse.Namespace) -> None:
     ending.say(" ".join(str(path) for path in (done.sheet, done.video) if path is not None))
 
 
-def _view_of(options: argparse.Namespace, config: dict[str, Any]) -> "Camera":
-    """The camera that --camera or --frame names."""
+def _view_of(options: argparse.Namespace, config: dict[str, Any]) -> "tuple[Camera, Sun | None]":
+    """The camera that --camera or --frame names, and the Sun of a frame."""
     from spacesim.data.transforms import read_camera, read_dataset
 
     if options.camera:
-        return read_camera(options.camera)
+        return read_camera(options.camera), None
     frames = read_dataset(options.data or _data_of(config)).frames
     index = options.frame or 0
     if not 0 <= index < len(frames):
         raise InputError(f"--frame: expected 0 to {len(frames) - 1}, found {index}")
-    return frames[index].camera
+    return frames[index].camera, frames[index].sun
 
 
 def _data_of(config: dict[str, Any]) -> Path:
@@ -439,6 +469,12 @@ def _print_headline(metrics: dict[str, Any]) -> None:
     ending.say(f"silhouette: PSNR {show('image', 'psnr', 2)} dB, SSIM {show('image', 'ssim', 4)}", end="")
     ending.say(f", FLIP {show('image', 'flip', 4)}; full frame: PSNR {show('image_full', 'psnr', 2)} dB")
     ending.say(f"shadows: BER {show('shadow', 'ber', 4)}, boundary MAE {show('shadow', 'boundary_mae', 4)}")
+    if metrics.get("shadow_mask"):
+        share, balanced = show("shadow_mask", "error_rate", 4), show("shadow_mask", "balanced_error_rate", 4)
+        ending.say(f"shadow masks: error rate {share}, balanced {balanced}")
+    if metrics.get("known_suns") and metrics.get("unseen_suns"):
+        known, unseen = (_mean(metrics[part], "image", "psnr", 2) for part in ("known_suns", "unseen_suns"))
+        ending.say(f"silhouette PSNR: {known} dB under known Suns, {unseen} dB under Suns never seen")
     for note in metrics.get("notes", []):
         ending.say(f"note: {note}")
 

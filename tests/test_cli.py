@@ -17,7 +17,7 @@ from spacesim.data.store import read_dataset, verify_dataset
 from spacesim.splat.ply import read_ply
 from spacesim.splat.run import load_run
 
-COMMANDS = ("doctor", "demo", "generate", "train", "eval", "report", "render", "export")
+COMMANDS = ("doctor", "demo", "generate", "train", "eval", "report", "render", "sweep", "export")
 
 
 def test_help_names_every_command(spacesim):
@@ -277,11 +277,15 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("train RUN --out OUT", ["RUN", "transforms.json"]),
         ("train DATA --out OUT --iterations 0", ["--iterations", "at least 1", "found 0"]),
         ("train DATA --out OUT --iterations 1e3", ["--iterations", "1e3"]),
-        ("train DATA --out OUT --method park", ["--method", "vanilla", "park"]),
         ("train DATA --out OUT --strategy none", ["--strategy", "default", "none"]),
         ("train DATA --out OUT --preset huge", ["--preset", "thesis", "huge"]),
         ("train DATA --out OUT --init sphere", ["--init", "points", "sphere"]),
         ("train DATA --out OUT --init-count 0", ["--init-count", "found 0"]),
+        ("train DATA --out OUT --method magic", ["--method", "vanilla, relight, shadow-map, shadow-splat, park", "magic"]),
+        ("train DATA --out OUT --field surface", ["--field", "learns light", "vanilla"]),
+        ("train DATA --out OUT --method relight --shadow-bias 3", ["--shadow-bias", "with shadows", "relight"]),
+        ("train DATA --out OUT --method relight --visibility-weight 1", ["--visibility-weight", "shadows", "relight"]),
+        ("train DATA --out OUT --method shadow-splat --grazing lift --shadow-bias -1", ["bias", "-1"]),
         ("train DATA --out OUT --seed -1", ["--seed", "found -1"]),
         ("train DATA --out OUT --backend vulkan", ["--backend", "vulkan"]),
         ("train DATA --out DATA", ["DATA", "empty or new folder"]),
@@ -300,6 +304,8 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("render RUN --out OUT.png --camera ABSENT", ["ABSENT"]),
         ("render RUN --out OUT.png --camera DATA/scene.json", ["scene.json", "w and h"]),
         ("render RUN --out OUT.png --kind shade", ["--kind", "shade"]),
+        ("render RUN --out OUT.png --kind shadow", ["--kind shadow", "predicts shadows"]),
+        ("sweep RUN --out OUT", ["RUN", "vanilla"]),
         ("render RUN --out OUT.png --sun 5", ["--sun", "5"]),
         ("render RUN --out OUT.jpg", ["OUT.jpg", ".png"]),
         ("render RUN --out OUT", [".png", ".exr"]),

@@ -7,11 +7,11 @@ import numpy as np
 from spacesim.data.images import srgb_from_linear
 from spacesim.eval.image import Mask
 from spacesim.eval.shadow import KINDS
+from spacesim.splat.picture import LIT, SHADOWED
 
 ERROR_SCALE = 0.25
 """Mean absolute error of the channels at the bright end of the colour map; more is drawn as that."""
 
-LIT, SHADOWED = (222, 222, 216), (58, 64, 82)
 WRONGLY_SHADOWED, WRONGLY_LIT = (213, 94, 0), (86, 180, 233)
 """sRGB colours of shadow masks; the mistakes' are Okabe and Ito's, which colour-blind readers tell apart."""
 

@@ -6,16 +6,22 @@ import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import write_exr, write_png
+from spacesim.data.tone import as_bytes
 from spacesim.splat.run import Prediction
+
+LIT, SHADOWED = (222, 222, 216), (58, 64, 82)  #: sRGB colours of visibility 1 and 0
 
 
 def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
     """kind: "rgb" (PNG: straight alpha; EXR: sRGB over black), "alpha", "depth" (PNG: near is bright; EXR: metres)
-    or "normal" (PNG: world x, y, z from -1 to 1 as red, green, blue; EXR: the vectors).
+    "normal" (PNG: world x, y, z from -1 to 1 as red, green, blue; EXR: the vectors) or "shadow" (PNG: `shadow_colours`;
+    EXR: visibility, 1 where all of the Sun is seen).
 
-    Raises InputError for another suffix than .png or .exr.
+    Raises InputError for another suffix than .png or .exr, and for shadows of a method without.
     """
-    path, plane = Path(path), getattr(prediction, kind)
+    path, plane = Path(path), getattr(prediction, "visibility" if kind == "shadow" else kind)
+    if plane is None:
+        raise InputError(f"--kind {kind}: expected a run whose method predicts shadows, found one that does not")
     if path.suffix == ".exr":
         write_exr(path, {kind: plane.astype(np.float32)})
     elif path.suffix != ".png":
@@ -23,18 +29,26 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
     elif kind == "rgb":
         alpha = np.clip(prediction.alpha, 0, 1)[..., None]
         straight = np.where(alpha > 0, plane / np.maximum(alpha, 1e-6), 0)
-        write_png(path, _bytes(np.concatenate([straight, alpha], axis=-1)))
+        write_png(path, as_bytes(np.concatenate([straight, alpha], axis=-1)))
     elif kind == "depth":
-        write_png(path, _bytes(_near_is_bright(plane)))
+        write_png(path, as_bytes(_near_is_bright(plane)))
+    elif kind == "shadow":
+        write_png(path, as_bytes(shadow_colours(prediction)))
     elif kind == "normal":
         surface = np.any(plane != 0, axis=-1, keepdims=True)
-        write_png(path, _bytes(np.where(surface, 0.5 + 0.5 * plane, 0)))
+        write_png(path, as_bytes(np.where(surface, 0.5 + 0.5 * plane, 0)))
     else:
-        write_png(path, _bytes(plane))
+        write_png(path, as_bytes(plane))
 
 
-def _bytes(plane: np.ndarray) -> np.ndarray:
-    return np.rint(np.clip(plane, 0, 1) * 255).astype(np.uint8)
+def shadow_colours(prediction: Prediction) -> np.ndarray:
+    """[H, W, 3] values in [0, 1], over black: SHADOWED where the Sun is hidden, LIT where it is seen. Raises ValueError
+    for a prediction without visibility."""
+    if prediction.visibility is None:
+        raise ValueError("prediction: expected one with visibility, found none")
+    lit, shadowed = (np.array(colour) / 255 for colour in (LIT, SHADOWED))
+    visibility = np.clip(np.nan_to_num(prediction.visibility), 0, 1)[..., None]
+    return (shadowed + visibility * (lit - shadowed)) * np.clip(prediction.alpha, 0, 1)[..., None]
 
 
 def _near_is_bright(depth: np.ndarray) -> np.ndarray:

@@ -20,7 +20,8 @@ from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Sun
 from spacesim.data.sheet import DARK_PAGE, DETAIL, TEXT, Tile, contact_sheet, fitted, font
 from spacesim.data.tone import as_bytes
-from spacesim.splat.run import Prediction, Run
+from spacesim.splat.picture import shadow_colours
+from spacesim.splat.run import Run
 from spacesim.splat.video import INSTALL, Video, encoder
 
 KINDS = ("rgb", "shadow")
@@ -31,7 +32,6 @@ SHEET_NAME, VIDEO_NAME, FRAMES_NAME = "sweep.png", "sweep.mp4", "frames"
 
 MOST_TILES, COLUMNS, SIDE = 24, 6, 224  #: of the sheet; pixels of a tile's longer side
 LEAST_SIDE = 320  #: pixels of a video's longer side: smaller pictures are enlarged by a whole number
-LIT, SHADOWED = (222, 222, 216), (58, 64, 82)  #: sRGB colours of visibility 1 and 0, those of the report's shadow masks
 SUN = (255, 190, 60)
 _STRIP = 28  #: pixels of the video's caption
 
@@ -130,15 +130,6 @@ def sweep(
         return Swept(out / SHEET_NAME, None, f"{out / VIDEO_NAME}: not written, PyAV is not installed; type: {INSTALL}")
     write_bytes(out / VIDEO_NAME, film.video.content())
     return Swept(out / SHEET_NAME, out / VIDEO_NAME, None)
-
-
-def shadow_colours(prediction: Prediction) -> np.ndarray:
-    """[H, W, 3] values in [0, 1], over black: SHADOWED where the Sun is hidden, LIT where it is seen."""
-    if prediction.visibility is None:
-        raise ValueError("prediction: expected one with visibility, found none")
-    lit, shadowed = (np.array(colour) / 255 for colour in (LIT, SHADOWED))
-    visibility = np.clip(np.nan_to_num(prediction.visibility), 0, 1)[..., None]
-    return (shadowed + visibility * (lit - shadowed)) * np.clip(prediction.alpha, 0, 1)[..., None]
 
 
 def sky_mark(sun: Sun, side: int = TEXT - 4) -> np.ndarray:

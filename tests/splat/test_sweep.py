@@ -16,9 +16,10 @@ from spacesim.data.records import Camera, Sun
 from spacesim.splat import sweep as module
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
+from spacesim.splat.picture import LIT, SHADOWED, shadow_colours
 from spacesim.splat.run import Prediction, Run
 from spacesim.splat.shadow.cast import ShadowConfig
-from spacesim.splat.sweep import LIT, SHADOWED, SUN, resized, shadow_colours, sky_mark, suns_around, sweep
+from spacesim.splat.sweep import SUN, resized, sky_mark, suns_around, sweep
 from spacesim.splat.video import Video, encoder, yuv420_from_rgb
 
 CAMERA = Camera.from_fov(look_at([3, 1, 1], np.zeros(3)), 24, 16, 30)

@@ -24,7 +24,7 @@ GRAZING = ("none", "bias", "lift")
 class ShadowConfig:
     """method: "mapping" (4.3.1) or "splatting" (4.3.2);  size: pixels of each side of the light image, of which the
     thesis names none;  bias: lambda_b of 4.26, 0 for none;  grazing: what holds at a grazing Sun, too, where the
-    thesis's bias goes to 0: "bias" (`grazing_bias`) or, with mapping, "lift" (`lifted`);  softness: epsilon_s of 4.5 as
+    thesis's bias goes to 0: "bias" (`grazing_bias`) or "lift" (`lifted`);  softness: epsilon_s of 4.5 as
     a share of the farthest training camera's distance;  mapping: how the light's picture is read;  refine: the network
     of 4.3.3, or None."""
 
@@ -39,10 +39,8 @@ class ShadowConfig:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise InputError(f"shadow method: expected {' or '.join(METHODS)}, found {self.method!r}")
-        if self.grazing not in GRAZING or (self.grazing == "lift" and self.method != "mapping"):
-            raise InputError(
-                f"grazing: expected one of {', '.join(GRAZING)}, the last with mapping only, found {self.grazing!r}"
-            )
+        if self.grazing not in GRAZING:
+            raise InputError(f"grazing: expected one of {', '.join(GRAZING)}, found {self.grazing!r}")
         if self.size < 4:
             raise InputError(f"light image: expected at least 4 pixels, found {self.size}")
         if not (self.bias >= 0 and self.softness > 0):
@@ -73,7 +71,7 @@ def cast_shadows(gaussians: Gaussians, light: Any, config: ShadowConfig, distanc
         softness = config.softness * distance
         occlusion = occlusion_by_mapping(gaussians, camera, bias.bias, softness, config.mapping, points)
     else:
-        occlusion = occlusion_by_splatting(gaussians, camera, bias.bias)
+        occlusion = occlusion_by_splatting(gaussians, camera, bias.bias, points)
     return Shadows(occlusion, bias)
 
 
