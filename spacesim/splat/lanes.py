@@ -21,7 +21,8 @@ class Lanes:
     [B, C, m]. A sum over all columns is then B short ones, made at once, and one over these (`mlp.backward`).
 
     Arrays [N] are gathered into columns first, and all is computed there: to gather what was computed takes a kernel
-    for each. In a recording the size of a kernel follows that of an array that it reads: hence `like`.
+    for each. In a recording the size of a kernel follows that of an array that it reads, first of one that it does not
+    read by index: where that is `count`, it is as many times as wide as it was, so M; elsewhere hence `like`.
     """
 
     count: Any

@@ -107,6 +107,15 @@ def test_recorded_passes_repeat_to_the_bit_and_serve_other_sizes():
         np.testing.assert_allclose(numbers(gradients[1]), exact_gradients[1], rtol=1e-4, atol=1e-2)
 
 
+def test_recordings_are_as_wide_as_the_columns_whatever_they_read():
+    record = recorded(lambda packed, lanes: lanes.matrix(lanes.block(packed, 4, 2)), 16)
+    for count in (512, 1000, 300):  # 512: the packed rows are a multiple of the columns, and more than the matrix
+        packed = np.random.default_rng(count).normal(size=(38, count)).astype(np.float32)
+        found = record(ad.Float(packed.ravel()), Lanes.of(count))
+        np.testing.assert_array_equal(columns(found, count), packed[4:6])
+        np.testing.assert_array_equal(columns(found, 1024)[:, count:], np.repeat(packed[4:6, -1:], 1024 - count, 1))
+
+
 def test_columns_beyond_the_gaussians_change_nothing():
     shape, count = SHAPES["as it is"], 1500
     case = Case(shape, count)
