@@ -49,7 +49,7 @@ class Pipeline:
 
     def forward(self) -> None:
         """Lists to pixels."""
-        self.blended = forward(self.splats, self.colour, self.lists, *self.size)
+        self.blended = forward(self.splats, self.colour, self.lists, *self.size, adjoint=True)
         dr.eval(self.blended.features, self.blended.transmittance, self.blended.tile_last)
 
     def loss(self) -> None:

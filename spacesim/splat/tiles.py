@@ -1,8 +1,12 @@
 """Stage 2: which splats each screen tile blends, front to back.
 
-Splats are sorted by depth once, expanded to (tile, splat) pairs, and the pairs are sorted by tile; both sorts are
-stable, so each tile's list is in depth order, ties in index order: the result does not depend on scheduling. Pairs come
-from the box around a splat's ellipse; those whose tile the ellipse misses are sorted behind all tiles.
+Each tile lists the splats whose ellipse reaches it, in depth order, ties in index order: the result does not depend on
+scheduling. Pairs of tile and splat come from the box around a splat's ellipse; those whose tile the ellipse misses are
+in no list. How the lists are put in order depends on the backend, the order does not:
+
+- CUDA counts the pairs into their tiles and orders each list by itself (`counting.py`): a radix sort's many launches
+  cost more than its work (docs/performance.md), and Dr.Jit 1.5 cannot replay them.
+- LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile; both sorts are stable.
 """
 
 from dataclasses import dataclass
@@ -12,10 +16,12 @@ import drjit as dr
 
 from spacesim.backend import ad, free_memory, recorded, select
 from spacesim.data.errors import WorkError
+from spacesim.splat.counting import ordered_lists, owners
 from spacesim.splat.project import ALPHA_MIN, Footprints, Splats
 
 RECORDINGS = 256  #: of a function that are kept: one for each size of picture, of the lists, and of the model
 
+DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
 LARGEST_PAIRS = 0.9 * 2**30  #: lists hold four numbers a pair, and Dr.Jit's arrays at most 2^32
 BYTES_A_PAIR = 150  #: of lists, sorting, and gradients of three channels, at most at once
 
@@ -66,42 +72,42 @@ class TileLists:
 
 
 @dataclass
-class _Ranked:
-    """Splats [M] with their boxes in tiles, and their order by depth [M] with the pairs before each and of each."""
+class _Boxes:
+    """Of splats [M]: boxes in tiles, how many tiles, the splats in the order in which pairs are numbered (None: that of
+    their indices), and the pairs up to and including each in that order, UInt64."""
 
     left: Any
     top: Any
     columns: Any
     count: Any
     order: Any
-    first: Any
-    pairs: Any  #: Float64 [1], of all
+    upto: Any
 
 
 def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) -> TileLists:
     """Sort splats [N] into the tiles of a width x height image. Raises WorkError for more pairs than can be
     sorted or held in memory.
 
-    Between its two parts the host waits for the number of pairs, which says how large arrays must be. On LLVM both are
-    recorded; on CUDA Dr.Jit 1.5 cannot replay its own sort.
+    Between its two parts, both recorded, the host waits for the number of pairs, which says how large arrays must be.
     """
-    rank, expand = (_rank, _expand) if select() == "llvm" else (_trace_rank, _trace_expand)
+    boxes_of, lists_of = (_boxes, _count) if select() == "cuda" else (_rank, _expand)
     shape, count = tile_shape(), dr.width(splats.x)
     tiles = -(-width // shape.width), -(-height // shape.height)
     splats, footprints = dr.detach(splats), dr.detach(footprints)
     pairs = 0
     if count > 0:
-        ranked: _Ranked = rank(splats, footprints, dr.opaque(ad.UInt32, count), room(count), tiles, shape)
-        _check_room(float(ranked.pairs[0]))
-        pairs = int(ranked.pairs[0])
+        capacity = room(count)
+        boxes: _Boxes = boxes_of(splats, footprints, dr.opaque(ad.UInt32, count), capacity, tiles, shape)
+        pairs = int(boxes.upto[capacity - 1])
+        _check_room(pairs)
     if pairs == 0:
         none, of_splats = dr.zeros(ad.UInt32, tiles[0] * tiles[1]), dr.zeros(ad.UInt32, max(count, 1))
         return TileLists(none, none, none, none, of_splats, of_splats, 0, *tiles, shape)
-    lists: TileLists = expand(splats, ranked, dr.opaque(ad.UInt32, pairs), room(pairs), room(count), tiles, shape)
+    lists: TileLists = lists_of(splats, footprints, boxes, room(pairs), capacity, tiles, shape)
     return lists
 
 
-def _check_room(pairs: float) -> None:
+def _check_room(pairs: int) -> None:
     needed = pairs * BYTES_A_PAIR
     if pairs > LARGEST_PAIRS:
         raise WorkError(f"rasterizer: {pairs:.3g} pairs of tile and splat, at most {LARGEST_PAIRS:.3g} can be sorted")
@@ -122,9 +128,33 @@ def room(count: int) -> int:
     return (count // step + 1) * step
 
 
+def _trace_boxes(
+    splats: Splats, footprints: Footprints, count: Any, capacity: int, tiles: tuple[int, int], shape: TileShape
+) -> _Boxes:
+    """Boxes of `count` splats; pairs are numbered in the order of the splats' indices."""
+    left, top, columns, pairs, _ = _boxes_in_tiles(splats, footprints, count, capacity, tiles, shape)
+    wide = ad.UInt64(pairs)
+    dr.eval(left, top, columns, pairs, wide)
+    return _Boxes(left, top, columns, pairs, None, _running_sum(wide))
+
+
 def _trace_rank(
     splats: Splats, footprints: Footprints, count: Any, capacity: int, tiles: tuple[int, int], shape: TileShape
-) -> _Ranked:
+) -> _Boxes:
+    """Boxes of `count` splats; pairs are numbered in depth order."""
+    left, top, columns, pairs, live = _boxes_in_tiles(splats, footprints, count, capacity, tiles, shape)
+    # Splats that cannot be seen have no pairs, so their place does not matter.
+    lane = dr.arange(ad.UInt32, capacity)
+    key = dr.select(live, dr.gather(ad.UInt32, footprints.order, lane, live), ad.UInt32(0xFFFFFFFF))
+    dr.eval(left, top, columns, pairs, key)
+    order = _stable_order(key, 32)
+    return _Boxes(left, top, columns, pairs, order, _running_sum(ad.UInt64(dr.gather(ad.UInt32, pairs, order))))
+
+
+def _boxes_in_tiles(
+    splats: Splats, footprints: Footprints, count: Any, capacity: int, tiles: tuple[int, int], shape: TileShape
+) -> tuple[Any, Any, Any, Any, Any]:
+    """(left, top, columns, pairs, whether it can be seen) of each splat's box, [M] = [capacity]."""
     lane = dr.arange(ad.UInt32, capacity)
     live = lane < count
     live &= dr.gather(ad.Bool, footprints.visible, lane, live)
@@ -133,50 +163,81 @@ def _trace_rank(
     )
     x0, x1 = _tile_range(x, half_width, shape.width, tiles[0])
     y0, y1 = _tile_range(y, half_height, shape.height, tiles[1])
-    pairs = dr.select(live, (x1 - x0) * (y1 - y0), ad.UInt32(0))
-    # Splats that cannot be seen have no pairs, so their place does not matter.
-    key = dr.select(live, dr.gather(ad.UInt32, footprints.order, lane, live), ad.UInt32(0xFFFFFFFF))
-    columns = dr.maximum(x1 - x0, 1)
-    dr.eval(x0, y0, columns, pairs, key)
-    order = _stable_order(key, 32)
-    in_order = dr.gather(ad.UInt32, pairs, order)
-    return _Ranked(x0, y0, columns, pairs, order, dr.prefix_sum(in_order), dr.sum(ad.Float64(in_order)))
+    return x0, y0, dr.maximum(x1 - x0, 1), dr.select(live, (x1 - x0) * (y1 - y0), ad.UInt32(0)), live
 
 
-def _trace_expand(
+def _running_sum(values: Any) -> Any:
+    return dr.prefix_reduce(dr.ReduceOp.Add, values, exclusive=False)
+
+
+def _trace_count(
     splats: Splats,
-    ranked: _Ranked,
-    pairs: Any,
+    footprints: Footprints,
+    boxes: _Boxes,
     capacity: int,
     splat_capacity: int,
     tiles: tuple[int, int],
     shape: TileShape,
 ) -> TileLists:
+    """Lists that are ordered one by one."""
+    slot = dr.arange(ad.UInt32, capacity)
+    total = ad.UInt32(dr.gather(ad.UInt64, boxes.upto, ad.UInt32(splat_capacity - 1)))
+    splat = owners(boxes.upto, dr.minimum(slot, total - 1), splat_capacity)  # beyond the last pair: that one's splat
+    before = ad.UInt32(dr.gather(ad.UInt64, boxes.upto, splat)) - dr.gather(ad.UInt32, boxes.count, splat)
+    tile = _tile_of(splats, boxes, splat, slot - before, slot < total, tiles, shape)
+    key = dr.gather(ad.UInt32, footprints.order, splat)
+    first_slot = ad.UInt32(boxes.upto) - boxes.count
+    dr.eval(first_slot)
+    splat, slot, start, end = ordered_lists(tile, key, splat, tiles[0] * tiles[1], capacity)
+    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, *tiles, shape)
+
+
+def _trace_expand(
+    splats: Splats,
+    _footprints: Footprints,
+    boxes: _Boxes,
+    capacity: int,
+    splat_capacity: int,
+    tiles: tuple[int, int],
+    shape: TileShape,
+) -> TileLists:
+    """Lists from two stable sorts."""
     # Mark each splat's first pair with its rank, then a running maximum fills in the rest.
     splat_rank = dr.arange(ad.UInt32, splat_capacity)
-    has_pairs = dr.gather(ad.UInt32, ranked.count, ranked.order) > 0
+    pairs_of = dr.gather(ad.UInt32, boxes.count, boxes.order)
+    first = ad.UInt32(boxes.upto) - pairs_of
+    dr.eval(first)
     rank = dr.zeros(ad.UInt32, capacity)
-    dr.scatter(rank, splat_rank, ranked.first, active=has_pairs)
+    dr.scatter(rank, splat_rank, first, active=pairs_of > 0)
     rank = dr.prefix_reduce(dr.ReduceOp.Max, rank, exclusive=False)
     first_slot = dr.zeros(ad.UInt32, splat_capacity)
-    dr.scatter(first_slot, ranked.first, ranked.order)
+    dr.scatter(first_slot, first, boxes.order)
 
     slot = dr.arange(ad.UInt32, capacity)
-    splat = dr.gather(ad.UInt32, ranked.order, rank)
-    within = slot - dr.gather(ad.UInt32, ranked.first, rank)
-    columns = dr.maximum(dr.gather(ad.UInt32, ranked.columns, splat), 1)
-    column = dr.gather(ad.UInt32, ranked.left, splat) + within % columns
-    row = dr.gather(ad.UInt32, ranked.top, splat) + within // columns
-    listed = (slot < pairs) & _touches(splats, splat, column, row, shape)
+    total = ad.UInt32(dr.gather(ad.UInt64, boxes.upto, ad.UInt32(splat_capacity - 1)))
+    splat = dr.gather(ad.UInt32, boxes.order, rank)
+    within = slot - dr.gather(ad.UInt32, first, rank)
+    tile = _tile_of(splats, boxes, splat, within, slot < total, tiles, shape)
     count = tiles[0] * tiles[1]
-    tile = dr.select(listed, row * tiles[0] + column, count)
     slot = _stable_order(tile, count.bit_length())
     tile = dr.gather(ad.UInt32, tile, slot)
     splat = dr.gather(ad.UInt32, splat, slot)
     dr.eval(tile, splat)
     start, end = _runs(tile, count, capacity)
     dr.eval(splat, slot, start, end, first_slot)
-    return TileLists(splat, slot, start, end, first_slot, ranked.count, capacity, *tiles, shape)
+    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, *tiles, shape)
+
+
+def _tile_of(
+    splats: Splats, boxes: _Boxes, splat: Any, within: Any, exists: Any, tiles: tuple[int, int], shape: TileShape
+) -> Any:
+    """Tile [P] of the pair `within` the box of a splat; the number of tiles where there is no such pair, or the ellipse
+    misses the tile."""
+    columns = dr.maximum(dr.gather(ad.UInt32, boxes.columns, splat), 1)
+    column = dr.gather(ad.UInt32, boxes.left, splat) + within % columns
+    row = dr.gather(ad.UInt32, boxes.top, splat) + within // columns
+    listed = exists & _touches(splats, splat, column, row, shape)
+    return dr.select(listed, row * tiles[0] + column, tiles[0] * tiles[1])
 
 
 def _touches(splats: Splats, splat: Any, column: Any, row: Any, shape: TileShape) -> Any:
@@ -203,8 +264,7 @@ def _touches(splats: Splats, splat: Any, column: Any, row: Any, shape: TileShape
 def _stable_order(keys: Any, bits: int) -> Any:
     """Indices that sort `keys` [N] of so many bits: a radix sort that knows how few digits there are, where dr.argsort
     goes through all 32 bits."""
-    digit_bits = 8 if select() == "cuda" else 11
-    passes = -(-bits // digit_bits)
+    passes = -(-bits // DIGIT_BITS)
     digit_bits = -(-bits // passes)
     order = dr.arange(ad.UInt32, dr.width(keys))
     for i in range(passes):
@@ -236,5 +296,7 @@ def _runs(tile: Any, tiles: int, capacity: int) -> tuple[Any, Any]:
     return start, end
 
 
+_boxes = recorded(_trace_boxes, RECORDINGS)
+_count = recorded(_trace_count, RECORDINGS)
 _rank = recorded(_trace_rank, RECORDINGS)
 _expand = recorded(_trace_expand, RECORDINGS)

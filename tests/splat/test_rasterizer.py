@@ -5,17 +5,27 @@ import numpy as np
 import pytest
 from splats import random_splats
 
-from spacesim.backend import ad
+from spacesim.backend import ad, select
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import look_at, quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
-from spacesim.splat import tiles
+from spacesim.splat import rasterize, tiles
 from spacesim.splat.gaussians import NAMES, Gaussians
-from spacesim.splat.project import Pinhole
+from spacesim.splat.project import Pinhole, project
 from spacesim.splat.reference import real_spherical_harmonics, render_reference
 from spacesim.splat.render import render
 
 SIZE = (40, 28)
+
+
+@pytest.fixture(autouse=True, params=["cuda", "llvm"])
+def way(request, monkeypatch):
+    """Each backend's tiles, order and adjoint, on the backend that runs."""
+    if request.param != select():
+        if select() == "cuda":
+            pytest.skip("Dr.Jit cannot replay its sort on CUDA")
+        monkeypatch.setattr(tiles, "select", lambda: "cuda")
+        monkeypatch.setattr(rasterize, "select", lambda: "cuda")
 
 
 def camera(width: int = SIZE[0], height: int = SIZE[1]) -> Camera:
@@ -249,3 +259,48 @@ def test_pictures_of_few_pixels(size):
     ours, twin = picture(arrays, view), render_reference(arrays, view)
     np.testing.assert_allclose(ours["colour"], twin.colour, atol=2e-5)
     np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=2e-5)
+
+
+def adjoints(arrays, view, channels: int, absolute: bool, monkeypatch) -> list[np.ndarray]:
+    """Gradients [N] of weighted sums of `channels` planes: by buckets, then by tiles, with CUDA's tiles."""
+    monkeypatch.setattr(tiles, "select", lambda: "cuda")
+    monkeypatch.setattr(rasterize, "select", lambda: "cuda")
+    splats, footprints = project(Gaussians.from_numpy(arrays), Pinhole.of(view))
+    rng, size = np.random.default_rng(4), (view.width, view.height)
+    features = [ad.Float(row) for row in rng.normal(size=(channels, len(arrays["means"]))).astype(np.float32)]
+    weights = [ad.Float(row) for row in rng.normal(size=(channels + 1, view.width * view.height)).astype(np.float32)]
+    lists = tiles.bin_splats(splats, footprints, *size)
+    found = []
+    for limit in (rasterize.CHECKPOINT_BYTES, 0):
+        monkeypatch.setattr(rasterize, "CHECKPOINT_BYTES", limit)
+        blended = rasterize.forward(splats, features, lists, *size, adjoint=True)
+        assert bool(blended.bucket) == bool(limit)
+        result = rasterize.backward(splats, blended, lists, size, weights[:-1], weights[-1], absolute)
+        numbers = [getattr(result.splats, name) for name in ("x", "y", "a", "b", "c", "opacity")] + result.features
+        assert (result.absolute_x is None) == (not absolute)
+        found.append(np.array(numbers + ([result.absolute_x, result.absolute_y] if absolute else [])))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("channels", "absolute"), [(0, True), (1, False), (3, True), (3, False), (4, True), (16, False)]
+)
+@pytest.mark.parametrize("logit", [-3.0, 3.0])
+def test_both_adjoints_agree(channels, absolute, logit, monkeypatch):
+    """Faint splats, whose lists are walked to their ends, and opaque ones, where lanes of a tile stop apart."""
+    arrays, view = random_splats(400, seed=12), camera(61, 45)
+    arrays["logit_opacities"] = arrays["logit_opacities"] + logit
+    by_buckets, by_tiles = adjoints(arrays, view, channels, absolute, monkeypatch)
+    assert by_tiles.shape == by_buckets.shape
+    for ours, twin in zip(by_buckets, by_tiles, strict=True):
+        np.testing.assert_allclose(ours, twin, atol=1e-5 * np.abs(twin).max())
+
+
+def test_frames_keep_nothing_for_an_adjoint(monkeypatch):
+    kept = []
+    plain = rasterize.forward
+    monkeypatch.setattr(rasterize, "forward", lambda *a, **k: kept.append(k.get("adjoint", False)) or plain(*a, **k))
+    arrays, view = random_splats(30), camera()
+    picture(arrays, view)
+    gradients(arrays, view)
+    assert kept == [False, True]

@@ -14,19 +14,18 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, recorded
+from spacesim.splat.adjoint import gather_slots, reduce_mode
 from spacesim.splat.cameras import LARGEST, Orthographic
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import ALPHA_MIN, Footprints, Splats, _sortable, project
-from spacesim.splat.rasterize import (
+from spacesim.splat.records import (
     ALPHA_MAX,
     TRANSMITTANCE_MIN,
-    _exponents,
-    _gather_slots,
-    _lane_pixels,
-    _list_records,
-    _load,
-    _reduce_mode,
-    _store,
+    exponents,
+    lane_pixels,
+    list_records,
+    load,
+    store,
 )
 from spacesim.splat.tiles import RECORDINGS, TileLists, bin_splats, room
 
@@ -141,7 +140,7 @@ class _Walked:
     """What `_walk` leaves behind. occlusion, weight (sum of beta): [capacity]
 
     Tile-major, for the adjoint: transmittance and one past the last blocker of each pixel [T * lanes * rows]; the
-    events' records in list order, see `rasterize.Blended`.
+    events' records in list order, see `records.Blended`.
     """
 
     occlusion: Any
@@ -155,26 +154,26 @@ def _trace_walk(events: Splats, lists: TileLists, image_size: tuple[Any, Any], c
     """What each receiver has lost; one lane holds a column of a tile's pixels."""
     shape, rows = lists.shape, lists.shape.rows
     receives = dr.select(dr.arange(ad.UInt32, 2 * capacity) < capacity, ad.Float(1), ad.Float(0))
-    records = _list_records(events, [receives], lists, room(2 * capacity))
+    records = list_records(events, [receives], lists, room(2 * capacity))
     lanes = lists.tiles_x * lists.tiles_y * shape.lanes
     lane = dr.arange(ad.UInt32, lanes)
-    px, py, column, row = _lane_pixels(lane, lists)
+    px, py, column, row = lane_pixels(lane, lists)
     inside = [(column < image_size[0]) & (row + p < image_size[1]) for p in range(rows)]
     slots = dr.zeros(ad.Float, 2 * lists.capacity)
-    mode = _reduce_mode(8 * lists.capacity)
+    mode = reduce_mode(8 * lists.capacity)
     end = dr.gather(ad.UInt32, lists.end, lane // shape.lanes)
 
     def remaining(k: Any, _transmittance: Any, _last: Any) -> Any:
         return k < end
 
     def take(k: Any, transmittance: list[Any], last: list[Any]) -> Any:
-        record = _load(records, k)
-        exponents = _exponents(record, px, py, rows)
+        record = load(records, k)
+        powers = exponents(record, px, py, rows)
         receiver = record[6] > 0
         transmittance, last = list(transmittance), list(last)
         lost, weight = ad.Float(0), ad.Float(0)
         for p in range(rows):
-            alpha = dr.minimum(dr.exp2(exponents[p]), ALPHA_MAX)
+            alpha = dr.minimum(dr.exp2(powers[p]), ALPHA_MAX)
             reached = alpha >= ALPHA_MIN
             beta = dr.select(reached & inside[p], alpha, 0)
             lost, weight = dr.fma(beta, 1 - transmittance[p], lost), weight + beta
@@ -192,7 +191,7 @@ def _trace_walk(events: Splats, lists: TileLists, image_size: tuple[Any, Any], c
         [ad.UInt32(0) for _ in range(rows)],
     )
     _, transmittance, last = dr.while_loop(state, remaining, take, mode="symbolic", label="shadow")
-    transmittance, last = _store(transmittance, lane, lanes), _store(last, lane, lanes)
+    transmittance, last = store(transmittance, lane, lanes), store(last, lane, lanes)
     dr.eval(slots, transmittance, last)
     lost, weight = _sum_slots(slots, lists, capacity)
     seen = weight > 0
@@ -227,14 +226,14 @@ def _trace_replay(
     """
     rows, lanes = lists.shape.rows, lists.shape.lanes
     lane = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * lanes)
-    px, py, column, row = _lane_pixels(lane, lists)
+    px, py, column, row = lane_pixels(lane, lists)
     inside = [(column < image_size[0]) & (row + p < image_size[1]) for p in range(rows)]
     transmittance = [dr.gather(ad.Float, walked.transmittance, lane * rows + p) for p in range(rows)]
     last = [dr.gather(ad.UInt32, walked.last, lane * rows + p) for p in range(rows)]
     shares = dr.select(walked.weight > 0, gradient / dr.maximum(walked.weight, 1e-30), 0)
     dr.eval(shares)
     slots = [dr.zeros(ad.Float, 4 * lists.capacity) for _ in range(2)]
-    mode = _reduce_mode(32 * lists.capacity)
+    mode = reduce_mode(32 * lists.capacity)
     start = dr.gather(ad.UInt32, lists.start, lane // lanes)
 
     def remaining(k: Any, _transmittance: Any, _behind: Any) -> Any:
@@ -242,9 +241,9 @@ def _trace_replay(
 
     def replay(k: Any, transmittance: list[Any], behind: list[Any]) -> Any:
         k = k - 1
-        record = _load(walked.records, k)
+        record = load(walked.records, k)
         dx, dy0 = px - record[0], py - record[1]
-        exponents = _exponents(record, px, py, rows)
+        powers = exponents(record, px, py, rows)
         receiver = record[6] > 0
         event = dr.gather(ad.UInt32, lists.splat, k)
         share = dr.gather(ad.Float, shares, event, receiver)
@@ -253,7 +252,7 @@ def _trace_replay(
         g0, g1, g2 = ad.Float(0), ad.Float(0), ad.Float(0)
         touched = ad.Bool(False)
         for p in range(rows):
-            unclamped = dr.exp2(exponents[p])
+            unclamped = dr.exp2(powers[p])
             alpha = dr.minimum(unclamped, ALPHA_MAX)
             reached = alpha >= ALPHA_MIN
             receives, blocks = reached & receiver & inside[p], reached & ~receiver & (k < last[p])
@@ -276,7 +275,7 @@ def _trace_replay(
     state = dr.gather(ad.UInt32, lists.end, lane // lanes), transmittance, [ad.Float(0) for _ in range(rows)]
     dr.while_loop(state, remaining, replay, mode="symbolic", label="replay shadow")
     dr.eval(slots)
-    gradients: Splats = _gather_slots(slots, events, lists, 0).splats
+    gradients: Splats = gather_slots(slots, events, lists, 0).splats
     return gradients
 
 

@@ -106,17 +106,19 @@ class Trainer:
         if shading:
             colour = [*shading.colours, shading.visibility] if supervised else shading.colours
         lists = bin_splats(splats, footprints, width, height)
-        blended = forward(splats, colour, lists, width, height)
+        blended = forward(splats, colour, lists, width, height, adjoint=True)
         rgba, valid, visibility = self.views.pixels(view)
         target = rgba, ad.Float(self.background(number, view)), valid, visibility
         weights = self.config.ssim_weight, self.config.visibility_weight
         loss, by_colour, by_transmittance = self._loss(blended.features, blended.transmittance, target, size, *weights)
-        by_splat = backward(splats, blended, lists, size, by_colour, by_transmittance)
-        gradient = dr.sqrt(
-            dr.square(by_splat.absolute_x * (0.5 * width)) + dr.square(by_splat.absolute_y * (0.5 * height))
-        )
-        radius = dr.maximum(footprints.half_width, footprints.half_height) / max(width, height)
-        self.strategy.observe(gradient, radius, footprints.visible)
+        watched = self.iteration + 1 < self.config.refinement.refine_stop  # whether refinement still asks
+        by_splat = backward(splats, blended, lists, size, by_colour, by_transmittance, absolute=watched)
+        if watched:
+            gradient = dr.sqrt(
+                dr.square(by_splat.absolute_x * (0.5 * width)) + dr.square(by_splat.absolute_y * (0.5 * height))
+            )
+            radius = dr.maximum(footprints.half_width, footprints.half_height) / max(width, height)
+            self.strategy.observe(gradient, radius, footprints.visible)
         if not shading or not self.light:
             return _Look(camera, by_splat.splats, by_splat.features, loss)
         of_visibility = by_splat.features[3] if supervised else None
