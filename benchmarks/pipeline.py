@@ -62,7 +62,7 @@ class Pipeline:
 
     def update(self) -> None:
         """Gradients of the ellipses to those of the parameters, and an Adam step whose rates are 0."""
-        gradients = [(self.camera, self.by_splat.splats, self.by_splat.features, None)]
+        gradients = [(self.camera, self.by_splat.splats, self.by_splat.features, None, [])]
         moments = self.optimizer.first, self.optimizer.second
         rows, first, second = self._update(self.gaussians.rows(), moments, DEGREE, gradients, self.factors)
         self.gaussians, self.optimizer.first, self.optimizer.second = Gaussians.from_rows(rows), first, second

@@ -151,10 +151,12 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--resume", action="store_true", help="go on from the newest checkpoint")
     lit = one.add_argument_group("light", "of the methods that learn it; see docs/relighting.md")
     lit.add_argument("--field", choices=("thesis", "surface"), help="what the appearance field is told")
+    lit.add_argument("--linear", action="store_true", help="blend colours in linear light, encode the picture")
     lit.add_argument("--shadow-bias", type=float, metavar="X", help="strength of the receiver-depth bias; 0: none")
     lit.add_argument("--grazing", choices=("none", "bias", "lift"), help="against acne where the Sun grazes")
     lit.add_argument("--shadow-filter", choices=("bilinear", "percentage-closer", "variance"), help="of shadow maps")
     lit.add_argument("--light-size", type=int, metavar="PX", help="sides of the Sun's picture")
+    lit.add_argument("--shadow-gradients", action="store_true", help="of shadow splatting move the Gaussians, too")
     lit.add_argument("--no-refinement", action="store_true", help="raw shadows, without the network")
     lit.add_argument(
         "--visibility-weight", type=float, metavar="W", help="learn shadows from path-traced visibility, too (0)"
@@ -305,14 +307,25 @@ def _train(options: argparse.Namespace) -> None:
 
 def _with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainConfig":
     """`config` with what the options say of fields and shadows. Raises InputError where the method has none of them."""
-    names = ("field", "shadow_bias", "grazing", "shadow_filter", "light_size", "no_refinement")
+    names = (
+        "field",
+        "linear",
+        "shadow_bias",
+        "grazing",
+        "shadow_filter",
+        "light_size",
+        "shadow_gradients",
+        "no_refinement",
+    )
     named = [name for name in names if getattr(options, name) not in (None, False)]
     if not named:
         return config
     light, option = config.light, "--" + named[0].replace("_", "-")
-    if light is None or (light.shadow is None and named != ["field"]):
+    if light is None or (light.shadow is None and not set(named) <= {"field", "linear"}):
         what = "that learns light" if light is None else "with shadows"
         raise InputError(f"{option}: expected a method {what}, found {config.method}")
+    if options.linear:
+        light = replace(light, linear=True)
     if options.field is not None:
         light = replace(light, field=replace(light.field, surface=options.field == "surface"))
     shadow = light.shadow
@@ -321,6 +334,7 @@ def _with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainCon
         shadow = replace(shadow, **{name: value for name, value in given.items() if value is not None})
         if options.shadow_filter is not None:
             shadow = replace(shadow, mapping=replace(shadow.mapping, filter=options.shadow_filter))
+        shadow = replace(shadow, gradients=True) if options.shadow_gradients else shadow
         shadow = replace(shadow, refine=None) if options.no_refinement else shadow
     return replace(config, light=replace(light, shadow=shadow))
 

@@ -46,7 +46,7 @@ class Encoding:
         return terms
 
     def of_one(self, vector: Any) -> Any:
-        """Float [size] of one vector, three numbers. They are no constants of a kernel: another one compiles nothing."""
+        """Float [size] of one vector, three numbers. They are no constants of a kernel: others compile nothing."""
         numbers = ad.Float(np.asarray(vector, dtype=np.float32))
         point = ad.Array3f([dr.gather(ad.Float, numbers, ad.UInt32(i)) for i in range(3)])
         return dr.concat([ad.Float(term) for term in self(point)])

@@ -1,8 +1,8 @@
 """Sun direction in, colours and visibility of the Gaussians out: the appearance field (thesis 4.2) and the shadows
 (4.3), and the adjoint of both.
 
-`LightModel.shade` is the forward pass, `LightModel.adjoint` the way back to features and weights. Geometry gets no
-gradients from here: view directions and shadows count as given, as in the thesis.
+`LightModel.shade` is the forward pass, `LightModel.adjoint` the way back to features and weights. View directions count
+as given, and so do shadows, as in the literature, unless `ShadowConfig.gradients` takes them back to the Gaussians.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from spacesim.splat.cameras import Projection
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.lanes import Lanes
 from spacesim.splat.shadow.cast import ShadowConfig, Shadows, cast_shadows
-from spacesim.splat.shadow.refine import RefineConfig, refine_inputs, refined
+from spacesim.splat.shadow.refine import RefineConfig, refine_inputs, refined, refined_slope
 from spacesim.splat.shadow.sunlight import light_rows, towards_sun
 from spacesim.splat.tiles import RECORDINGS
 
@@ -30,10 +30,13 @@ SUNS = 4096  #: whose encodings are kept
 
 @dataclass(frozen=True)
 class LightConfig:
-    """How light becomes colour. shadow: None leaves shadows to the field (the method `relight`)."""
+    """How light becomes colour. shadow: None leaves shadows to the field (the method `relight`);  linear: colours are
+    linear display values and blended as such, pictures are sRGB-encoded afterwards; else they are sRGB values, as in
+    the thesis (section 7.2 asks for the former)."""
 
     field: FieldConfig = field(default_factory=FieldConfig)
     shadow: ShadowConfig | None = None
+    linear: bool = False
 
     @property
     def refine(self) -> RefineConfig | None:
@@ -91,14 +94,25 @@ class _Tape:
 
 @dataclass
 class Shading:
-    """colours: 3 arrays [N], sRGB values that visibility has dimmed (4.17);  visibility: Float [N] in [0, 1], or None;
-    inputs, lanes, tape: what `LightModel.adjoint` wants"""
+    """colours: 3 arrays [N], display values that visibility has dimmed (4.17);  visibility: Float [N] in [0, 1], or
+    None;  shadows: raw, or None;  inputs, lanes, tape: what `LightModel.adjoint` wants"""
 
     colours: list[Any]
     visibility: Any
+    shadows: Shadows | None
     inputs: _Inputs
     lanes: Lanes
     tape: _Tape
+
+
+@dataclass
+class LightGradients:
+    """features: Float [F * N];  weights: as `LightModel.weights`;  geometry: of the first 11 rows of the Gaussians
+    (`Gaussians.rows`), through their shadows, or nothing where shadows count as given"""
+
+    features: Any
+    weights: list[Any]
+    geometry: list[Any]
 
 
 class LightModel:
@@ -139,15 +153,16 @@ class LightModel:
         inputs = _Inputs(gaussians.features, gaussians.means, camera, raw, self.sun_terms(sun), self._place)
         lanes = Lanes.of(gaussians.count)
         colours, visibility, tape = _shade(self.config, self.weights, inputs, lanes)
-        return Shading(colours, visibility[0] if visibility else None, inputs, lanes, tape)
+        return Shading(colours, visibility[0] if visibility else None, shadows, inputs, lanes, tape)
 
-    def adjoint(self, shading: Shading, by_colour: list[Any], by_visibility: Any = None) -> tuple[Any, list[Any]]:
-        """(gradient of the features [F * N], gradients of the weights) from those of the dimmed colours (3 arrays [N])
-        and, where visibility is seen on its own, of the visibility [N]."""
+    def adjoint(self, shading: Shading, by_colour: list[Any], by_visibility: Any = None) -> "LightGradients":
+        """From the gradients of the dimmed colours (3 arrays [N]) and, where visibility is seen on its own, of the
+        visibility [N]."""
         more = [] if by_visibility is None else [by_visibility]
         arguments = self.config, self.weights, shading.inputs, shading.lanes, shading.tape, by_colour, more
-        by_features, by_weights = _adjoint(*arguments)
-        return by_features, by_weights
+        by_features, by_weights, by_raw = _adjoint(*arguments)
+        by_geometry = shading.shadows.adjoint(by_raw[0]) if by_raw and shading.shadows else []
+        return LightGradients(by_features, by_weights, by_geometry)
 
     def tensors(self) -> dict[str, np.ndarray]:
         """For a file: the weights, and the training frame."""
@@ -204,8 +219,8 @@ def _trace_adjoint(
     tape: _Tape,
     by_colour: list[Any],
     by_visibility: list[Any],
-) -> tuple[Any, list[Any]]:
-    """(gradient of the features, gradients of the weights)."""
+) -> tuple[Any, list[Any], list[Any]]:
+    """(gradient of the features, gradients of the weights, [gradient of the raw occlusion] where it is asked for)."""
     of_field, of_refine = _split(config, weights)
     visibility = 1 - tape.occlusion[0] if tape.occlusion else 1
     pairs = [(lanes.padded(gradient), colour) for gradient, colour in zip(by_colour, tape.colours, strict=True)]
@@ -214,14 +229,20 @@ def _trace_adjoint(
     parts = [(by_items, 0, config.field.features)]
     if config.field.surface:
         parts.append((by_normals(config.field, _field_inputs(inputs), by_items, lanes), 0, 3))
+    by_raw: Any = -sum((g * c for g, c in pairs), sum(map(lanes.padded, by_visibility), ad.Float(0)))
     if config.refine:
         occlusion = tape.occlusion[0]
-        by_occlusion = -sum((g * c for g, c in pairs), sum(map(lanes.padded, by_visibility), ad.Float(0)))
-        by_output = lanes.matrix([by_occlusion * occlusion * (1 - occlusion)])
+        by_logit = by_raw * occlusion * (1 - occlusion)
+        by_output = lanes.matrix([by_logit])
         more, by_items = mlp.backward(config.refine.shape, of_refine, tape.refine, inputs.sun.refine, by_output)
         by_weights += more
         parts.append((by_items, 1, config.refine.features))  # the raw occlusion stands before them
-    return lanes.packed(parts, inputs.features), by_weights
+        by_raw = by_logit * refined_slope(lanes.padded(inputs.raw[0])) + lanes.row(by_items, 0)
+        if config.refine.bias_info:  # it is told 1 - occlusion, too, before the other three
+            by_raw -= lanes.row(by_items, config.refine.shape.inputs - 4)
+    wanted = [by_raw] if config.shadow and config.shadow.gradients else []
+    dr.eval(wanted)
+    return lanes.packed(parts, inputs.features), by_weights, lanes.narrowed(wanted, inputs.means.x)
 
 
 def _refine_items(config: LightConfig, refine: RefineConfig, inputs: _Inputs, lanes: Lanes) -> Any:

@@ -16,6 +16,7 @@ import numpy as np
 from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_json
+from spacesim.data.images import srgb_from_linear
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.light import LightModel
@@ -79,7 +80,8 @@ class Run:
         drawn, alpha = output.image("features"), output.image("alpha")
         visible = np.zeros_like(alpha)
         visibility = np.divide(drawn[..., 3], alpha, out=visible, where=alpha > 0) if drawn.shape[2] > 3 else None
-        return _prediction(output, drawn[..., :3], visibility, normals)
+        rgb = drawn[..., :3]
+        return _prediction(output, srgb_from_linear(rgb) if self.light.config.linear else rgb, visibility, normals)
 
 
 def draw_lit(

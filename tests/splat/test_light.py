@@ -1,6 +1,7 @@
 """Networks and their adjoints against a float64 twin; what light does to training, checkpoints and predictions."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
@@ -10,15 +11,16 @@ from scipy.special import sph_harm_y
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
-from spacesim.data.images import load_image
+from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
 from spacesim.data.records import Camera, Dataset, Sun
+from spacesim.splat import tone
 from spacesim.splat.appearance import FieldConfig
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.encoding import Encoding
 from spacesim.splat.gaussians import Gaussians, entries
 from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
 from spacesim.splat.mlp import MlpShape
-from spacesim.splat.run import Run, load_run
+from spacesim.splat.run import Run, draw_lit, load_run
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.shadow.refine import RefineConfig
 from spacesim.splat.train.checkpoint import read_tensors
@@ -36,6 +38,9 @@ CONFIGS = {
     "relight": LightConfig(FIELD),
     "map": LightConfig(FIELD, ShadowConfig("mapping", 32, refine=REFINE)),
     "splat": LightConfig(FIELD, ShadowConfig("splatting", 32, refine=None)),
+    "linear": LightConfig(FIELD, linear=True),
+    "gradients": LightConfig(FIELD, ShadowConfig("splatting", 32, refine=REFINE, gradients=True)),
+    "surface": LightConfig(replace(FIELD, surface=True), ShadowConfig("mapping", 32, grazing="lift", refine=REFINE)),
     "park": LightConfig(
         FIELD,
         ShadowConfig(
@@ -109,6 +114,17 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
     return 1 / (1 + np.exp(-x))
 
 
+def cosines(normal: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """[N, 4]: of the side that is seen with the Sun (and where that is positive), the viewer, and halfway between."""
+    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    normal *= -np.sign((normal * direction).sum(axis=1, keepdims=True))
+    half = SUN - direction
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    lambert = normal @ SUN
+    halfway = (normal * half).sum(axis=1)
+    return np.stack([lambert, np.maximum(lambert, 0), -(normal * direction).sum(axis=1), halfway], axis=1)
+
+
 def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray]) -> tuple:
     """(colours [N, 3], visibility [N]) of 4.2, 4.11 to 4.14 and 4.17; raw: occlusion and bias info as given."""
     config, field = light.config, light.config.field
@@ -116,6 +132,9 @@ def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[n
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     features, split = arrays["features"].astype(np.float64), 1 + 2 * field.layers
     items = np.concatenate([features[:, : field.features], encoded(field.view, direction)], axis=1)
+    if field.surface:
+        normal = features[:, field.features : field.stored]
+        items = np.concatenate([items, cosines(normal, direction)], axis=1)
     colour = sigmoid(network(field.shape, weights[:split], items, encoded(field.sun, SUN[None])[0]))
     if not raw:
         return colour, np.ones(len(colour))
@@ -127,7 +146,7 @@ def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[n
             axes = numbers(light.sun_terms(SUN).light).reshape(3, 3)
             np.testing.assert_allclose(axes[2], -SUN, atol=1e-6)
             position = position @ axes.T
-        told = [occlusion[:, None], features[:, field.features :]]
+        told = [occlusion[:, None], features[:, field.stored :]]
         told.append(encoded(Encoding("positional", refine.positional), position))
         if refine.bias_info:
             scale = light.frame.scale
@@ -150,23 +169,25 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name):
     shading = light.shade(splats, eye(), SUN)
     colour, visibility = twin(light, arrays, weights, raw)
     np.testing.assert_allclose(np.stack([numbers(c) for c in shading.colours], axis=1), colour, atol=3e-5)
-    assert (shading.visibility is None) == (name == "relight")
+    assert (shading.visibility is None) == (light.config.shadow is None)
     if shading.visibility is not None:
         np.testing.assert_allclose(numbers(shading.visibility), visibility, atol=3e-5)
 
     rng = np.random.default_rng(5)
     by_colour, by_visibility = rng.normal(size=(count, 3)), rng.normal(size=count) * bool(raw)
     given = ad.Float(by_visibility) if raw else None
-    by_features, by_weights = light.adjoint(shading, [ad.Float(column) for column in by_colour.T], given)
+    if raw:
+        shading.shadows = SimpleNamespace(adjoint=lambda by_occlusion: [by_occlusion])
+    back = light.adjoint(shading, [ad.Float(column) for column in by_colour.T], given)
 
-    def loss(arrays: dict, weights: list[np.ndarray]) -> float:
+    def loss(arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray] = raw) -> float:
         colour, visibility = twin(light, arrays, weights, raw)
         return float((by_colour * colour).sum() + by_visibility @ visibility)
 
     for _ in range(6):  # along random directions, all numbers at once
         step = rng.normal(size=arrays["features"].shape)
         slope = difference(lambda h, s=step: loss({**arrays, "features": arrays["features"] + h * s}, weights))
-        assert numbers(by_features).reshape(-1, count).T.ravel() @ step.ravel() == pytest.approx(
+        assert numbers(back.features).reshape(-1, count).T.ravel() @ step.ravel() == pytest.approx(
             slope, rel=2e-3, abs=2e-3
         )
     for i, weight in enumerate(weights):
@@ -174,7 +195,12 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name):
         slope = difference(
             lambda h, i=i, s=step: loss(arrays, [w + h * s * (j == i) if j == i else w for j, w in enumerate(weights)])
         )
-        assert numbers(by_weights[i]) @ step == pytest.approx(slope, rel=2e-3, abs=2e-3), i
+        assert numbers(back.weights[i]) @ step == pytest.approx(slope, rel=2e-3, abs=2e-3), i
+    assert len(back.geometry) == bool(light.config.shadow and light.config.shadow.gradients)
+    if back.geometry:
+        step = rng.normal(size=count) * (np.abs(raw[0] - 0.5) < 0.479)  # off the corners at `SURE`
+        slope = difference(lambda h: loss(arrays, weights, [raw[0] + h * step, *raw[1:]]))
+        assert numbers(back.geometry[0]) @ step == pytest.approx(slope, rel=2e-3, abs=2e-3)
 
 
 def difference(function) -> float:
@@ -242,19 +268,25 @@ def test_features_of_another_shape_are_refused(features):
 # ---- training ----
 
 REFINEMENT = DefaultStrategyConfig(
-    refine_start=10, refine_every=20, pause_after_reset=0, reset_every=4, refine_stop=80, screen_size_stop=0
+    refine_start=10,
+    refine_every=20,
+    pause_after_reset=0,
+    reset_every=4,
+    refine_stop=80,
+    screen_size_stop=0,
+    prune_opacity=0.01,
 )
 
 
 def training(name: str, **changes) -> TrainConfig:
-    method = {"map": "shadow-map", "splat": "shadow-splat"}.get(name, name)
+    method = name if name in METHODS else "shadow-map" if CONFIGS[name].shadow else "relight"
     given = {"method": method, "light": CONFIGS[name], "iterations": 60, "checkpoint_every": 25, "init_count": 40}
     return TrainConfig(**{**given, "refinement": REFINEMENT, **changes})
 
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_training_with_light_repeats_to_the_bit_and_resumes(small_lit_dataset, tmp_path, name):
-    config = training(name, visibility_weight=0.0 if name == "relight" else 0.1)
+    config = training(name, visibility_weight=0.1 if CONFIGS[name].shadow else 0.0)
     run = train(small_lit_dataset, tmp_path / "one", config)
     again = train(small_lit_dataset, tmp_path / "two", config)
     model_of = [(folder.path / "model.safetensors").read_bytes() for folder in (run, again)]
@@ -298,6 +330,20 @@ def test_light_learns_and_the_sun_changes_the_picture(small_lit_dataset, tmp_pat
         shown = loaded.predict(frame.camera, Sun(direction))
         assert np.isfinite(shown.rgb).all()
         assert np.isfinite(shown.visibility).all()
+
+
+def test_the_transfer_function_is_that_of_our_images():
+    values = np.linspace(-0.1, 1.2, 400).astype(np.float32)
+    np.testing.assert_allclose(numbers(tone.encoded(ad.Float(values))), srgb_from_linear(values), atol=2e-6)
+    inside = np.clip(values, 0, 1)
+    np.testing.assert_allclose(numbers(tone.decoded(ad.Float(inside))), linear_from_srgb(inside), atol=2e-6)
+
+
+def test_linear_colours_are_blended_before_they_are_encoded(small_lit_dataset, tmp_path):
+    run = train(small_lit_dataset, tmp_path / "run", training("linear", iterations=5))
+    frame = small_lit_dataset.test[0]
+    drawn = draw_lit(run.model, run.light, Pinhole.of(frame.camera), frame.sun.direction).image("features")
+    np.testing.assert_array_equal(run.predict(frame.camera, frame.sun).rgb, srgb_from_linear(drawn))
 
 
 def test_vanilla_ignores_suns_and_light_needs_them(small_lit_dataset):

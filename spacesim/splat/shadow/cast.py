@@ -12,7 +12,7 @@ from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.shadow.bias import Bias, grazing_bias, lifted, receiver_bias
 from spacesim.splat.shadow.mapping import MappingConfig, occlusion_by_mapping
 from spacesim.splat.shadow.refine import RefineConfig
-from spacesim.splat.shadow.splatting import occlusion_by_splatting
+from spacesim.splat.shadow.splatting import differentiable_occlusion, occlusion_by_splatting
 from spacesim.splat.shadow.sunlight import fit_camera, towards_sun
 from spacesim.splat.tiles import RECORDINGS
 
@@ -25,8 +25,8 @@ class ShadowConfig:
     """method: "mapping" (4.3.1) or "splatting" (4.3.2);  size: pixels of each side of the light image, of which the
     thesis names none;  bias: lambda_b of 4.26, 0 for none;  grazing: what holds at a grazing Sun, too, where the
     thesis's bias goes to 0: "bias" (`grazing_bias`) or "lift" (`lifted`);  softness: epsilon_s of 4.5 as
-    a share of the farthest training camera's distance;  mapping: how the light's picture is read;  refine: the network
-    of 4.3.3, or None."""
+    a share of the farthest training camera's distance;  mapping: how the light's picture is read;  gradients: of
+    training pass through the shadows to the Gaussians, with splatting only;  refine: the network of 4.3.3, or None."""
 
     method: str = "mapping"
     size: int = 512
@@ -34,11 +34,14 @@ class ShadowConfig:
     grazing: str = "none"
     softness: float = 1e-6
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    gradients: bool = False
     refine: RefineConfig | None = field(default_factory=RefineConfig)
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise InputError(f"shadow method: expected {' or '.join(METHODS)}, found {self.method!r}")
+        if self.gradients and self.method != "splatting":
+            raise InputError(f"gradients of shadows: expected the shadow method splatting, found {self.method}")
         if self.grazing not in GRAZING:
             raise InputError(f"grazing: expected one of {', '.join(GRAZING)}, found {self.grazing!r}")
         if self.size < 4:
@@ -51,15 +54,28 @@ class ShadowConfig:
 
 @dataclass
 class Shadows:
-    """occlusion: Float [N] in [0, 1], detached;  bias: what it was computed with, [N]"""
+    """occlusion: Float [N] in [0, 1], detached;  the rest is what it was computed with: the Gaussians' rows but for
+    colours (11 arrays [N]), the light camera, the bias [N], points in place of the receivers' means, or None"""
 
     occlusion: Any
+    rows: list[Any]
+    camera: Orthographic
     bias: Bias
+    points: Any
 
     @property
     def info(self) -> list[Any]:
         """Normal alignment, light extent (metres), bias (metres): three arrays [N]."""
         return [self.bias.alignment, self.bias.thickness, self.bias.bias]
+
+    def adjoint(self, by_occlusion: Any) -> list[Any]:
+        """Gradients of `rows` from that of the occlusion [N], by shadow splatting's adjoint: of the blockers' alpha and
+        the receivers' footprints; order, bias and light camera count as given."""
+        rows = [ad.Float(row) for row in self.rows]
+        dr.enable_grad(rows)
+        occlusion = differentiable_occlusion(Gaussians.from_rows(rows), self.camera, self.bias.bias, self.points)
+        dr.backward(occlusion * by_occlusion)
+        return [dr.grad(row) for row in rows]
 
 
 def cast_shadows(gaussians: Gaussians, light: Any, config: ShadowConfig, distance: float) -> Shadows:
@@ -72,7 +88,7 @@ def cast_shadows(gaussians: Gaussians, light: Any, config: ShadowConfig, distanc
         occlusion = occlusion_by_mapping(gaussians, camera, bias.bias, softness, config.mapping, points)
     else:
         occlusion = occlusion_by_splatting(gaussians, camera, bias.bias, points)
-    return Shadows(occlusion, bias)
+    return Shadows(occlusion, rows, camera, bias, points)
 
 
 def _trace_prepare(

@@ -52,3 +52,9 @@ def refined(occlusion: Any, correction: Any) -> Any:
     but occlusions within `SURE` of 0 and 1 (our reading of 4.13, which leaves the output's form open)."""
     sure = dr.clip(occlusion, SURE, 1 - SURE)
     return dr.rcp(1 + (1 - sure) / sure * dr.exp(-correction))
+
+
+def refined_slope(occlusion: Any) -> Any:
+    """d logit(occ) / d occ, 0 where the occlusion is held at `SURE`."""
+    inside = (occlusion > SURE) & (occlusion < 1 - SURE)
+    return dr.select(inside, dr.rcp(dr.maximum(occlusion * (1 - occlusion), 1e-6)), 0)

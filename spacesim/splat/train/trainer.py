@@ -5,7 +5,7 @@ binning and blending, whose lists change length from step to step, stand between
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from spacesim.splat.project import Footprints, Pinhole, Splats, project
 from spacesim.splat.rasterize import backward, forward
 from spacesim.splat.render import view_colours
 from spacesim.splat.tiles import bin_splats
+from spacesim.splat.tone import decoded, encoded
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.initialise import farthest_camera, initial_gaussians, scene_scale, surface_normals
@@ -109,8 +110,9 @@ class Trainer:
         blended = forward(splats, colour, lists, width, height, adjoint=True)
         rgba, valid, visibility = self.views.pixels(view)
         target = rgba, ad.Float(self.background(number, view)), valid, visibility
-        weights = self.config.ssim_weight, self.config.visibility_weight
-        loss, by_colour, by_transmittance = self._loss(blended.features, blended.transmittance, target, size, *weights)
+        linear = self.config.light is not None and self.config.light.linear
+        how = self.config.ssim_weight, self.config.visibility_weight, linear
+        loss, by_colour, by_transmittance = self._loss(blended.features, blended.transmittance, target, size, *how)
         watched = self.iteration + 1 < self.config.refinement.refine_stop  # whether refinement still asks
         by_splat = backward(splats, blended, lists, size, by_colour, by_transmittance, absolute=watched)
         if watched:
@@ -123,12 +125,12 @@ class Trainer:
             return _Look(camera, by_splat.splats, by_splat.features, loss)
         of_visibility = by_splat.features[3] if supervised else None
         by_light = self.light.adjoint(shading, by_splat.features[:3], of_visibility)
-        return _Look(camera, by_splat.splats, [], loss, *by_light)
+        return _Look(camera, by_splat.splats, [], loss, by_light.features, by_light.geometry, by_light.weights)
 
     def _move_gaussians(self, rows: list[Any], degree: int, looks: list["_Look"]) -> None:
         moments = self.optimizer.first, self.optimizer.second
         factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
-        gradients = [(look.camera, look.by_splats, look.by_colour, look.by_features) for look in looks]
+        gradients = [(look.camera, look.by_splats, look.by_colour, look.by_features, look.by_rows) for look in looks]
         weight = self.config.isotropy_weight / (self.scene_scale * self.gaussians.count)
         isotropy = [ad.Float(weight)] if weight > 0 else []
         rows, first, second = self._update(rows, moments, degree, gradients, factors, isotropy)
@@ -220,13 +222,14 @@ class Trainer:
 @dataclass
 class _Look:
     """What a step has learned from one view: gradients of its splats and of the colours (3 arrays [N]), or, of a method
-    of light, of features [F * N] and weights."""
+    of light, of features [F * N] and weights, and of the first rows where shadows move the Gaussians."""
 
     camera: Pinhole
     by_splats: Splats
     by_colour: list[Any]
     loss: Any
     by_features: Any = None
+    by_rows: list[Any] = field(default_factory=list)
     by_weights: Any = None
 
 
@@ -254,17 +257,23 @@ def _loss(
     target: tuple[Any, Any, Any, list[Any]],
     size: tuple[int, int],
     ssim_weight: float,
-    visibility_weight: float,
+    visibility_weight: float = 0.0,
+    linear: bool = False,
 ) -> tuple[Any, list[Any], Any]:
     """Loss of a picture over the target's background, and its gradients by its planes (colour, and visibility where it
-    is supervised) and transmittance."""
+    is supervised) and transmittance. linear: colours and background are blended in linear light."""
     rgba, background, valid, visibility = target
     channels = [ad.Float((rgba >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24)]
     below = ad.Array3f([dr.gather(ad.Float, background, ad.UInt32(c)) for c in range(3)])
-    truth = ad.Array3f(channels[:3]) * channels[3] + (1 - channels[3]) * below
+    straight = ad.Array3f(channels[:3])
+    if linear:
+        straight, below = decoded(straight), decoded(below)
+    truth = straight * channels[3] + (1 - channels[3]) * below
     planes, transmittance = [ad.Float(plane) for plane in planes], ad.Float(transmittance)
     dr.enable_grad(planes, transmittance)
     picture = dr.select(valid, ad.Array3f(planes[:3]) + transmittance * below, truth)
+    if linear:
+        picture, truth = encoded(picture), encoded(truth)
     loss = photometric_loss(picture, truth, *size, ssim_weight=ssim_weight)
     if visibility:
         loss += visibility_weight * visibility_loss(planes[3], visibility[0], valid)
@@ -276,7 +285,7 @@ def _update(
     rows: list[Any],
     moments: tuple[list[Any], list[Any]],
     degree: int,
-    gradients: list[tuple[Pinhole, Splats, list[Any], Any]],
+    gradients: list[tuple[Pinhole, Splats, list[Any], Any, list[Any]]],
     factors: Any,
     isotropy: Sequence[Any] = (),
 ) -> tuple[list[Any], list[Any], list[Any]]:
@@ -289,10 +298,12 @@ def _update(
     dr.enable_grad(rows)
     gaussians = Gaussians.from_rows(rows)
     along: Any = ad.Float(0)
-    for camera, by_splat, by_colour, by_features in gradients:
+    for camera, by_splat, by_colour, by_features, by_rows in gradients:
         splats, _ = project(gaussians, camera)
         for name in ("opacity", "x", "y", "a", "b", "c"):
             along += getattr(splats, name) * getattr(by_splat, name)
+        for row, gradient in zip(rows, by_rows, strict=False):
+            along += row * gradient
         if by_features is None:
             for value, gradient in zip(view_colours(gaussians, camera, degree), by_colour, strict=True):
                 along += value * gradient
@@ -302,7 +313,7 @@ def _update(
     numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(2 + len(rows))]
     by_row = [dr.grad(row) for row in rows]
     if gaussians.features is not None:
-        by_row[-1] = _mean([by_features for *_, by_features in gradients])
+        by_row[-1] = _mean([by_features for *_, by_features, _ in gradients])
     return adam_step(dr.detach(rows), by_row, moments, numbers[2:], (numbers[0], numbers[1]))
 
 
