@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from spacesim.backend import ad, recorded
-from spacesim.splat import mlp
+from spacesim.splat import cooperative, mlp
 from spacesim.splat.lanes import CHUNK, Lanes, aligned
 from spacesim.splat.mlp import MlpShape
 
@@ -151,3 +151,34 @@ def test_rows_come_back_from_matrices(count):
     other = lanes.matrix([lanes.spread(ad.Float(packed[5]))])
     back = lanes.packed([(one, 1, 2), (other, 0, 1)], ad.Float(np.zeros(3 * count)))
     np.testing.assert_array_equal(numbers(back).reshape(3, count), packed[[2, 3, 5]])
+
+
+def test_cooperative_vectors_give_the_same_colours():
+    assert cooperative.usable()
+    shape, count = MlpShape(57, 25, 3, 64, 3), 700
+    record = recorded(cooperative.forward, 4)
+    for seed in range(2):  # the second with other weights, by the recording of the first
+        case = Case(shape, count + seed)
+        weights, rows, shared, _, lanes = case.device()
+        found = record(shape, cooperative.pack(shape, weights), [lanes.spread(row) for row in rows], shared)
+        exact, *_ = case.exact()
+        for row, other in zip(found, exact, strict=True):
+            np.testing.assert_allclose(
+                1 / (1 + np.exp(-numbers(row)[: case.count])), 1 / (1 + np.exp(-other)), atol=2e-3
+            )
+
+
+def test_cooperative_vectors_that_fail_or_lie_are_not_used(monkeypatch, caplog):
+    def fails() -> float:
+        raise RuntimeError("no OptiX here")
+
+    for tried, told in (
+        (fails, "no OptiX here"),
+        (lambda: 0.1, "wrong by 0.1"),
+        (lambda: float("nan"), "wrong by nan"),
+    ):
+        monkeypatch.setattr(cooperative, "_tried", tried)
+        cooperative.usable.cache_clear()
+        assert not cooperative.usable()
+        assert told in caplog.records[-1].getMessage()
+    cooperative.usable.cache_clear()
