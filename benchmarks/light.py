@@ -3,8 +3,8 @@
     python benchmarks/light.py [--methods relight,shadow-map] [--preset fast] [--sizes 31622x1024] [--markdown]
 
 The scene is the sphere of random splats of the other benchmarks, with untrained networks of the preset's size: how
-long they take does not depend on what they have learned. A frame is what `spacesim render RUN --sun AZ,EL` draws, left on the
-device, each time under another Sun. "shadows" casts them, "field" is the networks, "draw" the picture; "kernels" is
+long they take does not depend on what they have learned. A frame is what `spacesim render RUN --sun AZ,EL` draws, left
+on the device, each time under another Sun. "shadows" casts them, "field" is the networks, "draw" the picture; "kernels" is
 what the device alone needs. The thesis's frames (RTX 5000 Ada) stand beside ours.
 """
 
@@ -45,7 +45,7 @@ class Frame:
         arrays = {**common.sphere_arrays(count), "sh": np.zeros((count, 0, 3))}
         arrays["features"] = np.random.default_rng(0).normal(size=(count, config.features)).astype(np.float32)
         self.gaussians = Gaussians.from_numpy(arrays)
-        self.light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, common.DISTANCE), 0)
+        self.light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, common.DISTANCE, 1.0), 0)
         self.camera = Pinhole.of(common.camera_from(DIRECTION, pixels))
         dr.eval(self.gaussians.rows(), self.camera.values)
         self.calls = 0

@@ -320,6 +320,8 @@ def _with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainCon
     named = [name for name in names if getattr(options, name) not in (None, False)]
     if not named:
         return config
+    from spacesim.splat.train.config import with_field
+
     light, option = config.light, "--" + named[0].replace("_", "-")
     if light is None or (light.shadow is None and not set(named) <= {"field", "linear"}):
         what = "that learns light" if light is None else "with shadows"
@@ -327,7 +329,7 @@ def _with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainCon
     if options.linear:
         light = replace(light, linear=True)
     if options.field is not None:
-        light = replace(light, field=replace(light.field, surface=options.field == "surface"))
+        light = replace(light, field=with_field(light.field, options.field))
     shadow = light.shadow
     if shadow is not None:
         given = {"bias": options.shadow_bias, "grazing": options.grazing, "size": options.light_size}

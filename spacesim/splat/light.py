@@ -20,7 +20,7 @@ from spacesim.splat.appearance import FieldConfig, FieldInputs, by_normals, fiel
 from spacesim.splat.cameras import Projection
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.lanes import Lanes
-from spacesim.splat.shadow.cast import ShadowConfig, Shadows, cast_shadows
+from spacesim.splat.shadow.cast import ShadowConfig, Shadows, cast_shadows, cast_shadows_adaptively
 from spacesim.splat.shadow.refine import RefineConfig, refine_inputs, refined, refined_slope
 from spacesim.splat.shadow.sunlight import light_rows, towards_sun
 from spacesim.splat.tiles import RECORDINGS
@@ -52,11 +52,13 @@ class LightConfig:
 @dataclass(frozen=True, eq=False)
 class TrainingFrame:
     """Where a model was when it was trained, metres. centre: [3], mu_model of 4.12;  scale: the unit of length of its
-    networks;  distance: of the farthest training camera from the centre, dist_max of 4.5"""
+    networks;  distance: of the farthest training camera from the centre, dist_max of 4.5;  radius: of the Gaussians
+    that training started from, about the centre"""
 
     centre: Array
     scale: float
     distance: float
+    radius: float
 
 
 @dataclass
@@ -141,14 +143,21 @@ class LightModel:
         terms: SunTerms = self._terms(*(float(value) for value in sun))
         return terms
 
-    def shadows(self, gaussians: Gaussians, sun: np.ndarray) -> Shadows | None:
-        """Raw occlusion of each Gaussian; None for a model without shadows."""
-        config = self.config.shadow
-        return cast_shadows(gaussians, self.sun_terms(sun).light, config, self.frame.distance) if config else None
+    def shadows(self, gaussians: Gaussians, sun: np.ndarray, adaptive: bool = False) -> Shadows | None:
+        """Raw occlusion of each Gaussian; None for a model without shadows. adaptive: several light cameras where one
+        has less than half the pixels a metre that it had of the whole model in training (f_min of algorithm 3)."""
+        config, frame = self.config.shadow, self.frame
+        if config is None:
+            return None
+        if adaptive:
+            least_scale = 0.25 * config.size / frame.radius
+            return cast_shadows_adaptively(gaussians, sun, config, frame.distance, least_scale)
+        return cast_shadows(gaussians, self.sun_terms(sun).light, config, frame.distance)
 
-    def shade(self, gaussians: Gaussians, camera: Projection, sun: np.ndarray) -> Shading:
-        """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes."""
-        shadows = self.shadows(gaussians, sun)
+    def shade(self, gaussians: Gaussians, camera: Projection, sun: np.ndarray, adaptive: bool = False) -> Shading:
+        """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes.
+        adaptive: see `shadows`."""
+        shadows = self.shadows(gaussians, sun, adaptive)
         raw = [shadows.occlusion, *shadows.info] if shadows else []
         inputs = _Inputs(gaussians.features, gaussians.means, camera, raw, self.sun_terms(sun), self._place)
         lanes = Lanes.of(gaussians.count)
@@ -167,14 +176,14 @@ class LightModel:
     def tensors(self) -> dict[str, np.ndarray]:
         """For a file: the weights, and the training frame."""
         weights = {f"light.weight.{i:02d}": np.array(weight) for i, weight in enumerate(self.weights)}
-        frame = [*self.frame.centre, self.frame.scale, self.frame.distance]
+        frame = [*self.frame.centre, self.frame.scale, self.frame.distance, self.frame.radius]
         return {**weights, "light.frame": np.array(frame, dtype=np.float64)}
 
     @staticmethod
     def from_tensors(config: LightConfig, tensors: Mapping[str, np.ndarray]) -> "LightModel":
         """The inverse of `tensors`. Raises KeyError where one is missing, ValueError where its length does not fit."""
-        *centre, scale, distance = tensors["light.frame"].tolist()
-        model = LightModel.initial(config, TrainingFrame(np.array(centre), scale, distance), 0)
+        *centre, scale, distance, radius = tensors["light.frame"].tolist()
+        model = LightModel.initial(config, TrainingFrame(np.array(centre), scale, distance, radius), 0)
         for i, like in enumerate(model.weights):
             weight = tensors[f"light.weight.{i:02d}"]
             if np.shape(weight) != (dr.width(like),):

@@ -89,7 +89,7 @@ def draw_lit(
 ) -> RenderOutput:
     """A relit and shadowed frame on the device. features: colour (3 planes), then, of a model with shadows, visibility,
     all premultiplied. sun: [3], unit, towards the Sun;  outputs: see `render`"""
-    shading = light.shade(model, camera, sun)
+    shading = light.shade(model, camera, sun, adaptive=True)
     lit = [] if shading.visibility is None else [shading.visibility]
     return render(model, camera, outputs=outputs, features=[*shading.colours, *lit])
 

@@ -74,7 +74,7 @@ def eye() -> Pinhole:
 
 def model(name: str, seed: int = 0) -> LightModel:
     """With a refinement that does something: its last layer starts at 0."""
-    light = LightModel.initial(CONFIGS[name], TrainingFrame(np.array([0.1, 0.2, -0.3]), 2.0, 7.0), seed)
+    light = LightModel.initial(CONFIGS[name], TrainingFrame(np.array([0.1, 0.2, -0.3]), 2.0, 7.0, 3.0), seed)
     rng = np.random.default_rng(seed)
     light.weights = [ad.Float(numbers(w) + 0.3 * rng.normal(size=dr.width(w))) for w in light.weights]
     return light
@@ -224,7 +224,7 @@ def test_encodings_are_those_of_scipy_and_numpy(kind):
 
 
 def test_an_untrained_refinement_passes_raw_shadows_on():
-    light = LightModel.initial(CONFIGS["map"], TrainingFrame(np.zeros(3), 1.0, 5.0), 0)
+    light = LightModel.initial(CONFIGS["map"], TrainingFrame(np.zeros(3), 1.0, 5.0, 3.0), 0)
     splats = gaussians(200, light.config.features)
     raw = numbers(light.shadows(splats, SUN).occlusion)
     refined = 1 - numbers(light.shade(splats, eye(), SUN).visibility)

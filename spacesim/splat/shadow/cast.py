@@ -1,19 +1,21 @@
 """Raw shadows of a set of Gaussians under one Sun: light camera, bias and one of the two methods, in one call."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
+from numpy.typing import ArrayLike
 
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError
 from spacesim.splat.cameras import Orthographic
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.shadow.bias import Bias, grazing_bias, lifted, receiver_bias
+from spacesim.splat.shadow.clusters import occlusion_in_clusters
 from spacesim.splat.shadow.mapping import MappingConfig, occlusion_by_mapping
 from spacesim.splat.shadow.refine import RefineConfig
 from spacesim.splat.shadow.splatting import differentiable_occlusion, occlusion_by_splatting
-from spacesim.splat.shadow.sunlight import fit_camera, towards_sun
+from spacesim.splat.shadow.sunlight import fit_camera
 from spacesim.splat.tiles import RECORDINGS
 
 METHODS = ("mapping", "splatting")
@@ -79,10 +81,30 @@ class Shadows:
 
 
 def cast_shadows(gaussians: Gaussians, light: Any, config: ShadowConfig, distance: float) -> Shadows:
-    """Raw occlusion (4.6, 4.10) of N Gaussians by each other. light: Float [9] of `light_rows`;  distance: metres, of
-    the farthest training camera."""
-    rows = [*gaussians.means, *gaussians.log_scales, *gaussians.quaternions, gaussians.logit_opacities]
-    camera, bias, points = _prepare(rows, light, config.size, dr.opaque(ad.Float, config.bias), config.grazing)
+    """Raw occlusion (4.6, 4.10) of N Gaussians by each other, with one light camera. light: Float [9] of `light_rows`;
+    distance: metres, of the farthest training camera."""
+    rows = _shapes(gaussians)
+    return _cast(gaussians, _fit(rows, light, config.size), config, distance)
+
+
+def cast_shadows_adaptively(
+    gaussians: Gaussians, direction: ArrayLike, config: ShadowConfig, distance: float, least_scale: float
+) -> Shadows:
+    """The same with as many light cameras as it takes to see every Gaussian at `least_scale` pixels a metre (4.3.5), so
+    that models far apart get the shadows of each alone. direction: [3], towards the Sun."""
+    casts: list[Shadows] = []
+
+    def occlude(gaussians: Gaussians, camera: Orthographic) -> Any:
+        casts.append(_cast(gaussians, camera, config, distance))
+        return casts[-1].occlusion
+
+    occlusion = occlusion_in_clusters(gaussians, direction, config.size, least_scale, occlude)
+    return replace(casts[0], occlusion=occlusion)
+
+
+def _cast(gaussians: Gaussians, camera: Orthographic, config: ShadowConfig, distance: float) -> Shadows:
+    rows = _shapes(gaussians)
+    bias, points = _receivers(rows, camera, dr.opaque(ad.Float, config.bias), config.grazing)
     if config.method == "mapping":
         softness = config.softness * distance
         occlusion = occlusion_by_mapping(gaussians, camera, bias.bias, softness, config.mapping, points)
@@ -91,15 +113,22 @@ def cast_shadows(gaussians: Gaussians, light: Any, config: ShadowConfig, distanc
     return Shadows(occlusion, rows, camera, bias, points)
 
 
-def _trace_prepare(
-    rows: list[Any], light: Any, size: int, strength: Any, grazing: str
-) -> tuple[Orthographic, Bias, Any]:
-    """(light camera, bias, points to test or None for the centres)."""
-    gaussians, sun = Gaussians.from_rows(rows), towards_sun(light)
-    camera, bias = fit_camera(gaussians, light, size), receiver_bias(gaussians, sun, strength)
+def _shapes(gaussians: Gaussians) -> list[Any]:
+    return gaussians.rows()[:11]
+
+
+def _trace_fit(rows: list[Any], light: Any, size: int) -> Orthographic:
+    return fit_camera(Gaussians.from_rows(rows), light, size)
+
+
+def _trace_receivers(rows: list[Any], camera: Orthographic, strength: Any, grazing: str) -> tuple[Bias, Any]:
+    """(bias, points to test or None for the centres)."""
+    gaussians, sun = Gaussians.from_rows(rows), -camera.row(2)
+    bias = receiver_bias(gaussians, sun, strength)
     if grazing == "bias":
         bias = bias.at_least(grazing_bias(gaussians, camera))
-    return camera, bias, lifted(gaussians, sun) if grazing == "lift" else None
+    return bias, lifted(gaussians, sun) if grazing == "lift" else None
 
 
-_prepare = recorded(_trace_prepare, RECORDINGS)
+_fit = recorded(_trace_fit, RECORDINGS)
+_receivers = recorded(_trace_receivers, RECORDINGS)

@@ -149,21 +149,27 @@ def _schedule(name: str) -> TrainConfig:
 
 
 def _light(name: str, method: str) -> LightConfig:
-    """Networks and shadows of a preset (tables 4.1 to 4.3); `fast` and `demo` have smaller ones, chosen."""
+    """Networks and shadows of a preset: `thesis` as in tables 4.1 to 4.3; `fast` and `demo` smaller, and with what we
+    found better (docs/relighting.md)."""
     features, width, image = {"thesis": (128, 256, 1024), "fast": (32, 64, 512)}.get(name, (16, 32, 256))
-    degree = 2 if name == "demo" else 4
     if method == "park":
         encoding = Encoding("positional", 4)
         field = FieldConfig(72 if name == "thesis" else features, width, 3, encoding, encoding)
         refine = RefineConfig(width=32, sun=encoding, positions="world", positional=4, bias_info=False)
         return LightConfig(field, ShadowConfig("splatting", image, bias=0.0, refine=refine))
-    encoding = Encoding("harmonics", degree)
-    field = FieldConfig(features, width, 3, encoding, encoding)
+    field = with_field(FieldConfig(features, width), "thesis" if name == "thesis" else "surface")
     if method == "relight":
         return LightConfig(field)
-    refine = RefineConfig(width=64 if name == "thesis" else 32, sun=encoding)
     kind = "mapping" if method == "shadow-map" else "splatting"
-    return LightConfig(field, ShadowConfig(kind, image, refine=refine))
+    if name == "thesis":
+        return LightConfig(field, ShadowConfig(kind, image))
+    return LightConfig(field, ShadowConfig(kind, image, bias=5.0, grazing="lift", refine=RefineConfig(width=32)))
+
+
+def with_field(field: FieldConfig, kind: str) -> FieldConfig:
+    """The field told what the thesis tells it, or the cosines about a learned normal in place of the directions."""
+    encoding = Encoding("harmonics", 0 if kind == "surface" else 4)
+    return replace(field, surface=kind == "surface", sun=encoding, view=encoding)
 
 
 def with_options(config: TrainConfig, **options: Any) -> TrainConfig:

@@ -204,13 +204,15 @@ class Trainer:
         """Networks in the frame of the Gaussians that training starts from."""
         if self.config.light is None:
             return None
-        centre = self.gaussians.to_numpy()["means"].astype(np.float64).mean(axis=0)
+        means = self.gaussians.to_numpy()["means"].astype(np.float64)
+        centre = means.mean(axis=0)
+        radius = max(float(np.linalg.norm(means - centre, axis=1).max()), 1e-6)
         field = self.config.light.field
         if field.surface:
             features = self.gaussians.to_numpy()["features"]
-            features[:, field.features : field.stored] = surface_normals(self.gaussians.to_numpy()["means"])
+            features[:, field.features : field.stored] = surface_normals(means)
             self.gaussians.features = ad.Float(np.ascontiguousarray(features.T).ravel())
-        frame = TrainingFrame(centre, self.scene_scale, farthest_camera(dataset, centre))
+        frame = TrainingFrame(centre, self.scene_scale, farthest_camera(dataset, centre), radius)
         return LightModel.initial(self.config.light, frame, self.config.seed)
 
     def _note(self, loss: float) -> None:
