@@ -22,8 +22,8 @@ from spacesim.splat.project import ALPHA_MIN, Footprints, Splats
 RECORDINGS = 256  #: of a function that are kept: one for each size of picture, of the lists, and of the model
 
 DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
-LARGEST_PAIRS = 0.9 * 2**30  #: lists hold four numbers a pair, and Dr.Jit's arrays at most 2^32
-BYTES_A_PAIR = 150  #: of lists, sorting, and gradients of three channels, at most at once
+LARGEST_PAIRS = 0.9 * 2**30  #: records hold four numbers a pair, and Dr.Jit's arrays at most 2^32
+BYTES_A_PAIR = 200  #: of lists, sorting and blending on LLVM, 100 to 210 measured; gradients take as much again
 
 
 @dataclass(frozen=True)
