@@ -4,8 +4,8 @@
 
 The scene is the sphere of random splats of the other benchmarks, with untrained networks of the preset's size: how
 long they take does not depend on what they have learned. A frame is what `spacesim render RUN --sun AZ,EL` draws, left
-on the device, each time under another Sun. "shadows" casts them, "field" is the networks, "draw" the picture; "kernels" is
-what the device alone needs. The thesis's frames (RTX 5000 Ada) stand beside ours.
+on the device, each time under another Sun. "shadows" casts them, "field" is the networks, "draw" the picture; "kernels"
+is what the device alone needs. The thesis's frames (RTX 5000 Ada) stand beside ours.
 """
 
 import sys
@@ -55,12 +55,11 @@ class Frame:
         return np.asarray(SUNS[self.calls % len(SUNS)])
 
     def shadows(self) -> None:
-        dr.eval(self.light.shadows(self.gaussians, self.sun()))
+        dr.eval(self.light.shadows(self.gaussians, self.sun(), adaptive=True))
 
     def shade(self) -> None:
         """Shadows and field."""
-        shading = self.light.shade(self.gaussians, self.camera, self.sun())
-        dr.eval(shading.colours, shading.visibility)
+        dr.eval(self.light.lit(self.gaussians, self.camera, self.sun(), adaptive=True))
 
     def frame(self) -> None:
         output = draw_lit(self.gaussians, self.light, self.camera, self.sun())

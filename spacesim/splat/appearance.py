@@ -55,11 +55,17 @@ class FieldInputs:
 
 def field_items(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:
     """Items of the network (4.2): TensorXf [B, C, m]."""
+    rows = [*lanes.block(inputs.features, 0, config.features), *field_views(config, inputs, lanes)]
+    return lanes.matrix(rows, config.shape.rows)
+
+
+def field_views(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> list[Any]:
+    """What stands behind the features among the network's inputs, and changes with Sun and camera: Floats [M]."""
     direction = inputs.camera.directions_to(lanes.spread(inputs.means))
-    rows = [*lanes.block(inputs.features, 0, config.features), *config.view(direction)]
+    rows: list[Any] = config.view(direction)
     if config.surface:
         rows += surface_cosines(_normals(config, inputs, lanes), direction, inputs.sun)
-    return lanes.matrix(rows, config.shape.rows)
+    return rows
 
 
 def by_normals(config: FieldConfig, inputs: FieldInputs, by_items: Any, lanes: Lanes) -> Any:

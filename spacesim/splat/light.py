@@ -15,17 +15,18 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.data.geometry import Array
-from spacesim.splat import mlp
-from spacesim.splat.appearance import FieldConfig, FieldInputs, by_normals, field_items
+from spacesim.splat import cooperative, mlp
+from spacesim.splat.appearance import FieldConfig, FieldInputs, by_normals, field_items, field_views
 from spacesim.splat.cameras import Projection
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.lanes import Lanes
+from spacesim.splat.lanes import Lanes, aligned
 from spacesim.splat.shadow.cast import ShadowConfig, Shadows, cast_shadows, cast_shadows_adaptively
 from spacesim.splat.shadow.refine import RefineConfig, refine_inputs, refined, refined_slope
 from spacesim.splat.shadow.sunlight import light_rows, towards_sun
 from spacesim.splat.tiles import RECORDINGS
 
 SUNS = 4096  #: whose encodings are kept
+COOPERATIVE = False  #: whether the field of pictures is computed by `cooperative` where it can be
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,16 @@ class Shading:
 
 
 @dataclass
+class _Kept:
+    """What pictures of one model have in common. read: the arrays that it was made of;  known: what the field's first
+    layer makes of the features;  packed: the field's network for `cooperative`. One of the two."""
+
+    read: list[Any]
+    known: mlp.Known | None
+    packed: list[Any]
+
+
+@dataclass
 class LightGradients:
     """features: Float [F * N];  weights: as `LightModel.weights`;  geometry: of the first 11 rows of the Gaussians
     (`Gaussians.rows`), through their shadows, or nothing where shadows count as given"""
@@ -128,6 +139,7 @@ class LightModel:
         self.config, self.weights, self.frame = config, weights, frame
         self._place = ad.Float([*np.asarray(frame.centre, np.float32), frame.scale])
         self._terms = lru_cache(maxsize=SUNS)(self._sun_terms)
+        self._kept = _Kept([], None, [])
 
     @staticmethod
     def initial(config: LightConfig, frame: TrainingFrame, seed: int) -> "LightModel":
@@ -157,12 +169,22 @@ class LightModel:
     def shade(self, gaussians: Gaussians, camera: Projection, sun: np.ndarray, adaptive: bool = False) -> Shading:
         """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes.
         adaptive: see `shadows`."""
-        shadows = self.shadows(gaussians, sun, adaptive)
-        raw = [shadows.occlusion, *shadows.info] if shadows else []
-        inputs = _Inputs(gaussians.features, gaussians.means, camera, raw, self.sun_terms(sun), self._place)
+        shadows, inputs = self._inputs(gaussians, camera, sun, adaptive)
         lanes = Lanes.of(gaussians.count)
         colours, visibility, tape = _shade(self.config, self.weights, inputs, lanes)
         return Shading(colours, visibility[0] if visibility else None, shadows, inputs, lanes, tape)
+
+    def lit(
+        self, gaussians: Gaussians, camera: Projection, sun: np.ndarray, adaptive: bool = False
+    ) -> tuple[list[Any], Any]:
+        """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. What the field's first layer
+        makes of the features does not change with Sun or camera and stays for the next picture: as many numbers for
+        each Gaussian as the layer has units."""
+        _, inputs = self._inputs(gaussians, camera, sun, adaptive)
+        lanes = Lanes.of(gaussians.count)
+        kept = self._kept_of(gaussians.features, lanes)
+        colours, visibility = _lit(self.config, self.weights, inputs, lanes, kept.known, kept.packed)
+        return colours, visibility[0] if visibility else None
 
     def adjoint(self, shading: Shading, by_colour: list[Any], by_visibility: Any = None) -> "LightGradients":
         """From the gradients of the dimmed colours (3 arrays [N]) and, where visibility is seen on its own, of the
@@ -191,6 +213,28 @@ class LightModel:
             model.weights[i] = ad.Float(weight.astype(np.float32))
         return model
 
+    def _inputs(
+        self, gaussians: Gaussians, camera: Projection, sun: np.ndarray, adaptive: bool
+    ) -> tuple[Shadows | None, _Inputs]:
+        shadows = self.shadows(gaussians, sun, adaptive)
+        raw = [shadows.occlusion, *shadows.info] if shadows else []
+        terms = self.sun_terms(sun)
+        return shadows, _Inputs(gaussians.features, gaussians.means, camera, raw, terms, self._place)
+
+    def _kept_of(self, features: Any, lanes: Lanes) -> _Kept:
+        """Made anew where features or weights have changed. Copies hold what was read: a number of Dr.Jit's that is in
+        use is never another array's."""
+        of_field, _ = _split(self.config, self.weights)
+        by_vectors = COOPERATIVE and cooperative.usable()
+        read = of_field if by_vectors else [features, of_field[1]]
+        if [array.index for array in read] != [array.index for array in self._kept.read]:
+            self._kept = _Kept([], None, [])  # room for the next
+            field = self.config.field
+            packed = cooperative.pack(field.shape, of_field) if by_vectors else []
+            known = None if by_vectors else _known(field, of_field, features, lanes)
+            self._kept = _Kept([ad.Float(array) for array in read], known, packed)
+        return self._kept
+
     def _sun_terms(self, *sun: float) -> SunTerms:
         refine = self.config.refine or self.config.field
         terms = SunTerms(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun))
@@ -206,6 +250,43 @@ def _trace_shade(
     items = field_items(config.field, _field_inputs(inputs), lanes)
     output, field_tape = mlp.forward(config.field.shape, of_field, items, inputs.sun.field)
     colours = [_sigmoid(lanes.row(output, i)) for i in range(3)]
+    shown, visibility, occlusion, refine_tape = _dimmed(config, of_refine, inputs, lanes, colours)
+    return shown, visibility, _Tape(field_tape, refine_tape, colours, occlusion)
+
+
+def _trace_lit(
+    config: LightConfig,
+    weights: list[Any],
+    inputs: _Inputs,
+    lanes: Lanes,
+    known: mlp.Known | None,
+    packed: list[Any],
+) -> tuple[list[Any], list[Any]]:
+    """(dimmed colours, [visibility] or []); known, packed: see `_Kept`"""
+    of_field, of_refine = _split(config, weights)
+    field = config.field
+    rows = field_views(field, _field_inputs(inputs), lanes)
+    if known:
+        items = lanes.matrix(rows, aligned(len(rows)))
+        output, _ = mlp.forward(field.shape, of_field, items, inputs.sun.field, known)
+        outputs = [lanes.row(output, i) for i in range(3)]
+    else:
+        rows = lanes.block(inputs.features, 0, field.features) + rows
+        outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field)
+    colours = [_sigmoid(value) for value in outputs]
+    shown, visibility, _, _ = _dimmed(config, of_refine, inputs, lanes, colours)
+    return shown, visibility
+
+
+def _trace_known(field: FieldConfig, weights: list[Any], features: Any, lanes: Lanes) -> mlp.Known:
+    items = lanes.matrix(lanes.block(features, 0, field.features), aligned(field.features))
+    return mlp.known(field.shape, weights, items, field.features)
+
+
+def _dimmed(
+    config: LightConfig, of_refine: list[Any], inputs: _Inputs, lanes: Lanes, colours: list[Any]
+) -> tuple[list[Any], list[Any], list[Any], list[Any]]:
+    """(dimmed colours [N], [visibility [N]] or [], refined occlusion, tape of the refinement) of colours [M]."""
     occlusion = [lanes.padded(row) for row in inputs.raw[:1]]
     refine_tape: list[Any] = []
     if config.refine:
@@ -216,8 +297,7 @@ def _trace_shade(
     shown = [colour * visibility[0] if visibility else colour for colour in colours] + visibility
     dr.eval(shown, colours, occlusion)
     *shown, last = lanes.narrowed(shown, inputs.means.x)
-    tape = _Tape(field_tape, refine_tape, colours, occlusion)
-    return (shown, [last], tape) if visibility else ([*shown, last], [], tape)
+    return (shown, [last], occlusion, refine_tape) if visibility else ([*shown, last], [], occlusion, refine_tape)
 
 
 def _trace_adjoint(
@@ -283,4 +363,6 @@ def _sigmoid(value: Any) -> Any:
 
 
 _shade = recorded(_trace_shade, RECORDINGS)
+_lit = recorded(_trace_lit, RECORDINGS)
+_known = recorded(_trace_known, RECORDINGS)
 _adjoint = recorded(_trace_adjoint, RECORDINGS)

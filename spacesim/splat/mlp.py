@@ -56,12 +56,29 @@ def initial_weights(shape: MlpShape, rng: np.random.Generator, last: float = 1.0
     return [weight.astype(np.float32) for weight in weights]
 
 
-def forward(shape: MlpShape, weights: list[Any], items: Any, shared: Any) -> tuple[Any, list[Any]]:
+@dataclass
+class Known:
+    """What the first layer makes of the first `inputs` inputs, values: TensorXf [B, width, m]: where only the others
+    change from call to call, it is computed once."""
+
+    values: Any
+    inputs: int
+
+
+def known(shape: MlpShape, weights: list[Any], items: Any, inputs: int) -> Known:
+    """Of the first `inputs` inputs, items: TensorXf [B, `aligned(inputs)`, m], 0 in the rows that fill them up."""
+    return Known(dr.matmul(_matrix(shape, weights, 0, 0, inputs), items), inputs)
+
+
+def forward(
+    shape: MlpShape, weights: list[Any], items: Any, shared: Any, known: Known | None = None
+) -> tuple[Any, list[Any]]:
     """(outputs [B, outputs, m], the tape that `backward` wants): ReLU between layers, nothing after the last.
 
     weights: as `initial_weights` orders them, Float each;  items: TensorXf [B, `shape.rows`, m], finite everywhere;
-    shared: Float [shared]
+    shared: Float [shared];  known: where there is some, items are the other inputs alone, and the tape is of no use
     """
+    first = known.inputs if known else 0
     tape = [items]
     value = items
     for i, (rows, _) in enumerate(shape.sizes):
@@ -69,7 +86,9 @@ def forward(shape: MlpShape, weights: list[Any], items: Any, shared: Any) -> tup
         if i == 0:
             common = ad.TensorXf(weights[0], (rows, shape.shared))
             bias = bias + dr.matmul(common, ad.TensorXf(shared, (shape.shared, 1)))
-        value = dr.matmul(_matrix(shape, weights, i), value) + bias
+        value = dr.matmul(_matrix(shape, weights, i, first if i == 0 else 0), value) + bias
+        if known and i == 0:
+            value += known.values
         if i < shape.layers - 1:
             value = dr.maximum(value, 0)
             tape.append(value)
@@ -102,20 +121,23 @@ def backward(
     return gradients, by_value
 
 
-def _matrix(shape: MlpShape, weights: list[Any], i: int) -> Any:
-    """TensorXf [rows, columns] of layer i; that of the first has the columns of what fills the items up, 0."""
+def _matrix(shape: MlpShape, weights: list[Any], i: int, first: int = 0, count: int | None = None) -> Any:
+    """TensorXf [rows, columns] of layer i, or of `count` of its columns from `first` on; that of the first layer has
+    columns of 0, too, where rows fill the items up."""
     rows, columns = shape.sizes[i]
-    wanted = shape.rows if i == 0 else columns
-    return ad.TensorXf(_columns(weights[1 + 2 * i], rows, columns, wanted), (rows, wanted))
+    count = columns - first if count is None else count
+    wanted = aligned(count) if i == 0 else count
+    return ad.TensorXf(_columns(weights[1 + 2 * i], rows, columns, wanted, first, count), (rows, wanted))
 
 
-def _columns(matrix: Any, rows: int, stored: int, wanted: int) -> Any:
-    """Float [rows * wanted] of [rows * stored]: without its last columns, or with more of 0."""
-    if stored == wanted:
+def _columns(matrix: Any, rows: int, stored: int, wanted: int, first: int = 0, count: int | None = None) -> Any:
+    """Float [rows * wanted] of [rows * stored]: `count` columns from `first` on, all by default, then columns of 0."""
+    count = stored if count is None else count
+    if stored == wanted == count:
         return matrix
     place = dr.arange(ad.UInt32, rows * wanted)
     row, column = place // wanted, place % wanted
-    return dr.gather(ad.Float, matrix, row * stored + column, column < stored)
+    return dr.gather(ad.Float, matrix, row * stored + first + column, column < count)
 
 
 def _over_matrices(numbers: Any, size: int) -> Any:

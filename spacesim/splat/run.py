@@ -89,9 +89,9 @@ def draw_lit(
 ) -> RenderOutput:
     """A relit and shadowed frame on the device. features: colour (3 planes), then, of a model with shadows, visibility,
     all premultiplied. sun: [3], unit, towards the Sun;  outputs: see `render`"""
-    shading = light.shade(model, camera, sun, adaptive=True)
-    lit = [] if shading.visibility is None else [shading.visibility]
-    return render(model, camera, outputs=outputs, features=[*shading.colours, *lit])
+    colours, visibility = light.lit(model, camera, sun, adaptive=True)
+    lit = [] if visibility is None else [visibility]
+    return render(model, camera, outputs=outputs, features=[*colours, *lit])
 
 
 def _prediction(output: RenderOutput, rgb: np.ndarray, visibility: np.ndarray | None, normals: bool) -> Prediction:

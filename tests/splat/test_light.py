@@ -13,6 +13,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
 from spacesim.data.records import Camera, Dataset, Sun
+from spacesim.splat import light as light_module
 from spacesim.splat import tone
 from spacesim.splat.appearance import FieldConfig
 from spacesim.splat.cameras import Pinhole
@@ -221,6 +222,35 @@ def test_encodings_are_those_of_scipy_and_numpy(kind):
     signs = np.sign((rows * expected).sum(axis=0))  # conventions differ in the sign of a harmonic
     np.testing.assert_allclose(rows, expected * (signs if encoding.kind == "harmonics" else 1), atol=2e-5)
     np.testing.assert_array_equal(numbers(encoding.of_one(vectors[3]))[:1], rows[3, :1].astype(np.float32))
+
+
+@pytest.mark.parametrize("by_vectors", [False, True])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_pictures_have_the_colours_that_are_trained(monkeypatch, name, by_vectors):
+    monkeypatch.setattr(light_module, "COOPERATIVE", by_vectors)
+    light, tolerance = model(name), 2e-3 if by_vectors else 1e-5
+    splats = gaussians(700, light.config.features)
+    other_eye = Pinhole.of(Camera(look_at([5, 2, 1], [0, 0, 0]), 32, 32, 40, 40, 16, 16))
+
+    def same(camera, sun: np.ndarray) -> None:
+        (colours, visibility), trained = light.lit(splats, camera, sun), light.shade(splats, camera, sun)
+        for one, other in zip(colours, trained.colours, strict=True):
+            np.testing.assert_allclose(numbers(one), numbers(other), atol=tolerance)
+        assert (visibility is None) == (trained.visibility is None)
+        if visibility is not None:
+            np.testing.assert_array_equal(numbers(visibility), numbers(trained.visibility))
+
+    same(eye(), SUN)
+    kept = light._kept
+    same(other_eye, -SUN)
+    assert light._kept is kept, "computed again for another Sun"
+    splats.features += 0.5  # in place
+    same(eye(), SUN)
+    assert light._kept is kept if by_vectors else light._kept is not kept
+    light.weights[1] = light.weights[1] * 2
+    same(eye(), SUN)
+    splats = gaussians(40, light.config.features, seed=3)
+    same(eye(), SUN)
 
 
 def test_an_untrained_refinement_passes_raw_shadows_on():

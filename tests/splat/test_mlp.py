@@ -116,6 +116,16 @@ def test_recordings_are_as_wide_as_the_columns_whatever_they_read():
         np.testing.assert_array_equal(columns(found, 1024)[:, count:], np.repeat(packed[4:6, -1:], 1024 - count, 1))
 
 
+@pytest.mark.parametrize("first", [1, 4, 7])
+def test_a_network_that_knows_first_inputs_says_the_same(first):
+    case = Case(MlpShape(9, 3, 2, 12, 3), CHUNK + 1)
+    weights, rows, shared, _, lanes = case.device()
+    rows = [lanes.padded(row) for row in rows]
+    known = mlp.known(case.shape, weights, lanes.matrix(rows[:first], aligned(first)), first)
+    output, _ = mlp.forward(case.shape, weights, lanes.matrix(rows[first:], aligned(9 - first)), shared, known)
+    np.testing.assert_allclose(columns(output, case.count), case.exact()[0], atol=2e-6)
+
+
 def test_columns_beyond_the_gaussians_change_nothing():
     shape, count = SHAPES["as it is"], 1500
     case = Case(shape, count)
