@@ -29,9 +29,9 @@ class Lanes:
     capacity: int
 
     @staticmethod
-    def of(count: int) -> "Lanes":
-        """For N = `count` Gaussians, at least one."""
-        return Lanes(dr.opaque(ad.UInt32, count), room(count))
+    def of(count: int, still: bool = False) -> "Lanes":
+        """For N = `count` Gaussians, at least one. still: of a model that stays as large as it is, with less room."""
+        return Lanes(dr.opaque(ad.UInt32, count), (count // CHUNK + 1) * CHUNK if still else room(count))
 
     def spread(self, values: Any) -> Any:
         """[N] to [M], an array or nested ones; the last is repeated."""

@@ -181,7 +181,7 @@ class LightModel:
         makes of the features does not change with Sun or camera and stays for the next picture: as many numbers for
         each Gaussian as the layer has units."""
         _, inputs = self._inputs(gaussians, camera, sun, adaptive)
-        lanes = Lanes.of(gaussians.count)
+        lanes = Lanes.of(gaussians.count, still=True)
         kept = self._kept_of(gaussians.features, lanes)
         colours, visibility = _lit(self.config, self.weights, inputs, lanes, kept.known, kept.packed)
         return colours, visibility[0] if visibility else None

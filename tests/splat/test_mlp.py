@@ -137,6 +137,15 @@ def test_columns_beyond_the_gaussians_change_nothing():
         np.testing.assert_array_equal(numbers(one), numbers(other))
 
 
+@pytest.mark.parametrize("still", [False, True])
+@pytest.mark.parametrize("count", [1, CHUNK - 1, CHUNK, 31622, 100_000])
+def test_columns_are_more_than_the_gaussians_and_whole_chunks(count, still):
+    lanes = Lanes.of(count, still)
+    assert numbers(lanes.count) == count
+    assert count < lanes.capacity <= (count + CHUNK if still else 9 / 8 * count + 1024)
+    assert lanes.capacity % CHUNK == 0
+
+
 def test_weights_have_the_size_that_the_shape_says():
     for shape in SHAPES.values():
         weights = mlp.initial_weights(shape, np.random.default_rng(0))
