@@ -20,7 +20,6 @@ from spacesim.splat.records import ALPHA_MAX, LOG2_E, Blended, bucket_numbers, e
 from spacesim.splat.tiles import TileLists
 
 COPIES_BYTES = 2**30  #: that threads' copies of gradient slots may take on a CPU, chosen
-UNSEEN = -1e4  #: log2 of an opacity that is 0 in single precision
 
 
 @dataclass
@@ -116,9 +115,14 @@ def by_tiles(
     return gather_slots(slots, splats, lists, channels, absolute)
 
 
+def _numbers(channels: int, absolute: bool) -> int:
+    """Sums of a pair."""
+    return 6 + 2 * absolute + channels
+
+
 def _fours(channels: int, absolute: bool) -> int:
-    """How many packets of four hold the sums of a pair."""
-    return -(-(6 + 2 * absolute + channels) // 4)
+    """How many packets of four hold them."""
+    return -(-_numbers(channels, absolute) // 4)
 
 
 @dataclass
@@ -173,16 +177,17 @@ def by_buckets(
             transmittance, behind = _add_pixel(sums[i], record, (px, py), gradients, state, blends, absolute)
         return q + 1, sums
 
-    width = 4 * _fours(channels, absolute)
-    zeros = [[ad.Float(0) for _ in range(width)] for _ in range(bucket)]
+    zeros = [[ad.Float(0) for _ in range(_numbers(channels, absolute))] for _ in range(bucket)]
     _, sums = dr.while_loop((ad.UInt32(0), zeros), more, visit, mode="symbolic", label="buckets")
-    slots = dr.zeros(ad.Float, width * lists.capacity)  # a pair's numbers side by side
+    fours = _fours(channels, absolute)
+    slots = dr.zeros(ad.Float, 4 * fours * lists.capacity)  # a pair's numbers side by side
     for i in range(bucket):
         listed = buckets.first + i < buckets.end
         slot = dr.gather(ad.UInt32, lists.slot, buckets.first + i, listed)
-        for j in range(width // 4):
-            value, place = ad.Array4f(sums[i][4 * j : 4 * j + 4]), slot * (width // 4) + j
-            dr.scatter(slots, value, place, listed, dr.ReduceMode.NoConflicts)
+        values = sums[i] + [ad.Float(0)] * (4 * fours - len(sums[i]))
+        for j in range(fours):
+            value = ad.Array4f(values[4 * j : 4 * j + 4])
+            dr.scatter(slots, value, slot * fours + j, listed, dr.ReduceMode.NoConflicts)
     dr.eval(slots)
     return gather_slots([slots], splats, lists, channels, absolute)
 
@@ -233,11 +238,9 @@ def _buckets(blended: Blended, lists: TileLists, number: Any) -> _Buckets:
 
 
 def _record(blended: Blended, buckets: _Buckets, i: int) -> list[Any]:
-    """Of pair i of each bucket; one that cannot be seen where there is none."""
+    """Of pair i of each bucket; zeros where there is none, which no pixel has blended."""
     listed = buckets.first + i < buckets.end
-    record = [v for array in blended.records for v in dr.gather(ad.Array4f, array, buckets.first + i, listed)]
-    record[5] = dr.select(listed, record[5], UNSEEN)
-    return record
+    return [v for array in blended.records for v in dr.gather(ad.Array4f, array, buckets.first + i, listed)]
 
 
 def _pixel_packets(

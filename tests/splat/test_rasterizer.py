@@ -296,6 +296,28 @@ def test_both_adjoints_agree(channels, absolute, logit, monkeypatch):
         np.testing.assert_allclose(ours, twin, atol=1e-5 * np.abs(twin).max())
 
 
+@pytest.mark.parametrize("size", [(1, 1), (8, 8), (9, 1), (1, 17)])
+def test_both_adjoints_agree_on_few_pixels(size, monkeypatch):
+    for count in (300, 290):  # recorded, then replayed
+        by_buckets, by_tiles = adjoints(random_splats(count, seed=3), camera(*size), 3, True, monkeypatch)
+        monkeypatch.undo()
+        assert np.abs(by_tiles).max() > 0
+        for ours, twin in zip(by_buckets, by_tiles, strict=True):
+            np.testing.assert_allclose(ours, twin, atol=1e-5 * np.abs(twin).max())
+
+
+def test_absolute_sums_change_no_gradient(monkeypatch):
+    """And are as large as the sums with their signs, at least."""
+    arrays, view = random_splats(120, seed=5), camera()
+    with_them = adjoints(arrays, view, 3, True, monkeypatch)
+    monkeypatch.undo()
+    for ours, without in zip(with_them, adjoints(arrays, view, 3, False, monkeypatch), strict=True):
+        scale = np.abs(without).max(axis=1, keepdims=True)
+        np.testing.assert_allclose(ours[:-2] / scale, without / scale, atol=1e-6)
+        assert (ours[-2:] >= np.abs(ours[:2]) * (1 - 1e-5)).all()
+        assert (ours[-2:] > 1.5 * np.abs(ours[:2])).any()
+
+
 def test_frames_keep_nothing_for_an_adjoint(monkeypatch):
     kept = []
     plain = rasterize.forward
