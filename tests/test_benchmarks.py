@@ -27,6 +27,16 @@ def call(script: str, *arguments: str) -> str:
     return done.stdout
 
 
+@pytest.fixture(scope="module")
+def small_lit(tmp_path_factory) -> Path:
+    """A path-traced dataset of two Suns and one never seen."""
+    from spacesim.scenes import generate, read_scene
+
+    root = tmp_path_factory.mktemp("lit") / "data"
+    generate(read_scene("boxsat", suns=2, views=2, test_suns=1, test_views=1, resolution=(24, 24), spp=4), root)
+    return root
+
+
 def points_of(time):
     import growth
 
@@ -120,3 +130,23 @@ def test_memory_counts_the_parameters_and_their_moments():
     parameters = 59 * 4
     # values and two moments are there before and after an update; gradients and statistics beside them
     assert 3 * parameters < report["memory"][0]["bytes a Gaussian"] < 12 * parameters
+
+
+def test_shadows_compares_methods_and_goes_on_where_it_stopped(small_lit, tmp_path):
+    arguments = "--data", str(small_lit), "--out", str(tmp_path / "runs"), "--preset", "demo", "--iterations", "8"
+    first = json.loads(call("shadows.py", *arguments, "--rows", "none", "--json"))
+    both = json.loads(call("shadows.py", *arguments, "--rows", "none,map", "--json"))
+    assert first["rows"]["Unseen Suns"] == both["rows"]["Unseen Suns"][:1]
+    assert [row["method"] for row in both["rows"]["Unseen Suns"]] == ["none", "map"]
+    assert both["rows"]["Unseen Suns"][0]["mask error"] == "", "no shadows are predicted"
+    assert 0 <= float(both["rows"]["Unseen Suns"][1]["mask error"]) <= 1
+    assert (tmp_path / "runs/report.html").exists()
+
+
+def test_light_tells_frames_and_steps():
+    sizes = "--sizes", "300x32", "--step-sizes", "300x32", "--preset", "demo", "--repeats", "2"
+    report = json.loads(call("light.py", *sizes, "--methods", "relight,shadow-map", "--json"))
+    assert [row["method"] for row in report["frames"]] == ["relight", "shadow-map"]
+    assert all(row["frames/s"] > 0 for row in report["frames"])
+    assert report["frames"][1]["shadows"] > 0 == report["frames"][0]["shadows"]
+    assert len(report["steps"]) == 2

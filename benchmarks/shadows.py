@@ -1,0 +1,150 @@
+"""Trains the methods of light on one dataset and compares them under Suns that they know and Suns never seen.
+
+    python benchmarks/shadows.py --data DATA --out RUNS [--preset fast] [--iterations N] [--rows thesis,ours]
+    python benchmarks/shadows.py --out RUNS
+
+Without DATA it makes one first: boxsat, 16 Suns x 40 views of 256 pixels, judged under these and under 8 never seen.
+Prints, for each method, what tables 4.4 and 4.5 of the thesis have, and the errors of the predicted shadow masks. Rows
+"thesis" are the methods as the thesis has them, with and without bias and refinement, in networks of the preset's size;
+rows "ours" add the field that knows surfaces, the bias that holds at grazing Suns, and one option each. What is trained
+already is not trained again: an interrupted call goes on where it stopped. Every run's report is in RUNS/NAME/eval.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import common
+
+from spacesim import backend
+from spacesim.data.store import read_dataset
+from spacesim.eval.evaluate import evaluate
+from spacesim.eval.report import write_report
+from spacesim.progress import reporting, tell_training
+from spacesim.splat.light import LightConfig
+from spacesim.splat.shadow.mapping import MappingConfig
+from spacesim.splat.train.config import TrainConfig, preset, with_field, with_options
+from spacesim.splat.train.train import train
+
+SCENE = {"suns": 16, "views": 40, "test_suns": 8, "test_views": 5, "resolution": 256, "spp": 64}
+ROWS = ("thesis", "ours")
+SUNS = {"known": "known_suns", "unseen": "unseen_suns"}
+COLUMNS = (  # heading, group, metric
+    ("MAE", "image", "mae"),
+    ("RMSE", "image", "rmse"),
+    ("PSNR", "image", "psnr"),
+    ("SSIM", "image", "ssim"),
+    ("LPIPS", "image", "lpips"),
+    ("BER", "shadow", "ber"),
+    ("bias", "shadow", "bias"),
+    ("boundary MAE", "shadow", "boundary_mae"),
+    ("sharpness", "shadow", "sharpness_ratio"),
+    ("mask error", "shadow_mask", "error_rate"),
+    ("balanced", "shadow_mask", "balanced_error_rate"),
+    ("IoU", "shadow_mask", "iou"),
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--backend", choices=backend.NAMES, default="auto")
+    parser.add_argument("--data", type=Path, help="a dataset with Suns; without it one is made in RUNS/data")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUNS")
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--iterations", type=int, metavar="N")
+    parser.add_argument("--rows", default=",".join(ROWS), help="of thesis,ours, or names of single rows")
+    parser.add_argument("--markdown", action="store_true")
+    parser.add_argument("--json", nargs="?", const=Path("-"), type=Path, metavar="FILE")
+    options = parser.parse_args()
+    backend.select(options.backend)
+    table = {name: (kind, config) for kind in ROWS for name, config in configurations(kind, options.preset)}
+    wanted = options.rows.split(",")
+    unknown = [name for name in wanted if name not in (*ROWS, *table)]
+    if unknown:
+        sys.exit(f"--rows: expected some of {', '.join((*ROWS, *table))}, found {unknown[0]!r}")
+    data = options.data or make_data(options.out / "data")
+    results: dict[str, Any] = {}
+    for name, (kind, config) in table.items():
+        if kind in wanted or name in wanted:
+            results[name] = measure(name, with_options(config, iterations=options.iterations), data, options.out)
+    write_report([options.out / name / "eval" for name in results], options.out / "report.html")
+    tables = {
+        f"{label.capitalize()} Suns": [row(name, metrics, part) for name, metrics in results.items()]
+        for label, part in SUNS.items()
+        if any(metrics.get(part) for metrics in results.values())
+    }
+    common.emit({"rows": tables, "data": str(data)}, tables, options)
+
+
+def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
+    """(name, configuration) of the rows of a kind."""
+    if kind == "thesis":
+        yield "vanilla", preset(size)
+        yield "none", as_thesis(preset(size, "relight"))
+        for name, method in (("map", "shadow-map"), ("splat", "shadow-splat")):
+            whole = as_thesis(preset(size, method))
+            yield name, whole
+            yield f"{name}, no bias", with_shadow(whole, bias=0.0)
+            yield f"{name}, no refinement", with_shadow(whole, refine=None)
+        yield "park", preset(size, "park")
+        return
+    yield "none, surface", preset(size, "relight")
+    mapped, splatted = preset(size, "shadow-map"), preset(size, "shadow-splat")
+    yield "map, surface", mapped
+    yield "splat, surface", splatted
+    yield "map, surface, no refinement", with_shadow(mapped, refine=None)
+    yield "map, surface, variance", with_shadow(mapped, mapping=MappingConfig("variance"))
+    yield "map, surface, supervised", replace(mapped, visibility_weight=0.1)
+    yield "map, surface, linear", replace(mapped, light=replace(mapped.light, linear=True))
+    yield "splat, surface, gradients", with_shadow(splatted, gradients=True)
+
+
+def as_thesis(config: TrainConfig) -> TrainConfig:
+    """The field and the shadows as the thesis has them, in networks of the preset's size."""
+    assert config.light is not None
+    config = replace(config, light=replace(config.light, field=with_field(config.light.field, "thesis")))
+    return with_shadow(config, bias=10.0, grazing="none") if config.light.shadow else config
+
+
+def with_shadow(config: TrainConfig, **changes: Any) -> TrainConfig:
+    """`config` with another configuration of its shadows."""
+    light: LightConfig | None = config.light
+    assert light is not None
+    assert light.shadow is not None
+    return replace(config, light=replace(light, shadow=replace(light.shadow, **changes)))
+
+
+def make_data(out: Path) -> Path:
+    from spacesim.scenes import generate, read_scene
+
+    scene = read_scene("boxsat", **SCENE, known_test_views=2, shared_test_views=True)
+    with reporting("generate", "frames") as report:
+        generate(scene, out, resume=True, progress=report)
+    return out
+
+
+def measure(name: str, config: TrainConfig, data: Path, out: Path) -> dict[str, Any]:
+    """metrics.json of a configuration, trained and judged."""
+    dataset, folder = read_dataset(data), out / name
+    with reporting(f"train {name}", "iterations") as report:
+        run = train(dataset, folder / "run", config, resume=True, on_progress=tell_training(report))
+    with reporting(f"evaluate {name}", "frames") as report:
+        metrics: dict[str, Any] = evaluate(run, dataset, folder / "eval", progress=report)
+    write_report([folder / "eval"], folder / "eval/report.html")
+    return metrics
+
+
+def row(name: str, metrics: dict[str, Any], part: str) -> common.Row:
+    """Means over the frames of known or unseen Suns."""
+    found: common.Row = {"method": name, "Gaussians": metrics["model"]["gaussians"]}
+    for heading, group, metric in COLUMNS:
+        value = ((metrics.get(part) or {}).get(group) or {}).get(metric)
+        found[heading] = "" if value is None else f"{value['mean']:.{2 if metric == 'psnr' else 4}f}"
+    return found
+
+
+if __name__ == "__main__":
+    main()
