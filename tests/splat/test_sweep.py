@@ -180,7 +180,7 @@ def test_a_relightable_model_goes_through(tmp_path):
     """Gaussians with untrained networks: shadows fall by geometry alone."""
     config = LightConfig(shadow=ShadowConfig(size=64))
     arrays = random_splats(50, degree=0) | {"features": np.random.default_rng(1).normal(size=(50, config.features))}
-    light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, 3.0), seed=0)
+    light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, 3.0, 1.0), seed=0)
     run = Run(tmp_path / "run", {"method": "shadow-map"}, {}, Gaussians.from_numpy(arrays), 0, light)
     first, second = tmp_path / "a", tmp_path / "b"
     for out in (first, second):
