@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from spacesim.backend import ad, recorded
+from spacesim.backend import ad, recorded, select
 from spacesim.data.geometry import Array
 from spacesim.splat import cooperative, mlp
 from spacesim.splat.appearance import FieldConfig, FieldInputs, by_normals, field_items, field_views
@@ -26,7 +26,7 @@ from spacesim.splat.shadow.sunlight import light_rows, towards_sun
 from spacesim.splat.tiles import RECORDINGS
 
 SUNS = 4096  #: whose encodings are kept
-COOPERATIVE = False  #: whether the field of pictures is computed by `cooperative` where it can be
+COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed by `cooperative` where that works
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ class LightModel:
         """Made anew where features or weights have changed. Copies hold what was read: a number of Dr.Jit's that is in
         use is never another array's."""
         of_field, _ = _split(self.config, self.weights)
-        by_vectors = COOPERATIVE and cooperative.usable()
+        by_vectors = select() in COOPERATIVE and cooperative.usable()
         read = of_field if by_vectors else [features, of_field[1]]
         if [array.index for array in read] != [array.index for array in self._kept.read]:
             self._kept = _Kept([], None, [])  # room for the next
