@@ -216,14 +216,16 @@ def _constants(value: Any) -> str:
         return f"[{len(value)}" + ",".join(map(_constants, inner)) + "]"
     if kind is dict:
         return "{" + ",".join(f"{key}:{_constants(inner)}" for key, inner in value.items()) + "}"
-    if is_dataclass(kind):
-        return kind.__name__ + "(" + ",".join(_constants(getattr(value, name)) for name in _names(kind)) + ")"
-    return ""
+    names = _names(kind)
+    if names is None:
+        return ""
+    return kind.__name__ + "(" + ",".join([_constants(getattr(value, name)) for name in names]) + ")"
 
 
 @cache
-def _names(kind: type) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(kind))
+def _names(kind: type) -> tuple[str, ...] | None:
+    """Of a dataclass's fields; None for any other type."""
+    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else None
 
 
 def recordings() -> int:
