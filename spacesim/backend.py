@@ -216,7 +216,7 @@ def _constants(value: Any) -> str:
         return f"[{len(value)}" + ",".join(map(_constants, inner)) + "]"
     if kind is dict:
         return "{" + ",".join(f"{key}:{_constants(inner)}" for key, inner in value.items()) + "}"
-    names = _names(kind)
+    names = _names(kind)  # type: ignore[arg-type]
     if names is None:
         return ""
     return kind.__name__ + "(" + ",".join([_constants(getattr(value, name)) for name in names]) + ")"

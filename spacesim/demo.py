@@ -1,4 +1,4 @@
-"""`spacesim demo`: one satellite from a scene to a report, small enough for two CPU cores and three minutes."""
+"""`spacesim demo`: one satellite under several Suns, from a scene to a report: a few minutes on two CPU cores."""
 
 import json
 import logging
@@ -23,7 +23,17 @@ from spacesim.splat.train.train import train
 log = logging.getLogger(__name__)
 
 SCENE = "boxsat"
-DATA = {"views": 80, "test_views": 12, "resolution": 256, "spp": 64, "sun": ((40.0, 25.0),)}
+DATA = {
+    "sun": ((40.0, 25.0), (130.0, 10.0), (220.0, 40.0), (310.0, 20.0)),
+    "views": 80,
+    "test_suns": 3,
+    "test_views": 5,
+    "known_test_views": 5,
+    "shared_test_views": True,
+    "resolution": 128,
+    "spp": 64,
+}
+TRAINING = preset("demo", "shadow-map")
 
 
 def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Reporter]]) -> dict[str, Any]:
@@ -45,7 +55,7 @@ def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Repor
     finished("generate")
     with reporting("train", "iterations") as report:
         command = ("spacesim", "demo", "--out", str(out))
-        run = train(dataset, out / "run", preset("demo"), True, tell_training(report), command)
+        run = train(dataset, out / "run", TRAINING, True, tell_training(report), command)
     finished("train")
     with reporting("evaluate", "frames") as report:
         metrics = evaluate(run, dataset, out / "eval", EvaluateConfig(), report)
@@ -59,7 +69,7 @@ def _prepare(out: Path) -> None:
     marker = out / "demo.json"
     this = {
         "data": read_scene(SCENE, **DATA).to_json(),
-        "train": preset("demo").to_json(),
+        "train": TRAINING.to_json(),
         "backend": backend.select(),
         "versions": versions(),
     }

@@ -11,7 +11,8 @@ from spacesim.splat.encoding import Encoding
 from spacesim.splat.lanes import Lanes
 from spacesim.splat.mlp import MlpShape
 
-COSINES = 4  #: that `surface_cosines` gives
+LOBES = (8, 32, 128, 512)  #: exponents of n . h, from satin to mirror, chosen: each is the one before to the fourth
+COSINES = 4 + len(LOBES)  #: numbers that `surface_cosines` gives
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,8 @@ def by_normals(config: FieldConfig, inputs: FieldInputs, by_items: Any, lanes: L
 
 
 def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
-    """n . s, max(n . s, 0), n . v and n . h: what a reflectance model of an isotropic surface depends on, [M] each.
+    """n . s, max(n . s, 0), n . v, n . h, and powers of the last: what a reflectance model of an isotropic surface
+    depends on (Blinn 1977), [M] each. A network of few units makes no lobe as narrow as a glint out of n . h alone.
 
     normals: Array3f [3, M], of any length; the side that is seen counts, n . v >= 0;  direction: Array3f [3, M], unit,
     from the camera;  sun: Array3f, unit, towards the Sun;  h: halfway between the Sun and the viewer, v = -direction
@@ -94,7 +96,11 @@ def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
     half2 = dr.squared_norm(half)
     half *= dr.select(half2 > 1e-12, dr.rsqrt(dr.maximum(half2, 1e-12)), 0)
     lambert = dr.dot(seen, sun)
-    return [lambert, dr.maximum(lambert, 0), -dr.dot(seen, direction), dr.dot(seen, half)]
+    halfway = dr.maximum(dr.dot(seen, half), 0)
+    lobes = [dr.square(dr.square(dr.square(halfway)))]
+    for _ in LOBES[1:]:
+        lobes.append(dr.square(dr.square(lobes[-1])))
+    return [lambert, dr.maximum(lambert, 0), -dr.dot(seen, direction), halfway, *lobes]
 
 
 def _normals(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:

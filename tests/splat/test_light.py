@@ -116,14 +116,15 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
 
 
 def cosines(normal: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """[N, 4]: of the side that is seen with the Sun (and where that is positive), the viewer, and halfway between."""
+    """[N, 8]: of the side that is seen with the Sun (and where that is positive), the viewer, and halfway between."""
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     normal *= -np.sign((normal * direction).sum(axis=1, keepdims=True))
     half = SUN - direction
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     lambert = normal @ SUN
-    halfway = (normal * half).sum(axis=1)
-    return np.stack([lambert, np.maximum(lambert, 0), -(normal * direction).sum(axis=1), halfway], axis=1)
+    halfway = np.maximum((normal * half).sum(axis=1), 0)
+    lobes = [halfway**n for n in (8, 32, 128, 512)]
+    return np.stack([lambert, np.maximum(lambert, 0), -(normal * direction).sum(axis=1), halfway, *lobes], axis=1)
 
 
 def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray]) -> tuple:

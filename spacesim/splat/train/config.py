@@ -30,9 +30,9 @@ class LearningRates:
     logit_opacities: float = 5e-2
     sh_constant: float = 2.5e-3
     sh_rest: float = 1.25e-4
-    features: float = 5e-3
-    networks: float = 1e-3
-    networks_final: float = 1e-4
+    features: float = 2e-2
+    networks: float = 3e-3
+    networks_final: float = 3e-4
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def _schedule(name: str) -> TrainConfig:
 def _light(name: str, method: str) -> LightConfig:
     """Networks and shadows of a preset: `thesis` as in tables 4.1 to 4.3; `fast` and `demo` smaller, and with what we
     found better (docs/relighting.md)."""
-    features, width, image = {"thesis": (128, 256, 1024), "fast": (32, 64, 512)}.get(name, (16, 32, 256))
+    features, width, image = {"thesis": (128, 256, 1024), "fast": (32, 64, 512)}.get(name, (16, 64, 256))
     if method == "park":
         encoding = Encoding("positional", 4)
         field = FieldConfig(72 if name == "thesis" else features, width, 3, encoding, encoding)
