@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from spacesim.data.records import Camera, Sun
     from spacesim.splat.train.config import TrainConfig
 
+KNOWS_ONE_LIGHT = "a vanilla run knows the light that it was trained under only; --sun changes nothing"
 KINDS = ("rgb", "depth", "alpha", "normal", "shadow")
 
 
@@ -211,6 +212,7 @@ def _parser() -> argparse.ArgumentParser:
     form.add_argument("--ply", type=Path, metavar="FILE", help="Gaussians: INRIA layout, the dataset's frame and scale")
     form.add_argument("--speedplus", type=Path, metavar="DIR", help="a dataset's images and poses as SPEED+ has them")
     form.add_argument("--bop", type=Path, metavar="DIR", help="a dataset's images, depth, masks, poses, models for BOP")
+    one.add_argument("--sun", type=_angles, metavar="AZ,EL", help="for --ply of a relightable run: whose colours")
     one.add_argument("--object", metavar="K", help="for SPEED+: whose poses, by number or name (the first)")
     return parser
 
@@ -375,7 +377,7 @@ def _render(options: argparse.Namespace) -> None:
     run = load_run(options.path)
     sun = Sun.from_angles(*options.sun) if options.sun else None
     if sun is not None and not run.relightable:
-        print("a vanilla run knows the light that it was trained under only; --sun changes nothing", file=sys.stderr)
+        print(KNOWS_ONE_LIGHT, file=sys.stderr)
     camera, sun_of_frame = _view_of(options, run.config)
     sun = sun or sun_of_frame
     if sun is None and run.relightable:
@@ -446,12 +448,21 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _export_ply(options: argparse.Namespace) -> None:
+    from spacesim.data.records import Sun
+    from spacesim.splat.bake import baked
     from spacesim.splat.ply import write_ply
     from spacesim.splat.run import load_run
 
     backend.select(options.backend)
     run = load_run(options.path)
-    write_ply(run.model, options.ply)
+    model = run.model
+    if run.light is not None:
+        if options.sun is None:
+            raise InputError("--sun: expected AZ,EL, under which a relightable run is to be exported, found none")
+        model = baked(model, run.light, Sun.from_angles(*options.sun).direction)
+    elif options.sun is not None:
+        print(KNOWS_ONE_LIGHT, file=sys.stderr)
+    write_ply(model, options.ply)
     ending.say(f"{options.ply}: {run.gaussians} Gaussians")
 
 

@@ -10,17 +10,19 @@ from scipy.special import sph_harm_y
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import look_at
+from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.splat import light as light_module
 from spacesim.splat import tone
 from spacesim.splat.appearance import FieldConfig
+from spacesim.splat.bake import baked
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.encoding import Encoding
 from spacesim.splat.gaussians import Gaussians, entries
 from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
 from spacesim.splat.mlp import MlpShape
+from spacesim.splat.render import view_colours
 from spacesim.splat.run import Run, draw_lit, load_run
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.shadow.refine import RefineConfig
@@ -375,6 +377,22 @@ def test_linear_colours_are_blended_before_they_are_encoded(small_lit_dataset, t
     frame = small_lit_dataset.test[0]
     drawn = draw_lit(run.model, run.light, Pinhole.of(frame.camera), frame.sun.direction).image("features")
     np.testing.assert_array_equal(run.predict(frame.camera, frame.sun).rgb, srgb_from_linear(drawn))
+
+
+@pytest.mark.parametrize("name", ["map", "linear"])
+def test_baked_harmonics_show_what_the_model_shows_under_that_sun(name):
+    light, splats = model(name), gaussians(120, CONFIGS[name].features)
+    plain = baked(splats, light, SUN)
+    assert plain.sh_degree == 3
+    assert plain.features is None
+    errors, spread = [], []
+    for place in fibonacci_sphere(20):
+        camera = Pinhole.of(Camera(look_at(40 * place, [0, 0, 0]), 32, 32, 40, 40, 16, 16))
+        exact = np.stack([numbers(c) for c in light.lit(splats, camera, SUN)[0]])
+        exact = srgb_from_linear(exact) if CONFIGS[name].linear else exact
+        errors.append(numbers(view_colours(plain, camera)) - exact)
+        spread.append(exact)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.5 * np.std(spread, axis=0).mean(), "the view matters, and is kept"
 
 
 def test_vanilla_ignores_suns_and_light_needs_them(small_lit_dataset):
