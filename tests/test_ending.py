@@ -65,7 +65,7 @@ def run(*words: object, **options) -> subprocess.CompletedProcess:
         "import:argparse",  # of the command line itself
         "import:drjit",
         "import:mitsuba.mitsuba_ext",  # amid compiled modules, which wrap what is raised in them
-        "call:_parser",
+        "call:parser",
         "call:write_frame",  # while a thread writes
         "call:surface_points",  # when all frames are there
     ],

@@ -10,6 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "spacesim"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 # What a file may not import at all, by the folder or module in which it stands.
+TOP = ("cli", "options", "demo", "doctor")  #: over all folders
 FORBIDDEN = {
     "backend": ("spacesim.", "numpy"),
     "doctor": ("spacesim.scenes", "spacesim.splat", "spacesim.viewer", "spacesim.cli"),
@@ -17,12 +18,21 @@ FORBIDDEN = {
         "mitsuba",
         "drjit",
         "spacesim.backend",
-        *(f"spacesim.{top}" for top in ("scenes", "splat", "nerf", "eval", "viewer", "cli", "demo", "doctor")),
+        *(
+            f"spacesim.{top}"
+            for top in ("scenes", "splat", "nerf", "eval", "viewer", "cli", "options", "demo", "doctor")
+        ),
     ),
-    "scenes": tuple(f"spacesim.{top}" for top in ("splat", "nerf", "eval", "viewer", "cli", "demo", "doctor")),
-    "splat": tuple(f"spacesim.{top}" for top in ("scenes", "nerf", "eval", "viewer", "cli", "demo", "doctor")),
-    "nerf": tuple(f"spacesim.{top}" for top in ("scenes", "splat", "eval", "viewer", "cli", "demo", "doctor")),
-    "eval": tuple(f"spacesim.{top}" for top in ("viewer", "cli", "demo", "doctor")),
+    "scenes": tuple(
+        f"spacesim.{top}" for top in ("splat", "nerf", "eval", "viewer", "cli", "options", "demo", "doctor")
+    ),
+    "splat": tuple(
+        f"spacesim.{top}" for top in ("scenes", "nerf", "eval", "viewer", "cli", "options", "demo", "doctor")
+    ),
+    "nerf": tuple(
+        f"spacesim.{top}" for top in ("scenes", "splat", "eval", "viewer", "cli", "options", "demo", "doctor")
+    ),
+    "eval": tuple(f"spacesim.{top}" for top in ("viewer", *TOP)),
     "viewer": ("spacesim.cli", "spacesim.demo", "spacesim.doctor"),
 }
 RENDERER = ("render", "project", "tiles", "rasterize", "sh", "gaussians", "reference")

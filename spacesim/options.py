@@ -1,0 +1,189 @@
+"""The options of every command, and how wrong ones are told."""
+
+import argparse
+import math
+import re
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+from spacesim import __version__, backend, ending
+
+KINDS = ("rgb", "depth", "alpha", "normal", "shadow")
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with the usage in one sentence, and takes "-40,10" for an argument, not for an option."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._negative_number_matcher = re.compile(r"^-\.?\d")
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """argparse itself would not say that its help could not be written."""
+        if file is sys.stdout:
+            ending.say(message, end="")
+        else:
+            super()._print_message(message, file)
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.ArgumentParser:
+    """The parser of the command line. run: what each command calls with its options, by the command's name;
+    `options.run` is the one chosen, `options.needs_backend` whether a backend is to be selected before."""
+    parser = _Parser(prog="spacesim", description="Simulate spacecraft images, reconstruct them, judge the result.")
+    parser.add_argument("--version", action="version", version=f"spacesim {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
+
+    def command(name: str, text: str, needs_backend: bool = True) -> _Parser:
+        one: _Parser = commands.add_parser(name, help=text, description=text)
+        one.set_defaults(run=run[name], needs_backend=needs_backend, backend="auto")
+        one.add_argument("--debug", action="store_true", help="log more, and tracebacks of what failed")
+        if needs_backend:
+            one.add_argument("--backend", choices=backend.NAMES, default="auto", help="default: CUDA, else LLVM")
+        return one
+
+    one = command("doctor", "what can run here, and what to type if not", needs_backend=False)
+    one.add_argument("--json", action="store_true", help="print the findings as JSON alone")
+
+    one = command("demo", "generate, train, evaluate, report: a few minutes on two cores")
+    one.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+    one = command("generate", "path-trace a dataset with its truth", needs_backend=False)
+    scenes = f"a built-in scene ({', '.join(_built_in_scenes())}), a scene file (.toml) or a mesh file"
+    one.add_argument("scene", metavar="SCENE", help=scenes)
+    one.add_argument("--out", type=Path, metavar="DATA")
+    one.add_argument("--backend", choices=backend.NAMES, default="auto", help="default: CUDA, else LLVM")
+    one.add_argument("--suns", type=int, metavar="N", help="training Suns")
+    one.add_argument("--views", type=int, metavar="N", help="training views for each Sun")
+    one.add_argument("--test-suns", type=int, metavar="N", help="Suns kept for testing (0: those of training)")
+    one.add_argument("--test-views", type=int, metavar="N", help="test views for each test Sun")
+    one.add_argument("--known-test-views", type=int, metavar="N", help="test views for each training Sun beside them")
+    one.add_argument(
+        "--shared-test-views", action="store_true", default=None, help="the same test cameras under every Sun"
+    )
+    one.add_argument(
+        "--sun", type=_angles, action="append", metavar="AZ,EL", help="a training Sun, degrees; repeatable"
+    )
+    one.add_argument("--distance", type=float, metavar="M", help="metres from the cameras to the target's centre")
+    one.add_argument("--resolution", type=_resolution, metavar="PX", help="pixels of each side, or WIDTHxHEIGHT")
+    one.add_argument("--fov", type=float, metavar="DEG", help="angle that the image's width covers")
+    one.add_argument("--exposure", type=float, metavar="X", help="display value of a radiance of 1 W/m2/sr")
+    one.add_argument("--spp", type=int, metavar="N", help="samples a pixel")
+    one.add_argument("--seed", type=int, metavar="N")
+    one.add_argument("--units", metavar="UNIT", help="of a mesh file: m (default), cm, mm, km, in or ft")
+    one.add_argument("--up", metavar="AXIS", help="of a mesh file: x, y or z (default: the format's own)")
+    one.add_argument("--resume", action="store_true", help="complete what an interrupted run left")
+    many = one.add_mutually_exclusive_group()
+    many.add_argument("--workers", type=int, default=1, metavar="N", help="processes that render (1)")
+    many.add_argument(
+        "--ray", metavar="ADDRESS", help="render on a Ray cluster: auto, HOST:PORT, or local to start one"
+    )
+    one.add_argument("--estimate", action="store_true", help="render a few frames, tell time and disk, keep nothing")
+    one.add_argument("--print", action="store_true", help="render nothing, print the whole scene as a scene file")
+
+    one = command("train", "reconstruct a dataset with Gaussian splatting")
+    one.add_argument("data", type=Path, metavar="DATA")
+    one.add_argument("--out", type=Path, required=True, metavar="RUN")
+    one.add_argument("--method", default="vanilla", help="vanilla (default), relight, shadow-map, shadow-splat or park")
+    one.add_argument("--strategy", help="default")
+    one.add_argument("--init", help="mesh, points or random (default: points, else mesh, else random)")
+    one.add_argument("--init-count", type=int, metavar="N", help="Gaussians at the start, at most")
+    one.add_argument("--views-per-step", type=int, metavar="N", help="views whose mean gradient a step follows (1)")
+    one.add_argument("--preset", default="fast", help="demo, fast (default) or thesis")
+    one.add_argument("--iterations", type=int, metavar="N")
+    one.add_argument("--seed", type=int, metavar="N")
+    one.add_argument(
+        "--black-background", action="store_true", help="train over black, as the thesis, not against alpha"
+    )
+    one.add_argument("--resume", action="store_true", help="go on from the newest checkpoint")
+    lit = one.add_argument_group("light", "of the methods that learn it; see docs/relighting.md")
+    lit.add_argument("--field", choices=("thesis", "surface"), help="what the appearance field is told")
+    lit.add_argument("--linear", action="store_true", help="blend colours in linear light, encode the picture")
+    lit.add_argument("--shadow-bias", type=float, metavar="X", help="strength of the receiver-depth bias; 0: none")
+    lit.add_argument("--grazing", choices=("none", "bias", "lift"), help="against acne where the Sun grazes")
+    lit.add_argument("--shadow-filter", choices=("bilinear", "percentage-closer", "variance"), help="of shadow maps")
+    lit.add_argument("--light-size", type=int, metavar="PX", help="sides of the Sun's picture")
+    lit.add_argument("--shadow-gradients", action="store_true", help="of shadow splatting move the Gaussians, too")
+    lit.add_argument("--no-refinement", action="store_true", help="raw shadows, without the network")
+    lit.add_argument(
+        "--visibility-weight", type=float, metavar="W", help="learn shadows from path-traced visibility, too (0)"
+    )
+
+    one = command("eval", "judge a run: EVAL/metrics.json, EVAL/report.html, EVAL/frames")
+    one.add_argument("path", type=Path, metavar="RUN")
+    one.add_argument("--data", type=Path, required=True, metavar="DATA")
+    one.add_argument("--out", type=Path, required=True, metavar="EVAL")
+    one.add_argument("--split", default="test", help="test (default), train or all")
+    one.add_argument(
+        "--lpips-weights", type=Path, metavar="PATH", help="AlexNet and linear weights for LPIPS, a file or a folder"
+    )
+    one.add_argument("--json", action="store_true", help="print metrics.json alone")
+
+    one = command("report", "one page about several evaluations side by side", needs_backend=False)
+    one.add_argument("evals", type=Path, nargs="+", metavar="EVAL")
+    one.add_argument("--out", type=Path, required=True, metavar="FILE.html")
+
+    one = command("render", "one picture of a run")
+    one.add_argument("path", type=Path, metavar="RUN")
+    one.add_argument("--out", type=Path, required=True, metavar="FILE.png|.exr")
+    where = one.add_mutually_exclusive_group()
+    where.add_argument("--camera", type=Path, metavar="FILE", help="JSON with transform_matrix, w, h, fl_x, ...")
+    where.add_argument("--frame", type=int, metavar="K", help="frame K of the dataset, training frames first (0)")
+    one.add_argument("--data", type=Path, metavar="DATA", help="the dataset, where it has moved since training")
+    one.add_argument("--sun", type=_angles, metavar="AZ,EL", help="degrees; a vanilla run knows one light only")
+    one.add_argument("--kind", choices=KINDS, default="rgb")
+
+    one = command("sweep", "the Sun goes round a run: a contact sheet and a video")
+    one.add_argument("path", type=Path, metavar="RUN")
+    one.add_argument("--out", type=Path, required=True, metavar="DIR")
+    where = one.add_mutually_exclusive_group()
+    where.add_argument("--camera", type=Path, metavar="FILE", help="JSON with transform_matrix, w, h, fl_x, ...")
+    where.add_argument("--frame", type=int, metavar="K", help="frame K of the dataset, training frames first (0)")
+    one.add_argument("--data", type=Path, metavar="DATA", help="the dataset, where it has moved since training")
+    path = one.add_mutually_exclusive_group()
+    path.add_argument("--elevation", type=float, metavar="DEG", help="the Sun goes round at this elevation (30)")
+    path.add_argument("--azimuth", type=float, metavar="DEG", help="the Sun rises at this azimuth and goes overhead")
+    one.add_argument("--frames", type=int, metavar="N", help="Suns, evenly around the circle (72)")
+    one.add_argument("--kind", choices=("rgb", "shadow"), default="rgb")
+    one.add_argument("--size", type=_resolution, metavar="PX", help="pixels of the longer side, or WIDTHxHEIGHT")
+    one.add_argument("--keep-frames", action="store_true", help="write every picture into DIR/frames, too")
+
+    one = command("verify", "whether every file of a dataset is there and can be read", needs_backend=False)
+    one.add_argument("data", type=Path, metavar="DATA")
+
+    one = command("export", "a run or a dataset as files for other tools", needs_backend=False)
+    one.add_argument("path", type=Path, metavar="RUN|DATA")
+    one.add_argument("--backend", choices=backend.NAMES, default="auto", help="default: CUDA, else LLVM")
+    form = one.add_mutually_exclusive_group(required=True)
+    form.add_argument("--ply", type=Path, metavar="FILE", help="Gaussians: INRIA layout, the dataset's frame and scale")
+    form.add_argument("--speedplus", type=Path, metavar="DIR", help="a dataset's images and poses as SPEED+ has them")
+    form.add_argument("--bop", type=Path, metavar="DIR", help="a dataset's images, depth, masks, poses, models for BOP")
+    one.add_argument("--sun", type=_angles, metavar="AZ,EL", help="for --ply of a relightable run: whose colours")
+    one.add_argument("--object", metavar="K", help="for SPEED+: whose poses, by number or name (the first)")
+    return parser
+
+
+def _angles(text: str) -> tuple[float, float]:
+    try:
+        azimuth, elevation = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected AZ,EL in degrees, found {text!r}") from None
+    if not (math.isfinite(azimuth) and -90 <= elevation <= 90):
+        raise argparse.ArgumentTypeError(f"expected a finite azimuth and an elevation up to 90, found {text!r}")
+    return azimuth, elevation
+
+
+def _resolution(text: str) -> int | tuple[int, int]:
+    sides = text.lower().split("x")
+    if not all(side.isascii() and side.lstrip("-").isdigit() for side in sides) or len(sides) > 2:
+        raise argparse.ArgumentTypeError(f"expected pixels of each side, or WIDTHxHEIGHT, found {text!r}")
+    return (int(sides[0]), int(sides[1])) if len(sides) == 2 else int(sides[0])
+
+
+def _built_in_scenes() -> list[str]:
+    """Names, for the help: to import the scenes would take seconds."""
+    return sorted(path.stem for path in Path(__file__).parent.glob("assets/scenes/*.toml"))
