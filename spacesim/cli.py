@@ -143,7 +143,7 @@ def _with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainCon
         "shadow_gradients",
         "no_refinement",
     )
-    named = [name for name in names if getattr(options, name) not in (None, False)]
+    named = [name for name in names if getattr(options, name) is not None and getattr(options, name) is not False]
     if not named:
         return config
     from spacesim.splat.train.config import with_field
@@ -161,6 +161,8 @@ def _with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainCon
         given = {"bias": options.shadow_bias, "grazing": options.grazing, "size": options.light_size}
         shadow = replace(shadow, **{name: value for name, value in given.items() if value is not None})
         if options.shadow_filter is not None:
+            if shadow.method != "mapping":
+                raise InputError(f"--shadow-filter: expected --method shadow-map, found {config.method}")
             shadow = replace(shadow, mapping=replace(shadow.mapping, filter=options.shadow_filter))
         shadow = replace(shadow, gradients=True) if options.shadow_gradients else shadow
         shadow = replace(shadow, refine=None) if options.no_refinement else shadow

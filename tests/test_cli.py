@@ -40,6 +40,12 @@ def test_the_module_is_a_program_too():
     assert done.stdout.startswith("spacesim ")
 
 
+def test_no_bias_is_no_bias(spacesim, tiny_data, tmp_path):
+    words = "--method", "shadow-map", "--preset", "demo", "--iterations", 2, "--init-count", 50, "--light-size", 16
+    assert spacesim("train", tiny_data, "--out", tmp_path / "run", *words, "--shadow-bias", 0).code == 0
+    assert json.loads((tmp_path / "run/config.json").read_text())["light"]["shadow"]["bias"] == 0
+
+
 def test_demo_is_importable():
     from spacesim.demo import DATA, SCENE, demo
     from spacesim.scenes import read_scene
@@ -286,6 +292,10 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("train DATA --out OUT --method relight --shadow-bias 3", ["--shadow-bias", "with shadows", "relight"]),
         ("train DATA --out OUT --method relight --visibility-weight 1", ["--visibility-weight", "shadows", "relight"]),
         ("train DATA --out OUT --method shadow-splat --grazing lift --shadow-bias -1", ["bias", "-1"]),
+        ("train DATA --out OUT --method shadow-splat --shadow-filter variance", ["--shadow-filter", "shadow-map"]),
+        ("train DATA --out OUT --method shadow-map --shadow-gradients", ["--shadow-gradients", "splatting"]),
+        ("train DATA --out OUT --method shadow-map --shadow-bias inf", ["--shadow-bias", "inf"]),
+        ("train DATA --out OUT --method shadow-map --light-size 0", ["--light-size", "found 0"]),
         ("train DATA --out OUT --seed -1", ["--seed", "found -1"]),
         ("train DATA --out OUT --backend vulkan", ["--backend", "vulkan"]),
         ("train DATA --out DATA", ["DATA", "empty or new folder"]),

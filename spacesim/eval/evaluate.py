@@ -66,6 +66,11 @@ def evaluate(
     frames = {"test": dataset.test, "train": dataset.train, "all": dataset.frames}[config.split]
     if not frames:
         raise InputError(f"{dataset.root}: expected frames in the split {config.split}, found none")
+    dark = next((frame for frame in frames if frame.sun is None), None)
+    if dark is not None and run.relightable:
+        raise InputError(
+            f"{dataset.root}: expected the Sun of every frame for a relightable run, {dark.file_path} has none"
+        )
     network, lpips_sentence = lpips.load(config.lpips_weights)
     _prepare(out)
     run.predict(frames[0].camera, frames[0].sun)  # compiles the kernels

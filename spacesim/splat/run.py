@@ -113,6 +113,9 @@ def load_run(path: Path) -> Run:
         model = Gaussians.from_numpy(tensors)
         light_config = TrainConfig.from_json(config).light
         light = LightModel.from_tensors(light_config, tensors) if light_config else None
+        if light_config and (model.count == 0 or model.feature_count != light_config.features):
+            found = f"{model.count} with {model.feature_count if model.count else 0}"
+            raise ValueError(f"features: expected Gaussians with {light_config.features} each, found {found}")
     except (KeyError, ValueError) as error:
         raise InputError(f"{model_path}: expected the tensors of a model, found none or others ({error})") from None
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):

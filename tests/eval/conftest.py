@@ -85,6 +85,8 @@ class FakeRun:
         }
     )
 
+    relightable = False
+
     def predict(self, camera, sun):
         frame = next(frame for frame in self.dataset.test if frame.camera is camera)
         rgb = load_image(self.dataset, frame).over(np.zeros(3))

@@ -1,5 +1,6 @@
 """Networks and their adjoints against a float64 twin; what light does to training, checkpoints and predictions."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import pytest
 from scipy.special import sph_harm_y
 
 from spacesim.backend import ad
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
 from spacesim.data.records import Camera, Dataset, Sun
@@ -26,9 +27,10 @@ from spacesim.splat.render import view_colours
 from spacesim.splat.run import Run, draw_lit, load_run
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.shadow.refine import RefineConfig
-from spacesim.splat.train.checkpoint import read_tensors
+from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import METHODS, PRESETS, LearningRates, TrainConfig, preset
 from spacesim.splat.train.densify import grow, prune
+from spacesim.splat.train.losses import anisotropy
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.train import train
@@ -393,6 +395,57 @@ def test_baked_harmonics_show_what_the_model_shows_under_that_sun(name):
         errors.append(numbers(view_colours(plain, camera)) - exact)
         spread.append(exact)
     assert np.sqrt(np.mean(np.square(errors))) < 0.5 * np.std(spread, axis=0).mean(), "the view matters, and is kept"
+
+
+def test_round_gaussians_feel_no_pull_towards_roundness():
+    """Their scales differ by the last bit of an exponential; its sign must not decide a gradient."""
+    log_scales = ad.Array3f(np.repeat(np.random.default_rng(0).uniform(-9, 2, (1, 500)), 3, axis=0).astype(np.float32))
+    log_scales[1] *= 1 + 1e-7
+    dr.enable_grad(log_scales)
+    dr.backward(anisotropy(log_scales))
+    assert not numbers(dr.grad(log_scales)).any()
+    flat = np.log([[0.1], [0.2], [0.6]]).astype(np.float32)
+    assert numbers(anisotropy(ad.Array3f(flat)))[0] == pytest.approx((0.2 + 0.1 + 0.3) / 3, rel=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["empty", "no features", "few features"])
+def test_models_that_do_not_fit_their_networks_are_refused(small_lit_dataset, tmp_path, kind):
+    run = train(small_lit_dataset, tmp_path / "run", training("map", iterations=2))
+    tensors, header = read_tensors(run.path / "model.safetensors")
+    if kind == "empty":
+        tensors |= {name: tensors[name][:0] for name in run.model.to_numpy()}
+    elif kind == "no features":
+        del tensors["features"]
+    else:
+        tensors["features"] = tensors["features"][:, :4]
+    write_tensors(run.path / "model.safetensors", tensors, {k: v for k, v in header.items() if k != "format"})
+    with pytest.raises(InputError, match=r"model\.safetensors"):
+        load_run(run.path)
+
+
+def test_a_run_that_never_began_can_be_started_otherwise(small_lit_dataset, tmp_path, monkeypatch):
+    def broken(_self):
+        raise WorkError("the memory is short")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "step", broken)
+        with pytest.raises(WorkError):
+            train(small_lit_dataset, tmp_path / "run", training("map"))
+    run = train(small_lit_dataset, tmp_path / "run", training("map", iterations=2))
+    assert run.config["iterations"] == 2
+
+
+def test_resume_takes_what_an_older_version_did_not_write_for_the_default(small_lit_dataset, tmp_path):
+    config = training("map", iterations=2)
+    run = train(small_lit_dataset, tmp_path / "run", config)
+    written = json.loads((run.path / "config.json").read_text())
+    for name in ("views_per_step", "isotropy_weight"):
+        del written[name]
+    (run.path / "config.json").write_text(json.dumps(written))
+    assert train(small_lit_dataset, tmp_path / "run", config, resume=True).gaussians == run.gaussians
+    wider = replace(config, light=replace(config.light, field=replace(FIELD, width=20)))
+    with pytest.raises(InputError, match=r"light\.field\.width 12, --resume asks for 20"):
+        train(small_lit_dataset, tmp_path / "run", wider, resume=True)
 
 
 def test_vanilla_ignores_suns_and_light_needs_them(small_lit_dataset):

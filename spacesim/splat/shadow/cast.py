@@ -1,5 +1,6 @@
 """Raw shadows of a set of Gaussians under one Sun: light camera, bias and one of the two methods, in one call."""
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -43,14 +44,14 @@ class ShadowConfig:
         if self.method not in METHODS:
             raise InputError(f"shadow method: expected {' or '.join(METHODS)}, found {self.method!r}")
         if self.gradients and self.method != "splatting":
-            raise InputError(f"gradients of shadows: expected the shadow method splatting, found {self.method}")
+            raise InputError(f"--shadow-gradients: expected shadow splatting, found {self.method}")
         if self.grazing not in GRAZING:
             raise InputError(f"grazing: expected one of {', '.join(GRAZING)}, found {self.grazing!r}")
         if self.size < 4:
-            raise InputError(f"light image: expected at least 4 pixels, found {self.size}")
-        if not (self.bias >= 0 and self.softness > 0):
+            raise InputError(f"--light-size: expected at least 4 pixels, found {self.size}")
+        if not (0 <= self.bias < math.inf and 0 < self.softness < math.inf):
             raise InputError(
-                f"shadows: expected a bias of 0 or more and a softness above 0, found {self.bias} and {self.softness}"
+                f"--shadow-bias: expected 0 or more (and a softness above 0), found {self.bias} (and {self.softness})"
             )
 
 

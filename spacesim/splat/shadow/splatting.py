@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, recorded
+from spacesim.data.errors import WorkError
 from spacesim.splat.adjoint import gather_slots, reduce_mode
 from spacesim.splat.cameras import LARGEST, Orthographic
 from spacesim.splat.gaussians import Gaussians
@@ -70,7 +71,10 @@ def differentiable_occlusion(
     prepare = _trace_prepare if dr.grad_enabled(rows) else _prepare
     blockers, receivers, blocker_boxes, receiver_boxes = prepare(rows, away, camera, bias, antialiased)
     size = camera.width, camera.height
-    return dr.custom(_Occlusion, blockers, receivers, blocker_boxes, receiver_boxes, size)
+    try:
+        return dr.custom(_Occlusion, blockers, receivers, blocker_boxes, receiver_boxes, size)
+    except RuntimeError as error:  # Dr.Jit wraps what is raised in there
+        raise error.__cause__ if isinstance(error.__cause__, WorkError) else error from None
 
 
 def _rows(gaussians: Gaussians) -> list[Any]:

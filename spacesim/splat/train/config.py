@@ -80,7 +80,7 @@ class TrainConfig:
             raise InputError(f"--method {self.method}: expected a configuration of light for all but vanilla")
         for name in ("visibility_weight", "isotropy_weight"):
             if not 0 <= getattr(self, name) < float("inf"):
-                raise InputError(f"{name}: expected 0 or more, found {getattr(self, name)}")
+                raise InputError(f"--{name.replace('_', '-')}: expected 0 or more, found {getattr(self, name)}")
         if self.visibility_weight > 0 and not (self.light and self.light.shadow):
             raise InputError(f"--visibility-weight: expected a method with shadows, found {self.method}")
 

@@ -6,6 +6,8 @@ import drjit as dr
 
 from spacesim.splat.train.ssim import ssim
 
+ROUND = 1e-4  #: of a Gaussian's mean scale, chosen
+
 
 def photometric_loss(prediction: Any, target: Any, width: int, height: int, ssim_weight: float = 0.2) -> Any:
     """(1 - w) mean |p - t| + w (1 - SSIM(p, t)), thesis 2.8 with D-SSIM = 1 - SSIM as gsplat takes it.
@@ -28,7 +30,9 @@ def visibility_loss(prediction: Any, truth: Any, valid: Any) -> Any:
 
 def anisotropy(log_scales: Any) -> Any:
     """[N] metres: mean distance of a Gaussian's three scales, Array3f [3, N], from their mean (Matsuki et al. 2024,
-    section 3.3.3; the weight of the sum is the caller's)."""
+    section 3.3.3; the weight of the sum is the caller's). Within `ROUND` of the mean a scale counts as the mean: else
+    the last bit of a round Gaussian would decide the sign of its gradient."""
     scales = dr.exp(log_scales)
     mean = dr.mean(scales)
-    return (dr.abs(scales[0] - mean) + dr.abs(scales[1] - mean) + dr.abs(scales[2] - mean)) / 3
+    distances = [dr.abs(scales[i] - mean) for i in range(3)]
+    return sum((dr.select(d > ROUND * mean, d, 0) for d in distances), type(mean)(0)) / 3

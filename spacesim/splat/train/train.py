@@ -44,7 +44,8 @@ def train(
     out = Path(out)
     described = {**config.to_json(), "data": _identity(dataset)}
     if (out / "config.json").exists():
-        _check_resumable(out, described, resume)
+        if _checkpoints(out) or (out / "model.safetensors").exists():  # else nothing is there that could be lost
+            _check_resumable(out, described, resume)
         if (out / "model.safetensors").exists():
             return load_run(out)
     elif holds_files(out) or (out.exists() and not out.is_dir()):
@@ -127,9 +128,28 @@ def _check_resumable(out: Path, described: dict[str, Any], resume: bool) -> None
     if not isinstance(before, dict):
         raise InputError(f"{out / 'config.json'}: expected a JSON object, found {type(before).__name__}")
     before["data"] = {**(before.get("data") or {}), "path": described["data"]["path"]}  # it may have moved
-    for key, value in described.items():
-        if before.get(key) != value:
-            raise InputError(f"{out}: was started with {key} {before.get(key)!r}, --resume asks for {value!r}")
+    known = {
+        **before,
+        **TrainConfig.from_json(before).to_json(),
+    }  # what an older version did not write is as by default
+    difference = _first_difference(known, described)
+    if difference is not None:
+        key, old, new = difference
+        raise InputError(f"{out}: was started with {key} {old!r}, --resume asks for {new!r}")
+
+
+def _first_difference(old: dict[str, Any], new: dict[str, Any], within: str = "") -> tuple[str, Any, Any] | None:
+    """(key, old value, new value) of the first key of `new` that `old` has otherwise; "light.field.width" within
+    others."""
+    for key, value in new.items():
+        was = old.get(key)
+        if isinstance(was, dict) and isinstance(value, dict):
+            found = _first_difference(was, value, f"{within}{key}.")
+            if found is not None:
+                return found
+        elif was != value:
+            return f"{within}{key}", was, value
+    return None
 
 
 def _checkpoints(out: Path) -> list[Path]:
