@@ -120,6 +120,8 @@ def _train(options: argparse.Namespace) -> None:
     config = with_options(config, **{name: getattr(options, name) for name in names})
     if options.black_background:
         config = with_options(config, random_background=False)
+    if options.antialiased:
+        config = with_options(config, antialiased=True)
     config = _with_light(config, options)
     dataset = read_dataset(options.data)
     with reporting("train", "iterations") as report:

@@ -93,6 +93,9 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--init", help="mesh, points or random (default: points, else mesh, else random)")
     one.add_argument("--init-count", type=int, metavar="N", help="Gaussians at the start, at most")
     one.add_argument("--views-per-step", type=int, metavar="N", help="views whose mean gradient a step follows (1)")
+    one.add_argument(
+        "--antialiased", action="store_true", help="with Mip-Splatting's 2D filter: pictures hold at other distances"
+    )
     one.add_argument("--preset", default="fast", help="demo, fast (default) or thesis")
     one.add_argument("--iterations", type=int, metavar="N")
     one.add_argument("--seed", type=int, metavar="N")

@@ -61,6 +61,11 @@ class Run:
         return backend.select()
 
     @property
+    def antialiased(self) -> bool:
+        """Whether the model was trained, and so is drawn, with the anti-aliasing filter."""
+        return bool(self.config.get("antialiased", False))
+
+    @property
     def relightable(self) -> bool:
         """Whether the Sun's direction changes what is predicted."""
         return self.light is not None
@@ -70,13 +75,13 @@ class Run:
         method is not told the Sun."""
         names = ("alpha", "depth", *(("normal",) if normals else ()))
         if self.light is None:
-            output = render(self.model, Pinhole.of(camera), outputs=(*names, "colour"))
+            output = render(self.model, Pinhole.of(camera), outputs=(*names, "colour"), antialiased=self.antialiased)
             return _prediction(output, output.image("colour"), None, normals)
         if sun is None:
             raise InputError(
                 f"{self.path}: expected the Sun's direction for a run of {self.config['method']}, found none"
             )
-        output = draw_lit(self.model, self.light, Pinhole.of(camera), sun.direction, names)
+        output = draw_lit(self.model, self.light, Pinhole.of(camera), sun.direction, names, self.antialiased)
         drawn, alpha = output.image("features"), output.image("alpha")
         visible = np.zeros_like(alpha)
         visibility = np.divide(drawn[..., 3], alpha, out=visible, where=alpha > 0) if drawn.shape[2] > 3 else None
@@ -85,13 +90,18 @@ class Run:
 
 
 def draw_lit(
-    model: Gaussians, light: LightModel, camera: Projection, sun: np.ndarray, outputs: Sequence[str] = ()
+    model: Gaussians,
+    light: LightModel,
+    camera: Projection,
+    sun: np.ndarray,
+    outputs: Sequence[str] = (),
+    antialiased: bool = False,
 ) -> RenderOutput:
     """A relit and shadowed frame on the device. features: colour (3 planes), then, of a model with shadows, visibility,
-    all premultiplied. sun: [3], unit, towards the Sun;  outputs: see `render`"""
+    all premultiplied. sun: [3], unit, towards the Sun;  outputs, antialiased: see `render`"""
     colours, visibility = light.lit(model, camera, sun, adaptive=True)
     lit = [] if visibility is None else [visibility]
-    return render(model, camera, outputs=outputs, features=[*colours, *lit])
+    return render(model, camera, outputs=outputs, features=[*colours, *lit], antialiased=antialiased)
 
 
 def _prediction(output: RenderOutput, rgb: np.ndarray, visibility: np.ndarray | None, normals: bool) -> Prediction:

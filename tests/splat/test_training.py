@@ -58,6 +58,17 @@ def test_same_seed_same_model_to_the_bit(small_dataset, finished, tmp_path):
     assert not np.array_equal(other.model.to_numpy()["means"][:10], finished.model.to_numpy()["means"][:10])
 
 
+def test_a_run_trained_with_the_filter_is_drawn_with_it(small_dataset, tmp_path):
+    run = train(small_dataset, tmp_path / "run", replace(CONFIG, iterations=60, antialiased=True))
+    plain = train(small_dataset, tmp_path / "plain", replace(CONFIG, iterations=60))
+    assert not np.array_equal(run.model.to_numpy()["means"][:20], plain.model.to_numpy()["means"][:20])
+    camera = small_dataset.test[0].camera
+    drawn = render(load_run(run.path).model, Pinhole.of(camera), outputs=("colour",), antialiased=True)
+    np.testing.assert_array_equal(load_run(run.path).predict(camera).rgb, drawn.image("colour"))
+    unfiltered = render(run.model, Pinhole.of(camera), outputs=("colour",)).image("colour")
+    assert not np.array_equal(drawn.image("colour"), unfiltered)
+
+
 @pytest.mark.parametrize("stop", [50, 100])
 def test_a_restored_trainer_goes_on_as_if_never_stopped(small_dataset, tmp_path, stop):
     straight = Trainer(small_dataset, CONFIG)

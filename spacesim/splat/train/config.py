@@ -51,6 +51,7 @@ class TrainConfig:
     sh_every: int = 1_000  #: iterations after which one more degree of spherical harmonics joins
     ssim_weight: float = 0.2  #: lambda of thesis 2.8
     random_background: bool = True  #: train against alpha; False: over black, as the thesis
+    antialiased: bool = False  #: with Mip-Splatting's 2D filter, in training and in the run's pictures; see `project`
     light: LightConfig | None = None  #: how the Sun makes colours; None for `vanilla`, whose colours are fixed
     visibility_weight: float = 0.0  #: of the mean error of blended visibility against the path-traced one
     isotropy_weight: float = 0.0  #: of the scales' mean distance from a Gaussian's mean scale, per scene scale (`park`)

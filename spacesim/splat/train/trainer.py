@@ -101,7 +101,7 @@ class Trainer:
         view = self.views.at_step(number)
         camera = Pinhole.of(view.camera)
         size = width, height = camera.width, camera.height
-        splats, footprints, colour = self._project(rows, camera, degree)
+        splats, footprints, colour = self._project(rows, camera, degree, self.config.antialiased)
         shading = self.light.shade(self.gaussians, camera, view.sun) if self.light and view.sun is not None else None
         supervised = shading is not None and self.config.visibility_weight > 0
         if shading:
@@ -133,7 +133,7 @@ class Trainer:
         gradients = [(look.camera, look.by_splats, look.by_colour, look.by_features, look.by_rows) for look in looks]
         weight = self.config.isotropy_weight / (self.scene_scale * self.gaussians.count)
         isotropy = [ad.Float(weight)] if weight > 0 else []
-        rows, first, second = self._update(rows, moments, degree, gradients, factors, isotropy)
+        rows, first, second = self._update(rows, moments, degree, gradients, factors, isotropy, self.config.antialiased)
         self.gaussians = Gaussians.from_rows(rows)
         self.optimizer.first, self.optimizer.second = first, second
 
@@ -246,10 +246,12 @@ def _restore_moments(optimizer: Adam, tensors: Mapping[str, np.ndarray], name: s
             moments[i] = ad.Float(tensors[key])
 
 
-def _project(rows: list[Any], camera: Pinhole, degree: int) -> tuple[Splats, Footprints, list[Any]]:
+def _project(
+    rows: list[Any], camera: Pinhole, degree: int, antialiased: bool = False
+) -> tuple[Splats, Footprints, list[Any]]:
     """Splats, footprints and colours (3 x [N], or none where they come from a field), without gradients."""
     gaussians = Gaussians.from_rows(rows)
-    splats, footprints = project(gaussians, camera)
+    splats, footprints = project(gaussians, camera, antialiased)
     return splats, footprints, [] if gaussians.features is not None else list(view_colours(gaussians, camera, degree))
 
 
@@ -290,6 +292,7 @@ def _update(
     gradients: list[tuple[Pinhole, Splats, list[Any], Any, list[Any]]],
     factors: Any,
     isotropy: Sequence[Any] = (),
+    antialiased: bool = False,
 ) -> tuple[list[Any], list[Any], list[Any]]:
     """Gradients of the splats, and of the colours or features, in each view to the mean gradient of the parameters, and
     an Adam step.
@@ -301,7 +304,7 @@ def _update(
     gaussians = Gaussians.from_rows(rows)
     along: Any = ad.Float(0)
     for camera, by_splat, by_colour, by_features, by_rows in gradients:
-        splats, _ = project(gaussians, camera)
+        splats, _ = project(gaussians, camera, antialiased)
         for name in ("opacity", "x", "y", "a", "b", "c"):
             along += getattr(splats, name) * getattr(by_splat, name)
         for row, gradient in zip(rows, by_rows, strict=False):
