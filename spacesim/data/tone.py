@@ -23,5 +23,5 @@ def filmic(linear: np.ndarray) -> np.ndarray:
 
 
 def as_bytes(values: np.ndarray) -> NDArray[np.uint8]:
-    """8-bit numbers of values in [0, 1], any shape."""
-    return np.round(255 * values).astype(np.uint8)
+    """8-bit numbers of values, any shape, clipped to [0, 1] first."""
+    return np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)

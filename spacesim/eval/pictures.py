@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 
 from spacesim.data.images import srgb_from_linear
+from spacesim.data.tone import as_bytes
 from spacesim.eval.image import Mask
 from spacesim.eval.shadow import KINDS
 from spacesim.splat.picture import LIT, SHADOWED
@@ -17,11 +18,6 @@ WRONGLY_SHADOWED, WRONGLY_LIT = (213, 94, 0), (86, 180, 233)
 
 ATTACHED, SELF_CAST, OTHER_CAST = (124, 130, 142), SHADOWED, (122, 78, 132)
 """sRGB colours of the kinds of true shadow."""
-
-
-def as_bytes(picture: np.ndarray) -> np.ndarray:
-    """uint8 of values in [0, 1], rounded."""
-    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
 
 
 def error_picture(prediction: np.ndarray, truth: np.ndarray, valid: Mask) -> np.ndarray:

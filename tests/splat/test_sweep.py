@@ -16,7 +16,7 @@ from spacesim.data.records import Camera, Sun
 from spacesim.splat import sweep as module
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
-from spacesim.splat.picture import LIT, SHADOWED, shadow_colours
+from spacesim.splat.picture import LIT, SHADOWED, shadow_colours, write_picture
 from spacesim.splat.run import Prediction, Run
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.sweep import SUN, resized, sky_mark, suns_around, sweep
@@ -315,3 +315,10 @@ def test_the_command_refuses(spacesim, lit_run, small_dataset, tmp_path, options
     common = ("--data", small_dataset.root, "--out", tmp_path / "out")
     assert spacesim("sweep", tmp_path / "lit", *common, *options).is_refusal(named)
     assert not (tmp_path / "out").exists()
+
+
+def test_pictures_brighter_than_white_are_white(tmp_path):
+    """Colours of harmonics have no upper end; in eight bits they must not start again from black."""
+    rgb, alpha = np.full((4, 5, 3), 1.4, np.float32), np.ones((4, 5), np.float32)
+    write_picture(Prediction(rgb, alpha, alpha, None), "rgb", tmp_path / "bright.png")
+    assert (read_png(tmp_path / "bright.png") == 255).all()
