@@ -133,20 +133,14 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one = command("render", "one picture of a run")
     one.add_argument("path", type=Path, metavar="RUN")
     one.add_argument("--out", type=Path, required=True, metavar="FILE.png|.exr")
-    where = one.add_mutually_exclusive_group()
-    where.add_argument("--camera", type=Path, metavar="FILE", help="JSON with transform_matrix, w, h, fl_x, ...")
-    where.add_argument("--frame", type=int, metavar="K", help="frame K of the dataset, training frames first (0)")
-    one.add_argument("--data", type=Path, metavar="DATA", help="the dataset, where it has moved since training")
+    _add_view(one)
     one.add_argument("--sun", type=_angles, metavar="AZ,EL", help="degrees; a vanilla run knows one light only")
     one.add_argument("--kind", choices=KINDS, default="rgb")
 
     one = command("sweep", "the Sun goes round a run: a contact sheet and a video")
     one.add_argument("path", type=Path, metavar="RUN")
     one.add_argument("--out", type=Path, required=True, metavar="DIR")
-    where = one.add_mutually_exclusive_group()
-    where.add_argument("--camera", type=Path, metavar="FILE", help="JSON with transform_matrix, w, h, fl_x, ...")
-    where.add_argument("--frame", type=int, metavar="K", help="frame K of the dataset, training frames first (0)")
-    one.add_argument("--data", type=Path, metavar="DATA", help="the dataset, where it has moved since training")
+    _add_view(one)
     path = one.add_mutually_exclusive_group()
     path.add_argument("--elevation", type=float, metavar="DEG", help="the Sun goes round at this elevation (30)")
     path.add_argument("--azimuth", type=float, metavar="DEG", help="the Sun rises at this azimuth and goes overhead")
@@ -168,6 +162,14 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--sun", type=_angles, metavar="AZ,EL", help="for --ply of a relightable run: whose colours")
     one.add_argument("--object", metavar="K", help="for SPEED+: whose poses, by number or name (the first)")
     return parser
+
+
+def _add_view(one: _Parser) -> None:
+    """The options that say from where a run is seen."""
+    where = one.add_mutually_exclusive_group()
+    where.add_argument("--camera", type=Path, metavar="FILE", help="JSON with transform_matrix, w, h, fl_x, ...")
+    where.add_argument("--frame", type=int, metavar="K", help="frame K of the dataset, training frames first (0)")
+    one.add_argument("--data", type=Path, metavar="DATA", help="the dataset, where it has moved since training")
 
 
 def _angles(text: str) -> tuple[float, float]:

@@ -62,8 +62,12 @@ class Gaussians:
     def rows(self) -> list[Any]:
         """The parameters as a list of Floats [N], row after row in the order of `ROWS`; features, if any, are the last,
         [F * N]."""
-        drawn = [*self.means, *self.log_scales, *self.quaternions, self.logit_opacities, *self.sh]
+        drawn = [*self.shape_rows(), *self.sh]
         return drawn if self.features is None else [*drawn, self.features]
+
+    def shape_rows(self) -> list[Any]:
+        """The first of `rows`: what places Gaussians and makes them opaque, without their looks. 11 Floats [N]."""
+        return [*self.means, *self.log_scales, *self.quaternions, self.logit_opacities]
 
     @staticmethod
     def from_rows(rows: list[Any]) -> "Gaussians":

@@ -84,7 +84,7 @@ class Shadows:
 def cast_shadows(gaussians: Gaussians, light: Any, config: ShadowConfig, distance: float) -> Shadows:
     """Raw occlusion (4.6, 4.10) of N Gaussians by each other, with one light camera. light: Float [9] of `light_rows`;
     distance: metres, of the farthest training camera."""
-    rows = _shapes(gaussians)
+    rows = gaussians.shape_rows()
     return _cast(gaussians, _fit(rows, light, config.size), config, distance)
 
 
@@ -104,7 +104,7 @@ def cast_shadows_adaptively(
 
 
 def _cast(gaussians: Gaussians, camera: Orthographic, config: ShadowConfig, distance: float) -> Shadows:
-    rows = _shapes(gaussians)
+    rows = gaussians.shape_rows()
     bias, points = _receivers(rows, camera, dr.opaque(ad.Float, config.bias), config.grazing)
     if config.method == "mapping":
         softness = config.softness * distance
@@ -112,10 +112,6 @@ def _cast(gaussians: Gaussians, camera: Orthographic, config: ShadowConfig, dist
     else:
         occlusion = occlusion_by_splatting(gaussians, camera, bias.bias, points)
     return Shadows(occlusion, rows, camera, bias, points)
-
-
-def _shapes(gaussians: Gaussians) -> list[Any]:
-    return gaussians.rows()[:11]
 
 
 def _trace_fit(rows: list[Any], light: Any, size: int) -> Orthographic:

@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from spacesim.backend import ad, recorded
 from spacesim.data.geometry import Array
-from spacesim.splat.cameras import LARGEST, Orthographic, OrthographicCamera
-from spacesim.splat.gaussians import Gaussians, opacities, principal_axes
-from spacesim.splat.project import ALPHA_MIN
-from spacesim.splat.shadow.sunlight import MARGIN, NARROWEST, SUPPORT, fit_camera, light_axes, light_rows
+from spacesim.splat.cameras import Orthographic, OrthographicCamera
+from spacesim.splat.gaussians import Gaussians, principal_axes
+from spacesim.splat.shadow.sunlight import MARGIN, NARROWEST, SUPPORT, drawable, fit_camera, light_axes, light_rows
 from spacesim.splat.tiles import RECORDINGS
 
 MEANINGFUL_GAP = 0.05  #: of a cluster's extent: a narrower gap between supports is no place to split at, chosen
@@ -206,7 +205,7 @@ def _trace_fitted(shapes: tuple[Any, ...], light: Any, size: int) -> tuple[Ortho
     in its image, how many can be drawn). Counts are exact to 2^24."""
     means, log_scales, quaternions, logits = shapes
     camera = fit_camera(Gaussians(means, log_scales, quaternions, logits, ad.ArrayXf([])), light, size)
-    drawn = _drawn(shapes)
+    drawn = drawable(*shapes)
     screen = camera.screen(camera.transform(dr.select(drawn, means, ad.Array3f(0))))
     inside = drawn & (screen.x >= 0) & (screen.x <= size) & (screen.y >= 0) & (screen.y <= size)
     counts = [dr.sum(dr.select(mask, ad.Float(1), 0)) for mask in (inside, drawn)]
@@ -217,7 +216,7 @@ def _trace_radii(shapes: tuple[Any, ...], light: Any) -> list[Any]:
     """Three standard deviations along the light frame's x and y, [N] metres each (4.30, 4.31); NaN where a
     Gaussian cannot be drawn."""
     _, log_scales, quaternions, _ = shapes
-    drawn = _drawn(shapes)
+    drawn = drawable(*shapes)
     scales = dr.exp(dr.select(drawn, log_scales, ad.Array3f(0)))
     own = [axis * scales[a] for a, axis in enumerate(principal_axes(quaternions))]
     radii = []
@@ -226,16 +225,6 @@ def _trace_radii(shapes: tuple[Any, ...], light: Any) -> list[Any]:
         radius = SUPPORT * dr.norm(ad.Array3f([dr.dot(across, axis) for axis in own]))
         radii.append(dr.select(drawn, radius, dr.nan))
     return radii
-
-
-def _drawn(shapes: tuple[Any, ...]) -> Any:
-    """Bool [N]: what `project` would draw if the image were large enough."""
-    means, log_scales, quaternions, logits = shapes
-    length2 = dr.squared_norm(quaternions)
-    drawn = (length2 > 1e-24) & (length2 < 1e24) & (dr.abs(logits) < LARGEST)
-    for i in range(3):
-        drawn &= (dr.abs(means[i]) < LARGEST) & (log_scales[i] > -60) & (log_scales[i] < 20)
-    return drawn & (opacities(dr.select(drawn, logits, 0)) >= ALPHA_MIN)
 
 
 def _footprint(size: int, least_scale: float) -> float:

@@ -50,7 +50,7 @@ def occlusion_by_splatting(
     0 for what cannot be projected and where no pixel of a footprint is inside of the image. Raises ValueError for a
     bias of another length, WorkError where memory is short.
     """
-    rows = [dr.detach(row) for row in _rows(gaussians)]
+    rows = [dr.detach(row) for row in gaussians.shape_rows()]
     return differentiable_occlusion(Gaussians.from_rows(rows), camera, bias, points, antialiased)
 
 
@@ -67,7 +67,7 @@ def differentiable_occlusion(
         return dr.zeros(ad.Float, 0)
     bias = dr.detach(bias) + dr.zeros(ad.Float, count)
     dr.make_opaque(bias)
-    rows, away = _rows(gaussians), None if points is None else dr.detach(points) - dr.detach(gaussians.means)
+    rows, away = gaussians.shape_rows(), None if points is None else dr.detach(points) - dr.detach(gaussians.means)
     prepare = _trace_prepare if dr.grad_enabled(rows) else _prepare
     blockers, receivers, blocker_boxes, receiver_boxes = prepare(rows, away, camera, bias, antialiased)
     size = camera.width, camera.height
@@ -75,11 +75,6 @@ def differentiable_occlusion(
         return dr.custom(_Occlusion, blockers, receivers, blocker_boxes, receiver_boxes, size)
     except RuntimeError as error:  # Dr.Jit wraps what is raised in there
         raise error.__cause__ if isinstance(error.__cause__, WorkError) else error from None
-
-
-def _rows(gaussians: Gaussians) -> list[Any]:
-    """What places Gaussians and makes them opaque, rows [N]; their looks do not matter."""
-    return [*gaussians.means, *gaussians.log_scales, *gaussians.quaternions, gaussians.logit_opacities]
 
 
 def _trace_prepare(

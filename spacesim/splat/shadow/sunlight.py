@@ -65,7 +65,7 @@ def fit_camera(gaussians: Gaussians, light: Any, size: int) -> Orthographic:
         dr.detach(value)
         for value in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
     )
-    drawn = _drawn(means, log_scales, quaternions, logits)
+    drawn = drawable(means, log_scales, quaternions, logits)
     means, log_scales = dr.select(drawn, means, ad.Array3f(0)), dr.select(drawn, log_scales, ad.Array3f(0))
     counted = dr.select(drawn, ad.Float(1), 0)
     dr.eval(means, counted)  # here and below: one kernel for what several reductions read
@@ -95,7 +95,7 @@ def _axis(light: Any, i: int) -> Any:
     return ad.Array3f([dr.gather(ad.Float, light, ad.UInt32(3 * i + j)) for j in range(3)])
 
 
-def _drawn(means: Any, log_scales: Any, quaternions: Any, logits: Any) -> Any:
+def drawable(means: Any, log_scales: Any, quaternions: Any, logits: Any) -> Any:
     """Bool [N]: the Gaussians that `project` would draw if the image were large enough."""
     length2 = dr.squared_norm(quaternions)
     drawn = (length2 > 1e-24) & (length2 < 1e24) & (dr.abs(logits) < LARGEST)
