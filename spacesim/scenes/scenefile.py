@@ -7,13 +7,13 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NoReturn
 
+from spacesim.data import toml
 from spacesim.data.errors import InputError
-from spacesim.scenes import toml
+from spacesim.data.structure import Rules, keys_of, near, structure
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
 from spacesim.scenes.materials import changed, material_names
 from spacesim.scenes.rig import RIGS, RigConfig
 from spacesim.scenes.spacecraft import SPACECRAFT, spacecraft
-from spacesim.scenes.structure import Rules, keys_of, near, structure
 from spacesim.scenes.sun import SunConfig
 
 SCENES = Path(__file__).parents[1] / "assets" / "scenes"

@@ -11,8 +11,9 @@ from typing import get_args, get_origin, get_type_hints
 import numpy as np
 import pytest
 
+from spacesim.data import toml
 from spacesim.data.errors import InputError
-from spacesim.scenes import toml
+from spacesim.data.structure import keys_of
 from spacesim.scenes.build import build
 from spacesim.scenes.camera import CameraConfig
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, QualityConfig, SceneConfig
@@ -21,7 +22,6 @@ from spacesim.scenes.generate import plan_views
 from spacesim.scenes.rig import RIGS, RigConfig
 from spacesim.scenes.scenefile import BUILT_IN_SCENES, RULES, SCENES, read_scene, scene_text
 from spacesim.scenes.sensor import SensorConfig
-from spacesim.scenes.structure import keys_of
 from spacesim.scenes.sun import SunConfig
 
 PAGE = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")

@@ -8,7 +8,7 @@ from types import NoneType, UnionType
 from typing import Any, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from spacesim.data.errors import InputError
-from spacesim.scenes.toml import Document, Keys, dotted
+from spacesim.data.toml import Document, Keys, dotted
 
 T = TypeVar("T")
 _NOUNS = {int: "a whole number", float: "a finite number", bool: "true or false", str: "text in quotes"}
