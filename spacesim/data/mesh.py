@@ -1,0 +1,77 @@
+"""Meshes as vertices and faces, and the signed distance to one, also where it is not watertight."""
+
+from pathlib import Path
+from typing import Any
+
+import igl
+import numpy as np
+import trimesh
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import Array
+
+
+def read_mesh(path: Path) -> tuple[Array, np.ndarray]:
+    """(vertices [V, 3] metres, faces [F, 3] int64) of a mesh file. Raises InputError where it holds none."""
+    if not Path(path).exists():
+        raise InputError(f"{path}: expected a mesh, found no such file")
+    try:
+        mesh: Any = trimesh.load(path, force="mesh", process=False)
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    except Exception as error:
+        raise InputError(f"{path}: expected a mesh, found a file that cannot be read as one ({error})") from None
+    faces = _drawable(vertices, faces)
+    if len(faces) == 0:
+        raise InputError(f"{path}: expected a mesh, found no face with finite corners in it")
+    return vertices, faces
+
+
+class SignedDistance:
+    """Distance from points to a surface, metres: negative inside, positive outside (thesis 5.1).
+
+    Inside is where the generalised winding number (Jacobson et al. 2013; Barill et al. 2018 for its fast sum, as libigl
+    has it) is at least one half, or at most minus one half: so holes close smoothly, parts may overlap or be open, and
+    a mesh turned inside out counts like any other. A sheet has no inside.
+    """
+
+    def __init__(self, vertices: Array, faces: np.ndarray) -> None:
+        """vertices [V, 3] metres, faces [F, 3]. Raises InputError where no face has finite corners."""
+        self.vertices = np.ascontiguousarray(vertices, np.float64)
+        self.faces = np.ascontiguousarray(_drawable(self.vertices, np.asarray(faces, np.int64).reshape(-1, 3)))
+        if len(self.faces) == 0:
+            raise InputError("signed distance: expected a mesh, found no face with finite corners")
+        used = self.vertices[self.faces.ravel()]
+        self.lowest, self.highest = used.min(axis=0), used.max(axis=0)
+        self._tree, self._winding = igl.AABB(), igl.FastWindingNumberBVH()
+        self._tree.init(self.vertices, self.faces)
+        self._winding.init(self.vertices, self.faces)
+
+    @staticmethod
+    def of(path: Path) -> "SignedDistance":
+        """To the surface in a mesh file. Raises InputError where it holds none."""
+        return SignedDistance(*read_mesh(path))
+
+    def __call__(self, points: Array) -> Array:
+        """[N] metres, for points [N, 3]; infinite for those that are not finite."""
+        points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
+        finite = np.isfinite(points).all(axis=1)
+        found = np.full(len(points), np.inf)
+        if not finite.any():
+            return found
+        asked = points[finite]
+        distance = np.sqrt(self._tree.squared_distance(self.vertices, self.faces, asked)[0])
+        within = np.flatnonzero(((asked >= self.lowest) & (asked <= self.highest)).all(axis=1))
+        if len(within):
+            inside = within[np.abs(self._winding.winding_number(asked[within])) >= 0.5]
+            distance[inside] *= -1
+        found[finite] = distance
+        return found
+
+
+def _drawable(vertices: Array, faces: np.ndarray) -> np.ndarray:
+    """The faces whose corners are there and finite."""
+    if len(vertices) == 0 or faces.ndim != 2 or len(faces) == 0:
+        return np.zeros((0, 3), np.int64)
+    known = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
+    faces = faces[known]
+    return faces[np.isfinite(vertices).all(axis=1)[faces].all(axis=1)]

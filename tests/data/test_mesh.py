@@ -1,0 +1,111 @@
+"""Signed distance against closed forms, against exact winding numbers, and for meshes that are not whole."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from spacesim.data.errors import InputError
+from spacesim.data.mesh import SignedDistance, read_mesh
+
+
+def queries(count: int = 4000, reach: float = 2.0) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-reach, reach, (count, 3))
+
+
+def of(mesh: trimesh.Trimesh) -> SignedDistance:
+    return SignedDistance(mesh.vertices, mesh.faces)
+
+
+def to_box(points: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Exact signed distance to the box |x| <= half."""
+    beyond = np.abs(points) - half
+    return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+
+
+def test_box_is_exact():
+    half = np.array([0.5, 0.8, 1.1])
+    points = queries()
+    found = of(trimesh.creation.box(2 * half))(points)
+    np.testing.assert_allclose(found, to_box(points, half), atol=1e-12)
+    assert 100 < (found < 0).sum() < 3900
+
+
+def test_sphere_and_torus_up_to_their_facets():
+    points = queries()
+    sphere = trimesh.creation.icosphere(5, 1.0)
+    facets = 1 - np.linalg.norm(sphere.triangles_center, axis=1).min()  # how far facets lie below the sphere
+    exact = np.linalg.norm(points, axis=1) - 1
+    found = of(sphere)(points)
+    assert (found - exact >= -1e-9).all()
+    assert (found - exact <= 1.01 * facets).all()
+
+    torus = trimesh.creation.torus(1.0, 0.4, major_sections=256, minor_sections=128)
+    around = np.hypot(points[:, 0], points[:, 1]) - 1.0
+    exact = np.hypot(around, points[:, 2]) - 0.4
+    np.testing.assert_allclose(of(torus)(points), exact, atol=5e-4)
+
+
+def solid_angle_sum(points: np.ndarray, mesh: trimesh.Trimesh) -> np.ndarray:
+    """Winding numbers by the exact sum over all faces (van Oosterom & Strackee 1983)."""
+    total = np.zeros(len(points))
+    for corners in mesh.triangles:
+        a, b, c = (corner - points for corner in corners)
+        la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+        top = np.einsum("ni,ni->n", a, np.cross(b, c))
+        dot_ab, dot_bc, dot_ca = ((x * y).sum(axis=1) for x, y in ((a, b), (b, c), (c, a)))
+        total += 2 * np.arctan2(top, la * lb * lc + dot_ab * lc + dot_bc * la + dot_ca * lb)
+    return total / (4 * np.pi)
+
+
+@pytest.mark.parametrize("kind", ["whole", "overlapping", "holed", "inverted", "partly inverted"])
+def test_sign_is_that_of_exact_winding_numbers(kind):
+    ball, box = trimesh.creation.icosphere(2, 0.9), trimesh.creation.box((1.0, 1.0, 2.6))
+    mesh = trimesh.util.concatenate([ball, box]) if "overlapping" in kind else ball
+    if kind == "holed":
+        mesh = trimesh.Trimesh(ball.vertices, ball.faces[:-30], process=False)
+    if kind == "inverted":
+        mesh = trimesh.Trimesh(ball.vertices, ball.faces[:, ::-1], process=False)
+    if kind == "partly inverted":
+        other = trimesh.Trimesh(box.vertices + np.array([0, 3, 0]), box.faces[:, ::-1], process=False)
+        mesh = trimesh.util.concatenate([ball, other])
+    points = queries(1500)
+    winding = np.abs(solid_angle_sum(points, mesh))
+    clear = np.abs(winding - 0.5) > 0.02  # the fast sum is good to about 0.01
+    found = of(mesh)(points)
+    np.testing.assert_array_equal(found[clear] < 0, winding[clear] > 0.5)
+    assert clear.mean() > 0.95
+    assert (found < 0).sum() > 50
+
+
+def test_nested_and_missing_points():
+    distance = of(trimesh.creation.box((1, 1, 1)))
+    assert len(distance(np.zeros((0, 3)))) == 0
+    found = distance(np.array([[0, 0, 0], [np.nan, 0, 0], [0, np.inf, 0], [2, 0, 0]]))
+    np.testing.assert_allclose(found, [-0.5, np.inf, np.inf, 1.5])
+
+
+def test_a_sheet_has_no_inside():
+    sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    points = np.array([[0.5, 0.5, 0.2], [0.5, 0.5, -0.2], [2, 0.5, 0]])
+    np.testing.assert_allclose(of(sheet)(points), [0.2, 0.2, 1.0])
+
+
+def test_meshes_that_are_none_are_told(tmp_path):
+    with pytest.raises(InputError, match=r"gone\.ply"):
+        read_mesh(tmp_path / "gone.ply")
+    (tmp_path / "broken.ply").write_bytes(b"nonsense")
+    with pytest.raises(InputError, match=r"broken\.ply"):
+        SignedDistance.of(tmp_path / "broken.ply")
+    trimesh.PointCloud(np.eye(3)).export(tmp_path / "points.ply")
+    with pytest.raises(InputError, match=r"points\.ply"):
+        SignedDistance.of(tmp_path / "points.ply")
+    with pytest.raises(InputError, match="finite corners"):
+        SignedDistance(np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
+
+
+def test_read_mesh_reads_what_was_written(tmp_path):
+    box = trimesh.creation.box((1, 2, 3))
+    box.export(tmp_path / "box.ply")
+    vertices, faces = read_mesh(tmp_path / "box.ply")
+    np.testing.assert_allclose(np.sort(vertices, axis=0), np.sort(box.vertices, axis=0))
+    assert faces.shape == (12, 3)
