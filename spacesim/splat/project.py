@@ -42,11 +42,11 @@ class Footprints:
     order: Any  #: [N] UInt32 below 2^31, grows with depth; whatever its sign, and however far away the camera is
 
 
-def project(gaussians: Gaussians, camera: Projection, antialiased: bool = False) -> tuple[Splats, Footprints]:
+def project(gaussians: Gaussians, camera: Projection, antialiased: Any = False) -> tuple[Splats, Footprints]:
     """Project N Gaussians. Returns `Splats` (differentiable) and `Footprints`, all [N].
 
     antialiased: what the dilation adds to a splat's area is taken from its opacity (Yu et al. 2024, Mip-Splatting's 2D
-    filter): a splat thinner than a pixel fades instead of growing.
+    filter): a splat thinner than a pixel fades instead of growing. True, False, or Bool [N]: of which Gaussians.
     """
     means, log_scales, quaternions = gaussians.means, gaussians.log_scales, gaussians.quaternions
     logits = gaussians.logit_opacities
@@ -86,8 +86,9 @@ def project(gaussians: Gaussians, camera: Projection, antialiased: bool = False)
     determinant = own_determinant + DILATION * (xx + yy) + DILATION * DILATION
     xx, yy = xx + DILATION, yy + DILATION
     inverse_determinant = dr.rcp(determinant)
-    if antialiased:
-        opacity *= _compensation(own_determinant * inverse_determinant)
+    if antialiased is not False:
+        kept = _compensation(own_determinant * inverse_determinant)
+        opacity *= kept if antialiased is True else dr.select(antialiased, kept, 1)
     splats = Splats(
         x=screen.x,
         y=screen.y,

@@ -72,7 +72,7 @@ def render(
     sh_degree: int | None = None,
     outputs: Sequence[str] = ("colour", "alpha", "depth"),
     features: Any = None,
-    antialiased: bool = False,
+    antialiased: Any = False,
 ) -> RenderOutput:
     """Render; differentiable with respect to every parameter of `gaussians`, `camera.values` (or `camera.moved`) and
     `features` that has gradients enabled.
@@ -116,7 +116,7 @@ def render(
 
 
 def _trace_prepare(
-    rows: list[Any], camera: Projection, sh_degree: int | None, outputs: tuple[str, ...], antialiased: bool
+    rows: list[Any], camera: Projection, sh_degree: int | None, outputs: tuple[str, ...], antialiased: Any
 ) -> tuple[Splats, Footprints, dict[str, list[Any]]]:
     """(splats, footprints, features to blend by output) of the Gaussians with these `rows`."""
     gaussians = Gaussians.from_rows(rows)

@@ -21,6 +21,7 @@ from spacesim.splat.tiles import RECORDINGS
 
 METHODS = ("mapping", "splatting")
 GRAZING = ("none", "bias", "lift")
+UNSEEN = -80.0  #: logit of an opacity that nothing draws
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,43 @@ def cast_shadows_adaptively(
 
     occlusion = occlusion_in_clusters(gaussians, direction, config.size, least_scale, occlude)
     return replace(casts[0], occlusion=occlusion)
+
+
+@dataclass
+class Between:
+    """Shadows that some of a set of N Gaussians cast on M of it. whole: the set;  casts: Bool [N];  own: those that
+    receive, as a set of their own;  receives: Bool [N], where they stand in the whole;  members: UInt32 [M], their
+    indices"""
+
+    whole: Gaussians
+    casts: Any
+    own: Gaussians
+    receives: Any
+    members: Any
+
+
+def cast_between(
+    between: Between, direction: ArrayLike, config: ShadowConfig, distance: float, least_scale: float
+) -> Any:
+    """Float [M]: raw occlusion of the receivers by the casters, with light cameras fitted to the receivers, as many as
+    it takes (4.3.5). direction: [3], towards the Sun;  distance, least_scale: as in `cast_shadows_adaptively`"""
+    rows, strength = between.whole.shape_rows(), dr.opaque(ad.Float, config.bias)
+    logit = dr.select(between.casts, rows[-1], UNSEEN)
+    dr.eval(logit)
+    blockers = Gaussians.from_rows([*rows[:-1], logit])
+
+    def by_mapping(receivers: Gaussians, camera: Orthographic) -> Any:
+        bias, points = _receivers(receivers.shape_rows(), camera, strength, config.grazing)
+        softness = config.softness * distance
+        return occlusion_by_mapping(receivers, camera, bias.bias, softness, config.mapping, points, blockers)
+
+    def by_splatting(_receiving: Gaussians, camera: Orthographic) -> Any:
+        bias, points = _receivers(rows, camera, strength, config.grazing)
+        occlusion = occlusion_by_splatting(blockers, camera, bias.bias, points, receives=between.receives)
+        return dr.gather(ad.Float, occlusion, between.members)
+
+    occlude = by_mapping if config.method == "mapping" else by_splatting
+    return occlusion_in_clusters(between.own, direction, config.size, least_scale, occlude)
 
 
 def _cast(gaussians: Gaussians, camera: Orthographic, config: ShadowConfig, distance: float) -> Shadows:

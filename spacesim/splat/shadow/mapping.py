@@ -17,6 +17,7 @@ from spacesim.splat.cameras import Orthographic
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import Footprints, Splats, project
 from spacesim.splat.rasterize import forward
+from spacesim.splat.shadow.sunlight import drawable
 from spacesim.splat.tiles import RECORDINGS, bin_splats
 
 FILTERS = ("bilinear", "percentage-closer", "variance")
@@ -77,11 +78,13 @@ def occlusion_by_mapping(
     softness: float,
     config: MappingConfig | None = None,
     points: Any = None,
+    casters: Gaussians | None = None,
 ) -> Any:
     """Float [N] in [0, 1]: raw occlusion by the depth test (thesis 4.4 to 4.6), 0 = sees the Sun. Detached.
 
     camera: of `sunlight.fit_camera`;  bias: Float [N], metres (4.26; zeros for none);  softness: epsilon_s, metres
     points: Array3f [3, N], world, metres: where each Gaussian is tested, if not at its centre (`bias.lifted`)
+    casters: what the Sun's picture shows, if not the Gaussians themselves
     A Gaussian whose point is outside of the image, that cannot be drawn, or around whose point the image is empty
     counts as lit. Raises ValueError for a softness that is not positive.
     """
@@ -90,10 +93,14 @@ def occlusion_by_mapping(
         raise ValueError(f"softness: expected a positive number of metres, found {softness}")
     if gaussians.count == 0:
         return dr.zeros(ad.Float, 0)
-    _, footprints, light = light_map(gaussians, camera, squares=config.filter == "variance")
+    shown = gaussians if casters is None else casters
+    _, footprints, light = light_map(shown, camera, squares=config.filter == "variance")
+    visible = footprints.visible
+    if casters is not None:
+        visible = drawable(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
     points = dr.detach(gaussians.means if points is None else points)
     softness = dr.opaque(ad.Float, max(softness, 1e-20))
-    return _look_up(points, footprints.visible, dr.detach(bias), light, camera, softness, config)
+    return _look_up(points, visible, dr.detach(bias), light, camera, softness, config)
 
 
 def light_map(gaussians: Gaussians, camera: Orthographic, squares: bool = False) -> tuple[Splats, Footprints, LightMap]:

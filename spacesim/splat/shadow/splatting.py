@@ -35,7 +35,12 @@ _RECEIVER = ALPHA_MIN / BETA_MIN  # opacity with which a receiver stands in the 
 
 
 def occlusion_by_splatting(
-    gaussians: Gaussians, camera: Orthographic, bias: Any, points: Any = None, antialiased: bool = False
+    gaussians: Gaussians,
+    camera: Orthographic,
+    bias: Any,
+    points: Any = None,
+    antialiased: bool = False,
+    receives: Any = None,
 ) -> Any:
     """Float [N] in [0, 1], detached: the share of sunlight that is blocked before it reaches each Gaussian.
 
@@ -47,15 +52,21 @@ def occlusion_by_splatting(
     bias: Float [N] metres, of each receiver, or one for all; below 0, from 1e9 on or not a number counts as 0
     points: Array3f [3, N], world, metres: where each Gaussian is tested, if not at its centre (`bias.lifted`)
     antialiased: blockers thinner than a pixel of the light image fade, see `project`
+    receives: Bool [N]: who is asked about, all by default; the others block, and have 0
     0 for what cannot be projected and where no pixel of a footprint is inside of the image. Raises ValueError for a
     bias of another length, WorkError where memory is short.
     """
     rows = [dr.detach(row) for row in gaussians.shape_rows()]
-    return differentiable_occlusion(Gaussians.from_rows(rows), camera, bias, points, antialiased)
+    return differentiable_occlusion(Gaussians.from_rows(rows), camera, bias, points, antialiased, receives)
 
 
 def differentiable_occlusion(
-    gaussians: Gaussians, camera: Orthographic, bias: Any, points: Any = None, antialiased: bool = False
+    gaussians: Gaussians,
+    camera: Orthographic,
+    bias: Any,
+    points: Any = None,
+    antialiased: bool = False,
+    receives: Any = None,
 ) -> Any:
     """`occlusion_by_splatting` with gradients (reverse mode) by means, log scales, quaternions and opacities, of the
     blockers' alpha and the receivers' beta. Who is before whom, the bias, and by how much `points` are off the centres
@@ -69,7 +80,7 @@ def differentiable_occlusion(
     dr.make_opaque(bias)
     rows, away = gaussians.shape_rows(), None if points is None else dr.detach(points) - dr.detach(gaussians.means)
     prepare = _trace_prepare if dr.grad_enabled(rows) else _prepare
-    blockers, receivers, blocker_boxes, receiver_boxes = prepare(rows, away, camera, bias, antialiased)
+    blockers, receivers, blocker_boxes, receiver_boxes = prepare(rows, away, camera, bias, antialiased, receives)
     size = camera.width, camera.height
     try:
         return dr.custom(_Occlusion, blockers, receivers, blocker_boxes, receiver_boxes, size)
@@ -78,7 +89,7 @@ def differentiable_occlusion(
 
 
 def _trace_prepare(
-    rows: list[Any], away: Any, camera: Orthographic, bias: Any, antialiased: bool
+    rows: list[Any], away: Any, camera: Orthographic, bias: Any, antialiased: bool, receives: Any
 ) -> tuple[Splats, Splats, Footprints, Footprints]:
     """(splats of the blockers, of the receivers, footprints of both), [N], of the Gaussians with these `_rows`.
 
@@ -92,6 +103,8 @@ def _trace_prepare(
         means += away
     logit = dr.detach(dr.select(dr.abs(logit) < LARGEST, dr.log(ad.Float(_RECEIVER / (1 - _RECEIVER))), logit))
     receivers, receiver_boxes = project(Gaussians.from_rows([*means, *shape, logit]), camera)
+    if receives is not None:
+        receiver_boxes.visible &= receives
     bias = dr.select((bias > 0) & (bias < LARGEST), bias, 0)
     receiver_boxes.order = _sortable(_depth(means, camera) - bias)
     return blockers, receivers, blocker_boxes, receiver_boxes

@@ -1,0 +1,215 @@
+"""Trained runs as members of a scene: their Gaussians in one set, and what each adds to the colours.
+
+Everything here stays as it is while poses, Sun and camera change: arrays of one size each, so that nothing compiles
+anew and nothing is loaded again.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim.backend import ad, recorded
+from spacesim.data.geometry import Array
+from spacesim.splat.cameras import Pinhole
+from spacesim.splat.compose.pose import Pose
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.project import ALPHA_MIN
+from spacesim.splat.render import view_colours
+from spacesim.splat.run import Run
+from spacesim.splat.shadow.cast import ShadowConfig
+from spacesim.splat.shadow.mapping import MappingConfig
+from spacesim.splat.tiles import RECORDINGS
+from spacesim.splat.tone import encoded
+
+PLAIN_SHADOWS = ShadowConfig(mapping=MappingConfig("percentage-closer"), refine=None)
+"""How shadows of others fall on a run that was trained without any: a depth test that knows half-covered pixels
+(chosen: such a run has learned none to be consistent with)."""
+MODEL_DISTANCE = 5.0  #: farthest training camera of such a run, in its radii: chosen, only the softness depends on it
+
+
+@dataclass(frozen=True, eq=False)
+class Member:
+    """A run as it takes part in scenes; its frame is the model's. rows: 11 Floats [N], `Gaussians.shape_rows`;
+    centre: [3] metres;  radius: metres, of a sphere about the centre that holds every Gaussian to three standard
+    deviations;  shadow: how shadows of others fall on it;  distance, extent: metres, of the farthest training camera,
+    and of the Gaussians, as `TrainingFrame` has distance and radius;  key: equal for equal contents"""
+
+    run: Run
+    rows: list[Any]
+    centre: Array
+    radius: float
+    shadow: ShadowConfig
+    distance: float
+    extent: float
+    key: str
+
+    @staticmethod
+    def of(run: Run) -> "Member":
+        """What scenes know of a run."""
+        arrays = run.model.to_numpy()
+        means, spread = arrays["means"].astype(np.float64), 3 * np.exp(arrays["log_scales"].astype(np.float64).max(1))
+        shown = arrays["logit_opacities"] >= np.log(ALPHA_MIN / (1 - ALPHA_MIN))
+        means, spread = (means[shown], spread[shown]) if shown.any() else (np.zeros((1, 3)), np.zeros(1))
+        centre = 0.5 * (means.min(axis=0) + means.max(axis=0))
+        away = np.linalg.norm(means - centre, axis=1)
+        light = run.light
+        shadow = light.config.shadow if light and light.config.shadow else PLAIN_SHADOWS
+        extent = max(light.frame.radius if light else float(np.percentile(away, 99)), 1e-9)
+        distance = light.frame.distance if light else MODEL_DISTANCE * extent
+        rows = [ad.Float(row) for row in run.model.shape_rows()]
+        return Member(run, rows, centre, float((away + spread).max()), shadow, distance, extent, _digest(run))
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return self.run.gaussians
+
+    @property
+    def linear(self) -> bool:
+        """Whether its colours are linear display values."""
+        return self.run.light is not None and self.run.light.config.linear
+
+    def shade(self, pose: Pose, camera: Pinhole, sun: Array | None) -> tuple[list[Any], Any]:
+        """(colours, three Floats [N], visibility of the Sun [N] or None) as the run alone has them. camera: in the
+        model's frame;  sun: [3] in the world, unused by a run that knows one light."""
+        run = self.run
+        if run.light is None:
+            return list(_harmonic_colours(run.model.rows(), camera)), None
+        assert sun is not None, "the scene asks for a Sun first"
+        return run.light.lit(run.model, camera, pose.direction_in_model(sun), adaptive=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """Members one after another as one set of N Gaussians. members: in an order that does not depend on how they were
+    named, so that composing [A, B] and [B, A] is one and the same"""
+
+    members: Sequence[Member]
+    starts: Sequence[int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        counts = [member.count for member in self.members]
+        object.__setattr__(self, "starts", [sum(counts[:k]) for k in range(len(counts))])
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return sum(member.count for member in self.members)
+
+    @cached_property
+    def rows(self) -> list[Any]:
+        """11 Floats [N], each member's in its own frame."""
+        if len(self.members) == 1:
+            return self.members[0].rows
+        rows = [dr.concat([member.rows[i] for member in self.members]) for i in range(11)]
+        dr.eval(rows)
+        return rows
+
+    @cached_property
+    def owner(self) -> Any:
+        """UInt32 [N]: whose each Gaussian is."""
+        numbers = [np.full(member.count, k, np.uint32) for k, member in enumerate(self.members)]
+        return ad.UInt32(np.concatenate(numbers))
+
+    @cached_property
+    def indices(self) -> list[Any]:
+        """UInt32 of each member: where its Gaussians stand in the set."""
+        pairs = zip(self.starts, self.members, strict=True)
+        return [ad.UInt32(np.arange(start, start + member.count, dtype=np.uint32)) for start, member in pairs]
+
+    @cached_property
+    def shares(self) -> list[Any]:
+        """Float [N] of each member: 1 for its Gaussians, else 0."""
+        return [dr.opaque(ad.Float, 1, self.count)] if len(self.members) == 1 else list(map(self._share, self._ks))
+
+    @property
+    def _ks(self) -> range:
+        return range(len(self.members))
+
+    def _share(self, k: int) -> Any:
+        share = dr.select(self.owner == dr.opaque(ad.UInt32, k), ad.Float(1), 0)
+        dr.eval(share)
+        return share
+
+    @cached_property
+    def own(self) -> list[Any]:
+        """Bool [N] of each member: is a Gaussian its?"""
+        return self._masks([share > 0.5 for share in self.shares])
+
+    @cached_property
+    def others(self) -> list[Any]:
+        """Bool [N] of each member: is a Gaussian another's?"""
+        return self._masks([share < 0.5 for share in self.shares])
+
+    @cached_property
+    def antialiased(self) -> Any:
+        """Whether Gaussians are drawn with the anti-aliasing filter: one for all, or Bool [N] where runs differ."""
+        flags = [member.run.antialiased for member in self.members]
+        if len(set(flags)) == 1:
+            return flags[0]
+        return ad.Bool(np.concatenate([np.full(m.count, f) for m, f in zip(self.members, flags, strict=True)]))
+
+    @cached_property
+    def linear(self) -> bool:
+        """Whether the whole is blended in linear light: where all members are."""
+        return all(member.linear for member in self.members)
+
+    def placed(self, poses: Sequence[Pose]) -> Gaussians:
+        """The set with a pose of each member, colours left out (3.11 to 3.13)."""
+        numbers = [[*p.rotation.ravel(), *p.translation, p.scale, np.log(p.scale), *p.quaternion] for p in poses]
+        table = ad.Float(np.array(numbers, dtype=np.float32).ravel())
+        return Gaussians.from_rows([*_placed(self.rows[:10], self.owner, table), self.rows[10]])
+
+    def joined(self, parts: Sequence[Sequence[Any]]) -> list[Any]:
+        """Floats [N] of each member's, row by row. parts: of each member the same number of Floats."""
+        return list(parts[0]) if len(parts) == 1 else [dr.concat(list(row)) for row in zip(*parts, strict=True)]
+
+    @staticmethod
+    def _masks(masks: list[Any]) -> list[Any]:
+        dr.eval(masks)
+        return masks
+
+
+def display_colours(colours: list[Any], linear: bool, blended_linear: bool) -> list[Any]:
+    """Colours as they are blended: linear ones are sRGB-encoded first where not all members are linear."""
+    return [encoded(colour) for colour in colours] if linear and not blended_linear else colours
+
+
+def _trace_placed(rows: list[Any], owner: Any, table: Any) -> list[Any]:
+    """The first 10 of `Gaussians.shape_rows`, each by its owner's numbers: R (9), t (3), s, ln s, quaternion (4)."""
+    of = [dr.gather(ad.Float, table, owner * _NUMBERS + i) for i in range(_NUMBERS)]
+    x, y, z = rows[:3]
+    means = [of[12] * (of[3 * i] * x + of[3 * i + 1] * y + of[3 * i + 2] * z) + of[9 + i] for i in range(3)]  # 3.11
+    w, i, j, k = of[14:18]
+    a, b, c, d = rows[6:10]
+    quaternion = [  # 3.12
+        w * a - i * b - j * c - k * d,
+        w * b + i * a + j * d - k * c,
+        w * c - i * d + j * a + k * b,
+        w * d + i * c - j * b + k * a,
+    ]
+    return [*means, *(log_scale + of[13] for log_scale in rows[3:6]), *quaternion]  # 3.13
+
+
+def _trace_harmonic_colours(rows: list[Any], camera: Pinhole) -> Any:
+    return view_colours(Gaussians.from_rows(rows), camera)
+
+
+def _digest(run: Run) -> str:
+    """Of everything that a picture of the run depends on."""
+    digest = hashlib.sha256(repr((run.antialiased, run.light.config if run.light else None)).encode())
+    tensors = run.model.to_numpy() | (run.light.tensors() if run.light else {})
+    for name in sorted(tensors):
+        digest.update(f"{name}{tensors[name].shape}".encode())
+        digest.update(np.ascontiguousarray(tensors[name]).tobytes())
+    return digest.hexdigest()
+
+
+_NUMBERS = 18  # of a pose's row in the table
+_placed = recorded(_trace_placed, RECORDINGS)
+_harmonic_colours = recorded(_trace_harmonic_colours, RECORDINGS)

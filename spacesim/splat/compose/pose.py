@@ -1,0 +1,153 @@
+"""Where a model stands in a scene, how it is turned and how large it is there (thesis 3.11 to 3.13)."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import Array, quaternion_from_rotation, rotation_from_quaternion
+from spacesim.data.records import Camera
+
+FARTHEST = 1e8  #: metres of a position at most, chosen: single precision tells places 10 m apart there
+SMALLEST, LARGEST = 1e-9, 1e9  #: of a scale, chosen
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """x_world = scale R x_model + translation (3.11).
+
+    rotation: [3, 3], R, or [4], a quaternion (w, x, y, z) of any length, kept as R, float64
+    translation: [3] metres;  scale: metres in the world for one of the model's
+    Raises InputError for what is no rotation, not finite, or beyond the bounds named above.
+    """
+
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    translation: Array = field(default_factory=lambda: np.zeros(3))
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rotation", _rotation(self.rotation))
+        translation = _numbers(self.translation)
+        if translation.shape != (3,) or not np.all(np.abs(translation) <= FARTHEST):
+            raise InputError(f"position: expected 3 numbers of at most {FARTHEST:g} metres, found {self.translation!r}")
+        object.__setattr__(self, "translation", translation)
+        if not SMALLEST <= self.scale <= LARGEST:
+            raise InputError(f"scale: expected a factor from {SMALLEST:g} to {LARGEST:g}, found {self.scale}")
+        object.__setattr__(self, "scale", float(self.scale))
+
+    @property
+    def quaternion(self) -> Array:
+        """[4] (w, x, y, z), w >= 0; of no rotation exactly (1, 0, 0, 0)."""
+        if np.array_equal(self.rotation, np.eye(3)):
+            return np.array([1.0, 0.0, 0.0, 0.0])
+        return quaternion_from_rotation(self.rotation)
+
+    @property
+    def matrix(self) -> Array:
+        """[4, 4] world_from_model, with the scale."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.scale * self.rotation
+        matrix[:3, 3] = self.translation
+        return matrix
+
+    @property
+    def key(self) -> bytes:
+        """Equal for equal poses, and an order among others."""
+        return np.array([*self.translation, self.scale, *self.rotation.ravel()]).tobytes()
+
+    def points(self, points: ArrayLike) -> Array:
+        """[..., 3] model to world, metres."""
+        turned: Array = np.asarray(points, np.float64) @ self.rotation.T
+        return self.scale * turned + self.translation
+
+    def after(self, first: "Pose") -> "Pose":
+        """The pose that does `first`, then this one."""
+        return Pose(self.rotation @ first.rotation, self.points(first.translation), self.scale * first.scale)
+
+    def inverse(self) -> "Pose":
+        """model_from_world."""
+        scale = 1 / self.scale
+        return Pose(self.rotation.T, -scale * (self.rotation.T @ self.translation), scale)
+
+    def direction_in_model(self, direction: ArrayLike) -> Array:
+        """[3], a direction of the world in the model's axes; the same numbers where nothing is turned."""
+        turned: Array = self.rotation.T @ np.asarray(direction, np.float64)
+        return turned
+
+    def camera_in_model(self, camera: Camera) -> Camera:
+        """The camera that sees the model in its own frame and scale as `camera` sees it in the world: the same picture,
+        depths divided by the scale."""
+        place = np.eye(4)
+        place[:3, :3] = self.rotation.T @ camera.world_from_camera[:3, :3]
+        place[:3, 3] = self.rotation.T @ (camera.position - self.translation) / self.scale
+        return Camera(place, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def between(one: Pose, other: Pose, share: float) -> Pose:
+    """The pose `share` of the way (0 to 1): rotation by the shortest way at even speed (slerp, Shoemake 1985), position
+    along a line, scale by even factors."""
+    rotation = turned_between(one.rotation, other.rotation, share)
+    translation = (1 - share) * one.translation + share * other.translation
+    return Pose(rotation, translation, one.scale ** (1 - share) * other.scale**share)
+
+
+def turned_between(one: Array, other: Array, share: float) -> Array:
+    """The rotation [3, 3] `share` of the way from one to the other, by the shortest way; the ends exactly."""
+    if share <= 0 or np.array_equal(one, other):
+        return one
+    if share >= 1:
+        return other
+    return rotation_from_quaternion(slerp(quaternion_from_rotation(one), quaternion_from_rotation(other), share))
+
+
+def slerp(one: ArrayLike, other: ArrayLike, share: float) -> Array:
+    """The unit vector [n] `share` of the way on the great circle from unit vector `one` to `other`; quaternions, [4],
+    by the shorter way of both that mean the same rotations. Of opposite directions some way round."""
+    start, end = (np.asarray(values, np.float64) for values in (one, other))
+    cosine = float(start @ end)
+    if len(start) == 4 and cosine < 0:
+        end, cosine = -end, -cosine
+    across = end - cosine * start
+    length = float(np.linalg.norm(across))
+    if length < 1e-12:
+        if cosine > 0:
+            return start
+        across = np.cross(start, np.eye(3)[np.abs(start).argmin()])  # opposite: quaternions never are
+        length = float(np.linalg.norm(across))
+    angle = share * np.arctan2(length if cosine > -1 + 1e-12 else 0.0, cosine)
+    way: Array = np.cos(angle) * start + np.sin(angle) * across / length
+    return way / np.linalg.norm(way)
+
+
+def rotation_about(axis: ArrayLike, angle_deg: float) -> Array:
+    """[3, 3]: by `angle_deg` degrees about `axis` [3] of any length, counter-clockwise seen against it. Raises
+    InputError for an axis without a direction."""
+    direction = _numbers(axis)
+    length = float(np.linalg.norm(direction))
+    if direction.shape != (3,) or not 1e-12 < length < np.inf:
+        raise InputError(f"axis: expected 3 finite numbers, not all 0, found {axis!r}")
+    half = 0.5 * np.radians(angle_deg)
+    return rotation_from_quaternion([np.cos(half), *(np.sin(half) / length * direction)])
+
+
+def _rotation(values: ArrayLike) -> Array:
+    """[3, 3] of a matrix or a quaternion."""
+    given = _numbers(values)
+    if given.shape == (4,):
+        if not 1e-12 < np.linalg.norm(given) < np.inf:
+            raise InputError(f"rotation_wxyz: expected 4 finite numbers, not all 0, found {values!r}")
+        return rotation_from_quaternion(given)
+    is_rotation = given.shape == (3, 3) and np.abs(given @ given.T - np.eye(3)).max() < 1e-3
+    if not is_rotation or np.linalg.det(given) < 0:
+        raise InputError(f"rotation: expected a rotation matrix [3, 3] or a quaternion [4], found {values!r}")
+    return given
+
+
+def _numbers(values: ArrayLike) -> Array:
+    """Finite float64 numbers, or none at all."""
+    try:
+        numbers = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.empty(0)
+    return numbers if np.all(np.isfinite(numbers)) else np.empty(0)

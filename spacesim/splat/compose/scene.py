@@ -1,0 +1,334 @@
+"""Trained runs in one scene: each posed, all drawn as one set of Gaussians under one Sun (thesis 3.2, algorithm 2).
+
+Each run's colours, and the shadows that it casts on itself, are computed in its own frame, with camera and Sun brought
+into it: harmonics turn with the model, fields and refinement see the directions, places and lengths that they were
+trained with. Shadows that other models cast on it (4.15) are computed there, too, and multiply its colours (4.16).
+Then its Gaussians go to the world (3.11 to 3.13).
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim import backend
+from spacesim.backend import ad
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import Array
+from spacesim.data.images import srgb_from_linear
+from spacesim.data.records import Camera, Sun
+from spacesim.splat.cameras import Pinhole
+from spacesim.splat.compose.members import Ensemble, Member, display_colours
+from spacesim.splat.compose.pose import Pose
+from spacesim.splat.render import RenderOutput, render
+from spacesim.splat.run import Prediction, Run
+from spacesim.splat.shadow.cast import Between, cast_between
+
+OUTPUTS = ("rgb", "alpha", "depth", "median_depth", "normal", "visibility", "id")
+SHADOWS = ("others", "ratio", "none")
+LEAST_SHARE = (
+    0.25  #: of the pixels a metre that a light camera had in training, before a model gets another one; chosen
+)
+RATIO_EPSILON = 1e-3  #: epsilon of 4.15, for which the thesis names no number: chosen
+COVERED = 0.5  #: alpha from which on a pixel shows an object: chosen
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A run and where it stands. name: for messages and files"""
+
+    run: Run
+    pose: Pose = field(default_factory=Pose)
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class ComposeConfig:
+    """shadows: of models on each other. "others": from the other models alone, which is what 4.15 estimates. "ratio":
+    4.15 itself, light from all over light from the model's own Gaussians; where a model's raw shadow of itself is
+    wrongly dark, the ratio says nothing, and what refinement has mended is dark again. "none": no such shadows."""
+
+    shadows: str = "others"
+
+    def __post_init__(self) -> None:
+        if self.shadows not in SHADOWS:
+            raise InputError(f"shadows: expected one of {', '.join(SHADOWS)}, found {self.shadows!r}")
+
+
+@dataclass(frozen=True, eq=False)
+class ComposedPrediction(Prediction):
+    """A view of a scene. visibility: of models without shadows of their own 1 where no other model is before the Sun;
+    id: [H, W] int32, number of the object with the largest share of the pixel, counted from 1 in the order of the
+    models; 0 where less than half of the pixel is covered"""
+
+    id: np.ndarray | None = None
+
+
+@dataclass
+class Drawn:
+    """A view on the device. output: alpha, depth, ... and `features`, of which `planes` says what they are: "rgb" (3,
+    premultiplied, linear where `linear`), "visibility" (1, premultiplied), "id" (one a model, in the order of `order`)
+    """
+
+    output: RenderOutput
+    planes: dict[str, list[Any]]
+    order: list[int]
+    linear: bool
+
+    def image(self, name: str) -> np.ndarray:
+        """One of `OUTPUTS` that was asked for: rgb [H, W, 3] sRGB values over black, normal [H, W, 3], others [H, W];
+        float32, id int32. Raises ValueError for what was not."""
+        if name not in ("rgb", "visibility", "id"):
+            return self.output.image(name)
+        if name not in self.planes:
+            raise ValueError(f"name: expected one of the outputs asked for, found {name!r}")
+        shape = self.output.height, self.output.width
+        planes = [np.array(plane, dtype=np.float32).reshape(shape) for plane in self.planes[name]]
+        if name == "rgb":
+            rgb = np.stack(planes, axis=-1)
+            return srgb_from_linear(rgb) if self.linear else rgb
+        alpha = self.output.image("alpha")
+        if name == "visibility":
+            return np.divide(planes[0], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+        numbers = np.array(self.order, np.int32) + 1
+        return np.where(alpha >= COVERED, numbers[np.argmax(np.stack(planes), axis=0)], 0)
+
+
+class Composition:
+    """Posed models under one Sun. What does not change with poses, Sun and camera is kept, also by what `moved` makes.
+
+    models: at least one;  config: how they shade each other
+    The same models in another order give the same picture to the bit, `id` apart. One model with no pose gives what its
+    run gives alone, to the bit.
+    """
+
+    def __init__(self, models: Sequence[Placed], config: ComposeConfig | None = None, path: Path | None = None) -> None:
+        if not models:
+            raise InputError("models: expected at least one, found none")
+        self.models, self.config, self.path = tuple(models), config or ComposeConfig(), path
+        known: dict[int, Member] = {id(model.run): Member.of(model.run) for model in self.models}
+        self._members = [known[id(model.run)] for model in self.models]
+        self._ensemble = Ensemble(sorted(self._members, key=lambda member: member.key))
+        self._kept = _Kept()
+        _tell(self.models, self._ensemble)
+
+    # ---- what a run is asked for, too ----
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians."""
+        return self._ensemble.count
+
+    @property
+    def bytes(self) -> int:
+        """Size of the models' files, each counted once."""
+        return sum(run.bytes for run in {id(model.run): model.run for model in self.models}.values())
+
+    @property
+    def backend(self) -> str:
+        """The backend that renders now."""
+        return backend.select()
+
+    @property
+    def relightable(self) -> bool:
+        """Whether the Sun's direction changes what is predicted."""
+        return self._shades or any(model.run.relightable for model in self.models)
+
+    def predict(self, camera: Camera, sun: Sun | None = None, normals: bool = False) -> ComposedPrediction:
+        """Render one view. Raises InputError where the Sun matters and none is told."""
+        names = [name for name in OUTPUTS if name not in ("median_depth", "normal")]
+        drawn = self.draw(camera, sun, [*names, *(("normal",) if normals else ())])
+        visibility = drawn.image("visibility") if "visibility" in drawn.planes else None
+        normal = drawn.image("normal") if normals else None
+        rgb = np.ascontiguousarray(drawn.image("rgb"))
+        return ComposedPrediction(
+            rgb, drawn.image("alpha"), drawn.image("depth"), visibility, normal, drawn.image("id")
+        )
+
+    # ---- scenes ----
+
+    def moved(self, index: int, pose: Pose) -> "Composition":
+        """The scene with model `index` at another pose. Cheap: all that was loaded and computed of models is shared."""
+        models = list(self.models)
+        models[index] = replace(models[index], pose=pose)
+        return self.posed([model.pose for model in models])
+
+    def posed(self, poses: Sequence[Pose]) -> "Composition":
+        """The scene with these poses, one of each model."""
+        other: Composition = object.__new__(Composition)
+        other.models = tuple(replace(m, pose=pose) for m, pose in zip(self.models, poses, strict=True))
+        other.config, other.path = self.config, self.path
+        other._members, other._ensemble, other._kept = self._members, self._ensemble, self._kept
+        return other
+
+    def shaded(self, config: ComposeConfig) -> "Composition":
+        """The scene with other shadows between its models."""
+        other = self.posed([model.pose for model in self.models])
+        other.config, other._kept = config, _Kept()
+        return other
+
+    def draw(self, camera: Camera, sun: Sun | None, outputs: Sequence[str] = ("rgb",)) -> Drawn:
+        """A view on the device: of `OUTPUTS` those asked for, and alpha. Visibility is left out where no model knows
+        any. Raises ValueError for another output, InputError where the Sun matters and none is told."""
+        unknown = [name for name in outputs if name not in OUTPUTS]
+        if unknown:
+            raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
+        order = self._order()
+        poses = [self.models[i].pose for i in order]
+        planes: dict[str, list[Any]] = {}
+        if "rgb" in outputs or "visibility" in outputs:
+            colours, visibility = self._lit(poses, camera, sun)
+            if "rgb" in outputs:
+                planes["rgb"] = colours
+            if "visibility" in outputs and visibility is not None:
+                planes["visibility"] = [visibility]
+        if "id" in outputs:
+            planes["id"] = self._ensemble.shares
+        names = [name for name in outputs if name in ("depth", "median_depth", "normal")]
+        features = [plane for group in planes.values() for plane in group]
+        antialiased = self._ensemble.antialiased
+        output = render(
+            self._ensemble.placed(poses),
+            Pinhole.of(camera),
+            outputs=("alpha", *names),
+            features=features,
+            antialiased=antialiased,
+        )
+        drawn = iter(output.features or [])
+        found = {name: [next(drawn) for _ in group] for name, group in planes.items()}
+        return Drawn(output, found, order, self._ensemble.linear)
+
+    # ---- light ----
+
+    @property
+    def _shades(self) -> bool:
+        """Whether models may shade each other."""
+        return len(self.models) > 1 and self.config.shadows != "none"
+
+    def _order(self) -> list[int]:
+        """Which model is each member of the ensemble; models of one run stand in the order of their poses."""
+        return sorted(range(len(self.models)), key=lambda i: (self._members[i].key, self.models[i].pose.key))
+
+    def _lit(self, poses: Sequence[Pose], camera: Camera, sun: Sun | None) -> tuple[list[Any], Any]:
+        """(colours as blended, three Floats [N], visibility Float [N] or None)."""
+        if sun is None and self.relightable:
+            told = self.path or self.models[0].run.path
+            raise InputError(f"{told}: expected the Sun's direction for a scene that it changes, found none")
+        direction = None if sun is None else sun.direction
+        between = self._between(poses, direction)
+        members = self._ensemble.members
+        knows = any(v is not None for v in between) or self._shades or any(self._own_shadows(m) for m in members)
+        parts = []
+        for k, (member, pose) in enumerate(zip(members, poses, strict=True)):
+            key = (pose.key, camera.world_from_camera.tobytes(), _bytes(direction))
+            parts.append(self._kept.own(k, key, lambda m=member, p=pose: self._part(m, p, camera, direction)))
+        shown = []
+        for (colours, visibility), other in zip(parts, between, strict=True):
+            if other is not None:
+                colours = [colour * other for colour in colours]
+                visibility = other if visibility is None else visibility * other
+            shown.append((colours, visibility))
+        joined = self._ensemble.joined(
+            [
+                display_colours(colours, member.linear, self._ensemble.linear)
+                for member, (colours, _) in zip(members, shown, strict=True)
+            ]
+        )
+        if not knows:
+            return joined, None
+        planes = [
+            [dr.opaque(ad.Float, 1, m.count) if v is None else v] for m, (_, v) in zip(members, shown, strict=True)
+        ]
+        return joined, self._ensemble.joined(planes)[0]
+
+    @staticmethod
+    def _part(member: Member, pose: Pose, camera: Camera, sun: Array | None) -> tuple[list[Any], Any]:
+        """Colours and visibility of a member as it is alone."""
+        return member.shade(pose, Pinhole.of(pose.camera_in_model(camera)), sun)
+
+    @staticmethod
+    def _own_shadows(member: Member) -> bool:
+        light = member.run.light
+        return light is not None and light.config.shadow is not None
+
+    def _between(self, poses: Sequence[Pose], sun: Array | None) -> list[Any]:
+        """Of each member v_inter, Float [N of it], or None where no other can be before the Sun."""
+        if not self._shades:
+            return [None] * len(poses)
+        assert sun is not None, "a scene with such shadows asks for a Sun first"
+        key = (b"".join(pose.key for pose in poses), sun.tobytes(), self.config.shadows)
+        return self._kept.between(key, lambda: [self._inter(poses, sun, k) for k in range(len(poses))])
+
+    def _inter(self, poses: Sequence[Pose], sun: Array, k: int) -> Any:
+        """v_inter of 4.15 for member k, in its own frame: what is seen of the Sun depends neither on where all stands
+        nor on how it is turned, and softness, bias and pixels are those of its training."""
+        ensemble, members = self._ensemble, self._ensemble.members
+        if not any(_may_shade(members[j], poses[j], members[k], poses[k], sun) for j in range(len(poses)) if j != k):
+            return None
+        member, back = members[k], poses[k].inverse()
+        whole = ensemble.placed([Pose() if j == k else back.after(pose) for j, pose in enumerate(poses)])
+        direction, least = poses[k].direction_in_model(sun), LEAST_SHARE * member.shadow.size / member.extent
+
+        def seen(casts: Any) -> Any:
+            between = Between(whole, casts, member.run.model, ensemble.own[k], ensemble.indices[k])
+            return 1 - cast_between(between, direction, member.shadow, member.distance, least)
+
+        if self.config.shadows == "others":
+            visible = seen(ensemble.others[k])
+        else:
+            everything = dr.opaque(ad.Bool, True, ensemble.count)
+            visible = dr.clip(seen(everything) / (seen(ensemble.own[k]) + RATIO_EPSILON), 0, 1)  # 4.15
+        dr.eval(visible)
+        return visible
+
+
+@dataclass
+class _Kept:
+    """What the last picture has computed and the next may use again: where only a model moves, the other models' own
+    light; where only the camera moves, the shadows between models. Each with what it depends on."""
+
+    parts: dict[int, tuple[Any, Any]] = field(default_factory=dict)
+    inter: tuple[Any, Any] = (None, None)
+
+    def own(self, k: int, key: Any, make: Any) -> Any:
+        if k not in self.parts or self.parts[k][0] != key:
+            self.parts[k] = key, make()
+        return self.parts[k][1]
+
+    def between(self, key: Any, make: Any) -> Any:
+        if self.inter[0] != key:
+            self.inter = key, make()
+        return self.inter[1]
+
+
+def _may_shade(caster: Member, at: Pose, receiver: Member, there: Pose, sun: Array) -> bool:
+    """Could a Gaussian of `caster` be before the Sun for one of `receiver`? By spheres around both; True where it is
+    not sure."""
+    reach = caster.radius * at.scale + receiver.radius * there.scale
+    offset = at.points(caster.centre) - there.points(receiver.centre)
+    ahead = float(offset @ sun)
+    aside = float(np.linalg.norm(offset - ahead * sun))
+    return ahead > -reach and aside < reach
+
+
+def _tell(models: Sequence[Placed], ensemble: Ensemble) -> None:
+    """One sentence about each choice that the models leave open."""
+    fixed = [model.name or str(model.run.path) for model in models if not model.run.relightable]
+    if fixed:
+        log.info(
+            "%s: knows the light that it was trained under only and cannot be relit; it casts shadows, and those of "
+            "others dim its colours",
+            ", ".join(dict.fromkeys(fixed)),
+        )
+    if len({member.linear for member in ensemble.members}) > 1:
+        log.info("colours in linear light stand beside sRGB values: all are blended as sRGB values")
+
+
+def _bytes(direction: Array | None) -> bytes:
+    return b"" if direction is None else direction.tobytes()
