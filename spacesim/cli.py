@@ -115,13 +115,15 @@ def _train(options: argparse.Namespace) -> None:
     from spacesim.splat.train.config import preset, with_options
     from spacesim.splat.train.train import train
 
-    names = ("strategy", "init", "init_count", "views_per_step", "iterations", "seed", "visibility_weight")
-    config = preset(options.preset, options.method)
+    names = ("init", "init_count", "views_per_step", "iterations", "seed", "visibility_weight", "flatten_weight")
+    config = preset(options.preset, options.method, options.strategy)
     config = with_options(config, **{name: getattr(options, name) for name in names})
     if options.black_background:
         config = with_options(config, random_background=False)
     if options.antialiased:
         config = with_options(config, antialiased=True)
+    if options.max_gaussians is not None:
+        config = with_options(config, refinement=replace(config.refinement, max_gaussians=options.max_gaussians))
     config = _with_light(config, options)
     dataset = read_dataset(options.data)
     with reporting("train", "iterations") as report:

@@ -89,10 +89,14 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("data", type=Path, metavar="DATA")
     one.add_argument("--out", type=Path, required=True, metavar="RUN")
     one.add_argument("--method", default="vanilla", help="vanilla (default), relight, shadow-map, shadow-splat or park")
-    one.add_argument("--strategy", help="default")
+    one.add_argument("--strategy", default="default", help="default, mesh-aware, support-aware or mcmc")
+    one.add_argument("--max-gaussians", type=int, metavar="N", help="refinement makes no more (250,000)")
     one.add_argument("--init", help="mesh, points or random (default: points, else mesh, else random)")
     one.add_argument("--init-count", type=int, metavar="N", help="Gaussians at the start, at most")
     one.add_argument("--views-per-step", type=int, metavar="N", help="views whose mean gradient a step follows (1)")
+    one.add_argument(
+        "--flatten", type=float, dest="flatten_weight", metavar="W", help="weight that makes Gaussians discs (0)"
+    )
     one.add_argument(
         "--antialiased", action="store_true", help="with Mip-Splatting's 2D filter: pictures hold at other distances"
     )

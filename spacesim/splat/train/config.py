@@ -10,12 +10,17 @@ from spacesim.splat.light import LightConfig
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.shadow.refine import RefineConfig
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
+from spacesim.splat.train.strategies.mcmc import McmcConfig
+from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig
+from spacesim.splat.train.strategies.support_aware import SupportAwareConfig
 
 METHODS = ("vanilla", "relight", "shadow-map", "shadow-splat", "park")
-STRATEGIES = ("default",)
+STRATEGIES = ("default", "mesh-aware", "support-aware", "mcmc")
 INITS = ("mesh", "points", "random")
 PRESETS = ("demo", "fast", "thesis")
 ISOTROPY = 1e-2  #: weight of the isotropy term of `park`, chosen
+MCMC_PENALTY = 1e-2  #: weights of the penalties on opacity and scale of `mcmc` (Kheradmand et al. 2024)
+WEIGHTS = ("visibility_weight", "isotropy_weight", "opacity_weight", "scale_weight", "flatten_weight")
 
 
 @dataclass(frozen=True)
@@ -55,9 +60,15 @@ class TrainConfig:
     light: LightConfig | None = None  #: how the Sun makes colours; None for `vanilla`, whose colours are fixed
     visibility_weight: float = 0.0  #: of the mean error of blended visibility against the path-traced one
     isotropy_weight: float = 0.0  #: of the scales' mean distance from a Gaussian's mean scale, per scene scale (`park`)
+    opacity_weight: float = 0.0  #: of the mean opacity (`mcmc`)
+    scale_weight: float = 0.0  #: of the mean scale, per scene scale (`mcmc`)
+    flatten_weight: float = 0.0  #: of the mean shortest scale, per scene scale: Gaussians become discs
     checkpoint_every: int = 1_000  #: iterations
     rates: LearningRates = field(default_factory=LearningRates)
-    refinement: DefaultStrategyConfig = field(default_factory=DefaultStrategyConfig)
+    refinement: DefaultStrategyConfig = field(default_factory=DefaultStrategyConfig)  #: of every strategy
+    mesh_aware: MeshAwareConfig = field(default_factory=MeshAwareConfig)  #: beside it, of that strategy alone
+    support_aware: SupportAwareConfig = field(default_factory=SupportAwareConfig)
+    mcmc: McmcConfig = field(default_factory=McmcConfig)
 
     def __post_init__(self) -> None:
         for name, allowed in (("method", METHODS), ("strategy", STRATEGIES), ("preset", (None, *PRESETS))):
@@ -79,9 +90,10 @@ class TrainConfig:
             raise InputError(f"--seed: expected 0 or more, found {self.seed}")
         if (self.light is None) != (self.method == "vanilla"):
             raise InputError(f"--method {self.method}: expected a configuration of light for all but vanilla")
-        for name in ("visibility_weight", "isotropy_weight"):
+        for name in WEIGHTS:
             if not 0 <= getattr(self, name) < float("inf"):
-                raise InputError(f"--{name.replace('_', '-')}: expected 0 or more, found {getattr(self, name)}")
+                option = "flatten" if name == "flatten_weight" else name.replace("_", "-")
+                raise InputError(f"--{option}: expected 0 or more, found {getattr(self, name)}")
         if self.visibility_weight > 0 and not (self.light and self.light.shadow):
             raise InputError(f"--visibility-weight: expected a method with shadows, found {self.method}")
 
@@ -111,19 +123,21 @@ def _record(kind: Any, values: dict[str, Any]) -> Any:
     return kind(**known)
 
 
-def preset(name: str, method: str = "vanilla") -> TrainConfig:
+def preset(name: str, method: str = "vanilla", strategy: str = "default") -> TrainConfig:
     """`thesis`: the schedule of section 4.3.6 and tables 4.1 to 5.1 as they stand; `fast`: half a minute on a GPU,
     minutes on two CPU cores; `demo`: a minute on two CPU cores.
 
     The last two are for pictures of some hundred pixels. Table 5.1 splits what is wider than a hundredth of the
     picture: at 256 pixels that is every splat, and the maximum of 250,000 is reached for nothing (docs/performance.md).
-    Raises InputError for another name or method.
+    Raises InputError for another name, method or strategy.
     """
     if method not in METHODS:
         raise InputError(f"--method: expected one of {', '.join(METHODS)}, found {method!r}")
     light = None if method == "vanilla" else _light(name, method)
     isotropy = ISOTROPY if method == "park" else 0.0
-    return replace(_schedule(name), method=method, light=light, isotropy_weight=isotropy)
+    penalty = MCMC_PENALTY if strategy == "mcmc" else 0.0
+    config = replace(_schedule(name), method=method, light=light, isotropy_weight=isotropy, strategy=strategy)
+    return replace(config, opacity_weight=penalty, scale_weight=penalty)
 
 
 def _schedule(name: str) -> TrainConfig:
@@ -137,7 +151,8 @@ def _schedule(name: str) -> TrainConfig:
         )
     gentle = DefaultStrategyConfig(prune_screen_size=0.5, split_screen_size=0.1)
     if name == "fast":
-        return TrainConfig(preset=name, refinement=replace(gentle, refine_stop=5_000))
+        refinement = replace(gentle, refine_stop=5_000)
+        return TrainConfig(preset=name, refinement=refinement, mesh_aware=MeshAwareConfig(cull_every=500))
     if name == "demo":
         return TrainConfig(
             preset=name,
@@ -145,6 +160,8 @@ def _schedule(name: str) -> TrainConfig:
             init_count=8_000,
             sh_every=600,
             refinement=replace(gentle, refine_start=300, refine_stop=2_000, pause_after_reset=0),
+            mesh_aware=MeshAwareConfig(cull_every=500, min_gaussians=8_000),
+            support_aware=SupportAwareConfig(warm_up=300, backfill_start=400, min_gaussians=8_000),
         )
     raise InputError(f"--preset: expected one of {', '.join(PRESETS)}, found {name!r}")
 

@@ -22,6 +22,8 @@ class Refinement:
     duplicated: int = 0
     split: int = 0
     pruned: int = 0
+    added: int = 0
+    relocated: int = 0
 
 
 def rearrange(gaussians: Gaussians, optimizer: Adam, index: np.ndarray, fresh: np.ndarray) -> None:
@@ -49,21 +51,36 @@ def grow(
     fresh = np.arange(len(index)) >= stay
     if not fresh.any():
         return index
-    arrays = gaussians.to_numpy()
     rearrange(gaussians, optimizer, index, fresh)
-    if len(splitting) == 0:
-        return index
-
-    parents = np.tile(splitting, SPLIT_COUNT)
-    scales = np.exp(arrays["log_scales"][parents].astype(np.float64))
-    axes = rotation_from_quaternion(arrays["quaternions"][parents])
-    offsets = np.einsum("nij,nj->ni", axes, scales * rng.standard_normal((len(parents), 3)))
-    means = np.concatenate([arrays["means"][index[: -len(parents)]], arrays["means"][parents] + offsets])
-    log_scales = arrays["log_scales"][index]
-    log_scales[-len(parents) :] -= np.float32(np.log(SPLIT_SHRINK))
-    gaussians.means = ad.Array3f(np.ascontiguousarray(means.T.astype(np.float32)))
-    gaussians.log_scales = ad.Array3f(np.ascontiguousarray(log_scales.T))
+    if len(splitting):
+        scatter_copies(gaussians, SPLIT_COUNT * len(splitting), rng)
+        shrink = np.zeros(len(index), np.float32)
+        shrink[-SPLIT_COUNT * len(splitting) :] = np.log(SPLIT_SHRINK)
+        gaussians.log_scales -= ad.Float(shrink)
+        dr.eval(gaussians.log_scales)
     return index
+
+
+def append_copies(gaussians: Gaussians, optimizer: Adam, parents: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Add a copy of each of the Gaussians `parents` [K], which may repeat, at a point drawn from its parent; without
+    moments. Returns the source of each Gaussian [N + K].
+
+    Copies in one place and without moments would get the same gradients, and stay together for good."""
+    index = np.concatenate([np.arange(gaussians.count), parents]).astype(np.int64)
+    if len(parents):
+        rearrange(gaussians, optimizer, index, np.arange(len(index)) >= gaussians.count)
+        scatter_copies(gaussians, len(parents), rng)
+    return index
+
+
+def scatter_copies(gaussians: Gaussians, count: int, rng: np.random.Generator) -> None:
+    """Move each of the last `count` Gaussians to a point drawn from itself."""
+    scales = np.exp(np.array(gaussians.log_scales, np.float64)[:, -count:])
+    axes = rotation_from_quaternion(np.array(gaussians.quaternions, np.float64)[:, -count:].T)
+    offsets = np.zeros((3, gaussians.count), np.float32)
+    offsets[:, -count:] = np.einsum("nij,nj->in", axes, scales.T * rng.standard_normal((count, 3)))
+    gaussians.means += ad.Array3f(offsets)
+    dr.eval(gaussians.means)
 
 
 def prune(gaussians: Gaussians, optimizer: Adam, remove: np.ndarray) -> np.ndarray:

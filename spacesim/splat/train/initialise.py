@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
+from spacesim.data.mesh import read_mesh
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_points
 from spacesim.splat.gaussians import SH_C0, Gaussians
@@ -87,11 +88,8 @@ def _from_points(dataset: Dataset, count: int, rng: np.random.Generator) -> tupl
 def _from_mesh(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     if dataset.mesh_path is None or not (dataset.root / dataset.mesh_path).exists():
         raise InputError(f"{dataset.root}: --init mesh expects a mesh.ply, found none")
-    try:
-        mesh = trimesh.load(dataset.root / dataset.mesh_path, force="mesh", process=False)
-        points, _ = trimesh.sample.sample_surface(mesh, count, seed=rng)
-    except Exception as error:
-        raise InputError(f"{dataset.root / dataset.mesh_path}: expected a mesh, found {error}") from None
+    mesh = trimesh.Trimesh(*read_mesh(dataset.root / dataset.mesh_path), process=False)
+    points, _ = trimesh.sample.sample_surface(mesh, count, seed=rng)
     return np.asarray(points), np.full((count, 3), 0.5)
 
 

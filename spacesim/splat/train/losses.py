@@ -4,6 +4,7 @@ from typing import Any
 
 import drjit as dr
 
+from spacesim.splat.gaussians import Gaussians, opacities
 from spacesim.splat.train.ssim import ssim
 
 ROUND = 1e-4  #: of a Gaussian's mean scale, chosen
@@ -26,6 +27,24 @@ def visibility_loss(prediction: Any, truth: Any, valid: Any) -> Any:
     of all pixels. truth: below 0 where there is no surface;  valid: Bool, pixels that count."""
     counts = valid & (truth >= 0)
     return dr.sum(dr.select(counts, dr.abs(prediction - truth), 0)) / dr.width(truth)
+
+
+def penalty(name: str, gaussians: Gaussians) -> Any:
+    """[N] what a named penalty on Gaussians adds up; lengths in metres. The weight of the sum is the caller's.
+
+    "isotropy": see `anisotropy`;  "opacity" and "scale": opacity, and mean scale (Kheradmand et al. 2024);
+    "flatten": the shortest scale, so that Gaussians become discs (Chen et al. 2023, NeuSG)."""
+    scales = dr.exp(gaussians.log_scales)
+    if name == "isotropy":
+        return anisotropy(gaussians.log_scales)
+    if name == "opacity":
+        return opacities(gaussians.logit_opacities)
+    if name == "scale":
+        return dr.mean(scales)
+    if name == "flatten":
+        first = dr.detach((scales[0] <= scales[1]) & (scales[0] <= scales[2]))
+        return dr.select(first, scales[0], dr.select(dr.detach(scales[1] <= scales[2]), scales[1], scales[2]))
+    raise ValueError(f"name: expected isotropy, opacity, scale or flatten, found {name!r}")
 
 
 def anisotropy(log_scales: Any) -> Any:

@@ -4,7 +4,7 @@ A step is five stages. Those of fixed shape (project, loss, update) are recorded
 binning and blending, whose lists change length from step to step, stand between them.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,9 @@ from spacesim.splat.tone import decoded, encoded
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.initialise import farthest_camera, initial_gaussians, scene_scale, surface_normals
-from spacesim.splat.train.losses import anisotropy, photometric_loss, visibility_loss
+from spacesim.splat.train.losses import penalty, photometric_loss, visibility_loss
 from spacesim.splat.train.optimizer import Adam, adam_step
-from spacesim.splat.train.strategies.default import DefaultStrategy
+from spacesim.splat.train.strategies.choose import strategy_of
 from spacesim.splat.train.views import TrainingViews, View
 
 HISTORY_EVERY = 50  #: iterations between two entries of the history
@@ -61,7 +61,7 @@ class Trainer:
         self.optimizer = Adam(self.gaussians.rows())
         self.light = self._initial_light(dataset)
         self.light_optimizer = Adam(self.light.weights if self.light else [])
-        self.strategy = DefaultStrategy(config.refinement, self.scene_scale, self.gaussians.count)
+        self.strategy = strategy_of(config, dataset, self.scene_scale, self.gaussians.count)
         self.history: list[dict[str, float]] = []
         self._project = recorded(_project, RECORDINGS)
         self._loss = recorded(_loss, RECORDINGS)
@@ -91,6 +91,7 @@ class Trainer:
             self._move_light(self.light, looks)
 
         self.iteration += 1
+        self.strategy.disturb(self.iteration, self.gaussians, self.means_rate(index), config.seed)
         rng = np.random.default_rng([config.seed, 2, self.iteration])
         self.strategy.refine(self.iteration, self.gaussians, self.optimizer, rng)
         losses = [look.loss for look in looks]
@@ -113,7 +114,7 @@ class Trainer:
         linear = self.config.light is not None and self.config.light.linear
         how = self.config.ssim_weight, self.config.visibility_weight, linear
         loss, by_colour, by_transmittance = self._loss(blended.features, blended.transmittance, target, size, *how)
-        watched = self.iteration + 1 < self.config.refinement.refine_stop  # whether refinement still asks
+        watched = self.strategy.watches(self.iteration + 1)
         by_splat = backward(splats, blended, lists, size, by_colour, by_transmittance, absolute=watched)
         if watched:
             gradient = dr.sqrt(
@@ -131,11 +132,22 @@ class Trainer:
         moments = self.optimizer.first, self.optimizer.second
         factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
         gradients = [(look.camera, look.by_splats, look.by_colour, look.by_features, look.by_rows) for look in looks]
-        weight = self.config.isotropy_weight / (self.scene_scale * self.gaussians.count)
-        isotropy = [ad.Float(weight)] if weight > 0 else []
-        rows, first, second = self._update(rows, moments, degree, gradients, factors, isotropy, self.config.antialiased)
+        more = self._penalties(), self.config.antialiased
+        rows, first, second = self._update(rows, moments, degree, gradients, factors, *more)
         self.gaussians = Gaussians.from_rows(rows)
         self.optimizer.first, self.optimizer.second = first, second
+
+    def _penalties(self) -> dict[str, Any]:
+        """{name: weight of each Gaussian's share} of the penalties on Gaussians that the configuration has."""
+        config, count = self.config, self.gaussians.count
+        of_lengths = {
+            "isotropy": config.isotropy_weight,
+            "scale": config.scale_weight,
+            "flatten": config.flatten_weight,
+        }
+        weights = {name: weight / self.scene_scale for name, weight in of_lengths.items()}
+        weights["opacity"] = config.opacity_weight
+        return {name: ad.Float(weight / count) for name, weight in weights.items() if weight > 0}
 
     def _move_light(self, light: LightModel, looks: list["_Look"]) -> None:
         optimizer, rates, done = self.light_optimizer, self.config.rates, self.iteration / self.config.iterations
@@ -175,7 +187,7 @@ class Trainer:
             iteration, steps, history = int(header["iteration"]), int(header["adam_steps"]), list(header["history"])
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {error}") from None
-        if {dr.width(row) for row in state.values()} != {gaussians.count}:
+        if not {dr.width(row) for row in state.values()} <= {gaussians.count}:
             raise InputError(f"{path}: expected statistics of {gaussians.count} Gaussians, found others")
         if not 0 <= iteration <= self.config.iterations:
             raise InputError(f"{path}: expected an iteration up to {self.config.iterations}, found {iteration}")
@@ -191,14 +203,20 @@ class Trainer:
         return np.random.default_rng([self.config.seed, 3, index]).uniform(size=3).astype(np.float32)
 
     def rates(self, index: int) -> Iterator[float]:
-        """The step size of each row; that of the means falls exponentially over the whole training."""
-        rates, done = self.config.rates, index / self.config.iterations
-        means = self.scene_scale * rates.means ** (1 - done) * rates.means_final**done
-        yield from [means] * 3 + [rates.log_scales] * 3 + [rates.quaternions] * 4 + [rates.logit_opacities]
+        """The step size of each row."""
+        rates = self.config.rates
+        yield from (
+            [self.means_rate(index)] * 3 + [rates.log_scales] * 3 + [rates.quaternions] * 4 + [rates.logit_opacities]
+        )
         if self.gaussians.features is not None:
             yield rates.features
         else:
             yield from [rates.sh_constant] * 3 + [rates.sh_rest] * (len(self.gaussians.sh) - 3)
+
+    def means_rate(self, index: int) -> float:
+        """Metres; falls exponentially over the whole training."""
+        rates, done = self.config.rates, index / self.config.iterations
+        return float(self.scene_scale * rates.means ** (1 - done) * rates.means_final**done)
 
     def _initial_light(self, dataset: Dataset) -> LightModel | None:
         """Networks in the frame of the Gaussians that training starts from."""
@@ -291,13 +309,13 @@ def _update(
     degree: int,
     gradients: list[tuple[Pinhole, Splats, list[Any], Any, list[Any]]],
     factors: Any,
-    isotropy: Sequence[Any] = (),
+    penalties: Mapping[str, Any],
     antialiased: bool = False,
 ) -> tuple[list[Any], list[Any], list[Any]]:
     """Gradients of the splats, and of the colours or features, in each view to the mean gradient of the parameters, and
     an Adam step.
 
-    factors: Float [2 + R], Adam's two corrections and the step size of each row;  isotropy: the weight, or nothing.
+    factors: Float [2 + R], Adam's two corrections and the step size of each row;  penalties: weights by name.
     """
     rows = [ad.Float(row) for row in rows]
     dr.enable_grad(rows)
@@ -312,8 +330,8 @@ def _update(
         if by_features is None:
             for value, gradient in zip(view_colours(gaussians, camera, degree), by_colour, strict=True):
                 along += value * gradient
-    for weight in isotropy:
-        along += len(gradients) * weight * anisotropy(gaussians.log_scales)
+    for name, weight in penalties.items():
+        along += len(gradients) * weight * penalty(name, gaussians)
     dr.backward(along if len(gradients) == 1 else along / len(gradients))
     numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(2 + len(rows))]
     by_row = [dr.grad(row) for row in rows]

@@ -1,0 +1,124 @@
+"""The mesh-aware strategy (thesis 5.2.1, 5.1 to 5.9, table 5.2): a mesh says where Gaussians may be.
+
+The signed distance is asked for lazily: only of Gaussians whose fate depends on it. All are asked for when the exterior
+is pruned, and when there are too few.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim.backend import ad
+from spacesim.data.errors import InputError, WorkError
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.train.strategies.control import DefaultStrategyConfig, DensityControl, Survey, chosen_parents
+
+
+@dataclass(frozen=True)
+class MeshAwareConfig:
+    """Lengths are fractions of the scene's scale."""
+
+    cull_every: int = 2_500  #: table 5.2, iterations between two prunings of the exterior
+    exterior_margin: float = 1e-4  #: table 5.2, tau_out: farther outside is the exterior
+    interior_margin: float = 0.05  #: table 5.2, tau_in: deeper inside is the interior
+    boundary_ease: float = 0.3  #: table 5.2, lambda_b, factor of the growth threshold between both margins
+    min_gaussians: int = 20_000  #: table 5.2
+    protect_interior: bool = True  #: from weak pruning, as what is near the surface
+
+    def __post_init__(self) -> None:
+        if self.cull_every < 1 or self.min_gaussians < 0 or min(self.exterior_margin, self.interior_margin) < 0:
+            raise InputError(f"mesh-aware strategy: expected margins and counts of 0 or more, found {self}")
+        if not 0 < self.boundary_ease <= 1:
+            raise InputError(f"mesh-aware strategy: expected boundary_ease in (0, 1], found {self.boundary_ease}")
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """The partition of 5.2, [N] bool each: exterior, interior, boundary layer."""
+
+    exterior: np.ndarray
+    interior: np.ndarray
+    boundary: np.ndarray
+
+
+def regions(distance: np.ndarray, exterior_margin: float, interior_margin: float) -> Regions:
+    """Of signed distances [N] (5.2); metres, margins too."""
+    exterior, interior = distance > exterior_margin, distance < -interior_margin
+    return Regions(exterior, interior, ~(exterior | interior))
+
+
+def backfill_score(opacity: np.ndarray, distance: np.ndarray, seen: np.ndarray, where: Regions) -> np.ndarray:
+    """s_bf [N] of 5.9. seen [N]: steps in which each was seen, of which c is the share of the largest; the largest
+    depth below the surface is d_max."""
+    depth = np.maximum(-distance, 0)
+    score: np.ndarray = opacity + depth / max(depth.max(initial=0), 1e-12)
+    score = score + 0.25 * seen / max(seen.max(initial=0), 1)
+    return score + 0.5 * where.interior + 0.1 * where.boundary
+
+
+class MeshAwareStrategy(DensityControl):
+    """State beside that of `DensityControl`: "views", steps in which a Gaussian, or what it was copied from, was seen
+    since the start."""
+
+    def __init__(
+        self,
+        config: DefaultStrategyConfig,
+        mesh_aware: MeshAwareConfig,
+        distance: Callable[[np.ndarray], np.ndarray],
+        scene_scale: float,
+        count: int,
+    ) -> None:
+        """distance: from points [N, 3] to signed metres [N], see `spacesim.data.mesh.SignedDistance`."""
+        super().__init__(config, scene_scale, count, kept=("views",))
+        self.mesh_aware, self.distance = mesh_aware, distance
+
+    def _accumulate(self, gradient: Any, radius: Any, visible: Any) -> None:
+        self.state["views"] = self.state["views"] + dr.select(visible, ad.Float(1), 0)
+
+    def _thresholds(self, gaussians: Gaussians, survey: Survey) -> np.ndarray:
+        """5.6."""
+        ease, usual = self.mesh_aware.boundary_ease, self.config.grow_gradient
+        open_ = (survey.gradient > ease * usual) & (survey.gradient <= usual)
+        boundary = self._regions(gaussians, open_)[1].boundary & open_
+        return np.where(boundary, ease * usual, usual)
+
+    def _expendable(self, gaussians: Gaussians, survey: Survey, weak: np.ndarray) -> np.ndarray:
+        """The second term of 5.5."""
+        where = self._regions(gaussians, weak)[1]
+        return weak & (where.exterior if self.mesh_aware.protect_interior else ~where.boundary)
+
+    def _outside_is_due(self, step: int) -> bool:
+        every = self.mesh_aware.cull_every
+        return step // every != (step - self.config.refine_every) // every
+
+    def _outside(self, gaussians: Gaussians, survey: Survey) -> np.ndarray:
+        """5.3."""
+        outside = self._regions(gaussians, np.ones(gaussians.count, bool))[1].exterior
+        if outside.all():
+            raise WorkError(
+                "training: --strategy mesh-aware would prune every Gaussian, none is within the mesh; "
+                "is mesh.ply in the place and scale of the pictures?"
+            )
+        return outside
+
+    def _parents(
+        self, gaussians: Gaussians, survey: Survey, remove: np.ndarray, rng: np.random.Generator
+    ) -> np.ndarray:
+        """5.7 to 5.9, from the interior and the boundary layer."""
+        missing = self.mesh_aware.min_gaussians - int((~remove).sum())
+        if missing <= 0:
+            return np.zeros(0, np.int64)
+        distance, where = self._regions(gaussians, ~remove)
+        score = backfill_score(survey.opacity, distance, survey.kept["views"], where)
+        return chosen_parents(score, ~(remove | where.exterior), missing, rng)
+
+    def _regions(self, gaussians: Gaussians, asked: np.ndarray) -> tuple[np.ndarray, Regions]:
+        """(signed distance [N] metres, regions); those that are not asked for, [N] bool, have distance 0."""
+        distance = np.zeros(gaussians.count)
+        if asked.any():
+            distance[asked] = self.distance(np.array(gaussians.means, np.float64)[:, asked].T)
+        margins = self.mesh_aware.exterior_margin, self.mesh_aware.interior_margin
+        return distance, regions(distance, *(self.scene_scale * margin for margin in margins))

@@ -1,0 +1,41 @@
+"""What every strategy of refinement is: it watches steps, and now and then changes the set of Gaussians.
+
+It knows nothing of pictures, losses or cameras: a trainer tells it gradients and radii on the screen, and hands it
+Gaussians and the optimizer whose moments have to follow them.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.train.densify import Refinement
+from spacesim.splat.train.optimizer import Adam
+
+
+class Strategy(ABC):
+    """state: {name: Float [N]}, all that the next refinement depends on beside the Gaussians themselves; goes into
+    checkpoints and follows every Gaussian that is duplicated, split or pruned."""
+
+    state: dict[str, Any]
+
+    @abstractmethod
+    def watches(self, step: int) -> bool:
+        """Whether `observe` is wanted after step number `step`, the first of which is 1."""
+
+    @abstractmethod
+    def observe(self, gradient: Any, radius: Any, visible: Any) -> None:
+        """After each view of a step. gradient: norm of the absolute screen-space gradient [N]; radius: largest
+        screen-space radius as a fraction of the image's longer side [N]; visible: [N] bool."""
+
+    @abstractmethod
+    def refine(
+        self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator, leniency: float = 1.0
+    ) -> Refinement:
+        """Refine if it is time to, after `step` finished steps. Changes `gaussians`, `optimizer` and the state.
+
+        leniency: factor of the opacity below which a Gaussian is too faint (conservative culling, thesis 5.3)."""
+
+    def disturb(self, step: int, gaussians: Gaussians, rate: float, seed: int) -> None:  # noqa: B027
+        """After each step, before `refine`. rate: step size of the means, metres. Most do nothing."""
