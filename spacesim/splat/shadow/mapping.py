@@ -37,6 +37,8 @@ class MappingConfig:
         throws across the mean gap to the blockers (Fernando 2005); 0 does not; `SUN_RADIUS_DEG` is the Sun's
     widest: pixels, half the width of the widest such window, and of that in which blockers are looked for; chosen
     bleeding: with "variance", lit shares below it count as none (Lauritzen 2007): what passes two blockers; chosen
+    antialiased: what is thinner than a light pixel fades in the picture, where it would else grow to a pixel (see
+        `project`): shadows end where bodies do, within two pixels. The thesis does not say
     """
 
     filter: str = "bilinear"
@@ -44,6 +46,7 @@ class MappingConfig:
     sun_radius_deg: float = 0.0
     widest: float = 8.0
     bleeding: float = 0.2
+    antialiased: bool = True
 
     def __post_init__(self) -> None:
         if self.filter not in FILTERS:
@@ -94,31 +97,28 @@ def occlusion_by_mapping(
     if gaussians.count == 0:
         return dr.zeros(ad.Float, 0)
     shown = gaussians if casters is None else casters
-    _, footprints, light = light_map(shown, camera, squares=config.filter == "variance")
-    visible = footprints.visible
-    if casters is not None:
-        visible = drawable(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
+    light = light_map(shown, camera, config.filter == "variance", config.antialiased)
+    visible = drawable(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
     points = dr.detach(gaussians.means if points is None else points)
     softness = dr.opaque(ad.Float, max(softness, 1e-20))
     return _look_up(points, visible, dr.detach(bias), light, camera, softness, config)
 
 
-def light_map(gaussians: Gaussians, camera: Orthographic, squares: bool = False) -> tuple[Splats, Footprints, LightMap]:
-    """The Gaussians as the Sun sees them, and its picture; with the second moments of depth if `squares`. Detached."""
+def light_map(gaussians: Gaussians, camera: Orthographic, squares: bool = False, antialiased: bool = True) -> LightMap:
+    """What the Sun sees of the Gaussians, with the second moments of depth if `squares`. Detached."""
     shape = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
-    splats, footprints, moments = _prepare(*dr.detach(shape), camera, squares)
+    splats, footprints, moments = _prepare(*dr.detach(shape), camera, squares, antialiased)
     lists = bin_splats(splats, footprints, camera.width, camera.height)
     blended = forward(splats, moments, lists, camera.width, camera.height)
     depth, *square = blended.features
-    light = LightMap(1 - blended.transmittance, depth, square[0] if squares else None, camera.width, camera.height)
-    return splats, footprints, light
+    return LightMap(1 - blended.transmittance, depth, square[0] if squares else None, camera.width, camera.height)
 
 
 def _trace_prepare(
-    means: Any, log_scales: Any, quaternions: Any, logits: Any, camera: Orthographic, squares: bool
+    means: Any, log_scales: Any, quaternions: Any, logits: Any, camera: Orthographic, squares: bool, antialiased: bool
 ) -> tuple[Splats, Footprints, list[Any]]:
     """Splats, footprints, and the moments of depth to blend."""
-    splats, footprints = project(Gaussians(means, log_scales, quaternions, logits, None), camera)
+    splats, footprints = project(Gaussians(means, log_scales, quaternions, logits, None), camera, antialiased)
     return splats, footprints, [splats.depth, splats.depth * splats.depth] if squares else [splats.depth]
 
 

@@ -22,6 +22,7 @@ CONFIGS = {
     "closer": MappingConfig("percentage-closer", radius=1.3),
     "penumbra": MappingConfig("percentage-closer", sun_radius_deg=4.0, widest=5.0),
     "variance": MappingConfig("variance", radius=1.0),
+    "dilated": MappingConfig(antialiased=False),
 }
 SOFTNESS = 1e-3
 
@@ -82,7 +83,7 @@ def test_full_and_none(name):
 def test_softness_by_hand(gap):
     """Below a wide opaque plate at z = 0.4, D is its depth but for the receiver's own share of the pixel's light."""
     arrays = joined(splats([[0, 0, 0.4]], [5, 5, 0.001], 0.999), splats([[0, 0, 0]], 0.01, 0.006))
-    found = occlusion(arrays, from_above(), [0, 0.4 + gap], softness=1e-3)
+    found = occlusion(arrays, from_above(), [0, 0.4 + gap], softness=1e-3, config=CONFIGS["dilated"])
     behind = 0.4 * 0.001 * 0.006 / 0.999  # metres: the receiver's own share, 0.001 of the light passes the plate
     assert found[1] == pytest.approx(1 / (1 + np.exp((gap + behind) / 1e-3)), abs=2e-3)
 
@@ -92,7 +93,7 @@ def test_half_of_the_window_half_dark():
     row = splats([[x, y, 0.5] for x in np.arange(0.02, 0.9, 0.02) for y in np.arange(-0.9, 0.9, 0.02)], 0.01, 0.999)
     places = np.linspace(-0.3, 0.3, 25)
     arrays = joined(row, splats([[x, 0, 0] for x in places], 0.001, 0.01))
-    config = MappingConfig("percentage-closer", radius=6)
+    config = MappingConfig("percentage-closer", radius=6, antialiased=False)
     found = occlusion(arrays, from_above(128, 2.0), [0.02] * len(arrays["means"]), config=config)[-25:]
     assert np.all(np.diff(found) > -1e-3)
     half = np.interp(0.5, found, places)
@@ -108,7 +109,7 @@ def test_penumbra_grows_with_the_gap():
         row = splats([[x, y, h] for x in np.arange(0.01, 0.9, 0.01) for y in np.arange(-0.5, 0.5, 0.01)], 0.005, 0.999)
         places = np.linspace(-0.2, 0.2, 81)
         arrays = joined(row, splats([[x, 0, 0] for x in places], 0.001, 0.01))
-        config = MappingConfig("percentage-closer", radius=0.5, sun_radius_deg=3.0, widest=16)
+        config = MappingConfig("percentage-closer", radius=0.5, sun_radius_deg=3.0, widest=16, antialiased=False)
         found = occlusion(arrays, from_above(256, 2.0), [0.02] * len(arrays["means"]), config=config)[-81:]
         widths.append((np.interp(0.9, found, places) - np.interp(0.1, found, places)) / 0.8)
     assert widths == pytest.approx([2 * h * np.tan(np.radians(3.0)) for h in (0.5, 1.0)], abs=2 * 2 / 256)
@@ -116,7 +117,8 @@ def test_penumbra_grows_with_the_gap():
 
 
 def test_two_half_transparent_blockers():
-    """The depth test knows one depth: behind both it is dark. Filters weight it with what they cover, 1 - (1 - a)^2."""
+    """The depth test knows one depth: behind both it is dark. Filters weight it with what they cover, 1 - (1 - a)^2.
+    The receiver is as wide so faint that its own share of a pixel does not count."""
     blockers = splats([[0, 0, 0.6], [0, 0, 0.3]], [5, 5, 0.001], 0.5)
     arrays = joined(blockers, splats([[0, 0, 0]], 0.001, 0.004))
     expected = {"bilinear": 1, "closer": 0.75, "penumbra": 0.75}
@@ -130,14 +132,18 @@ def test_two_half_transparent_blockers():
     assert found[2] == pytest.approx(0.75 * behind**2 / (variance + behind**2), abs=0.01)
 
 
-def test_blockers_smaller_than_a_pixel_blend():
-    """One of a hundredth of a pixel darkens its pixel as its dilated splat covers it, no more."""
-    pixel = 2 / 64
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_blockers_smaller_than_a_pixel_blend(antialiased):
+    """One of a tenth of a pixel darkens its pixel as its dilated splat covers it, or, anti-aliased, by the area that it
+    has of that, and no more."""
+    pixel, width = 2 / 64, 0.3
+    kept = width**2 / (width**2 + 0.3) if antialiased else 1
     arrays = joined(
-        splats([[pixel / 2, pixel / 2, 0.5]], 0.01 * pixel, 0.9), splats([[pixel / 2, pixel / 2, 0]], 1e-4, 0.004)
+        splats([[pixel / 2, pixel / 2, 0.5]], width * pixel, 0.9), splats([[pixel / 2, pixel / 2, 0]], 1e-4, 0.004)
     )
-    found = occlusion(arrays, from_above(), [0.01, 0.01], config=MappingConfig("percentage-closer", radius=0.5))
-    assert found[1] == pytest.approx(0.9, abs=0.01)
+    config = MappingConfig("percentage-closer", radius=0.5, antialiased=antialiased)
+    found = occlusion(arrays, from_above(), [0.01, 0.01], config=config)
+    assert found[1] == pytest.approx(0.9 * kept, abs=0.01)
     arrays["means"][1, 0] += 4 * pixel
     assert occlusion(arrays, from_above(), [0.01, 0.01])[1] < 1e-3
 
