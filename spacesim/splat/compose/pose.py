@@ -17,7 +17,7 @@ SMALLEST, LARGEST = 1e-9, 1e9  #: of a scale, chosen
 class Pose:
     """x_world = scale R x_model + translation (3.11).
 
-    rotation: [3, 3], R, or [4], a quaternion (w, x, y, z) of any length, kept as R, float64
+    rotation: [3, 3], R, or [4], a quaternion (w, x, y, z) of any length; kept as R, float64
     translation: [3] metres;  scale: metres in the world for one of the model's
     Raises InputError for what is no rotation, not finite, or beyond the bounds named above.
     """
@@ -27,7 +27,9 @@ class Pose:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rotation", _rotation(self.rotation))
+        rotation, quaternion = _rotation(self.rotation)
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "_quaternion", quaternion)
         translation = _numbers(self.translation)
         if translation.shape != (3,) or not np.all(np.abs(translation) <= FARTHEST):
             raise InputError(f"position: expected 3 numbers of at most {FARTHEST:g} metres, found {self.translation!r}")
@@ -38,10 +40,10 @@ class Pose:
 
     @property
     def quaternion(self) -> Array:
-        """[4] (w, x, y, z), w >= 0; of no rotation exactly (1, 0, 0, 0)."""
-        if np.array_equal(self.rotation, np.eye(3)):
-            return np.array([1.0, 0.0, 0.0, 0.0])
-        return quaternion_from_rotation(self.rotation)
+        """[4] unit (w, x, y, z): the one that was given, so that a file that holds it means the same pose to the bit,
+        or that of the matrix, w >= 0, (1, 0, 0, 0) exactly where nothing is turned."""
+        given: Array = self._quaternion  # type: ignore[attr-defined]
+        return given
 
     @property
     def matrix(self) -> Array:
@@ -131,17 +133,20 @@ def rotation_about(axis: ArrayLike, angle_deg: float) -> Array:
     return rotation_from_quaternion([np.cos(half), *(np.sin(half) / length * direction)])
 
 
-def _rotation(values: ArrayLike) -> Array:
-    """[3, 3] of a matrix or a quaternion."""
+def _rotation(values: ArrayLike) -> tuple[Array, Array]:
+    """(matrix [3, 3], unit quaternion [4]) of one of them."""
     given = _numbers(values)
     if given.shape == (4,):
-        if not 1e-12 < np.linalg.norm(given) < np.inf:
+        length = float(np.linalg.norm(given))
+        if not 1e-12 < length < np.inf:
             raise InputError(f"rotation_wxyz: expected 4 finite numbers, not all 0, found {values!r}")
-        return rotation_from_quaternion(given)
+        unit = given if abs(length - 1) < 1e-12 else given / length
+        return rotation_from_quaternion(unit), unit
     is_rotation = given.shape == (3, 3) and np.abs(given @ given.T - np.eye(3)).max() < 1e-3
     if not is_rotation or np.linalg.det(given) < 0:
         raise InputError(f"rotation: expected a rotation matrix [3, 3] or a quaternion [4], found {values!r}")
-    return given
+    turned = not np.array_equal(given, np.eye(3))
+    return given, quaternion_from_rotation(given) if turned else np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def _numbers(values: ArrayLike) -> Array:

@@ -24,9 +24,11 @@ from spacesim.data.records import Camera, Sun
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose.members import Ensemble, Member, display_colours
 from spacesim.splat.compose.pose import Pose
+from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.render import RenderOutput, render
 from spacesim.splat.run import Prediction, Run
 from spacesim.splat.shadow.cast import Between, cast_between
+from spacesim.splat.tone import encoded
 
 OUTPUTS = ("rgb", "alpha", "depth", "median_depth", "normal", "visibility", "id")
 SHADOWS = ("others", "ratio", "none")
@@ -151,6 +153,11 @@ class Composition:
             rgb, drawn.image("alpha"), drawn.image("depth"), visibility, normal, drawn.image("id")
         )
 
+    @property
+    def contents(self) -> list[str]:
+        """A digest of what each model is made of, in their order."""
+        return [member.key for member in self._members]
+
     # ---- scenes ----
 
     def moved(self, index: int, pose: Pose) -> "Composition":
@@ -173,14 +180,27 @@ class Composition:
         other.config, other._kept = config, _Kept()
         return other
 
+    @property
+    def placed(self) -> list[Placed]:
+        """The models in the order in which their Gaussians stand in the set."""
+        return [self.models[i] for i in self._order()]
+
+    def in_world(self) -> Gaussians:
+        """All Gaussians, colours left out, in the order of `placed`."""
+        return self._ensemble.placed([model.pose for model in self.placed])
+
+    def light_between(self, sun: Sun | None) -> list[Any]:
+        """Of each model, in the order of `placed`, the share of sunlight that the others let through, v_inter of 4.15:
+        Float [N of it], or None where no other can be before the Sun."""
+        return self._between([model.pose for model in self.placed], None if sun is None else sun.direction)
+
     def draw(self, camera: Camera, sun: Sun | None, outputs: Sequence[str] = ("rgb",)) -> Drawn:
         """A view on the device: of `OUTPUTS` those asked for, and alpha. Visibility is left out where no model knows
         any. Raises ValueError for another output, InputError where the Sun matters and none is told."""
         unknown = [name for name in outputs if name not in OUTPUTS]
         if unknown:
             raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
-        order = self._order()
-        poses = [self.models[i].pose for i in order]
+        poses = [model.pose for model in self.placed]
         planes: dict[str, list[Any]] = {}
         if "rgb" in outputs or "visibility" in outputs:
             colours, visibility = self._lit(poses, camera, sun)
@@ -202,7 +222,14 @@ class Composition:
         )
         drawn = iter(output.features or [])
         found = {name: [next(drawn) for _ in group] for name, group in planes.items()}
-        return Drawn(output, found, order, self._ensemble.linear)
+        return Drawn(output, found, self._order(), self._ensemble.linear)
+
+    def lit_gaussians(self, camera: Camera, sun: Sun | None) -> tuple[Gaussians, list[Any]]:
+        """(the set in the world, its colours seen from the camera: three Floats [N], sRGB display values), to draw it
+        in another way. Raises InputError where the Sun matters and none is told."""
+        poses = [self.models[i].pose for i in self._order()]
+        colours, _ = self._lit(poses, camera, sun)
+        return self._ensemble.placed(poses), [encoded(c) for c in colours] if self._ensemble.linear else colours
 
     # ---- light ----
 

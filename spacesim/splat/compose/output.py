@@ -1,0 +1,222 @@
+"""A scene of trained runs as files: pictures of every frame, a video, a contact sheet.
+
+OUT/rgb/0000.png         sRGB, 8 bits, straight alpha
+OUT/depth/0000.exr       metres along the optical axis, float, 0 where nothing is
+OUT/id/0000.png          which model: its number, from 1, in the file's order, 0 for none
+OUT/visibility/0000.png  share of the Sun that is seen, 255 all of it, 0 where nothing is; of scenes with shadows
+OUT/shots/0000.json      when that was: time, camera as in transforms.json, Sun, poses; written last
+OUT/sheet.png            some of the pictures, OUT/video.mp4 all of them, where there is more than one and an encoder
+"""
+
+import hashlib
+import json
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacesim import __version__, backend
+from spacesim.data.errors import InputError
+from spacesim.data.files import holds_files, read_json, remove_leftovers, write_bytes, write_json
+from spacesim.data.images import read_png, write_exr, write_png
+from spacesim.data.integrity import is_whole
+from spacesim.data.lock import locked
+from spacesim.data.sheet import DARK_PAGE, Tile, contact_sheet, fitted
+from spacesim.data.tone import as_bytes
+from spacesim.splat.compose.path import PosedScene, Shot
+from spacesim.splat.compose.scene import ComposedPrediction
+from spacesim.splat.picture import write_picture
+from spacesim.splat.sweep import COLUMNS, MOST_TILES, SIDE, resized, sky_mark
+from spacesim.splat.video import INSTALL, Video, encoder
+
+SHOTS = "shots"
+PICTURES = {"rgb": ".png", "depth": ".exr", "id": ".png", "visibility": ".png"}
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Composed:
+    """What is on the disk. rendered: frames that were not there yet, of `frames`;  note: why there is no video, or
+    None where there is one, or one picture"""
+
+    frames: int
+    rendered: int
+    sheet: Path
+    video: Path | None
+    note: str | None
+
+
+def compose(
+    scene: PosedScene,
+    out: Path,
+    size: int | tuple[int, int] | None = None,
+    report: Callable[[int, int], None] | None = None,
+) -> Composed:
+    """Render every frame of a scene into `out`. Frames that are there already and show the same, from an earlier call
+    that was interrupted or before something else was changed, are kept.
+
+    size: pixels of the longer side, or (width, height), in place of the camera's;  report: told (frames done, of all)
+    Raises InputError where the scene lacks a camera or a Sun that it needs, or the folder holds other files.
+    """
+    out = Path(out)
+    if holds_files(out) and not (out / SHOTS).is_dir():
+        raise InputError(
+            f"{out}: expected an empty or new folder, or one of an earlier compose, found other files in it"
+        )
+    if scene.camera is not None and size is not None:
+        scene = replace(scene, camera=resized(scene.camera, size))
+    shot = scene.shot(0)
+    if shot.sun is None and shot.composition.relightable:
+        told = scene.composition.path or "scene"
+        raise InputError(f"{told}: expected the Sun's direction for a scene that it changes, found none; add [sun]")
+    with locked(out):
+        _make(out)
+        remove_leftovers(out)
+        return _rendered(scene, out, report)
+
+
+def _rendered(scene: PosedScene, out: Path, report: Callable[[int, int], None] | None) -> Composed:
+    many = scene.frames > 1
+    film = _film(scene) if many else None
+    count = min(MOST_TILES, scene.frames)
+    shown = {k * scene.frames // count for k in range(count)}
+    tiles: list[Tile] = []
+    rendered = 0
+    _forget(out, scene.frames)
+    for index in range(scene.frames):
+        shot = scene.shot(index)
+        what = _described(shot)
+        if not _is_there(out, index, what):
+            _write(out, index, shot, what)
+            rendered += 1
+        if film is not None or index in shown:
+            picture = read_png(out / "rgb" / f"{index:04d}.png")
+            if film is not None:
+                film.add(_over_black(picture))
+            if index in shown:
+                tiles.append(_tile(picture, shot))
+        if report is not None:
+            report(index + 1, scene.frames)
+    camera = scene.shot(0).camera
+    title = f"{_title(scene)}, {scene.frames} frame{'s' * many}, {camera.width} x {camera.height} px"
+    columns = math.ceil(len(tiles) / math.ceil(len(tiles) / COLUMNS))
+    aspect = camera.height / camera.width
+    sheet = contact_sheet(title, tiles, len(tiles), aspect, columns, SIDE, DARK_PAGE)
+    write_png(out / "sheet.png", sheet)
+    if film is None:
+        (out / "video.mp4").unlink(missing_ok=True)
+        note = f"{out / 'video.mp4'}: not written, PyAV is not installed; type: {INSTALL}" if many else None
+        return Composed(scene.frames, rendered, out / "sheet.png", None, note)
+    write_bytes(out / "video.mp4", film.content())
+    return Composed(scene.frames, rendered, out / "sheet.png", out / "video.mp4", None)
+
+
+def _make(out: Path) -> None:
+    try:
+        (out / SHOTS).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: expected a folder that can be written, found none ({error.strerror})") from None
+
+
+def _film(scene: PosedScene) -> Video | None:
+    if encoder() is None:
+        return None
+    camera = scene.shot(0).camera
+    return Video(camera.width, camera.height, max(1, round(scene.fps)))
+
+
+def _forget(out: Path, frames: int) -> None:
+    """Take away frames beyond the scene's, of an earlier and longer one."""
+    for shot in (out / SHOTS).glob("*.json"):
+        if shot.stem.isdigit() and int(shot.stem) >= frames:
+            shot.unlink()
+            for kind, suffix in PICTURES.items():
+                (out / kind / f"{shot.stem}{suffix}").unlink(missing_ok=True)
+
+
+def _described(shot: Shot) -> dict[str, Any]:
+    """What a frame shows: as shots/*.json has it, with a digest of all that the pictures depend on."""
+    camera = shot.camera
+    values: dict[str, Any] = {
+        "time": shot.time,
+        "transform_matrix": camera.opengl.tolist(),
+        **{
+            "w": camera.width,
+            "h": camera.height,
+            "fl_x": camera.fx,
+            "fl_y": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+        },
+        "sun_direction": None if shot.sun is None else shot.sun.direction.tolist(),
+        "models": [
+            {
+                "name": model.name,
+                "position": model.pose.translation.tolist(),
+                "rotation_wxyz": model.pose.quaternion.tolist(),
+                "scale": model.pose.scale,
+            }
+            for model in shot.composition.models
+        ],
+    }
+    composition = shot.composition
+    made_by = [__version__, backend.select(), composition.config.shadows, composition.contents]
+    text = json.dumps([values, made_by], sort_keys=True)
+    return {"digest": hashlib.sha256(text.encode()).hexdigest(), **values}
+
+
+def _is_there(out: Path, index: int, what: dict[str, Any]) -> bool:
+    path = out / SHOTS / f"{index:04d}.json"
+    try:
+        told = read_json(path)
+    except InputError:
+        return False
+    if not isinstance(told, dict) or told.get("digest") != what["digest"]:
+        return False
+    return all(is_whole(out / kind / f"{index:04d}{PICTURES[kind]}") for kind in told.get("pictures", PICTURES))
+
+
+def _write(out: Path, index: int, shot: Shot, what: dict[str, Any]) -> None:
+    """The pictures of a frame, then its shots/*.json; while they are written, an earlier one is gone."""
+    record = out / SHOTS / f"{index:04d}.json"
+    record.unlink(missing_ok=True)
+    prediction = shot.composition.predict(shot.camera, shot.sun)
+    planes = _planes(prediction)
+    write_picture(prediction, "rgb", out / "rgb" / f"{index:04d}.png")
+    write_exr(out / "depth" / f"{index:04d}.exr", {"depth": prediction.depth})
+    for kind, plane in planes.items():
+        write_png(out / kind / f"{index:04d}.png", plane)
+    write_json(record, {**what, "pictures": ["rgb", "depth", *planes]})
+
+
+def _planes(prediction: ComposedPrediction) -> dict[str, np.ndarray]:
+    """Pictures of numbers, [H, W] uint8, or uint16 for more than 255 models."""
+    assert prediction.id is not None
+    few = prediction.id.max(initial=0) < 256
+    planes = {"id": prediction.id.astype(np.uint8 if few else np.uint16)}
+    if prediction.visibility is not None:
+        planes["visibility"] = as_bytes(np.clip(np.nan_to_num(prediction.visibility), 0, 1))
+    return planes
+
+
+def _over_black(picture: np.ndarray) -> np.ndarray:
+    return np.asarray(fitted(picture, picture.shape[1], picture.shape[0]))
+
+
+def _tile(picture: np.ndarray, shot: Shot) -> Tile:
+    small = np.asarray(fitted(picture, SIDE, SIDE))
+    when = f"{shot.time:.2f} s"
+    if shot.sun is None:
+        return Tile(small, when)
+    azimuth, elevation = (f"{round(angle, 1) + 0.0:g}°" for angle in shot.sun.angles)
+    return Tile(small, when, f"Sun {azimuth}, {elevation}", sky_mark(shot.sun))
+
+
+def _title(scene: PosedScene) -> str:
+    path = scene.composition.path
+    return path.stem if path else ", ".join(scene.names)

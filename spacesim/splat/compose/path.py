@@ -1,0 +1,172 @@
+"""What changes with time in a scene: keyframes of poses, Sun and camera, what is between them, and orbits."""
+
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import Array, direction_from_angles, look_at
+from spacesim.data.records import Camera, Sun
+from spacesim.splat.compose.pose import Pose, between, slerp, turned_between
+from spacesim.splat.compose.scene import Composition
+
+FPS = 24.0  #: pictures a second where nothing is said, chosen
+ORBIT_FRAMES = 120  #: of an orbit where nothing is said: five seconds, chosen
+MOST_FRAMES = 100_000  #: chosen
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Where a camera stands, and what it looks at. world_from_camera: [4, 4] OpenCV axes, metres;  target: [3] metres,
+    a point that stays in the middle on the way to another view that has one, or None;  focal: (fx, fy) pixels, or None
+    for those of the scene's camera"""
+
+    world_from_camera: Array
+    target: Array | None = None
+    focal: tuple[float, float] | None = None
+
+    def of(self, camera: Camera) -> Camera:
+        """`camera` at this place."""
+        fx, fy = self.focal or (camera.fx, camera.fy)
+        return replace(camera, world_from_camera=self.world_from_camera, fx=fx, fy=fy)
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """What is where at a time, seconds; what it does not name goes on as the keyframes around say. poses: by the names
+    of models"""
+
+    time: float
+    sun: Sun | None = None
+    view: View | None = None
+    poses: Mapping[str, Pose] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """A camera that goes round and looks at the middle. radius: metres, of the sphere;  centre: metres;  elevation_deg,
+    azimuth_deg: where it starts, seen from the centre;  turns: rounds in all, negative ones clockwise seen from +z"""
+
+    radius: float
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    elevation_deg: float = 20.0
+    azimuth_deg: float = 0.0
+    turns: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.radius < np.inf:
+            raise InputError(f"radius: expected a positive number of metres, found {self.radius}")
+        if not abs(self.elevation_deg) <= 90:
+            raise InputError(f"elevation_deg: expected -90 to 90 degrees, found {self.elevation_deg}")
+
+    def view(self, share: float) -> View:
+        """After a share of the way, 0 to 1."""
+        direction = direction_from_angles(self.azimuth_deg + 360 * self.turns * share, self.elevation_deg)
+        centre = np.array(self.centre)
+        return View(look_at(centre + self.radius * direction, centre), centre)
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One picture of a scene. time: seconds;  composition: with the poses of that time"""
+
+    time: float
+    composition: Composition
+    camera: Camera
+    sun: Sun | None
+
+
+@dataclass(frozen=True, eq=False)
+class PosedScene:
+    """All that a scene file says. sun, camera: None where it names none;  frames: pictures, 1 / fps seconds apart"""
+
+    composition: Composition
+    sun: Sun | None = None
+    camera: Camera | None = None
+    keyframes: Sequence[Keyframe] = ()
+    orbit: Orbit | None = None
+    frames: int = 1
+    fps: float = FPS
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "keyframes", tuple(sorted(self.keyframes, key=lambda key: key.time)))
+
+    @property
+    def names(self) -> list[str]:
+        """Of the models."""
+        return [model.name for model in self.composition.models]
+
+    def shot(self, index: int) -> Shot:
+        """Picture `index`, from 0. Raises InputError where the scene has no camera."""
+        share = index / self.frames if self.orbit else 0.0
+        return self.at(index / self.fps, share)
+
+    def at(self, time: float, share: float = 0.0) -> Shot:
+        """The scene at a time, seconds; share: of an orbit, 0 to 1. Raises InputError where the scene has no camera."""
+        if self.camera is None:
+            told = self.composition.path or "scene"
+            raise InputError(f"{told}: expected a camera, found none; add a table [camera]")
+        view = self.orbit.view(share) if self.orbit else self._track(lambda key: key.view, view_between, time)
+        sun = self._track(lambda key: key.sun, sun_between, time) or self.sun
+        poses = [
+            self._track(lambda key, name=model.name: key.poses.get(name), between, time) or model.pose  # type: ignore[misc]
+            for model in self.composition.models
+        ]
+        composition = self.composition.posed(poses)
+        return Shot(time, composition, view.of(self.camera) if view else self.camera, sun)
+
+    def _track(self, value: Callable[[Keyframe], T | None], blend: Callable[[T, T, float], T], time: float) -> T | None:
+        """What the keyframes that name it say of a value; None where none does."""
+        named = [(key.time, found) for key in self.keyframes if (found := value(key)) is not None]
+        return Track([when for when, _ in named], [what for _, what in named], blend).at(time) if named else None
+
+
+@dataclass(frozen=True, eq=False)
+class Track(Generic[T]):
+    """Values at rising times, seconds; before the first and after the last the value stays."""
+
+    times: Sequence[float]
+    values: Sequence[T]
+    blend: Callable[[T, T, float], T]
+
+    def at(self, time: float) -> T:
+        """The value at a time; at a keyframe's own exactly what it says."""
+        after = bisect_right(self.times, time)
+        if after == 0:
+            return self.values[0]
+        before = after - 1
+        if after == len(self.times) or time == self.times[before]:
+            return self.values[before]
+        share = (time - self.times[before]) / (self.times[after] - self.times[before])
+        return self.blend(self.values[before], self.values[after], share)
+
+
+def sun_between(one: Sun, other: Sun, share: float) -> Sun:
+    """On the great circle from one to the other."""
+    return Sun(slerp(one.direction, other.direction, share))
+
+
+def view_between(one: View, other: View, share: float) -> View:
+    """Position along a line; the target, where both have one, too, else the camera turns by the shortest way; focal
+    lengths by even factors, where both name them."""
+    position = _line(one.world_from_camera[:3, 3], other.world_from_camera[:3, 3], share)
+    focal = one.focal
+    if one.focal is not None and other.focal is not None:
+        focal = tuple(a ** (1 - share) * b**share for a, b in zip(one.focal, other.focal, strict=True))
+    if one.target is not None and other.target is not None:
+        target = _line(one.target, other.target, share)
+        if np.linalg.norm(target - position) > 0:
+            return View(look_at(position, target), target, focal)
+    pose = np.eye(4)
+    pose[:3, :3] = turned_between(one.world_from_camera[:3, :3], other.world_from_camera[:3, :3], share)
+    pose[:3, 3] = position
+    return View(pose, None, focal)
+
+
+def _line(one: Array, other: Array, share: float) -> Array:
+    return (1 - share) * one + share * other
