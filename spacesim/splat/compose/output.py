@@ -1,7 +1,7 @@
 """A scene of trained runs as files: pictures of every frame, a video, a contact sheet.
 
 OUT/rgb/0000.png         sRGB, 8 bits, straight alpha
-OUT/depth/0000.exr       metres along the optical axis, float, 0 where nothing is
+OUT/depth/0000.exr       float: depth, metres along the optical axis, 0 where nothing is; alpha
 OUT/id/0000.png          which model: its number, from 1, in the file's order, 0 for none
 OUT/visibility/0000.png  share of the Sun that is seen, 255 all of it, 0 where nothing is; of scenes with shadows
 OUT/shots/0000.json      when that was: time, camera as in transforms.json, Sun, poses; written last
@@ -188,7 +188,7 @@ def _write(out: Path, index: int, shot: Shot, what: dict[str, Any]) -> None:
     prediction = shot.composition.predict(shot.camera, shot.sun)
     planes = _planes(prediction)
     write_picture(prediction, "rgb", out / "rgb" / f"{index:04d}.png")
-    write_exr(out / "depth" / f"{index:04d}.exr", {"depth": prediction.depth})
+    write_exr(out / "depth" / f"{index:04d}.exr", {"depth": prediction.depth, "alpha": prediction.alpha})
     for kind, plane in planes.items():
         write_png(out / kind / f"{index:04d}.png", plane)
     write_json(record, {**what, "pictures": ["rgb", "depth", *planes]})

@@ -367,24 +367,24 @@ def _view_values(view: View) -> dict[str, Any]:
     position = view.world_from_camera[:3, 3]
     if view.target is not None and np.array_equal(look_at(position, view.target), view.world_from_camera):
         values = {"position": position.tolist(), "look_at": view.target.tolist()}
-    return values | ({} if view.focal is None else {"focal": list(view.focal)})
+    return values | ({} if view.focal is None else {"focal": [float(length) for length in view.focal]})
 
 
 def _camera_values(camera: Camera, orbit: Orbit | None) -> dict[str, Any]:
     values: dict[str, Any] = {
         "resolution": [camera.width, camera.height],
-        "focal": [camera.fx, camera.fy],
-        "principal": [camera.cx, camera.cy],
+        "focal": [float(camera.fx), float(camera.fy)],
+        "principal": [float(camera.cx), float(camera.cy)],
     }
     if orbit is None:
         return values | {"transform_matrix": camera.opengl.tolist()}
     return values | {
         "orbit": {
-            "radius": orbit.radius,
-            "centre": list(orbit.centre),
-            "elevation_deg": orbit.elevation_deg,
-            "azimuth_deg": orbit.azimuth_deg,
-            "turns": orbit.turns,
+            "radius": float(orbit.radius),
+            "centre": [float(x) for x in orbit.centre],
+            "elevation_deg": float(orbit.elevation_deg),
+            "azimuth_deg": float(orbit.azimuth_deg),
+            "turns": float(orbit.turns),
         }
     }
 
