@@ -65,6 +65,20 @@ class Renderer:
         earth, _ = self._means(earthlight, camera)
         return Truth(radiance=radiance + earth, alpha=alpha, **labels, radiance_earth=earth)
 
+    def radiance(self, camera: Camera, sun: Sun, seed: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """(radiance [H, W, 3] from all sources, alpha [H, W]) of what `render` returns, without the labels."""
+        self._loaded.point(sun)
+        radiance, alpha = self._means(self._launched(self._loaded.sunlit, camera, seed), camera)
+        if self._loaded.earthlit is not None:
+            earth = self._launched(self._loaded.earthlit, camera, (*seed, _EARTH))
+            radiance = radiance + self._means(earth, camera)[0]
+        return radiance, alpha
+
+    def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
+        """All fields of what `render` returns but radiance and alpha, which take no paths."""
+        self._loaded.point(sun)
+        return self._labeller.labels(camera, sun)
+
     def _launched(self, scene: Any, camera: Camera, seed: Sequence[int]) -> list[Any]:
         """Sums over samples, as `_trace_paths` returns them, of each pass; the device may still be at work on them."""
         uint, view = backend.mitsuba().UInt32, View.of(camera, self._loaded.units)

@@ -1,0 +1,137 @@
+"""A browser that is connected: its session, its panel, its camera."""
+
+import io
+import threading
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from spacesim.data.geometry import quaternion_from_rotation
+from spacesim.data.records import Camera, Dataset
+from spacesim.viewer.controls import ClientControls, SunControls
+from spacesim.viewer.frames import drawn
+from spacesim.viewer.handles import FRUSTUM, add_frusta
+from spacesim.viewer.loop import RenderLoop
+from spacesim.viewer.paint import Bytes, with_scale
+from spacesim.viewer.session import Session, Statistics
+from spacesim.viewer.stage import Stage
+from spacesim.viewer.state import Shared, View, view_of
+from spacesim.viewer.truthsource import TruthService
+
+QUALITY, QUALITY_AT_REST = 75, 95  #: of JPEG, chosen
+MOST_PICTURE = 4096  #: pixels a side of a picture that is saved
+
+
+class Client:
+    """One browser. handle: viser's;  facts: lines for the statistics"""
+
+    def __init__(
+        self,
+        handle: Any,
+        stage: Stage,
+        shared: Shared,
+        loop: RenderLoop,
+        truth: TruthService,
+        dataset: Dataset | None,
+        sun: SunControls | None,
+        facts: list[str],
+    ) -> None:
+        self.handle, self._stage, self._shared, self._loop, self._dataset = handle, stage, shared, loop, dataset
+        self._sun = sun
+        self._frusta: list[Any] = []
+        self._lock = threading.Lock()
+        self._closed = False
+        self.session = Session(stage, shared, loop, self, truth)
+        frames = len(dataset.frames) if dataset else 0
+        self.controls = ClientControls(handle.gui, self.session, self, facts, frames)
+        handle.camera.on_update(self._moved)
+        self._look(handle.camera)
+
+    def close(self) -> None:
+        """It has gone."""
+        with self._lock:
+            self._closed = True
+        self.session.close()
+
+    # ---- Screen ----
+
+    def show(self, picture: Bytes, sharp: bool) -> None:
+        """See `Screen`."""
+        if not self._closed:
+            quality = QUALITY_AT_REST if sharp else QUALITY
+            self.handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+            self.handle.flush()
+
+    def tell(self, statistics: Statistics) -> None:
+        """See `Screen`."""
+        if not self._closed:
+            self.controls.tell(statistics)
+
+    # ---- Actions ----
+
+    def jump(self, frame: int) -> None:
+        """See `Actions`."""
+        if self._dataset is None or not 0 <= frame < len(self._dataset.frames):
+            return
+        found = self._dataset.frames[frame]
+        if found.sun is not None and self._sun is not None:
+            self._sun.drag(found.sun)
+        view = self.session.view
+        aspect = view.width / view.height if view else 1.0
+        self.look_from(found.camera.world_from_camera, fov_to_hold(found.camera, aspect))
+
+    def frusta(self, visible: bool) -> None:
+        """See `Actions`."""
+        for handle in self._frusta:
+            handle.remove()
+        self._frusta = []
+        if visible and self._dataset is not None:
+            size = FRUSTUM * self._stage.bounds(self._shared.stand)[1]
+            self._frusta = add_frusta(self.handle.scene, self._dataset, size, self.jump)
+
+    def picture(self) -> None:
+        """See `Actions`."""
+        view, mode = self.session.view, self.session.look.mode
+        if view is not None and not self._closed:
+            self._loop.do(lambda: self._send_picture(view, mode))
+
+    def look_from(self, world_from_camera: np.ndarray, fov: float) -> None:
+        """Move the client's camera to a pose [4, 4]; it goes round what is in the middle of the scene then."""
+        camera = self.handle.camera
+        place = world_from_camera[:3, 3]
+        centre = self._stage.bounds(self._shared.stand)[0]
+        ahead = max(float((centre - place) @ world_from_camera[:3, 2]), 1e-3)
+        with self.handle.atomic():
+            camera.position = tuple(place)
+            camera.look_at = tuple(place + ahead * world_from_camera[:3, 2])
+            camera.wxyz = tuple(quaternion_from_rotation(world_from_camera[:3, :3]))
+            camera.fov = float(fov)
+
+    def _send_picture(self, view: View, mode: str) -> None:
+        """On the render thread: with square pixels, as large as the window."""
+        scale = min(1.0, MOST_PICTURE / max(view.width, view.height))
+        width, height = (max(1, round(scale * side)) for side in (view.width, view.height))
+        _, picture, depths, _ = drawn(self._stage, self._shared.stand, view.camera(width, height), mode)
+        file = io.BytesIO()
+        Image.fromarray(with_scale(picture, depths) if depths else picture).save(file, "PNG")
+        if not self._closed:
+            name = f"{mode.replace(' ', '-')}.png"
+            self.handle.send_file_download(name, file.getvalue(), save_immediately=True)
+
+    async def _moved(self, camera: Any) -> None:
+        self._look(camera)
+
+    def _look(self, camera: Any) -> None:
+        told = camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height
+        view = view_of(*told)
+        if view is not None:
+            self.session.moved(view)
+
+
+def fov_to_hold(camera: Camera, aspect: float) -> float:
+    """Vertical field of view, radians, of a window of an aspect (width over height) that holds all of a camera's
+    picture about its principal point."""
+    across = max(camera.cx, camera.width - camera.cx) / camera.fx
+    down = max(camera.cy, camera.height - camera.cy) / camera.fy
+    return float(2 * np.arctan(max(down, across / aspect)))

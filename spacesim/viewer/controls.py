@@ -1,0 +1,158 @@
+"""The panel: what all clients share (Sun, models), and what is each client's own (view, truth, statistics)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Protocol
+
+from spacesim.data.records import Sun
+from spacesim.splat.compose.pose import Pose
+from spacesim.viewer.handles import Gizmos, SunHandle
+from spacesim.viewer.paint import scale_html
+from spacesim.viewer.session import Session, Statistics
+from spacesim.viewer.stage import Stage
+from spacesim.viewer.state import COMPARISONS, MODES, SIDES, Shared, Stand, bounded
+
+SCALES = (1e-3, 1e3)  #: factors that the field of a model takes, chosen
+SAMPLES = (4, 1024)  #: of the path tracer, a pixel
+
+
+class SunControls:
+    """Azimuth and elevation as sliders; they follow the Sun that is dragged. Nothing where no Sun matters."""
+
+    def __init__(self, gui: Any, shared: Shared) -> None:
+        self._shared = shared
+        sun = shared.stand.sun
+        azimuth, elevation = sun.angles if sun else (0.0, 0.0)
+        with gui.add_folder("Sun", order=2):
+            self.azimuth = gui.add_slider("Azimuth", 0.0, 360.0, 0.1, round(azimuth, 1), hint="degrees, from +x to +y")
+            self.elevation = gui.add_slider("Elevation", -90.0, 90.0, 0.1, round(elevation, 1), hint="degrees above xy")
+        self.azimuth.on_update(self._slid)
+        self.elevation.on_update(self._slid)
+
+    def drag(self, sun: Sun) -> None:
+        """The Sun was moved by other means."""
+        self._shared.change(lambda stand: replace(stand, sun=sun))
+        self.follow(sun)
+
+    def follow(self, sun: Sun) -> None:
+        """Put the sliders where the Sun is."""
+        azimuth, elevation = sun.angles
+        self.azimuth.value, self.elevation.value = round(azimuth, 1) % 360, round(elevation, 1)
+
+    async def _slid(self, event: Any) -> None:
+        if event.client is None:  # we moved it ourselves
+            return
+        azimuth = bounded(self.azimuth.value, 0, 360, 0)
+        elevation = bounded(self.elevation.value, -90, 90, 0)
+        self._shared.change(lambda stand: replace(stand, sun=Sun.from_angles(azimuth, elevation)))
+
+
+class ModelControls:
+    """A scale for each model, its place in numbers, and a way back to where it was."""
+
+    def __init__(self, gui: Any, stage: Stage, shared: Shared, gizmos: Gizmos, sun: SunHandle | None) -> None:
+        self._shared, self._gizmos, self._start = shared, gizmos, shared.stand
+        self.scales: list[Any] = []
+        with gui.add_folder("Models", order=3):
+            self.handles = gui.add_checkbox("Handles", True, hint="gizmos of the models and of the Sun")
+            for k, model in enumerate(stage.models):
+                scale = shared.stand.poses[k].scale
+                field = gui.add_number(f"Scale of {model.name}", float(scale), min=SCALES[0], max=SCALES[1], step=0.001)
+                field.on_update(self._scaled(k))
+                self.scales.append(field)
+            reset = gui.add_button("Reset poses")
+        reset.on_click(self._reset)
+
+        @self.handles.on_update
+        async def _(_event: Any) -> None:
+            gizmos.show(bool(self.handles.value))
+            if sun is not None:
+                sun.show(bool(self.handles.value))
+
+    def _scaled(self, k: int) -> Callable[[Any], Any]:
+        async def scaled(event: Any) -> None:
+            if event.client is None:
+                return
+            scale = bounded(self.scales[k].value, *SCALES, 1.0)
+            stand = self._shared.change(lambda s: s.placed(k, Pose(s.poses[k].rotation, s.poses[k].translation, scale)))
+            self._gizmos.put(k, stand.poses[k])
+
+        return scaled
+
+    async def _reset(self, _event: Any) -> None:
+        poses = self._start.poses
+        self._shared.change(lambda stand: Stand(poses, stand.sun))
+        for k, pose in enumerate(poses):
+            self._gizmos.put(k, pose)
+            self.scales[k].value = float(pose.scale)
+
+
+class Actions(Protocol):
+    """What buttons of a client's panel call."""
+
+    def jump(self, frame: int) -> None:
+        """To the camera, and the Sun, of a frame of the data."""
+
+    def frusta(self, visible: bool) -> None:
+        """Show or hide the cameras of the data."""
+
+    def picture(self) -> None:
+        """Send a PNG of the view."""
+
+
+class ClientControls:
+    """A client's own part of the panel, and its statistics."""
+
+    def __init__(self, gui: Any, session: Session, actions: Actions, facts: Sequence[str], frames: int) -> None:
+        self._facts = facts
+        self._session = session
+        with gui.add_folder("View", order=1):
+            mode = gui.add_dropdown("Mode", MODES, initial_value=MODES[0])
+            self.scale = gui.add_html("", visible=False)
+            sizes = tuple(map(str, SIDES))
+            side = gui.add_dropdown("Resolution", sizes, initial_value="1024", hint="most pixels a side, at rest")
+            picture = gui.add_button("Picture (PNG)")
+        with gui.add_folder("Truth", order=4):
+            compare = gui.add_dropdown("Compare", COMPARISONS, initial_value=COMPARISONS[0])
+            wipe = gui.add_slider("Wipe", 0.0, 1.0, 0.01, 0.5, hint="the truth is on the left")
+            samples = gui.add_slider("Samples", *SAMPLES, 4, 32, hint="of the path tracer, a pixel")
+            self.status = gui.add_markdown("")
+        if frames:
+            with gui.add_folder("Data", order=5):
+                shown = gui.add_checkbox("Cameras", False, hint="click one to look from there, under its Sun")
+                frame = gui.add_number("Frame", 0, min=0, max=frames - 1, step=1)
+                go = gui.add_button("Go to frame")
+            shown.on_update(_call(lambda: actions.frusta(bool(shown.value))))
+            go.on_click(_call(lambda: actions.jump(int(bounded(frame.value, 0, frames - 1, 0)))))
+        with gui.add_folder("Statistics", order=9):
+            self.numbers = gui.add_markdown(" ")
+        mode.on_update(_call(lambda: session.set(mode=mode.value)))
+        side.on_update(_call(lambda: session.set(side=side.value)))
+        compare.on_update(_call(lambda: session.set(compare=compare.value)))
+        wipe.on_update(_call(lambda: session.set(wipe=wipe.value)))
+        samples.on_update(_call(lambda: session.set(samples=samples.value)))
+        picture.on_click(_call(actions.picture))
+
+    def tell(self, told: Statistics) -> None:
+        """Show statistics."""
+        rate = f"{told.rate:.0f} frames/s while moving, " if told.rate else ""
+        lines = [
+            f"{rate}{1000 * told.seconds:.0f} ms a picture",
+            f"{told.width} × {told.height} px ({100 * told.share:.0f} % of full resolution)",
+            *self._facts,
+        ]
+        self.numbers.content = "  \n".join(lines)
+        self.status.content = told.status
+        html = scale_html(told.depths)
+        if html:
+            self.scale.content = html
+        self.scale.visible = bool(html)
+
+
+def _call(action: Callable[[], None]) -> Callable[[Any], Any]:
+    """A callback that awaits nothing: those of a client happen in the order in which it acted."""
+
+    async def called(_event: Any) -> None:
+        action()
+
+    return called

@@ -1,0 +1,91 @@
+"""From what a client looks at to a picture: nothing here knows of servers or threads."""
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from spacesim.data.records import Camera
+from spacesim.viewer.paint import NEEDED, Bytes, Planes, depth_range, painted
+from spacesim.viewer.stage import Stage
+from spacesim.viewer.state import Look, Stand, View
+
+BUDGET = 1 / 15  #: seconds that a frame may take while the view moves, chosen: 15 frames a second
+SHARES = (1.0, 0.75, 0.5, 0.375, 0.25)  #: of the full resolution, while the view moves
+STEP = 16  #: sides of pictures are multiples of this many pixels: few sizes occur, each of which compiles kernels
+WARM = 3  #: frames of a size that compile kernels and tell nothing of its speed
+LEAST = 64  #: pixels of a side
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A picture for a client. picture: [H, W, 3];  planes: what it was painted from;  seconds: that it took;  share: of
+    the full resolution;  depths: ends of the colour map in metres, or None;  note: a sentence for the user, or "" """
+
+    picture: Bytes
+    planes: Planes
+    seconds: float
+    share: float
+    depths: tuple[float, float] | None
+    note: str = ""
+
+
+def sides(view: View, most: int, share: float = 1.0) -> tuple[int, int]:
+    """(width, height) of the picture of a view, pixels: the window's shape, at most `most` times `share` on its longer
+    side, in multiples of STEP. Pixels are not quite square then, and the camera knows that."""
+    scale = share * min(1.0, most / max(view.width, view.height))
+    width, height = (max(LEAST, STEP * round(scale * side / STEP)) for side in (view.width, view.height))
+    return width, height
+
+
+def draw(stage: Stage, stand: Stand, view: View, look: Look, share: float = 1.0) -> Frame:
+    """The picture of a view in the look's mode, without the truth."""
+    start = time.perf_counter()
+    camera = view.camera(*sides(view, look.side, share))
+    planes, picture, depths, note = drawn(stage, stand, camera, look.mode)
+    return Frame(picture, planes, time.perf_counter() - start, share, depths, note)
+
+
+def drawn(
+    stage: Stage, stand: Stand, camera: Camera, mode: str
+) -> tuple[Planes, Bytes, tuple[float, float] | None, str]:
+    """(planes, picture, depths, note) of a camera in a mode; black, and a note that says why, where there is nothing of
+    the mode to see."""
+    planes = stage.draw(stand, camera, mode)
+    depths = depth_range(planes) if mode == "depth" else None
+    picture = painted(planes, mode, depths)
+    if picture is not None:
+        return planes, picture, depths, ""
+    note = f"no {mode} to be seen: {stage.lacks(NEEDED[mode])}"
+    return planes, np.zeros((camera.height, camera.width, 3), np.uint8), None, note
+
+
+@dataclass
+class Pace:
+    """Which share of the full resolution a moving view is drawn at, so that a frame takes BUDGET at most.
+
+    One step down after a frame that took longer; one up where the larger picture, with that many more pixels, would
+    still take 70 % of BUDGET at most. Frames of a size new to the kernels do not count.
+    """
+
+    level: int = 0
+    _seen: dict[tuple[int, int], int] = field(default_factory=dict)
+
+    @property
+    def share(self) -> float:
+        """Of the full resolution."""
+        return SHARES[self.level]
+
+    def took(self, share: float, size: tuple[int, int], seconds: float) -> None:
+        """Told that a frame of `size` at `share` took so long."""
+        if len(self._seen) > 256:
+            self._seen.clear()
+        self._seen[size] = self._seen.get(size, 0) + 1
+        if self._seen[size] <= WARM or share != self.share:
+            return
+        if seconds > BUDGET:
+            self.level = min(self.level + 1, len(SHARES) - 1)
+        elif self.level > 0:
+            larger = SHARES[self.level - 1]
+            if seconds * (larger / share) ** 2 < 0.7 * BUDGET:
+                self.level -= 1

@@ -1,0 +1,103 @@
+"""The one thread that draws: newest wishes first served, one picture a client at a time, full resolution at rest.
+
+Dr.Jit is called from this thread alone. A client that moves gets coarse pictures as fast as they come; once nothing new
+is wished for during REST seconds, one in full resolution. A newer wish of a client takes the place of an older one, so
+nothing queues up, and clients take turns.
+"""
+
+import logging
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from typing import Any
+
+REST = 0.2  #: seconds without a new wish after which a view is at rest, chosen
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Wish:
+    """A picture that a client wants. draw: told whether in full resolution, makes and delivers it, on the render
+    thread"""
+
+    draw: Callable[[bool], Any]
+
+
+class RenderLoop:
+    """Draws what clients wish for, until `stop`."""
+
+    def __init__(self, rest: float = REST) -> None:
+        self._rest = rest
+        self._wishes: OrderedDict[Hashable, tuple[Wish, bool]] = OrderedDict()
+        self._resting: dict[Hashable, tuple[float, Wish]] = {}
+        self._work: list[Callable[[], Any]] = []
+        self._changed = threading.Condition()
+        self._going = True
+        self._thread = threading.Thread(target=self._run, name="render", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def wish(self, client: Hashable, wish: Wish, moving: bool = True) -> None:
+        """Draw for a client, instead of what it wished for before; moving: coarse first, in full at rest."""
+        with self._changed:
+            self._wishes[client] = (wish, moving)
+            self._resting.pop(client, None)
+            self._changed.notify()
+
+    def forget(self, client: Hashable) -> None:
+        """A client has gone."""
+        with self._changed:
+            self._wishes.pop(client, None)
+            self._resting.pop(client, None)
+
+    def do(self, work: Callable[[], Any]) -> None:
+        """Call `work` on the render thread, before the next picture."""
+        with self._changed:
+            self._work.append(work)
+            self._changed.notify()
+
+    def stop(self, patience: float = 5.0) -> None:
+        """End after the picture that is being drawn."""
+        with self._changed:
+            self._going = False
+            self._changed.notify()
+        if self._thread.is_alive() and threading.current_thread() is not self._thread:
+            self._thread.join(patience)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                task = self._next()
+                while task is None and self._going:
+                    due = min((moment for moment, _ in self._resting.values()), default=None)
+                    self._changed.wait(None if due is None else max(due - time.monotonic(), 0.0))
+                    task = self._next()
+                if not self._going:
+                    return
+            assert task is not None
+            try:
+                task()
+            except Exception as error:  # one picture that fails must not end all others
+                _log.warning("viewer: a picture failed (%s)", " ".join(str(error).split()) or type(error).__name__)
+                _log.debug("traceback", exc_info=error)
+
+    def _next(self) -> Callable[[], Any] | None:
+        """What to do now, None for nothing. The lock is held."""
+        if self._work:
+            return self._work.pop(0)
+        if self._wishes:
+            client, (wish, moving) = self._wishes.popitem(last=False)
+            if moving:
+                self._resting[client] = (time.monotonic() + self._rest, wish)
+            return lambda: wish.draw(not moving)
+        now = time.monotonic()
+        for client, (moment, wish) in self._resting.items():
+            if moment <= now:
+                del self._resting[client]
+                return lambda: wish.draw(True)
+        return None

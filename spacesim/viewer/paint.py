@@ -1,0 +1,143 @@
+"""Planes of numbers to pictures for people: a colour map for each mode, the truth beside the prediction, a scale."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from spacesim.data.sheet import font
+from spacesim.data.tone import as_bytes
+from spacesim.eval.pictures import error_colours, visibility_picture
+
+Bytes = NDArray[np.uint8]
+
+PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
+"""sRGB colours of objects, from the first again for the eighth: Okabe and Ito's, which the colour-blind tell apart."""
+
+FARTHEST_SHADE = 0.15  #: of the colour map at the farthest depth: the background alone is black
+ERROR_SCALE = 0.25  #: mean absolute error of the channels at the bright end, as in reports
+SURFACE = 0.5  #: alpha from which a pixel shows a surface, of depth's range and of ids
+UNKNOWN = (38, 38, 42)  #: sRGB colour of where the truth is not known
+_LINE = (255, 255, 255)
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """What a frame knows, float32; None for what was not asked for or cannot be had.
+
+    rgb: [H, W, 3] sRGB values over black;  alpha: [H, W];  depth: [H, W] metres, 0 where there is none
+    visibility: [H, W] of the Sun;  normal: [H, W, 3] world axes, 0 where there is none
+    object_id: [H, W] uint8, from 1, 0 none
+    """
+
+    alpha: np.ndarray
+    rgb: np.ndarray | None = None
+    depth: np.ndarray | None = None
+    visibility: np.ndarray | None = None
+    normal: np.ndarray | None = None
+    object_id: np.ndarray | None = None
+
+
+NEEDED = {
+    "colour": "rgb",
+    "depth": "depth",
+    "accumulation": "alpha",
+    "visibility": "visibility",
+    "normals": "normal",
+    "object id": "object_id",
+    "ellipsoids": "rgb",
+}
+"""The plane that each mode shows."""
+
+
+def depth_range(planes: Planes) -> tuple[float, float] | None:
+    """(nearest, farthest) depth of surfaces, metres; None where there is none."""
+    if planes.depth is None:
+        return None
+    seen = planes.depth[(planes.alpha >= SURFACE) & (planes.depth > 0)]
+    return (float(seen.min()), float(seen.max())) if seen.size else None
+
+
+def painted(planes: Planes, mode: str, depths: tuple[float, float] | None = None) -> Bytes | None:
+    """[H, W, 3] of the planes in a mode; None where the plane that it shows is not there. depths: of the colour map's
+    ends, metres."""
+    values = getattr(planes, NEEDED[mode])
+    if values is None:
+        return None
+    values = np.nan_to_num(values)
+    alpha = np.clip(np.nan_to_num(planes.alpha), 0, 1)
+    if mode == "depth":
+        near, far = depths or depth_range(planes) or (0.0, 1.0)
+        share = np.clip((values - near) / max(far - near, 1e-9), 0, 1)
+        picture = error_colours(1 - (1 - FARTHEST_SHADE) * share)
+        return np.where((values > 0)[..., None], (picture * alpha[..., None]).astype(np.uint8), np.uint8(0))
+    if mode == "accumulation":
+        return np.repeat(as_bytes(alpha)[..., None], 3, axis=-1)
+    if mode == "visibility":
+        return visibility_picture(values, alpha)
+    if mode == "normals":
+        surface = np.any(values != 0, axis=-1, keepdims=True)
+        return as_bytes(np.where(surface, (0.5 + 0.5 * values) * alpha[..., None], 0))
+    if mode == "object id":
+        colours = np.array([(0, 0, 0), *PALETTE], np.uint8)
+        return colours[np.where(values > 0, 1 + (values.astype(int) - 1) % len(PALETTE), 0)]
+    return as_bytes(values)
+
+
+def compared(picture: Bytes, truth: Bytes, known: NDArray[np.bool_], how: str, wipe: float) -> Bytes:
+    """The prediction with the truth, [H, W, 3] both, by one of COMPARISONS.
+
+    known: [H, W], where there is truth;  wipe: left of that share of the width is the truth;  beside: both, each half
+    as large, the truth on the left;  difference: mean absolute difference of the channels as a colour, black none
+    """
+    height, width = picture.shape[:2]
+    truth = np.where(known[..., None], truth, np.array(UNKNOWN, np.uint8))
+    if how == "wipe":
+        edge = round(wipe * width)
+        result = np.concatenate([truth[:, :edge], picture[:, edge:]], axis=1)
+        if 0 < edge < width:
+            result[:, edge : edge + 1] = _LINE
+        return result
+    if how == "beside":
+        half = max(1, width // 2), max(1, height // 2)
+        small = [np.asarray(Image.fromarray(one).resize(half, Image.Resampling.BOX)) for one in (truth, picture)]
+        result = np.zeros_like(picture)
+        top = (height - small[0].shape[0]) // 2
+        for left, one in zip((0, width - small[1].shape[1]), small, strict=True):
+            result[top : top + one.shape[0], left : left + one.shape[1]] = one
+        result[top : top + small[0].shape[0], width // 2] = _LINE
+        return result
+    if how == "difference":
+        error = np.abs(picture.astype(np.float32) - truth).mean(axis=-1) / 255
+        return np.where(known[..., None], error_colours(error / ERROR_SCALE), np.array(UNKNOWN, np.uint8))
+    return picture
+
+
+def with_scale(picture: Bytes, depths: tuple[float, float]) -> Bytes:
+    """A picture of depths with the colour map and its ends in metres at the bottom; as it is where there is no room."""
+    height, width = picture.shape[:2]
+    if width < 160 or height < 80:
+        return picture
+    page = Image.fromarray(picture)
+    draw, size = ImageDraw.Draw(page), 14
+    left, right, bottom = 12, 12 + min(240, width - 24), height - 10
+    bar = error_colours(1 - (1 - FARTHEST_SHADE) * np.linspace(0, 1, right - left))
+    page.paste(Image.fromarray(np.repeat(bar[None], 10, axis=0)), (left, bottom - 10))
+    near, far = (f"{value:.4g} m" for value in depths)
+    draw.text((left, bottom - 14), near, (255, 255, 255), font(size), anchor="ls")
+    draw.text((right, bottom - 14), far, (255, 255, 255), font(size), anchor="rs")
+    return np.array(page)
+
+
+def scale_html(depths: tuple[float, float] | None) -> str:
+    """The colour map of depths and its ends for the panel."""
+    if depths is None:
+        return ""
+    stops = error_colours(1 - (1 - FARTHEST_SHADE) * np.linspace(0, 1, 9))
+    colours = ", ".join(f"rgb({r}, {g}, {b})" for r, g, b in stops.tolist())
+    near, far = (f"{value:.4g} m" for value in depths)
+    return (
+        f'<div style="margin: 0 0.8em 0.4em; font-size: 0.85em"><div style="height: 0.8em; background: '
+        f'linear-gradient(to right, {colours})"></div><span>{near}</span><span style="float: right">{far}</span></div>'
+    )

@@ -1,0 +1,159 @@
+"""What is shown: the scene, which all clients share, and what each of them looks at, in which way."""
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import Array, rotation_from_quaternion
+from spacesim.data.records import Camera, Sun
+from spacesim.splat.compose.pose import Pose
+
+MODES = ("colour", "depth", "accumulation", "visibility", "normals", "object id", "ellipsoids")
+COMPARISONS = ("off", "wipe", "beside", "difference")
+SIDES = (256, 512, 768, 1024, 1536, 2048)  #: pixels of a picture's longer side at rest that clients may choose
+MOST_WINDOW = 8192  #: pixels a side of a client's window, chosen: more is nonsense
+FIELDS_OF_VIEW = (np.radians(0.01), np.radians(170.0))  #: vertical, chosen
+FARTHEST = 1e7  #: metres of a camera in each coordinate, chosen
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Where a client looks from. world_from_camera: [4, 4] OpenCV axes, metres;  fov: vertical, radians;  width,
+    height: of the client's window, pixels. Raises InputError for what no camera can be."""
+
+    world_from_camera: Array
+    fov: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        least, most = FIELDS_OF_VIEW
+        if not least <= self.fov <= most:
+            raise InputError(f"view: expected a field of view of at most 170 degrees, found {self.fov} radians")
+        if not (1 <= self.width <= MOST_WINDOW and 1 <= self.height <= MOST_WINDOW):
+            raise InputError(f"view: expected 1 to {MOST_WINDOW} pixels a side, found {self.width}x{self.height}")
+        if not np.all(np.abs(np.asarray(self.world_from_camera)[:3, 3]) <= FARTHEST):
+            raise InputError(f"view: expected a camera within {FARTHEST:g} metres, found one beyond")
+        self.camera(self.width, self.height)
+
+    def camera(self, width: int, height: int) -> Camera:
+        """The camera that sees what the window shows in a picture of width x height pixels; they are as wide as they
+        are high where the picture's shape is the window's."""
+        focal = 0.5 / np.tan(0.5 * self.fov)
+        fx = focal * width * self.height / self.width
+        return Camera(self.world_from_camera, width, height, fx, focal * height, 0.5 * width, 0.5 * height)
+
+    def same(self, other: "View | None") -> bool:
+        """Whether both show the same, to single precision."""
+        if other is None or (self.width, self.height) != (other.width, other.height):
+            return False
+        pose = np.allclose(self.world_from_camera, other.world_from_camera, rtol=1e-6, atol=1e-7)
+        return pose and bool(np.isclose(self.fov, other.fov, rtol=1e-6))
+
+
+def view_of(wxyz: Any, position: Any, fov: Any, width: Any, height: Any) -> View | None:
+    """The view that a client tells, or None where that is nonsense."""
+    try:
+        turn, place = np.array(wxyz, dtype=np.float64), np.array(position, dtype=np.float64)
+        if turn.shape != (4,) or place.shape != (3,) or not _turns(turn):
+            return None
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(turn), place
+        return View(pose, float(fov), int(width), int(height))
+    except (InputError, TypeError, ValueError, OverflowError):
+        return None
+
+
+def _turns(quaternion: Array) -> bool:
+    """Whether [4] is about as long as a quaternion that a browser tells."""
+    return bool(np.abs(quaternion).max() < 2 and 0.5 < np.linalg.norm(quaternion) < 2)
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a client wants pictures. mode: of MODES;  compare: of COMPARISONS, with the truth;  wipe: share of the width
+    that shows the truth;  side: most pixels of the longer side;  samples: of the path tracer, a pixel. What is out of
+    range becomes the nearest in range, other words the default."""
+
+    mode: str = MODES[0]
+    compare: str = COMPARISONS[0]
+    wipe: float = 0.5
+    side: int = 1024
+    samples: int = 32
+
+    def __post_init__(self) -> None:
+        mode = self.mode if self.mode in MODES else MODES[0]
+        compare = self.compare if self.compare in COMPARISONS else COMPARISONS[0]
+        changed = {"mode": mode, "compare": compare, "wipe": bounded(self.wipe, 0, 1, 0.5)}
+        changed["side"] = int(bounded(self.side, SIDES[0], SIDES[-1], 1024))
+        changed["samples"] = int(bounded(self.samples, 1, 4096, 32))
+        for name, value in changed.items():
+            object.__setattr__(self, name, value)
+
+
+def bounded(value: Any, least: float, most: float, otherwise: float) -> float:
+    """`value` as a number from `least` to `most`; `otherwise` where it is no number."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        return otherwise
+    return otherwise if np.isnan(number) else min(max(number, least), most)
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """How the scene stands. poses: world_from_model of each model;  sun: None where nobody has said"""
+
+    poses: tuple[Pose, ...]
+    sun: Sun | None
+
+    def placed(self, index: int, pose: Pose) -> "Stand":
+        """With another pose of model `index`."""
+        return replace(self, poses=(*self.poses[:index], pose, *self.poses[index + 1 :]))
+
+    def same(self, other: "Stand | None") -> bool:
+        """Whether both are the same scene."""
+        if other is None or [pose.key for pose in self.poses] != [pose.key for pose in other.poses]:
+            return False
+        if self.sun is None or other.sun is None:
+            return self.sun is other.sun
+        return bool(np.array_equal(self.sun.direction, other.sun.direction))
+
+
+@dataclass
+class Shared:
+    """The one scene that all clients see and change, from any thread: each change is a whole new `Stand`."""
+
+    stand: Stand
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _listeners: list[Callable[[Stand], None]] = field(default_factory=list)
+
+    def change(self, change: Callable[[Stand], Stand]) -> Stand:
+        """Put `change` of the scene in its place and tell the listeners, where it is another one."""
+        with self._lock:
+            before, self.stand = self.stand, change(self.stand)
+            now, listeners = self.stand, tuple(self._listeners)
+        if not now.same(before):
+            for listener in listeners:
+                listener(now)
+        return now
+
+    def listen(self, listener: Callable[[Stand], None]) -> None:
+        """From now on tell `listener` of changes, on the thread that makes them."""
+        with self._lock:
+            self._listeners.append(listener)
+
+
+def changed_pose(pose: Pose, wxyz: Sequence[float], position: Sequence[float]) -> Pose:
+    """`pose` turned and placed as a handle says; unchanged where that is nonsense."""
+    try:
+        turn = np.asarray(wxyz, dtype=np.float64)
+        if turn.shape != (4,) or not _turns(turn):
+            return pose
+        return Pose(turn, np.asarray(position, dtype=np.float64), pose.scale)
+    except (InputError, TypeError, ValueError):
+        return pose

@@ -1,0 +1,156 @@
+"""A process that path-traces the truth: the viewer's own draws meanwhile (Dr.Jit is not shared between threads).
+
+It is started with a socket (see `truth`), gets `Request`s, and answers each with an `Answer` after
+every few samples a pixel; a newer request, or None, ends the one before. Where the viewer has gone, it ends.
+"""
+
+import os
+import queue
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from spacesim import backend
+from spacesim.data.records import Camera, Sun
+from spacesim.data.tone import displayed
+from spacesim.viewer.paint import Planes
+
+PASS = 4  #: samples a pixel between two answers, chosen
+NICENESS = 10  #: less urgent than the viewer's own pictures
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """What to trace. number: given back with answers;  scene: a `SceneConfig`;  samples: a pixel;  mode: whose planes:
+    "colour" asks for paths, the others for labels"""
+
+    number: int
+    scene: Any
+    camera: Camera
+    sun: Sun
+    samples: int
+    mode: str
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """planes: of all samples so far, None where `error` says in a sentence why there are none;  samples: a pixel, so
+    far;  done: nothing more comes"""
+
+    number: int
+    planes: Planes | None
+    samples: int
+    done: bool
+    error: str = ""
+
+
+class Tracer:
+    """Answers requests; keeps the scene last asked for."""
+
+    def __init__(self) -> None:
+        self._scene: Any = None
+        self._renderer: Any = None
+
+    def answers(self, request: Request) -> Iterator[Answer]:
+        """One answer after another, each of more samples than the one before."""
+        renderer = self._loaded(request.scene)
+        camera, sun, config = request.camera, request.sun, request.scene.camera
+        if request.mode not in ("colour", "ellipsoids", "accumulation"):
+            labels = renderer.labels(camera, sun)
+            yield Answer(request.number, _label_planes(labels), 1, True)
+            return
+        total, weight, done = 0.0, 0.0, 0
+        while done < request.samples:
+            radiance, alpha = renderer.radiance(camera, sun, (request.scene.seed, done))
+            total, weight, done = total + radiance.astype(np.float64), weight + alpha.astype(np.float64), done + PASS
+            share = PASS / done
+            planes = _picture(np.asarray(total) * share, np.asarray(weight) * share, config)
+            yield Answer(request.number, planes, done, done >= request.samples)
+
+    def _loaded(self, scene: Any) -> Any:
+        if self._renderer is None or scene != self._scene:
+            from spacesim.scenes import Renderer, build
+
+            self._renderer = None
+            self._renderer = Renderer(build(scene), PASS, scene.quality.max_depth)
+            self._scene = scene
+        return self._renderer
+
+
+def _picture(radiance: np.ndarray, alpha: np.ndarray, config: Any) -> Planes:
+    """As the data's pictures are, over black, without a sensor's noise. config: a `CameraConfig`"""
+    if config.sensor is not None:  # which records what is over black
+        rgb = displayed(config.exposure * radiance, config.tone)
+    else:
+        straight = radiance / np.where(alpha > 0, alpha, 1)[..., None]
+        rgb = displayed(config.exposure * straight, config.tone) * alpha[..., None]
+    return Planes(alpha.astype(np.float32), rgb=rgb.astype(np.float32))
+
+
+def _label_planes(labels: dict[str, np.ndarray]) -> Planes:
+    surface = (labels["object_id"] > 0).astype(np.float32)
+    return Planes(
+        surface,
+        depth=labels["depth"],
+        visibility=labels["sun_visibility"],
+        normal=labels["normal"],
+        object_id=labels["object_id"],
+    )
+
+
+def _work(connection: Connection) -> None:
+    """What the process does."""
+    inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+
+    def listen() -> None:
+        """Ends the process as soon as the viewer has gone, also while it traces."""
+        while True:
+            try:
+                inbox.put(connection.recv())
+            except (EOFError, OSError):
+                os._exit(0)
+
+    def tell(answer: Answer) -> None:
+        try:
+            connection.send(answer)
+        except OSError:
+            os._exit(0)
+
+    threading.Thread(target=listen, daemon=True).start()
+    name, threads = inbox.get()
+    with suppress(OSError, AttributeError):
+        os.nice(NICENESS)
+    tracer, ready = None, None
+    while True:
+        request = ready or inbox.get()
+        while not inbox.empty():  # the newest counts
+            request = inbox.get()
+        ready = None
+        if request is None:
+            continue
+        try:
+            if tracer is None:
+                backend.select(name)
+                backend.mitsuba()
+                if name == "llvm":
+                    import drjit
+
+                    drjit.set_thread_count(threads)
+                tracer = Tracer()
+            for answer in tracer.answers(request):
+                tell(answer)
+                if not inbox.empty():
+                    break
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            tell(Answer(request.number, None, 0, True, reason))
+
+
+def main(socket: int) -> None:
+    """Answer requests that come through a socket, for ever."""
+    _work(Connection(socket))

@@ -1,0 +1,85 @@
+"""The scene that the truth is path-traced from: the recorded scenes of the models' data, posed as the models are."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacesim.data.errors import InputError
+from spacesim.data.files import read_json
+from spacesim.data.structure import structure
+from spacesim.data.toml import Document
+from spacesim.scenes.config import ObjectConfig, SceneConfig
+from spacesim.scenes.scenefile import RULES
+from spacesim.splat.compose.pose import Pose
+
+
+def recorded_scene(data: Path) -> SceneConfig:
+    """What scene.json of a dataset says of its scene; mesh files as absolute paths. Raises InputError where there is
+    none, or a mesh file that it names is not to be found from the dataset or the working directory."""
+    path = Path(data) / "scene.json"
+    if not path.is_file():
+        raise InputError(f"{path}: expected the scene that the data were made from, found none; the truth is not known")
+    values = read_json(path)
+    config = values.get("config") if isinstance(values, dict) else None
+    if not isinstance(config, dict):
+        raise InputError(f"{path}: expected an object with the key config, found none")
+    known = _without_nulls(config)
+    known.get("sun", {}).pop("color", None)  # what the white balance makes of it, again
+    scene = structure(SceneConfig, Document(str(path), known, {}), RULES)
+    return replace(scene, objects=tuple(_found(one, path) for one in scene.objects))
+
+
+def composed_scene(scenes: Sequence[SceneConfig], poses: Sequence[Pose]) -> SceneConfig:
+    """All objects of the models' scenes, each scene moved, turned and scaled as its model is. Raises InputError where
+    the scenes differ in the Sun, the Earth or in what makes a picture of light."""
+    first = scenes[0]
+    for other in scenes[1:]:
+        for what in ("sun", "earth"):
+            _same(first, other, what, getattr(first, what), getattr(other, what))
+        for what in ("exposure", "tone", "white_balance", "distortion"):
+            _same(first, other, what, getattr(first.camera, what), getattr(other.camera, what))
+    objects: list[ObjectConfig] = []
+    materials: dict[str, Any] = {}
+    for k, (scene, pose) in enumerate(zip(scenes, poses, strict=True)):
+        renamed = {name: f"{name}@{k}" for name in scene.materials} if k else {name: name for name in scene.materials}
+        materials |= {renamed[name]: material for name, material in scene.materials.items()}
+        objects += [_posed(one, pose, renamed) for one in scene.objects]
+    return replace(first, objects=tuple(objects), materials=materials)
+
+
+def _posed(one: ObjectConfig, pose: Pose, renamed: Mapping[str, str]) -> ObjectConfig:
+    placed = pose.after(Pose(np.array(one.rotation_wxyz), np.array(one.position), one.scale))
+    (x, y, z), (w, i, j, k) = placed.translation.tolist(), placed.quaternion.tolist()
+    used = {pattern: renamed.get(name, name) for pattern, name in one.materials.items()}
+    return replace(one, position=(x, y, z), rotation_wxyz=(w, i, j, k), scale=placed.scale, materials=used)
+
+
+def _same(one: SceneConfig, other: SceneConfig, what: str, value: Any, found: Any) -> None:
+    if value != found:
+        raise InputError(
+            f"{other.name}: expected the {what} of {one.name} ({value}), found another ({found}); the truth of both "
+            "together is not known"
+        )
+
+
+def _found(one: ObjectConfig, path: Path) -> ObjectConfig:
+    """With the mesh file, if it has one, as an absolute path."""
+    if not one.mesh:
+        return one
+    places = [path.parent / one.mesh, Path.cwd() / one.mesh]
+    place = next((place for place in places if place.is_file()), None)
+    if place is None:
+        raise InputError(
+            f"{path}: expected the mesh file {one.mesh} beside it or in the working directory, found none; the truth "
+            "is not known"
+        )
+    return replace(one, mesh=str(place.resolve()))
+
+
+def _without_nulls(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _without_nulls(one) for key, one in value.items() if one is not None}
+    return [_without_nulls(one) for one in value] if isinstance(value, list) else value

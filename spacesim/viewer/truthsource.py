@@ -1,0 +1,92 @@
+"""Which truth a client gets: stored where the data have it, traced where the scene is known, else a sentence."""
+
+import threading
+from collections.abc import Hashable, Sequence
+from pathlib import Path
+from typing import Any
+
+from spacesim.data.errors import InputError
+from spacesim.data.records import Dataset
+from spacesim.splat.run import Run
+from spacesim.viewer.frames import sides
+from spacesim.viewer.session import Session
+from spacesim.viewer.state import Look, Stand, View
+from spacesim.viewer.tracer import Answer, Request
+from spacesim.viewer.truth import SIDE, Truth, TruthDesk, frame_at, stored_truth
+from spacesim.viewer.truthscene import composed_scene, recorded_scene
+
+
+class TruthService:
+    """Truth for sessions.
+
+    data: of each model, the folder of the dataset that its scene is recorded in, or None;  dataset: whose frames show
+    the scene as `start` has it, or None
+    """
+
+    def __init__(self, data: Sequence[Path | None], dataset: Dataset | None, start: Stand) -> None:
+        self._data, self._dataset, self._start = data, dataset, start
+        self._scenes: list[Any] | str | None = None
+        self._lock = threading.Lock()
+        self._desk = TruthDesk(self._answered)
+
+    def truth(self, session: Session, view: View, stand: Stand, look: Look) -> Truth | int | str:
+        """See `TruthSource`."""
+        number = self._frame(view, stand)
+        if number is not None and self._dataset is not None:
+            stored = stored_truth(self._dataset, number, look.mode)
+            if stored is not None:
+                return stored
+        if stand.sun is None:
+            return "the Sun's direction is not known"
+        scenes = self._recorded()
+        if isinstance(scenes, str):
+            return scenes
+        try:
+            scene = composed_scene(scenes, stand.poses)
+        except InputError as error:
+            return str(error)
+        camera = view.camera(*sides(view, min(SIDE, look.side)))
+        return self._desk.ask(session, Request(0, scene, camera, stand.sun, look.samples, look.mode))
+
+    def no_truth(self, session: Session) -> None:
+        """See `TruthSource`."""
+        self._desk.cancel(session)
+
+    def stop(self) -> None:
+        """End the process that traces."""
+        self._desk.stop()
+
+    def _frame(self, view: View, stand: Stand) -> int | None:
+        """Number of the frame that shows this."""
+        as_recorded = [pose.key for pose in stand.poses] == [pose.key for pose in self._start.poses]
+        if self._dataset is None or not as_recorded:
+            return None
+        return frame_at(self._dataset, view, stand)
+
+    def _recorded(self) -> list[Any] | str:
+        """The scenes of the models' data, or why they are not known; looked up once."""
+        with self._lock:
+            if self._scenes is None:
+                try:
+                    self._scenes = [self._scene(path) for path in self._data]
+                except InputError as error:
+                    self._scenes = str(error)
+            return self._scenes
+
+    @staticmethod
+    def _scene(path: Path | None) -> Any:
+        if path is None:
+            raise InputError("the data that a model was trained on are not where they were; name them with --data")
+        return recorded_scene(path)
+
+    @staticmethod
+    def _answered(session: Hashable, answer: Answer) -> None:
+        assert isinstance(session, Session)
+        session.answer(answer)
+
+
+def data_of(run: Run) -> Path | None:
+    """The folder of the dataset that a run was trained on, if it is there."""
+    path = Path(str(run.config.get("data", {}).get("path", "")))
+    folder = path if path.is_dir() else path.parent
+    return folder if str(path) and (folder / "transforms.json").is_file() else None

@@ -1,0 +1,86 @@
+"""The thread that draws: newest first, clients take turns, full resolution at rest, nothing ends it."""
+
+import threading
+import time
+
+from browser import wait_for
+
+from spacesim.viewer.loop import RenderLoop, Wish
+
+
+class Drawn:
+    """What was drawn, in order; the first picture may be held up."""
+
+    def __init__(self):
+        self.made, self.threads, self.gate, self.begun = [], set(), threading.Event(), threading.Event()
+
+    def wish(self, name, held=False):
+        def draw(full):
+            self.threads.add(threading.get_ident())
+            if held:
+                self.begun.set()
+                assert self.gate.wait(5)
+            self.made.append((name, full))
+
+        return Wish(draw)
+
+
+def test_only_the_newest_wish_of_a_client_is_drawn():
+    loop, drawn = RenderLoop(rest=60), Drawn()
+    loop.start()
+    loop.wish("a", drawn.wish(0, held=True))
+    assert drawn.begun.wait(5)
+    for k in range(1, 100):
+        loop.wish("a", drawn.wish(k))
+    loop.wish("b", drawn.wish("b"))
+    drawn.gate.set()
+    wait_for(lambda: len(drawn.made) == 3, "three pictures")
+    time.sleep(0.1)
+    assert drawn.made == [(0, False), (99, False), ("b", False)]
+    loop.stop()
+    assert len(drawn.threads) == 1
+    assert threading.get_ident() not in drawn.threads
+
+
+def test_full_resolution_comes_at_rest_and_once():
+    loop, drawn = RenderLoop(rest=0.1), Drawn()
+    loop.start()
+    loop.wish("a", drawn.wish(1))
+    loop.wish("b", drawn.wish(2), moving=False)
+    wait_for(lambda: len(drawn.made) == 3, "three pictures")
+    time.sleep(0.3)
+    loop.stop()
+    assert drawn.made == [(1, False), (2, True), (1, True)]
+
+
+def test_a_client_that_has_gone_gets_nothing():
+    loop, drawn = RenderLoop(rest=0.05), Drawn()
+    loop.start()
+    loop.wish("a", drawn.wish(0, held=True))
+    assert drawn.begun.wait(5)
+    loop.wish("b", drawn.wish("b"))
+    loop.forget("a")
+    loop.forget("b")
+    drawn.gate.set()
+    loop.wish("c", drawn.wish("c"))
+    wait_for(lambda: ("c", True) in drawn.made, "the picture of c")
+    loop.stop()
+    assert drawn.made == [(0, False), ("c", False), ("c", True)]
+
+
+def test_a_picture_that_fails_ends_no_others(caplog):
+    loop, drawn = RenderLoop(rest=0.05), Drawn()
+    loop.start()
+
+    def fail(_full):
+        raise RuntimeError("out of\nmemory")
+
+    loop.wish("a", Wish(fail), moving=False)
+    done = threading.Event()
+    loop.do(done.set)
+    assert done.wait(5)
+    loop.wish("b", drawn.wish("b"), moving=False)
+    wait_for(lambda: drawn.made, "the picture of b")
+    loop.stop()
+    assert "out of memory" in caplog.text
+    assert not loop._thread.is_alive()
