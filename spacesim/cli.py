@@ -280,26 +280,6 @@ def _view(options: argparse.Namespace) -> None:
     serve(opened(options.path, options.data, options.out), options.host, options.port, ending.say)
 
 
-def _compose(options: argparse.Namespace) -> None:
-    from spacesim.progress import reporting
-    from spacesim.splat.compose.output import compose
-    from spacesim.splat.compose.plain import gathered
-    from spacesim.splat.compose.scenefile import load_scene
-    from spacesim.splat.ply import write_ply
-
-    scene = load_scene(options.scene)
-    with reporting("compose", "frames") as report:
-        done = compose(scene, options.out, options.size, report)
-    written = [done.sheet, done.video]
-    if options.ply is not None:
-        first = scene.shot(0)
-        write_ply(gathered(first.composition, first.sun), options.ply)
-        written.append(options.ply)
-    if done.note is not None:
-        print(done.note, file=sys.stderr)
-    ending.say(" ".join(str(path) for path in written if path is not None))
-
-
 def _verify(options: argparse.Namespace) -> None:
     from spacesim.data.verify import verify
 

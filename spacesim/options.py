@@ -166,12 +166,6 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--port", type=int, default=8080, metavar="N", help="to listen at, or the next free one (8080)")
     one.add_argument("--out", type=Path, metavar="DIR", help="where scenes are saved (the working directory)")
 
-    one = command("compose", "several runs in one scene: pictures, depth, object numbers, shadows, a video")
-    one.add_argument("scene", type=Path, metavar="SCENE.toml", help="runs, poses, Sun, camera: docs/composition.md")
-    one.add_argument("--out", type=Path, required=True, metavar="DIR")
-    one.add_argument("--size", type=_resolution, metavar="PX", help="pixels of the longer side, or WIDTHxHEIGHT")
-    one.add_argument("--ply", type=Path, metavar="FILE", help="write the scene as plain Gaussians, too")
-
     one = command("verify", "whether every file of a dataset is there and can be read", needs_backend=False)
     one.add_argument("data", type=Path, metavar="DATA")
 
