@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from spacesim import backend
 from spacesim.data.errors import InputError, WorkError
@@ -20,6 +20,7 @@ from spacesim.options import parser
 
 if TYPE_CHECKING:
     from spacesim.data.records import Camera, Sun
+    from spacesim.splat.run import Run
     from spacesim.splat.train.config import TrainConfig
 
 KNOWS_ONE_LIGHT = "a vanilla run knows the light that it was trained under only; --sun changes nothing"
@@ -112,16 +113,21 @@ def _generate(options: argparse.Namespace) -> None:
 def _train(options: argparse.Namespace) -> None:
     from spacesim.data.store import read_dataset
     from spacesim.progress import reporting, tell_training
-    from spacesim.splat.train.config import preset, with_options
+    from spacesim.splat.train.config import preset, warm_start, with_options
     from spacesim.splat.train.train import train
 
-    names = ("init", "init_count", "views_per_step", "iterations", "seed", "visibility_weight", "flatten_weight")
+    names = (
+        *("init", "init_count", "init_box", "views_per_step", "iterations", "seed", "visibility_weight"),
+        *("flatten_weight", "depth_weight", "normal_weight", "prior"),
+    )
     config = preset(options.preset, options.method, options.strategy)
     config = with_options(config, **{name: getattr(options, name) for name in names})
     if options.black_background:
         config = with_options(config, random_background=False)
     if options.antialiased:
         config = with_options(config, antialiased=True)
+    if options.warm_start:
+        config = with_options(config, warm_start=warm_start(options.preset))
     if options.max_gaussians is not None:
         config = with_options(config, refinement=replace(config.refinement, max_gaussians=options.max_gaussians))
     config = _with_light(config, options)
@@ -178,10 +184,9 @@ def _eval(options: argparse.Namespace) -> None:
     from spacesim.eval.evaluate import EvaluateConfig, evaluate
     from spacesim.eval.report import write_report
     from spacesim.progress import reporting
-    from spacesim.splat.run import load_run
 
     config = EvaluateConfig(options.split, options.lpips_weights)
-    run, dataset = load_run(options.path), read_dataset(options.data)
+    run, dataset = _judged(options.path), read_dataset(options.data)
     with reporting("evaluate", "frames", quiet=options.json) as report:
         metrics = evaluate(run, dataset, options.out, config, report)
     write_report([options.out], options.out / "report.html")
@@ -190,6 +195,18 @@ def _eval(options: argparse.Namespace) -> None:
     else:
         _print_headline(metrics)
         ending.say(f"report: {(options.out / 'report.html').resolve()}")
+
+
+def _judged(path: Path) -> "Run":
+    """A run, or a scene of several in the place of one."""
+    from spacesim.splat.run import load_run
+
+    if path.suffix != ".toml":
+        return load_run(path)
+    from spacesim.eval.composition import ComposedRun
+    from spacesim.splat.compose.scenefile import load_scene
+
+    return cast("Run", ComposedRun(load_scene(path).composition, path))
 
 
 def _report(options: argparse.Namespace) -> None:
@@ -253,6 +270,13 @@ def _data_of(config: dict[str, Any]) -> Path:
     return path
 
 
+def _view(options: argparse.Namespace) -> None:
+    from spacesim.viewer.opened import opened
+    from spacesim.viewer.server import serve
+
+    serve(opened(options.path, options.data, options.out), options.host, options.port, ending.say)
+
+
 def _compose(options: argparse.Namespace) -> None:
     from spacesim.progress import reporting
     from spacesim.splat.compose.output import compose
@@ -271,13 +295,6 @@ def _compose(options: argparse.Namespace) -> None:
     if done.note is not None:
         print(done.note, file=sys.stderr)
     ending.say(" ".join(str(path) for path in written if path is not None))
-
-
-def _view(options: argparse.Namespace) -> None:
-    from spacesim.viewer.opened import opened
-    from spacesim.viewer.server import serve
-
-    serve(opened(options.path, options.data, options.out), options.host, options.port, ending.say)
 
 
 def _verify(options: argparse.Namespace) -> None:
@@ -377,8 +394,8 @@ _COMMANDS = {
     "report": _report,
     "render": _render,
     "sweep": _sweep,
-    "compose": _compose,
     "view": _view,
+    "compose": _compose,
     "verify": _verify,
     "export": _export,
 }

@@ -100,6 +100,13 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument(
         "--antialiased", action="store_true", help="with Mip-Splatting's 2D filter: pictures hold at other distances"
     )
+    one.add_argument(
+        "--init-box", type=float, metavar="X", help="--init random in a cube X times as wide as the object"
+    )
+    one.add_argument("--warm-start", action="store_true", help="pull Gaussians to the foreground before refinement")
+    one.add_argument("--depth-weight", type=float, metavar="W", help="learn depth from the truth, too (0)")
+    one.add_argument("--normal-weight", type=float, metavar="W", help="learn normals from the truth, too (0)")
+    one.add_argument("--prior", choices=("truth", "mesh"), help="whose depth and normals: truth (default) or mesh")
     one.add_argument("--preset", default="fast", help="demo, fast (default) or thesis")
     one.add_argument("--iterations", type=int, metavar="N")
     one.add_argument("--seed", type=int, metavar="N")
@@ -120,8 +127,8 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
         "--visibility-weight", type=float, metavar="W", help="learn shadows from path-traced visibility, too (0)"
     )
 
-    one = command("eval", "judge a run: EVAL/metrics.json, EVAL/report.html, EVAL/frames")
-    one.add_argument("path", type=Path, metavar="RUN")
+    one = command("eval", "judge a run, or a scene of several: EVAL/metrics.json, EVAL/report.html, EVAL/frames")
+    one.add_argument("path", type=Path, metavar="RUN|SCENE.toml")
     one.add_argument("--data", type=Path, required=True, metavar="DATA")
     one.add_argument("--out", type=Path, required=True, metavar="EVAL")
     one.add_argument("--split", default="test", help="test (default), train or all")
@@ -153,18 +160,18 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--size", type=_resolution, metavar="PX", help="pixels of the longer side, or WIDTHxHEIGHT")
     one.add_argument("--keep-frames", action="store_true", help="write every picture into DIR/frames, too")
 
-    one = command("compose", "several runs in one scene: pictures, depth, object numbers, shadows, a video")
-    one.add_argument("scene", type=Path, metavar="SCENE.toml", help="runs, poses, Sun, camera: docs/composition.md")
-    one.add_argument("--out", type=Path, required=True, metavar="DIR")
-    one.add_argument("--size", type=_resolution, metavar="PX", help="pixels of the longer side, or WIDTHxHEIGHT")
-    one.add_argument("--ply", type=Path, metavar="FILE", help="write the scene as plain Gaussians, too")
-
     one = command("view", "look at a run or a composed scene in the browser")
     one.add_argument("path", type=Path, metavar="RUN|SCENE.toml")
     one.add_argument("--data", type=Path, metavar="DATA", help="whose cameras and truth (of a run: its own)")
     one.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="to listen at (this machine alone)")
     one.add_argument("--port", type=int, default=8080, metavar="N", help="to listen at, or the next free one (8080)")
     one.add_argument("--out", type=Path, metavar="DIR", help="where scenes are saved (the working directory)")
+
+    one = command("compose", "several runs in one scene: pictures, depth, object numbers, shadows, a video")
+    one.add_argument("scene", type=Path, metavar="SCENE.toml", help="runs, poses, Sun, camera: docs/composition.md")
+    one.add_argument("--out", type=Path, required=True, metavar="DIR")
+    one.add_argument("--size", type=_resolution, metavar="PX", help="pixels of the longer side, or WIDTHxHEIGHT")
+    one.add_argument("--ply", type=Path, metavar="FILE", help="write the scene as plain Gaussians, too")
 
     one = command("verify", "whether every file of a dataset is there and can be read", needs_backend=False)
     one.add_argument("data", type=Path, metavar="DATA")

@@ -13,6 +13,7 @@ from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.strategies.mcmc import McmcConfig
 from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig
 from spacesim.splat.train.strategies.support_aware import SupportAwareConfig
+from spacesim.splat.train.warm_start import WarmStartConfig
 
 METHODS = ("vanilla", "relight", "shadow-map", "shadow-splat", "park")
 STRATEGIES = ("default", "mesh-aware", "support-aware", "mcmc")
@@ -20,7 +21,14 @@ INITS = ("mesh", "points", "random")
 PRESETS = ("demo", "fast", "thesis")
 ISOTROPY = 1e-2  #: weight of the isotropy term of `park`, chosen
 MCMC_PENALTY = 1e-2  #: weights of the penalties on opacity and scale of `mcmc` (Kheradmand et al. 2024)
-WEIGHTS = ("visibility_weight", "isotropy_weight", "opacity_weight", "scale_weight", "flatten_weight")
+PRIORS = ("truth", "mesh")
+WEIGHTS = (
+    *("visibility_weight", "isotropy_weight", "opacity_weight", "scale_weight", "flatten_weight"),
+    *("depth_weight", "normal_weight"),
+)
+
+
+_CHOICES = (("method", METHODS), ("strategy", STRATEGIES), ("preset", (None, *PRESETS)), ("prior", PRIORS))
 
 
 @dataclass(frozen=True)
@@ -63,6 +71,11 @@ class TrainConfig:
     opacity_weight: float = 0.0  #: of the mean opacity (`mcmc`)
     scale_weight: float = 0.0  #: of the mean scale, per scene scale (`mcmc`)
     flatten_weight: float = 0.0  #: of the mean shortest scale, per scene scale: Gaussians become discs
+    depth_weight: float = 0.0  #: of the depth's mean error, per scene scale; see `depth_loss`
+    normal_weight: float = 0.0  #: of 1 less the cosine between normals; see `normal_loss`
+    prior: str = "truth"  #: truth or mesh: whose depth and normals these are
+    warm_start: WarmStartConfig | None = None  #: foreground attraction (thesis 5.3); None for none
+    init_box: float | None = None  #: side of the cube that `random` fills, in sizes of the object
     checkpoint_every: int = 1_000  #: iterations
     rates: LearningRates = field(default_factory=LearningRates)
     refinement: DefaultStrategyConfig = field(default_factory=DefaultStrategyConfig)  #: of every strategy
@@ -71,13 +84,17 @@ class TrainConfig:
     mcmc: McmcConfig = field(default_factory=McmcConfig)
 
     def __post_init__(self) -> None:
-        for name, allowed in (("method", METHODS), ("strategy", STRATEGIES), ("preset", (None, *PRESETS))):
+        for name, allowed in _CHOICES:
             if getattr(self, name) not in allowed:
                 raise InputError(
                     f"--{name}: expected one of {', '.join(filter(None, allowed))}, found {getattr(self, name)!r}"
                 )
         if self.init is not None and self.init not in INITS:
             raise InputError(f"--init: expected one of {', '.join(INITS)}, found {self.init!r}")
+        if self.init_box is not None and not 0 < self.init_box < float("inf"):
+            raise InputError(f"--init-box: expected a number above 0, found {self.init_box}")
+        if self.init_box is not None and self.init != "random":
+            raise InputError(f"--init-box: expected --init random, found {self.init}")
         if self.iterations < 1:
             raise InputError(f"--iterations: expected at least 1, found {self.iterations}")
         if self.views_per_step < 1:
@@ -96,6 +113,12 @@ class TrainConfig:
                 raise InputError(f"--{option}: expected 0 or more, found {getattr(self, name)}")
         if self.visibility_weight > 0 and not (self.light and self.light.shadow):
             raise InputError(f"--visibility-weight: expected a method with shadows, found {self.method}")
+
+    @property
+    def shape_terms(self) -> tuple[str, ...]:
+        """Which of depth and normals are told to training."""
+        weights = {"depth": self.depth_weight, "normal": self.normal_weight}
+        return tuple(name for name, weight in weights.items() if weight > 0)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for config.json."""
@@ -138,6 +161,15 @@ def preset(name: str, method: str = "vanilla", strategy: str = "default") -> Tra
     penalty = MCMC_PENALTY if strategy == "mcmc" else 0.0
     config = replace(_schedule(name), method=method, light=light, isotropy_weight=isotropy, strategy=strategy)
     return replace(config, opacity_weight=penalty, scale_weight=penalty)
+
+
+def warm_start(name: str) -> WarmStartConfig:
+    """Of a preset: `thesis` as in table 5.7, the others shorter, as their training is (chosen)."""
+    if name == "thesis":
+        return WarmStartConfig()
+    if name == "fast":
+        return WarmStartConfig(steps=1_000, decay=1_000, conservative=500)
+    return WarmStartConfig(steps=500, decay=500, conservative=250)
 
 
 def _schedule(name: str) -> TrainConfig:

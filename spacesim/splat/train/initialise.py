@@ -17,13 +17,21 @@ FEATURES = 0.3  #: standard deviation of the features at the start, chosen
 
 
 def initial_gaussians(
-    dataset: Dataset, init: str | None, count: int, sh_degree: int, seed: int, features: int = 0
+    dataset: Dataset,
+    init: str | None,
+    count: int,
+    sh_degree: int,
+    seed: int,
+    features: int = 0,
+    box: float | None = None,
 ) -> Gaussians:
     """At most `count` Gaussians: isotropic, as wide as the mean distance to their three nearest neighbours.
 
     With `features` > 0 they have that many, normally distributed, and no harmonics.
     init: "mesh" samples the ground-truth mesh evenly, "points" takes the dataset's points, "random" fills the cube
-    around the scene; None takes points, else the mesh, else random. Raises InputError where `init` is not to be had.
+    around the scene; None takes points, else the mesh, else random
+    box: side of that cube in sizes of the object; None: within the cameras
+    Raises InputError where `init` is not to be had.
     """
     rng = np.random.default_rng([seed, 0])
     if init is None:
@@ -33,7 +41,7 @@ def initial_gaussians(
     elif init == "mesh":
         means, colours = _from_mesh(dataset, count, rng)
     else:
-        means, colours = _at_random(dataset, count, rng)
+        means, colours = _at_random(dataset, count, rng, box)
     gaussians = gaussians_at(means, colours, -1 if features else sh_degree)
     if features:
         values = FEATURES * rng.standard_normal((features, gaussians.count))
@@ -93,11 +101,28 @@ def _from_mesh(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[
     return np.asarray(points), np.full((count, 3), 0.5)
 
 
-def _at_random(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Uniform in the cube about the point that the cameras look at, within which they all stand."""
+def _at_random(
+    dataset: Dataset, count: int, rng: np.random.Generator, box: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform in a cube about the point that the cameras look at: as wide as the nearest camera is far, or `box` times
+    as wide as the object."""
     center = focus_point(dataset)
     half = 0.5 * min(np.linalg.norm(f.camera.position - center) for f in dataset.train)
+    if box is not None:
+        half = 0.5 * box * object_size(dataset)
     return center + rng.uniform(-half, half, (count, 3)), rng.uniform(0, 1, (count, 3))
+
+
+def object_size(dataset: Dataset) -> float:
+    """Metres: the longest side of the box around the dataset's mesh, or its points. InputError without either."""
+    if dataset.mesh_path is not None:
+        vertices, faces = read_mesh(dataset.root / dataset.mesh_path)
+        points = vertices[faces.ravel()]
+    elif dataset.ply_file_path is not None:
+        points = read_points(dataset.root / dataset.ply_file_path)[0]
+    else:
+        raise InputError(f"{dataset.root}: --init-box expects a mesh or points that tell the object's size, found none")
+    return float(np.ptp(points, axis=0).max())
 
 
 def farthest_camera(dataset: Dataset, center: np.ndarray) -> float:

@@ -29,6 +29,22 @@ def visibility_loss(prediction: Any, truth: Any, valid: Any) -> Any:
     return dr.sum(dr.select(counts, dr.abs(prediction - truth), 0)) / dr.width(truth)
 
 
+def depth_loss(blended: Any, transmittance: Any, truth: Any, valid: Any) -> Any:
+    """Mean |sum_i w_i (z_i - z)| over the surface's pixels, as a share of all pixels: the expected depth's error, times
+    alpha. blended: plane of sum_i w_i z_i;  truth: plane of z, 0 where there is no surface;  both in one unit"""
+    counts = valid & (truth > 0)
+    error = dr.abs(blended - (1 - transmittance) * truth)
+    return dr.sum(dr.select(counts, error, 0)) / dr.width(truth)
+
+
+def normal_loss(blended: Any, transmittance: Any, truth: Any, valid: Any) -> Any:
+    """Mean of sum_i w_i (1 - n_i . n) over the surface's pixels, as a share of all pixels (Huang et al. 2024, 2DGS,
+    with the true normal). blended: Array3f of sum_i w_i n_i;  truth: Array3f, unit, 0 where there is no surface"""
+    counts = valid & (dr.squared_norm(truth) > 0.25)
+    error = 1 - transmittance - dr.dot(blended, truth)
+    return dr.sum(dr.select(counts, error, 0)) / dr.width(truth)
+
+
 def penalty(name: str, gaussians: Gaussians) -> Any:
     """[N] what a named penalty on Gaussians adds up; lengths in metres. The weight of the sum is the caller's.
 

@@ -17,18 +17,24 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Dataset
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.light import LightModel, TrainingFrame
-from spacesim.splat.project import Footprints, Pinhole, Splats, project
+from spacesim.splat.project import Pinhole, Splats
 from spacesim.splat.rasterize import backward, forward
-from spacesim.splat.render import view_colours
 from spacesim.splat.tiles import bin_splats
-from spacesim.splat.tone import decoded, encoded
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.initialise import farthest_camera, initial_gaussians, scene_scale, surface_normals
-from spacesim.splat.train.losses import penalty, photometric_loss, visibility_loss
-from spacesim.splat.train.optimizer import Adam, adam_step
+from spacesim.splat.train.initialise import (
+    farthest_camera,
+    focus_point,
+    initial_gaussians,
+    scene_scale,
+    surface_normals,
+)
+from spacesim.splat.train.optimizer import Adam
+from spacesim.splat.train.prior import MeshPrior
+from spacesim.splat.train.stages import LossConfig, Target, picture_loss, project_views, update, update_light
 from spacesim.splat.train.strategies.choose import strategy_of
 from spacesim.splat.train.views import TrainingViews, View
+from spacesim.splat.train.warm_start import Attraction, WarmStart
 
 HISTORY_EVERY = 50  #: iterations between two entries of the history
 RECORDINGS = 64  #: of a stage that are kept: one for each size of picture and degree of harmonics
@@ -53,20 +59,34 @@ class Trainer:
 
     def __init__(self, dataset: Dataset, config: TrainConfig) -> None:
         self.config, self.iteration = config, 0
-        self.views = TrainingViews(dataset, config.seed, config.light is not None, config.visibility_weight > 0)
+        self.views = _views(dataset, config)
         self.scene_scale = scene_scale(dataset)
         features = config.light.features if config.light else 0
-        start = config.init_count, config.sh_degree, config.seed, features
+        start = config.init_count, config.sh_degree, config.seed, features, config.init_box
         self.gaussians = initial_gaussians(dataset, config.init, *start)
         self.optimizer = Adam(self.gaussians.rows())
         self.light = self._initial_light(dataset)
         self.light_optimizer = Adam(self.light.weights if self.light else [])
         self.strategy = strategy_of(config, dataset, self.scene_scale, self.gaussians.count)
+        self.warm_start: WarmStart | None = None
+        if config.warm_start is not None:
+            centre = focus_point(dataset)
+            self.warm_start = WarmStart(config.warm_start, self.views, centre, self.gaussians.count)
+            offsets = self.gaussians.to_numpy()["means"] - centre
+            self._start_radius = float(np.linalg.norm(offsets, axis=1).max())
+        self._terms = LossConfig(
+            config.ssim_weight,
+            config.visibility_weight,
+            config.depth_weight,
+            config.normal_weight,
+            self.scene_scale,
+            config.light is not None and config.light.linear,
+        )
         self.history: list[dict[str, float]] = []
-        self._project = recorded(_project, RECORDINGS)
-        self._loss = recorded(_loss, RECORDINGS)
-        self._update = recorded(_update, RECORDINGS)
-        self._update_light = recorded(_update_light, RECORDINGS)
+        self._project = recorded(project_views, RECORDINGS)
+        self._loss = recorded(picture_loss, RECORDINGS)
+        self._update = recorded(update, RECORDINGS)
+        self._update_light = recorded(update_light, RECORDINGS)
 
     def run(self, on_progress: Callable[[Progress], None], on_checkpoint: Callable[[], None]) -> None:
         """Train from `self.iteration` to the end."""
@@ -92,61 +112,94 @@ class Trainer:
 
         self.iteration += 1
         self.strategy.disturb(self.iteration, self.gaussians, self.means_rate(index), config.seed)
-        rng = np.random.default_rng([config.seed, 2, self.iteration])
-        self.strategy.refine(self.iteration, self.gaussians, self.optimizer, rng)
+        self._refine()
         losses = [look.loss for look in looks]
         return losses[0] if count == 1 else sum(losses, ad.Float(0)) / count
 
+    def _refine(self) -> None:
+        """After a step: what the strategy does, or in the time of the warm start the rescue."""
+        warm, done = self.warm_start, self.iteration
+        if warm is not None and warm.active(done - 1):
+            warm.after_step(done, self.gaussians)
+            return
+        rng = np.random.default_rng([self.config.seed, 2, done])
+        leniency = 1.0 if warm is None else warm.config.leniency(done)
+        self.strategy.refine(done, self.gaussians, self.optimizer, rng, leniency)
+
     def _look(self, rows: list[Any], degree: int, number: int) -> "_Look":
         """Blend view `number` of the training, compare, and go back."""
-        view = self.views.at_step(number)
+        config, view, index = self.config, self.views.at_step(number), self.iteration
         camera = Pinhole.of(view.camera)
         size = width, height = camera.width, camera.height
-        splats, footprints, colour = self._project(rows, camera, degree, self.config.antialiased)
+        splats, footprints, values = self._project(
+            rows, camera, degree, config.antialiased, config.shape_terms, self.scene_scale
+        )
         shading = self.light.shade(self.gaussians, camera, view.sun) if self.light and view.sun is not None else None
-        supervised = shading is not None and self.config.visibility_weight > 0
         if shading:
-            colour = [*shading.colours, shading.visibility] if supervised else shading.colours
+            values["colour"] = shading.colours
+            if config.visibility_weight > 0:
+                values["visibility"] = [shading.visibility]
         lists = bin_splats(splats, footprints, width, height)
-        blended = forward(splats, colour, lists, width, height, adjoint=True)
-        rgba, valid, visibility = self.views.pixels(view)
-        target = rgba, ad.Float(self.background(number, view)), valid, visibility
-        linear = self.config.light is not None and self.config.light.linear
-        how = self.config.ssim_weight, self.config.visibility_weight, linear
-        loss, by_colour, by_transmittance = self._loss(blended.features, blended.transmittance, target, size, *how)
-        watched = self.strategy.watches(self.iteration + 1)
-        by_splat = backward(splats, blended, lists, size, by_colour, by_transmittance, absolute=watched)
+        blended = forward(splats, [v for group in values.values() for v in group], lists, width, height, adjoint=True)
+        planes, attraction = iter(blended.features), self._attraction(view)
+        by_name = {name: [next(planes) for _ in group] for name, group in values.items()}
+        target = self._target(number, view, attraction)
+        loss, by_plane, by_transmittance = self._loss(by_name, blended.transmittance, target, size, self._terms)
+        watched = self.strategy.watches(index + 1) and not self._warming(index)
+        by_planes = [plane for group in by_plane.values() for plane in group]
+        by_splat = backward(splats, blended, lists, size, by_planes, by_transmittance, absolute=watched)
         if watched:
             gradient = dr.sqrt(
                 dr.square(by_splat.absolute_x * (0.5 * width)) + dr.square(by_splat.absolute_y * (0.5 * height))
             )
             radius = dr.maximum(footprints.half_width, footprints.half_height) / max(width, height)
             self.strategy.observe(gradient, radius, footprints.visible)
+        found = iter(by_splat.features)
+        by_value = {name: [next(found) for _ in group] for name, group in values.items()}
+        by_rows = self.warm_start.pull(rows, camera, attraction, index) if self.warm_start and attraction else []
         if not shading or not self.light:
-            return _Look(camera, by_splat.splats, by_splat.features, loss)
-        of_visibility = by_splat.features[3] if supervised else None
-        by_light = self.light.adjoint(shading, by_splat.features[:3], of_visibility)
-        return _Look(camera, by_splat.splats, [], loss, by_light.features, by_light.geometry, by_light.weights)
+            return _Look(camera, by_splat.splats, by_value, loss, by_rows=by_rows)
+        of_visibility = by_value.pop("visibility", [None])[0]
+        by_light = self.light.adjoint(shading, by_value.pop("colour"), of_visibility)
+        by_rows = _added(by_light.geometry, by_rows)
+        return _Look(camera, by_splat.splats, by_value, loss, by_light.features, by_rows, by_light.weights)
+
+    def _warming(self, index: int) -> bool:
+        """Whether the warm start keeps refinement off in step number `index`, the first of which is 0."""
+        return self.warm_start is not None and self.warm_start.active(index)
+
+    def _attraction(self, view: View) -> Attraction | None:
+        """What the warm start pulls with in this step, if it still does."""
+        warm = self.warm_start
+        return warm.attraction(view) if warm and warm.config.strength(self.iteration) > 0 else None
+
+    def _target(self, number: int, view: View, attraction: Attraction | None) -> Target:
+        rgba, valid, truth = self.views.pixels(view)
+        if self.warm_start and attraction:
+            truth = {
+                **truth,
+                "foreground": [attraction.mask, ad.Float(self.warm_start.config.strength(self.iteration))],
+            }
+        return Target(rgba, ad.Float(self.background(number, view)), valid, truth)
 
     def _move_gaussians(self, rows: list[Any], degree: int, looks: list["_Look"]) -> None:
         moments = self.optimizer.first, self.optimizer.second
         factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
-        gradients = [(look.camera, look.by_splats, look.by_colour, look.by_features, look.by_rows) for look in looks]
-        more = self._penalties(), self.config.antialiased
+        gradients = [(look.camera, look.by_splats, look.by_value, look.by_features, look.by_rows) for look in looks]
+        more = self._penalties(), self.config.antialiased, self.scene_scale
         rows, first, second = self._update(rows, moments, degree, gradients, factors, *more)
         self.gaussians = Gaussians.from_rows(rows)
         self.optimizer.first, self.optimizer.second = first, second
 
     def _penalties(self) -> dict[str, Any]:
         """{name: weight of each Gaussian's share} of the penalties on Gaussians that the configuration has."""
-        config, count = self.config, self.gaussians.count
-        of_lengths = {
-            "isotropy": config.isotropy_weight,
-            "scale": config.scale_weight,
-            "flatten": config.flatten_weight,
+        config, count, unit = self.config, self.gaussians.count, self.scene_scale
+        weights = {
+            "isotropy": config.isotropy_weight / unit,
+            "scale": config.scale_weight / unit,
+            "flatten": config.flatten_weight / unit,
+            "opacity": config.opacity_weight,
         }
-        weights = {name: weight / self.scene_scale for name, weight in of_lengths.items()}
-        weights["opacity"] = config.opacity_weight
         return {name: ad.Float(weight / count) for name, weight in weights.items() if weight > 0}
 
     def _move_light(self, light: LightModel, looks: list["_Look"]) -> None:
@@ -167,6 +220,8 @@ class Trainer:
                 moments = getattr(optimizer, order)
                 tensors |= {f"{name}.{order}.{i:02d}": np.array(moment) for i, moment in enumerate(moments)}
         tensors |= {f"strategy.{name}": np.array(value) for name, value in self.strategy.state.items()}
+        if self.warm_start and self._warming(self.iteration):
+            tensors |= {f"warm_start.{name}": np.array(value) for name, value in self.warm_start.state.items()}
         header = {"iteration": self.iteration, "adam_steps": self.optimizer.steps, "history": self.history}
         write_tensors(path, tensors, header)
 
@@ -185,9 +240,14 @@ class Trainer:
             _restore_moments(light_optimizer, tensors, "adam.light")
             state = {name: ad.Float(tensors[f"strategy.{name}"]) for name in self.strategy.state}
             iteration, steps, history = int(header["iteration"]), int(header["adam_steps"]), list(header["history"])
+            if self.warm_start and self._warming(iteration):
+                warm = {name: ad.Float(tensors[f"warm_start.{name}"]) for name in self.warm_start.state}
+                state_sizes = {dr.width(row) for row in (*state.values(), *warm.values())}
+            else:
+                warm, state_sizes = {}, {dr.width(row) for row in state.values()}
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {error}") from None
-        if not {dr.width(row) for row in state.values()} <= {gaussians.count}:
+        if not state_sizes <= {gaussians.count}:
             raise InputError(f"{path}: expected statistics of {gaussians.count} Gaussians, found others")
         if not 0 <= iteration <= self.config.iterations:
             raise InputError(f"{path}: expected an iteration up to {self.config.iterations}, found {iteration}")
@@ -195,6 +255,8 @@ class Trainer:
         self.optimizer, self.light_optimizer = optimizer, light_optimizer
         optimizer.steps = light_optimizer.steps = steps
         self.iteration, self.history = iteration, history
+        if self.warm_start and warm:
+            self.warm_start.state = warm
 
     def background(self, index: int, view: View) -> np.ndarray:
         """[3] float32: the colour that a step's picture and its truth are laid over; black below opaque pictures."""
@@ -204,18 +266,19 @@ class Trainer:
 
     def rates(self, index: int) -> Iterator[float]:
         """The step size of each row."""
-        rates = self.config.rates
-        yield from (
-            [self.means_rate(index)] * 3 + [rates.log_scales] * 3 + [rates.quaternions] * 4 + [rates.logit_opacities]
-        )
+        rates, means = self.config.rates, self.means_rate(index)
+        if self.config.warm_start is not None:
+            means = self.config.warm_start.means_rate(index, means, self._start_radius)
+        yield from ([means] * 3 + [rates.log_scales] * 3 + [rates.quaternions] * 4 + [rates.logit_opacities])
         if self.gaussians.features is not None:
             yield rates.features
         else:
             yield from [rates.sh_constant] * 3 + [rates.sh_rest] * (len(self.gaussians.sh) - 3)
 
     def means_rate(self, index: int) -> float:
-        """Metres; falls exponentially over the whole training."""
-        rates, done = self.config.rates, index / self.config.iterations
+        """Metres; falls exponentially over the whole training, or over what follows the warm start."""
+        rates, waits = self.config.rates, self.config.warm_start.steps if self.config.warm_start else 0
+        done = max(index - waits, 0) / max(self.config.iterations - waits, 1)
         return float(self.scene_scale * rates.means ** (1 - done) * rates.means_final**done)
 
     def _initial_light(self, dataset: Dataset) -> LightModel | None:
@@ -241,16 +304,30 @@ class Trainer:
 
 @dataclass
 class _Look:
-    """What a step has learned from one view: gradients of its splats and of the colours (3 arrays [N]), or, of a method
-    of light, of features [F * N] and weights, and of the first rows where shadows move the Gaussians."""
+    """What a step has learned from one view: gradients of its splats and of the values that it blends, by name (of a
+    method of light without colours), of features [F * N] and weights, and of the first rows where shadows or the warm
+    start move the Gaussians."""
 
     camera: Pinhole
     by_splats: Splats
-    by_colour: list[Any]
+    by_value: dict[str, list[Any]]
     loss: Any
     by_features: Any = None
     by_rows: list[Any] = field(default_factory=list)
     by_weights: Any = None
+
+
+def _added(one: list[Any], other: list[Any]) -> list[Any]:
+    """Rows added up, those that only one has as they are."""
+    longer, shorter = (one, other) if len(one) >= len(other) else (other, one)
+    return [row + more for row, more in zip(longer, shorter, strict=False)] + longer[len(shorter) :]
+
+
+def _views(dataset: Dataset, config: TrainConfig) -> TrainingViews:
+    """The training pictures with the truth that the loss asks for."""
+    truth = config.shape_terms + (("visibility",) if config.visibility_weight > 0 else ())
+    prior = MeshPrior.of(dataset.root, dataset.mesh_path) if config.shape_terms and config.prior == "mesh" else None
+    return TrainingViews(dataset, config.seed, config.light is not None, truth, prior)
 
 
 def _restore_moments(optimizer: Adam, tensors: Mapping[str, np.ndarray], name: str) -> None:
@@ -262,92 +339,3 @@ def _restore_moments(optimizer: Adam, tensors: Mapping[str, np.ndarray], name: s
             if tensors[key].shape != (dr.width(fresh),):
                 raise ValueError(f"{key}: expected {dr.width(fresh)} numbers, found {tensors[key].shape}")
             moments[i] = ad.Float(tensors[key])
-
-
-def _project(
-    rows: list[Any], camera: Pinhole, degree: int, antialiased: bool = False
-) -> tuple[Splats, Footprints, list[Any]]:
-    """Splats, footprints and colours (3 x [N], or none where they come from a field), without gradients."""
-    gaussians = Gaussians.from_rows(rows)
-    splats, footprints = project(gaussians, camera, antialiased)
-    return splats, footprints, [] if gaussians.features is not None else list(view_colours(gaussians, camera, degree))
-
-
-def _loss(
-    planes: list[Any],
-    transmittance: Any,
-    target: tuple[Any, Any, Any, list[Any]],
-    size: tuple[int, int],
-    ssim_weight: float,
-    visibility_weight: float = 0.0,
-    linear: bool = False,
-) -> tuple[Any, list[Any], Any]:
-    """Loss of a picture over the target's background, and its gradients by its planes (colour, and visibility where it
-    is supervised) and transmittance. linear: colours and background are blended in linear light."""
-    rgba, background, valid, visibility = target
-    channels = [ad.Float((rgba >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24)]
-    below = ad.Array3f([dr.gather(ad.Float, background, ad.UInt32(c)) for c in range(3)])
-    straight = ad.Array3f(channels[:3])
-    if linear:
-        straight, below = decoded(straight), decoded(below)
-    truth = straight * channels[3] + (1 - channels[3]) * below
-    planes, transmittance = [ad.Float(plane) for plane in planes], ad.Float(transmittance)
-    dr.enable_grad(planes, transmittance)
-    picture = dr.select(valid, ad.Array3f(planes[:3]) + transmittance * below, truth)
-    if linear:
-        picture, truth = encoded(picture), encoded(truth)
-    loss = photometric_loss(picture, truth, *size, ssim_weight=ssim_weight)
-    if visibility:
-        loss += visibility_weight * visibility_loss(planes[3], visibility[0], valid)
-    dr.backward(loss)
-    return dr.detach(loss), [dr.grad(plane) for plane in planes], dr.grad(transmittance)
-
-
-def _update(
-    rows: list[Any],
-    moments: tuple[list[Any], list[Any]],
-    degree: int,
-    gradients: list[tuple[Pinhole, Splats, list[Any], Any, list[Any]]],
-    factors: Any,
-    penalties: Mapping[str, Any],
-    antialiased: bool = False,
-) -> tuple[list[Any], list[Any], list[Any]]:
-    """Gradients of the splats, and of the colours or features, in each view to the mean gradient of the parameters, and
-    an Adam step.
-
-    factors: Float [2 + R], Adam's two corrections and the step size of each row;  penalties: weights by name.
-    """
-    rows = [ad.Float(row) for row in rows]
-    dr.enable_grad(rows)
-    gaussians = Gaussians.from_rows(rows)
-    along: Any = ad.Float(0)
-    for camera, by_splat, by_colour, by_features, by_rows in gradients:
-        splats, _ = project(gaussians, camera, antialiased)
-        for name in ("opacity", "x", "y", "a", "b", "c"):
-            along += getattr(splats, name) * getattr(by_splat, name)
-        for row, gradient in zip(rows, by_rows, strict=False):
-            along += row * gradient
-        if by_features is None:
-            for value, gradient in zip(view_colours(gaussians, camera, degree), by_colour, strict=True):
-                along += value * gradient
-    for name, weight in penalties.items():
-        along += len(gradients) * weight * penalty(name, gaussians)
-    dr.backward(along if len(gradients) == 1 else along / len(gradients))
-    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(2 + len(rows))]
-    by_row = [dr.grad(row) for row in rows]
-    if gaussians.features is not None:
-        by_row[-1] = _mean([by_features for *_, by_features, _ in gradients])
-    return adam_step(dr.detach(rows), by_row, moments, numbers[2:], (numbers[0], numbers[1]))
-
-
-def _update_light(
-    weights: list[Any], moments: tuple[list[Any], list[Any]], gradients: list[list[Any]], factors: Any
-) -> tuple[list[Any], list[Any], list[Any]]:
-    """An Adam step of the networks by their mean gradient. factors: Float [3], two corrections and the step size."""
-    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(3)]
-    means = [_mean(list(of_views)) for of_views in zip(*gradients, strict=True)]
-    return adam_step(weights, means, moments, [numbers[2]] * len(weights), (numbers[0], numbers[1]))
-
-
-def _mean(values: list[Any]) -> Any:
-    return values[0] if len(values) == 1 else sum(values[1:], values[0]) / len(values)

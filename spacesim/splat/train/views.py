@@ -1,5 +1,6 @@
 """The training pictures: decoded once, kept packed in memory, handed out in a seeded order."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
-from spacesim.data.records import Camera, Dataset
+from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
 
 CACHE_BYTES = 6 * 2**30
@@ -20,7 +21,8 @@ DEVICE_BYTES = 2 * 2**30  #: of pictures that stay on the device, chosen: 512 of
 class View:
     """rgba: [H * W] uint32, 8 bits a channel, red lowest; valid: [H * W] bool, or None where all pixels count;
     opaque: the picture has no transparency, so that what is behind the object is part of it;
-    visibility: [H * W] float32, path-traced, below 0 where there is no surface; None where it is not asked for."""
+    truth: {name: planes [H * W] float32} of what is asked for: "visibility", path-traced, below 0 where there is no
+    surface; "depth", along the optical axis, metres, 0 where there is none; "normal", 3 planes, world axes."""
 
     index: int
     camera: Camera
@@ -28,21 +30,32 @@ class View:
     rgba: np.ndarray
     valid: np.ndarray | None
     opaque: bool
-    visibility: np.ndarray | None = None
+    truth: dict[str, list[np.ndarray]]
 
 
 class TrainingViews:
     """Views of a dataset's training frames by index, decoded at first use and kept while `CACHE_BYTES` last.
 
-    suns: every frame must name its Sun;  visibility: and have path-traced truth. Raises InputError where one has not.
+    suns: every frame must name its Sun;  truth: path-traced planes that it must have, by name
+    surface: gives depth and normals of a camera, in place of the path-traced ones; see `prior.MeshPrior`
+    Raises InputError where a frame has not what it must have.
     """
 
-    def __init__(self, dataset: Dataset, seed: int, suns: bool = False, visibility: bool = False) -> None:
+    def __init__(
+        self,
+        dataset: Dataset,
+        seed: int,
+        suns: bool = False,
+        truth: Sequence[str] = (),
+        surface: Callable[[Camera], tuple[np.ndarray, np.ndarray]] | None = None,
+    ) -> None:
         if not dataset.train:
             raise InputError(f"{dataset.root}: expected at least one training image, found none")
-        _check_known(dataset, suns, visibility)
-        self.dataset, self.seed, self.visibility = dataset, seed, visibility
-        largest = max(4 * f.camera.width * f.camera.height for f in dataset.train)
+        traced = [name for name in truth if surface is None or name == "visibility"]
+        _check_known(dataset, suns, traced)
+        self.dataset, self.seed, self.truth, self.surface = dataset, seed, tuple(truth), surface
+        self.most_pixels = max(f.camera.width * f.camera.height for f in dataset.train)
+        largest = 4 * self.most_pixels * (1 + sum(3 if name == "normal" else 1 for name in truth))
         self._order = lru_cache(maxsize=1)(self._shuffle)
         self._cached = lru_cache(maxsize=max(1, CACHE_BYTES // largest))(self._load)
         self._uploaded = lru_cache(maxsize=max(1, DEVICE_BYTES // largest))(self._upload)
@@ -58,15 +71,16 @@ class TrainingViews:
         epoch, place = divmod(step, len(self))
         return self[int(self._order(epoch)[place])]
 
-    def pixels(self, view: View) -> tuple[Any, Any, list[Any]]:
-        """(rgba UInt32 [H * W], valid Bool [H * W] or of width 1, [visibility Float [H * W]] or []) of a view."""
-        pixels: tuple[Any, Any, list[Any]] = self._uploaded(view.index)
+    def pixels(self, view: View) -> tuple[Any, Any, dict[str, list[Any]]]:
+        """(rgba UInt32 [H * W], valid Bool [H * W] or of width 1, truth as Floats [H * W]) of a view."""
+        pixels: tuple[Any, Any, dict[str, list[Any]]] = self._uploaded(view.index)
         return pixels
 
-    def _upload(self, index: int) -> tuple[Any, Any, list[Any]]:
+    def _upload(self, index: int) -> tuple[Any, Any, dict[str, list[Any]]]:
         view = self[index]
         valid = ad.Bool(True) if view.valid is None else ad.Bool(view.valid)
-        return ad.UInt32(view.rgba), valid, [] if view.visibility is None else [ad.Float(view.visibility)]
+        truth = {name: [ad.Float(plane) for plane in planes] for name, planes in view.truth.items()}
+        return ad.UInt32(view.rgba), valid, truth
 
     def _shuffle(self, epoch: int) -> np.ndarray:
         return np.random.default_rng([self.seed, 1, epoch]).permutation(len(self))
@@ -78,15 +92,29 @@ class TrainingViews:
         bytes_ = np.ascontiguousarray(np.rint(rgba * 255).astype(np.uint8)).reshape(-1, 4)
         valid = None if image.valid.all() else image.valid.ravel()
         sun = None if frame.sun is None else frame.sun.direction
-        visibility = None
-        if self.visibility:
-            truth = load_truth(self.dataset, frame)
-            visibility = np.where(truth.shadow > 0, truth.sun_visibility, -1).astype(np.float32).ravel()
         opaque = bool((image.alpha == 1).all())
-        return View(index, frame.camera, sun, bytes_.view("<u4").ravel(), valid, opaque, visibility)
+        return View(index, frame.camera, sun, bytes_.view("<u4").ravel(), valid, opaque, self._planes(frame))
+
+    def _planes(self, frame: Frame) -> dict[str, list[np.ndarray]]:
+        """What is asked for of a frame's truth, or of the surface as its camera sees it."""
+        traced = None
+        if "visibility" in self.truth or (self.truth and self.surface is None):
+            traced = load_truth(self.dataset, frame)
+        planes: dict[str, np.ndarray] = {}
+        if traced is not None:
+            planes["visibility"] = np.where(traced.shadow > 0, traced.sun_visibility, -1)[..., None]
+        if self.surface is not None:
+            depth, normal = self.surface(frame.camera)
+        elif traced is not None:
+            depth, normal = traced.depth, traced.normal
+        else:
+            return {}
+        planes |= {"depth": depth[..., None], "normal": normal}
+        wanted = {name: np.moveaxis(planes[name], -1, 0).astype(np.float32) for name in self.truth}
+        return {name: [np.ascontiguousarray(plane).ravel() for plane in group] for name, group in wanted.items()}
 
 
-def _check_known(dataset: Dataset, suns: bool, visibility: bool) -> None:
+def _check_known(dataset: Dataset, suns: bool, traced: Sequence[str]) -> None:
     """Raises InputError in one sentence that names the first frame which lacks what is asked for."""
     for frame in dataset.train:
         if suns and frame.sun is None:
@@ -94,8 +122,8 @@ def _check_known(dataset: Dataset, suns: bool, visibility: bool) -> None:
                 f"{dataset.root}: expected sun_direction in every training frame, for methods of light, "
                 f"found none in {frame.file_path}"
             )
-        if visibility and frame.gt_path is None:
+        if traced and frame.gt_path is None:
             raise InputError(
-                f"{dataset.root}: expected path-traced visibility (gt_path) in every training frame, "
+                f"{dataset.root}: expected path-traced {' and '.join(traced)} (gt_path) in every training frame, "
                 f"found none in {frame.file_path}"
             )

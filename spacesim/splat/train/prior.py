@@ -1,0 +1,52 @@
+"""Depth and normals of a mesh as a camera sees it: what training may be told of a shape that is known."""
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim import backend
+from spacesim.data.errors import InputError
+from spacesim.data.mesh import read_mesh
+from spacesim.data.records import Camera
+
+
+class MeshPrior:
+    """One ray through each pixel's centre, as labels of our own data have it."""
+
+    def __init__(self, path: Path) -> None:
+        """Of a mesh file in the world's axes, metres. Raises InputError where it holds none."""
+        vertices, faces = read_mesh(path)
+        mi = backend.mitsuba()
+        mesh = mi.Mesh("prior", len(vertices), len(faces))
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = vertices.astype(np.float32).ravel()
+        parameters["faces"] = faces.astype(np.uint32).ravel()
+        parameters.update()
+        self._scene: Any = mi.load_dict({"type": "scene", "mesh": mesh})
+
+    @staticmethod
+    def of(root: Path, mesh_path: str | None) -> "MeshPrior":
+        """Of a dataset's mesh. Raises InputError where it has none."""
+        if mesh_path is None:
+            raise InputError(f"{root}: --prior mesh expects a mesh.ply, found none")
+        return MeshPrior(root / mesh_path)
+
+    def __call__(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """(depth [H, W] along the optical axis, metres; normal [H, W, 3], unit, world axes, towards the camera); 0
+        where the ray meets nothing."""
+        mi = backend.mitsuba()
+        column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], axis=-1)
+        world = rays.reshape(-1, 3) @ camera.world_from_camera[:3, :3].T
+        length = np.linalg.norm(world, axis=1)
+        origin = mi.Point3f(*camera.position.tolist())
+        direction = mi.Vector3f(np.ascontiguousarray((world / length[:, None]).T, np.float32))
+        found = self._scene.ray_intersect(mi.Ray3f(origin, direction))
+        hit = found.is_valid()
+        normal = dr.select(dr.dot(found.n, direction) > 0, -found.n, found.n)
+        depth = np.where(np.array(hit), np.array(found.t) / length, 0).astype(np.float32)
+        normals = np.array(dr.select(hit, normal, 0), np.float32).T
+        shape = camera.height, camera.width
+        return depth.reshape(shape), np.ascontiguousarray(normals).reshape(*shape, 3)

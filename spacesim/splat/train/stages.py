@@ -1,0 +1,152 @@
+"""The stages of a training step that Dr.Jit differentiates; each is recorded once and replayed."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from spacesim.backend import ad
+from spacesim.splat.cameras import Pinhole
+from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.project import Footprints, Splats, project
+from spacesim.splat.render import view_colours
+from spacesim.splat.surface import normals
+from spacesim.splat.tone import decoded, encoded
+from spacesim.splat.train.losses import depth_loss, normal_loss, penalty, photometric_loss, visibility_loss
+from spacesim.splat.train.optimizer import adam_step
+from spacesim.splat.train.warm_start import foreground_loss
+
+
+def project_views(
+    rows: list[Any], camera: Pinhole, degree: int, antialiased: bool, shape: tuple[str, ...], scale: float
+) -> tuple[Splats, Footprints, dict[str, list[Any]]]:
+    """Splats, footprints and what is blended, Floats [N] by name, without gradients: "colour", none where it comes from
+    a field, and of `shape` "depth", in units of `scale` metres, and "normal"."""
+    gaussians = Gaussians.from_rows(rows)
+    splats, footprints = project(gaussians, camera, antialiased)
+    colour = [] if gaussians.features is not None else list(view_colours(gaussians, camera, degree))
+    return splats, footprints, {"colour": colour, **_shape(gaussians, splats, camera, shape, scale)}
+
+
+def _shape(
+    gaussians: Gaussians, splats: Splats, camera: Pinhole, shape: Iterable[str], scale: float
+) -> dict[str, list[Any]]:
+    found = {}
+    if "depth" in shape:
+        found["depth"] = [splats.depth / scale]
+    if "normal" in shape:
+        found["normal"] = list(normals(gaussians, camera))
+    return found
+
+
+@dataclass
+class Target:
+    """What a picture is compared with. rgba: UInt32 [H * W];  background: Float [3];  valid: Bool [H * W] or of width 1
+    truth: Floats [H * W] by name, see `View`, and "foreground": Bool [H * W] and its weight, Float"""
+
+    rgba: Any
+    background: Any
+    valid: Any
+    truth: dict[str, list[Any]]
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the terms;  scale: metres, the unit of depth;  linear: colours and background are blended in linear
+    light"""
+
+    ssim: float
+    visibility: float
+    depth: float
+    normal: float
+    scale: float
+    linear: bool
+
+
+def picture_loss(
+    planes: dict[str, list[Any]], transmittance: Any, target: Target, size: tuple[int, int], config: LossConfig
+) -> tuple[Any, dict[str, list[Any]], Any]:
+    """Loss of a picture over the target's background, and its gradients by its planes (by name) and transmittance."""
+    channels = [ad.Float((target.rgba >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24)]
+    below = ad.Array3f([dr.gather(ad.Float, target.background, ad.UInt32(c)) for c in range(3)])
+    straight = ad.Array3f(channels[:3])
+    if config.linear:
+        straight, below = decoded(straight), decoded(below)
+    truth = straight * channels[3] + (1 - channels[3]) * below
+    planes = {name: [ad.Float(plane) for plane in group] for name, group in planes.items()}
+    transmittance = ad.Float(transmittance)
+    dr.enable_grad(planes, transmittance)
+    picture = dr.select(target.valid, ad.Array3f(planes["colour"]) + transmittance * below, truth)
+    if config.linear:
+        picture, truth = encoded(picture), encoded(truth)
+    loss = photometric_loss(picture, truth, *size, ssim_weight=config.ssim)
+    known, valid = target.truth, target.valid
+    if "visibility" in planes:
+        loss += config.visibility * visibility_loss(planes["visibility"][0], known["visibility"][0], valid)
+    if "depth" in planes:
+        depth = known["depth"][0] / config.scale
+        loss += config.depth * depth_loss(planes["depth"][0], transmittance, depth, valid)
+    if "normal" in planes:
+        normal = ad.Array3f(planes["normal"]), transmittance, ad.Array3f(known["normal"])
+        loss += config.normal * normal_loss(*normal, valid)
+    if "foreground" in known:
+        mask, weight = known["foreground"]
+        loss += weight * foreground_loss(transmittance, mask)
+    dr.backward(loss)
+    by_plane = {name: [dr.grad(plane) for plane in group] for name, group in planes.items()}
+    return dr.detach(loss), by_plane, dr.grad(transmittance)
+
+
+def update(
+    rows: list[Any],
+    moments: tuple[list[Any], list[Any]],
+    degree: int,
+    gradients: list[tuple[Pinhole, Splats, dict[str, list[Any]], Any, list[Any]]],
+    factors: Any,
+    penalties: Mapping[str, Any],
+    antialiased: bool,
+    scale: float,
+) -> tuple[list[Any], list[Any], list[Any]]:
+    """Gradients of the splats, of what was blended, and of features and first rows, in each view to the mean gradient
+    of the parameters, and an Adam step.
+
+    factors: Float [2 + R], Adam's two corrections and the step size of each row;  penalties: weights by name.
+    """
+    rows = [ad.Float(row) for row in rows]
+    dr.enable_grad(rows)
+    gaussians = Gaussians.from_rows(rows)
+    along: Any = ad.Float(0)
+    for camera, by_splat, by_value, by_features, by_rows in gradients:
+        splats, _ = project(gaussians, camera, antialiased)
+        for name in ("opacity", "x", "y", "a", "b", "c"):
+            along += getattr(splats, name) * getattr(by_splat, name)
+        for row, gradient in zip(rows, by_rows, strict=False):
+            along += row * gradient
+        values = _shape(gaussians, splats, camera, by_value, scale)
+        if by_features is None:
+            values["colour"] = list(view_colours(gaussians, camera, degree))
+        for name, group in values.items():
+            for value, gradient in zip(group, by_value[name], strict=True):
+                along += value * gradient
+    for name, weight in penalties.items():
+        along += len(gradients) * weight * penalty(name, gaussians)
+    dr.backward(along if len(gradients) == 1 else along / len(gradients))
+    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(2 + len(rows))]
+    by_row = [dr.grad(row) for row in rows]
+    if gaussians.features is not None:
+        by_row[-1] = _mean([by_features for *_, by_features, _ in gradients])
+    return adam_step(dr.detach(rows), by_row, moments, numbers[2:], (numbers[0], numbers[1]))
+
+
+def update_light(
+    weights: list[Any], moments: tuple[list[Any], list[Any]], gradients: list[list[Any]], factors: Any
+) -> tuple[list[Any], list[Any], list[Any]]:
+    """An Adam step of the networks by their mean gradient. factors: Float [3], two corrections and the step size."""
+    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(3)]
+    means = [_mean(list(of_views)) for of_views in zip(*gradients, strict=True)]
+    return adam_step(weights, means, moments, [numbers[2]] * len(weights), (numbers[0], numbers[1]))
+
+
+def _mean(values: list[Any]) -> Any:
+    return values[0] if len(values) == 1 else sum(values[1:], values[0]) / len(values)
