@@ -10,7 +10,7 @@ import re
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,7 @@ from spacesim.data.files import write_json
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset, Frame
 from spacesim.eval import grazing, lpips
+from spacesim.eval.geometry import GeometryConfig, judge_geometry
 from spacesim.eval.judge import judge_picture, judge_visibility, light_of, tally_grazing, view_of, write_pictures
 from spacesim.eval.labels import GROUPS
 from spacesim.eval.notes import explain, explain_light
@@ -39,10 +40,12 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """split: "test", "train" or "all";  lpips_weights: see `spacesim.eval.lpips.find_weights`."""
+    """split: "test", "train" or "all";  lpips_weights: see `spacesim.eval.lpips.find_weights`;  geometry: how the
+    shape is judged, None: not at all"""
 
     split: str = "test"
     lpips_weights: Path | None = None
+    geometry: GeometryConfig | None = field(default_factory=GeometryConfig)
 
     def __post_init__(self) -> None:
         if self.split not in ("test", "train", "all"):
@@ -81,7 +84,8 @@ def evaluate(
         judged.append(_judge(run, dataset, frame, known, network, out / "frames" / name))
     sweep, no_sweep = write_sweep(run, dataset, frames, out)
     if progress:
-        progress(len(frames), len(frames), "")
+        progress(len(frames), len(frames), "its shape" if config.geometry else "")
+    shape = judge_geometry(run, dataset, config.geometry)
 
     method = str(run.config.get("method"))
     records = [one.record for one in judged]
@@ -97,11 +101,12 @@ def evaluate(
             "backend": run.backend,
         },
         **_summaries(judged),
-        "geometry": None,
+        "geometry": shape.values,
         "known_suns": _over([one for one in judged if one.known is True]),
         "unseen_suns": _over([one for one in judged if one.known is False]),
         "relight": sweep,
         "notes": [
+            *([shape.note] if shape.note else []),
             *explain(records, [one.source for one in judged], None if network else lpips_sentence, method),
             *explain_light([one.known for one in judged], any(one.grazing is not None for one in judged), no_sweep),
         ],

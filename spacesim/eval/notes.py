@@ -17,7 +17,7 @@ def explain(records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips:
     sources: where each silhouette is from ("truth", "alpha" or "frame");  no_lpips: why there is none at all
     """
     total = len(records)
-    notes = ["Geometry is null: no mesh is extracted from this run yet."]
+    notes = []
     if no_lpips:
         notes.append(f"LPIPS is null; {no_lpips}.")
     if all(record["shadow_mask"] is None for record in records):
