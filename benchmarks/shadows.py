@@ -98,6 +98,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, no refinement", with_shadow(mapped, refine=None)
     yield "map, surface, variance", with_shadow(mapped, mapping=MappingConfig("variance"))
     yield "map, surface, supervised", replace(mapped, visibility_weight=0.1)
+    yield "splat, surface, supervised", replace(splatted, visibility_weight=0.1)
     yield "map, surface, linear", replace(mapped, light=replace(mapped.light, linear=True))
     yield "splat, surface, gradients", with_shadow(splatted, gradients=True)
 
