@@ -3,7 +3,7 @@
 Sums over the pixels of a tile, of each (tile, splat) pair, go into a slot of the pair's own; a second pass adds up each
 splat's slots in order. No two tiles write to one address, so the gradients are the same to the bit in every run.
 
-- `by_tiles`: one lane holds a column of a tile's pixels, as in blending, and replays the tile's list from the last
+- `by_tiles`: one lane holds a block of a tile's pixels, as in blending, and replays the tile's list from the last
   splat blended to the first, recovering each transmittance by division. Lanes meet in a sum for each pair.
 - `by_buckets`: one lane holds a bucket of a tile's list, some pairs, and walks over the tile's pixels, from the state
   that blending kept before the bucket. Lanes share nothing; what they read twice, and the states kept, cost memory.
@@ -15,11 +15,29 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, select
-from spacesim.splat.project import ALPHA_MIN, Splats
-from spacesim.splat.records import ALPHA_MAX, LOG2_E, Blended, bucket_numbers, exponents, lane_pixels, load, store
-from spacesim.splat.tiles import TileLists
+from spacesim.splat.project import Splats
+from spacesim.splat.records import (
+    ALPHA_MAX,
+    LOG2_E,
+    POWER_MIN,
+    Blended,
+    bucket_numbers,
+    exp2,
+    exponents,
+    lane_offsets,
+    lane_pixels,
+    load,
+    packet,
+    packet_sizes,
+    packets,
+    pixel_in_tile,
+    store,
+)
+from spacesim.splat.tiles import TileLists, TileShape
 
 COPIES_BYTES = 2**30  #: that threads' copies of gradient slots may take on a CPU, chosen
+PACKET = 4  #: lanes that run together on any CPU: Dr.Jit's packets have 4, 8 or 16, and start at a multiple
+ONE_PIXEL = TileShape(1, 1, 1)
 
 
 @dataclass
@@ -41,78 +59,108 @@ def by_tiles(
     transmittance_gradient: Any,
     absolute: bool,
 ) -> SplatGradients:
-    """See `rasterize.backward`. A lane for a column of a tile's pixels."""
-    channels, rows, lanes = len(feature_gradients), lists.shape.rows, lists.shape.lanes
-    lane = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * lanes)
-    tile = lane // lanes
-    px, py, column, row = lane_pixels(lane, lists)
-
+    """See `rasterize.backward`. A lane for a block of a tile's pixels."""
+    channels, shape = len(feature_gradients), lists.shape
+    lane, offsets = lane_pixels(lists), lane_offsets(shape)
     width, height = image_size
     transmittance, last, behind, gradients = [], [], [], []
-    for p in range(rows):
-        inside = (column < width) & (row + p < height)
-        pixel = (row + p) * width + column
+    for p, (i, j) in enumerate(offsets):
+        inside = (lane.column + i < width) & (lane.row + j < height)
+        pixel, place = (lane.row + j) * width + lane.column + i, lane.place * shape.pixels + p
         gradients.append([dr.gather(ad.Float, plane, pixel, inside) for plane in feature_gradients])
-        end = dr.gather(ad.Float, blended.tile_transmittance, lane * rows + p)
+        end = dr.gather(ad.Float, blended.tile_transmittance, place)
         transmittance.append(end)
         behind.append(end * dr.gather(ad.Float, transmittance_gradient, pixel, inside))
-        last.append(dr.select(inside, dr.gather(ad.UInt32, blended.last, lane * rows + p), 0))
+        last.append(dr.select(inside, dr.gather(ad.UInt32, blended.last, place), 0))
 
-    arrays = _fours(channels, absolute)
-    mode = reduce_mode(16 * lists.capacity * arrays)
-    slots = [dr.zeros(ad.Float, 4 * lists.capacity) for _ in range(arrays)]
-    records, start = blended.records, dr.gather(ad.UInt32, lists.start, tile)
+    sizes = packet_sizes(_numbers(channels, absolute))
+    mode = reduce_mode(4 * sum(sizes) * lists.capacity, shape)
+    slots = [dr.zeros(ad.Float, size * lists.capacity) for size in sizes]
+    records, start = blended.records, dr.gather(ad.UInt32, lists.start, lane.tile)
 
     def remaining(k: Any, _transmittance: Any, _behind: Any) -> Any:
         return k > start
 
     def replay(k: Any, transmittance: list[Any], behind: list[Any]) -> Any:
         k = k - 1
-        record = load(records, k)
-        dx, dy0 = px - record[0], py - record[1]
+        record = load(records, k, lists.capacity)
+        dx, dy = lane.x - record[0], lane.y - record[1]
         a, b, c = record[2], record[3], record[4]
-        powers = exponents(record, px, py, rows)
+        powers = exponents(record, lane.x, lane.y, shape)
         transmittance, behind = list(transmittance), list(behind)
-        g0, g1, g2, absolute_x, absolute_y = (ad.Float(0) for _ in range(5))
+        moments = Moments(dx, dy)
+        absolute_x, absolute_y = ad.Float(0), ad.Float(0)
         by_feature = [ad.Float(0) for _ in range(channels)]
-        touched = ad.Bool(False)
-        for p in range(rows):
-            dy = dy0 + p
-            unclamped = dr.exp2(powers[p])
+        for p, (i, j) in enumerate(offsets):
+            unclamped = exp2(powers[p])
             alpha = dr.minimum(unclamped, ALPHA_MAX)
-            blends = (alpha >= ALPHA_MIN) & (k < last[p])
-            alpha = dr.select(blends, alpha, 0)
-            inverse = dr.rcp(1 - alpha)
-            before = transmittance[p] * inverse
-            weight = alpha * before
-            along = ad.Float(0)
-            for i in range(channels):
-                along = dr.fma(gradients[p][i], record[6 + i], along)
-                by_feature[i] = dr.fma(weight, gradients[p][i], by_feature[i])
-            by_alpha = dr.fma(along, before, -behind[p] * inverse)
+            blends = (powers[p] >= POWER_MIN) & (k < last[p])
+            # with T behind the pair: T before it is T / (1 - alpha), and its weight alpha T / (1 - alpha)
+            ratio = dr.select(blends, alpha * dr.rcp(1 - alpha), 0)
+            weight = ratio * transmittance[p]
+            along = _dot(gradients[p], record[6:])
+            for n, gradient in enumerate(gradients[p]):
+                by_feature[n] = dr.fma(weight, gradient, by_feature[n])
+            by_log_alpha = ratio * dr.fma(along, transmittance[p], -behind[p])
             behind[p] = dr.fma(weight, along, behind[p])
-            transmittance[p] = before
-            g = dr.select(blends & (unclamped < ALPHA_MAX), by_alpha * alpha, 0)  # dL / d ln alpha
-            g_dy = g * dy
-            g0, g1, g2 = g0 + g, g1 + g_dy, dr.fma(g_dy, dy, g2)
+            transmittance[p] += weight
+            g = dr.select(unclamped < ALPHA_MAX, by_log_alpha, 0)
+            g_dy = moments.add(i, j, g)
             # records hold -a/2, -b, -c/2 in units of log2 e; the factor is put back with the sums below
             if absolute:
-                absolute_x += dr.abs(2 * a * dx * g + b * g_dy)
-                absolute_y += dr.abs(b * dx * g + 2 * c * g_dy)
-            touched |= blends
-        sums = [g0, g0 * dx, g1, g0 * dx * dx, g1 * dx, g2]
+                absolute_x += dr.abs(dr.fma(b, g_dy, 2 * a * (dx + i) * g))
+                absolute_y += dr.abs(dr.fma(2 * c, g_dy, b * (dx + i) * g))
+        sums = moments.sums()
         sums += [absolute_x, absolute_y, *by_feature] if absolute else by_feature
-        sums += [ad.Float(0)] * (-len(sums) % 4)
-        slot = dr.gather(ad.UInt32, lists.slot, k)
-        for i, target in enumerate(slots):
-            value = ad.Array4f(sums[4 * i : 4 * i + 4])
-            dr.scatter_reduce(dr.ReduceOp.Add, target, value, slot, active=touched, mode=mode)
+        add_to_slots(slots, sums, dr.gather(ad.UInt32, lists.slot, k), mode)
         return k, transmittance, behind
 
-    first = dr.gather(ad.UInt32, blended.tile_last, tile)
+    first = dr.gather(ad.UInt32, blended.tile_last, lane.tile)
     dr.while_loop((first, transmittance, behind), remaining, replay, mode="symbolic", label="replay")
     dr.eval(slots)
     return gather_slots(slots, splats, lists, channels, absolute)
+
+
+class Moments:
+    """Sums over a lane's pixels, column by column, of g, g dx, g dy, g dx^2, g dx dy and g dy^2, with (dx, dy) from the
+    splat's centre to the pixel. dx, dy: of the lane's first pixel"""
+
+    def __init__(self, dx: Any, dy: Any) -> None:
+        self.dx, self.dy = dx, dy
+        self.columns: dict[int, list[Any]] = {}
+
+    def add(self, column: int, row: int, g: Any) -> Any:
+        """A pixel's g. Returns g dy."""
+        dy = self.dy + row
+        g_dy = g * dy
+        s0, s1, s2 = self.columns.get(column, [ad.Float(0)] * 3)
+        self.columns[column] = [s0 + g, s1 + g_dy, dr.fma(g_dy, dy, s2)]
+        return g_dy
+
+    def sums(self) -> list[Any]:
+        """The six."""
+        total = [ad.Float(0) for _ in range(6)]
+        for column, (s0, s1, s2) in self.columns.items():
+            dx = self.dx + column
+            s0_dx = s0 * dx
+            for n, value in enumerate((s0, s0_dx, s1, s0_dx * dx, s1 * dx, s2)):
+                total[n] += value
+        return total
+
+
+def add_to_slots(slots: list[Any], sums: list[Any], slot: Any, mode: Any) -> None:
+    """Add a lane's sums to its pair's slot in each array. All lanes do: to ask each whether it has anything to add
+    costs more, on a CPU and on CUDA."""
+    for target, values in zip(slots, packets(sums), strict=True):
+        dr.scatter_reduce(dr.ReduceOp.Add, target, packet(values), slot, mode=mode)
+
+
+def _dot(one: list[Any], other: list[Any]) -> Any:
+    """Scalar product over as many entries as `one` has."""
+    total = one[0] * other[0] if one else ad.Float(0)
+    for x, y in zip(one[1:], other[1:], strict=False):
+        total = dr.fma(x, y, total)
+    return total
 
 
 def _numbers(channels: int, absolute: bool) -> int:
@@ -150,22 +198,22 @@ def by_buckets(
     """See `rasterize.backward`. A lane for a bucket: what lies behind a pair is all that the pixel shows, less what
     has been blended up to the pair."""
     channels, shape = len(feature_gradients), lists.shape
-    rows, pixels, bucket = shape.rows, shape.width * shape.height, blended.bucket
+    pixels, bucket = shape.width * shape.height, blended.bucket
     looks = _pixel_packets(blended, lists, image_size, feature_gradients, transmittance_gradient)
-    number = dr.arange(ad.UInt32, bucket_numbers(lists, bucket))
+    tiles, bucket_count = lists.tiles_x * lists.tiles_y, bucket_numbers(lists, bucket)
+    number = dr.arange(ad.UInt32, bucket_count)
     buckets = _buckets(blended, lists, number)
-    records = [_record(blended, buckets, i) for i in range(bucket)]
+    records = [_record(blended, buckets, i, lists.capacity) for i in range(bucket)]
     until = dr.select(buckets.live, ad.UInt32(pixels), ad.UInt32(0))
 
     def more(q: Any, _sums: Any) -> Any:
         return q < until
 
     def visit(q: Any, sums: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
-        within, below = q // rows, q % rows
-        px = buckets.left + ad.Float(within % shape.width) + 0.5
-        py = buckets.top + ad.Float((within // shape.width) * rows + below) + 0.5
-        total, *gradients = load(looks, buckets.tile * pixels + q)
-        transmittance, *shown = load(blended.checkpoints, number * pixels + q)
+        column, row = pixel_in_tile(q, shape)
+        px, py = buckets.left + ad.Float(column) + 0.5, buckets.top + ad.Float(row) + 0.5
+        total, *gradients = load(looks, buckets.tile * pixels + q, tiles * pixels)
+        transmittance, *shown = load(blended.checkpoints, number * pixels + q, bucket_count * pixels)
         last = dr.gather(ad.UInt32, blended.last, buckets.tile * pixels + q)
         gradients, behind = gradients[:channels], total
         for gradient, feature in zip(gradients, shown, strict=False):
@@ -205,9 +253,10 @@ def _add_pixel(
     of what is behind). A state that blending did not keep has no part, since `blends` is false."""
     (px, py), (transmittance, behind), channels = centre, state, len(gradients)
     dx, dy = px - record[0], py - record[1]
-    unclamped = dr.exp2(exponents(record, px, py, 1)[0])
+    power = exponents(record, px, py, ONE_PIXEL)[0]
+    unclamped = exp2(power)
     alpha = dr.minimum(unclamped, ALPHA_MAX)
-    blends &= alpha >= ALPHA_MIN
+    blends &= power >= POWER_MIN
     weight = dr.select(blends, alpha * transmittance, 0)
     along = ad.Float(0)
     for gradient, feature in zip(gradients, record[6 : 6 + channels], strict=True):
@@ -237,10 +286,10 @@ def _buckets(blended: Blended, lists: TileLists, number: Any) -> _Buckets:
     return _Buckets(tile, live, ad.Float(left), ad.Float(top), first, end)
 
 
-def _record(blended: Blended, buckets: _Buckets, i: int) -> list[Any]:
+def _record(blended: Blended, buckets: _Buckets, i: int, capacity: int) -> list[Any]:
     """Of pair i of each bucket; zeros where there is none, which no pixel has blended."""
     listed = buckets.first + i < buckets.end
-    return [v for array in blended.records for v in dr.gather(ad.Array4f, array, buckets.first + i, listed)]
+    return load(blended.records, buckets.first + i, capacity, listed)
 
 
 def _pixel_packets(
@@ -252,10 +301,11 @@ def _pixel_packets(
 ) -> list[Any]:
     """Of each pixel, tile by tile, by fours: the scalar product of all that it shows, transmittance too, with their
     gradients; and its features' gradients."""
-    rows, (width, height) = lists.shape.rows, image_size
-    index = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * lists.shape.lanes * rows)
-    _, _, column, row = lane_pixels(index // rows, lists)
-    row = row + index % rows
+    (width, height), shape = image_size, lists.shape
+    pixels = shape.width * shape.height
+    index = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * pixels)
+    tile, (column, row) = index // pixels, pixel_in_tile(index % pixels, shape)
+    column, row = column + (tile % lists.tiles_x) * shape.width, row + (tile // lists.tiles_x) * shape.height
     inside = (column < width) & (row < height)
     pixel = row * width + column
     gradients = [dr.gather(ad.Float, plane, pixel, inside) for plane in feature_gradients]
@@ -265,16 +315,22 @@ def _pixel_packets(
         total = dr.fma(gradient, dr.gather(ad.Float, plane, pixel, inside), total)
     values = [total, *gradients]
     values += [ad.Float(0)] * (-len(values) % 4)
-    packets = [store(values[i : i + 4], index, dr.width(index)) for i in range(0, len(values), 4)]
-    dr.eval(packets)
-    return packets
+    looks = [store(values[i : i + 4], index, dr.width(index)) for i in range(0, len(values), 4)]
+    dr.eval(looks)
+    return looks
 
 
-def reduce_mode(bytes_: int) -> Any:
-    """How a tile's lanes add to the slots, `bytes_` large. On CUDA a warp sums first. On LLVM every thread has a copy
-    of the slots, unless that is too much. One tile alone adds to a slot: the sums depend on none of this."""
+def reduce_mode(bytes_: int, shape: TileShape) -> Any:
+    """How a tile's lanes add to the slots, `bytes_` large. One tile alone adds to a slot: the sums depend on none of
+    this.
+
+    On CUDA a warp sums first. On LLVM a tile whose lanes are all in one packet is one thread's, which adds lane by lane
+    in place, as Dr.Jit does to a thread's copy where every thread has one: for larger tiles, unless that is too much.
+    """
     if select() == "cuda":
         return dr.ReduceMode.Local
+    if PACKET % shape.lanes == 0:
+        return dr.ReduceMode.NoConflicts
     return dr.ReduceMode.Expand if dr.thread_count() * bytes_ < COPIES_BYTES else dr.ReduceMode.Local
 
 
@@ -283,23 +339,23 @@ def gather_slots(
 ) -> SplatGradients:
     """Add up each splat's slots, in order, and turn the sums into gradients of the splat's own numbers.
 
-    slots: [4 F P] each, F fours of a pair's sums side by side
+    slots: arrays [F P], F of a pair's sums side by side in each
     """
     splat = dr.arange(ad.UInt32, dr.width(splats.x))
     position = dr.gather(ad.UInt32, lists.first_slot, splat)
     end = position + dr.gather(ad.UInt32, lists.slot_count, splat)
-    parts = [(array, dr.width(array) // (4 * lists.capacity)) for array in slots]
 
     def remaining(position: Any, _sums: Any) -> Any:
         return position < end
 
     def add(position: Any, sums: list[Any]) -> Any:
-        values = [dr.gather(ad.Array4f, array, position * fours + j) for array, fours in parts for j in range(fours)]
+        values = load(slots, position, lists.capacity)
         return position + 1, [total + value for total, value in zip(sums, values, strict=True)]
 
-    state = position, [ad.Array4f(0) for _, fours in parts for _ in range(fours)]
+    numbers = sum(dr.width(array) for array in slots) // lists.capacity
+    state = position, [ad.Float(0) for _ in range(numbers)]
     _, sums = dr.while_loop(state, remaining, add, mode="symbolic", label="gather slots")
-    s0, sx, sy, sxx, sxy, syy, *rest = (v for total in sums for v in total)
+    s0, sx, sy, sxx, sxy, syy, *rest = sums
     by_splat = Splats(
         x=dr.fma(splats.a, sx, splats.b * sy),
         y=dr.fma(splats.b, sx, splats.c * sy),

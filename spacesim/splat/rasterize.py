@@ -1,26 +1,30 @@
 """Stage 3: blend each tile's splats front to back (thesis 2.14 to 2.16), and the adjoint of that.
 
-One lane holds a column of a tile's pixels and walks the tile's list. `forward` and `backward` are the two passes;
+One lane holds a block of a tile's pixels and walks the tile's list. `forward` and `backward` are the two passes;
 `rasterize` is the differentiable operation made of them. The adjoint is by hand (`adjoint.py`): by buckets of pairs on
 CUDA, by tiles on LLVM. Buckets read what `forward` has kept of each pixel before each bucket. On an H100 to keep it
 costs a twentieth of what the adjoint gains; on a CPU it costs more than that (docs/performance.md).
 """
 
+from functools import reduce
 from typing import Any
 
 import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.splat.adjoint import SplatGradients, by_buckets, by_tiles
-from spacesim.splat.project import ALPHA_MIN, Splats
+from spacesim.splat.project import Splats
 from spacesim.splat.records import (
     ALPHA_MAX,
+    POWER_MIN,
     TRANSMITTANCE_MIN,
     Blended,
     bucket_numbers,
+    exp2,
     exponents,
     lane_pixels,
     list_records,
+    load,
     store,
     tiled_index,
 )
@@ -55,20 +59,15 @@ def _trace_forward(
     splats: Splats, features: list[Any], lists: TileLists, width: int, height: int, capacity: int, bucket: int
 ) -> Blended:
     shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
-    channels, rows = len(features), lists.shape.rows
+    channels, pixels = len(features), lists.shape.pixels
     turn = min(BUCKET_TURN, bucket) if bucket else 1
     records = list_records(splats, features, lists, capacity)
-    lane = dr.arange(ad.UInt32, tiles * shape.lanes)
-    tile = lane // shape.lanes
-    px, py, _, _ = lane_pixels(lane, lists)
-    start = dr.gather(ad.UInt32, lists.start, tile)
-    kept = _Checkpoints(lists, bucket, channels, lane, start) if bucket else None
+    lane = lane_pixels(lists)
+    start = dr.gather(ad.UInt32, lists.start, lane.tile)
+    kept = _Checkpoints(lists, bucket, channels, lane.place, start) if bucket else None
 
     def alive(k: Any, end: Any, transmittance: list[Any], _sums: Any, _last: Any) -> Any:
-        open_pixel = transmittance[0] > TRANSMITTANCE_MIN
-        for value in transmittance[1:]:
-            open_pixel |= value > TRANSMITTANCE_MIN
-        return (k < end) & open_pixel
+        return (k < end) & (reduce(dr.maximum, transmittance) > TRANSMITTANCE_MIN)
 
     def blend(k: Any, end: Any, transmittance: list[Any], sums: list[list[Any]], last: list[Any]) -> Any:
         if kept:
@@ -76,11 +75,11 @@ def _trace_forward(
         transmittance, last, sums = list(transmittance), list(last), [list(pixel) for pixel in sums]
         for u in range(turn):
             listed = k + u < end if u else ad.Bool(True)
-            record = [value for array in records for value in dr.gather(ad.Array4f, array, k + u, listed)]
-            powers = exponents(record, px, py, rows)
-            for p in range(rows):
-                alpha = dr.minimum(dr.exp2(powers[p]), ALPHA_MAX)
-                blends = listed & (alpha >= ALPHA_MIN) & (transmittance[p] > TRANSMITTANCE_MIN)
+            record = load(records, k + u, lists.capacity, listed)
+            powers = exponents(record, lane.x, lane.y, shape)
+            for p in range(pixels):
+                alpha = dr.minimum(exp2(powers[p]), ALPHA_MAX)
+                blends = listed & (powers[p] >= POWER_MIN) & (transmittance[p] > TRANSMITTANCE_MIN)
                 weight = dr.select(blends, alpha * transmittance[p], 0)
                 for c in range(channels):
                     sums[p][c] = dr.fma(weight, record[6 + c], sums[p][c])
@@ -90,18 +89,18 @@ def _trace_forward(
 
     state = (
         start,
-        dr.gather(ad.UInt32, lists.end, tile),
-        [ad.Float(1) for _ in range(rows)],
-        [[ad.Float(0) for _ in range(channels)] for _ in range(rows)],
-        [ad.UInt32(0) for _ in range(rows)],
+        dr.gather(ad.UInt32, lists.end, lane.tile),
+        [ad.Float(1) for _ in range(pixels)],
+        [[ad.Float(0) for _ in range(channels)] for _ in range(pixels)],
+        [ad.UInt32(0) for _ in range(pixels)],
     )
     if lists.capacity > 0:
         state = dr.while_loop(state, alive, blend, mode="symbolic", label="blend")
     _, _, transmittance, sums, last = state
 
     lanes = tiles * shape.lanes
-    tiled = [store([sums[p][c] for p in range(rows)], lane, lanes) for c in range(channels)]
-    tiled_transmittance, tiled_last = store(transmittance, lane, lanes), store(last, lane, lanes)
+    tiled = [store([sums[p][c] for p in range(pixels)], lane.place, lanes) for c in range(channels)]
+    tiled_transmittance, tiled_last = store(transmittance, lane.place, lanes), store(last, lane.place, lanes)
     checkpoints, bucket_tile = (kept.states, kept.tile) if kept else ([], None)
     dr.eval(tiled, tiled_transmittance, tiled_last, checkpoints, bucket_tile)
     pixel = tiled_index(lists, width, height)
@@ -110,7 +109,7 @@ def _trace_forward(
         transmittance=dr.gather(ad.Float, tiled_transmittance, pixel),
         tile_transmittance=tiled_transmittance,
         last=tiled_last,
-        tile_last=dr.block_reduce(dr.ReduceOp.Max, tiled_last, shape.lanes * rows),
+        tile_last=dr.block_reduce(dr.ReduceOp.Max, tiled_last, shape.lanes * pixels),
         records=records,
         bucket=bucket,
         checkpoints=checkpoints,
@@ -119,7 +118,7 @@ def _trace_forward(
 
 
 class _Checkpoints:
-    """What the blending loop keeps of each pixel before each bucket, see `Blended`. lane, start: [T * lanes]"""
+    """What the blending loop keeps of pixels before each bucket, see `Blended`. lane (its place), start: [T * lanes]"""
 
     def __init__(self, lists: TileLists, bucket: int, channels: int, lane: Any, start: Any) -> None:
         numbers, fours = bucket_numbers(lists, bucket), -(-(1 + channels) // 4)
@@ -133,12 +132,12 @@ class _Checkpoints:
     def keep(self, k: Any, transmittance: list[Any], sums: list[list[Any]]) -> None:
         """Before pair k, where a bucket starts there; of the pixels whose lane still walks."""
         starts = ((k - self.start) & (self.bucket - 1)) == 0
-        number, rows = self.first + (k - self.start) // self.bucket, self.shape.rows
+        number, own = self.first + (k - self.start) // self.bucket, self.shape.pixels
         dr.scatter(self.tile, self.tile_number, number, active=starts)  # whichever lane still walks
-        for p in range(rows):
+        for p in range(own):
             values = [transmittance[p], *sums[p]]
             values += [ad.Float(0)] * (-len(values) % 4)
-            place = (number * self.shape.lanes + self.within) * rows + p
+            place = (number * self.shape.lanes + self.within) * own + p
             for i, target in enumerate(self.states):
                 dr.scatter(target, ad.Array4f(values[4 * i : 4 * i + 4]), place, starts, dr.ReduceMode.NoConflicts)
 

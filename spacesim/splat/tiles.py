@@ -22,28 +22,37 @@ from spacesim.splat.project import ALPHA_MIN, Footprints, Splats
 RECORDINGS = 256  #: of a function that are kept: one for each size of picture, of the lists, and of the model
 
 DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
+LONGEST = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long
+PACKET = 16  #: lanes that run together on a CPU with AVX-512; elsewhere fewer
+HANDS = 64  #: at most, chosen: no fewer than the parts into which Dr.Jit divides a launch, two a thread, as a rule
 LARGEST_PAIRS = 0.9 * 2**30  #: records hold four numbers a pair, and Dr.Jit's arrays at most 2^32
 BYTES_A_PAIR = 200  #: of lists, sorting and blending on LLVM, 100 to 210 measured; gradients take as much again
 
 
 @dataclass(frozen=True)
 class TileShape:
-    """A tile of width x height pixels is blended by `lanes` lanes; each holds a column of `rows` pixels."""
+    """A tile of width x height pixels is blended by `lanes` lanes; each holds `columns` columns of `rows` pixels."""
 
     width: int
     height: int
     lanes: int
+    columns: int = 1
 
     @property
-    def rows(self) -> int:
+    def pixels(self) -> int:
         """Pixels a lane."""
         return self.width * self.height // self.lanes
 
+    @property
+    def rows(self) -> int:
+        """Pixels of a column."""
+        return self.pixels // self.columns
+
 
 def tile_shape() -> TileShape:
-    """The fastest shape measured for the backend (docs/performance.md). One tile is one warp on CUDA, one
-    AVX-512 packet on LLVM: a tile's gradients meet in a single reduction, whose order is fixed."""
-    return TileShape(8, 8, 32) if select() == "cuda" else TileShape(16, 8, 16)
+    """The fastest shape measured for the backend (docs/performance.md). One tile is one warp on CUDA, a part of a
+    packet on LLVM, whose packets have 4 lanes or a multiple: a tile's gradients meet in an order that is fixed."""
+    return TileShape(8, 8, 32) if select() == "cuda" else TileShape(8, 8, 4, columns=2)
 
 
 @dataclass
@@ -52,6 +61,7 @@ class TileLists:
 
     Slots number the pairs splat by splat: those of splat i are `first_slot[i]` .. + `slot_count[i]`, [M]. Arrays have
     room for more pairs and splats than there are, so that few sizes occur: P is `capacity`, M at least N.
+    order: the tiles in the order in which they are given to lanes [T], or None for that of their indices.
     """
 
     splat: Any
@@ -64,6 +74,7 @@ class TileLists:
     tiles_x: int
     tiles_y: int
     shape: TileShape
+    order: Any = None
 
     @property
     def pairs(self) -> int:
@@ -224,8 +235,34 @@ def _trace_expand(
     splat = dr.gather(ad.UInt32, splat, slot)
     dr.eval(tile, splat)
     start, end = _runs(tile, count, capacity)
-    dr.eval(splat, slot, start, end, first_slot)
-    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, *tiles, shape)
+    order = _longest_first(end - start, shape)
+    dr.eval(splat, slot, start, end, first_slot, order)
+    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, *tiles, shape, order)
+
+
+def _longest_first(length: Any, shape: TileShape) -> Any:
+    """Tiles by the lengths [T] of their lists, longest first, then dealt to `HANDS` hands.
+
+    Tiles that share a packet are walked together until the longest list ends: neighbours are of about one length.
+    Threads take runs of packets: each hand has long lists and short ones.
+    """
+    count = dr.width(length)
+    sorted_ = _stable_order(LONGEST - dr.minimum(length, LONGEST), LONGEST.bit_length())
+    group = max(PACKET // shape.lanes, 1)
+    groups = count // group
+    hands = min(HANDS, groups // 4)
+    if hands < 2:
+        return sorted_
+    index = dr.arange(ad.UInt32, count)
+    dealt, within = index // group, index % group
+    few, more = divmod(groups, hands)  # the first `more` hands have one group more
+    in_first = dealt < more * (few + 1)
+    rest = dealt - more * (few + 1)
+    hand = dr.select(in_first, dealt // (few + 1), more + rest // few)
+    turn = dr.select(in_first, dealt % (few + 1), rest % few)
+    hand = dr.select((turn % 2 == 1) & (turn < few), hands - 1 - hand, hand)  # there and back, as long as all get one
+    whole = index < groups * group  # the last few tiles, with the shortest lists, stay where they are
+    return dr.gather(ad.UInt32, sorted_, dr.select(whole, (turn * hands + hand) * group + within, index))
 
 
 def _tile_of(

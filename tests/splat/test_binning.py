@@ -162,3 +162,21 @@ def test_owners_of_slots():
     upto = ad.UInt64(np.cumsum(counts).astype(np.uint64))
     found = np.array(owners(upto, dr.arange(ad.UInt32, 11), len(counts)))
     np.testing.assert_array_equal(found, [*np.repeat(np.arange(7), counts), 7, 7])
+
+
+@pytest.mark.parametrize(
+    "lengths", [[3], [0, 5, 2], [7] * 70, list(range(300)), list(range(1024)), [5000, 3000, 2047, 1, 0] * 40]
+)
+def test_tiles_are_dealt_longest_first(lengths):
+    """Each tile once; those that share a packet have lists of about one length; runs of tiles have long and short."""
+    lengths = np.random.default_rng(0).permutation(lengths)
+    shape = tiles.TileShape(8, 8, 4, 2)
+    order = np.array(tiles._longest_first(ad.UInt32(lengths.astype(np.uint32)), shape))
+    assert sorted(order.tolist()) == list(range(len(lengths)))
+    dealt = np.minimum(lengths, tiles.LONGEST)[order]
+    ranks = np.sort(np.minimum(lengths, tiles.LONGEST))[::-1]
+    packets = dealt[: len(dealt) // 4 * 4].reshape(-1, 4)
+    assert sorted(map(tuple, packets)) == sorted(map(tuple, ranks[: len(dealt) // 4 * 4].reshape(-1, 4)))
+    if len(lengths) >= 300:
+        quarters = [part.sum() for part in np.array_split(dealt, 4)]
+        assert max(quarters) < (1.3 if len(lengths) == 300 else 1.1) * min(quarters)

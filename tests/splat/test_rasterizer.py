@@ -1,5 +1,7 @@
 """The Dr.Jit rasterizer against its float64 twin: pictures, gradients, symmetries, hostile input."""
 
+from functools import cache
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from spacesim.backend import ad, select
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import look_at, quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
-from spacesim.splat import rasterize, tiles
+from spacesim.splat import rasterize, records, tiles
 from spacesim.splat.gaussians import NAMES, Gaussians
 from spacesim.splat.project import Pinhole, project
 from spacesim.splat.reference import real_spherical_harmonics, render_reference
@@ -326,3 +328,71 @@ def test_frames_keep_nothing_for_an_adjoint(monkeypatch):
     picture(arrays, view)
     gradients(arrays, view)
     assert kept == [False, True]
+
+
+SHAPES = [(8, 8, 4, 2), (8, 8, 4, 4), (8, 8, 2, 4), (8, 8, 1, 8), (16, 8, 16, 1), (16, 8, 4, 8), (4, 16, 4, 1)]
+
+
+@pytest.mark.parametrize("shape", SHAPES[:1] + SHAPES[3:6])
+def test_any_tile_shape_blends_the_same(shape, monkeypatch):
+    """Lanes that hold columns or blocks, tiles that share a packet or fill it: pictures and gradients by the twin."""
+    monkeypatch.setattr(tiles, "tile_shape", lambda: tiles.TileShape(*shape))
+    arrays, view = random_splats(25, seed=11, degree=1), camera(24, 17)
+    ours, twin = picture(arrays, view), render_reference(arrays, view)
+    np.testing.assert_allclose(ours["colour"], twin.colour, atol=1e-5)
+    np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=1e-5)
+    slope, expected = gradients(arrays, view), differences()
+    for name in NAMES:
+        error = np.linalg.norm(slope[name] - expected[name]) / np.linalg.norm(expected[name])
+        assert error < 1e-3, (name, error)
+
+
+@cache
+def differences() -> dict[str, np.ndarray]:
+    return central_differences(random_splats(25, seed=11, degree=1), camera(24, 17), step=1e-7)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_lanes_hold_each_pixel_of_a_picture_once(shape):
+    """And `tiled_index` finds it where its lane stores it, `pixel_in_tile` where it is."""
+    shape, (width, height) = tiles.TileShape(*shape), (37, 21)
+    across, down = -(-width // shape.width), -(-height // shape.height)
+    none, order = ad.UInt32(0), np.random.default_rng(0).permutation(across * down)
+    lists = tiles.TileLists(*[none] * 6, 0, across, down, shape, ad.UInt32(order.astype(np.uint32)))
+    lane = records.lane_pixels(lists)
+    found = {}
+    for p, (i, j) in enumerate(records.lane_offsets(shape)):
+        column, row, place = (np.array(v) for v in (lane.column + i, lane.row + j, lane.place * shape.pixels + p))
+        found |= {(x, y): n for x, y, n in zip(column.tolist(), row.tolist(), place.tolist(), strict=True)}
+        inside = records.pixel_in_tile(lane.place * shape.pixels % (shape.width * shape.height) + p, shape)
+        np.testing.assert_array_equal(np.array(inside[0]), column % shape.width)
+        np.testing.assert_array_equal(np.array(inside[1]), row % shape.height)
+    pixels = across * down * shape.width * shape.height
+    assert sorted(found.values()) == list(range(pixels))
+    index = np.array(records.tiled_index(lists, width, height)).reshape(height, width)
+    assert all(found[x, y] == index[y, x] for y in range(height) for x in range(width))
+
+
+def test_powers_of_two():
+    """Within two units in the last place where splats are blended, and nowhere far off."""
+    power = np.linspace(-126, 1, 300_001).astype(np.float32)
+    error = np.array(records.exp2(ad.Float(power))).astype(np.float64) / np.exp2(power.astype(np.float64)) - 1
+    assert np.abs(error[power >= records.POWER_MIN]).max() < 2.4e-7
+    assert np.abs(error).max() < 1e-6
+    np.testing.assert_array_equal(np.array(records.exp2(ad.Float([0.0, -1.0, -7.0]))), [1.0, 0.5, 2.0**-7])
+
+
+def test_the_number_of_threads_does_not_show():
+    if select() != "llvm":
+        pytest.skip("threads of the CPU")
+    arrays, view, threads = random_splats(3000, seed=9), camera(150, 90), dr.thread_count()
+    found = []
+    try:
+        for count in (1, 2, 3):
+            dr.set_thread_count(count)
+            found.append(gradients(arrays, view))
+    finally:
+        dr.set_thread_count(threads)
+    for other in found[1:]:
+        for name in NAMES:
+            np.testing.assert_array_equal(found[0][name], other[name])

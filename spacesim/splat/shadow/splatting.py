@@ -15,17 +15,22 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import WorkError
-from spacesim.splat.adjoint import gather_slots, reduce_mode
+from spacesim.splat.adjoint import Moments, add_to_slots, gather_slots, reduce_mode
 from spacesim.splat.cameras import LARGEST, Orthographic
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import ALPHA_MIN, Footprints, Splats, _sortable, project
 from spacesim.splat.records import (
     ALPHA_MAX,
+    POWER_MIN,
     TRANSMITTANCE_MIN,
+    LanePixels,
+    exp2,
     exponents,
+    lane_offsets,
     lane_pixels,
     list_records,
     load,
+    packet_sizes,
     store,
 )
 from spacesim.splat.tiles import RECORDINGS, TileLists, bin_splats, room
@@ -163,30 +168,28 @@ class _Walked:
 
 
 def _trace_walk(events: Splats, lists: TileLists, image_size: tuple[Any, Any], capacity: int) -> _Walked:
-    """What each receiver has lost; one lane holds a column of a tile's pixels."""
-    shape, rows = lists.shape, lists.shape.rows
+    """What each receiver has lost; one lane holds a block of a tile's pixels."""
+    shape, pixels = lists.shape, lists.shape.pixels
     receives = dr.select(dr.arange(ad.UInt32, 2 * capacity) < capacity, ad.Float(1), ad.Float(0))
     records = list_records(events, [receives], lists, room(2 * capacity))
-    lanes = lists.tiles_x * lists.tiles_y * shape.lanes
-    lane = dr.arange(ad.UInt32, lanes)
-    px, py, column, row = lane_pixels(lane, lists)
-    inside = [(column < image_size[0]) & (row + p < image_size[1]) for p in range(rows)]
+    lanes, lane = lists.tiles_x * lists.tiles_y * shape.lanes, lane_pixels(lists)
+    inside = [_inside(lane, offset, image_size) for offset in lane_offsets(shape)]
     slots = dr.zeros(ad.Float, 2 * lists.capacity)
-    mode = reduce_mode(8 * lists.capacity)
-    end = dr.gather(ad.UInt32, lists.end, lane // shape.lanes)
+    mode = reduce_mode(8 * lists.capacity, shape)
+    end = dr.gather(ad.UInt32, lists.end, lane.tile)
 
     def remaining(k: Any, _transmittance: Any, _last: Any) -> Any:
         return k < end
 
     def take(k: Any, transmittance: list[Any], last: list[Any]) -> Any:
-        record = load(records, k)
-        powers = exponents(record, px, py, rows)
+        record = load(records, k, lists.capacity)
+        powers = exponents(record, lane.x, lane.y, shape)
         receiver = record[6] > 0
         transmittance, last = list(transmittance), list(last)
         lost, weight = ad.Float(0), ad.Float(0)
-        for p in range(rows):
-            alpha = dr.minimum(dr.exp2(powers[p]), ALPHA_MAX)
-            reached = alpha >= ALPHA_MIN
+        for p in range(pixels):
+            alpha = dr.minimum(exp2(powers[p]), ALPHA_MAX)
+            reached = powers[p] >= POWER_MIN
             beta = dr.select(reached & inside[p], alpha, 0)
             lost, weight = dr.fma(beta, 1 - transmittance[p], lost), weight + beta
             blocks = reached & ~receiver & (transmittance[p] > TRANSMITTANCE_MIN)
@@ -198,17 +201,22 @@ def _trace_walk(events: Splats, lists: TileLists, image_size: tuple[Any, Any], c
         return k + 1, transmittance, last
 
     state = (
-        dr.gather(ad.UInt32, lists.start, lane // shape.lanes),
-        [ad.Float(1) for _ in range(rows)],
-        [ad.UInt32(0) for _ in range(rows)],
+        dr.gather(ad.UInt32, lists.start, lane.tile),
+        [ad.Float(1) for _ in range(pixels)],
+        [ad.UInt32(0) for _ in range(pixels)],
     )
     _, transmittance, last = dr.while_loop(state, remaining, take, mode="symbolic", label="shadow")
-    transmittance, last = store(transmittance, lane, lanes), store(last, lane, lanes)
+    transmittance, last = store(transmittance, lane.place, lanes), store(last, lane.place, lanes)
     dr.eval(slots, transmittance, last)
     lost, weight = _sum_slots(slots, lists, capacity)
     seen = weight > 0
     occlusion = dr.select(seen, dr.clip(lost / dr.select(seen, weight, 1), 0, 1), 0)
     return _Walked(occlusion, weight, transmittance, last, records)
+
+
+def _inside(lane: LanePixels, offset: tuple[int, int], image_size: tuple[Any, Any]) -> Any:
+    """Is the lane's pixel at an offset from its first one of the picture's?"""
+    return (lane.column + offset[0] < image_size[0]) & (lane.row + offset[1] < image_size[1])
 
 
 def _sum_slots(slots: Any, lists: TileLists, capacity: int) -> Any:
@@ -236,37 +244,34 @@ def _trace_replay(
     With u_i = dL/d occ_i / sum of beta_i: dL/d beta_i = u_i (1 - T_i - occ_i), and
     dL/d alpha_j = (sum over receivers i behind j of u_i beta_i T_i) / (1 - alpha_j).
     """
-    rows, lanes = lists.shape.rows, lists.shape.lanes
-    lane = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * lanes)
-    px, py, column, row = lane_pixels(lane, lists)
-    inside = [(column < image_size[0]) & (row + p < image_size[1]) for p in range(rows)]
-    transmittance = [dr.gather(ad.Float, walked.transmittance, lane * rows + p) for p in range(rows)]
-    last = [dr.gather(ad.UInt32, walked.last, lane * rows + p) for p in range(rows)]
+    shape, lane, offsets = lists.shape, lane_pixels(lists), lane_offsets(lists.shape)
+    inside = [_inside(lane, offset, image_size) for offset in offsets]
+    places = [lane.place * shape.pixels + p for p in range(shape.pixels)]
+    transmittance = [dr.gather(ad.Float, walked.transmittance, place) for place in places]
+    last = [dr.gather(ad.UInt32, walked.last, place) for place in places]
     shares = dr.select(walked.weight > 0, gradient / dr.maximum(walked.weight, 1e-30), 0)
     dr.eval(shares)
-    slots = [dr.zeros(ad.Float, 4 * lists.capacity) for _ in range(2)]
-    mode = reduce_mode(32 * lists.capacity)
-    start = dr.gather(ad.UInt32, lists.start, lane // lanes)
+    slots = [dr.zeros(ad.Float, size * lists.capacity) for size in packet_sizes(6)]
+    mode = reduce_mode(32 * lists.capacity, shape)
+    start = dr.gather(ad.UInt32, lists.start, lane.tile)
 
     def remaining(k: Any, _transmittance: Any, _behind: Any) -> Any:
         return k > start
 
     def replay(k: Any, transmittance: list[Any], behind: list[Any]) -> Any:
         k = k - 1
-        record = load(walked.records, k)
-        dx, dy0 = px - record[0], py - record[1]
-        powers = exponents(record, px, py, rows)
+        record = load(walked.records, k, lists.capacity)
+        powers = exponents(record, lane.x, lane.y, shape)
         receiver = record[6] > 0
         event = dr.gather(ad.UInt32, lists.splat, k)
         share = dr.gather(ad.Float, shares, event, receiver)
         occlusion = dr.gather(ad.Float, walked.occlusion, event, receiver)
         transmittance, behind = list(transmittance), list(behind)
-        g0, g1, g2 = ad.Float(0), ad.Float(0), ad.Float(0)
-        touched = ad.Bool(False)
-        for p in range(rows):
-            unclamped = dr.exp2(powers[p])
+        moments = Moments(lane.x - record[0], lane.y - record[1])
+        for p, offset in enumerate(offsets):
+            unclamped = exp2(powers[p])
             alpha = dr.minimum(unclamped, ALPHA_MAX)
-            reached = alpha >= ALPHA_MIN
+            reached = powers[p] >= POWER_MIN
             receives, blocks = reached & receiver & inside[p], reached & ~receiver & (k < last[p])
             weight = dr.select(receives, alpha * share, 0)
             inverse = dr.rcp(1 - dr.select(blocks, alpha, 0))
@@ -274,17 +279,11 @@ def _trace_replay(
             by_alpha = dr.select(blocks & (unclamped < ALPHA_MAX), behind[p] * inverse * alpha, 0)  # dL / d ln alpha
             behind[p] = dr.fma(weight, transmittance[p], behind[p])
             transmittance[p] *= inverse
-            g, dy = by_beta + by_alpha, dy0 + p
-            g0, g1, g2 = g0 + g, dr.fma(g, dy, g1), dr.fma(g * dy, dy, g2)
-            touched |= receives | blocks
-        sums = [g0, g0 * dx, g1, g0 * dx * dx, g1 * dx, g2, ad.Float(0), ad.Float(0)]
-        slot = dr.gather(ad.UInt32, lists.slot, k)
-        for i, target in enumerate(slots):
-            value = ad.Array4f(sums[4 * i : 4 * i + 4])
-            dr.scatter_reduce(dr.ReduceOp.Add, target, value, slot, active=touched, mode=mode)
+            moments.add(*offset, by_beta + by_alpha)
+        add_to_slots(slots, moments.sums(), dr.gather(ad.UInt32, lists.slot, k), mode)
         return k, transmittance, behind
 
-    state = dr.gather(ad.UInt32, lists.end, lane // lanes), transmittance, [ad.Float(0) for _ in range(rows)]
+    state = dr.gather(ad.UInt32, lists.end, lane.tile), transmittance, [ad.Float(0) for _ in offsets]
     dr.while_loop(state, remaining, replay, mode="symbolic", label="replay shadow")
     dr.eval(slots)
     gradients: Splats = gather_slots(slots, events, lists, 0).splats
