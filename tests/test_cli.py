@@ -296,6 +296,7 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("train DATA --out OUT --method shadow-map --shadow-gradients", ["--shadow-gradients", "splatting"]),
         ("train DATA --out OUT --method shadow-map --shadow-bias inf", ["--shadow-bias", "inf"]),
         ("train DATA --out OUT --method shadow-map --light-size 0", ["--light-size", "found 0"]),
+        ("train DATA --out OUT --method shadow-map --light-size 100000", ["--light-size", "found 100000"]),
         ("train DATA --out OUT --seed -1", ["--seed", "found -1"]),
         ("train DATA --out OUT --backend vulkan", ["--backend", "vulkan"]),
         ("train DATA --out DATA", ["DATA", "empty or new folder"]),

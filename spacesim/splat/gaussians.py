@@ -113,7 +113,7 @@ class Gaussians:
             log_scales=ad.Array3f(rows["log_scales"]),
             quaternions=ad.Array4f(rows["quaternions"]),
             logit_opacities=ad.Float(np.ascontiguousarray(rows["logit_opacities"])),
-            sh=ad.ArrayXf(np.ascontiguousarray(sh.reshape(count, sh.shape[1] * 3).T)) if sh.size else ad.ArrayXf([]),
+            sh=ad.ArrayXf(np.ascontiguousarray(sh.reshape(count, sh.shape[1] * 3).T)) if sh.shape[1] else ad.ArrayXf([]),
             features=None if features is None else ad.Float(np.ascontiguousarray(features.T, np.float32).ravel()),
         )
 

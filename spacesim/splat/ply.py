@@ -24,7 +24,7 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     quaternions = arrays["quaternions"] / np.maximum(
         np.linalg.norm(arrays["quaternions"], axis=1, keepdims=True), 1e-12
     )
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, -1)
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (sh.shape[1] - 1))
     opacity = arrays["logit_opacities"][:, None]
     parts = [
         arrays["means"],

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
+from splats import random_splats
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image
@@ -218,6 +219,12 @@ def test_broken_files_are_named(finished, tmp_path):
     (tmp_path / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
     with pytest.raises(InputError, match=r"broken\.ply"):
         read_ply(tmp_path / "broken.ply")
+
+
+def test_ply_of_no_gaussians(tmp_path):
+    empty = Gaussians.from_numpy({name: values[:0] for name, values in random_splats(3).items()})
+    write_ply(empty, tmp_path / "empty.ply")
+    assert read_ply(tmp_path / "empty.ply").count == 0
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from spacesim.splat.tiles import RECORDINGS
 
 METHODS = ("mapping", "splatting")
 GRAZING = ("none", "bias", "lift")
+LARGEST = 8192  #: pixels of a side of the light's picture, chosen
 UNSEEN = -80.0  #: logit of an opacity that nothing draws
 
 
@@ -48,8 +49,8 @@ class ShadowConfig:
             raise InputError(f"--shadow-gradients: expected shadow splatting, found {self.method}")
         if self.grazing not in GRAZING:
             raise InputError(f"grazing: expected one of {', '.join(GRAZING)}, found {self.grazing!r}")
-        if self.size < 4:
-            raise InputError(f"--light-size: expected at least 4 pixels, found {self.size}")
+        if not 4 <= self.size <= LARGEST:
+            raise InputError(f"--light-size: expected 4 to {LARGEST} pixels, found {self.size}")
         if not (0 <= self.bias < math.inf and 0 < self.softness < math.inf):
             raise InputError(
                 f"--shadow-bias: expected 0 or more (and a softness above 0), found {self.bias} (and {self.softness})"
