@@ -108,12 +108,13 @@ class Gaussians:
         if features is not None and (np.ndim(features) != 2 or len(features) != count or features.shape[1] == 0):
             raise ValueError(f"features: expected shape ({count}, F), found {np.shape(features)}")
         rows = {name: np.asarray(arrays[name], dtype=np.float32).T for name in expected}
+        harmonics = sh.reshape(count, sh.shape[1] * 3)
         return Gaussians(
             means=ad.Array3f(rows["means"]),
             log_scales=ad.Array3f(rows["log_scales"]),
             quaternions=ad.Array4f(rows["quaternions"]),
             logit_opacities=ad.Float(np.ascontiguousarray(rows["logit_opacities"])),
-            sh=ad.ArrayXf(np.ascontiguousarray(sh.reshape(count, sh.shape[1] * 3).T)) if sh.shape[1] else ad.ArrayXf([]),
+            sh=ad.ArrayXf(np.ascontiguousarray(harmonics.T)) if sh.shape[1] else ad.ArrayXf([]),
             features=None if features is None else ad.Float(np.ascontiguousarray(features.T, np.float32).ravel()),
         )
 
