@@ -98,6 +98,7 @@ class FakeRun:
 class RelightableRun(FakeRun):
     """Predicts the sphere under any Sun, and that its columns from `edge` on see the Sun."""
 
+    relightable = True
     edge: int = SIZE // 2
     config: dict = field(default_factory=lambda: {"method": "shadow-map", "preset": "demo", "seed": 7})
 

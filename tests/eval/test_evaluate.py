@@ -211,6 +211,14 @@ def test_no_frames(make_run, dataset, tmp_path):
         EvaluateConfig(split="validation")
 
 
+def test_a_frame_without_a_sun_is_named(relightable, tmp_path):
+    run, dataset = relightable()
+    first, second, *others = dataset.test
+    lacking = replace(dataset, test=(first, replace(second, sun=None), *others))
+    with pytest.raises(InputError, match=r"expected the Sun of every frame .*, images/test_00001\.png has none"):
+        evaluate(run, lacking, tmp_path / "eval")
+
+
 def test_old_numbers_do_not_outlive_new_pictures(make_run, dataset, tmp_path):
     evaluate(make_run(), dataset, tmp_path / "eval")
     with pytest.raises(WorkError):
