@@ -186,6 +186,8 @@ def _eval(options: argparse.Namespace) -> None:
     from spacesim.progress import reporting
 
     config = EvaluateConfig(options.split, options.lpips_weights)
+    if options.no_geometry:
+        config = replace(config, geometry=None)
     run, dataset = _judged(options.path), read_dataset(options.data)
     with reporting("evaluate", "frames", quiet=options.json) as report:
         metrics = evaluate(run, dataset, options.out, config, report)
@@ -313,10 +315,15 @@ def _verify(options: argparse.Namespace) -> None:
 def _export(options: argparse.Namespace) -> None:
     if options.object is not None and options.speedplus is None:
         raise InputError("--object: expected with --speedplus, found without it")
+    for name in ("data", "views", "voxel", "truncation"):
+        if getattr(options, name) is not None and options.mesh is None:
+            raise InputError(f"--{name}: expected with --mesh, found without it")
     if options.speedplus is not None:
         _export_speedplus(options)
     elif options.bop is not None:
         _export_bop(options)
+    elif options.mesh is not None:
+        _export_mesh(options)
     else:
         _export_ply(options)
 
@@ -338,6 +345,32 @@ def _export_ply(options: argparse.Namespace) -> None:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
     write_ply(model, options.ply)
     ending.say(f"{options.ply}: {run.gaussians} Gaussians")
+
+
+def _export_mesh(options: argparse.Namespace) -> None:
+    from spacesim.data.mesh import mesh_suffix, write_mesh
+    from spacesim.data.store import read_dataset
+    from spacesim.progress import reporting
+    from spacesim.splat.meshing import MeshConfig, cameras_around, mesh_of
+    from spacesim.splat.run import load_run
+
+    mesh_suffix(options.mesh)
+    given = {"voxel": options.voxel, "truncation": options.truncation, "views": options.views}
+    config = MeshConfig(**{name: value for name, value in given.items() if value is not None})
+    backend.select(options.backend)
+    run = load_run(options.path)
+    data = options.data or Path(run.config["data"]["path"])
+    if options.data or data.exists():
+        cameras = [frame.camera for frame in read_dataset(data).train]
+    else:
+        print(f"{data}: is gone; {config.views} cameras around the model take the place of its views", file=sys.stderr)
+        cameras = cameras_around(run.model, config.views)
+    with reporting("export", "steps") as report:
+        found = mesh_of(run.model, cameras, config, run.antialiased, report)
+    if len(found.faces) == 0:
+        raise WorkError(f"{options.path}: no view of the run shows an opaque surface, so there is no mesh to write")
+    write_mesh(options.mesh, found.vertices, found.faces)
+    ending.say(f"{options.mesh}: {len(found.faces)} faces from {found.views} views, voxels of {found.voxel:.4g} m")
 
 
 def _export_speedplus(options: argparse.Namespace) -> None:

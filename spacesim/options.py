@@ -135,6 +135,7 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument(
         "--lpips-weights", type=Path, metavar="PATH", help="AlexNet and linear weights for LPIPS, a file or a folder"
     )
+    one.add_argument("--no-geometry", action="store_true", help="do not judge the shape (docs/geometry.md)")
     one.add_argument("--json", action="store_true", help="print metrics.json alone")
 
     one = command("report", "one page about several evaluations side by side", needs_backend=False)
@@ -181,10 +182,15 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--backend", choices=backend.NAMES, default="auto", help="default: CUDA, else LLVM")
     form = one.add_mutually_exclusive_group(required=True)
     form.add_argument("--ply", type=Path, metavar="FILE", help="Gaussians: INRIA layout, the dataset's frame and scale")
+    form.add_argument("--mesh", type=Path, metavar="FILE", help="the surface of a run: .ply, .obj, .glb or .stl")
     form.add_argument("--speedplus", type=Path, metavar="DIR", help="a dataset's images and poses as SPEED+ has them")
     form.add_argument("--bop", type=Path, metavar="DIR", help="a dataset's images, depth, masks, poses, models for BOP")
     one.add_argument("--sun", type=_angles, metavar="AZ,EL", help="for --ply of a relightable run: whose colours")
     one.add_argument("--object", metavar="K", help="for SPEED+: whose poses, by number or name (the first)")
+    one.add_argument("--data", type=Path, metavar="DATA", help="for --mesh: the dataset, where it has moved")
+    one.add_argument("--views", type=int, metavar="N", help="for --mesh: how many are fused, at most (100)")
+    one.add_argument("--voxel", type=float, metavar="M", help="for --mesh: metres (1/192 of the object's size)")
+    one.add_argument("--truncation", type=float, metavar="N", help="for --mesh: voxels behind the surface (3)")
     return parser
 
 

@@ -8,7 +8,10 @@ import numpy as np
 import trimesh
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import write_bytes
 from spacesim.data.geometry import Array
+
+WRITTEN = (".ply", ".obj", ".glb", ".stl")
 
 
 def read_mesh(path: Path) -> tuple[Array, np.ndarray]:
@@ -24,6 +27,26 @@ def read_mesh(path: Path) -> tuple[Array, np.ndarray]:
     if len(faces) == 0:
         raise InputError(f"{path}: expected a mesh, found no face with finite corners in it")
     return vertices, faces
+
+
+def mesh_suffix(path: Path) -> str:
+    """The format that a mesh's file name asks for. Raises InputError for one that `write_mesh` does not know."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in WRITTEN:
+        raise InputError(
+            f"{path}: expected a file name that ends in {', '.join(WRITTEN)}, found {suffix or 'no ending'}"
+        )
+    return suffix
+
+
+def write_mesh(path: Path, vertices: Array, faces: np.ndarray) -> None:
+    """Write vertices [V, 3] metres and faces [F, 3] as PLY, OBJ, STL or glTF (.glb), by the file's name. World axes; in
+    glTF y is up, and it is turned to that. Raises InputError for another name and where it cannot be written."""
+    suffix = mesh_suffix(path)
+    if suffix == ".glb":
+        vertices = np.stack([vertices[:, 0], vertices[:, 2], -vertices[:, 1]], axis=1)
+    content = trimesh.Trimesh(vertices, faces, process=False).export(file_type=suffix[1:])
+    write_bytes(Path(path), content.encode() if isinstance(content, str) else content)
 
 
 class SignedDistance:

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from spacesim.data.errors import InputError
-from spacesim.data.mesh import SignedDistance, read_mesh
+from spacesim.data.mesh import WRITTEN, SignedDistance, read_mesh, write_mesh
 
 
 def queries(count: int = 4000, reach: float = 2.0) -> np.ndarray:
@@ -109,3 +109,23 @@ def test_read_mesh_reads_what_was_written(tmp_path):
     vertices, faces = read_mesh(tmp_path / "box.ply")
     np.testing.assert_allclose(np.sort(vertices, axis=0), np.sort(box.vertices, axis=0))
     assert faces.shape == (12, 3)
+
+
+@pytest.mark.parametrize("suffix", WRITTEN)
+def test_written_meshes_read_back(tmp_path, suffix):
+    mesh = trimesh.creation.box((1, 2, 3)).apply_translation((5, -6, 7))
+    path = tmp_path / f"box{suffix}"
+    write_mesh(path, np.array(mesh.vertices), np.array(mesh.faces))
+    vertices, faces = read_mesh(path)
+    if suffix == ".glb":  # y is up there
+        vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
+    back = trimesh.Trimesh(vertices, faces)
+    assert back.bounds == pytest.approx(mesh.bounds, abs=1e-5)
+    assert back.volume == pytest.approx(6, rel=1e-5)  # faces turn as before
+
+
+def test_a_mesh_of_unknown_kind_is_not_written(tmp_path):
+    for name in ("mesh.xyz", "mesh"):
+        with pytest.raises(InputError, match=r"expected a file name that ends in .ply"):
+            write_mesh(tmp_path / name, np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    assert not list(tmp_path.iterdir())
