@@ -150,3 +150,24 @@ def test_light_tells_frames_and_steps():
     assert all(row["frames/s"] > 0 for row in report["frames"])
     assert report["frames"][1]["shadows"] > 0 == report["frames"][0]["shadows"]
     assert len(report["steps"]) == 2
+
+
+def test_strategies_tells_tables_and_the_figure_and_goes_on_where_it_stopped(small_lit, tmp_path):
+    arguments = ["--data", str(small_lit), "--out", str(tmp_path / "runs"), "--preset", "demo", "--method", "vanilla"]
+    arguments += ["--iterations", "6", "--figure-steps", "4", "--start-gaussians", "50", "--json"]
+    first = json.loads(call("strategies.py", *arguments, "--rows", "default"))
+    plot = tmp_path / "figure.svg"
+    both = json.loads(call("strategies.py", *arguments, "--rows", "default,mesh-aware,figure", "--plot", str(plot)))
+    for title, rows in first["rows"].items():
+        assert rows == both["rows"][title][: len(rows)] or title.startswith("Inside")
+    pictures = both["rows"]["Pictures (table 5.4)"]
+    assert [row["strategy"] for row in pictures] == ["default", "mesh-aware"]
+    assert pictures[0]["thesis PSNR"] == "36.3851"
+    sizes = both["rows"]["Size and speed (table 5.6)"]
+    assert 0 <= float(sizes[1]["refinement [%]"]) <= 100
+    for curve in both["curves"].values():
+        assert [step for step, _ in curve["inside"]] == [0, 1, 2, 3, 4]
+        assert all(0 <= share <= 1 for _, share in curve["inside"])
+    root = ElementTree.fromstring(plot.read_text())
+    lines = [path for path in root.iter("{http://www.w3.org/2000/svg}path") if "line" in path.get("class", "")]
+    assert len(lines) == len(both["curves"]) == 3

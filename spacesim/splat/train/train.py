@@ -57,11 +57,11 @@ def train(
     if newest is not None:
         trainer.restore(newest)
         log.info("resumed at iteration %d from %s", trainer.iteration, newest)
-    seconds = _Seconds(out, trainer.iteration)
+    seconds = _Seconds(out, trainer)
 
     def checkpoint() -> None:
         trainer.save(out / "checkpoints" / f"step_{trainer.iteration:08d}.safetensors")
-        seconds.write(trainer.iteration)
+        seconds.write()
         for old in _checkpoints(out)[:-KEEP_CHECKPOINTS]:
             old.unlink(missing_ok=True)
 
@@ -71,6 +71,7 @@ def train(
         {
             "history": trainer.history,
             "seconds": round(seconds.total(), 3),
+            "refinement_seconds": round(trainer.refinement_seconds, 3),
             "gaussians": trainer.gaussians.count,
             "backend": backend.select(),
             "device": device(),
@@ -157,15 +158,18 @@ def _checkpoints(out: Path) -> list[Path]:
 
 
 class _Seconds:
-    """Wall-clock time of training, kept across interruptions beside the checkpoints."""
+    """Wall-clock time of training and the part of it that refinement took, kept across interruptions beside the
+    checkpoints."""
 
-    def __init__(self, out: Path, iteration: int) -> None:
-        self.path = out / "checkpoints" / "seconds.json"
+    def __init__(self, out: Path, trainer: Trainer) -> None:
+        self.path, self.trainer = out / "checkpoints" / "seconds.json", trainer
         known = read_json(self.path) if self.path.exists() else {}
-        self.before, self.start = float(known.get(str(iteration), 0.0)), time.monotonic()
+        self.before, self.start = float(known.get(str(trainer.iteration), 0.0)), time.monotonic()
+        trainer.refinement_seconds = float(known.get("refinement", 0.0)) if self.before else 0.0
 
     def total(self) -> float:
         return self.before + time.monotonic() - self.start
 
-    def write(self, iteration: int) -> None:
-        write_json(self.path, {str(iteration): self.total()})
+    def write(self) -> None:
+        spent = {str(self.trainer.iteration): self.total(), "refinement": self.trainer.refinement_seconds}
+        write_json(self.path, spent)

@@ -4,6 +4,7 @@ A step is five stages. Those of fixed shape (project, loss, update) are recorded
 binning and blending, whose lists change length from step to step, stand between them.
 """
 
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -58,7 +59,7 @@ class Trainer:
     """
 
     def __init__(self, dataset: Dataset, config: TrainConfig) -> None:
-        self.config, self.iteration = config, 0
+        self.config, self.iteration, self.refinement_seconds = config, 0, 0.0
         self.views = _views(dataset, config)
         self.scene_scale = scene_scale(dataset)
         features = config.light.features if config.light else 0
@@ -122,9 +123,16 @@ class Trainer:
         if warm is not None and warm.active(done - 1):
             warm.after_step(done, self.gaussians)
             return
+        timed = done % self.config.refinement.refine_every == 0
+        if timed:
+            dr.sync_thread()  # what the steps before have left to compute is not refinement's
+        start = time.perf_counter()
         rng = np.random.default_rng([self.config.seed, 2, done])
         leniency = 1.0 if warm is None else warm.config.leniency(done)
         self.strategy.refine(done, self.gaussians, self.optimizer, rng, leniency)
+        if timed:
+            dr.sync_thread()
+            self.refinement_seconds += time.perf_counter() - start
 
     def _look(self, rows: list[Any], degree: int, number: int) -> "_Look":
         """Blend view `number` of the training, compare, and go back."""
