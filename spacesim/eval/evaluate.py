@@ -25,7 +25,9 @@ from spacesim.eval import grazing, lpips
 from spacesim.eval.geometry import GeometryConfig, judge_geometry
 from spacesim.eval.judge import judge_picture, judge_visibility, light_of, tally_grazing, view_of, write_pictures
 from spacesim.eval.labels import GROUPS
-from spacesim.eval.notes import explain, explain_light
+from spacesim.eval.notes import explain, explain_light, explain_objects
+from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
+from spacesim.eval.objects import judge_objects, object_names
 from spacesim.eval.relight import write_sweep
 from spacesim.eval.suns import count_suns, known_suns, rounded_angles
 
@@ -62,7 +64,8 @@ def evaluate(
     """Judge every frame of the split and return what EVAL/metrics.json, written last, then holds.
 
     progress: called with (frames done, frames in all, the next one's file) before each frame and at the end.
-    Raises InputError where there is no frame to judge or the dataset is broken, WorkError where a prediction
+    run: or a `ComposedRun` in its place. Raises InputError where there is no frame to judge or the dataset is broken,
+    WorkError where a prediction
     is not finite.
     """
     config = config or EvaluateConfig()
@@ -77,11 +80,14 @@ def evaluate(
     network, lpips_sentence = lpips.load(config.lpips_weights)
     _prepare(out)
     run.predict(frames[0].camera, frames[0].sun)  # compiles the kernels
+    models: list[str] | None = getattr(run, "names", None)  # of a composed scene, which was not trained on this dataset
+    objects = object_names(dataset, models or ())
+    known_of = known_suns(frames, dataset.train if models is None else ())
     judged: list[Judgement] = []
-    for name, frame, known in zip(frame_names(frames), frames, known_suns(frames, dataset.train), strict=True):
+    for name, frame, known in zip(frame_names(frames), frames, known_of, strict=True):
         if progress:
             progress(len(judged), len(frames), frame.file_path)
-        judged.append(_judge(run, dataset, frame, known, network, out / "frames" / name))
+        judged.append(_judge(run, dataset, frame, known, network, out / "frames" / name, objects))
     sweep, no_sweep = write_sweep(run, dataset, frames, out)
     if progress:
         progress(len(frames), len(frames), "its shape" if config.geometry else "")
@@ -102,6 +108,7 @@ def evaluate(
         },
         **_summaries(judged),
         "geometry": shape.values,
+        "objects": _by_object(judged, objects),
         "known_suns": _over([one for one in judged if one.known is True]),
         "unseen_suns": _over([one for one in judged if one.known is False]),
         "relight": sweep,
@@ -109,6 +116,7 @@ def evaluate(
             *([shape.note] if shape.note else []),
             *explain(records, [one.source for one in judged], None if network else lpips_sentence, method),
             *explain_light([one.known for one in judged], any(one.grazing is not None for one in judged), no_sweep),
+            *explain_objects(objects, records, models),
         ],
         "dataset": _describe(dataset, frames),
         "config": dict(run.config),
@@ -134,9 +142,15 @@ class Judgement:
 
 
 def _judge(
-    run: "Run", dataset: Dataset, frame: Frame, known: bool | None, network: lpips.Lpips | None, folder: Path
+    run: "Run",
+    dataset: Dataset,
+    frame: Frame,
+    known: bool | None,
+    network: lpips.Lpips | None,
+    folder: Path,
+    objects: Mapping[int, str],
 ) -> Judgement:
-    """Predict a frame, judge it, write its pictures into `folder`."""
+    """Predict a frame, judge it and each of its `objects`, write its pictures into `folder`."""
     start = time.perf_counter()
     prediction = run.predict(frame.camera, frame.sun)
     seconds = time.perf_counter() - start
@@ -144,7 +158,9 @@ def _judge(
     light = light_of(dataset, frame, prediction)
     write_pictures(folder, view, light)
     named = {"file_path": frame.file_path, "name": folder.name, "sun": rounded_angles(frame), "known_sun": known}
-    record = named | judge_picture(view, network) | judge_visibility(light, view)
+    record: dict[str, Any] = named | judge_picture(view, network) | judge_visibility(light, view)
+    if objects:
+        record["objects"] = judge_objects(dataset, frame, objects, view, light, network)
     return Judgement(frame, record, source, known, tally_grazing(light, view), seconds)
 
 
@@ -152,6 +168,18 @@ def _summaries(judged: Sequence[Judgement]) -> dict[str, Any]:
     """The groups over some frames."""
     groups = {group: summary(one.record[group] for one in judged) for group in GROUPS}
     return {**groups, "by_grazing_angle": grazing.summary(one.grazing for one in judged)}
+
+
+def _by_object(judged: Sequence[Judgement], names: Mapping[int, str]) -> list[dict[str, Any]] | None:
+    """Of each object that a frame shows: number, name, in how many frames, the groups over its pixels; None for data
+    with one object."""
+    found: list[dict[str, Any]] = []
+    for number, name in names.items():
+        records = [one.record["objects"][name] for one in judged if name in one.record["objects"]]
+        if records:
+            groups = {group: summary(record[group] for record in records) for group in OBJECT_GROUPS}
+            found.append({"id": number, "name": name, "frames": len(records), **groups})
+    return found or None
 
 
 def _over(judged: Sequence[Judgement]) -> dict[str, Any] | None:

@@ -1,6 +1,6 @@
 """Why a value of metrics.json is null, and what stands in for missing truth: a sentence each."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from spacesim.eval.labels import GROUPS
@@ -43,6 +43,25 @@ def explain_light(known: Sequence[bool | None], by_grazing_angle: bool, no_sweep
     if not by_grazing_angle:
         notes.append("by_grazing_angle is null: the data has no path-traced truth.")
     return [*notes, no_sweep] if no_sweep else notes
+
+
+def explain_objects(
+    names: Mapping[int, str], records: Sequence[dict[str, Any]], models: Sequence[str] | None
+) -> list[str]:
+    """Sentences about objects that are judged on their own. names: of the data's objects, {} where it has one;
+    models: names of a composed scene's, None for a run"""
+    if not names:
+        return ["objects is null: the data does not say of more than one object."]
+    notes = []
+    if models is not None and len(models) != len(names):
+        have = f"The scene has {len(models)} models, the data {len(names)} objects"
+        notes.append(f"{have}: objects have the data's names.")
+    counts = {name: sum(name in record["objects"] for record in records) for name in names.values()}
+    return notes + [
+        f"{name} is in {count} of {len(records)} frames; its numbers are over these."
+        for name, count in counts.items()
+        if count < len(records)
+    ]
 
 
 def _explain_suns(known: Sequence[bool | None]) -> list[str]:

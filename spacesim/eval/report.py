@@ -15,7 +15,7 @@ from spacesim.eval.judged import Judged, legend, read_evals
 from spacesim.eval.labels import IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric
 from spacesim.eval.lighting import by_grazing_angle, relighting, shadow_masks
 from spacesim.eval.page import escape, page, section, table
-from spacesim.eval.results import Cell, best_in_bold, results, results_by_suns, summary_cell
+from spacesim.eval.results import Cell, best_in_bold, by_object, results, results_by_suns, summary_cell
 
 MANY_SUNS = 12
 """With more Suns than this, histograms become columns of one chart."""
@@ -56,6 +56,12 @@ def _content(runs: Sequence[Judged]) -> str:
             "over lit and cast-shadow pixels. Half of the solar disc or more is lit.",
         ),
         section("Results", results(runs), "Mean ± population standard deviation over the frames."),
+        _section(
+            "Object by object",
+            by_object(runs),
+            "Over the pixels that show the object in the true picture: what models that were trained apart do to each "
+            "other (tables 4.6 and 4.7). Mean ± population standard deviation over the frames that show it.",
+        ),
         _section(
             "Known and unseen Suns",
             results_by_suns(runs),

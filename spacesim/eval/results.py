@@ -1,6 +1,7 @@
 """The report's tables of numbers: a row for each run, the best of each column in bold."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from spacesim.eval.judged import Judged
 from spacesim.eval.labels import GROUPS, IMAGE, RECALL, SHADOW, SHADOW_KIND, SHADOW_MASK, Metric
@@ -19,6 +20,13 @@ _TABLES: tuple[tuple[str, tuple[Metric, ...], tuple[str, ...], tuple[Metric, ...
     ("Each kind of shadow by predicted visibility", SHADOW_KIND, tuple(KINDS), (RECALL,)),
 )
 """Caption, columns, groups, and the columns whose meaning is told."""
+
+_OBJECT_TABLES: tuple[tuple[str, str, tuple[Metric, ...]], ...] = (
+    ("image", "image", IMAGE),
+    ("shadow by luminance", "shadow", SHADOW),
+    ("shadow by predicted visibility", "shadow_mask", SHADOW_MASK),
+)
+"""Of each object: caption, group, columns."""
 
 
 def results(runs: Sequence[Judged]) -> str:
@@ -60,9 +68,26 @@ def results_by_suns(runs: Sequence[Judged]) -> str:
     return "".join(parts)
 
 
+def by_object(runs: Sequence[Judged]) -> str:
+    """HTML: of each object the tables 4.6 and 4.7, a row for each run; "" where no run tells objects apart."""
+    every = [entry for run in runs for entry in run.metrics.get("objects") or []]
+    numbers = sorted({entry["id"] for entry in every})
+    parts = []
+    for number in numbers:
+        names = " or ".join(dict.fromkeys(entry["name"] for entry in every if entry["id"] == number))
+        for what, group, metrics in _OBJECT_TABLES:
+            rows = _object_rows(runs, number, group, metrics)
+            if rows:
+                parts.append(table(f"{escape(names)}: {what}", ["", *map(_heading, metrics)], [("", rows)]))
+    return "".join(parts)
+
+
 def summary_cell(run: Judged, group: str, metric: Metric, suns: str = "") -> Cell:
     """A metric's cell; suns: as `Judged.summary` takes it."""
-    value = run.summary(group, metric.key, suns)
+    return _cell(run.summary(group, metric.key, suns), metric)
+
+
+def _cell(value: dict[str, Any] | None, metric: Metric) -> Cell:
     if value is None:
         return None, _NONE, ""
     return value["mean"], f"{value['mean']:.{metric.digits}f}", f"± {value['std']:.{metric.digits}f}"
@@ -89,6 +114,21 @@ def _rows(runs: Sequence[Judged], columns: Sequence[tuple[str, Metric]], suns: s
         numbers = best_in_bold(metric, cells)
         made.append([f"{n} <small>{cell[2]}</small>" for n, cell in zip(numbers, cells, strict=True)])
     return [[run.label, *row] for run, *row in zip(runs, *made, strict=True)]
+
+
+def _object_rows(runs: Sequence[Judged], number: int, group: str, metrics: Sequence[Metric]) -> list[list[str]]:
+    """A row for each run; [] where none has the group."""
+    summaries = [
+        next((one.get(group) for one in run.metrics.get("objects") or [] if one["id"] == number), None) for run in runs
+    ]
+    if all(summary is None for summary in summaries):
+        return []
+    columns = []
+    for metric in metrics:
+        cells = [_cell((summary or {}).get(metric.key), metric) for summary in summaries]
+        bold = best_in_bold(metric, cells)
+        columns.append([f"{n} <small>{cell[2]}</small>" for n, cell in zip(bold, cells, strict=True)])
+    return [[run.label, *row] for run, *row in zip(runs, *columns, strict=True)]
 
 
 def _heading(metric: Metric, prefix: str = "") -> str:

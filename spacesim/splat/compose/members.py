@@ -6,7 +6,7 @@ anew and nothing is loaded again.
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -36,7 +36,7 @@ MODEL_DISTANCE = 5.0  #: farthest training camera of such a run, in its radii: c
 class Member:
     """A run as it takes part in scenes; its frame is the model's. rows: 11 Floats [N], `Gaussians.shape_rows`;
     centre: [3] metres;  radius: metres, of a sphere about the centre that holds every Gaussian to three standard
-    deviations;  shadow: how shadows of others fall on it;  distance, extent: metres, of the farthest training camera,
+    deviations;  shadow: its own kind of shadows;  distance, extent: metres, of the farthest training camera,
     and of the Gaussians, as `TrainingFrame` has distance and radius;  key: equal for equal contents"""
 
     run: Run
@@ -68,6 +68,15 @@ class Member:
     def count(self) -> int:
         """N."""
         return self.run.gaussians
+
+    @property
+    def received(self) -> ShadowConfig:
+        """How shadows of other models fall on it: as its own, but that a depth test in a picture of the others alone
+        must know how much of a pixel they cover. Nothing refines these shadows, and a faint rim is no wall."""
+        mapping = self.shadow.mapping
+        if mapping.filter != "bilinear":
+            return self.shadow
+        return replace(self.shadow, mapping=replace(mapping, filter="percentage-closer"))
 
     @property
     def linear(self) -> bool:

@@ -302,11 +302,14 @@ class Composition:
         whole = ensemble.placed([Pose() if j == k else back.after(pose) for j, pose in enumerate(poses)])
         direction, least = poses[k].direction_in_model(sun), LEAST_SHARE * member.shadow.size / member.extent
 
+        alone = self.config.shadows == "others"
+        shadow = member.received if alone else member.shadow
+
         def seen(casts: Any) -> Any:
             between = Between(whole, casts, member.run.model, ensemble.own[k], ensemble.indices[k])
-            return 1 - cast_between(between, direction, member.shadow, member.distance, least)
+            return 1 - cast_between(between, direction, shadow, member.distance, least)
 
-        if self.config.shadows == "others":
+        if alone:
             visible = seen(ensemble.others[k])
         else:
             everything = dr.opaque(ad.Bool, True, ensemble.count)

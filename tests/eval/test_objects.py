@@ -1,0 +1,152 @@
+"""Objects judged one by one, and a composed scene in the place of a run."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spacesim.data.images import load_image, luminance, read_exr, write_exr
+from spacesim.eval import image, shadow
+from spacesim.eval.composition import ComposedRun
+from spacesim.eval.evaluate import evaluate
+from spacesim.eval.objects import GROUPS, object_names
+from spacesim.eval.report import write_report
+
+CUT = 24  #: column at which the second object begins
+
+
+@pytest.fixture(autouse=True)
+def no_weights(monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "nowhere"))
+
+
+@pytest.fixture
+def pair(dataset):
+    """The spheres cut in two objects; the last frame shows the first alone."""
+    for index, frame in enumerate(dataset.test):
+        path = dataset.root / frame.gt_path
+        layers = read_exr(path)
+        second = (np.arange(layers["alpha"].shape[1]) >= CUT) & (index < 3)
+        ids = np.where(layers["alpha"] > 0, 1 + second, 0).astype(np.float32)
+        write_exr(path, layers | {"object_id": ids})
+    objects = [{"id": 1, "name": "ball"}, {"id": 2, "name": "ball"}]
+    return replace(dataset, scene={**dataset.scene, "objects": objects})
+
+
+class FakeScene:
+    """What `ComposedRun` asks a composition for."""
+
+    def __init__(self, run, names):
+        self.run, self.gaussians, self.bytes, self.backend, self.relightable = run, 7, 8, "llvm", False
+        self.names = names
+
+    def predict(self, camera, sun, normals=False):
+        return self.run.predict(camera, sun)
+
+
+class Scene(ComposedRun):
+    """With names and a configuration as the test wants."""
+
+    @property
+    def names(self):
+        return self.composition.names
+
+    @property
+    def config(self):
+        return {"method": "shadow-map and vanilla"}
+
+
+def shifted(rgb):
+    return np.roll(rgb, 2, axis=1)
+
+
+def test_values_are_those_of_each_objects_pixels(make_run, pair, tmp_path):
+    columns = np.arange(40)[None] * np.ones((40, 1))
+    metrics = evaluate(make_run(shifted, (columns >= 22).astype(float)), pair, tmp_path / "eval")
+    assert [(one["id"], one["name"], one["frames"]) for one in metrics["objects"]] == [
+        (1, "ball 1", 4),
+        (2, "ball 2", 3),
+    ]
+    for number, one in enumerate(metrics["objects"], start=1):
+        found = []
+        for index, frame in enumerate(pair.test):
+            truth = load_image(pair, frame).over(np.zeros(3))
+            mask = read_exr(pair.root / frame.gt_path)["object_id"] == number
+            judged = metrics["frames"][index]["objects"].get(one["name"])
+            assert (judged is None) == (not mask.any())
+            if judged is None:
+                continue
+            found.append(image.psnr(shifted(truth), truth, mask))
+            assert judged["image"]["psnr"] == found[-1]
+            assert judged["image"]["ssim"] == pytest.approx(image.ssim(shifted(truth), truth, mask))
+            expected = shadow.luminance_metrics(luminance(shifted(truth)), luminance(truth), mask)
+            assert judged["shadow"] == expected
+        found = [value for value in found if value is not None]  # where all is black, all is right
+        assert one["image"]["psnr"] == {"mean": np.mean(found), "std": np.std(found), "count": len(found)}
+        assert len(found) >= 2
+        assert set(one) == {"id", "name", "frames", *GROUPS}
+    first, second = (one["shadow_mask"]["error_rate"]["mean"] for one in metrics["objects"])
+    assert first > 0  # columns 20 and 21 are lit, and predicted dark
+    assert second == 0
+    assert any("ball 2 is in 3 of 4 frames" in note for note in metrics["notes"])
+
+
+def test_one_object_is_no_list(make_run, dataset, tmp_path):
+    metrics = evaluate(make_run(), dataset, tmp_path / "eval")
+    assert metrics["objects"] is None
+    assert "objects" not in metrics["frames"][0]
+    assert sum(note.startswith("objects is null") for note in metrics["notes"]) == 1
+    assert object_names(replace(dataset, scene={})) == {}
+
+
+def test_a_scene_in_the_place_of_a_run(make_run, pair, tmp_path):
+    trained = replace(pair, train=pair.test[:1])  # other data than the models were trained on
+    scene = Scene(FakeScene(make_run(shifted), ["left", "right"]), Path("pair.toml"))
+    metrics = evaluate(scene, trained, tmp_path / "eval")
+    assert [one["name"] for one in metrics["objects"]] == ["left", "right"]
+    assert (metrics["known_suns"], metrics["unseen_suns"]) == (None, None)
+    assert (metrics["run"], metrics["model"]["gaussians"]) == ("pair.toml", 7)
+    alone = evaluate(make_run(shifted), trained, tmp_path / "alone")
+    assert metrics["image"] == alone["image"]
+    three = Scene(FakeScene(make_run(shifted), ["a", "b", "c"]), Path("three.toml"))
+    other = evaluate(three, trained, tmp_path / "three")
+    assert [one["name"] for one in other["objects"]] == ["ball 1", "ball 2"]
+    assert any("3 models" in note and "2 objects" in note for note in other["notes"])
+
+
+def test_the_report_has_both_tables_of_each_object(make_run, pair, tmp_path):
+    for name, change in (("good", lambda rgb: rgb + 0.01), ("bad", shifted)):
+        evaluate(make_run(change, path=Path(name)), pair, tmp_path / name)
+    write_report([tmp_path / "good", tmp_path / "bad"], tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert "Object by object" in text
+    for caption in ("ball 1: image", "ball 2: image", "ball 1: shadow by luminance", "ball 2: shadow by luminance"):
+        assert caption in text
+    assert "ball 1: shadow by predicted visibility" not in text  # these runs predict none
+    write_report([tmp_path / "good"], tmp_path / "one.html")
+    assert "Object by object" in (tmp_path / "one.html").read_text()
+
+
+def test_old_evaluations_have_no_objects(make_run, dataset, tmp_path):
+    evaluate(make_run(), dataset, tmp_path / "eval")
+    write_report([tmp_path / "eval"], tmp_path / "report.html")
+    assert "Object by object" not in (tmp_path / "report.html").read_text()
+
+
+def test_the_command_judges_a_scene(spacesim, tiny_run, tmp_path):
+    """Two runs against a path-traced pair: from TOML to report."""
+    done = spacesim(
+        "generate", "boxsat-pair", "--out", tmp_path / "pair", "--sun", "45,35", "--views", 1, "--test-suns", 0,
+        "--test-views", 2, "--resolution", 40, "--spp", 4,
+    )  # fmt: skip
+    assert done.code == 0, done.errors
+    model = f'[[models]]\nrun = "{tiny_run}"\n'
+    text = f'{model}name = "a"\n{model}name = "b"\nposition = [-3, -3, -3]\n'
+    (tmp_path / "pair.toml").write_text(text)
+    judged = spacesim("eval", tmp_path / "pair.toml", "--data", tmp_path / "pair", "--out", tmp_path / "eval", "--json")
+    assert judged.code == 0, judged.errors
+    assert '"name": "b"' in judged.output
+    assert "Object by object" in (tmp_path / "eval" / "report.html").read_text()
+    refused = spacesim("eval", tmp_path / "no.toml", "--data", tmp_path / "pair", "--out", tmp_path / "eval")
+    assert refused.is_refusal("no.toml")
