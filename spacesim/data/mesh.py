@@ -82,10 +82,13 @@ class SignedDistance:
         if not finite.any():
             return found
         asked = points[finite]
-        distance = np.sqrt(self._tree.squared_distance(self.vertices, self.faces, asked)[0])
-        distance[self.inside(asked)] *= -1
-        found[finite] = distance
+        found[finite] = np.where(self.inside(asked), -1, 1) * self.unsigned(asked)
         return found
+
+    def unsigned(self, points: Array) -> Array:
+        """[N] metres, for finite points [N, 3]: how far they are from the surface, on whichever side."""
+        points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
+        return np.asarray(np.sqrt(self._tree.squared_distance(self.vertices, self.faces, points)[0]), np.float64)
 
     def inside(self, points: Array) -> np.ndarray:
         """[N] bool, for points [N, 3]: whether they are inside. Cheaper than their distances."""

@@ -125,7 +125,8 @@ def entries(row: Any, index: Any, count: int) -> Any:
     if copies == 1:
         return dr.gather(type(row), row, index)
     place = dr.arange(ad.UInt32, copies * chosen)
-    return dr.gather(type(row), row, place // chosen * count + dr.gather(ad.UInt32, index, place % chosen))
+    old, new = dr.opaque(ad.UInt32, count), dr.opaque(ad.UInt32, chosen)  # as literals each size would be compiled
+    return dr.gather(type(row), row, place // new * old + dr.gather(ad.UInt32, index, place % new))
 
 
 def opacities(logit_opacities: Any) -> Any:

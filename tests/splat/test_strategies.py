@@ -9,6 +9,7 @@ from scipy.integrate import quad
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.mesh import SignedDistance
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.train.config import STRATEGIES, TrainConfig, preset
 from spacesim.splat.train.optimizer import Adam
@@ -54,14 +55,19 @@ def model(heights, opacity=0.9, log_scale=TINY) -> Gaussians:
 
 
 class Height:
-    """Signed distance to the half space x < 0; counts what it is asked."""
+    """Signed distance to the half space x < 0, as `SignedDistance` has it; counts what it is asked."""
 
     def __init__(self) -> None:
         self.asked: list[int] = []
+        self.sides: list[int] = []
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
+    def unsigned(self, points: np.ndarray) -> np.ndarray:
         self.asked.append(len(points))
-        return points[:, 0]
+        return np.abs(points[:, 0])
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        self.sides.append(len(points))
+        return points[:, 0] < 0
 
 
 def show(strategy: Strategy, gradient, radius=None, visible=None, times: int = 1) -> None:
@@ -134,6 +140,42 @@ def test_the_exterior_is_pruned_on_its_own_cadence():
     uneven = replace(MESH, cull_every=250)  # every 100 steps, the first refinement at or after 250, 500, 750, ...
     for step, pruned in ((1100, 0), (1200, 0), (1300, 1), (1400, 0), (1500, 1), (1600, 0)):
         assert refine(mesh_aware(2, uneven)[0], model([0.5, 0.0]), step).pruned == pruned, step
+
+
+def test_a_side_stays_known_while_a_gaussian_cannot_have_crossed():
+    """At 0.5, 0.3 and -0.5; then the first has moved by 0.4, the second by 0.35, the third by 0.45 to 0.05 inside."""
+    strategy, height = mesh_aware(3)
+    gaussians = model([0.5, 0.3, -0.5], 0.01)
+    survey = strategy._survey(STEP, gaussians)
+    everyone = np.ones(3, bool)
+    np.testing.assert_allclose(strategy._regions(gaussians, survey, everyone)[0], [0.5, 0.3, -0.5], atol=1e-7)
+    gaussians.means = ad.Array3f([0.9, -0.05, -0.05], [0, 0, 0], [0, 0, 0])
+    distance, where = strategy._regions(gaussians, survey, everyone)
+    np.testing.assert_allclose(distance, [0.9, -0.05, -0.05], atol=1e-7)
+    np.testing.assert_array_equal(where.boundary, [False, True, True])
+    assert height.sides == [3, 0]  # nearer than both margins the side does not matter
+    gaussians.means = ad.Array3f([0.9, -0.3, -0.3], [0, 0, 0], [0, 0, 0])
+    strategy._regions(gaussians, survey, everyone)
+    assert height.sides == [3, 0, 1]  # the second has moved by more than it was away
+
+
+def test_known_sides_change_nothing(meshed):
+    """Random walks about a mesh: regions as if each were asked for anew."""
+    surface = SignedDistance.of(meshed.root / meshed.mesh_path)
+    config = MeshAwareConfig(exterior_margin=0.02, interior_margin=0.1)
+    strategy = MeshAwareStrategy(DefaultStrategyConfig(), config, surface, scene_scale=1.0, count=500)
+    rng = np.random.default_rng(0)
+    means = rng.uniform(-1, 1, (500, 3))
+    survey = strategy._survey(STEP, model(np.zeros(500)))
+    for step in range(12):
+        means += rng.normal(scale=0.04, size=means.shape)
+        gaussians = model(np.zeros(500))
+        gaussians.means = ad.Array3f(np.ascontiguousarray(means.T, np.float32))
+        asked = rng.random(500) < 0.7
+        found = strategy._regions(gaussians, survey, asked)[1]
+        exact = regions(np.where(asked, surface(np.array(gaussians.means, np.float64).T), 0), 0.02, 0.1)
+        np.testing.assert_array_equal(found.exterior, exact.exterior, err_msg=str(step))
+        np.testing.assert_array_equal(found.interior, exact.interior, err_msg=str(step))
 
 
 def test_large_gaussians_go_in_spite_of_the_mesh():

@@ -27,10 +27,13 @@ class Adam:
         """Entry i of each moment becomes entry index[i], or zero where `fresh[i]`. index, fresh: [M]. The first row is
         of length N; longer ones are packed rows."""
         count, chosen = dr.width(self.first[0]), dr.width(index)
+        size = dr.opaque(ad.UInt32, chosen)  # as a literal each size would be compiled
         keep = []
         for moment in (*self.first, *self.second):
-            place = dr.arange(ad.UInt32, dr.width(moment) // count * chosen)
-            keep.append(dr.select(dr.gather(ad.Bool, fresh, place % chosen), 0, entries(moment, index, count)))
+            copies, forget = dr.width(moment) // count, fresh
+            if copies > 1:
+                forget = dr.gather(ad.Bool, fresh, dr.arange(ad.UInt32, copies * chosen) % size)
+            keep.append(dr.select(forget, 0, entries(moment, index, count)))
         dr.eval(keep)
         self.first, self.second = keep[: len(self.first)], keep[len(self.first) :]
 

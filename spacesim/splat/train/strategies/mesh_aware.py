@@ -1,10 +1,10 @@
 """The mesh-aware strategy (thesis 5.2.1, 5.1 to 5.9, table 5.2): a mesh says where Gaussians may be.
 
-The signed distance is asked for lazily: only of Gaussians whose fate depends on it. All are asked for when the exterior
-is pruned, and when there are too few.
+The signed distance is asked for lazily: only of Gaussians whose fate depends on it; of all when the exterior is pruned,
+and when there are too few. The side of the surface, which costs most, stays known while a Gaussian has moved less than
+it was away from it.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +13,11 @@ import numpy as np
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.mesh import SignedDistance
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig, DensityControl, Survey, chosen_parents
+
+KNOWN = ("known", "known_x", "known_y", "known_z")
 
 
 @dataclass(frozen=True)
@@ -61,19 +64,19 @@ def backfill_score(opacity: np.ndarray, distance: np.ndarray, seen: np.ndarray, 
 
 class MeshAwareStrategy(DensityControl):
     """State beside that of `DensityControl`: "views", steps in which a Gaussian, or what it was copied from, was seen
-    since the start."""
+    since the start; "known" and "known_x", "known_y", "known_z", the signed distance (metres) and the place at which
+    its side was asked for, 0 where it was not."""
 
     def __init__(
         self,
         config: DefaultStrategyConfig,
         mesh_aware: MeshAwareConfig,
-        distance: Callable[[np.ndarray], np.ndarray],
+        surface: SignedDistance,
         scene_scale: float,
         count: int,
     ) -> None:
-        """distance: from points [N, 3] to signed metres [N], see `spacesim.data.mesh.SignedDistance`."""
-        super().__init__(config, scene_scale, count, kept=("views",))
-        self.mesh_aware, self.distance = mesh_aware, distance
+        super().__init__(config, scene_scale, count, kept=("views", *KNOWN))
+        self.mesh_aware, self.surface = mesh_aware, surface
 
     def _accumulate(self, gradient: Any, radius: Any, visible: Any) -> None:
         self.state["views"] = self.state["views"] + dr.select(visible, ad.Float(1), 0)
@@ -82,12 +85,12 @@ class MeshAwareStrategy(DensityControl):
         """5.6."""
         ease, usual = self.mesh_aware.boundary_ease, self.config.grow_gradient
         open_ = (survey.gradient > ease * usual) & (survey.gradient <= usual)
-        boundary = self._regions(gaussians, open_)[1].boundary & open_
+        boundary = self._regions(gaussians, survey, open_)[1].boundary & open_
         return np.where(boundary, ease * usual, usual)
 
     def _expendable(self, gaussians: Gaussians, survey: Survey, weak: np.ndarray) -> np.ndarray:
         """The second term of 5.5."""
-        where = self._regions(gaussians, weak)[1]
+        where = self._regions(gaussians, survey, weak)[1]
         return weak & (where.exterior if self.mesh_aware.protect_interior else ~where.boundary)
 
     def _outside_is_due(self, step: int) -> bool:
@@ -96,7 +99,7 @@ class MeshAwareStrategy(DensityControl):
 
     def _outside(self, gaussians: Gaussians, survey: Survey) -> np.ndarray:
         """5.3."""
-        outside = self._regions(gaussians, np.ones(gaussians.count, bool))[1].exterior
+        outside = self._regions(gaussians, survey, np.ones(gaussians.count, bool))[1].exterior
         if outside.all():
             raise WorkError(
                 "training: --strategy mesh-aware would prune every Gaussian, none is within the mesh; "
@@ -111,14 +114,33 @@ class MeshAwareStrategy(DensityControl):
         missing = self.mesh_aware.min_gaussians - int((~remove).sum())
         if missing <= 0:
             return np.zeros(0, np.int64)
-        distance, where = self._regions(gaussians, ~remove)
+        distance, where = self._regions(gaussians, survey, ~remove)
         score = backfill_score(survey.opacity, distance, survey.kept["views"], where)
         return chosen_parents(score, ~(remove | where.exterior), missing, rng)
 
-    def _regions(self, gaussians: Gaussians, asked: np.ndarray) -> tuple[np.ndarray, Regions]:
+    def _regions(self, gaussians: Gaussians, survey: Survey, asked: np.ndarray) -> tuple[np.ndarray, Regions]:
         """(signed distance [N] metres, regions); those that are not asked for, [N] bool, have distance 0."""
-        distance = np.zeros(gaussians.count)
+        margins = [self.scene_scale * m for m in (self.mesh_aware.exterior_margin, self.mesh_aware.interior_margin)]
+        distance, means = np.zeros(gaussians.count), np.array(gaussians.means, np.float64).T
+        finite = np.isfinite(means).all(axis=1)
+        distance[~finite] = np.inf
+        asked = asked & finite
         if asked.any():
-            distance[asked] = self.distance(np.array(gaussians.means, np.float64)[:, asked].T)
-        margins = self.mesh_aware.exterior_margin, self.mesh_aware.interior_margin
-        return distance, regions(distance, *(self.scene_scale * margin for margin in margins))
+            distance[asked] = self._signed(means, survey.kept, asked, min(margins))
+        return distance, regions(distance, *margins)
+
+    def _signed(self, means: np.ndarray, kept: dict[str, np.ndarray], asked: np.ndarray, near: float) -> np.ndarray:
+        """Signed distances of those asked for, metres; nearer than `near` they count as inside: the regions are the
+        same. means [N, 3]; kept: the state, [N] each, which is brought up to date."""
+        points = means[asked]
+        known, *place = (kept[name][asked].astype(np.float64) for name in KNOWN)
+        distance = self.surface.unsigned(points)
+        moved = np.linalg.norm(points - np.stack(place, axis=1), axis=1)
+        stale = (moved >= np.abs(known)) & (distance > near)
+        outside = known > 0
+        outside[stale] = ~self.surface.inside(points[stale])
+        signed = np.where(outside & (distance > near), distance, -distance)
+        fresh = np.flatnonzero(asked)[stale]
+        for name, values in zip(KNOWN, (signed, *points.T), strict=True):
+            kept[name][fresh] = values[stale]
+        return signed
