@@ -107,13 +107,13 @@ class ClientControls:
         self._facts = facts
         self._session = session
         with gui.add_folder("View", order=1):
-            mode = gui.add_dropdown("Mode", MODES, initial_value=MODES[0])
+            self.mode = gui.add_dropdown("Mode", MODES, initial_value=MODES[0])
             self.scale = gui.add_html("", visible=False)
             sizes = tuple(map(str, SIDES))
             side = gui.add_dropdown("Resolution", sizes, initial_value="1024", hint="most pixels a side, at rest")
             picture = gui.add_button("Picture (PNG)")
         with gui.add_folder("Truth", order=4):
-            compare = gui.add_dropdown("Compare", COMPARISONS, initial_value=COMPARISONS[0])
+            self.compare = gui.add_dropdown("Compare", COMPARISONS, initial_value=COMPARISONS[0])
             wipe = gui.add_slider("Wipe", 0.0, 1.0, 0.01, 0.5, hint="the truth is on the left")
             samples = gui.add_slider("Samples", *SAMPLES, 4, 32, hint="of the path tracer, a pixel")
             self.status = gui.add_markdown("")
@@ -126,6 +126,7 @@ class ClientControls:
             go.on_click(_call(lambda: actions.jump(int(bounded(frame.value, 0, frames - 1, 0)))))
         with gui.add_folder("Statistics", order=9):
             self.numbers = gui.add_markdown(" ")
+        mode, compare = self.mode, self.compare
         mode.on_update(_call(lambda: session.set(mode=mode.value)))
         side.on_update(_call(lambda: session.set(side=side.value)))
         compare.on_update(_call(lambda: session.set(compare=compare.value)))

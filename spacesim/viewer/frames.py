@@ -12,7 +12,8 @@ from spacesim.viewer.state import Look, Stand, View
 
 BUDGET = 1 / 15  #: seconds that a frame may take while the view moves, chosen: 15 frames a second
 SHARES = (1.0, 0.75, 0.5, 0.375, 0.25)  #: of the full resolution, while the view moves
-STEP = 16  #: sides of pictures are multiples of this many pixels: few sizes occur, each of which compiles kernels
+STEP = 16  #: sides of pictures are multiples of this many pixels
+STAIR = 128  #: and the longer one, in full resolution, of this many: few sizes occur, each of which compiles kernels
 WARM = 3  #: frames of a size that compile kernels and tell nothing of its speed
 LEAST = 64  #: pixels of a side
 
@@ -31,9 +32,11 @@ class Frame:
 
 
 def sides(view: View, most: int, share: float = 1.0) -> tuple[int, int]:
-    """(width, height) of the picture of a view, pixels: the window's shape, at most `most` times `share` on its longer
-    side, in multiples of STEP. Pixels are not quite square then, and the camera knows that."""
-    scale = share * min(1.0, most / max(view.width, view.height))
+    """(width, height) of the picture of a view, pixels: the window's shape and, in full resolution, its size rounded up
+    to a STAIR, but at most `most` on the longer side; `share` of that. Pixels are not quite square then, and the camera
+    knows that."""
+    longer = max(view.width, view.height)
+    scale = share * min(STAIR * -(-longer // STAIR), most) / longer
     width, height = (max(LEAST, STEP * round(scale * side / STEP)) for side in (view.width, view.height))
     return width, height
 

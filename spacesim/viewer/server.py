@@ -104,7 +104,7 @@ class Viewer:
             handle = SunHandle(server.scene, show.stage, self.shared, self._sun.drag)
         self._models = ModelControls(server.gui, show.stage, self.shared, gizmos, handle)
         self.paths = PathControls(server.gui, show.stage, self.shared, self._client, self.put, show.path)
-        FileControls(server.gui, show.stage, self.shared, self.paths, show.out, self.loop.do)
+        self.files = FileControls(server.gui, show.stage, self.shared, self.paths, show.out, self.loop.do)
         self.shared.listen(self._changed)
         server.on_client_connect(self._came)
         server.on_client_disconnect(self._went)

@@ -140,3 +140,38 @@ class Page:
             self.send("Page.close")
         finally:
             self._socket.close()
+
+
+def fill(page: Page, uuid: str, value: str) -> None:
+    """Type into the field of a control of viser, by its number."""
+    found = page.evaluate(
+        f"""(() => {{
+            let row = document.getElementById({uuid!r}) || document.querySelector("label[for='{uuid}']");
+            const visible = "input:not([type=hidden])";
+            while (!row.matches(visible) && !row.querySelector(visible)) row = row.parentElement;
+            const field = row.matches(visible) ? row : row.querySelector(visible);
+            field.scrollIntoView(); field.focus(); field.select(); return true; }})()"""
+    )
+    assert found
+    page.send("Input.insertText", text=value)
+    for kind in ("keyDown", "keyUp"):
+        page.send("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", windowsVirtualKeyCode=13)
+    page.evaluate("document.activeElement.blur()")
+
+
+def choose(page: Page, uuid: str, option: str) -> None:
+    """Choose in a dropdown of viser, by its number."""
+    page.evaluate(f"(() => {{ const one = document.getElementById({uuid!r}); one.focus(); one.click(); }})()")
+    text = f"""[...document.querySelectorAll("[role=option]")].find(one => one.innerText.trim() == {option!r})"""
+    wait_for(lambda: page.evaluate(f"(() => {{ const o = {text}; if (o) o.click(); return !!o; }})()"), option)
+
+
+def press(page: Page, words: str) -> None:
+    """Click the button, or open the folder, that says so."""
+    found = page.evaluate(
+        f"""(() => {{
+            const all = [...document.querySelectorAll("button, p, div, span")];
+            const one = all.findLast(one => one.innerText && one.innerText.trim() == {words!r});
+            if (one) {{ one.scrollIntoView(); one.click(); }} return !!one; }})()"""
+    )
+    assert found, words

@@ -11,8 +11,29 @@ from spacesim.data.records import Sun
 from spacesim.splat.compose import Composition, Placed, Pose
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.run import Run
+from spacesim.viewer.opened import opened
+from spacesim.viewer.server import Viewer
 from spacesim.viewer.stage import Stage
 from spacesim.viewer.state import Stand, View
+
+SCENE = """
+[[models]]
+name = "below"
+run = "{run}"
+[[models]]
+name = "above"
+run = "{run}"
+position = [0.0, 0.0, 1.6]
+scale = 0.5
+[sun]
+azimuth_deg = 20.0
+elevation_deg = 60.0
+[camera]
+position = [12.0, -4.0, 4.5]
+look_at = [0.0, 0.0, 0.8]
+resolution = [400, 400]
+fov_deg = 35.0
+"""
 
 
 def ball_run(name: str, colour: tuple[float, float, float], count: int = 400, radius: float = 0.5) -> Run:
@@ -51,3 +72,22 @@ def stand(stage) -> Stand:
 def view() -> View:
     """From 5 m on the -x side, window 4:3."""
     return View(look_at([-5.0, 0, 0], [0.0, 0, 0]), np.radians(40), 640, 480)
+
+
+@pytest.fixture(scope="module")
+def viewer(tiny_run, tmp_path_factory):
+    """Two models of one run, one above the other, served on loopback."""
+    pytest.importorskip("viser", reason="viser is not installed")
+    folder = tmp_path_factory.mktemp("viewer")
+    (folder / "pair.toml").write_text(SCENE.format(run=tiny_run))
+    one = Viewer(opened(folder / "pair.toml", out=folder), port=0)
+    one.start()
+    yield one
+    one.stop()
+
+
+@pytest.fixture
+def at_start(viewer):
+    """The scene as it was opened."""
+    viewer.put(viewer.show.stand)
+    return viewer.show.stand

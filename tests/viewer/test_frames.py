@@ -101,7 +101,7 @@ def test_every_mode_has_a_picture_from_anywhere(stage, stand, mode):
     away = View(look_at([50.0, 0, 0], [100.0, 0, 0]), np.radians(40), 100, 80)
     for one in (within, away):
         frame = draw(stage, stand, one, Look(mode, side=256))
-        assert frame.picture.shape == (80, 96, 3)
+        assert frame.picture.shape == (96, 128, 3)
         assert frame.picture.dtype == np.uint8
 
 

@@ -1,0 +1,186 @@
+"""The viewer in headless Chromium: it opens, handles are dragged, truth appears, what is saved is drawn again."""
+
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, Browser, choose, fill, press, wait_for
+
+from spacesim.data.images import read_png
+from spacesim.data.records import Sun
+from spacesim.splat.compose import Pose
+from spacesim.viewer.frames import drawn
+from spacesim.viewer.handles import GIZMO, SUN_AWAY
+from spacesim.viewer.paint import PALETTE
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium to drive")
+    one = Browser(tmp_path_factory.mktemp("chromium"))
+    yield one
+    one.close()
+
+
+@pytest.fixture(scope="module")
+def tab(viewer, browser):
+    """A page that shows its first picture: page, client, size of the window."""
+    return opened_tab(viewer, browser)
+
+
+def opened_tab(viewer, browser, width=900, height=560):
+    before = set(viewer.clients)
+    page = browser.open(f"{viewer.url}/?fixedDpr=1", width, height)  # else viser draws fewer pixels where it is slow
+    client = wait_for(lambda: next((c for k, c in viewer.clients.items() if k not in before), None), "a client")
+    wait_for(lambda: "ms a picture" in page.text(), "the first picture")
+    close = 'document.querySelector("[class*=Notification-closeButton]")'  # of a note that WebGL runs in software
+    wait_for(lambda: page.evaluate(f"(() => {{ if ({close}) {close}.click(); return !{close}; }})()"), "the note to go")
+    wait_for(lambda: shown(page, client).max() > 40, "a picture that is not black")
+    return SimpleNamespace(page=page, client=client)
+
+
+def shown(page, client):
+    """[H, W, 3] int: the part of the page where the scene is."""
+    view = client.session.view
+    return page.picture()[: view.height, : view.width].astype(int)
+
+
+def settled(page, client):
+    """What is shown once it changes no more."""
+    last = shown(page, client)
+    for _ in range(40):
+        time.sleep(0.3)
+        now = shown(page, client)
+        if np.abs(now - last).max() < 8:
+            return now
+        last = now
+    raise AssertionError("the picture never settles")
+
+
+def on_page(client, point):
+    """(x, y) of a point of the world on the page."""
+    view = client.session.view
+    camera = view.camera(view.width, view.height)
+    x, y, z = camera.camera_from_world[:3, :3] @ point + camera.camera_from_world[:3, 3]
+    return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+
+
+def test_it_opens_with_the_scene(viewer, tab):
+    picture = settled(tab.page, tab.client)
+    view = tab.client.session.view
+    assert view.width > 300
+    camera = viewer.show.camera
+    assert np.allclose(view.world_from_camera, camera.world_from_camera, atol=1e-4)
+    assert (picture.max(axis=-1) > 60).mean() > 0.01
+    text = tab.page.text()
+    for words in ("Mode", "Azimuth", "Scale of above", "Compare", "600 Gaussians", "CPU (LLVM)"):
+        assert words.lower() in text.lower() or words == "CPU (LLVM)"
+
+
+def test_a_dragged_gizmo_moves_its_model(viewer, tab, at_start):
+    choose(tab.page, tab.client.controls.mode._impl.uuid, "object id")
+    before = settled(tab.page, tab.client)
+    pose, radius = at_start.poses[1], viewer.show.stage.models[1].radius
+    up, grab = np.array([0, 0, 1]), 0.3 * GIZMO * pose.scale * radius  # between the other handles
+    start, end = (on_page(tab.client, pose.translation + length * up) for length in (grab, grab + 0.5))
+    tab.page.drag(start, end)
+    moved = viewer.shared.stand.poses[1].translation
+    assert moved[:2] == pytest.approx(pose.translation[:2], abs=0.02)
+    assert 0.3 < moved[2] - pose.translation[2] < 0.7
+    after = settled(tab.page, tab.client)
+    blue = [np.argwhere((p[..., 2] > 180) & (p[..., 0] < 130)) for p in (before, after)]
+    top, lower = (rows[:, 0].mean() for rows in (blue[1], blue[0]))
+    assert top < lower - 20  # pixels: it has gone up
+    viewer.put(at_start)
+
+
+def test_a_dragged_sun_moves_the_shadow(viewer, tab, at_start):
+    choose(tab.page, tab.client.controls.mode._impl.uuid, "visibility")
+    before = settled(tab.page, tab.client)
+    centre, radius = viewer.show.stage.bounds(at_start)
+    ball = centre + SUN_AWAY * radius * at_start.sun.direction
+    other = centre + SUN_AWAY * radius * Sun.from_angles(320, 20).direction
+    tab.page.drag(on_page(tab.client, ball), on_page(tab.client, other), steps=12)
+    azimuth, elevation = viewer.shared.stand.sun.angles
+    assert abs(azimuth - 320) < 8
+    assert abs(elevation - 20) < 8
+    after = settled(tab.page, tab.client)
+    assert (np.abs(after - before).max(axis=-1) > 60).mean() > 0.005
+    sliders = viewer._sun
+    assert float(sliders.azimuth.value) == pytest.approx(azimuth, abs=0.1)
+    fill(tab.page, sliders.azimuth._impl.uuid, "20")
+    fill(tab.page, sliders.elevation._impl.uuid, "60")
+    wait_for(lambda: viewer.shared.stand.sun.angles == pytest.approx((20, 60), abs=1e-6), "the typed Sun")
+    again = settled(tab.page, tab.client)
+    assert np.abs(again - before).mean() < 2
+
+
+def test_the_truth_appears(viewer, tab, at_start):
+    controls = tab.client.controls
+    choose(tab.page, controls.mode._impl.uuid, "colour")
+    plain = settled(tab.page, tab.client)
+    tab.client.session.set(samples=8)
+    choose(tab.page, controls.compare._impl.uuid, "wipe")
+    wait_for(lambda: "path-traced, 8 samples" in tab.page.text(), "the truth", 60)
+    wiped = settled(tab.page, tab.client)
+    half = plain.shape[1] // 2
+    assert np.abs(wiped[:, half + 3 :] - plain[:, half + 3 :]).mean() < 1.5
+    assert np.abs(wiped[:, : half - 3] - plain[:, : half - 3]).mean() > 2
+    choose(tab.page, controls.compare._impl.uuid, "off")
+    back = settled(tab.page, tab.client)
+    assert np.abs(back - plain).mean() < 1.5
+
+
+def test_what_is_saved_is_drawn_by_the_command_line(viewer, tab, at_start, spacesim, tmp_path):
+    viewer.put(at_start.placed(1, at_start.poses[0]))  # something else than what was opened
+    viewer.put(at_start.placed(1, Pose(translation=np.array([0.1, 0.9, 1.0]), scale=0.7)))
+    press(tab.page, "Files")
+    uuid = viewer.files.name._impl.uuid
+    wait_for(lambda: tab.page.evaluate(f"!!document.querySelector(\"label[for='{uuid}']\")"), "the folder")
+    fill(tab.page, uuid, "saved.toml")
+    wait_for(lambda: viewer.files.name.value == "saved.toml", "the name")
+    press(tab.page, "Save scene")
+    path = viewer.show.out / "saved.toml"
+    wait_for(path.exists, "the file")
+    done = spacesim("compose", path, "--out", tmp_path / "frames")
+    assert done.code == 0, done.errors
+    picture = read_png(tmp_path / "frames" / "rgb" / "0000.png").astype(np.float64)
+    over_black = np.rint(picture[..., :3] * picture[..., 3:] / 255)
+    view, stand = tab.client.session.view, viewer.shared.stand
+    _, ours, _, _ = drawn(viewer.show.stage, stand, view.camera(view.width, view.height), "colour")
+    assert ours.shape == over_black.shape
+    assert np.abs(ours - over_black).max() <= 2  # straight alpha is rounded twice
+    press(tab.page, "Save scene")  # our own file may be written again, others' not
+    time.sleep(0.3)
+    assert "saved" in viewer.files.told.content
+    fill(tab.page, uuid, "pair.toml")
+    wait_for(lambda: viewer.files.name.value == "pair.toml", "the name")
+    press(tab.page, "Save scene")
+    wait_for(lambda: "not saved" in viewer.files.told.content, "the refusal")
+
+
+def test_two_clients_at_once(viewer, browser, tab, at_start):
+    """Each has a camera and a mode of its own; the scene is one."""
+    other = opened_tab(viewer, browser, 700, 300)
+    try:
+        choose(other.page, other.client.controls.mode._impl.uuid, "object id")
+        ids = settled(other.page, other.client)
+        mine = settled(tab.page, tab.client)
+        assert tab.client.session.look.mode == "colour"
+        palette = np.array([(0, 0, 0), *PALETTE[:2]])
+        near = np.abs(ids[:, :, None] - palette).max(axis=-1).min(axis=-1) < 30
+        assert near.mean() > 0.9  # but for handles
+        x, y = other.client.session.view.width / 2, 60.0
+        other.page.drag((x, y), (x + 80, y))
+        wait_for(lambda: not other.client.session.view.same(tab.client.session.view), "another view")
+        viewer.put(at_start.placed(1, Pose(translation=np.array([0.0, 1.2, 1.0]))))
+        assert np.abs(settled(tab.page, tab.client) - mine).mean() > 1
+        assert np.abs(settled(other.page, other.client) - ids).mean() > 1
+    finally:
+        count = len(viewer.clients)
+        other.page.close()
+    wait_for(lambda: len(viewer.clients) == count - 1, "the client to go")
+    viewer.put(at_start)
+    assert settled(tab.page, tab.client).max() > 40

@@ -1,0 +1,192 @@
+"""Clients without a browser: pictures for them, nonsense from them, leaving in the middle, memory."""
+
+import gc
+import random
+import threading
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from browser import wait_for
+
+from spacesim.data.records import Sun
+from spacesim.viewer.state import Stand
+
+viser = pytest.importorskip("viser", reason="viser is not installed")
+msgspec, zstandard = (pytest.importorskip(name) for name in ("msgspec", "zstandard"))  # which it brings
+websockets = pytest.importorskip("websockets")
+client = pytest.importorskip("websockets.sync.client")
+
+pytestmark = pytest.mark.filterwarnings(r"ignore:(Queued a |\[viser\])")  # as the viewer has it; pytest undoes that
+
+
+def connected(viewer):
+    url = viewer.url.replace("http", "ws")
+    return client.connect(url, subprotocols=[f"viser-v{viser.__version__}"], compression=None, max_size=None)
+
+
+def camera_message(angle=0.0, **changes):
+
+    wxyz = (np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2))
+    message = {
+        "type": "ViewerCameraMessage",
+        "wxyz": [float(x) for x in wxyz],
+        "position": [0.0, -6.0, 0.0],
+        "fov": 0.6,
+        "near": 0.01,
+        "far": 1000.0,
+        "image_height": 240,
+        "image_width": 320,
+        "look_at": [0.0, 0.0, 0.0],
+        "up_direction": [0.0, 0.0, 1.0],
+    }
+    return msgspec.msgpack.encode({**message, **changes})
+
+
+def pictures(socket, count, patience=20.0):
+    """Messages until so many background pictures have come."""
+
+    found, deadline = 0, time.monotonic() + patience
+    while found < count:
+        assert time.monotonic() < deadline, f"{found} of {count} pictures in {patience} s"
+        data = socket.recv(timeout=patience)
+        size = int.from_bytes(data[8:16], "little")
+        plain = zstandard.ZstdDecompressor().decompress(data[16 : 16 + size])
+        messages = msgspec.msgpack.decode(plain)["messages"]
+        found += sum(message["type"] == "BackgroundImageMessage" for message in messages)
+    return found
+
+
+def test_a_client_without_a_browser_gets_pictures(viewer):
+    with connected(viewer) as socket:
+        socket.send(camera_message())
+        pictures(socket, 2)  # coarse, then at rest
+
+
+def test_nonsense_of_a_client_harms_no_other(viewer, at_start, caplog, capfd):
+    """1,000 messages: bytes, msgpack of anything, messages that look right with wild values."""
+
+    rng = random.Random(0)
+    uuids = list(viewer._server.gui._gui_input_handle_from_uuid)
+    known = [viewer._sun.azimuth._impl.uuid, viewer.paths.step._impl.uuid, viewer.files.name._impl.uuid]
+    shared_before, clients_before = viewer.shared, len(viewer.clients)
+
+    def anything(depth=0):
+        values = [None, True, -1, 0.5, 1e308, float("nan"), float("inf"), 2**63 - 1, "", "x" * 300, b"\0\xff"]
+        kinds = [lambda: rng.choice(values)]
+        if depth < 3:
+            kinds += [
+                lambda: [anything(depth + 1) for _ in range(rng.randrange(5))],
+                lambda: {rng.choice(["type", "uuid", "value", "name", "wxyz", "x"]): anything(depth + 1)},
+            ]
+        return rng.choice(kinds)()
+
+    every = viser._messages.Message.get_subclasses()
+    types = [one.__name__ for one in every]
+    fields = {one.__name__: list(getattr(one, "__dataclass_fields__", {})) for one in every}
+
+    def unreadable(k):
+        return [rng.randbytes(rng.randrange(200)), msgspec.msgpack.encode(anything()), "text"][k % 3]
+
+    def message(k):
+        name = rng.choice(types) if k % 2 else rng.choice(["ViewerCameraMessage", "GuiUpdateMessage"])
+        values = {field: anything() for field in fields[name]}
+        if name == "GuiUpdateMessage":
+            what = rng.choice(["value", "update_cb", "label"])
+            values = {"uuid": rng.choice(known + uuids), "updates": {what: anything()}}
+        if name.startswith("TransformControls"):
+            values |= {"name": "/models/0", "owner": ""}
+        return msgspec.msgpack.encode({"type": name, **values})
+
+    socket = connected(viewer)
+    socket.send(camera_message())
+    sent = dropped = 0
+    while sent < 1000:
+        try:
+            socket.send(unreadable(sent) if sent % 20 == 0 else message(sent))
+            sent += 1
+        except websockets.exceptions.ConnectionClosed:  # over what cannot be read; the client comes back
+            dropped += 1
+            socket = connected(viewer)
+            socket.send(camera_message())
+    socket.close()
+    assert dropped < 200
+    with connected(viewer) as good:
+        good.send(camera_message(0.3))
+        pictures(good, 2)
+    wait_for(lambda: len(viewer.clients) == clients_before, "all of them to be gone")
+    stand = viewer.shared.stand
+    assert viewer.shared is shared_before
+    assert viewer.shared.stand is stand
+    assert all(np.isfinite(pose.matrix).all() for pose in stand.poses)
+    assert np.linalg.norm(stand.sun.direction) == pytest.approx(1)
+    assert viewer.loop._thread.is_alive()
+    assert viewer._server._share_tunnel is None  # nobody can open a way in from outside
+    said = caplog.text + "".join(capfd.readouterr())
+    assert "Traceback" not in said
+
+
+def test_pages_of_other_sites_are_refused(viewer):
+    url = viewer.url.replace("http", "ws")
+    version = [f"viser-v{viser.__version__}"]
+    with client.connect(url, subprotocols=version, origin="https://example.org", max_size=None) as socket:
+
+        def listen():
+            for _ in range(100):
+                socket.recv(timeout=10)
+
+        with pytest.raises(websockets.exceptions.ConnectionClosed):
+            listen()
+
+
+def test_clients_that_leave_in_the_middle(viewer):
+    """While pictures are on their way to them."""
+    threads = threading.active_count()
+    for k in range(12):
+        socket = connected(viewer)
+        for j in range(5):
+            socket.send(camera_message(0.1 * j + k))
+        if k % 2:
+            socket.close()
+        else:
+            socket.socket.close()  # without a word
+    with connected(viewer) as good:
+        good.send(camera_message(-0.3))
+        pictures(good, 2)
+    wait_for(lambda: threading.active_count() <= threads + 34, "threads to end")  # viser has a pool of up to 32
+
+
+def test_the_page_is_served_and_nothing_else(viewer):
+    with urllib.request.urlopen(viewer.url, timeout=10) as answer:
+        assert b"<html" in answer.read()[:500].lower()
+    with pytest.raises(urllib.error.HTTPError):
+        urllib.request.urlopen(f"{viewer.url}/../../../etc/passwd", timeout=10)
+
+
+def test_looking_around_takes_no_memory(viewer, at_start):
+    """A few hundred pictures under changing Suns and poses, after as many to warm up."""
+
+    def resident():
+        gc.collect()
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[1]) * 4096
+
+    def look_around(socket, count):
+        for k in range(count):
+            socket.send(camera_message(0.02 * k))
+            viewer.put(Stand(at_start.poses, Sun.from_angles(3 * k % 360, 30)))
+            pictures(socket, 1)
+
+    try:
+        with open("/proc/self/statm"):
+            pass
+    except OSError:
+        pytest.skip("no /proc to read the memory from")
+    with connected(viewer) as socket:
+        look_around(socket, 100)
+        before = resident()
+        look_around(socket, 150)
+        grown = resident() - before
+    assert grown < 20 << 20, f"{grown / 2**20:.1f} MiB"
