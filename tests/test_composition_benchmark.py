@@ -1,0 +1,67 @@
+"""benchmarks/composition.py: its rows, its verdicts, and a whole run of it on almost nothing."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture(autouse=True)
+def _importable(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+
+
+def test_rows_by_kind_and_by_name():
+    import composition
+
+    names = [row.name for row in composition.chosen_rows("thesis,ours", "demo")]
+    assert names[:4] == ["none", "map", "splat", "park"]
+    assert len(set(names)) == len(names)
+    assert set(composition.THESIS) == set(names[:4])
+    chosen = composition.chosen_rows("map-ratio,none", "demo")
+    assert [(row.name, row.run, row.shadows) for row in chosen] == [
+        ("none", "none", "none"),
+        ("map-ratio", "map", "ratio"),
+    ]
+    assert chosen[1].config.method == "shadow-map"
+    with pytest.raises(SystemExit, match="--rows: expected some of thesis, ours, none"):
+        composition.chosen_rows("mapp", "demo")
+
+
+def test_verdicts():
+    import composition
+
+    def metrics(first, second, ber):
+        summary = [{"psnr": {"mean": value}} for value in (first, second)]
+        shadow = [{"ber": {"mean": 0.5}}, {"ber": {"mean": ber}}]
+        return {
+            "objects": [
+                {"name": name, "image": image, "shadow": one}
+                for name, image, one in zip(("first", "second"), summary, shadow, strict=True)
+            ]
+        }
+
+    row = next(row for row in composition.chosen_rows("map", "demo"))
+    told = composition.targets(row, {"map": metrics(20.0, 36.5, 0.01), "none": metrics(20.5, 26.0, 0.2)})
+    assert (told["second, dB"], told["at least 10"]) == ("+10.50", "yes")
+    assert (told["error rate, share left"], told["at most 0.1"]) == ("0.050", "yes")
+    assert (told["first, dB"], told["not worse"]) == ("-0.50", "no")
+
+
+def test_it_runs_and_says_both_tables(tiny_run, tmp_path):
+    command = [sys.executable, str(FOLDER / "composition.py"), "--backend", "llvm", "--out", str(tmp_path / "runs")]
+    command += ["--rows", "none,none-shaded", "--run", f"none={tiny_run}", "--views", "2", "--resolution", "32"]
+    done = subprocess.run([*command, "--json", str(tmp_path / "found.json")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "found.json").read_text())
+    for which in ("first", "second"):
+        rows = found["rows"][f"The {which} boxsat, Sun (45, 35)"]
+        assert [row["row"] for row in rows] == ["none", "none-shaded"]
+    second = found["rows"]["The second boxsat, Sun (45, 35)"]
+    assert float(second[1]["PSNR"]) > float(second[0]["PSNR"])
+    assert "map" in done.stdout
+    assert (tmp_path / "runs/pairs/report.html").exists()
