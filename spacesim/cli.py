@@ -409,8 +409,19 @@ def _print_headline(metrics: dict[str, Any]) -> None:
     if metrics.get("known_suns") and metrics.get("unseen_suns"):
         known, unseen = (_mean(metrics[part], "image", "psnr", 2) for part in ("known_suns", "unseen_suns"))
         ending.say(f"silhouette PSNR: {known} dB under known Suns, {unseen} dB under Suns never seen")
+    if (metrics.get("geometry") or {}).get("chamfer") is not None:
+        ending.say(_shape_words(metrics["geometry"]))
     for note in metrics.get("notes", []):
         ending.say(f"note: {note}")
+
+
+def _shape_words(geometry: dict[str, Any]) -> str:
+    """The headline of metrics.json's "geometry"."""
+    near, overlap = geometry["precision_recall"], geometry["iou"]
+    words = f"shape: Chamfer {geometry['chamfer']:.3g} m2, Hausdorff-99 {geometry['hausdorff99']:.3g} m"
+    words += f", IoU {'null' if overlap is None else f'{overlap:.4f}'}, F {near['f']:.4f} at {near['distance']:.3g} m"
+    floating = (geometry["floaters"] or {}).get("outside")
+    return words if floating is None else f"{words}, floaters {100 * floating:.2f} %"
 
 
 def _mean(metrics: dict[str, Any], group: str, name: str, digits: int) -> str:

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import igl
 import numpy as np
 import trimesh
 
@@ -59,6 +58,8 @@ class SignedDistance:
 
     def __init__(self, vertices: Array, faces: np.ndarray) -> None:
         """vertices [V, 3] metres, faces [F, 3]. Raises InputError where no face has finite corners."""
+        import igl  # a third of a second, that readers of meshes need not wait
+
         self.vertices = np.ascontiguousarray(vertices, np.float64)
         self.faces = np.ascontiguousarray(_drawable(self.vertices, np.asarray(faces, np.int64).reshape(-1, 3)))
         if len(self.faces) == 0:

@@ -29,6 +29,7 @@ from spacesim.eval.notes import explain, explain_light, explain_objects
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
 from spacesim.eval.objects import judge_objects, object_names
 from spacesim.eval.relight import write_sweep
+from spacesim.eval.shape import write_shapes
 from spacesim.eval.suns import count_suns, known_suns, rounded_angles
 
 if TYPE_CHECKING:
@@ -92,6 +93,7 @@ def evaluate(
     if progress:
         progress(len(frames), len(frames), "its shape" if config.geometry else "")
     shape = judge_geometry(run, dataset, config.geometry)
+    write_shapes(out / "geometry", shape)
 
     method = str(run.config.get("method"))
     records = [one.record for one in judged]

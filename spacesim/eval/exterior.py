@@ -67,16 +67,10 @@ class Sight:
 
     def __init__(self, vertices: Array, faces: np.ndarray) -> None:
         """vertices: [V, 3] metres;  faces: [F, 3], at least one."""
-        mi = backend.mitsuba()
         corners = np.asarray(vertices, np.float64)[faces]
         low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
         self.centre, self.size = 0.5 * (low + high), float(np.linalg.norm(high - low)) or 1.0
-        mesh = mi.Mesh("surface", 3 * len(corners), len(corners))
-        parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = mi.Float(self._unit(corners).astype(np.float32).ravel())
-        parameters["faces"] = mi.UInt32(np.arange(3 * len(corners), dtype=np.uint32))
-        parameters.update()
-        self.scene = mi.load_dict({"type": "scene", "mesh": mesh})
+        self.scene = _scene(self._unit(corners))
         directions = fibonacci_sphere(DIRECTIONS, seed=0)
         self.directions = np.random.default_rng(0).permutation(directions)  # any first few are even
 
@@ -88,6 +82,17 @@ class Sight:
     def seen(self, points: Array) -> np.ndarray:
         """[N] bool, of points [N, 3] that are not on the surface: whether anything far away sees them."""
         return self._look(points, np.zeros_like(points)) != 0
+
+    def first(self, start: Array, towards: Array) -> tuple[Array, np.ndarray]:
+        """Where rays from points [N, 3] metres in directions [N, 3] meet the surface: (distances [N] in lengths of the
+        directions, infinite where they do not; the faces [N])."""
+        mi = backend.mitsuba()
+        origin, ray = (
+            np.ascontiguousarray(values.T, np.float32) for values in (self._unit(start), towards / self.size)
+        )
+        found = self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(ray)))
+        hit = np.array(found.is_valid())
+        return np.where(hit, np.array(found.t, np.float64), np.inf), np.where(hit, np.array(found.prim_index), 0)
 
     def _unit(self, points: Array) -> Array:
         """In units of the surface's size, about its centre: single precision resolves any scene."""
@@ -118,3 +123,14 @@ class Sight:
         state = dr.zeros(mi.UInt32, len(points)), dr.zeros(mi.Float, len(points))
         _, side = dr.while_loop(state, hidden, look, mode="symbolic", label="sight")
         return np.array(side).astype(np.int8)
+
+
+def _scene(corners: Array) -> Any:
+    """Mitsuba's scene of triangles [F, 3, 3]."""
+    mi = backend.mitsuba()
+    mesh = mi.Mesh("surface", 3 * len(corners), len(corners))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(corners.astype(np.float32).ravel())
+    parameters["faces"] = mi.UInt32(np.arange(3 * len(corners), dtype=np.uint32))
+    parameters.update()
+    return mi.load_dict({"type": "scene", "mesh": mesh})

@@ -71,7 +71,7 @@ class Comparison:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class JudgedShape:
     """values: metrics.json's "geometry", or None;  note: a sentence where it, or a part of it, is None, else "";
     comparison: None where the surfaces cannot be compared;  truth, found: both surfaces, None where there is none"""
 
@@ -82,19 +82,19 @@ class Judged:
     found: RunMesh | None = None
 
 
-def judge_geometry(run: "Run", dataset: Dataset, config: GeometryConfig | None) -> Judged:
+def judge_geometry(run: "Run", dataset: Dataset, config: GeometryConfig | None) -> JudgedShape:
     """The shape of a run against the dataset's mesh. The views are the dataset's training cameras. config: None for no
     judgement, only the sentence that says so.
 
     Raises InputError where the file of the mesh is missing or holds none, or the grid does not fit into memory.
     """
     if config is None:
-        return Judged(None, "Geometry is null: it was not asked for.")
+        return JudgedShape(None, "Geometry is null: it was not asked for.")
     model = getattr(run, "model", None)
     if dataset.mesh_path is None:
-        return Judged(None, "Geometry is null: the data has no true mesh.")
+        return JudgedShape(None, "Geometry is null: the data has no true mesh.")
     if model is None:
-        return Judged(None, "Geometry is null: it is measured of single runs.")
+        return JudgedShape(None, "Geometry is null: it is measured of single runs.")
     truth = read_mesh(dataset.root / dataset.mesh_path)
     size = size_of(*truth)
     cameras = [frame.camera for frame in dataset.train or dataset.frames]
@@ -108,7 +108,7 @@ def judge_geometry(run: "Run", dataset: Dataset, config: GeometryConfig | None) 
         "size": size,
         "mesh": {"faces": len(found.faces), "voxel": found.voxel, "views": found.views, "depth": config.mesh.depth},
     }
-    return Judged(values, note, compared, truth, found)
+    return JudgedShape(values, note, compared, truth, found)
 
 
 def size_of(vertices: Array, faces: np.ndarray) -> float:

@@ -16,6 +16,7 @@ from spacesim.eval.labels import IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric
 from spacesim.eval.lighting import by_grazing_angle, relighting, shadow_masks
 from spacesim.eval.page import escape, page, section, table
 from spacesim.eval.results import Cell, best_in_bold, by_object, results, results_by_suns, summary_cell
+from spacesim.eval.surfaces import shapes
 
 MANY_SUNS = 12
 """With more Suns than this, histograms become columns of one chart."""
@@ -74,6 +75,12 @@ def _content(runs: Sequence[Judged]) -> str:
             "How high the Sun stands over the surface itself: at 0° it brushes it. Pixels of all frames that face the "
             "Sun, lit or in cast shadow. False shadow: share of lit pixels predicted dark; missed shadow: of cast "
             "shadow predicted lit.",
+        ),
+        _section(
+            "Shape",
+            shapes(runs),
+            "The surface of each run, fused from its depth, against the true one: equally many points of what can be "
+            "seen of both from outside.",
         ),
         section(
             "By Sun",

@@ -89,6 +89,8 @@ tr.group th { color: var(--muted); font-size: 0.86rem; padding-top: 1rem; }
 .bar { display: inline-block; width: 11rem; height: 0.75rem; border-radius: 3px; margin: 0 0.5rem;
   vertical-align: -0.08rem; border: 1px solid var(--line); }
 .strip { display: grid; grid-template-columns: repeat(5, 1fr); gap: 0.7rem; margin: 0 0 1.2rem; }
+.thirds { display: grid; grid-template-columns: repeat(3, 1fr); gap: 0.7rem; margin: 0 0 1.2rem; }
+.thirds figcaption:empty { display: none; }
 .strip.small img { image-rendering: pixelated; }
 .sweep { display: grid; grid-template-columns: 5.6rem repeat(var(--suns), minmax(5.2rem, 1fr)); gap: 0.5rem;
   align-items: center; font-size: 0.82rem; }
