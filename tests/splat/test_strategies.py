@@ -243,7 +243,8 @@ def test_normalisation_and_score_by_hand():
     np.testing.assert_array_equal(normalised(np.zeros(5)), 0)
     assert len(normalised(np.zeros(0))) == 0
     channels = [np.array([0.0, 1.0]), np.array([2.0, 0.0]), np.array([1.0, 1.0])]
-    score, scaled = support_score(channels, SupportAwareConfig())
+    scaled = [normalised(channel) for channel in channels]
+    score = support_score(scaled, SupportAwareConfig())
     high = 1 / 0.95  # of two values 0 and 1 the 95th percentile is 0.95
     np.testing.assert_allclose(scaled, np.minimum([[0, high], [high, 0], [1, 1]], 1))
     np.testing.assert_allclose(score, [(0.75 + 0.25) / 2, (1 + 0.25) / 2])

@@ -51,7 +51,8 @@ class Survey:
     step: how many are finished
     gradient: mean over the views since the last refinement that showed it, half images per unit of loss
     radius: largest since then, fraction of the image's longer side;  opacity: in (0, 1)
-    scale: standard deviation along the longest axis, metres;  kept: {name: [N]} of the state that outlives refinements
+    scale: standard deviation along the longest axis, metres;  kept: {name: [N]} of the state that outlives refinements,
+        and what a strategy adds of its own
     """
 
     step: int
@@ -78,7 +79,7 @@ class DensityControl(Strategy):
     """
 
     def __init__(self, config: DefaultStrategyConfig, scene_scale: float, count: int, kept: tuple[str, ...]) -> None:
-        self.config, self.scene_scale = config, scene_scale
+        self.config, self.scene_scale, self.kept = config, scene_scale, kept
         self.state = {name: dr.zeros(ad.Float, count) for name in (*WINDOW, *kept)}
 
     def watches(self, step: int) -> bool:
@@ -176,7 +177,7 @@ class DensityControl(Strategy):
         copies = append_copies(gaussians, optimizer, np.searchsorted(index, parents), rng)
         survey = survey.at(index[copies])
         self.state = {name: dr.zeros(ad.Float, gaussians.count) for name in WINDOW}
-        self.state |= {name: ad.Float(values.astype(np.float32)) for name, values in survey.kept.items()}
+        self.state |= {name: ad.Float(survey.kept[name].astype(np.float32)) for name in self.kept}
         return len(parents)
 
     def _survey(self, step: int, gaussians: Gaussians) -> Survey:

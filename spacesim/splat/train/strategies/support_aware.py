@@ -50,11 +50,10 @@ def normalised(values: np.ndarray) -> np.ndarray:
     return np.clip(values / (np.quantile(values, 0.95) + TINY), 0, 1)
 
 
-def support_score(channels: list[np.ndarray], config: SupportAwareConfig) -> tuple[np.ndarray, list[np.ndarray]]:
-    """(S [N], normalised c, g and r) of 5.12, from the moving averages c, g and r, [N] each."""
+def support_score(scaled: list[np.ndarray], config: SupportAwareConfig) -> np.ndarray:
+    """S [N] of 5.12, from normalised averages of visibility, gradient and radius, [N] each."""
     weights = config.count_weight, config.gradient_weight, config.radius_weight
-    scaled = [normalised(np.asarray(channel, np.float64)) for channel in channels]
-    return np.average(scaled, axis=0, weights=weights), scaled
+    return np.average(scaled, axis=0, weights=weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,13 +99,13 @@ class SupportAwareStrategy(DensityControl):
         usual = np.full(gaussians.count, self.config.grow_gradient)
         if survey.step < self.support.warm_up:
             return usual
-        return np.where(self._score(survey)[0] >= self.support.ease_support, self.support.ease * usual, usual)
+        return np.where(self._score(survey) >= self.support.ease_support, self.support.ease * usual, usual)
 
     def _expendable(self, gaussians: Gaussians, survey: Survey, weak: np.ndarray) -> np.ndarray:
         """5.14."""
         if survey.step < self.support.warm_up:
             return weak
-        return weak & (self._score(survey)[0] < self.support.protect_support)
+        return weak & (self._score(survey) < self.support.protect_support)
 
     def _parents(
         self, gaussians: Gaussians, survey: Survey, remove: np.ndarray, rng: np.random.Generator
@@ -115,11 +114,18 @@ class SupportAwareStrategy(DensityControl):
         missing = self.support.min_gaussians - int((~remove).sum())
         if missing <= 0 or survey.step < self.support.backfill_start:
             return np.zeros(0, np.int64)
-        score, (count, gradient, _) = self._score(survey)
+        score, (count, gradient, _) = self._score(survey), self._scaled(survey)
         means = np.array(gaussians.means, np.float64).T
         found = candidates(means, score, survey.opacity, self.support)
         rank = 1.5 * score + 0.75 * survey.opacity + 0.25 * count + 0.25 * gradient - 0.5 * found.off_core  # 5.22
         return chosen_parents(rank, found.eligible & ~remove, missing, rng)
 
-    def _score(self, survey: Survey) -> tuple[np.ndarray, list[np.ndarray]]:
-        return support_score([survey.kept[name] for name in CHANNELS], self.support)
+    def _scaled(self, survey: Survey) -> list[np.ndarray]:
+        """Normalised averages, [N] each; made once in a refinement, and copied where Gaussians are."""
+        names = [f"scaled_{name}" for name in CHANNELS]
+        if names[0] not in survey.kept:
+            survey.kept.update({f"scaled_{name}": normalised(survey.kept[name]) for name in CHANNELS})
+        return [survey.kept[name] for name in names]
+
+    def _score(self, survey: Survey) -> np.ndarray:
+        return support_score(self._scaled(survey), self.support)
