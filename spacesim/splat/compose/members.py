@@ -88,7 +88,8 @@ class Member:
         model's frame;  sun: [3] in the world, unused by a run that knows one light."""
         run = self.run
         if run.light is None:
-            return list(_harmonic_colours(run.model.rows(), camera)), None
+            colours = _harmonic_colours if self.count > 1 else _trace_harmonic_colours
+            return list(colours(run.model.rows(), camera)), None
         assert sun is not None, "the scene asks for a Sun first"
         return run.light.lit(run.model, camera, pose.direction_in_model(sun), adaptive=True)
 
@@ -134,11 +135,9 @@ class Ensemble:
     @cached_property
     def shares(self) -> list[Any]:
         """Float [N] of each member: 1 for its Gaussians, else 0."""
-        return [dr.opaque(ad.Float, 1, self.count)] if len(self.members) == 1 else list(map(self._share, self._ks))
-
-    @property
-    def _ks(self) -> range:
-        return range(len(self.members))
+        if len(self.members) == 1:
+            return [dr.opaque(ad.Float, 1, self.count)]
+        return [self._share(k) for k in range(len(self.members))]
 
     def _share(self, k: int) -> Any:
         share = dr.select(self.owner == dr.opaque(ad.UInt32, k), ad.Float(1), 0)
@@ -159,20 +158,24 @@ class Ensemble:
     def antialiased(self) -> Any:
         """Whether Gaussians are drawn with the anti-aliasing filter: one for all, or Bool [N] where runs differ."""
         flags = [member.run.antialiased for member in self.members]
-        if len(set(flags)) == 1:
-            return flags[0]
+        if len(set(flags)) < 2:
+            return any(flags)
         return ad.Bool(np.concatenate([np.full(m.count, f) for m, f in zip(self.members, flags, strict=True)]))
 
     @cached_property
     def linear(self) -> bool:
         """Whether the whole is blended in linear light: where all members are."""
-        return all(member.linear for member in self.members)
+        return bool(self.members) and all(member.linear for member in self.members)
 
     def placed(self, poses: Sequence[Pose]) -> Gaussians:
         """The set with a pose of each member, colours left out (3.11 to 3.13)."""
+        if not self.members:
+            none = [ad.Float([]) for _ in range(11)]
+            return Gaussians.from_rows(none)
         numbers = [[*p.rotation.ravel(), *p.translation, p.scale, np.log(p.scale), *p.quaternion] for p in poses]
         table = ad.Float(np.array(numbers, dtype=np.float32).ravel())
-        return Gaussians.from_rows([*_placed(self.rows[:10], self.owner, table), self.rows[10]])
+        run = _placed if self.count > 1 else _trace_placed  # a recording takes one number for a constant
+        return Gaussians.from_rows([*run(self.rows[:10], self.owner, table), self.rows[10]])
 
     def joined(self, parts: Sequence[Sequence[Any]]) -> list[Any]:
         """Floats [N] of each member's, row by row. parts: of each member the same number of Floats."""

@@ -19,6 +19,8 @@ def gathered(composition: Composition, sun: Sun | None) -> Gaussians:
     if sun is None and composition.relightable:
         told = composition.path or composition.models[0].run.path
         raise InputError(f"{told}: expected the Sun's direction for a scene that it changes, found none")
+    if not composition.placed:
+        return composition.in_world()
     parts = []
     for model, visible in zip(composition.placed, composition.light_between(sun), strict=True):
         run, own = model.run, model.run.model

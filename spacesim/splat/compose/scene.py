@@ -98,6 +98,8 @@ class Drawn:
         alpha = self.output.image("alpha")
         if name == "visibility":
             return np.divide(planes[0], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+        if not planes:
+            return np.zeros(shape, np.int32)
         numbers = np.array(self.order, np.int32) + 1
         return np.where(alpha >= COVERED, numbers[np.argmax(np.stack(planes), axis=0)], 0)
 
@@ -116,7 +118,7 @@ class Composition:
         self.models, self.config, self.path = tuple(models), config or ComposeConfig(), path
         known: dict[int, Member] = {id(model.run): Member.of(model.run) for model in self.models}
         self._members = [known[id(model.run)] for model in self.models]
-        self._ensemble = Ensemble(sorted(self._members, key=lambda member: member.key))
+        self._ensemble = Ensemble(sorted((m for m in self._members if m.count), key=lambda member: member.key))
         self._kept = _Kept()
         _tell(self.models, self._ensemble)
 
@@ -182,7 +184,7 @@ class Composition:
 
     @property
     def placed(self) -> list[Placed]:
-        """The models in the order in which their Gaussians stand in the set."""
+        """The models that have Gaussians, in the order in which these stand in the set."""
         return [self.models[i] for i in self._order()]
 
     def in_world(self) -> Gaussians:
@@ -240,13 +242,16 @@ class Composition:
 
     def _order(self) -> list[int]:
         """Which model is each member of the ensemble; models of one run stand in the order of their poses."""
-        return sorted(range(len(self.models)), key=lambda i: (self._members[i].key, self.models[i].pose.key))
+        drawn = [i for i, member in enumerate(self._members) if member.count]
+        return sorted(drawn, key=lambda i: (self._members[i].key, self.models[i].pose.key))
 
     def _lit(self, poses: Sequence[Pose], camera: Camera, sun: Sun | None) -> tuple[list[Any], Any]:
         """(colours as blended, three Floats [N], visibility Float [N] or None)."""
         if sun is None and self.relightable:
             told = self.path or self.models[0].run.path
             raise InputError(f"{told}: expected the Sun's direction for a scene that it changes, found none")
+        if not poses:
+            return [ad.Float([]) for _ in range(3)], None
         direction = None if sun is None else sun.direction
         between = self._between(poses, direction)
         members = self._ensemble.members

@@ -312,3 +312,17 @@ def test_wrong_scenes_are_refused(caplog):
     with caplog.at_level(logging.INFO, "spacesim"):
         Composition([Placed(made_run("linear")), Placed(made_run("map"))])
     assert any("blended as sRGB" in line for line in caplog.messages)
+
+
+def test_models_of_one_gaussian_and_of_none():
+    one, other = made_run("vanilla", 1, count=1), made_run("map", 2, count=1)
+    for run in (one, other):
+        for k in range(3):
+            shifted = Composition([Placed(run, Pose(translation=[0.1 * k, 0, 0]))]).predict(EYE, SUN)
+            back = run.predict(seen_from([3.0 - 0.1 * k, -2.0, 1.5], [-0.1 * k, 0, 0]), SUN)
+            np.testing.assert_allclose(shifted.rgb, back.rgb, atol=1e-5)
+    empty = replace(one, model=made_run("vanilla", 1, count=0).model)
+    assert Composition([Placed(empty)]).predict(EYE, SUN).alpha.max() == 0
+    beside = Composition([Placed(empty), Placed(other), Placed(empty, Pose(translation=[0, 0, 1]))]).predict(EYE, SUN)
+    assert np.array_equal(beside.rgb, other.predict(EYE, SUN).rgb)
+    assert set(np.unique(beside.id)) <= {0, 2}
