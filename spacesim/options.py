@@ -188,9 +188,9 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--sun", type=_angles, metavar="AZ,EL", help="for --ply of a relightable run: whose colours")
     one.add_argument("--object", metavar="K", help="for SPEED+: whose poses, by number or name (the first)")
     one.add_argument("--data", type=Path, metavar="DATA", help="for --mesh: the dataset, where it has moved")
-    one.add_argument("--views", type=int, metavar="N", help="for --mesh: how many are fused, at most (100)")
+    one.add_argument("--views", type=int, metavar="N", help="for --mesh: how many are fused, at most (64)")
     one.add_argument("--voxel", type=float, metavar="M", help="for --mesh: metres (1/192 of the object's size)")
-    one.add_argument("--truncation", type=float, metavar="N", help="for --mesh: voxels behind the surface (3)")
+    one.add_argument("--truncation", type=float, metavar="N", help="for --mesh: voxels behind the surface (2)")
     return parser
 
 

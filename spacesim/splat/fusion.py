@@ -18,7 +18,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
 
-TRUNCATION = 3.0  #: voxels (docs/geometry.md says what was tried)
+TRUNCATION = 2.0  #: voxels (docs/geometry.md says what was tried)
 STEP = 2.0  #: voxels; between pixels whose depths differ by more, depth is not interpolated (chosen)
 BATCH = 16  #: views in one kernel
 BYTES = 48  #: a voxel takes at most, while views are fused and the surface is looked for

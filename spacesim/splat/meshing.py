@@ -43,7 +43,7 @@ class MeshConfig:
     voxels: int = 192
     voxel: float | None = None
     truncation: float = TRUNCATION
-    views: int = 100
+    views: int = 64
     depth: str = "surface"
 
     def __post_init__(self) -> None:
