@@ -5,7 +5,7 @@ component by component ([3, N] in memory), the layout in which a Dr.Jit kernel r
 network reads of each Gaussian, its features, is one packed array: hundreds of rows would be hundreds of pointers.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import drjit as dr
@@ -117,6 +117,16 @@ class Gaussians:
             sh=ad.ArrayXf(np.ascontiguousarray(harmonics.T)) if sh.shape[1] else ad.ArrayXf([]),
             features=None if features is None else ad.Float(np.ascontiguousarray(features.T, np.float32).ravel()),
         )
+
+
+def numbers(rows: Iterable[Any]) -> np.ndarray:
+    """[K, N] of K Floats [N]. Dr.Jit's own way compiles a kernel for each N, for it writes the rows as one array."""
+    return np.stack([np.array(row) for row in rows])
+
+
+def triple(rows: np.ndarray) -> Any:
+    """Array3f [3, N] of an array [3, N]; nothing is compiled, see `numbers`."""
+    return ad.Array3f(*(ad.Float(np.ascontiguousarray(row, np.float32)) for row in rows))
 
 
 def entries(row: Any, index: Any, count: int) -> Any:

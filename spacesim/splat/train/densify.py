@@ -8,7 +8,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import rotation_from_quaternion
-from spacesim.splat.gaussians import NAMES, ROWS, Gaussians, entries
+from spacesim.splat.gaussians import NAMES, ROWS, Gaussians, entries, numbers, triple
 from spacesim.splat.train.optimizer import Adam
 
 SPLIT_SHRINK = 1.6  #: halves of a split are this much smaller (Kerbl et al. 2023, section 5.2)
@@ -75,11 +75,11 @@ def append_copies(gaussians: Gaussians, optimizer: Adam, parents: np.ndarray, rn
 
 def scatter_copies(gaussians: Gaussians, count: int, rng: np.random.Generator) -> None:
     """Move each of the last `count` Gaussians to a point drawn from itself."""
-    scales = np.exp(np.array(gaussians.log_scales, np.float64)[:, -count:])
-    axes = rotation_from_quaternion(np.array(gaussians.quaternions, np.float64)[:, -count:].T)
+    scales = np.exp(numbers(gaussians.log_scales)[:, -count:].astype(np.float64))
+    axes = rotation_from_quaternion(numbers(gaussians.quaternions)[:, -count:].T)
     offsets = np.zeros((3, gaussians.count), np.float32)
     offsets[:, -count:] = np.einsum("nij,nj->in", axes, scales.T * rng.standard_normal((count, 3)))
-    gaussians.means += ad.Array3f(offsets)
+    gaussians.means += triple(offsets)
     dr.eval(gaussians.means)
 
 

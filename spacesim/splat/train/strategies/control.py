@@ -13,7 +13,7 @@ import numpy as np
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
-from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.gaussians import Gaussians, numbers
 from spacesim.splat.train.densify import Refinement, append_copies, grow, limit_opacities, prune
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.strategies.strategy import Strategy
@@ -219,7 +219,7 @@ def chosen_parents(score: np.ndarray, eligible: np.ndarray, count: int, rng: np.
 
 def _largest_scale(gaussians: Gaussians) -> np.ndarray:
     """[N] metres."""
-    scales: np.ndarray = np.exp(np.array(gaussians.log_scales).max(axis=0))
+    scales: np.ndarray = np.exp(numbers(gaussians.log_scales).max(axis=0))
     return scales
 
 

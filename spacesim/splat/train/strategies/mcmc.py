@@ -13,7 +13,7 @@ from scipy.special import comb
 
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError
-from spacesim.splat.gaussians import Gaussians, opacities, principal_axes
+from spacesim.splat.gaussians import Gaussians, numbers, opacities, principal_axes, triple
 from spacesim.splat.train.densify import Refinement, rearrange
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig
@@ -71,8 +71,8 @@ class McmcStrategy(Strategy):
             return
         factor = self.mcmc.noise * rate / self.scene_scale**2
         streams = np.random.SeedSequence([seed, 5, step]).generate_state(1, np.uint64)
-        numbers = ad.Float([factor, self.mcmc.min_opacity])
-        gaussians.means = ad.Array3f(_jittered(gaussians.shape_rows(), numbers, ad.UInt64(streams)))
+        values = ad.Float([factor, self.mcmc.min_opacity])
+        gaussians.means = ad.Array3f(_jittered(gaussians.shape_rows(), values, ad.UInt64(streams)))
 
     def refine(
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator, leniency: float = 1.0
@@ -103,22 +103,23 @@ class McmcStrategy(Strategy):
         index[fresh] = chosen
         copies = 1 + np.bincount(chosen, minlength=len(opacity))
         moved = copies[index] > 1
-        scales = np.exp(np.array(gaussians.log_scales, np.float64)).T
+        before = numbers(gaussians.log_scales)
+        scales = np.exp(before.T.astype(np.float64))
         each, narrower = opacity.copy(), scales.copy()
         several = copies > 1
         each[several], narrower[several] = shared(opacity[several], scales[several], copies[several])
         each = np.clip(each, self.mcmc.min_opacity, 1 - 1e-6)
         logits = np.array(gaussians.logit_opacities)[index]
-        log_scales = np.array(gaussians.log_scales)[:, index]
+        log_scales = before[:, index]
         logits[moved] = np.log(each / (1 - each))[index[moved]]
         log_scales[:, moved] = np.log(narrower[index[moved]]).T
         rearrange(gaussians, optimizer, index, moved)
         gaussians.logit_opacities = ad.Float(logits)
-        gaussians.log_scales = ad.Array3f(np.ascontiguousarray(log_scales))
+        gaussians.log_scales = triple(log_scales)
 
 
-def _trace_jittered(rows: list[Any], numbers: Any, streams: Any) -> list[Any]:
-    """Means after noise. numbers: Float [2], factor and gate;  streams: UInt64 [1], where random numbers begin"""
+def _trace_jittered(rows: list[Any], values: Any, streams: Any) -> list[Any]:
+    """Means after noise. values: Float [2], factor and gate;  streams: UInt64 [1], where random numbers begin"""
     place = dr.arange(ad.UInt32, dr.width(rows[0]))
     random = ad.PCG32()
     start = dr.gather(ad.UInt64, streams, ad.UInt32(0)) ^ (ad.UInt64(place) * GOLDEN)  # neighbours begin far apart
@@ -126,7 +127,7 @@ def _trace_jittered(rows: list[Any], numbers: Any, streams: Any) -> list[Any]:
     normal = [random.next_float32_normal() for _ in range(3)]
     scales = [dr.exp(row) for row in rows[3:6]]
     axes = principal_axes(ad.Array4f(rows[6:10]))
-    factor, gate = (dr.gather(ad.Float, numbers, ad.UInt32(i)) for i in range(2))
+    factor, gate = (dr.gather(ad.Float, values, ad.UInt32(i)) for i in range(2))
     opening = factor * dr.rcp(1 + dr.exp(GATE * (opacities(rows[10]) - gate)))
     vector = ad.Array3f(normal)
     along = [dr.dot(axis, vector) * scale * scale for axis, scale in zip(axes, scales, strict=True)]

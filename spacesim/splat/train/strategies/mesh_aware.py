@@ -14,7 +14,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.mesh import SignedDistance
-from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.gaussians import Gaussians, numbers
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig, DensityControl, Survey, chosen_parents
 
 KNOWN = ("known", "known_x", "known_y", "known_z")
@@ -121,7 +121,7 @@ class MeshAwareStrategy(DensityControl):
     def _regions(self, gaussians: Gaussians, survey: Survey, asked: np.ndarray) -> tuple[np.ndarray, Regions]:
         """(signed distance [N] metres, regions); those that are not asked for, [N] bool, have distance 0."""
         margins = [self.scene_scale * m for m in (self.mesh_aware.exterior_margin, self.mesh_aware.interior_margin)]
-        distance, means = np.zeros(gaussians.count), np.array(gaussians.means, np.float64).T
+        distance, means = np.zeros(gaussians.count), numbers(gaussians.means).T.astype(np.float64)
         finite = np.isfinite(means).all(axis=1)
         distance[~finite] = np.inf
         asked = asked & finite

@@ -8,7 +8,7 @@ import numpy as np
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
-from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.gaussians import Gaussians, numbers
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig, DensityControl, Survey, chosen_parents
 
 CHANNELS = ("support_count", "support_gradient", "support_radius")  #: c, g and r of 5.10
@@ -115,7 +115,7 @@ class SupportAwareStrategy(DensityControl):
         if missing <= 0 or survey.step < self.support.backfill_start:
             return np.zeros(0, np.int64)
         score, (count, gradient, _) = self._score(survey), self._scaled(survey)
-        means = np.array(gaussians.means, np.float64).T
+        means = numbers(gaussians.means).T.astype(np.float64)
         found = candidates(means, score, survey.opacity, self.support)
         rank = 1.5 * score + 0.75 * survey.opacity + 0.25 * count + 0.25 * gradient - 0.5 * found.off_core  # 5.22
         return chosen_parents(rank, found.eligible & ~remove, missing, rng)
