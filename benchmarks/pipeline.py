@@ -14,7 +14,8 @@ from spacesim.splat.render import render
 from spacesim.splat.tiles import bin_splats
 from spacesim.splat.train.losses import photometric_loss
 from spacesim.splat.train.optimizer import Adam
-from spacesim.splat.train.trainer import _project, _update
+from spacesim.splat.train.stages import project_views
+from spacesim.splat.train.update import Update, ViewGradients
 
 SSIM_WEIGHT = 0.2
 DEGREE = 3  #: of spherical harmonics
@@ -35,13 +36,15 @@ class Pipeline:
         self.truth = list(ad.Array3f(noise))
         self.factors = ad.Float([1.0, 1.0, *[0.0] * len(self.gaussians.rows())])
         dr.eval(self.gaussians.rows(), self.optimizer.first, self.optimizer.second, self.truth, self.factors)
-        self._project, self._loss, self._update = (recorded(stage, RECORDINGS) for stage in (_project, _loss, _update))
+        self._project, self._loss = recorded(project_views, RECORDINGS), recorded(_loss, RECORDINGS)
+        self._update = Update(antialiased=False, scale=1.0, recordings=RECORDINGS)
         for stage in (self.project, self.bin, self.forward, self.loss, self.backward, self.update):
             stage()
 
     def project(self) -> None:
         """Gaussians to ellipses on the screen and colours."""
-        self.splats, self.footprints, self.colour = self._project(self.gaussians.rows(), self.camera, DEGREE)
+        found = self._project(self.gaussians.rows(), self.camera, DEGREE, False, (), 1.0)
+        self.splats, self.footprints, self.colour = *found[:2], found[2]["colour"]
 
     def bin(self) -> None:
         """Ellipses to lists of tiles."""
@@ -62,10 +65,8 @@ class Pipeline:
 
     def update(self) -> None:
         """Gradients of the ellipses to those of the parameters, and an Adam step whose rates are 0."""
-        gradients = [(self.camera, self.by_splat.splats, self.by_splat.features, None, [])]
-        moments = self.optimizer.first, self.optimizer.second
-        rows, first, second = self._update(self.gaussians.rows(), moments, DEGREE, gradients, self.factors)
-        self.gaussians, self.optimizer.first, self.optimizer.second = Gaussians.from_rows(rows), first, second
+        gradients = ViewGradients(self.camera, self.by_splat.splats, {"colour": self.by_splat.features})
+        self._update(self.gaussians, self.optimizer, DEGREE, [gradients], self.factors, {})
 
     def frame(self) -> None:
         """Parameters to picture, as a user asks for it: colour and alpha, without gradients."""

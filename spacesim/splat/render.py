@@ -195,15 +195,25 @@ def view_colours(gaussians: Gaussians, camera: Projection, sh_degree: int | None
     c(d) = max(sum_lm a_lm Y_lm(d) + 1/2, 0), d from the camera towards the Gaussian (along the axis of an
     orthographic camera); the offset is INRIA's.
     """
-    degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
-    sh = gaussians.sh
-    colour = ad.Array3f(*(SH_C0 * sh[c] + 0.5 for c in range(3)))
+    sums = harmonics(gaussians, camera, gaussians.sh_degree if sh_degree is None else sh_degree)
+    return ad.Array3f([dr.select(shown(total), total, 0) for total in sums])
+
+
+def harmonics(gaussians: Gaussians, camera: Projection, sh_degree: int) -> list[Any]:
+    """The sums of `view_colours` before they are cut off: 3 Floats [N]."""
+    degree, sh = min(sh_degree, gaussians.sh_degree), gaussians.sh
+    sums = [SH_C0 * sh[c] + 0.5 for c in range(3)]
     if degree > 0:
         basis = dr.sh_eval(camera.directions_to(gaussians.means), degree)
         for k in range(1, (degree + 1) ** 2):
-            colour += basis[k] * ad.Array3f(*(sh[3 * k + c] for c in range(3)))
-    finite = dr.detach(dr.abs(colour) < 1e9)
-    return dr.maximum(dr.select(finite, colour, 0), 0)
+            sums = [total + basis[k] * sh[3 * k + c] for c, total in enumerate(sums)]
+    return sums
+
+
+def shown(total: Any) -> Any:
+    """Whether a sum of harmonics is a colour as it is: Bool [N]. Elsewhere the colour is 0 and has no gradient."""
+    total = dr.detach(total)
+    return (total > 0) & (total < 1e9)
 
 
 _prepare = recorded(_trace_prepare, RECORDINGS)

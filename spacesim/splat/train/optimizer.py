@@ -23,19 +23,22 @@ class Adam:
         self.steps += 1
         return 1 / (1 - BETA1**self.steps), 1 / (1 - BETA2**self.steps)
 
+    def part(self, rows: slice) -> tuple[list[Any], list[Any]]:
+        """First and second moments of some rows."""
+        return self.first[rows], self.second[rows]
+
     def select(self, index: Any, fresh: Any) -> None:
         """Entry i of each moment becomes entry index[i], or zero where `fresh[i]`. index, fresh: [M]. The first row is
         of length N; longer ones are packed rows."""
         count, chosen = dr.width(self.first[0]), dr.width(index)
         size = dr.opaque(ad.UInt32, chosen)  # as a literal each size would be compiled
-        keep = []
-        for moment in (*self.first, *self.second):
-            copies, forget = dr.width(moment) // count, fresh
-            if copies > 1:
-                forget = dr.gather(ad.Bool, fresh, dr.arange(ad.UInt32, copies * chosen) % size)
-            keep.append(dr.select(forget, 0, entries(moment, index, count)))
-        dr.eval(keep)
-        self.first, self.second = keep[: len(self.first)], keep[len(self.first) :]
+        for moments in (self.first, self.second):
+            for row, moment in enumerate(moments):  # one by one, so that old ones go as new ones come
+                copies, forget = dr.width(moment) // count, fresh
+                if copies > 1:
+                    forget = dr.gather(ad.Bool, fresh, dr.arange(ad.UInt32, copies * chosen) % size)
+                moments[row] = dr.select(forget, 0, entries(moment, index, count))
+                dr.eval(moments[row])
 
     def forget(self, rows: slice) -> None:
         """Set the moments of some rows to zero."""

@@ -1,6 +1,6 @@
 """The stages of a training step that Dr.Jit differentiates; each is recorded once and replayed."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from spacesim.splat.project import Footprints, Splats, project
 from spacesim.splat.render import view_colours
 from spacesim.splat.surface import normals
 from spacesim.splat.tone import decoded, encoded
-from spacesim.splat.train.losses import depth_loss, normal_loss, penalty, photometric_loss, visibility_loss
+from spacesim.splat.train.losses import depth_loss, normal_loss, photometric_loss, visibility_loss
 from spacesim.splat.train.optimizer import adam_step
 from spacesim.splat.train.warm_start import foreground_loss
 
@@ -26,12 +26,13 @@ def project_views(
     gaussians = Gaussians.from_rows(rows)
     splats, footprints = project(gaussians, camera, antialiased)
     colour = [] if gaussians.features is not None else list(view_colours(gaussians, camera, degree))
-    return splats, footprints, {"colour": colour, **_shape(gaussians, splats, camera, shape, scale)}
+    return splats, footprints, {"colour": colour, **shape_values(gaussians, splats, camera, shape, scale)}
 
 
-def _shape(
+def shape_values(
     gaussians: Gaussians, splats: Splats, camera: Pinhole, shape: Iterable[str], scale: float
 ) -> dict[str, list[Any]]:
+    """What is blended for the sake of the shape, see `project_views`, of the names in `shape`."""
     found = {}
     if "depth" in shape:
         found["depth"] = [splats.depth / scale]
@@ -98,55 +99,15 @@ def picture_loss(
     return dr.detach(loss), by_plane, dr.grad(transmittance)
 
 
-def update(
-    rows: list[Any],
-    moments: tuple[list[Any], list[Any]],
-    degree: int,
-    gradients: list[tuple[Pinhole, Splats, dict[str, list[Any]], Any, list[Any]]],
-    factors: Any,
-    penalties: Mapping[str, Any],
-    antialiased: bool,
-    scale: float,
-) -> tuple[list[Any], list[Any], list[Any]]:
-    """Gradients of the splats, of what was blended, and of features and first rows, in each view to the mean gradient
-    of the parameters, and an Adam step.
-
-    factors: Float [2 + R], Adam's two corrections and the step size of each row;  penalties: weights by name.
-    """
-    rows = [ad.Float(row) for row in rows]
-    dr.enable_grad(rows)
-    gaussians = Gaussians.from_rows(rows)
-    along: Any = ad.Float(0)
-    for camera, by_splat, by_value, by_features, by_rows in gradients:
-        splats, _ = project(gaussians, camera, antialiased)
-        for name in ("opacity", "x", "y", "a", "b", "c"):
-            along += getattr(splats, name) * getattr(by_splat, name)
-        for row, gradient in zip(rows, by_rows, strict=False):
-            along += row * gradient
-        values = _shape(gaussians, splats, camera, by_value, scale)
-        if by_features is None:
-            values["colour"] = list(view_colours(gaussians, camera, degree))
-        for name, group in values.items():
-            for value, gradient in zip(group, by_value[name], strict=True):
-                along += value * gradient
-    for name, weight in penalties.items():
-        along += len(gradients) * weight * penalty(name, gaussians)
-    dr.backward(along if len(gradients) == 1 else along / len(gradients))
-    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(2 + len(rows))]
-    by_row = [dr.grad(row) for row in rows]
-    if gaussians.features is not None:
-        by_row[-1] = _mean([by_features for *_, by_features, _ in gradients])
-    return adam_step(dr.detach(rows), by_row, moments, numbers[2:], (numbers[0], numbers[1]))
-
-
 def update_light(
     weights: list[Any], moments: tuple[list[Any], list[Any]], gradients: list[list[Any]], factors: Any
 ) -> tuple[list[Any], list[Any], list[Any]]:
     """An Adam step of the networks by their mean gradient. factors: Float [3], two corrections and the step size."""
     numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(3)]
-    means = [_mean(list(of_views)) for of_views in zip(*gradients, strict=True)]
+    means = [mean(list(of_views)) for of_views in zip(*gradients, strict=True)]
     return adam_step(weights, means, moments, [numbers[2]] * len(weights), (numbers[0], numbers[1]))
 
 
-def _mean(values: list[Any]) -> Any:
+def mean(values: list[Any]) -> Any:
+    """Of some views' gradients."""
     return values[0] if len(values) == 1 else sum(values[1:], values[0]) / len(values)

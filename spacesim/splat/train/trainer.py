@@ -6,7 +6,7 @@ binning and blending, whose lists change length from step to step, stand between
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Dataset
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.light import LightModel, TrainingFrame
-from spacesim.splat.project import Pinhole, Splats
+from spacesim.splat.project import Pinhole
 from spacesim.splat.rasterize import backward, forward
 from spacesim.splat.tiles import bin_splats
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
@@ -32,8 +32,9 @@ from spacesim.splat.train.initialise import (
 )
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.prior import MeshPrior
-from spacesim.splat.train.stages import LossConfig, Target, picture_loss, project_views, update, update_light
+from spacesim.splat.train.stages import LossConfig, Target, picture_loss, project_views, update_light
 from spacesim.splat.train.strategies.choose import strategy_of
+from spacesim.splat.train.update import Update, ViewGradients
 from spacesim.splat.train.views import TrainingViews, View
 from spacesim.splat.train.warm_start import Attraction, WarmStart
 
@@ -86,7 +87,7 @@ class Trainer:
         self.history: list[dict[str, float]] = []
         self._project = recorded(project_views, RECORDINGS)
         self._loss = recorded(picture_loss, RECORDINGS)
-        self._update = recorded(update, RECORDINGS)
+        self._update = Update(config.antialiased, self.scene_scale, RECORDINGS)
         self._update_light = recorded(update_light, RECORDINGS)
 
     def run(self, on_progress: Callable[[Progress], None], on_checkpoint: Callable[[], None]) -> None:
@@ -107,7 +108,8 @@ class Trainer:
         degree = min(config.sh_degree, index // config.sh_every)
         rows = self.gaussians.rows()
         looks = [self._look(rows, degree, index * count + i) for i in range(count)]
-        self._move_gaussians(rows, degree, looks)
+        del rows  # so that old ones go as new ones come
+        self._move_gaussians(degree, looks)
         if self.light:
             self._move_light(self.light, looks)
 
@@ -166,11 +168,12 @@ class Trainer:
         by_value = {name: [next(found) for _ in group] for name, group in values.items()}
         by_rows = self.warm_start.pull(rows, camera, attraction, index) if self.warm_start and attraction else []
         if not shading or not self.light:
-            return _Look(camera, by_splat.splats, by_value, loss, by_rows=by_rows)
+            return _Look(ViewGradients(camera, by_splat.splats, by_value, by_rows=by_rows), loss)
         of_visibility = by_value.pop("visibility", [None])[0]
         by_light = self.light.adjoint(shading, by_value.pop("colour"), of_visibility)
         by_rows = _added(by_light.geometry, by_rows)
-        return _Look(camera, by_splat.splats, by_value, loss, by_light.features, by_rows, by_light.weights)
+        gradients = ViewGradients(camera, by_splat.splats, by_value, by_light.features, by_rows)
+        return _Look(gradients, loss, by_light.weights)
 
     def _warming(self, index: int) -> bool:
         """Whether the warm start keeps refinement off in step number `index`, the first of which is 0."""
@@ -190,14 +193,10 @@ class Trainer:
             }
         return Target(rgba, ad.Float(self.background(number, view)), valid, truth)
 
-    def _move_gaussians(self, rows: list[Any], degree: int, looks: list["_Look"]) -> None:
-        moments = self.optimizer.first, self.optimizer.second
+    def _move_gaussians(self, degree: int, looks: list["_Look"]) -> None:
         factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
-        gradients = [(look.camera, look.by_splats, look.by_value, look.by_features, look.by_rows) for look in looks]
-        more = self._penalties(), self.config.antialiased, self.scene_scale
-        rows, first, second = self._update(rows, moments, degree, gradients, factors, *more)
-        self.gaussians = Gaussians.from_rows(rows)
-        self.optimizer.first, self.optimizer.second = first, second
+        views = [look.gradients for look in looks]
+        self._update(self.gaussians, self.optimizer, degree, views, factors, self._penalties())
 
     def _penalties(self) -> dict[str, Any]:
         """{name: weight of each Gaussian's share} of the penalties on Gaussians that the configuration has."""
@@ -312,16 +311,10 @@ class Trainer:
 
 @dataclass
 class _Look:
-    """What a step has learned from one view: gradients of its splats and of the values that it blends, by name (of a
-    method of light without colours), of features [F * N] and weights, and of the first rows where shadows or the warm
-    start move the Gaussians."""
+    """What a step has learned from one view: for the Gaussians, and for the weights of networks."""
 
-    camera: Pinhole
-    by_splats: Splats
-    by_value: dict[str, list[Any]]
+    gradients: ViewGradients
     loss: Any
-    by_features: Any = None
-    by_rows: list[Any] = field(default_factory=list)
     by_weights: Any = None
 
 
