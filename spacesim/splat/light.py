@@ -175,12 +175,18 @@ class LightModel:
         return Shading(colours, visibility[0] if visibility else None, shadows, inputs, lanes, tape)
 
     def lit(
-        self, gaussians: Gaussians, camera: Projection, sun: np.ndarray, adaptive: bool = False
+        self,
+        gaussians: Gaussians,
+        camera: Projection,
+        sun: np.ndarray,
+        adaptive: bool = False,
+        known: Shadows | None = None,
     ) -> tuple[list[Any], Any]:
-        """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. What the field's first layer
+        """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. known: what `shadows` has
+        made under this Sun for an earlier picture. What the field's first layer
         makes of the features does not change with Sun or camera and stays for the next picture: as many numbers for
         each Gaussian as the layer has units."""
-        _, inputs = self._inputs(gaussians, camera, sun, adaptive)
+        _, inputs = self._inputs(gaussians, camera, sun, adaptive, known)
         lanes = Lanes.of(gaussians.count, still=True)
         kept = self._kept_of(gaussians.features, lanes)
         colours, visibility = _lit(self.config, self.weights, inputs, lanes, kept.known, kept.packed)
@@ -214,9 +220,14 @@ class LightModel:
         return model
 
     def _inputs(
-        self, gaussians: Gaussians, camera: Projection, sun: np.ndarray, adaptive: bool
+        self,
+        gaussians: Gaussians,
+        camera: Projection,
+        sun: np.ndarray,
+        adaptive: bool,
+        known: Shadows | None = None,
     ) -> tuple[Shadows | None, _Inputs]:
-        shadows = self.shadows(gaussians, sun, adaptive)
+        shadows = known or self.shadows(gaussians, sun, adaptive)
         raw = [shadows.occlusion, *shadows.info] if shadows else []
         terms = self.sun_terms(sun)
         return shadows, _Inputs(gaussians.features, gaussians.means, camera, raw, terms, self._place)

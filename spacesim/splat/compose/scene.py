@@ -255,39 +255,32 @@ class Composition:
         direction = None if sun is None else sun.direction
         between = self._between(poses, direction)
         members = self._ensemble.members
-        knows = any(v is not None for v in between) or self._shades or any(self._own_shadows(m) for m in members)
-        parts = []
-        for k, (member, pose) in enumerate(zip(members, poses, strict=True)):
-            key = (pose.key, camera.world_from_camera.tobytes(), _bytes(direction))
-            parts.append(self._kept.own(k, key, lambda m=member, p=pose: self._part(m, p, camera, direction)))
-        shown = []
-        for (colours, visibility), other in zip(parts, between, strict=True):
-            if other is not None:
-                colours = [colour * other for colour in colours]
-                visibility = other if visibility is None else visibility * other
-            shown.append((colours, visibility))
-        joined = self._ensemble.joined(
-            [
-                display_colours(colours, member.linear, self._ensemble.linear)
-                for member, (colours, _) in zip(members, shown, strict=True)
-            ]
-        )
-        if not knows:
-            return joined, None
-        planes = [
-            [dr.opaque(ad.Float, 1, m.count) if v is None else v] for m, (_, v) in zip(members, shown, strict=True)
+        parts = [self._part(k, poses[k], camera, direction) for k in range(len(poses))]
+        parts = [_dimmed(part, share) for part, share in zip(parts, between, strict=True)]
+        linear = [member.linear for member in members]
+        colours = [
+            display_colours(part[0], own, self._ensemble.linear) for part, own in zip(parts, linear, strict=True)
         ]
-        return joined, self._ensemble.joined(planes)[0]
+        joined = self._ensemble.joined(colours)
+        if not self._shades and not any(member.has_shadows for member in members):
+            return joined, None
+        seen = [
+            dr.opaque(ad.Float, 1, member.count) if part[1] is None else part[1]
+            for member, part in zip(members, parts, strict=True)
+        ]
+        return joined, self._ensemble.joined([[plane] for plane in seen])[0]
 
-    @staticmethod
-    def _part(member: Member, pose: Pose, camera: Camera, sun: Array | None) -> tuple[list[Any], Any]:
-        """Colours and visibility of a member as it is alone."""
-        return member.shade(pose, Pinhole.of(pose.camera_in_model(camera)), sun)
-
-    @staticmethod
-    def _own_shadows(member: Member) -> bool:
-        light = member.run.light
-        return light is not None and light.config.shadow is not None
+    def _part(self, k: int, pose: Pose, camera: Camera, sun: Array | None) -> tuple[list[Any], Any]:
+        """(colours, visibility or None) of member k as it is alone."""
+        member = self._ensemble.members[k]
+        near, towards = pose.camera_in_model(camera), None if sun is None else pose.direction_in_model(sun)
+        light = _bytes(towards)
+        shadows = self._kept.get(("shadows", k), light, lambda: member.own_shadows(towards))
+        key = near.world_from_camera.tobytes(), light
+        part: tuple[list[Any], Any] = self._kept.get(
+            ("light", k), key, lambda: member.shade(Pinhole.of(near), towards, shadows)
+        )
+        return part
 
     def _between(self, poses: Sequence[Pose], sun: Array | None) -> list[Any]:
         """Of each member v_inter, Float [N of it], or None where no other can be before the Sun."""
@@ -295,7 +288,10 @@ class Composition:
             return [None] * len(poses)
         assert sun is not None, "a scene with such shadows asks for a Sun first"
         key = (b"".join(pose.key for pose in poses), sun.tobytes(), self.config.shadows)
-        return self._kept.between(key, lambda: [self._inter(poses, sun, k) for k in range(len(poses))])
+        found: list[Any] = self._kept.get(
+            "between", key, lambda: [self._inter(poses, sun, k) for k in range(len(poses))]
+        )
+        return found
 
     def _inter(self, poses: Sequence[Pose], sun: Array, k: int) -> Any:
         """v_inter of 4.15 for member k, in its own frame: what is seen of the Sun depends neither on where all stands
@@ -325,21 +321,24 @@ class Composition:
 
 @dataclass
 class _Kept:
-    """What the last picture has computed and the next may use again: where only a model moves, the other models' own
-    light; where only the camera moves, the shadows between models. Each with what it depends on."""
+    """What the last picture has computed and the next may use again, each with what it depends on: where only a model
+    moves, the light of the others; where only the camera moves, the shadows."""
 
-    parts: dict[int, tuple[Any, Any]] = field(default_factory=dict)
-    inter: tuple[Any, Any] = (None, None)
+    values: dict[Any, tuple[Any, Any]] = field(default_factory=dict)
 
-    def own(self, k: int, key: Any, make: Any) -> Any:
-        if k not in self.parts or self.parts[k][0] != key:
-            self.parts[k] = key, make()
-        return self.parts[k][1]
+    def get(self, name: Any, key: Any, make: Any) -> Any:
+        if name not in self.values or self.values[name][0] != key:
+            self.values.pop(name, None)  # room for the next
+            self.values[name] = key, make()
+        return self.values[name][1]
 
-    def between(self, key: Any, make: Any) -> Any:
-        if self.inter[0] != key:
-            self.inter = key, make()
-        return self.inter[1]
+
+def _dimmed(part: tuple[list[Any], Any], share: Any) -> tuple[list[Any], Any]:
+    """Colours and visibility in the shadows of others (4.16, 4.17). share: v_inter, or None where there are none"""
+    colours, visibility = part
+    if share is None:
+        return part
+    return [colour * share for colour in colours], share if visibility is None else visibility * share
 
 
 def _may_shade(caster: Member, at: Pose, receiver: Member, there: Pose, sun: Array) -> bool:
