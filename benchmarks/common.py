@@ -3,6 +3,7 @@
 import argparse
 import json
 import platform
+import re
 import subprocess
 import sys
 import time
@@ -66,6 +67,11 @@ def parse_sizes(text: str) -> list[tuple[int, int]]:
     if min(min(size) for size in sizes) < 1:
         raise SystemExit(f"--sizes: expected numbers of at least 1, found {text!r}")
     return sizes
+
+
+def row_names(text: str) -> list[str]:
+    """The names of `--rows`: commas separate them, but one before a space belongs to a name ("map, no bias")."""
+    return re.split(r",(?! )", text)
 
 
 def sphere_arrays(count: int, seed: int = 0) -> dict[str, np.ndarray]:

@@ -107,7 +107,7 @@ def main() -> None:
 def chosen_rows(wanted: str, size: str) -> list[Row]:
     """Those of the kinds or names in `wanted`; ends the program with a sentence where there is no such row."""
     table = {kind: list(rows_of(kind, size)) for kind in ROWS}
-    names = wanted.split(",")
+    names = common.row_names(wanted)
     known = [*ROWS, *(row.name for rows in table.values() for row in rows)]
     unknown = [name for name in names if name not in known]
     if unknown:

@@ -61,7 +61,7 @@ def main() -> None:
     options = parser.parse_args()
     backend.select(options.backend)
     table = {name: (kind, config) for kind in ROWS for name, config in configurations(kind, options.preset)}
-    wanted = options.rows.split(",")
+    wanted = common.row_names(options.rows)
     unknown = [name for name in wanted if name not in (*ROWS, *table)]
     if unknown:
         sys.exit(f"--rows: expected some of {', '.join((*ROWS, *table))}, found {unknown[0]!r}")

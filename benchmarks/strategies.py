@@ -70,7 +70,7 @@ def main() -> None:
     options = arguments().parse_args()
     backend.select(options.backend)
     table = {name: (kind, config) for kind in KINDS[:-1] for name, config in configurations(kind, options)}
-    wanted = options.rows.split(",")
+    wanted = common.row_names(options.rows)
     unknown = [name for name in wanted if name not in (*KINDS, *table)]
     if unknown:
         sys.exit(f"--rows: expected some of {', '.join((*KINDS, *table))}, found {unknown[0]!r}")

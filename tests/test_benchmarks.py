@@ -37,6 +37,12 @@ def small_lit(tmp_path_factory) -> Path:
     return root
 
 
+def test_rows_are_named_with_commas_in_them():
+    import common
+
+    assert common.row_names("none,map, no bias,ours") == ["none", "map, no bias", "ours"]
+
+
 def points_of(time):
     import growth
 
