@@ -101,6 +101,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "splat, surface, supervised", replace(splatted, visibility_weight=0.1)
     yield "map, surface, linear", replace(mapped, light=replace(mapped.light, linear=True))
     yield "splat, surface, gradients", with_shadow(splatted, gradients=True)
+    yield "splat, surface, supervised, gradients", with_shadow(replace(splatted, visibility_weight=0.1), gradients=True)
 
 
 def as_thesis(config: TrainConfig) -> TrainConfig:
