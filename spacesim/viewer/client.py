@@ -45,8 +45,11 @@ class Client:
         self.session = Session(stage, shared, loop, self, truth)
         frames = len(dataset.frames) if dataset else 0
         self.controls = ClientControls(handle.gui, self.session, self, facts, frames)
-        handle.camera.on_update(self._moved)
-        self._look(handle.camera)
+
+    def begin(self) -> None:
+        """Draw for it from now on."""
+        self.handle.camera.on_update(self._moved)
+        self._look(self.handle.camera)
 
     def close(self) -> None:
         """It has gone."""

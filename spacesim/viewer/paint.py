@@ -8,7 +8,8 @@ from PIL import Image, ImageDraw
 
 from spacesim.data.sheet import font
 from spacesim.data.tone import as_bytes
-from spacesim.eval.pictures import error_colours, visibility_picture
+from spacesim.eval.pictures import error_colours
+from spacesim.splat.picture import LIT, SHADOWED
 
 Bytes = NDArray[np.uint8]
 
@@ -75,10 +76,12 @@ def painted(planes: Planes, mode: str, depths: tuple[float, float] | None = None
     if mode == "accumulation":
         return np.repeat(as_bytes(alpha)[..., None], 3, axis=-1)
     if mode == "visibility":
-        return visibility_picture(values, alpha)
+        lit, shadowed = (np.array(colour, np.float32) / 255 for colour in (LIT, SHADOWED))
+        seen = (np.clip(values, 0, 1) * alpha)[..., None]
+        return as_bytes(alpha[..., None] * shadowed + seen * (lit - shadowed))
     if mode == "normals":
-        surface = np.any(values != 0, axis=-1, keepdims=True)
-        return as_bytes(np.where(surface, (0.5 + 0.5 * values) * alpha[..., None], 0))
+        surface = (values[..., 0] != 0) | (values[..., 1] != 0) | (values[..., 2] != 0)
+        return as_bytes((0.5 + 0.5 * values) * (alpha * surface)[..., None])
     if mode == "object id":
         colours = np.array([(0, 0, 0), *PALETTE], np.uint8)
         return colours[np.where(values > 0, 1 + (values.astype(int) - 1) % len(PALETTE), 0)]

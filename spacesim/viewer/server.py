@@ -152,6 +152,7 @@ class Viewer:
         client = Client(handle, show.stage, self.shared, self.loop, self._truth, show.dataset, self._sun, facts)
         with self._lock:
             self.clients[handle.client_id] = client
+        client.begin()
         _log.debug("viewer: client %d has come", handle.client_id)
 
     async def _went(self, handle: Any) -> None:

@@ -55,7 +55,7 @@ def pictures(socket, count, patience=20.0):
         size = int.from_bytes(data[8:16], "little")
         plain = zstandard.ZstdDecompressor().decompress(data[16 : 16 + size])
         messages = msgspec.msgpack.decode(plain)["messages"]
-        found += sum(message["type"] == "BackgroundImageMessage" for message in messages)
+        found += sum(message["type"] == "BackgroundImageMessage" and bool(message["rgb_data"]) for message in messages)
     return found
 
 
