@@ -99,6 +99,15 @@ def picture_loss(
     return dr.detach(loss), by_plane, dr.grad(transmittance)
 
 
+def on_screen(absolute: tuple[Any, Any], half: tuple[Any, Any], sizes: Any) -> tuple[Any, Any]:
+    """What refinement watches, [N] each: the norm of the absolute gradient by half a picture, and the larger radius as
+    a share of the picture's longer side. absolute: by x and y, a pixel;  half: width and height of the box, pixels;
+    sizes: Float [3], half the picture's width and height, its longer side"""
+    half_width, half_height, longer = (dr.gather(ad.Float, sizes, ad.UInt32(i)) for i in range(3))
+    gradient = dr.sqrt(dr.square(absolute[0] * half_width) + dr.square(absolute[1] * half_height))
+    return gradient, dr.maximum(*half) / longer
+
+
 def update_light(
     weights: list[Any], moments: tuple[list[Any], list[Any]], gradients: list[list[Any]], factors: Any
 ) -> tuple[list[Any], list[Any], list[Any]]:

@@ -32,7 +32,7 @@ from spacesim.splat.train.initialise import (
 )
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.prior import MeshPrior
-from spacesim.splat.train.stages import LossConfig, Target, picture_loss, project_views, update_light
+from spacesim.splat.train.stages import LossConfig, Target, on_screen, picture_loss, project_views, update_light
 from spacesim.splat.train.strategies.choose import strategy_of
 from spacesim.splat.train.update import Update, ViewGradients
 from spacesim.splat.train.views import TrainingViews, View
@@ -88,6 +88,7 @@ class Trainer:
         self._project = recorded(project_views, RECORDINGS)
         self._loss = recorded(picture_loss, RECORDINGS)
         self._update = Update(config.antialiased, self.scene_scale, RECORDINGS)
+        self._on_screen = recorded(on_screen, RECORDINGS)
         self._update_light = recorded(update_light, RECORDINGS)
 
     def run(self, on_progress: Callable[[Progress], None], on_checkpoint: Callable[[], None]) -> None:
@@ -159,10 +160,10 @@ class Trainer:
         by_planes = [plane for group in by_plane.values() for plane in group]
         by_splat = backward(splats, blended, lists, size, by_planes, by_transmittance, absolute=watched)
         if watched:
-            gradient = dr.sqrt(
-                dr.square(by_splat.absolute_x * (0.5 * width)) + dr.square(by_splat.absolute_y * (0.5 * height))
-            )
-            radius = dr.maximum(footprints.half_width, footprints.half_height) / max(width, height)
+            sizes = ad.Float([0.5 * width, 0.5 * height, max(width, height)])
+            absolute = by_splat.absolute_x, by_splat.absolute_y
+            half = footprints.half_width, footprints.half_height
+            gradient, radius = self._on_screen(absolute, half, sizes)
             self.strategy.observe(gradient, radius, footprints.visible)
         found = iter(by_splat.features)
         by_value = {name: [next(found) for _ in group] for name, group in values.items()}

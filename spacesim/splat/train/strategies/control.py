@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from spacesim.backend import ad
+from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError
 from spacesim.splat.gaussians import Gaussians, numbers
 from spacesim.splat.train.densify import Refinement, append_copies, grow, limit_opacities, prune
@@ -19,6 +19,7 @@ from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.strategies.strategy import Strategy
 
 WINDOW = ("gradient", "seen", "radius")  #: statistics since the last refinement
+RECORDINGS = 8  #: of an observation that are kept
 
 
 @dataclass(frozen=True)
@@ -80,18 +81,23 @@ class DensityControl(Strategy):
 
     def __init__(self, config: DefaultStrategyConfig, scene_scale: float, count: int, kept: tuple[str, ...]) -> None:
         self.config, self.scene_scale, self.kept = config, scene_scale, kept
-        self.state = {name: dr.zeros(ad.Float, count) for name in (*WINDOW, *kept)}
+        self.state = {name: _zeros(count) for name in (*WINDOW, *kept)}
+        self._observed = recorded(self._observation, RECORDINGS)
 
     def watches(self, step: int) -> bool:
         return step < self.config.refine_stop
 
     def observe(self, gradient: Any, radius: Any, visible: Any) -> None:
-        state = self.state
+        self.state = self._observed(self.state, gradient, radius, visible)
+
+    def _observation(self, state: dict[str, Any], gradient: Any, radius: Any, visible: Any) -> dict[str, Any]:
+        """The state with an observation more."""
+        state = dict(state)
         state["gradient"] = state["gradient"] + dr.select(visible, gradient, 0)
         state["seen"] = state["seen"] + dr.select(visible, ad.Float(1), 0)
         state["radius"] = dr.maximum(state["radius"], dr.select(visible, radius, 0))
-        self._accumulate(gradient, radius, visible)
-        dr.eval(state)
+        self._accumulate(state, gradient, radius, visible)
+        return state
 
     def refine(
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator, leniency: float = 1.0
@@ -109,8 +115,8 @@ class DensityControl(Strategy):
             limit_opacities(gaussians, optimizer, 2 * config.prune_opacity)
         return done
 
-    def _accumulate(self, gradient: Any, radius: Any, visible: Any) -> None:
-        """Add an observation to the state that outlives refinements."""
+    def _accumulate(self, state: dict[str, Any], gradient: Any, radius: Any, visible: Any) -> None:
+        """Add an observation to what of the state outlives refinements. Recorded: it depends on nothing else."""
 
     @abstractmethod
     def _thresholds(self, gaussians: Gaussians, survey: Survey) -> np.ndarray:
@@ -176,7 +182,7 @@ class DensityControl(Strategy):
         index = prune(gaussians, optimizer, remove)
         copies = append_copies(gaussians, optimizer, np.searchsorted(index, parents), rng)
         survey = survey.at(index[copies])
-        self.state = {name: dr.zeros(ad.Float, gaussians.count) for name in WINDOW}
+        self.state = {name: _zeros(gaussians.count) for name in WINDOW}
         self.state |= {name: ad.Float(survey.kept[name].astype(np.float32)) for name in self.kept}
         return len(parents)
 
@@ -231,3 +237,8 @@ def _limit(duplicate: np.ndarray, split: np.ndarray, gradient: np.ndarray, room:
     keep = np.zeros_like(duplicate)
     keep[wanted[np.argsort(-gradient[wanted], kind="stable")[: max(room, 0)]]] = True
     return duplicate & keep, split & keep
+
+
+def _zeros(count: int) -> Any:
+    """An array of its own: zeros as constants would be one to a recording."""
+    return dr.opaque(ad.Float, 0, count)

@@ -78,8 +78,8 @@ class MeshAwareStrategy(DensityControl):
         super().__init__(config, scene_scale, count, kept=("views", *KNOWN))
         self.mesh_aware, self.surface = mesh_aware, surface
 
-    def _accumulate(self, gradient: Any, radius: Any, visible: Any) -> None:
-        self.state["views"] = self.state["views"] + dr.select(visible, ad.Float(1), 0)
+    def _accumulate(self, state: dict[str, Any], gradient: Any, radius: Any, visible: Any) -> None:
+        state["views"] = state["views"] + dr.select(visible, ad.Float(1), 0)
 
     def _thresholds(self, gaussians: Gaussians, survey: Survey) -> np.ndarray:
         """5.6."""

@@ -88,11 +88,11 @@ class SupportAwareStrategy(DensityControl):
         super().__init__(config, scene_scale, count, kept=CHANNELS)
         self.support = support
 
-    def _accumulate(self, gradient: Any, radius: Any, visible: Any) -> None:
+    def _accumulate(self, state: dict[str, Any], gradient: Any, radius: Any, visible: Any) -> None:
         """5.10, every step; a Gaussian that is not seen adds 0."""
         beta = self.support.decay
         for name, seen in zip(CHANNELS, (ad.Float(1), gradient, radius), strict=True):
-            self.state[name] = beta * self.state[name] + (1 - beta) * dr.select(visible, seen, 0)
+            state[name] = beta * state[name] + (1 - beta) * dr.select(visible, seen, 0)
 
     def _thresholds(self, gaussians: Gaussians, survey: Survey) -> np.ndarray:
         """5.16."""
