@@ -38,6 +38,15 @@ def run(data):
     return out
 
 
+def test_compose(run, tmp_path):
+    scene = example("05_compose").main(run, tmp_path / "scene.toml", tmp_path / "out", frames=3, size=40)
+    assert scene.frames == 3
+    ids = [read_png(tmp_path / f"out/id/{k:04d}.png") for k in range(3)]
+    assert set(np.unique(ids[0])) == {0, 1, 2}
+    assert (ids[0] != ids[2]).any()
+    assert (tmp_path / "scene.toml").exists()
+
+
 def test_simulate(data, capsys):
     assert verify_dataset(data) == []
     dataset = example("01_simulate").main(data, views=6, resolution=48, spp=4)  # all there already
