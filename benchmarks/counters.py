@@ -22,19 +22,19 @@ UNSEEN = -20.0  #: logit of an opacity too faint to be drawn
 
 
 def memory(count: int, pixels: int) -> Row:
-    """Bytes a Gaussian beside the tile lists: what 2 x `count` Gaussians hold more than `count`, over their number.
+    """Bytes a Gaussian beside the tile lists: what `count` Gaussians hold more than a few of them, over how many more.
 
-    The second half is too faint to be drawn, so that lists and picture are the same. The sizes are rounded to powers of
-    two, to which Dr.Jit rounds what it allocates.
+    Those few, an eighth or less and a power of two, are drawn; the others are too faint, so that lists and picture are
+    the same.
     """
-    count = 2 ** round(np.log2(count))
-    few, many = _watermark(count, 0, pixels), _watermark(count, count, pixels)
+    drawn = 2 ** max(int(np.log2(count)) - 3, 0)
+    few, many = _watermark(drawn, 0, pixels), _watermark(drawn, count - drawn, pixels)
     return {
         "Gaussians": count,
         "pixels": pixels,
-        "peak, MB": few / 1e6,
-        "peak of twice as many, MB": many / 1e6,
-        "bytes a Gaussian": round((many - few) / count),
+        "peak, MB": many / 1e6,
+        "of those drawn, MB": few / 1e6,
+        "bytes a Gaussian": round((many - few) / (count - drawn)),
     }
 
 

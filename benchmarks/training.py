@@ -33,6 +33,7 @@ from synthetic import NEVER, STILL, still_trainer, write_dataset
 from spacesim import backend
 from spacesim.data.images import load_image
 
+MEMORY_SIZES = "16384x64,17000x64,20000x64,24000x64,30000x64,40000x64"  #: a power of two, and above one
 SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "30000x256"}
 ROUNDS = 3  #: of ours and OpenSplat in turn
 WARM_UP = 20  #: steps: all degrees of harmonics are recorded, all pictures decoded
@@ -50,7 +51,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, metavar="N", help="counters over N steps with refinement")
     options = parser.parse_args()
     name = backend.select(options.backend)
-    sizes = common.parse_sizes(options.sizes or (growth.SIZES if options.growth else SIZES)[name])
+    usual = MEMORY_SIZES if options.memory else (growth.SIZES if options.growth else SIZES)[name]
+    sizes = common.parse_sizes(options.sizes or usual)
     if options.steps is not None:
         rows = counters.over_steps(options.steps)
         return common.emit({"steps": rows}, {"Training with refinement, 64 x 64 pixels": rows}, options)

@@ -27,6 +27,7 @@ PACKET = 16  #: lanes that run together on a CPU with AVX-512; elsewhere fewer
 HANDS = 64  #: at most, chosen: no fewer than the parts into which Dr.Jit divides a launch, two a thread, as a rule
 LARGEST_PAIRS = 0.9 * 2**30  #: records hold four numbers a pair, and Dr.Jit's arrays at most 2^32
 BYTES_A_PAIR = 200  #: of lists, sorting and blending on LLVM, 100 to 210 measured; gradients take as much again
+BYTES_A_PIXEL = 85  #: of colour, transmittance and what blending keeps of them, measured on LLVM; others beside
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) 
         capacity = room(count)
         boxes: _Boxes = boxes_of(splats, footprints, dr.opaque(ad.UInt32, count), capacity, tiles, shape)
         pairs = int(boxes.upto[capacity - 1])
-        _check_room(pairs)
+    _check_room(pairs, width * height)
     if pairs == 0:
         none, of_splats = dr.zeros(ad.UInt32, tiles[0] * tiles[1]), dr.zeros(ad.UInt32, max(count, 1))
         return TileLists(none, none, none, none, of_splats, of_splats, 0, *tiles, shape)
@@ -118,15 +119,15 @@ def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) 
     return lists
 
 
-def _check_room(pairs: int) -> None:
-    needed = pairs * BYTES_A_PAIR
+def _check_room(pairs: int, pixels: int) -> None:
+    needed = pairs * BYTES_A_PAIR + pixels * BYTES_A_PIXEL
     if pairs > LARGEST_PAIRS:
         raise WorkError(f"rasterizer: {pairs:.3g} pairs of tile and splat, at most {LARGEST_PAIRS:.3g} can be sorted")
     free = free_memory() if needed > 2**28 else None
     if free is not None and needed > free:
         raise WorkError(
-            f"rasterizer: {pairs:.3g} pairs of tile and splat need about {needed / 1e9:.3g} GB of memory, "
-            f"{free / 1e9:.3g} GB are free"
+            f"rasterizer: {pairs:.3g} pairs of tile and splat on {pixels:.3g} pixels need about {needed / 1e9:.3g} GB "
+            f"of memory, {free / 1e9:.3g} GB are free"
         )
 
 

@@ -255,6 +255,17 @@ def test_more_pairs_than_memory_holds_are_a_sentence(count, sentence, monkeypatc
         render(Gaussians.from_numpy(arrays), Pinhole.of(camera(1024, 1024)))
 
 
+def test_a_picture_larger_than_memory_is_a_sentence(monkeypatch):
+    """Also of a single splat, and of none in sight."""
+    monkeypatch.setattr(tiles, "free_memory", lambda: 10**9)
+    arrays, view = random_splats(1), camera(4096, 4096)
+    with pytest.raises(WorkError, match=r"on 1.68e\+07 pixels need about 1.43 GB of memory, 1 GB are free"):
+        render(Gaussians.from_numpy(arrays), Pinhole.of(view))
+    arrays["means"] += 1e4
+    with pytest.raises(WorkError, match=r"0 pairs of tile and splat on 1.68e\+07"):
+        render(Gaussians.from_numpy(arrays), Pinhole.of(view))
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (16, 8), (17, 9)])
 def test_pictures_of_few_pixels(size):
     arrays, view = random_splats(60, seed=4, degree=0), camera(*size)
