@@ -9,7 +9,7 @@ from spacesim.cli import main
 
 GENERATE = ("--views", "6", "--test-views", "2", "--resolution", "40", "--spp", "4")
 TRAIN = ("--preset", "demo", "--iterations", "50", "--init-count", "300")
-PROGRESS = re.compile(r"(generate|train|evaluate|sweep|compose): \d+/\d+ ")
+PROGRESS = re.compile(r"(generate|train|evaluate|sweep|compose|export): \d+/\d+ ")
 
 
 @dataclass(frozen=True)

@@ -95,8 +95,12 @@ def judge_geometry(run: "Run", dataset: Dataset, config: GeometryConfig | None) 
         return JudgedShape(None, "Geometry is null: the data has no true mesh.")
     if model is None:
         return JudgedShape(None, "Geometry is null: it is measured of single runs.")
-    truth = read_mesh(dataset.root / dataset.mesh_path)
-    size = size_of(*truth)
+    path = dataset.root / dataset.mesh_path
+    truth = read_mesh(path)
+    try:
+        size = size_of(*truth)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     cameras = [frame.camera for frame in dataset.train or dataset.frames]
     found = mesh_of(model, cameras, config.mesh, run.antialiased)
     answer = compare(truth, (found.vertices, found.faces), config) if len(found.faces) else NO_SURFACE
