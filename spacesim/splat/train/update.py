@@ -21,6 +21,7 @@ from spacesim.splat.train.stages import mean, shape_values
 
 OWN = ROWS["sh"].start  #: rows of place, shape and opacity; harmonics or features come behind
 PART = 4  #: coefficients of harmonics that are moved at once, each three rows
+MOST_PARTS = 4  #: of degree 3
 
 
 @dataclass
@@ -41,13 +42,13 @@ class ViewGradients:
 class Update:
     """Moves all parameters by the mean gradient of some views.
 
-    antialiased: see `project`;  scale: metres, the unit of depth;  recordings: that are kept of each part
+    antialiased: see `project`;  scale: metres, the unit of depth;  recordings: that are kept of a part
     """
 
     def __init__(self, antialiased: bool, scale: float, recordings: int) -> None:
         self.antialiased, self.scale = antialiased, scale
-        self._own, self._harmonics = recorded(_move_own, recordings), recorded(_move_harmonics, recordings)
-        self._features = recorded(_move_features, recordings)
+        self._own, self._features = recorded(_move_own, recordings), recorded(_move_features, recordings)
+        self._harmonics = recorded(_move_harmonics, MOST_PARTS * recordings)
 
     def __call__(
         self,
