@@ -21,7 +21,7 @@ from spacesim.data.records import Camera
 TRUNCATION = 2.0  #: voxels (docs/geometry.md says what was tried)
 STEP = 2.0  #: voxels; between pixels whose depths differ by more, depth is not interpolated (chosen)
 BATCH = 16  #: views in one kernel
-BYTES = 48  #: a voxel takes at most, while views are fused and the surface is looked for
+BYTES = 32  #: a voxel takes at most, while views are fused and the surface is looked for: 23 to 30 were seen
 MOST_VOXELS = 2**31  #: what 32-bit indices reach
 NEAR = 1e-6  #: metres; nearer voxels are behind the camera
 
