@@ -208,7 +208,7 @@ def _judged(path: Path) -> "Run":
     from spacesim.eval.composition import ComposedRun
     from spacesim.splat.compose.scenefile import load_scene
 
-    return cast("Run", ComposedRun(load_scene(path).composition, path))
+    return cast("Run", ComposedRun(load_scene(path).posed_at(0.0), path))
 
 
 def _report(options: argparse.Namespace) -> None:

@@ -173,6 +173,7 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--out", type=Path, required=True, metavar="DIR")
     one.add_argument("--size", type=_resolution, metavar="PX", help="pixels of the longer side, or WIDTHxHEIGHT")
     one.add_argument("--ply", type=Path, metavar="FILE", help="write the scene as plain Gaussians, too")
+    one.add_argument("--resume", action="store_true", help="go on where an earlier call stopped: it does so anyway")
 
     one = command("verify", "whether every file of a dataset is there and can be read", needs_backend=False)
     one.add_argument("data", type=Path, metavar="DATA")

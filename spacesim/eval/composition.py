@@ -66,5 +66,5 @@ class ComposedRun:
         }
 
     def predict(self, camera: Camera, sun: Sun | None = None, normals: bool = False) -> "ComposedPrediction":
-        """Render one view of the scene under a Sun, with the poses of the scene's start."""
+        """Render one view of the scene under a Sun."""
         return self.composition.predict(camera, sun, normals)

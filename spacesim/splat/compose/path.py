@@ -113,12 +113,15 @@ class PosedScene:
             raise InputError(f"{told}: expected a camera, found none; add a table [camera]")
         view = self.orbit.view(share) if self.orbit else self._track(lambda key: key.view, view_between, time)
         sun = self._track(lambda key: key.sun, sun_between, time) or self.sun
+        return Shot(time, self.posed_at(time), view.of(self.camera) if view else self.camera, sun)
+
+    def posed_at(self, time: float) -> Composition:
+        """The models where they are at a time, seconds."""
         poses = [
             self._track(lambda key, name=model.name: key.poses.get(name), between, time) or model.pose  # type: ignore[misc]
             for model in self.composition.models
         ]
-        composition = self.composition.posed(poses)
-        return Shot(time, composition, view.of(self.camera) if view else self.camera, sun)
+        return self.composition.posed(poses)
 
     def _track(self, value: Callable[[Keyframe], T | None], blend: Callable[[T, T, float], T], time: float) -> T | None:
         """What the keyframes that name it say of a value; None where none does."""

@@ -119,6 +119,7 @@ def test_keyframes(tmp_path):
     np.testing.assert_allclose(scene.shot(24).sun.angles, (45, 0), atol=1e-9)
     np.testing.assert_allclose(half.camera.position, [8, 0, 1])  # the only keyframe with a camera
     assert half.composition.models[0].pose.translation.tolist() == [0, 0, 0]
+    assert scene.posed_at(1.0).models[1].pose.scale == pytest.approx(4)
     late = scene.at(100.0)
     np.testing.assert_allclose(late.composition.models[1].pose.translation, [2, 0, 0])
 
