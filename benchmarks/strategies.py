@@ -49,7 +49,7 @@ KINDS = ("thesis", "field", "ours", "start", "figure")
 BOX = 10.0  #: sizes of the object
 NEVER = 10**9
 SCHEDULE = 200_000  #: iterations of the thesis, over which the figure's step sizes fall
-CURVES = ("nominal", "warm start", "warm start, usual step size")
+CURVES = ("nominal", "warm start", "warm start, as the thesis")
 COLOURS = ("#5a6472", "#b9560f", "#2a66ad")
 
 THESIS: dict[str, dict[str, float]] = {
@@ -238,7 +238,8 @@ def figure(dataset: Dataset, options: argparse.Namespace) -> dict[str, Any]:
     table = WarmStartConfig()
     shorter = min(1.0, options.figure_steps / 5_000)
     table = replace(table, steps=int(shorter * table.steps), decay=int(shorter * table.decay))
-    starts = dict(zip(CURVES, (None, table, replace(table, travel=0.0)), strict=True))
+    plain = replace(table, travel=0.0, gather=False, revive=0.0)
+    starts = dict(zip(CURVES, (None, table, plain), strict=True))
     found = {}
     for name, warm_start in starts.items():
         config, path = replace(base, warm_start=warm_start), options.out / "figure" / f"{folder_of(name)}.json"

@@ -22,6 +22,7 @@ from spacesim.splat.render import render
 from spacesim.splat.train.config import STRATEGIES, TrainConfig, preset, warm_start
 from spacesim.splat.train.initialise import initial_gaussians, object_size
 from spacesim.splat.train.losses import depth_loss, normal_loss, penalty
+from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.prior import MeshPrior
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.trainer import Trainer
@@ -193,14 +194,35 @@ def cloud(means: np.ndarray) -> Gaussians:
 def test_rescue_of_5_31(small_dataset, least, target):
     """Two were seen, at x = 2 and 4; one was not, at x = 10; too few seen, and the centre, x = 0.5, is the target."""
     config = replace(CONFIG, least_seen=least, rescue=0.25)
-    warm = WarmStart(config, TrainingViews(small_dataset, 0), np.array([0.5, 0, 0]), 3)
+    warm = WarmStart(config, TrainingViews(small_dataset, 0), np.array([0.5, 0, 0]), 20.0, 3)
     gaussians = cloud(np.array([[2.0, 0, 0], [4, 0, 0], [10, 0, 0]]))
     warm.state["framed"] = ad.Float([1, 5, 0])
-    warm.after_step(99, gaussians)
+    optimizer = Adam(gaussians.rows())
+    warm.after_step(99, gaussians, optimizer)
     np.testing.assert_allclose(np.array(gaussians.means)[0], [2, 4, 10])
-    warm.after_step(100, gaussians)
+    warm.after_step(100, gaussians, optimizer)
     np.testing.assert_allclose(np.array(gaussians.means)[0], [2, 4, 0.75 * 10 + 0.25 * target])
     assert not np.array(warm.state["framed"]).any()
+
+
+def test_those_beyond_the_cameras_come_back_and_the_faint_are_revived(small_dataset):
+    for within, revive in ((True, 0.2), (False, 0.0)):
+        config = replace(CONFIG, least_seen=1, gather=within, revive=revive)
+        warm = WarmStart(config, TrainingViews(small_dataset, 0), np.zeros(3), 5.0, 3)
+        gaussians = cloud(np.array([[4.0, 0, 0], [0, 6, 0], [2, 0, 0]]))
+        gaussians.logit_opacities = ad.Float([-9.0, 0.0, -1.0])
+        optimizer = Adam(gaussians.rows())
+        optimizer.first[10] = ad.Float([1, 1, 1])
+        warm.state["framed"] = ad.Float([1, 1, 1])
+        warm.after_step(100, gaussians, optimizer)
+        moved = [[4, 0, 0], [1.5, 3, 0] if within else [0, 6, 0], [2, 0, 0]]
+        np.testing.assert_allclose(np.array(gaussians.means).T, moved, rtol=1e-6)
+        shrunk = [1, 0.5 if within else 1, 1]
+        np.testing.assert_allclose(np.exp(np.array(gaussians.log_scales)[0] + 3), shrunk, rtol=1e-5)
+        opacity = 1 / (1 + np.exp(-numbers(gaussians.logit_opacities)))
+        before = 1 / (1 + np.exp(-np.array([-9.0, 0.0, -1.0])))
+        np.testing.assert_allclose(opacity, np.maximum(before, revive), rtol=1e-5)
+        assert np.array(optimizer.first[10]).any() != within
 
 
 # In training

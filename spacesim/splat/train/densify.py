@@ -1,6 +1,7 @@
 """The moves that refinement is made of: duplicate, split, prune, reset. Numpy decides, Dr.Jit moves the rows."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -95,6 +96,19 @@ def prune(gaussians: Gaussians, optimizer: Adam, remove: np.ndarray) -> np.ndarr
 
 def limit_opacities(gaussians: Gaussians, optimizer: Adam, highest: float) -> None:
     """Lower every opacity to at most `highest` and forget its moments (opacity reset)."""
-    gaussians.logit_opacities = dr.minimum(gaussians.logit_opacities, float(np.log(highest / (1 - highest))))
-    dr.eval(gaussians.logit_opacities)
+    _set_opacities(gaussians, optimizer, dr.minimum(gaussians.logit_opacities, _logit(highest)))
+
+
+def raise_opacities(gaussians: Gaussians, optimizer: Adam, lowest: float) -> None:
+    """Raise every opacity to at least `lowest` and forget its moments."""
+    _set_opacities(gaussians, optimizer, dr.maximum(gaussians.logit_opacities, _logit(lowest)))
+
+
+def _set_opacities(gaussians: Gaussians, optimizer: Adam, logits: Any) -> None:
+    gaussians.logit_opacities = logits
+    dr.eval(logits)
     optimizer.forget(ROWS["logit_opacities"])
+
+
+def _logit(opacity: float) -> float:
+    return float(np.log(opacity / (1 - opacity)))

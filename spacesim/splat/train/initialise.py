@@ -107,7 +107,7 @@ def _at_random(
     """Uniform in a cube about the point that the cameras look at: as wide as the nearest camera is far, or `box` times
     as wide as the object."""
     center = focus_point(dataset)
-    half = 0.5 * min(np.linalg.norm(f.camera.position - center) for f in dataset.train)
+    half = 0.5 * nearest_camera(dataset, center)
     if box is not None:
         half = 0.5 * box * object_size(dataset)
     return center + rng.uniform(-half, half, (count, 3)), rng.uniform(0, 1, (count, 3))
@@ -128,6 +128,11 @@ def object_size(dataset: Dataset) -> float:
 def farthest_camera(dataset: Dataset, center: np.ndarray) -> float:
     """Metres from `center` [3] to the farthest training camera (dist_max of thesis 4.5)."""
     return float(max(np.linalg.norm(frame.camera.position - center) for frame in dataset.train))
+
+
+def nearest_camera(dataset: Dataset, center: np.ndarray) -> float:
+    """Metres from `center` [3] to the nearest training camera."""
+    return float(min(np.linalg.norm(frame.camera.position - center) for frame in dataset.train))
 
 
 def focus_point(dataset: Dataset) -> np.ndarray:

@@ -27,6 +27,7 @@ from spacesim.splat.train.initialise import (
     farthest_camera,
     focus_point,
     initial_gaussians,
+    nearest_camera,
     scene_scale,
     surface_normals,
 )
@@ -73,7 +74,8 @@ class Trainer:
         self.warm_start: WarmStart | None = None
         if config.warm_start is not None:
             centre = focus_point(dataset)
-            self.warm_start = WarmStart(config.warm_start, self.views, centre, self.gaussians.count)
+            nearest = nearest_camera(dataset, centre)
+            self.warm_start = WarmStart(config.warm_start, self.views, centre, nearest, self.gaussians.count)
             offsets = self.gaussians.to_numpy()["means"] - centre
             self._start_radius = float(np.linalg.norm(offsets, axis=1).max())
         self._terms = LossConfig(
@@ -124,7 +126,7 @@ class Trainer:
         """After a step: what the strategy does, or in the time of the warm start the rescue."""
         warm, done = self.warm_start, self.iteration
         if warm is not None and warm.active(done - 1):
-            warm.after_step(done, self.gaussians)
+            warm.after_step(done, self.gaussians, self.optimizer)
             return
         timed = done % self.config.refinement.refine_every == 0
         if timed:

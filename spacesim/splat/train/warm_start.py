@@ -14,7 +14,9 @@ from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError
 from spacesim.data.images import luminance
 from spacesim.splat.cameras import NEAR, Pinhole
-from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.gaussians import Gaussians, numbers, triple
+from spacesim.splat.train.densify import raise_opacities
+from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.views import DEVICE_BYTES, TrainingViews, View
 
 RECORDINGS = 64
@@ -36,6 +38,8 @@ class WarmStartConfig:
     rescue: float = 0.5  #: table 5.7, alpha_rescue
     rescue_every: int = 100  #: steps, chosen; a Gaussian that no view of them had in its picture is unseen
     least_seen: int = 16  #: Gaussians that make a visible cloud, chosen as table 5.3's least supported cloud
+    gather: bool = True  #: beyond the nearest camera is unseen, too; rescued Gaussians shrink as they close up, chosen
+    revive: float = 0.1  #: opacity to which fainter ones are raised at each rescue, chosen: that of the start; 0: none
     conservative: int = 1_000  #: table 5.7, steps after `steps` with a lower opacity threshold
     opacity_scale: float = 0.5  #: table 5.7, of that threshold
 
@@ -117,9 +121,11 @@ class WarmStart:
     change while it is kept.
     """
 
-    def __init__(self, config: WarmStartConfig, views: TrainingViews, centre: np.ndarray, count: int) -> None:
-        """centre: [3] metres, where the cameras look;  count: of Gaussians"""
-        self.config, self.views, self.centre = config, views, centre
+    def __init__(
+        self, config: WarmStartConfig, views: TrainingViews, centre: np.ndarray, nearest: float, count: int
+    ) -> None:
+        """centre: [3] metres, where the cameras look;  nearest: metres to the nearest of them;  count: of Gaussians"""
+        self.config, self.views, self.centre, self.nearest = config, views, centre, nearest
         self.state = {"framed": dr.zeros(ad.Float, count)}
         self._cached = lru_cache(maxsize=max(1, DEVICE_BYTES // (2 * views.most_pixels)))(self._attraction)
 
@@ -142,20 +148,26 @@ class WarmStart:
             dr.eval(self.state)
         return list(gradients)
 
-    def after_step(self, step: int, gaussians: Gaussians) -> None:
-        """Rescue the unseen if it is time to, after `step` finished steps (5.31)."""
+    def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> None:
+        """Rescue the unseen (5.31) and revive the faint if it is time to, after `step` finished steps."""
         config = self.config
         if step > config.steps or step % config.rescue_every:
             return
+        means = numbers(gaussians.means).astype(np.float64)
         unseen = np.array(self.state["framed"]) == 0
+        if config.gather:
+            unseen |= np.linalg.norm(means - self.centre[:, None], axis=0) > self.nearest
         self.state["framed"] = dr.zeros(ad.Float, gaussians.count)
-        if not unseen.any():
-            return
-        means = np.array(gaussians.means, np.float64)
-        enough = (~unseen).sum() >= config.least_seen
-        target = means[:, ~unseen].mean(axis=1) if enough else self.centre
-        means[:, unseen] += config.rescue * (np.asarray(target)[:, None] - means[:, unseen])
-        gaussians.means = ad.Array3f(np.ascontiguousarray(means, np.float32))
+        if unseen.any():
+            enough = (~unseen).sum() >= config.least_seen
+            target = means[:, ~unseen].mean(axis=1) if enough else self.centre
+            means[:, unseen] += config.rescue * (target[:, None] - means[:, unseen])
+            gaussians.means = triple(means)
+            if config.gather and config.rescue < 1:
+                gaussians.log_scales += ad.Float(np.where(unseen, np.log1p(-config.rescue), 0).astype(np.float32))
+                dr.eval(gaussians.log_scales)
+        if config.revive > 0:
+            raise_opacities(gaussians, optimizer, config.revive)
 
     def _attraction(self, index: int) -> Attraction | None:
         view = self.views[index]
