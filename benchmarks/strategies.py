@@ -9,7 +9,7 @@ the training time that refinement takes. Rows:
 
     thesis   default, mesh-aware, support-aware
     field    mcmc
-    ours     default with discs, with depth and normals of the truth or of the mesh, and variants of mesh-aware
+    ours     default with discs, with depth and normals of the truth or of the mesh; other margins and thresholds
     start    support-aware from the mesh, at random in a box of ten times the object's size, and there with a warm start
     figure   figure 5.5: the share of Gaussians inside the true mesh over the first steps, without refinement
 
@@ -124,8 +124,10 @@ def configurations(kind: str, options: argparse.Namespace) -> Iterator[tuple[str
         yield "default, discs", made(flatten_weight=1.0)
         yield "default, depth and normals", made(depth_weight=3.0, normal_weight=0.05)
         yield "default, mesh prior", made(depth_weight=3.0, normal_weight=0.05, prior="mesh")
-        mesh_aware = made("mesh-aware").mesh_aware
+        mesh_aware, support = made("mesh-aware").mesh_aware, made("support-aware").support_aware
+        yield "mesh-aware, narrow margin", made("mesh-aware", mesh_aware=replace(mesh_aware, exterior_margin=1e-4))
         yield "mesh-aware, wide margin", made("mesh-aware", mesh_aware=replace(mesh_aware, exterior_margin=2e-3))
+        yield "support-aware, eased", made("support-aware", support_aware=replace(support, ease_support=0.75))
         yield "mesh-aware, mesh prior", made("mesh-aware", depth_weight=3.0, normal_weight=0.05, prior="mesh")
     if kind == "start":
         yield "from the mesh", made("support-aware", init="mesh")

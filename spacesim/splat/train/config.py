@@ -20,6 +20,9 @@ STRATEGIES = ("default", "mesh-aware", "support-aware", "mcmc")
 INITS = ("mesh", "points", "random")
 PRESETS = ("demo", "fast", "thesis")
 ISOTROPY = 1e-2  #: weight of the isotropy term of `park`, chosen
+MARGIN = (
+    1e-3  #: to the exterior, of `fast` and `demo`: at few pixels 1e-4 prunes half of the surface (docs/strategies.md)
+)
 MCMC_PENALTY = 1e-2  #: weights of the penalties on opacity and scale of `mcmc` (Kheradmand et al. 2024)
 PRIORS = ("truth", "mesh")
 WEIGHTS = (
@@ -184,7 +187,8 @@ def _schedule(name: str) -> TrainConfig:
     gentle = DefaultStrategyConfig(prune_screen_size=0.5, split_screen_size=0.1)
     if name == "fast":
         refinement = replace(gentle, refine_stop=5_000)
-        return TrainConfig(preset=name, refinement=refinement, mesh_aware=MeshAwareConfig(cull_every=500))
+        mesh_aware = MeshAwareConfig(cull_every=500, exterior_margin=MARGIN)
+        return TrainConfig(preset=name, refinement=refinement, mesh_aware=mesh_aware)
     if name == "demo":
         return TrainConfig(
             preset=name,
@@ -192,7 +196,7 @@ def _schedule(name: str) -> TrainConfig:
             init_count=8_000,
             sh_every=600,
             refinement=replace(gentle, refine_start=300, refine_stop=2_000, pause_after_reset=0),
-            mesh_aware=MeshAwareConfig(cull_every=500, min_gaussians=8_000),
+            mesh_aware=MeshAwareConfig(cull_every=500, exterior_margin=MARGIN, min_gaussians=8_000),
             support_aware=SupportAwareConfig(warm_up=300, backfill_start=400, min_gaussians=8_000),
         )
     raise InputError(f"--preset: expected one of {', '.join(PRESETS)}, found {name!r}")
