@@ -112,7 +112,7 @@ def by_tiles(
                 absolute_y += dr.abs(dr.fma(2 * c, g_dy, b * (dx + i) * g))
         sums = moments.sums()
         sums += [absolute_x, absolute_y, *by_feature] if absolute else by_feature
-        add_to_slots(slots, sums, dr.gather(ad.UInt32, lists.slot, k), mode)
+        add_to_slots(slots, sums, lists.sum_index(k), mode)
         return k, transmittance, behind
 
     first = dr.gather(ad.UInt32, blended.tile_last, lane.tile)
@@ -231,7 +231,7 @@ def by_buckets(
     slots = dr.zeros(ad.Float, 4 * fours * lists.capacity)  # a pair's numbers side by side
     for i in range(bucket):
         listed = buckets.first + i < buckets.end
-        slot = dr.gather(ad.UInt32, lists.slot, buckets.first + i, listed)
+        slot = lists.sum_index(buckets.first + i, listed)
         values = sums[i] + [ad.Float(0)] * (4 * fours - len(sums[i]))
         for j in range(fours):
             value = ad.Array4f(values[4 * j : 4 * j + 4])
@@ -349,7 +349,7 @@ def gather_slots(
         return position < end
 
     def add(position: Any, sums: list[Any]) -> Any:
-        values = load(slots, position, lists.capacity)
+        values = load(slots, lists.sum_of_slot(position), lists.capacity)
         return position + 1, [total + value for total, value in zip(sums, values, strict=True)]
 
     numbers = sum(dr.width(array) for array in slots) // lists.capacity

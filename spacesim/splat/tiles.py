@@ -63,6 +63,7 @@ class TileLists:
     Slots number the pairs splat by splat: those of splat i are `first_slot[i]` .. + `slot_count[i]`, [M]. Arrays have
     room for more pairs and splats than there are, so that few sizes occur: P is `capacity`, M at least N.
     order: the tiles in the order in which they are given to lanes [T], or None for that of their indices.
+    place: where each slot's pair stands in `splat` [P], or None: sums of pairs are then kept by slots (`sum_index`).
     """
 
     splat: Any
@@ -76,6 +77,18 @@ class TileLists:
     tiles_y: int
     shape: TileShape
     order: Any = None
+    place: Any = None
+
+    def sum_index(self, k: Any, active: Any = True) -> Any:
+        """Where the sums of pair k of `splat` are kept while they are added up.
+
+        Threads of a CPU add to the pairs of their tiles, which must not share cache lines: there it is the pair's
+        place."""
+        return dr.gather(ad.UInt32, self.slot, k, active) if self.place is None else k
+
+    def sum_of_slot(self, slot: Any) -> Any:
+        """The same of a slot."""
+        return slot if self.place is None else dr.gather(ad.UInt32, self.place, slot)
 
     @property
     def pairs(self) -> int:
@@ -237,8 +250,10 @@ def _trace_expand(
     dr.eval(tile, splat)
     start, end = _runs(tile, count, capacity)
     order = _longest_first(end - start, shape)
-    dr.eval(splat, slot, start, end, first_slot, order)
-    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, *tiles, shape, order)
+    place = dr.empty(ad.UInt32, capacity)
+    dr.scatter(place, dr.arange(ad.UInt32, capacity), slot)
+    dr.eval(splat, slot, start, end, first_slot, order, place)
+    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, *tiles, shape, order, place)
 
 
 def _longest_first(length: Any, shape: TileShape) -> Any:

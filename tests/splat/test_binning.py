@@ -87,6 +87,9 @@ def test_slots_are_the_splats_own(way):
     assert (slot < first + count).all()
     assert len(np.unique(slot)) == len(slot)
     assert slot.max() < lists.capacity
+    kept = np.array(lists.sum_index(ad.UInt32(entries.astype(np.uint32))))
+    np.testing.assert_array_equal(np.array(lists.sum_of_slot(ad.UInt32(slot))), kept)
+    assert len(np.unique(kept)) == len(kept)
 
 
 @pytest.mark.parametrize(("count", "size"), [(2000, (64, 64)), (500, (33, 90)), (9000, (8, 8))])

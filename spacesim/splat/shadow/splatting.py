@@ -195,7 +195,7 @@ def _trace_walk(events: Splats, lists: TileLists, image_size: tuple[Any, Any], c
             blocks = reached & ~receiver & (transmittance[p] > TRANSMITTANCE_MIN)
             transmittance[p] = dr.select(blocks, transmittance[p] * (1 - alpha), transmittance[p])
             last[p] = dr.select(blocks, k + 1, last[p])
-        slot = dr.gather(ad.UInt32, lists.slot, k)
+        slot = lists.sum_index(k)
         noted = receiver & (weight > 0)
         dr.scatter_reduce(dr.ReduceOp.Add, slots, ad.Array2f(lost, weight), slot, active=noted, mode=mode)
         return k + 1, transmittance, last
@@ -229,7 +229,7 @@ def _sum_slots(slots: Any, lists: TileLists, capacity: int) -> Any:
         return position < end
 
     def add(position: Any, total: Any) -> Any:
-        return position + 1, total + dr.gather(ad.Array2f, slots, position)
+        return position + 1, total + dr.gather(ad.Array2f, slots, lists.sum_of_slot(position))
 
     state = position, ad.Array2f(0)
     _, total = dr.while_loop(state, remaining, add, mode="symbolic", label="sum shadow slots")
@@ -280,7 +280,7 @@ def _trace_replay(
             behind[p] = dr.fma(weight, transmittance[p], behind[p])
             transmittance[p] *= inverse
             moments.add(*offset, by_beta + by_alpha)
-        add_to_slots(slots, moments.sums(), dr.gather(ad.UInt32, lists.slot, k), mode)
+        add_to_slots(slots, moments.sums(), lists.sum_index(k), mode)
         return k, transmittance, behind
 
     state = dr.gather(ad.UInt32, lists.end, lane.tile), transmittance, [ad.Float(0) for _ in offsets]
