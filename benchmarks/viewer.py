@@ -11,8 +11,10 @@ second half. `--seconds 0` leaves that out.
 """
 
 import itertools
+import socket
 import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -230,9 +232,11 @@ def _visit(viewer: Viewer, number: int, counts: list[int], stop: threading.Event
                 counts[number] += 1
                 if rng.random() < 0.05:
                     _act(viewer, visitor, rng)
-            visitor.socket.socket.close()  # without a word
         except (ConnectionClosed, TimeoutError, OSError):
-            counts[number] += 0
+            pass
+        with suppress(OSError):
+            visitor.socket.socket.shutdown(socket.SHUT_RDWR)  # without a word
+        visitor.socket.close()
 
 
 def _act(viewer: Viewer, visitor: Visitor, rng: np.random.Generator) -> None:

@@ -166,7 +166,7 @@ class Viewer:
 
 def _backend_fact(stage: Stage) -> str:
     names = {"llvm": "CPU (LLVM)", "cuda": "GPU (CUDA)"}
-    return names[stage.composition.backend]
+    return names[stage.backend]
 
 
 def serve(show: Show, host: str, port: int, say: Callable[[str], None]) -> None:

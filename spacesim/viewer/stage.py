@@ -1,4 +1,9 @@
-"""The models that are shown, and their planes under any camera, Sun and poses. Only the render thread draws."""
+"""The models that are shown, and their planes under any camera, Sun and poses.
+
+Only the render thread draws: a recorded call holds Dr.Jit's lock while it runs Python, so that another thread that asks
+Dr.Jit for anything at all, be it the length of an array, would wait for it for ever, and keep Python from going on. All
+that others ask of a `Stage` is therefore found out when it is made.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,25 +32,21 @@ class Model:
 
 
 class Stage:
-    """A composed scene to be drawn. composition: with the poses that the viewer starts with"""
+    """A composed scene to be drawn. composition: with the poses that the viewer starts with
+
+    gaussians: how many there are;  relightable: whether the Sun changes the picture;  backend: that draws
+    """
 
     def __init__(self, composition: Composition) -> None:
         self.composition = composition
+        self.gaussians = composition.gaussians
+        self.relightable = composition.relightable
+        self.backend = composition.backend
         names = _told_apart([placed.name or placed.run.path.resolve().name for placed in composition.models])
         self.models = tuple(
             Model(name, *_bounds(placed.run.model.to_numpy()))
             for name, placed in zip(names, composition.models, strict=True)
         )
-
-    @property
-    def gaussians(self) -> int:
-        """Number of Gaussians."""
-        return self.composition.gaussians
-
-    @property
-    def relightable(self) -> bool:
-        """Whether the Sun changes the picture."""
-        return self.composition.relightable
 
     def bounds(self, stand: Stand) -> tuple[Array, float]:
         """(centre [3], radius) of a sphere about all models, world, metres."""

@@ -144,6 +144,7 @@ def test_what_is_saved_is_drawn_by_the_command_line(viewer, tab, at_start, space
     press(tab.page, "Save scene")
     path = viewer.show.out / "saved.toml"
     wait_for(path.exists, "the file")
+    settled(tab.page, tab.client)  # nothing is drawn from here on: two threads must not call Dr.Jit
     done = spacesim("compose", path, "--out", tmp_path / "frames")
     assert done.code == 0, done.errors
     picture = read_png(tmp_path / "frames" / "rgb" / "0000.png").astype(np.float64)

@@ -1,6 +1,5 @@
 """Clients without a browser: pictures for them, nonsense from them, leaving in the middle, memory."""
 
-import gc
 import random
 import threading
 import time
@@ -62,7 +61,7 @@ def pictures(socket, count, patience=20.0):
 def test_a_client_without_a_browser_gets_pictures(viewer):
     with connected(viewer) as socket:
         socket.send(camera_message())
-        pictures(socket, 2)  # coarse, then at rest
+        pictures(socket, 1)
 
 
 def test_nonsense_of_a_client_harms_no_other(viewer, at_start, caplog, capfd):
@@ -115,7 +114,7 @@ def test_nonsense_of_a_client_harms_no_other(viewer, at_start, caplog, capfd):
     assert dropped < 200
     with connected(viewer) as good:
         good.send(camera_message(0.3))
-        pictures(good, 2)
+        pictures(good, 1)
     wait_for(lambda: len(viewer.clients) == clients_before, "all of them to be gone")
     stand = viewer.shared.stand
     assert viewer.shared is shared_before
@@ -154,7 +153,7 @@ def test_clients_that_leave_in_the_middle(viewer):
             socket.socket.close()  # without a word
     with connected(viewer) as good:
         good.send(camera_message(-0.3))
-        pictures(good, 2)
+        pictures(good, 1)
     wait_for(lambda: threading.active_count() <= threads + 34, "threads to end")  # viser has a pool of up to 32
 
 
@@ -169,7 +168,6 @@ def test_looking_around_takes_no_memory(viewer, at_start):
     """A few hundred pictures under changing Suns and poses, after as many to warm up."""
 
     def resident():
-        gc.collect()
         with open("/proc/self/statm") as file:
             return int(file.read().split()[1]) * 4096
 
@@ -190,3 +188,128 @@ def test_looking_around_takes_no_memory(viewer, at_start):
         look_around(socket, 150)
         grown = resident() - before
     assert grown < 20 << 20, f"{grown / 2**20:.1f} MiB"
+
+
+def messages_of(data):
+    size = int.from_bytes(data[8:16], "little")
+    content = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(data[16 : 16 + size]))
+    position, buffers = 16 + size, []
+    for length in content["binaryBufferLengths"]:
+        position += -position % 8
+        buffers.append(data[position : position + length])
+        position += length
+    return content["messages"], buffers
+
+
+def press(socket, handle, value=True):
+    """What a browser sends where a control is used."""
+    message = {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}
+    socket.send(msgspec.msgpack.encode(message))
+
+
+def button(viewer, label, client=None):
+    """The control of that label."""
+    gui = client.handle.gui if client else viewer._server.gui
+    return next(h for h in gui._gui_input_handle_from_uuid.values() if getattr(h, "label", None) == label)
+
+
+def test_a_picture_is_sent_as_a_png(viewer, at_start):
+    import io
+
+    from PIL import Image
+
+    with connected(viewer) as socket:
+        before = set(viewer.clients)
+        socket.send(camera_message())
+        pictures(socket, 1)
+        (number,) = set(viewer.clients) - before or set(viewer.clients)
+        press(socket, button(viewer, "Picture (PNG)", viewer.clients[number]))
+        content, name, deadline = b"", None, time.monotonic() + 20
+        while not content and time.monotonic() < deadline:
+            messages, buffers = messages_of(socket.recv(timeout=20))
+            for message in messages:
+                if message["type"] == "FileTransferStartDownload":
+                    name = message["filename"]
+                if message["type"] == "FileTransferPart":
+                    part = message["content"]
+                    content += buffers[part["__binary_index"]] if isinstance(part, dict) else part
+    assert name == "colour.png"
+    with Image.open(io.BytesIO(content)) as image:
+        assert image.size == (320, 240)
+        assert np.asarray(image).max() > 60
+
+
+def test_a_path_is_played_by_the_camera_of_who_asks(viewer, at_start):
+    with connected(viewer) as socket, connected(viewer) as other:
+        for one in (socket, other):
+            one.send(camera_message())
+            pictures(one, 1)
+        viewer.paths._change(type(viewer.paths.path)())
+        press(socket, button(viewer, "Add this view"))
+        wait_for(lambda: len(viewer.paths.path.keyframes) == 1, "a keyframe")
+        socket.send(camera_message(position=[6.0, 0.0, 0.0], wxyz=[0.5, 0.5, -0.5, -0.5]))
+        pictures(socket, 1)
+        press(socket, viewer.paths.step, 0.5)
+        wait_for(lambda: viewer.paths.step.value == 0.5, "the time")
+        press(socket, button(viewer, "Add this view"))
+        wait_for(lambda: len(viewer.paths.path.keyframes) == 2, "another keyframe")
+        assert viewer.paths.path.seconds == 0.5
+        press(socket, button(viewer, "Play / stop"))
+        places, deadline = [], time.monotonic() + 20
+        while (not places or np.abs(np.array(places[-1]) - [6, 0, 0]).max() > 1e-3) and time.monotonic() < deadline:
+            messages, _ = messages_of(socket.recv(timeout=20))
+            places += [m["position"] for m in messages if m["type"] == "SetCameraPositionMessage"]
+        assert len(places) > 3
+        assert places[0][1] < -3  # near where the first keyframe is
+        wait_for(lambda: not viewer.paths._players, "the end")
+        press(socket, button(viewer, "Remove all"))
+        wait_for(lambda: not viewer.paths.path.keyframes, "no keyframes")
+        moved = []
+        other.send(camera_message(0.2))
+        for _ in range(2):
+            messages, _ = messages_of(other.recv(timeout=20))
+            moved += [m for m in messages if m["type"] == "SetCameraPositionMessage" and not m["initial"]]
+        assert moved == []
+
+
+def test_only_the_render_thread_asks_dr_jit(viewer, at_start, monkeypatch):
+    """Whatever is pressed: a second thread in Dr.Jit would stop the whole process for good, now and then."""
+    import drjit
+
+    asked = set()
+
+    def watched(function):
+        def call(*arguments, **named):
+            asked.add(threading.current_thread().name)
+            return function(*arguments, **named)
+
+        return call
+
+    for name in ("width", "eval", "gather", "select", "zeros", "full", "sync_thread", "concat", "opaque"):
+        monkeypatch.setattr(drjit, name, watched(getattr(drjit, name)))
+    with connected(viewer) as socket:
+        before = set(viewer.clients)
+        socket.send(camera_message(0.1))
+        pictures(socket, 1)
+        client = viewer.clients[next(iter(set(viewer.clients) - before))]
+        for gui in (viewer._server.gui, client.handle.gui):
+            for handle in list(gui._gui_input_handle_from_uuid.values()):
+                if getattr(handle, "label", "") == "Compare":
+                    continue  # tracing is a process of its own
+                value = getattr(handle, "value", True)
+                if isinstance(value, bool):
+                    press(socket, handle, not value)
+                    press(socket, handle, value)
+                elif isinstance(value, float | int):
+                    press(socket, handle, value + 1)
+                    press(socket, handle, value)
+        for mode in ("depth", "object id", "ellipsoids", "normals", "colour"):
+            press(socket, client.controls.mode, mode)
+            pictures(socket, 1)
+        moved = {"type": "TransformControlsUpdateMessage", "name": "/models/0", "owner": ""}
+        socket.send(msgspec.msgpack.encode({**moved, "wxyz": [1.0, 0, 0, 0], "position": [0.0, 0, 0.2]}))
+        pictures(socket, 1)
+        socket.send(camera_message(0.5))
+        pictures(socket, 1)
+    viewer.paths.stop()
+    assert asked == {"render"}
