@@ -174,7 +174,7 @@ def _add(sums: tuple[Any, Any], batch: _Batch, lattice: tuple[Any, Any], limits:
         pixel = ad.Array2f(column, row)
         cell = _cell(batch.depth, dr.gather(ad.UInt32, batch.start, view), width, height, pixel, inside, step)
         ahead, slope = _ahead(cell, ad.Array2f(at.x, at.y) * scale, at.z, focal, truncation)
-        share = slope * dr.minimum(1 + ahead / truncation, 1)  # what is behind the surface is guessed
+        share = slope * dr.minimum(2 * (1 + ahead / truncation), 1)  # deep behind the surface is guessed
         share = dr.select(inside & (ahead > -truncation), share, 0)
         return view + 1, total + share * dr.minimum(dr.maximum(ahead / truncation, -1), 1), weight + share
 
@@ -210,7 +210,7 @@ def _ahead(cell: _Cell, ray: Any, z: Any, focal: Any, truncation: Any) -> tuple[
     whole = cell.share > 1 - 1e-4
     across = (0.5 - cell.share) * z / focal.x
     front = (cell.depth - z) * slope
-    inner = dr.select(whole | (front >= 0), front, dr.maximum(front, across))
+    inner = dr.select(whole | (front >= 0) | (front <= -truncation), front, dr.maximum(front, across))
     beside = dr.minimum(cell.back - z, across)
     ahead = dr.select(cell.depth > 0, dr.select(cell.share >= 0.5, inner, beside), truncation)
     return ahead, slope

@@ -8,6 +8,7 @@ from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at, rotation_from_quaternion
 from spacesim.data.records import Camera
+from spacesim.data.store import load_truth, read_dataset
 from spacesim.splat import fusion
 from spacesim.splat.fusion import DepthView, Field, Grid, fuse
 from spacesim.splat.gaussians import Gaussians
@@ -270,3 +271,20 @@ def test_cameras_around_see_all_of_the_model():
 def test_options_out_of_range(options):
     with pytest.raises(InputError, match=next(iter(options)) if "view" not in next(iter(options)) else "view"):
         MeshConfig(**options)
+
+
+def test_a_path_traced_sphere_within_half_a_voxel(spacesim, tmp_path):
+    trimesh.creation.icosphere(subdivisions=5).export(tmp_path / "ball.stl")
+    done = spacesim(
+        *("generate", tmp_path / "ball.stl", "--out", tmp_path / "data", "--suns", 1, "--views", 30),
+        *("--test-views", 1, "--resolution", 72, "--spp", 1),
+    )
+    assert done.code == 0, done.errors
+    dataset = read_dataset(tmp_path / "data")
+    views = [DepthView(frame.camera, load_truth(dataset, frame).depth) for frame in dataset.train]
+    low, high = bounds(views)
+    assert np.abs(np.concatenate([low + 1, high - 1])).max() < 0.05
+    grid = Grid.around(low, high, 1 / 24, 0.2)
+    vertices, faces = surface(fuse(views, grid))
+    assert np.abs(np.linalg.norm(vertices, axis=1) - 1).max() < 0.5 * grid.voxel
+    assert trimesh.Trimesh(vertices, faces).is_watertight
