@@ -307,6 +307,25 @@ def test_opaque_pictures_have_a_foreground_too(tmp_path, known_gaussians, write_
     assert inside(trainer) > 1.5 * before
 
 
+@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_gaussian_and_pictures_that_show_nothing(meshed, strategy, count, tmp_path):
+    """A start of one Gaussian; the second time every picture is empty."""
+    dataset = meshed
+    if count == 2:
+        for frame in meshed.frames:
+            (tmp_path / frame.file_path).parent.mkdir(exist_ok=True)
+            Image.new("RGBA", (32, 32), (0, 0, 0, 0)).save(tmp_path / frame.file_path)
+        dataset = replace(meshed, root=tmp_path)
+    config = replace(BASE, warm_start=replace(WARM, steps=10, decay=5), strategy=strategy, init_count=count)
+    config = replace(config, mesh_aware=replace(config.mesh_aware, min_gaussians=0))
+    trainer = Trainer(dataset, config)
+    for _ in range(18):
+        trainer.step()
+    assert np.isfinite(trainer.gaussians.to_numpy()["means"]).all()
+    assert trainer.gaussians.count >= 1
+
+
 def test_presets_and_table_5_7():
     table = warm_start("thesis")
     assert (table.steps, table.decay, table.weight, table.luminance, table.dilation) == (2000, 2000, 0.5, 0.03, 3)

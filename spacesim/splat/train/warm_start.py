@@ -133,9 +133,9 @@ class WarmStart:
         """Whether refinement waits, and the unseen are rescued, at step number `step`, the first of which is 0."""
         return step < self.config.steps
 
-    def attraction(self, view: View) -> Attraction | None:
-        """What pulls in a view; None where it shows no foreground."""
-        found: Attraction | None = self._cached(view.index)
+    def attraction(self, view: View) -> Attraction:
+        """What pulls in a view; nothing does where it shows no foreground."""
+        found: Attraction = self._cached(view.index)
         return found
 
     def pull(self, rows: list[Any], camera: Pinhole, found: Attraction, step: int) -> list[Any]:
@@ -169,11 +169,8 @@ class WarmStart:
         if config.revive > 0:
             raise_opacities(gaussians, optimizer, config.revive)
 
-    def _attraction(self, index: int) -> Attraction | None:
-        view = self.views[index]
-        mask = foreground(view, self.config)
-        if not mask.any():
-            return None
+    def _attraction(self, index: int) -> Attraction:
+        mask = foreground(self.views[index], self.config)
         image = distance_image(mask, self.config)
         return Attraction(ad.Bool(mask.ravel()), ad.Float(image.ravel()), (image.shape[1], image.shape[0]))
 
