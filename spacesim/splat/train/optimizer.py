@@ -8,6 +8,7 @@ from spacesim.backend import ad
 from spacesim.splat.gaussians import entries
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+AT_ONCE = 12  #: rows of moments that are rearranged at once, chosen
 
 
 class Adam:
@@ -33,12 +34,15 @@ class Adam:
         count, chosen = dr.width(self.first[0]), dr.width(index)
         size = dr.opaque(ad.UInt32, chosen)  # as a literal each size would be compiled
         for moments in (self.first, self.second):
-            for row, moment in enumerate(moments):  # one by one, so that old ones go as new ones come
-                copies, forget = dr.width(moment) // count, fresh
-                if copies > 1:
-                    forget = dr.gather(ad.Bool, fresh, dr.arange(ad.UInt32, copies * chosen) % size)
-                moments[row] = dr.select(forget, 0, entries(moment, index, count))
-                dr.eval(moments[row])
+            for start in range(0, len(moments), AT_ONCE):  # in parts, so that old ones go as new ones come
+                part = []
+                for moment in moments[start : start + AT_ONCE]:
+                    copies, forget = dr.width(moment) // count, fresh
+                    if copies > 1:
+                        forget = dr.gather(ad.Bool, fresh, dr.arange(ad.UInt32, copies * chosen) % size)
+                    part.append(dr.select(forget, 0, entries(moment, index, count)))
+                dr.eval(part)
+                moments[start : start + AT_ONCE] = part
 
     def forget(self, rows: slice) -> None:
         """Set the moments of some rows to zero."""
