@@ -13,7 +13,7 @@ from spacesim.viewer.stage import Stage
 from spacesim.viewer.state import COMPARISONS, MODES, SIDES, Shared, Stand, bounded
 
 SCALES = (1e-3, 1e3)  #: factors that the field of a model takes, chosen
-SAMPLES = (4, 1024)  #: of the path tracer, a pixel
+SAMPLES = (4, 256)  #: of the path tracer, a pixel
 
 
 class SunControls:
@@ -114,8 +114,8 @@ class ClientControls:
             picture = gui.add_button("Picture (PNG)")
         with gui.add_folder("Truth", order=4):
             self.compare = gui.add_dropdown("Compare", COMPARISONS, initial_value=COMPARISONS[0])
-            wipe = gui.add_slider("Wipe", 0.0, 1.0, 0.01, 0.5, hint="the truth is on the left")
-            samples = gui.add_slider("Samples", *SAMPLES, 4, 32, hint="of the path tracer, a pixel")
+            self.wipe = wipe = gui.add_slider("Wipe", 0.0, 1.0, 0.01, 0.5, hint="the truth is on the left")
+            self.samples = samples = gui.add_slider("Samples", *SAMPLES, 4, 32, hint="of the path tracer, a pixel")
             self.status = gui.add_markdown("")
         if frames:
             with gui.add_folder("Data", order=5):

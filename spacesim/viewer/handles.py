@@ -102,15 +102,15 @@ class SunHandle:
         radius = self._place(shared.stand)[1]
         self._size = radius
         self._frame = scene.add_frame("/sun", show_axes=False)
-        ball = scene.add_icosphere("/sun/ball", radius=0.06 * radius, color=SUN_COLOUR, cast_shadow=False)
-        points = np.array([[[0, 0, -0.08 * radius], [0, 0, -0.3 * radius]]], np.float32)
+        ball = scene.add_icosphere("/sun/ball", radius=0.04 * radius, color=SUN_COLOUR, cast_shadow=False)
+        points = np.array([[[0, 0, -0.06 * radius], [0, 0, -0.22 * radius]]], np.float32)
         scene.add_arrows(
             "/sun/arrow",
             points,
             np.array(SUN_COLOUR, np.uint8),
-            shaft_radius=0.012 * radius,
-            head_radius=0.035 * radius,
-            head_length=0.08 * radius,
+            shaft_radius=0.008 * radius,
+            head_radius=0.024 * radius,
+            head_length=0.06 * radius,
         )
         ball.on_drag(self._drag)
         self.follow(shared.stand)
