@@ -28,7 +28,7 @@ GATE = 100.0  #: steepness of the paper's gate: faint Gaussians jitter, opaque o
 class McmcConfig:
     """Schedule and the greatest number of Gaussians are those of `DefaultStrategyConfig`."""
 
-    min_opacity: float = 0.005  #: at most so opaque is dead (section 3.3)
+    min_opacity: float = 0.005  #: at most so opaque is dead
     growth: float = 0.05  #: more Gaussians each time, a share of those there are
     noise: float = 5e5  #: lambda_noise of the paper's code, for scenes as large as 1
 
@@ -38,8 +38,8 @@ class McmcConfig:
 
 
 def shared(opacity: np.ndarray, scales: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(opacities [N], scales [N, 3]) that `copies` [N] Gaussians in one place need to look like one (section 3.3 of the
-    paper): o' = 1 - (1 - o)^(1/n), s' = s o / sum_{i=1}^n sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1).
+    """(opacities [N], scales [N, 3]) that `copies` [N] Gaussians in one place need to look like one, by the paper:
+    o' = 1 - (1 - o)^(1/n), s' = s o / sum_{i=1}^n sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1).
 
     The sum over i is C(n, k+1): hockey sticks of Pascal's triangle."""
     copies = np.minimum(copies, MOST_COPIES)
@@ -65,8 +65,9 @@ class McmcStrategy(Strategy):
         pass
 
     def disturb(self, step: int, gaussians: Gaussians, rate: float, seed: int) -> None:
-        """Noise on the means (section 3.2 of the paper): Sigma times a normal vector, times the learning rate, times a
-        gate that closes above the opacity at which Gaussians are dead. In a scene of size 1, as the paper's lengths."""
+        """Noise on the means (stochastic gradient Langevin dynamics): Sigma times a normal vector, times the learning
+        rate, times a gate that closes above the opacity at which Gaussians are dead. In a scene of size 1, as the
+        paper's lengths."""
         if self.mcmc.noise == 0:
             return
         factor = self.mcmc.noise * rate / self.scene_scale**2
