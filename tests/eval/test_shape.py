@@ -20,6 +20,7 @@ from spacesim.eval.surfaces import value_of
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.meshing import MeshConfig
 from spacesim.splat.run import load_run
+from spacesim.splat.train.initialise import initial_gaussians
 
 SMALL = GeometryConfig(samples=3000, voxels=40, mesh=MeshConfig(voxels=48, views=6))
 
@@ -51,13 +52,16 @@ def test_a_trained_run_has_numbers(tiny):
 
 def test_better_shapes_have_better_numbers(tiny):
     run, dataset = tiny
-    arrays = run.model.to_numpy()
-    worse = replace(run, model=Gaussians.from_numpy({**arrays, "means": arrays["means"] * np.float32(1.2)}))
-    good, bad = (judge_geometry(one, dataset, SMALL).values for one in (run, worse))
+    arrays = initial_gaussians(dataset, "mesh", 30_000, 0, seed=0).to_numpy()
+    arrays["logit_opacities"][:] = 4  # opaque, thin, on the true surface
+    arrays["log_scales"] -= 0.4
+    worse = {**arrays, "means": arrays["means"] * np.float32(1.2)}
+    models = (Gaussians.from_numpy(one) for one in (arrays, worse))
+    good, bad = (judge_geometry(replace(run, model=model), dataset, SMALL).values for model in models)
     assert bad["chamfer"] > 2 * good["chamfer"]
     assert bad["hausdorff99"] > good["hausdorff99"]
     assert bad["iou"] < good["iou"]
-    assert bad["floaters"]["outside"] > good["floaters"]["outside"]
+    assert good["floaters"]["outside"] < 0.01 < bad["floaters"]["outside"]
 
 
 def test_runs_without_a_surface_have_a_sentence(tiny):
