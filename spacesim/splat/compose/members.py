@@ -22,13 +22,11 @@ from spacesim.splat.project import ALPHA_MIN
 from spacesim.splat.render import view_colours
 from spacesim.splat.run import Run
 from spacesim.splat.shadow.cast import ShadowConfig, Shadows
-from spacesim.splat.shadow.mapping import MappingConfig
 from spacesim.splat.tiles import RECORDINGS
 from spacesim.splat.tone import encoded
 
-PLAIN_SHADOWS = ShadowConfig(mapping=MappingConfig("percentage-closer"), refine=None)
-"""How shadows of others fall on a run that was trained without any: a depth test that knows half-covered pixels
-(chosen: such a run has learned none to be consistent with)."""
+PLAIN_SHADOWS = ShadowConfig(refine=None)
+"""Of a run that was trained without any: a depth test (chosen)."""
 MODEL_DISTANCE = 5.0  #: farthest training camera of such a run, in its radii: chosen, only the softness depends on it
 
 
@@ -71,12 +69,13 @@ class Member:
 
     @property
     def received(self) -> ShadowConfig:
-        """How shadows of other models fall on it: as its own, but that a depth test in a picture of the others alone
-        must know how much of a pixel they cover. Nothing refines these shadows, and a faint rim is no wall."""
+        """How shadows of other models fall on it: as its own, but where the Sun's picture shows the others alone, a
+        depth test must know how much of a pixel they cover, as a faint rim is no wall, and neither bias nor lifted
+        points are needed, as no surface is tested against itself."""
         mapping = self.shadow.mapping
-        if mapping.filter != "bilinear":
-            return self.shadow
-        return replace(self.shadow, mapping=replace(mapping, filter="percentage-closer"))
+        if mapping.filter == "bilinear":
+            mapping = replace(mapping, filter="percentage-closer", radius=0.5)
+        return replace(self.shadow, bias=0.0, grazing="none", mapping=mapping)
 
     @property
     def linear(self) -> bool:
