@@ -535,6 +535,15 @@ def test_a_mesh_that_is_missing_or_elsewhere_is_told(small_dataset, tmp_path):
         trainer.run(lambda progress: None, lambda: None)
 
 
+def test_a_configuration_tells_of_its_own_strategy_alone():
+    config = config_of("mesh-aware")
+    told = config.to_json()
+    assert told["mesh_aware"]["cull_every"] == 40
+    assert not {"support_aware", "mcmc"} & set(told)
+    assert TrainConfig.from_json(told).mesh_aware == config.mesh_aware
+    assert set(config_of("default").to_json()) & {"mesh_aware", "support_aware", "mcmc"} == set()
+
+
 def test_presets_know_their_strategies():
     thesis = preset("thesis", "vanilla", "support-aware")
     assert thesis.strategy == "support-aware"

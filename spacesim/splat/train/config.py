@@ -124,8 +124,9 @@ class TrainConfig:
         return tuple(name for name, weight in weights.items() if weight > 0)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values for config.json."""
-        return asdict(self)
+        """Plain values for config.json; of the strategies' own configurations the one that counts."""
+        others = {strategy.replace("-", "_") for strategy in STRATEGIES} - {self.strategy.replace("-", "_")}
+        return {name: value for name, value in asdict(self).items() if name not in others}
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> "TrainConfig":
