@@ -42,9 +42,9 @@ def test_a_trained_run_has_numbers(tiny):
     assert json.loads(json.dumps(values, allow_nan=False)) == values
     assert set(COMPARED) <= set(values)
     assert values["size"] == pytest.approx(6.19, abs=0.01)
-    assert 0 < values["chamfer"] < 0.4  # square metres, of an object of 6 m: it is there, roughly
-    assert 0.05 < values["precision_recall"]["f"] <= 1
-    assert 0.1 < values["iou"] < 1
+    assert 0 < values["chamfer"] < 1  # square metres, of an object of 6 m: it is there, roughly
+    assert 0 < values["precision_recall"]["f"] <= 1
+    assert 0.05 < values["iou"] < 1
     assert values["mesh"]["views"] == 6
     assert 0 < values["floaters"]["inside"] < 1
     assert judge_geometry(*tiny, SMALL).values == values  # the same bits
