@@ -68,8 +68,8 @@ def reference_occlusion(
     config = config or MappingConfig()
     pose = camera.camera_from_world
     centers = np.asarray(gaussians["means"], np.float64) @ pose[:3, :3].T + pose[:3, 3]
-    how = {"sh_degree": 0, "antialiased": config.antialiased}
-    picture = render_reference(gaussians, camera, features=centers[:, 2:] ** 2, **how)
+    depths2 = centers[:, 2:] ** 2
+    picture = render_reference(gaussians, camera, sh_degree=0, features=depths2, antialiased=config.antialiased)
     occlusion = np.zeros(len(centers))
     for i, (x, y, z) in enumerate(centers * [camera.scale_x, camera.scale_y, 1] + [camera.cx, camera.cy, 0]):
         if not (0 <= x < camera.width and 0 <= y < camera.height):
