@@ -163,6 +163,22 @@ def test_a_kilometre_apart_each_keeps_its_own_shadows_to_the_bit_and_aligned_the
     assert 0.3 < partly.visibility[covered].sum() / apart.visibility[covered].sum() < 0.6
 
 
+@pytest.mark.parametrize("method", ["vanilla", "map", "surface"])
+def test_shadows_of_others_end_where_they_end_whatever_is_done_against_acne(method):
+    """A disc whose edge cuts the model in half: each Gaussian's centre is dark or lit by its side of the edge alone."""
+    run, across = made_run(method, 5, count=300), np.cross(SUN.direction, [0, 0, 1])
+    across /= np.linalg.norm(across)
+    facing = rotation_about(np.cross([0, 0, 1], SUN.direction), 55)
+    edge = Pose(facing, 50 * SUN.direction + 3.0 * across)
+    scene = Composition([Placed(run, name="cut"), Placed(disc_run(3.0), edge, "disc")])
+    lights = dict(zip((model.name for model in scene.placed), scene.light_between(SUN), strict=True))
+    visible, side = np.array(lights["cut"]), run.model.to_numpy()["means"] @ across  # < 0 is beyond the disc
+    assert (visible[side > 0.1] < 0.1).all()
+    assert (visible[side < -0.2] > 0.9).all()
+    assert min((side > 0.1).sum(), (side < -0.2).sum()) > 50
+    assert lights["disc"] is None
+
+
 def replace_translation(pose: Pose, translation) -> Pose:
     return Pose(pose.rotation, translation, pose.scale)
 
