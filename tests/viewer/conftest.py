@@ -75,12 +75,12 @@ def view() -> View:
 
 
 @pytest.fixture(scope="module")
-def viewer(tiny_run, tmp_path_factory):
+def viewer(tiny_run, tiny_data, tmp_path_factory):
     """Two models of one run, one above the other, served on loopback."""
     pytest.importorskip("viser", reason="viser is not installed")
     folder = tmp_path_factory.mktemp("viewer")
     (folder / "pair.toml").write_text(SCENE.format(run=tiny_run))
-    one = Viewer(opened(folder / "pair.toml", out=folder), port=0)
+    one = Viewer(opened(folder / "pair.toml", tiny_data, folder), port=0)
     one.start()
     yield one
     one.stop()

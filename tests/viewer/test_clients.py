@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from browser import wait_for
 
+from spacesim.data.geometry import look_at, quaternion_from_rotation
 from spacesim.data.records import Sun
 from spacesim.viewer.state import Stand
 
@@ -27,18 +28,18 @@ def connected(viewer):
 
 
 def camera_message(angle=0.0, **changes):
-
-    wxyz = (np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2))
+    """From 7 m away, looking at the scene."""
+    place = [7 * np.sin(angle), -7 * np.cos(angle), 1.0]
     message = {
         "type": "ViewerCameraMessage",
-        "wxyz": [float(x) for x in wxyz],
-        "position": [0.0, -6.0, 0.0],
-        "fov": 0.6,
+        "wxyz": quaternion_from_rotation(look_at(place, [0.0, 0, 0.5])[:3, :3]).tolist(),
+        "position": [float(x) for x in place],
+        "fov": 0.9,
         "near": 0.01,
         "far": 1000.0,
         "image_height": 240,
         "image_width": 320,
-        "look_at": [0.0, 0.0, 0.0],
+        "look_at": [0.0, 0.0, 0.5],
         "up_direction": [0.0, 0.0, 1.0],
     }
     return msgspec.msgpack.encode({**message, **changes})
@@ -183,9 +184,9 @@ def test_looking_around_takes_no_memory(viewer, at_start):
     except OSError:
         pytest.skip("no /proc to read the memory from")
     with connected(viewer) as socket:
-        look_around(socket, 100)
+        look_around(socket, 60)
         before = resident()
-        look_around(socket, 150)
+        look_around(socket, 100)
         grown = resident() - before
     assert grown < 20 << 20, f"{grown / 2**20:.1f} MiB"
 
@@ -247,7 +248,7 @@ def test_a_path_is_played_by_the_camera_of_who_asks(viewer, at_start):
         viewer.paths._change(type(viewer.paths.path)())
         press(socket, button(viewer, "Add this view"))
         wait_for(lambda: len(viewer.paths.path.keyframes) == 1, "a keyframe")
-        socket.send(camera_message(position=[6.0, 0.0, 0.0], wxyz=[0.5, 0.5, -0.5, -0.5]))
+        socket.send(camera_message(np.pi / 2))
         pictures(socket, 1)
         press(socket, viewer.paths.step, 0.5)
         wait_for(lambda: viewer.paths.step.value == 0.5, "the time")
@@ -256,7 +257,7 @@ def test_a_path_is_played_by_the_camera_of_who_asks(viewer, at_start):
         assert viewer.paths.path.seconds == 0.5
         press(socket, button(viewer, "Play / stop"))
         places, deadline = [], time.monotonic() + 20
-        while (not places or np.abs(np.array(places[-1]) - [6, 0, 0]).max() > 1e-3) and time.monotonic() < deadline:
+        while (not places or np.abs(np.array(places[-1]) - [7, 0, 1]).max() > 1e-3) and time.monotonic() < deadline:
             messages, _ = messages_of(socket.recv(timeout=20))
             places += [m["position"] for m in messages if m["type"] == "SetCameraPositionMessage"]
         assert len(places) > 3
@@ -270,6 +271,30 @@ def test_a_path_is_played_by_the_camera_of_who_asks(viewer, at_start):
             messages, _ = messages_of(other.recv(timeout=20))
             moved += [m for m in messages if m["type"] == "SetCameraPositionMessage" and not m["initial"]]
         assert moved == []
+
+
+def test_a_click_on_a_camera_of_the_data_looks_from_there(viewer, at_start):
+    frame = viewer.show.dataset.frames[3]
+    with connected(viewer) as socket:
+        before = set(viewer.clients)
+        socket.send(camera_message())
+        pictures(socket, 1)
+        client = viewer.clients[next(iter(set(viewer.clients) - before))]
+        press(socket, button(viewer, "Cameras", client))
+        names, owner, place, deadline = set(), "", None, time.monotonic() + 20
+        while place is None and time.monotonic() < deadline:
+            for message in messages_of(socket.recv(timeout=20))[0]:
+                if message["type"] == "CameraFrustumMessage":
+                    names.add(message["name"])
+                    owner = message["owner"]
+                if message["type"] == "SetCameraPositionMessage" and not message["initial"]:
+                    place = message["position"]
+            if len(names) == len(viewer.show.dataset.frames):
+                rays = {"ray_origin": [0.0] * 3, "ray_direction": [0.0, 0, 1], "screen_pos": [0.5, 0.5]}
+                click = {"name": "/cameras/3", "instance_index": None, "modifier": None, "owner": owner, **rays}
+                socket.send(msgspec.msgpack.encode({"type": "SceneNodeClickMessage", **click}))
+                names = set()
+        assert place == pytest.approx(frame.camera.position.tolist())
 
 
 def test_only_the_render_thread_asks_dr_jit(viewer, at_start, monkeypatch):
