@@ -19,7 +19,7 @@ from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.strategies.strategy import Strategy
 
 WINDOW = ("gradient", "seen", "radius")  #: statistics since the last refinement
-RECORDINGS = 8  #: of an observation that are kept
+RECORDINGS = 64  #: of an observation that are kept
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,8 @@ class DensityControl(Strategy):
     last refinement; and what a subclass adds, which outlives refinements.
     """
 
+    unseen: tuple[str, ...] = ()  #: of the state, what no observation changes
+
     def __init__(self, config: DefaultStrategyConfig, scene_scale: float, count: int, kept: tuple[str, ...]) -> None:
         self.config, self.scene_scale, self.kept = config, scene_scale, kept
         self.state = {name: _zeros(count) for name in (*WINDOW, *kept)}
@@ -88,7 +90,8 @@ class DensityControl(Strategy):
         return step < self.config.refine_stop
 
     def observe(self, gradient: Any, radius: Any, visible: Any) -> None:
-        self.state = self._observed(self.state, gradient, radius, visible)
+        seen = {name: values for name, values in self.state.items() if name not in self.unseen}
+        self.state |= self._observed(seen, gradient, radius, visible)
 
     def _observation(self, state: dict[str, Any], gradient: Any, radius: Any, visible: Any) -> dict[str, Any]:
         """The state with an observation more."""
@@ -183,7 +186,7 @@ class DensityControl(Strategy):
         copies = append_copies(gaussians, optimizer, np.searchsorted(index, parents), rng)
         survey = survey.at(index[copies])
         self.state = {name: _zeros(gaussians.count) for name in WINDOW}
-        self.state |= {name: ad.Float(survey.kept[name].astype(np.float32)) for name in self.kept}
+        self.state |= {name: _uploaded(survey.kept[name]) for name in self.kept}
         return len(parents)
 
     def _survey(self, step: int, gaussians: Gaussians) -> Survey:
@@ -237,6 +240,13 @@ def _limit(duplicate: np.ndarray, split: np.ndarray, gradient: np.ndarray, room:
     keep = np.zeros_like(duplicate)
     keep[wanted[np.argsort(-gradient[wanted], kind="stable")[: max(room, 0)]]] = True
     return duplicate & keep, split & keep
+
+
+def _uploaded(values: np.ndarray) -> Any:
+    """Float [N] in memory of Dr.Jit's own: numpy's may lie otherwise, and each way to lie is recorded."""
+    found = dr.gather(ad.Float, ad.Float(values.astype(np.float32)), dr.arange(ad.UInt32, len(values)))
+    dr.eval(found)
+    return found
 
 
 def _zeros(count: int) -> Any:

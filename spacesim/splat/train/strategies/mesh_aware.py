@@ -67,6 +67,8 @@ class MeshAwareStrategy(DensityControl):
     since the start; "known" and "known_x", "known_y", "known_z", the signed distance (metres) and the place at which
     its side was asked for, 0 where it was not."""
 
+    unseen = KNOWN
+
     def __init__(
         self,
         config: DefaultStrategyConfig,
