@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 REST = 0.2  #: seconds without a new wish after which a view is at rest, chosen
+PATIENCE = 0.5  #: seconds that a view at rest waits for others that move, chosen
 
 _log = logging.getLogger(__name__)
 
@@ -90,12 +91,19 @@ class RenderLoop:
         """What to do now, None for nothing. The lock is held."""
         if self._work:
             return self._work.pop(0)
+        now = time.monotonic()
+        late = self._rested(now - PATIENCE)
+        if late is not None:
+            return late
         if self._wishes:
             client, (wish, moving) = self._wishes.popitem(last=False)
             if moving:
-                self._resting[client] = (time.monotonic() + self._rest, wish)
+                self._resting[client] = (now + self._rest, wish)
             return lambda: wish.draw(not moving)
-        now = time.monotonic()
+        return self._rested(now)
+
+    def _rested(self, now: float) -> Callable[[], Any] | None:
+        """A picture in full resolution that was due before `now`. The lock is held."""
         for client, (moment, wish) in self._resting.items():
             if moment <= now:
                 del self._resting[client]

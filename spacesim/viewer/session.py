@@ -162,9 +162,10 @@ class Session:
 
     def _kept(self, view: View, stand: Stand, look: Look) -> Frame | None:
         """The last picture in full resolution, if it is this one but for the comparison with the truth."""
-        if self._last is None:
+        last = self._last  # which `close` may take away at any moment
+        if last is None:
             return None
-        last_view, last_stand, last_look, frame = self._last
+        last_view, last_stand, last_look, frame = last
         same = (last_look.mode, last_look.side) == (look.mode, look.side)
         return frame if same and view.same(last_view) and stand.same(last_stand) else None
 

@@ -53,6 +53,23 @@ def test_full_resolution_comes_at_rest_and_once():
     assert drawn.made == [(1, False), (2, True), (1, True)]
 
 
+def test_a_view_at_rest_is_not_kept_waiting_by_one_that_moves_for_ever():
+    loop, drawn = RenderLoop(rest=0.05), Drawn()
+    loop.start()
+    loop.wish("still", drawn.wish("still"))
+
+    def draw(_full):
+        time.sleep(0.01)
+        drawn.made.append(("moving", False))
+        if len(drawn.made) < 400:
+            loop.wish("moving", Wish(draw))
+
+    loop.wish("moving", Wish(draw))
+    wait_for(lambda: ("still", True) in drawn.made, "the picture at rest")
+    loop.stop()
+    assert 5 < drawn.made.index(("still", True)) < 400
+
+
 def test_a_client_that_has_gone_gets_nothing():
     loop, drawn = RenderLoop(rest=0.05), Drawn()
     loop.start()
