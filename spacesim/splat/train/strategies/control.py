@@ -243,8 +243,9 @@ def _limit(duplicate: np.ndarray, split: np.ndarray, gradient: np.ndarray, room:
 
 
 def _uploaded(values: np.ndarray) -> Any:
-    """Float [N] in memory of Dr.Jit's own: numpy's may lie otherwise, and each way to lie is recorded."""
-    found = dr.gather(ad.Float, ad.Float(values.astype(np.float32)), dr.arange(ad.UInt32, len(values)))
+    """Float [N] in memory of Dr.Jit's own: numpy's may lie otherwise, and each way to lie is recorded anew."""
+    found = _zeros(len(values))
+    dr.scatter(found, ad.Float(values.astype(np.float32)), dr.arange(ad.UInt32, len(values)))
     dr.eval(found)
     return found
 
