@@ -6,8 +6,8 @@ Without a run the scene is the sphere of random splats of the other benchmarks, 
 a picture in full resolution under another camera, or another Sun or pose, numpy and colour map included; "frames/s" is
 what a client over a websocket gets that moves its camera as soon as a picture has come, and the resolution that the
 viewer has chosen by then. Then, for --seconds, clients turn round the scene, move models and the Sun, change modes and
-the window's size, leave without a word and come back; memory is that of the process, and its growth a line through the
-second half. `--seconds 0` leaves that out.
+the window's size, leave without a word and come back; all kernels are compiled before. Memory is that of the process,
+and its growth a line through the second half. `--seconds 0` leaves that out.
 """
 
 import itertools
@@ -37,7 +37,7 @@ from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.light import LightModel, TrainingFrame
 from spacesim.splat.run import Run
 from spacesim.splat.train.config import preset
-from spacesim.viewer.frames import draw
+from spacesim.viewer.frames import SHARES, draw
 from spacesim.viewer.opened import opened
 from spacesim.viewer.server import Show, Viewer
 from spacesim.viewer.stage import Stage
@@ -60,6 +60,8 @@ def main() -> None:
     backend.select(options.backend)
     show = opened(options.path) if options.path else spheres(options.gaussians)
     rows = draws(show, options.side, options.repeats)
+    if options.seconds > 0:
+        warm(show)
     viewer = Viewer(show, port=0)
     viewer.start()
     try:
@@ -128,6 +130,14 @@ def draws(show: Show, side: int, repeats: int) -> list[common.Row]:
     return [
         {"picture": name, "ms": str(timing), "frames/s": f"{1e3 / timing.median:.1f}"} for name, timing in found.items()
     ]
+
+
+def warm(show: Show) -> None:
+    """Compile every kernel that looking around needs: memory shall tell of what is lost, not of these."""
+    camera = places(show)
+    for (width, height), mode, share in itertools.product(WINDOWS, MODES, SHARES):
+        view = View(next(camera), float(FOV), width, height)
+        draw(show.stage, show.stand, view, Look(mode), share)
 
 
 class Visitor:
