@@ -126,7 +126,15 @@ def numbers(rows: Iterable[Any]) -> np.ndarray:
 
 def triple(rows: np.ndarray) -> Any:
     """Array3f [3, N] of an array [3, N]; nothing is compiled, see `numbers`."""
-    return ad.Array3f(*(ad.Float(np.ascontiguousarray(row, np.float32)) for row in rows))
+    return ad.Array3f(*(uploaded(row) for row in rows))
+
+
+def uploaded(values: np.ndarray) -> Any:
+    """Float [N] in memory of Dr.Jit's own: numpy's may lie otherwise, and each way to lie is recorded anew."""
+    found = dr.opaque(ad.Float, 0, len(values))
+    dr.scatter(found, ad.Float(np.ascontiguousarray(values, np.float32)), dr.arange(ad.UInt32, len(values)))
+    dr.eval(found)
+    return found
 
 
 def entries(row: Any, index: Any, count: int) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError
-from spacesim.splat.gaussians import Gaussians, numbers
+from spacesim.splat.gaussians import Gaussians, numbers, uploaded
 from spacesim.splat.train.densify import Refinement, append_copies, grow, limit_opacities, prune
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.strategies.strategy import Strategy
@@ -186,7 +186,7 @@ class DensityControl(Strategy):
         copies = append_copies(gaussians, optimizer, np.searchsorted(index, parents), rng)
         survey = survey.at(index[copies])
         self.state = {name: _zeros(gaussians.count) for name in WINDOW}
-        self.state |= {name: _uploaded(survey.kept[name]) for name in self.kept}
+        self.state |= {name: uploaded(survey.kept[name]) for name in self.kept}
         return len(parents)
 
     def _survey(self, step: int, gaussians: Gaussians) -> Survey:
@@ -240,14 +240,6 @@ def _limit(duplicate: np.ndarray, split: np.ndarray, gradient: np.ndarray, room:
     keep = np.zeros_like(duplicate)
     keep[wanted[np.argsort(-gradient[wanted], kind="stable")[: max(room, 0)]]] = True
     return duplicate & keep, split & keep
-
-
-def _uploaded(values: np.ndarray) -> Any:
-    """Float [N] in memory of Dr.Jit's own: numpy's may lie otherwise, and each way to lie is recorded anew."""
-    found = _zeros(len(values))
-    dr.scatter(found, ad.Float(values.astype(np.float32)), dr.arange(ad.UInt32, len(values)))
-    dr.eval(found)
-    return found
 
 
 def _zeros(count: int) -> Any:

@@ -13,7 +13,7 @@ from scipy.special import comb
 
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError
-from spacesim.splat.gaussians import Gaussians, numbers, opacities, principal_axes, triple
+from spacesim.splat.gaussians import Gaussians, numbers, opacities, principal_axes, triple, uploaded
 from spacesim.splat.train.densify import Refinement, rearrange
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig
@@ -115,7 +115,7 @@ class McmcStrategy(Strategy):
         logits[moved] = np.log(each / (1 - each))[index[moved]]
         log_scales[:, moved] = np.log(narrower[index[moved]]).T
         rearrange(gaussians, optimizer, index, moved)
-        gaussians.logit_opacities = ad.Float(logits)
+        gaussians.logit_opacities = uploaded(logits)
         gaussians.log_scales = triple(log_scales)
 
 
