@@ -467,7 +467,8 @@ def test_supervised_visibility_needs_truth(small_lit_dataset):
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_survive_json_and_have_the_thesis_numbers(name, method):
     config = preset(name, method)
-    assert TrainConfig.from_json(config.to_json()) == config
+    written = json.loads(json.dumps(config.to_json()))
+    assert TrainConfig.from_json(written).to_json() == config.to_json()  # other strategies are left out
     if name != "thesis" or method == "vanilla":
         return
     field, shadow = config.light.field, config.light.shadow
