@@ -24,7 +24,9 @@ pytestmark = pytest.mark.filterwarnings(r"ignore:(Queued a |\[viser\])")  # as t
 
 def connected(viewer):
     url = viewer.url.replace("http", "ws")
-    return client.connect(url, subprotocols=[f"viser-v{viser.__version__}"], compression=None, max_size=None)
+    return client.connect(
+        url, subprotocols=[f"viser-v{viser.__version__}"], compression=None, max_size=None, close_timeout=0.5
+    )
 
 
 def camera_message(angle=0.0, **changes):
