@@ -17,6 +17,7 @@ import drjit as dr
 import numpy as np
 
 from spacesim import backend
+from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera
 
@@ -67,6 +68,15 @@ def parse_sizes(text: str) -> list[tuple[int, int]]:
     if min(min(size) for size in sizes) < 1:
         raise SystemExit(f"--sizes: expected numbers of at least 1, found {text!r}")
     return sizes
+
+
+def told(main: Callable[[], None]) -> None:
+    """Run a benchmark; what its user can mend ends it with a sentence and code 2."""
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
 
 
 def row_names(text: str) -> list[str]:

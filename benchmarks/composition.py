@@ -218,4 +218,4 @@ def _of(metrics: Mapping[str, Any], which: str, group: str, metric: str) -> floa
 
 
 if __name__ == "__main__":
-    main()
+    common.told(main)

@@ -25,7 +25,8 @@ from spacesim.eval.evaluate import evaluate
 from spacesim.eval.report import write_report
 from spacesim.progress import reporting, tell_training
 from spacesim.splat.light import LightConfig
-from spacesim.splat.shadow.mapping import MappingConfig
+from spacesim.splat.shadow.cast import ShadowConfig
+from spacesim.splat.shadow.mapping import SUN_RADIUS_DEG, MappingConfig
 from spacesim.splat.train.config import TrainConfig, preset, with_field, with_options
 from spacesim.splat.train.train import train
 
@@ -95,10 +96,14 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     mapped, splatted = preset(size, "shadow-map"), preset(size, "shadow-splat")
     yield "map, surface", mapped
     yield "splat, surface", splatted
+    yield "map, surface, thesis's bias", with_shadow(mapped, bias=10.0, grazing="none")
     yield "map, surface, no refinement", with_shadow(mapped, refine=None)
+    closer = MappingConfig("percentage-closer", sun_radius_deg=SUN_RADIUS_DEG)
+    yield "map, surface, percentage-closer", with_shadow(mapped, mapping=closer)
     yield "map, surface, variance", with_shadow(mapped, mapping=MappingConfig("variance"))
     yield "map, surface, supervised", replace(mapped, visibility_weight=0.1)
     yield "splat, surface, supervised", replace(splatted, visibility_weight=0.1)
+    yield "map, surface, light of twice the size", with_shadow(mapped, size=2 * shadow_of(mapped).size)
     yield "map, surface, linear", replace(mapped, light=replace(mapped.light, linear=True))
     yield "splat, surface, gradients", with_shadow(splatted, gradients=True)
     yield "splat, surface, supervised, gradients", with_shadow(replace(splatted, visibility_weight=0.1), gradients=True)
@@ -115,8 +120,13 @@ def with_shadow(config: TrainConfig, **changes: Any) -> TrainConfig:
     """`config` with another configuration of its shadows."""
     light: LightConfig | None = config.light
     assert light is not None
-    assert light.shadow is not None
-    return replace(config, light=replace(light, shadow=replace(light.shadow, **changes)))
+    return replace(config, light=replace(light, shadow=replace(shadow_of(config), **changes)))
+
+
+def shadow_of(config: TrainConfig) -> ShadowConfig:
+    assert config.light is not None
+    assert config.light.shadow is not None
+    return config.light.shadow
 
 
 def make_data(out: Path) -> Path:
@@ -149,4 +159,4 @@ def row(name: str, metrics: dict[str, Any], part: str) -> common.Row:
 
 
 if __name__ == "__main__":
-    main()
+    common.told(main)

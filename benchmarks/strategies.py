@@ -283,4 +283,4 @@ def plot(curves: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    common.told(main)

@@ -149,6 +149,7 @@ def _with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainCon
         "shadow_bias",
         "grazing",
         "shadow_filter",
+        "sun_radius",
         "light_size",
         "shadow_gradients",
         "no_refinement",
@@ -174,6 +175,12 @@ def _with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainCon
             if shadow.method != "mapping":
                 raise InputError(f"--shadow-filter: expected --method shadow-map, found {config.method}")
             shadow = replace(shadow, mapping=replace(shadow.mapping, filter=options.shadow_filter))
+        if options.sun_radius is not None:
+            if shadow.mapping.filter != "percentage-closer":
+                raise InputError(
+                    f"--sun-radius: expected --shadow-filter percentage-closer, found {shadow.mapping.filter}"
+                )
+            shadow = replace(shadow, mapping=replace(shadow.mapping, sun_radius_deg=options.sun_radius))
         shadow = replace(shadow, gradients=True) if options.shadow_gradients else shadow
         shadow = replace(shadow, refine=None) if options.no_refinement else shadow
     return replace(config, light=replace(light, shadow=shadow))

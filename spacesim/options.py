@@ -120,6 +120,9 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     lit.add_argument("--shadow-bias", type=float, metavar="X", help="strength of the receiver-depth bias; 0: none")
     lit.add_argument("--grazing", choices=("none", "bias", "lift"), help="against acne where the Sun grazes")
     lit.add_argument("--shadow-filter", choices=("bilinear", "percentage-closer", "variance"), help="of shadow maps")
+    lit.add_argument(
+        "--sun-radius", type=float, metavar="DEG", help="penumbrae of such a disc (0.2666 at 1 au), percentage-closer"
+    )
     lit.add_argument("--light-size", type=int, metavar="PX", help="sides of the Sun's picture")
     lit.add_argument("--shadow-gradients", action="store_true", help="of shadow splatting move the Gaussians, too")
     lit.add_argument("--no-refinement", action="store_true", help="raw shadows, without the network")

@@ -46,6 +46,34 @@ def test_no_bias_is_no_bias(spacesim, tiny_data, tmp_path):
     assert json.loads((tmp_path / "run/config.json").read_text())["light"]["shadow"]["bias"] == 0
 
 
+@pytest.mark.parametrize(
+    ("words", "keys", "value"),
+    [
+        ("--method shadow-map --linear", "light linear", True),
+        ("--method shadow-map --field thesis", "light field surface", False),
+        ("--method shadow-map --grazing bias", "light shadow grazing", "bias"),
+        ("--method shadow-map --light-size 24", "light shadow size", 24),
+        ("--method shadow-map --shadow-filter variance", "light shadow mapping filter", "variance"),
+        (
+            "--method shadow-map --shadow-filter percentage-closer --sun-radius 0.2666",
+            "light shadow mapping sun_radius_deg",
+            0.2666,
+        ),
+        ("--method shadow-map --no-refinement", "light shadow refine", None),
+        ("--method shadow-splat --shadow-gradients", "light shadow gradients", True),
+        ("--method shadow-splat --visibility-weight 0.3", "visibility_weight", 0.3),
+    ],
+)
+def test_options_of_light_reach_the_run(spacesim, tiny_data, tmp_path, words, keys, value):
+    small = "--preset", "demo", "--iterations", 1, "--init-count", 50
+    size = () if "--light-size" in words else ("--light-size", 16)
+    assert spacesim("train", tiny_data, "--out", tmp_path / "run", *small, *size, *words.split()).code == 0
+    found = json.loads((tmp_path / "run/config.json").read_text())
+    for key in keys.split():
+        found = found[key]
+    assert found == value
+
+
 def test_demo_is_importable():
     from spacesim.demo import DATA, SCENE, demo
     from spacesim.scenes import read_scene
@@ -296,6 +324,7 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("train DATA --out OUT --method shadow-map --shadow-gradients", ["--shadow-gradients", "splatting"]),
         ("train DATA --out OUT --method shadow-map --shadow-bias inf", ["--shadow-bias", "inf"]),
         ("train DATA --out OUT --method shadow-map --light-size 0", ["--light-size", "found 0"]),
+        ("train DATA --out OUT --method shadow-map --sun-radius 0.27", ["--sun-radius", "percentage-closer"]),
         ("train DATA --out OUT --method shadow-map --light-size 100000", ["--light-size", "found 100000"]),
         ("train DATA --out OUT --seed -1", ["--seed", "found -1"]),
         ("train DATA --out OUT --backend vulkan", ["--backend", "vulkan"]),

@@ -8,6 +8,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from scipy.special import sph_harm_y
+from splats import random_splats
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError, WorkError
@@ -25,8 +26,9 @@ from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
 from spacesim.splat.mlp import MlpShape
 from spacesim.splat.render import view_colours
 from spacesim.splat.run import Run, draw_lit, load_run
-from spacesim.splat.shadow.cast import ShadowConfig
+from spacesim.splat.shadow.cast import ShadowConfig, cast_shadows
 from spacesim.splat.shadow.refine import RefineConfig
+from spacesim.splat.shadow.sunlight import light_rows
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import METHODS, PRESETS, LearningRates, TrainConfig, preset
 from spacesim.splat.train.densify import grow, prune
@@ -406,6 +408,48 @@ def test_round_gaussians_feel_no_pull_towards_roundness():
     assert not numbers(dr.grad(log_scales)).any()
     flat = np.log([[0.1], [0.2], [0.6]]).astype(np.float32)
     assert numbers(anisotropy(ad.Array3f(flat)))[0] == pytest.approx((0.2 + 0.1 + 0.3) / 3, rel=1e-5)
+
+
+SPLATTED = LightConfig(FIELD, ShadowConfig("splatting", 32, refine=REFINE))
+
+
+@pytest.mark.parametrize(
+    ("tensor", "changes"),
+    [
+        ("light.weight.05", {"visibility_weight": 1.0}),
+        ("features", {"light": replace(SPLATTED, linear=True)}),
+        ("means", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, gradients=True))}),
+        ("features", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, grazing="lift"))}),
+        ("features", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, bias=0.0))}),
+    ],
+    ids=["supervised", "linear", "gradients", "grazing", "bias"],
+)
+def test_every_option_changes_what_is_learned(small_lit_dataset, tensor, changes):
+    learned = []
+    for given in ({"light": SPLATTED}, {"light": SPLATTED, **changes}):
+        trainer = Trainer(small_lit_dataset, training("splat", **given))
+        for _ in range(4):
+            trainer.step()
+        learned.append(trainer.model_tensors()[tensor])
+    assert not np.array_equal(*learned)
+
+
+def test_shadow_gradients_are_those_of_the_occlusion():
+    """By central differences of the whole of what casts shadows, light camera and bias held."""
+    arrays = random_splats(30, seed=4)
+    config, light = ShadowConfig("splatting", 32, bias=0.0, gradients=True, refine=None), light_rows([0.2, -0.3, 0.9])
+    shadows = cast_shadows(Gaussians.from_numpy(arrays), light, config, 3.0)
+    by_rows = shadows.adjoint(ad.Float(np.ones(30, np.float32)))
+    opacity = np.array(by_rows[10])
+    assert np.abs(opacity).max() > 1e-3
+    for index in np.argsort(-np.abs(opacity))[:5]:
+        sums = []
+        for step in (0.05, -0.05):
+            moved = {name: values.copy() for name, values in arrays.items()}
+            moved["logit_opacities"][index] += step
+            found = cast_shadows(Gaussians.from_numpy(moved), light, config, 3.0).occlusion
+            sums.append(float(np.array(found, np.float64).sum()))
+        assert opacity[index] == pytest.approx((sums[0] - sums[1]) / 0.1, rel=0.1)
 
 
 @pytest.mark.parametrize("kind", ["empty", "no features", "few features"])

@@ -55,7 +55,7 @@ class MappingConfig:
             if not 0.5 <= getattr(self, name) <= LARGEST_WINDOW:
                 raise InputError(f"{name}: expected 0.5 to {LARGEST_WINDOW} pixels, found {getattr(self, name)}")
         if not 0 <= self.sun_radius_deg < 45:
-            raise InputError(f"sun_radius_deg: expected 0 to 45 degrees, found {self.sun_radius_deg}")
+            raise InputError(f"--sun-radius: expected 0 to 45 degrees, found {self.sun_radius_deg}")
         if not 0 <= self.bleeding < 1:
             raise InputError(f"bleeding: expected a share from 0 to below 1, found {self.bleeding}")
 

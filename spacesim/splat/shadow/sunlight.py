@@ -20,6 +20,7 @@ from spacesim.splat.project import ALPHA_MIN
 SUPPORT = 3.0  #: standard deviations of a single Gaussian that its light camera holds (thesis 4.31)
 REACH = 4.0  #: standard deviations of the whole, on either side of its mean, that a light camera holds at most; chosen
 MARGIN = 1.0  #: pixels left free along each border; chosen
+UPRIGHT = 1e-10  #: radians off the vertical that are rounding of angles; chosen
 NARROWEST = 1e-3  #: least extent of the image, as a share of its larger one; chosen
 
 
@@ -32,7 +33,7 @@ def light_axes(direction: ArrayLike) -> Array:
     """
     x, y, z = Sun(np.asarray(direction, dtype=np.float64)).direction
     across = x * x + y * y
-    if across == 0.0:
+    if across < UPRIGHT**2:
         return np.diag([1.0, -1.0, -1.0]) if z > 0 else np.diag([1.0, 1.0, 1.0])
     inverse = 1 / (1 + z) if z >= 0 else (1 - z) / across  # equal on the unit sphere; the latter does not cancel
     right = [1 - x * x * inverse, -x * y * inverse, -x]

@@ -305,7 +305,7 @@ def test_a_face_along_the_light_stays_finite():
         ({"filter": "soft"}, "filter: expected one of bilinear, percentage-closer, variance, found 'soft'"),
         ({"radius": 0.2}, "radius: expected 0.5 to 16 pixels, found 0.2"),
         ({"widest": 99}, "widest: expected 0.5 to 16 pixels, found 99"),
-        ({"sun_radius_deg": -1}, "sun_radius_deg: expected 0 to 45 degrees, found -1"),
+        ({"sun_radius_deg": -1}, "--sun-radius: expected 0 to 45 degrees, found -1"),
         ({"bleeding": 1.0}, "bleeding: expected a share from 0 to below 1, found 1.0"),
     ],
 )

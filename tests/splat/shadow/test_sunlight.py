@@ -7,7 +7,7 @@ from splats import random_splats
 
 from spacesim.backend import recorded, recordings
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import fibonacci_sphere
+from spacesim.data.geometry import direction_from_angles, fibonacci_sphere
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.shadow.reference import camera_record, reference_bounds
 from spacesim.splat.shadow.sunlight import MARGIN, REACH, fit_camera, light_axes, light_rows, towards_sun
@@ -119,3 +119,9 @@ def test_sun_of_the_rows():
 def test_a_tiny_image_is_refused():
     with pytest.raises(ValueError, match="size: expected at least 4 pixels, found 2"):
         fit_camera(Gaussians.from_numpy(random_splats(3)), light_rows([0, 0, 1]), 2)
+
+
+@pytest.mark.parametrize("elevation", [90.0, -90.0])
+def test_azimuth_of_a_vertical_sun_says_nothing(elevation):
+    first, second = (light_axes(direction_from_angles(azimuth, elevation)) for azimuth in (0.0, 37.0))
+    np.testing.assert_allclose(first, second, atol=1e-15)
