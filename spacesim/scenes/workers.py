@@ -15,7 +15,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
@@ -173,12 +173,12 @@ def cuda_devices() -> list[str]:
 _ROOT = str(Path(__file__).parents[2])
 
 
-def _work(connection: Connection) -> None:
-    """What a worker does: frames of each task, until there are no more."""
+def linked(connection: Connection) -> tuple[queue.SimpleQueue[Any], Callable[[Any], None]]:
+    """(what the parent has sent, a way to tell it something). Ends this process as soon as the parent has
+    gone, whatever it is doing."""
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
     def listen() -> None:
-        """Ends the process as soon as the parent has gone, also while a frame is being rendered."""
         while True:
             try:
                 inbox.put(connection.recv())
@@ -188,22 +188,34 @@ def _work(connection: Connection) -> None:
     def tell(message: Any) -> None:
         try:
             connection.send(message)
-        except OSError:  # the parent has gone
+        except OSError:
             os._exit(0)
+
+    threading.Thread(target=listen, daemon=True).start()
+    return inbox, tell
+
+
+def select_backend(name: str, threads: int) -> None:
+    """Render with backend `name` from now on, on a CPU with so many threads."""
+    backend.select(name)
+    backend.mitsuba()
+    if name == "llvm":
+        import drjit
+
+        drjit.set_thread_count(threads)
+
+
+def _work(connection: Connection) -> None:
+    """What a worker does: frames of each task, until there are no more."""
+    inbox, tell = linked(connection)
 
     def ask() -> Any:
         tell(None)
         return inbox.get()
 
-    threading.Thread(target=listen, daemon=True).start()
     name, threads, job = ask()
     try:
-        backend.select(name)
-        backend.mitsuba()
-        if name == "llvm":
-            import drjit
-
-            drjit.set_thread_count(threads)
+        select_backend(name, threads)
         maker = FrameMaker(job)
         while True:
             for done in maker.make(ask()):

@@ -5,8 +5,6 @@ every few samples a pixel; a newer request, or None, ends the one before. Where 
 """
 
 import os
-import queue
-import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from spacesim import backend
 from spacesim.data.records import Camera, Sun
 from spacesim.data.tone import displayed
+from spacesim.scenes.workers import linked, select_backend
 from spacesim.viewer.paint import Planes
 
 PASS = 4  #: samples a pixel between two answers, chosen
@@ -105,23 +103,7 @@ def _label_planes(labels: dict[str, np.ndarray]) -> Planes:
 
 def _work(connection: Connection) -> None:
     """What the process does."""
-    inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
-
-    def listen() -> None:
-        """Ends the process as soon as the viewer has gone, also while it traces."""
-        while True:
-            try:
-                inbox.put(connection.recv())
-            except (EOFError, OSError):
-                os._exit(0)
-
-    def tell(answer: Answer) -> None:
-        try:
-            connection.send(answer)
-        except OSError:
-            os._exit(0)
-
-    threading.Thread(target=listen, daemon=True).start()
+    inbox, tell = linked(connection)
     name, threads = inbox.get()
     with suppress(OSError, AttributeError):
         os.nice(NICENESS)
@@ -135,12 +117,7 @@ def _work(connection: Connection) -> None:
             continue
         try:
             if tracer is None:
-                backend.select(name)
-                backend.mitsuba()
-                if name == "llvm":
-                    import drjit
-
-                    drjit.set_thread_count(threads)
+                select_backend(name, threads)
                 tracer = Tracer()
             for answer in tracer.answers(request):
                 tell(answer)
