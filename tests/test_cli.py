@@ -74,6 +74,13 @@ def test_options_of_light_reach_the_run(spacesim, tiny_data, tmp_path, words, ke
     assert found == value
 
 
+@pytest.mark.parametrize("strategy", ["mesh-aware", "support-aware"])
+def test_backfill_keeps_to_the_most_gaussians(spacesim, tiny_data, tmp_path, strategy):
+    words = "--preset", "demo", "--iterations", 420, "--init-count", 100, "--max-gaussians", 150
+    assert spacesim("train", tiny_data, "--out", tmp_path / "run", "--strategy", strategy, *words).code == 0
+    assert 100 <= json.loads((tmp_path / "run/training.json").read_text())["gaussians"] <= 150
+
+
 def test_demo_is_importable():
     from spacesim.demo import DATA, SCENE, demo
     from spacesim.scenes import read_scene

@@ -22,7 +22,7 @@ from spacesim.data.files import write_json
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset, Frame
 from spacesim.eval import grazing, lpips
-from spacesim.eval.geometry import GeometryConfig, judge_geometry
+from spacesim.eval.geometry import GeometryConfig, JudgedShape, judge_geometry
 from spacesim.eval.judge import judge_picture, judge_visibility, light_of, tally_grazing, view_of, write_pictures
 from spacesim.eval.labels import GROUPS
 from spacesim.eval.notes import explain, explain_light, explain_objects
@@ -92,7 +92,7 @@ def evaluate(
     sweep, no_sweep = write_sweep(run, dataset, frames, out)
     if progress:
         progress(len(frames), len(frames), "its shape" if config.geometry else "")
-    shape = judge_geometry(run, dataset, config.geometry)
+    shape = _judge_shape(run, dataset, config.geometry)
     write_shapes(out / "geometry", shape)
 
     method = str(run.config.get("method"))
@@ -117,7 +117,12 @@ def evaluate(
         "notes": [
             *([shape.note] if shape.note else []),
             *explain(records, [one.source for one in judged], None if network else lpips_sentence, method),
-            *explain_light([one.known for one in judged], any(one.grazing is not None for one in judged), no_sweep),
+            *explain_light(
+                [one.known for one in judged],
+                any(one.grazing is not None for one in judged),
+                no_sweep,
+                models is not None,
+            ),
             *explain_objects(objects, records, models),
         ],
         "dataset": _describe(dataset, frames),
@@ -141,6 +146,14 @@ class Judgement:
     known: bool | None
     grazing: Array | None
     seconds: float
+
+
+def _judge_shape(run: "Run", dataset: Dataset, config: GeometryConfig | None) -> JudgedShape:
+    """A mesh that cannot be read, or a grid that does not fit, costs the shape's numbers and no others."""
+    try:
+        return judge_geometry(run, dataset, config)
+    except InputError as error:
+        return JudgedShape(None, f"Geometry is null: {error}.")
 
 
 def _judge(

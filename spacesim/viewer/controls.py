@@ -5,14 +5,14 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from spacesim.data.records import Sun
-from spacesim.splat.compose.pose import Pose
+from spacesim.splat.compose.pose import LARGEST, SMALLEST, Pose
 from spacesim.viewer.handles import Gizmos, SunHandle
 from spacesim.viewer.paint import scale_html
 from spacesim.viewer.session import Session, Statistics
 from spacesim.viewer.stage import Stage
 from spacesim.viewer.state import COMPARISONS, MODES, SIDES, Shared, Stand, bounded
 
-SCALES = (1e-3, 1e3)  #: factors that the field of a model takes, chosen
+SCALES = (SMALLEST, LARGEST)  #: factors that the field of a model takes
 SAMPLES = (4, 256)  #: of the path tracer, a pixel
 
 

@@ -204,6 +204,15 @@ def test_nan_names_the_frame(make_run, dataset, tmp_path):
     assert not (tmp_path / "eval" / "metrics.json").exists()
 
 
+def test_a_mesh_that_is_missing_costs_the_shape_alone(make_run, dataset, tmp_path):
+    run = make_run()
+    run.model = object()
+    metrics = evaluate(run, replace(dataset, mesh_path="gone.ply"), tmp_path / "eval")
+    assert metrics["geometry"] is None
+    assert metrics["image"]["ssim"]
+    assert any("gone.ply" in note for note in metrics["notes"])
+
+
 def test_no_frames(make_run, dataset, tmp_path):
     with pytest.raises(InputError, match="expected frames in the split train, found none"):
         evaluate(make_run(), dataset, tmp_path / "eval", EvaluateConfig(split="train"))

@@ -13,7 +13,7 @@ import json
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ def compose(
             f"{out}: expected an empty or new folder, or one of an earlier compose, found other files in it"
         )
     if scene.camera is not None and size is not None:
-        scene = replace(scene, camera=resized(scene.camera, size))
+        scene = scene.seen_by(resized(scene.camera, size))
     shot = scene.shot(0)
     if shot.sun is None and shot.composition.relightable:
         told = scene.composition.path or "scene"
@@ -191,7 +191,10 @@ def _write(out: Path, index: int, shot: Shot, what: dict[str, Any]) -> None:
     write_exr(out / "depth" / f"{index:04d}.exr", {"depth": prediction.depth, "alpha": prediction.alpha})
     for kind, plane in planes.items():
         write_png(out / kind / f"{index:04d}.png", plane)
-    write_json(record, {**what, "pictures": ["rgb", "depth", *planes]})
+    written = ["rgb", "depth", *planes]
+    for kind in PICTURES.keys() - written:
+        (out / kind / f"{index:04d}{PICTURES[kind]}").unlink(missing_ok=True)
+    write_json(record, {**what, "pictures": written})
 
 
 def _planes(prediction: ComposedPrediction) -> dict[str, np.ndarray]:

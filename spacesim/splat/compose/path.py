@@ -30,6 +30,10 @@ class View:
     target: Array | None = None
     focal: tuple[float, float] | None = None
 
+    def focused(self, camera: Camera) -> "View":
+        """With `camera`'s focal lengths where it names none."""
+        return self if self.focal else replace(self, focal=(camera.fx, camera.fy))
+
     def of(self, camera: Camera) -> Camera:
         """`camera` at this place."""
         fx, fy = self.focal or (camera.fx, camera.fy)
@@ -111,7 +115,7 @@ class PosedScene:
         if self.camera is None:
             told = self.composition.path or "scene"
             raise InputError(f"{told}: expected a camera, found none; add a table [camera]")
-        view = self.orbit.view(share) if self.orbit else self._track(lambda key: key.view, view_between, time)
+        view = self.orbit.view(share) if self.orbit else self._view(self.camera, time)
         sun = self._track(lambda key: key.sun, sun_between, time) or self.sun
         return Shot(time, self.posed_at(time), view.of(self.camera) if view else self.camera, sun)
 
@@ -122,6 +126,28 @@ class PosedScene:
             for model in self.composition.models
         ]
         return self.composition.posed(poses)
+
+    def seen_by(self, camera: Camera) -> "PosedScene":
+        """The same through another camera; the focal lengths of keyframes change with the camera's."""
+        if self.camera is None:
+            return replace(self, camera=camera)
+        x, y = camera.fx / self.camera.fx, camera.fy / self.camera.fy
+
+        def follow(key: Keyframe) -> Keyframe:
+            if key.view is None or key.view.focal is None:
+                return key
+            return replace(key, view=replace(key.view, focal=(key.view.focal[0] * x, key.view.focal[1] * y)))
+
+        return replace(self, camera=camera, keyframes=[follow(key) for key in self.keyframes])
+
+    def _view(self, camera: Camera, time: float) -> View | None:
+        """What the keyframes say of the camera; those without focal lengths have `camera`'s where others name some."""
+        named = any(key.view is not None and key.view.focal for key in self.keyframes)
+
+        def view(key: Keyframe) -> View | None:
+            return key.view.focused(camera) if key.view is not None and named else key.view
+
+        return self._track(view, view_between, time)
 
     def _track(self, value: Callable[[Keyframe], T | None], blend: Callable[[T, T, float], T], time: float) -> T | None:
         """What the keyframes that name it say of a value; None where none does."""

@@ -220,7 +220,8 @@ def load_scene(path: Path) -> PosedScene:
         models.append(Placed(runs[folder], one.pose(Pose()), name))
     composition = Composition(models, ComposeConfig(entry.shadows), path)
     camera = None if entry.camera is None else _camera(entry.camera, path.parent, document)
-    keyframes = [_keyframe(one, k, entry, models, document) for k, one in enumerate(entry.keyframes)]
+    width = camera.width if camera else RESOLUTION[0]
+    keyframes = [_keyframe(one, k, entry, models, width, document) for k, one in enumerate(entry.keyframes)]
     orbit = entry.camera.orbit if entry.camera else None
     sun = entry.sun.sun if entry.sun else None
     return PosedScene(composition, sun, camera, keyframes, orbit, _frames(entry), entry.fps)
@@ -304,10 +305,10 @@ def _told(document: toml.Document, key: str, read: Any) -> Any:
 
 
 def _keyframe(
-    one: KeyframeEntry, index: int, entry: SceneEntry, models: Sequence[Placed], document: toml.Document
+    one: KeyframeEntry, index: int, entry: SceneEntry, models: Sequence[Placed], width: int, document: toml.Document
 ) -> Keyframe:
-    """Raises InputError, with the line, for a time that does not rise, a model that there is none of, a camera that
-    cannot be."""
+    """width: of the scene's camera, pixels. Raises InputError, with the line, for a time that does not rise, a model
+    that there is none of, a camera that cannot be."""
     at = ("keyframes", index)
     if index > 0 and not one.time > entry.keyframes[index - 1].time:
         before = entry.keyframes[index - 1].time
@@ -325,7 +326,7 @@ def _keyframe(
         if entry.camera is None or entry.camera.orbit is not None:
             found = "none" if entry.camera is None else "an orbit"
             raise InputError(f"{label}: expected a table [camera] that says the image's size, found {found}")
-        view = one.camera.view((entry.camera.resolution or RESOLUTION)[0])
+        view = one.camera.view(width)
         if view is None:
             raise InputError(f"{label}: expected position and look_at, or transform_matrix, found neither")
     poses = {name: pose.pose(by_name[name].pose) for name, pose in one.models.items()}

@@ -115,7 +115,7 @@ def _at_random(
 
 def object_size(dataset: Dataset) -> float:
     """Metres: the longest side of the box around the dataset's mesh, or its points. InputError without either."""
-    if dataset.mesh_path is not None:
+    if dataset.mesh_path is not None and (dataset.root / dataset.mesh_path).exists():
         vertices, faces = read_mesh(dataset.root / dataset.mesh_path)
         points = vertices[faces.ravel()]
     elif dataset.ply_file_path is not None:

@@ -124,6 +124,18 @@ def test_keyframes(tmp_path):
     np.testing.assert_allclose(late.composition.models[1].pose.translation, [2, 0, 0])
 
 
+def test_keyframes_zoom_as_the_camera_is_resized():
+    """A field of view is one of the picture, however many pixels it has; between none and one it changes evenly."""
+    camera = Camera.from_fov(look_at([5, 0, 0], [0, 0, 0]), 64, 48, 40)
+    near = View(camera.world_from_camera, None, (4 * camera.fx, 4 * camera.fy))
+    keys = [Keyframe(0.0, view=View(camera.world_from_camera)), Keyframe(1.0, view=near)]
+    scene = PosedScene(Composition([Placed(made_run("vanilla", 0), name="one")]), None, camera, keys)
+    small = scene.seen_by(Camera.from_fov(camera.world_from_camera, 16, 12, 40))
+    for time, zoom in ((0.0, 1), (0.5, 2), (1.0, 4)):
+        assert scene.at(time).camera.fx == pytest.approx(zoom * camera.fx)
+        assert small.at(time).camera.fx == pytest.approx(zoom * camera.fx / 4)
+
+
 def test_a_camera_between_two_keeps_its_target_in_the_middle():
     one = View(look_at([4, 0, 0], [0, 0, 0]), np.zeros(3), (100, 100))
     other = View(look_at([0, 4, 2], [0, 0, 1]), np.array([0, 0, 1.0]), (400, 400))

@@ -31,6 +31,14 @@ def scene(frames: int = 3, away: float = 1.0, last: float = 0.2, methods=("map",
     return PosedScene(Composition(models), SUN, seen_from([4, -1, 2], pixels=24), keys, None, frames)
 
 
+def test_pictures_that_are_no_longer_written_go(tmp_path):
+    compose(scene(), tmp_path / "out")
+    assert (tmp_path / "out/visibility/0000.png").exists()
+    compose(scene(methods=("vanilla",)), tmp_path / "out")
+    assert (tmp_path / "out/rgb/0000.png").exists()
+    assert not (tmp_path / "out/visibility/0000.png").exists()
+
+
 def test_frames_hold_what_the_scene_predicts(tmp_path):
     told: list[tuple[int, int]] = []
     done = compose(scene(), tmp_path / "out", report=lambda *numbers: told.append(numbers))

@@ -113,7 +113,7 @@ class MeshAwareStrategy(DensityControl):
         self, gaussians: Gaussians, survey: Survey, remove: np.ndarray, rng: np.random.Generator
     ) -> np.ndarray:
         """5.7 to 5.9, from the interior and the boundary layer."""
-        missing = self.mesh_aware.min_gaussians - int((~remove).sum())
+        missing = min(self.mesh_aware.min_gaussians, self.config.max_gaussians) - int((~remove).sum())
         if missing <= 0:
             return np.zeros(0, np.int64)
         distance, where = self._regions(gaussians, survey, ~remove)

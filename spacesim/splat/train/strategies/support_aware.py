@@ -111,7 +111,7 @@ class SupportAwareStrategy(DensityControl):
         self, gaussians: Gaussians, survey: Survey, remove: np.ndarray, rng: np.random.Generator
     ) -> np.ndarray:
         """5.18 to 5.22."""
-        missing = self.support.min_gaussians - int((~remove).sum())
+        missing = min(self.support.min_gaussians, self.config.max_gaussians) - int((~remove).sum())
         if missing <= 0 or survey.step < self.support.backfill_start:
             return np.zeros(0, np.int64)
         score, (count, gradient, _) = self._score(survey), self._scaled(survey)
