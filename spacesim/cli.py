@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 from spacesim import backend
 from spacesim.data.errors import InputError, WorkError
-from spacesim.options import parser
+from spacesim.options import parser, with_light
 
 if TYPE_CHECKING:
     from spacesim.data.records import Camera, Sun
     from spacesim.splat.run import Run
-    from spacesim.splat.train.config import TrainConfig
 
 KNOWS_ONE_LIGHT = "a vanilla run knows the light that it was trained under only; --sun changes nothing"
 
@@ -130,7 +129,7 @@ def _train(options: argparse.Namespace) -> None:
         config = with_options(config, warm_start=warm_start(options.preset))
     if options.max_gaussians is not None:
         config = with_options(config, refinement=replace(config.refinement, max_gaussians=options.max_gaussians))
-    config = _with_light(config, options)
+    config = with_light(config, options)
     dataset = read_dataset(options.data)
     with reporting("train", "iterations") as report:
         run = train(dataset, options.out, config, options.resume, tell_training(report), options.command)
@@ -139,51 +138,6 @@ def _train(options: argparse.Namespace) -> None:
         f"{options.out}: {run.gaussians} Gaussians after {config.iterations} iterations in "
         f"{run.training['seconds']:.0f} s on {run.training['backend']}, final loss {history[-1]['loss']:.4f}"
     )
-
-
-def _with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainConfig":
-    """`config` with what the options say of fields and shadows. Raises InputError where the method has none of them."""
-    names = (
-        "field",
-        "linear",
-        "shadow_bias",
-        "grazing",
-        "shadow_filter",
-        "sun_radius",
-        "light_size",
-        "shadow_gradients",
-        "no_refinement",
-    )
-    named = [name for name in names if getattr(options, name) is not None and getattr(options, name) is not False]
-    if not named:
-        return config
-    from spacesim.splat.train.config import with_field
-
-    light, option = config.light, "--" + named[0].replace("_", "-")
-    if light is None or (light.shadow is None and not set(named) <= {"field", "linear"}):
-        what = "that learns light" if light is None else "with shadows"
-        raise InputError(f"{option}: expected a method {what}, found {config.method}")
-    if options.linear:
-        light = replace(light, linear=True)
-    if options.field is not None:
-        light = replace(light, field=with_field(light.field, options.field))
-    shadow = light.shadow
-    if shadow is not None:
-        given = {"bias": options.shadow_bias, "grazing": options.grazing, "size": options.light_size}
-        shadow = replace(shadow, **{name: value for name, value in given.items() if value is not None})
-        if options.shadow_filter is not None:
-            if shadow.method != "mapping":
-                raise InputError(f"--shadow-filter: expected --method shadow-map, found {config.method}")
-            shadow = replace(shadow, mapping=replace(shadow.mapping, filter=options.shadow_filter))
-        if options.sun_radius is not None:
-            if shadow.mapping.filter != "percentage-closer":
-                raise InputError(
-                    f"--sun-radius: expected --shadow-filter percentage-closer, found {shadow.mapping.filter}"
-                )
-            shadow = replace(shadow, mapping=replace(shadow.mapping, sun_radius_deg=options.sun_radius))
-        shadow = replace(shadow, gradients=True) if options.shadow_gradients else shadow
-        shadow = replace(shadow, refine=None) if options.no_refinement else shadow
-    return replace(config, light=replace(light, shadow=shadow))
 
 
 def _eval(options: argparse.Namespace) -> None:

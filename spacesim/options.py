@@ -5,10 +5,15 @@ import math
 import re
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from spacesim import __version__, backend, ending
+from spacesim.data.errors import InputError
+
+if TYPE_CHECKING:
+    from spacesim.splat.train.config import TrainConfig
 
 KINDS = ("rgb", "depth", "alpha", "normal", "shadow")
 
@@ -226,3 +231,48 @@ def _resolution(text: str) -> int | tuple[int, int]:
 def _built_in_scenes() -> list[str]:
     """Names, for the help: to import the scenes would take seconds."""
     return sorted(path.stem for path in Path(__file__).parent.glob("assets/scenes/*.toml"))
+
+
+def with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainConfig":
+    """`config` with what the options say of fields and shadows. Raises InputError where the method has none of them."""
+    names = (
+        "field",
+        "linear",
+        "shadow_bias",
+        "grazing",
+        "shadow_filter",
+        "sun_radius",
+        "light_size",
+        "shadow_gradients",
+        "no_refinement",
+    )
+    named = [name for name in names if getattr(options, name) is not None and getattr(options, name) is not False]
+    if not named:
+        return config
+    from spacesim.splat.train.config import with_field
+
+    light, option = config.light, "--" + named[0].replace("_", "-")
+    if light is None or (light.shadow is None and not set(named) <= {"field", "linear"}):
+        what = "that learns light" if light is None else "with shadows"
+        raise InputError(f"{option}: expected a method {what}, found {config.method}")
+    if options.linear:
+        light = replace(light, linear=True)
+    if options.field is not None:
+        light = replace(light, field=with_field(light.field, options.field))
+    shadow = light.shadow
+    if shadow is not None:
+        given = {"bias": options.shadow_bias, "grazing": options.grazing, "size": options.light_size}
+        shadow = replace(shadow, **{name: value for name, value in given.items() if value is not None})
+        if options.shadow_filter is not None:
+            if shadow.method != "mapping":
+                raise InputError(f"--shadow-filter: expected --method shadow-map, found {config.method}")
+            shadow = replace(shadow, mapping=replace(shadow.mapping, filter=options.shadow_filter))
+        if options.sun_radius is not None:
+            if shadow.mapping.filter != "percentage-closer":
+                raise InputError(
+                    f"--sun-radius: expected --shadow-filter percentage-closer, found {shadow.mapping.filter}"
+                )
+            shadow = replace(shadow, mapping=replace(shadow.mapping, sun_radius_deg=options.sun_radius))
+        shadow = replace(shadow, gradients=True) if options.shadow_gradients else shadow
+        shadow = replace(shadow, refine=None) if options.no_refinement else shadow
+    return replace(config, light=replace(light, shadow=shadow))

@@ -270,7 +270,7 @@ def _describe_frames(
     train: Sequence[tuple[str, Camera, Sun]], test: Sequence[tuple[str, Camera, Sun]], distortion: Sequence[float]
 ) -> dict[str, Any]:
     """transforms.json: intrinsics stand at the top where all frames share them."""
-    intrinsics = [_describe_intrinsics(camera) for _, camera, _ in (*train, *test)]
+    intrinsics = [intrinsics_of(camera) for _, camera, _ in (*train, *test)]
     shared = all(entry == intrinsics[0] for entry in intrinsics)
     frames = []
     for (name, camera, sun), own in zip((*train, *test), intrinsics, strict=True):
@@ -302,7 +302,8 @@ def _describe_frames(
     }
 
 
-def _describe_intrinsics(camera: Camera) -> dict[str, float]:
+def intrinsics_of(camera: Camera) -> dict[str, float]:
+    """As transforms.json names them, pixels."""
     return {
         "w": camera.width,
         "h": camera.height,

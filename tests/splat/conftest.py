@@ -1,10 +1,12 @@
 """A small dataset whose truth is known: pictures of random Gaussians by the float64 twin, in Nerfstudio's layout."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from spacesim.data.geometry import fibonacci_sphere, look_at
@@ -79,3 +81,11 @@ def small_lit_dataset(tmp_path_factory) -> Dataset:
     size = {"resolution": (32, 32), "spp": 8, "points": 400}
     scene = read_scene("boxsat", suns=2, views=5, test_suns=1, test_views=2, **size)
     return generate(scene, tmp_path_factory.mktemp("lit") / "data")
+
+
+@pytest.fixture(scope="module")
+def meshed(small_dataset, tmp_path_factory):
+    """The small dataset with a ball about its Gaussians as mesh."""
+    path = tmp_path_factory.mktemp("mesh") / "mesh.ply"
+    trimesh.creation.icosphere(3, 0.75).export(path)
+    return replace(small_dataset, mesh_path=str(path))

@@ -482,14 +482,6 @@ def test_noise_is_normal_along_the_scales_and_gated_by_opacity():
 # In training
 
 
-@pytest.fixture(scope="module")
-def meshed(small_dataset, tmp_path_factory):
-    """The small dataset with a ball about its Gaussians as mesh."""
-    path = tmp_path_factory.mktemp("mesh") / "mesh.ply"
-    trimesh.creation.icosphere(3, 0.75).export(path)
-    return replace(small_dataset, mesh_path=str(path))
-
-
 def config_of(strategy: str) -> TrainConfig:
     refinement = DefaultStrategyConfig(
         refine_start=10, refine_every=20, pause_after_reset=20, reset_every=4, refine_stop=150, screen_size_stop=0

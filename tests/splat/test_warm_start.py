@@ -234,14 +234,6 @@ WARM = WarmStartConfig(steps=40, decay=20, conservative=20, rescue_every=10)
 BASE = TrainConfig(iterations=100, sh_degree=0, init="random", init_count=400, refinement=REFINEMENT)
 
 
-@pytest.fixture(scope="module")
-def meshed(small_dataset, tmp_path_factory):
-    """The small dataset with a ball about its Gaussians as mesh."""
-    path = tmp_path_factory.mktemp("mesh") / "mesh.ply"
-    trimesh.creation.icosphere(3, 0.75).export(path)
-    return replace(small_dataset, mesh_path=str(path))
-
-
 def inside(trainer: Trainer) -> int:
     return int((np.linalg.norm(trainer.gaussians.to_numpy()["means"], axis=1) < 0.75).sum())
 

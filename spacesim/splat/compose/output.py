@@ -26,6 +26,7 @@ from spacesim.data.images import read_png, write_exr, write_png
 from spacesim.data.integrity import is_whole
 from spacesim.data.lock import locked
 from spacesim.data.sheet import DARK_PAGE, Tile, contact_sheet, fitted
+from spacesim.data.store import intrinsics_of
 from spacesim.data.tone import as_bytes
 from spacesim.splat.compose.path import PosedScene, Shot
 from spacesim.splat.compose.scene import ComposedPrediction
@@ -145,14 +146,7 @@ def _described(shot: Shot) -> dict[str, Any]:
     values: dict[str, Any] = {
         "time": shot.time,
         "transform_matrix": camera.opengl.tolist(),
-        **{
-            "w": camera.width,
-            "h": camera.height,
-            "fl_x": camera.fx,
-            "fl_y": camera.fy,
-            "cx": camera.cx,
-            "cy": camera.cy,
-        },
+        **intrinsics_of(camera),
         "sun_direction": None if shot.sun is None else shot.sun.direction.tolist(),
         "models": [
             {
