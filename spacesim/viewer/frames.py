@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from spacesim.data.errors import InputError
 from spacesim.data.records import Camera
 from spacesim.viewer.paint import NEEDED, Bytes, Planes, depth_range, painted
 from spacesim.viewer.stage import Stage
@@ -42,10 +43,14 @@ def sides(view: View, most: int, share: float = 1.0) -> tuple[int, int]:
 
 
 def draw(stage: Stage, stand: Stand, view: View, look: Look, share: float = 1.0) -> Frame:
-    """The picture of a view in the look's mode, without the truth."""
+    """The picture of a view in the look's mode, without the truth; black, and a note that says why, of a scene that
+    cannot be drawn."""
     start = time.perf_counter()
     camera = view.camera(*sides(view, look.side, share))
-    planes, picture, depths, note = drawn(stage, stand, camera, look.mode)
+    try:
+        planes, picture, depths, note = drawn(stage, stand, camera, look.mode)
+    except InputError as error:
+        planes, picture, depths, note = Planes(np.zeros((camera.height, camera.width))), _black(camera), None, f"no picture: {error}"
     return Frame(picture, planes, time.perf_counter() - start, share, depths, note)
 
 
@@ -60,7 +65,11 @@ def drawn(
     if picture is not None:
         return planes, picture, depths, ""
     note = f"no {mode} to be seen: {stage.lacks(NEEDED[mode])}"
-    return planes, np.zeros((camera.height, camera.width, 3), np.uint8), None, note
+    return planes, _black(camera), None, note
+
+
+def _black(camera: Camera) -> Bytes:
+    return np.zeros((camera.height, camera.width, 3), np.uint8)
 
 
 @dataclass

@@ -12,6 +12,7 @@ from browser import wait_for
 
 from spacesim.data.geometry import look_at, quaternion_from_rotation
 from spacesim.data.records import Sun
+from spacesim.splat.compose.pose import LARGEST, SMALLEST, Pose
 from spacesim.viewer.state import Stand
 
 viser = pytest.importorskip("viser", reason="viser is not installed")
@@ -143,7 +144,19 @@ def test_pages_of_other_sites_are_refused(viewer):
             listen()
 
 
-def test_clients_that_leave_in_the_middle(viewer):
+@pytest.mark.parametrize("scales", [(SMALLEST, 1.0), (1.0, SMALLEST), (LARGEST, SMALLEST), (LARGEST, LARGEST)])
+def test_models_of_any_size_that_the_panel_takes_are_drawn(viewer, at_start, caplog, scales):
+    poses = [Pose(pose.rotation, pose.translation, scale) for pose, scale in zip(at_start.poses, scales, strict=True)]
+    with connected(viewer) as socket:
+        socket.send(camera_message(0.4))
+        pictures(socket, 1)
+        viewer.put(Stand(tuple(poses), at_start.sun))
+        pictures(socket, 2)  # while it changes, and at rest
+    assert "a picture failed" not in caplog.text
+    viewer.put(at_start)
+
+
+def test_clients_that_leave_in_the_middle(viewer, at_start):
     """While pictures are on their way to them."""
     threads = threading.active_count()
     for k in range(12):

@@ -252,3 +252,11 @@ def test_a_camera_of_the_view_is_the_datas(view):
     camera = view.camera(640, 480)
     assert isinstance(camera, Camera)
     assert np.allclose(camera.position, [-5, 0, 0])
+
+
+def test_a_scene_that_cannot_be_drawn_is_black_and_says_why(stage, stand, view):
+    """Models that shade each other, and no Sun."""
+    frame = draw(stage, Stand(stand.poses, None), view, Look(side=256))
+    assert not frame.picture.any()
+    assert frame.note.startswith("no picture: ")
+    assert "Sun" in frame.note

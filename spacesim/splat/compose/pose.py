@@ -10,7 +10,7 @@ from spacesim.data.geometry import Array, quaternion_from_rotation, rotation_fro
 from spacesim.data.records import Camera
 
 FARTHEST = 1e8  #: metres of a position at most, chosen: single precision tells places 10 m apart there
-SMALLEST, LARGEST = 1e-9, 1e9  #: of a scale, chosen
+SMALLEST, LARGEST = 1e-6, 1e6  #: of a scale, chosen: squares of lengths in any model's frame stay in single precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +19,8 @@ class Pose:
 
     rotation: [3, 3], R, or [4], a quaternion (w, x, y, z) of any length; kept as R, float64
     translation: [3] metres;  scale: metres in the world for one of the model's
-    Raises InputError for what is no rotation, not finite, or beyond the bounds named above.
+    Raises InputError for what is no rotation, not finite, or beyond the bounds named above; poses that follow from
+    others (`after`, `inverse`) may be beyond them.
     """
 
     rotation: Array = field(default_factory=lambda: np.eye(3))
@@ -65,12 +66,12 @@ class Pose:
 
     def after(self, first: "Pose") -> "Pose":
         """The pose that does `first`, then this one."""
-        return Pose(self.rotation @ first.rotation, self.points(first.translation), self.scale * first.scale)
+        return _derived(self.rotation @ first.rotation, self.points(first.translation), self.scale * first.scale)
 
     def inverse(self) -> "Pose":
         """model_from_world."""
         scale = 1 / self.scale
-        return Pose(self.rotation.T, -scale * (self.rotation.T @ self.translation), scale)
+        return _derived(self.rotation.T, -scale * (self.rotation.T @ self.translation), scale)
 
     def direction_in_model(self, direction: ArrayLike) -> Array:
         """[3], a direction of the world in the model's axes; the same numbers where nothing is turned."""
@@ -84,6 +85,14 @@ class Pose:
         place[:3, :3] = self.rotation.T @ camera.world_from_camera[:3, :3]
         place[:3, 3] = self.rotation.T @ (camera.position - self.translation) / self.scale
         return Camera(place, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def _derived(rotation: Array, translation: Array, scale: float) -> Pose:
+    """What follows from poses within the bounds; of two models, one seen from the other may be beyond them."""
+    pose = Pose(rotation)
+    object.__setattr__(pose, "translation", translation)
+    object.__setattr__(pose, "scale", float(scale))
+    return pose
 
 
 def between(one: Pose, other: Pose, share: float) -> Pose:

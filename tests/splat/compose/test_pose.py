@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
-from spacesim.splat.compose.pose import Pose, between, rotation_about, slerp, turned_between
+from spacesim.splat.compose.pose import FARTHEST, LARGEST, SMALLEST, Pose, between, rotation_about, slerp, turned_between
 
 
 def random_pose(seed: int) -> Pose:
@@ -37,6 +37,16 @@ def test_a_camera_in_the_model_sees_the_same_pixels():
     world, model = pixels(camera, pose.points(points)), pixels(pose.camera_in_model(camera), points)
     np.testing.assert_allclose(world[:2], model[:2], atol=1e-9)
     np.testing.assert_allclose(world[2], pose.scale * model[2], atol=1e-9)
+
+
+def test_a_model_seen_from_another_may_be_beyond_the_bounds_of_poses():
+    small, far = Pose(scale=SMALLEST), Pose(translation=np.array([0, 0, FARTHEST]), scale=LARGEST)
+    seen = small.inverse().after(far)
+    np.testing.assert_allclose(seen.translation, [0, 0, FARTHEST / SMALLEST])
+    assert seen.scale == pytest.approx(LARGEST / SMALLEST)
+    for outside in ({"scale": SMALLEST / 2}, {"scale": 2 * LARGEST}, {"translation": np.full(3, 2 * FARTHEST)}):
+        with pytest.raises(InputError):
+            Pose(**outside)
 
 
 def test_no_pose_changes_no_bit():
