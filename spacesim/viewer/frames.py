@@ -50,7 +50,8 @@ def draw(stage: Stage, stand: Stand, view: View, look: Look, share: float = 1.0)
     try:
         planes, picture, depths, note = drawn(stage, stand, camera, look.mode)
     except InputError as error:
-        planes, picture, depths, note = Planes(np.zeros((camera.height, camera.width))), _black(camera), None, f"no picture: {error}"
+        planes = Planes(np.zeros((camera.height, camera.width)))
+        picture, depths, note = _black(camera), None, f"no picture: {error}"
     return Frame(picture, planes, time.perf_counter() - start, share, depths, note)
 
 

@@ -7,7 +7,16 @@ from scipy.spatial.transform import Rotation, Slerp
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
-from spacesim.splat.compose.pose import FARTHEST, LARGEST, SMALLEST, Pose, between, rotation_about, slerp, turned_between
+from spacesim.splat.compose.pose import (
+    FARTHEST,
+    LARGEST,
+    SMALLEST,
+    Pose,
+    between,
+    rotation_about,
+    slerp,
+    turned_between,
+)
 
 
 def random_pose(seed: int) -> Pose:
