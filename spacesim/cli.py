@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except (KeyboardInterrupt, Exception) as error:
         if ending.is_interrupt(error):
-            ending.tell(ending.STOPPED)
+            ending.tell(ending.stopped())
             return ending.STOPPED_CODE
         if not isinstance(error, RuntimeError | OSError):
             raise
@@ -56,6 +56,7 @@ def _run(arguments: Sequence[str]) -> None:
     logging.getLogger("trimesh").setLevel(logging.WARNING)
     options = parser(_COMMANDS).parse_args(arguments)
     options.command = ("spacesim", *arguments)
+    ending.resumed_by("--resume" if hasattr(options, "resume") else "")
     if options.debug:
         logging.getLogger("spacesim").setLevel(logging.DEBUG)
     if options.needs_backend:
@@ -74,6 +75,7 @@ def _demo(options: argparse.Namespace) -> None:
     from spacesim.demo import demo
     from spacesim.progress import reporting
 
+    ending.resumed_by("the same command")
     done = demo(options.out, reporting)
     _print_headline(done["metrics"])
     parts = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in done["seconds"].items())

@@ -8,13 +8,13 @@ other error, or leave them half made), else KeyboardInterrupt is raised as ever.
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
 from spacesim.data.errors import WorkError
 
-STOPPED = "stopped; what was finished is kept, --resume goes on from there"
+STOPPED = "stopped"
 STOPPED_CODE = 130  #: of a process that Ctrl-C ended, as shells have it: 128 + SIGINT
 
 _SHOW_CURSOR = "\x1b[?25h\n"  # which a bar of progress hides (ECMA-48 private mode 25)
@@ -22,6 +22,7 @@ _OWN = os.path.join(os.path.dirname(os.path.abspath(__file__)), "cli.py")
 
 _is_command = os.path.basename(sys.argv[0]) in ("spacesim", "spacesim.exe") or os.path.abspath(sys.argv[0]) == _OWN
 _at_work = False
+_goes_on = ""
 
 
 @contextmanager
@@ -40,6 +41,38 @@ def working() -> Iterator[None]:
         if _is_command:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         say("", end="")
+
+
+@contextmanager
+def postponed() -> Iterator[Callable[[], bool]]:
+    """Around work that has something to save when Ctrl-C comes: the first is not raised but told by what is yielded, a
+    second one is raised. Where the process is not the command, Ctrl-C is raised as ever."""
+    asked = False
+
+    def ask(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        signal.signal(signal.SIGINT, _interrupted)
+
+    ours = signal.getsignal(signal.SIGINT) is _interrupted
+    if ours:
+        signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: asked
+    finally:
+        if ours and signal.getsignal(signal.SIGINT) is ask:
+            signal.signal(signal.SIGINT, _interrupted)
+
+
+def resumed_by(words: str) -> None:
+    """What makes the command that runs go on where Ctrl-C has ended it, "" where nothing does."""
+    global _goes_on
+    _goes_on = words
+
+
+def stopped() -> str:
+    """The sentence of a command that Ctrl-C has ended."""
+    return f"{STOPPED}; what was finished is kept, {_goes_on} goes on from there" if _goes_on else STOPPED
 
 
 def say(text: object, end: str = "\n") -> None:
@@ -78,7 +111,7 @@ def _interrupted(_signal: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
     with suppress(OSError):
         cursor = _SHOW_CURSOR if os.isatty(2) else ""
-        os.write(2, f"{cursor}spacesim: {STOPPED}\n".encode())
+        os.write(2, f"{cursor}spacesim: {stopped()}\n".encode())
     os._exit(STOPPED_CODE)
 
 

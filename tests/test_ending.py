@@ -7,26 +7,29 @@ import sys
 from pathlib import Path
 
 import pytest
-from tiny import GENERATE
+from tiny import GENERATE, TRAIN
 
-STOPPED = "spacesim: stopped; what was finished is kept, --resume goes on from there\n"
+STOPPED = "spacesim: stopped\n"
+RESUMABLE = "spacesim: stopped; what was finished is kept, --resume goes on from there\n"
 FULL = Path("/dev/full")
 NO_SPACE = f"spacesim: standard output: cannot be written ({os.strerror(errno.ENOSPC)})\n"
 
-# Runs the command as `python -m spacesim.cli` does, and presses Ctrl-C once: when a module is looked for, or when a
-# function is called.
+# Runs the command as `python -m spacesim.cli` does, and presses Ctrl-C: when a module is looked for, or when a function
+# is called, for the first time or, as in "call:step:4:2", for the fourth time, twice.
 PRESSED = """
-import os, runpy, signal, sys, threading
-kind, wanted = sys.argv[1].split(":")
+import os, runpy, signal, sys, threading, time
+kind, wanted, nth, times = (sys.argv[1] + ":1:1").split(":")[:4]
 del sys.argv[1]
 
-pressed = False
+calls = 0
 
 def press():
-    global pressed
-    if not pressed:
-        pressed = True
-        os.kill(os.getpid(), signal.SIGINT)
+    global calls
+    calls += 1
+    if calls == int(nth):
+        for _ in range(int(times)):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)  # two that are pending at once are one
 
 class Watch:
     def find_spec(self, name, path=None, target=None):
@@ -60,22 +63,61 @@ def run(*words: object, **options) -> subprocess.CompletedProcess:
 
 
 @pytest.mark.parametrize(
-    "moment",
+    ("moment", "sentence"),
     [
-        "import:argparse",  # of the command line itself
-        "import:drjit",
-        "import:mitsuba.mitsuba_ext",  # amid compiled modules, which wrap what is raised in them
-        "call:parser",
-        "call:write_frame",  # while a thread writes
-        "call:surface_points",  # when all frames are there
+        ("import:argparse", STOPPED),  # of the command line itself
+        ("call:parser", STOPPED),
+        ("import:drjit", RESUMABLE),
+        ("import:mitsuba.mitsuba_ext", RESUMABLE),  # amid compiled modules, which wrap what is raised in them
+        ("call:write_frame", RESUMABLE),  # while a thread writes
+        ("call:surface_points", RESUMABLE),  # when all frames are there
     ],
 )
-def test_ctrl_c_at_any_moment_is_one_sentence(tmp_path, moment):
+def test_ctrl_c_at_any_moment_is_one_sentence(tmp_path, moment, sentence):
     out = tmp_path / "data"
     done = run("-c", PRESSED, moment, "generate", "boxsat", "--out", out, *GENERATE, stdout=subprocess.PIPE)
     lines = [line for line in done.stderr.splitlines(keepends=True) if not line.startswith("generate: ")]
-    assert (done.returncode, "".join(lines), done.stdout) == (130, STOPPED, "")
+    assert (done.returncode, "".join(lines), done.stdout) == (130, sentence, "")
     assert not (out / "transforms.json").exists()
+
+
+def test_ctrl_c_in_training_loses_no_step(tiny_data, tmp_path):
+    """It comes amid the fourth step; the resumed run is the undisturbed one to the bit."""
+    words = ["train", tiny_data, "--out", tmp_path / "run", *TRAIN]
+    done = run("-c", PRESSED, "call:_move_gaussians:4", *words, stdout=subprocess.PIPE)
+    assert (done.returncode, done.stderr.splitlines(keepends=True)[-1]) == (130, RESUMABLE)
+    assert [path.name for path in (tmp_path / "run" / "checkpoints").glob("*.safetensors")] == [
+        "step_00000004.safetensors"
+    ]
+    assert run("-m", "spacesim.cli", *words, "--resume", stdout=subprocess.PIPE).returncode == 0
+    assert run("-m", "spacesim.cli", *words[:3], tmp_path / "whole", *TRAIN, stdout=subprocess.PIPE).returncode == 0
+    resumed, whole = ((tmp_path / name / "model.safetensors").read_bytes() for name in ("run", "whole"))
+    assert resumed == whole
+
+
+def test_a_second_ctrl_c_ends_a_step_that_takes_long(tiny_data, tmp_path):
+    done = run(
+        "-c", PRESSED, "call:bin_splats:1:2", "train", tiny_data, "--out", tmp_path, *TRAIN, stdout=subprocess.PIPE
+    )
+    assert (done.returncode, done.stderr.splitlines(keepends=True)[-1]) == (130, RESUMABLE)
+    assert not list(tmp_path.rglob("*.safetensors"))
+
+
+def test_ctrl_c_in_what_cannot_be_resumed_promises_nothing(tiny_data, tiny_run, tmp_path):
+    done = run(
+        "-c",
+        PRESSED,
+        "call:predict",
+        "eval",
+        tiny_run,
+        "--data",
+        tiny_data,
+        "--out",
+        tmp_path / "e",
+        stdout=subprocess.PIPE,
+    )
+    assert (done.returncode, done.stderr.splitlines(keepends=True)[-1]) == (130, STOPPED)
+    assert not (tmp_path / "e" / "metrics.json").exists()
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")

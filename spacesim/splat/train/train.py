@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import spacesim
-from spacesim import backend
+from spacesim import backend, ending
 from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, read_json, write_json
 from spacesim.data.records import Camera, Dataset
@@ -39,7 +39,8 @@ def train(
     """Train and write RUN (see `spacesim.splat.run`). With `resume`, go on from the newest checkpoint, with the
     same result to the bit; a finished run is returned as it is. command: what the user typed, for the report.
 
-    Raises InputError where `out` holds a run and `resume` is not asked for, or one of another configuration.
+    Ctrl-C on the command line leaves a checkpoint of the step that it came in. Raises InputError where `out` holds a
+    run and `resume` is not asked for, or one of another configuration.
     """
     out = Path(out)
     described = {**config.to_json(), "data": _identity(dataset)}
@@ -65,7 +66,8 @@ def train(
         for old in _checkpoints(out)[:-KEEP_CHECKPOINTS]:
             old.unlink(missing_ok=True)
 
-    trainer.run(on_progress, checkpoint)
+    with ending.postponed() as asked_to_stop:
+        trainer.run(on_progress, checkpoint, asked_to_stop)
     write_json(
         out / "training.json",
         {

@@ -93,8 +93,14 @@ class Trainer:
         self._on_screen = recorded(on_screen, RECORDINGS)
         self._update_light = recorded(update_light, RECORDINGS)
 
-    def run(self, on_progress: Callable[[Progress], None], on_checkpoint: Callable[[], None]) -> None:
-        """Train from `self.iteration` to the end."""
+    def run(
+        self,
+        on_progress: Callable[[Progress], None],
+        on_checkpoint: Callable[[], None],
+        asked_to_stop: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Train from `self.iteration` to the end. Raises KeyboardInterrupt after a step and its checkpoint where it is
+        asked to stop, WorkError where the loss is not finite."""
         config = self.config
         while self.iteration < config.iterations:
             loss = self.step()
@@ -102,8 +108,13 @@ class Trainer:
             if self.iteration % HISTORY_EVERY == 0 or last:
                 self._note(float(loss[0]))
                 on_progress(Progress(self.iteration, config.iterations, float(loss[0]), self.gaussians.count))
-            if self.iteration % config.checkpoint_every == 0 and not last:
+            stop = asked_to_stop()
+            if stop:
+                self._check(float(loss[0]))
+            if stop or (self.iteration % config.checkpoint_every == 0 and not last):
                 on_checkpoint()
+            if stop:
+                raise KeyboardInterrupt
 
     def step(self) -> Any:
         """One update from one view or several, refinement if it is time. Returns the mean loss, Float of width 1."""
@@ -306,9 +317,12 @@ class Trainer:
         frame = TrainingFrame(centre, self.scene_scale, farthest_camera(dataset, centre), radius)
         return LightModel.initial(self.config.light, frame, self.config.seed)
 
-    def _note(self, loss: float) -> None:
+    def _check(self, loss: float) -> None:
         if not np.isfinite(loss):
             raise WorkError(f"training: the loss is {loss} at iteration {self.iteration}; the last checkpoint is kept")
+
+    def _note(self, loss: float) -> None:
+        self._check(loss)
         self.history.append({"iteration": self.iteration, "loss": loss, "gaussians": self.gaussians.count})
 
 
