@@ -1,10 +1,14 @@
 """One tiny dataset, one tiny run and its evaluation, for the tests of the command line."""
 
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from tiny import GENERATE, TRAIN, Outcome, call
+
+# A shell may have started us with Ctrl-C ignored, which the commands that tests start and stop would inherit.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
