@@ -11,7 +11,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import Any
 from weakref import WeakSet
 
 NAMES = ("auto", "cuda", "llvm")
-_PLAIN = (int, float, bool, str, type(None))
+_PLAIN = frozenset((int, float, bool, str, type(None)))
 MINIMUM_LLVM = 19
 INSTALL_LLVM = "sudo apt-get install libllvm19"
 INSTALL_ATOMIC = "sudo apt-get install libatomic1"
@@ -38,6 +38,7 @@ _LIBRARY_PLACES = (
 
 _selected: str | None = None
 _recorded: WeakSet[Any] = WeakSet()
+_leaves: set[type] = set()  # types of arguments that Dr.Jit is left to look into
 
 
 class BackendError(RuntimeError):
@@ -183,43 +184,88 @@ def free_memory() -> int | None:
 def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
     """`function` by `dr.freeze`: traced at its first call with arguments of a kind, replayed at the others.
 
-    At most `limit` recordings are kept. Python's garbage collector waits during a call: arrays that it frees in the
-    middle of a recording end the process. Dr.Jit 1.5 knows an argument that occurs twice in a call by identity, and
-    takes f(1, 2, 1) for f(1, 2, 2): a text of all that is no array tells them apart. No array may stand in two places.
+    At most `limit` recordings are kept. Arguments may be arrays, numbers and texts, and tuples, lists, dicts and
+    dataclasses of them. Dr.Jit 1.5 takes long to walk through these, knows an argument that occurs twice in a call by
+    identity, and takes f(1, 2, 1) for f(1, 2, 2): it gets a flat list of the arrays and one text of all the rest. No
+    array may stand in two places. Python's garbage collector waits during a call: arrays that it frees in the middle
+    of a recording end the process.
     """
     import drjit as dr
 
-    frozen = dr.freeze(lambda _, arguments: function(*arguments), limit=limit, warn_after=limit)
+    now = _Arguments()
+    frozen = dr.freeze(lambda _, arrays: function(*_joined(now.arguments, iter(arrays))), limit=limit, warn_after=limit)
     _recorded.add(frozen)
 
     def call(*arguments: Any) -> Any:
+        arrays: list[Any] = []
+        told = repr(_split(arguments, arrays))
+        now.arguments = arguments
         collecting = gc.isenabled()
         gc.disable()
         try:
-            return frozen(_constants(arguments), arguments)
+            return frozen(told, arrays)
         finally:
+            now.arguments = ()
             if collecting:
                 gc.enable()
 
     return call
 
 
-def _constants(value: Any) -> str:
-    """All of `value` that is no array, in words. Lists hold arrays alone, or none."""
+class _Arguments:
+    """Of the call that may be traced now; to Dr.Jit an object that never changes."""
+
+    arguments: tuple[Any, ...] = ()
+
+
+def _split(value: Any, arrays: list[Any]) -> Any:
+    """All of `value` that is no array, to be told by `repr`; its arrays are added to a list."""
     kind = type(value)
     if kind in _PLAIN:
-        return repr(value)
-    if kind is tuple:
-        return "(" + ",".join(map(_constants, value)) + ")"
-    if kind is list:
-        inner = value[:1] if value and not isinstance(value[0], tuple | list) else value
-        return f"[{len(value)}" + ",".join(map(_constants, inner)) + "]"
+        return value
+    if kind is list and _leaves.issuperset(map(type, value)):
+        arrays.extend(value)
+        return kind, len(value)
+    if kind is list or kind is tuple:
+        return kind, _split_each(value, arrays)
     if kind is dict:
-        return "{" + ",".join(f"{key}:{_constants(inner)}" for key, inner in value.items()) + "}"
+        return kind, list(value), _split_each(value.values(), arrays)
+    names = _names(kind)  # type: ignore[arg-type]
+    if names is not None:
+        return kind, _split_each([getattr(value, name) for name in names], arrays)
+    _leaves.add(kind)
+    arrays.append(value)
+    return ...
+
+
+def _split_each(values: Iterable[Any], arrays: list[Any]) -> list[Any]:
+    told = []
+    for value in values:
+        kind = type(value)
+        if kind in _leaves:  # as most are
+            arrays.append(value)
+            told.append(...)
+        else:
+            told.append(value if kind in _PLAIN else _split(value, arrays))
+    return told
+
+
+def _joined(value: Any, arrays: Iterator[Any]) -> Any:
+    """`value` with `arrays` in place of its own, in the order of `_split`."""
+    kind = type(value)
+    if kind in _PLAIN:
+        return value
+    if kind is list or kind is tuple:
+        return kind(_joined(one, arrays) for one in value)
+    if kind is dict:
+        return {key: _joined(one, arrays) for key, one in value.items()}
     names = _names(kind)  # type: ignore[arg-type]
     if names is None:
-        return ""
-    return kind.__name__ + "(" + ",".join([_constants(getattr(value, name)) for name in names]) + ")"
+        return next(arrays)
+    copy = object.__new__(kind)
+    for name in names:
+        object.__setattr__(copy, name, _joined(getattr(value, name), arrays))
+    return copy
 
 
 @cache

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -225,9 +226,39 @@ def test_recordings_tell_constants_apart_that_occur_twice():
 
 def test_constants_are_all_that_is_no_array():
     x = backend.ad.Float(1.0, 2.0)
-    told = [
-        backend._constants(value)
-        for value in ((1, x), (1.0, x), (True, x), ("1", x), (None, x), ([x], x), ([x, x], x), ({"a": 1}, x))
-    ]
-    assert len(set(told)) == len(told)
-    assert backend._constants((x, 1)) == backend._constants((x + 1, 1))
+
+    def told(value):
+        return repr(backend._split(value, []))
+
+    plain = [(1, x), (1.0, x), (True, x), ("1", x), (None, x), (x, None), ({"a": 1}, x), ({"a": x}, x), ((x,), x)]
+    kinds = [*plain, ([x], x), ([x, x], x), ([1, x], x), ([[x], [x]], x), ([[x, x]], x), (_Pair(x, 1), x), ([], x)]
+    assert len({told(value) for value in kinds}) == len(kinds)
+    assert told((x, 1)) == told((x + 1, 1))
+
+
+@dataclass(frozen=True)
+class _Pair:
+    one: object
+    other: object = None
+
+
+def test_recorded_functions_get_what_they_are_called_with():
+    """Arrays deep within other things, at the first call and at replays."""
+    ad, seen = backend.ad, []
+
+    def function(x, things, *rest):
+        seen.append((things, rest))
+        first = things["rows"]
+        return {"sum": [a + x * b for a, b in first], "rest": _Pair(rest[0].one[1] - x, rest[0].other)}
+
+    recorded = backend.recorded(function, 4)
+    for k in (1, 2):
+        x, y, z = (ad.Float(k, 2.0 * k, i) for i in range(3))
+        v = ad.Array2f(ad.Float(1.0, k, 0), ad.Float(0.0, k, 5))
+        found = recorded(x, {"rows": [(y, z)], "n": None}, _Pair((3, v, "a"), _Pair(None, 2.5)))
+        assert found["sum"][0].numpy() == pytest.approx((y + x * z).numpy())
+        assert found["rest"].one.numpy() == pytest.approx((v - x).numpy())
+        assert found["rest"].other == _Pair(None, 2.5)
+    assert len(seen) == 1
+    things, (pair,) = seen[0]
+    assert (things["n"], type(things["rows"][0]), pair.one[::2]) == (None, tuple, (3, "a"))
