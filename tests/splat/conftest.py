@@ -46,6 +46,18 @@ def black_dataset(tmp_path_factory, known_gaussians) -> Dataset:
 
 
 @pytest.fixture(scope="session")
+def opaque_dataset(tmp_path_factory, known_gaussians) -> Dataset:
+    """Pictures without alpha, over a black sky."""
+    dataset = _write_dataset(tmp_path_factory.mktemp("opaque"), known_gaussians)
+    for path in (dataset.root / frame.file_path for frame in dataset.frames):
+        rgba = Image.open(path)
+        sky = Image.new("RGBA", rgba.size, (0, 0, 0, 255))
+        sky.alpha_composite(rgba)
+        sky.convert("RGB").save(path)
+    return dataset
+
+
+@pytest.fixture(scope="session")
 def write_dataset():
     """The function (root, gaussians) -> Dataset."""
     return _write_dataset

@@ -246,18 +246,12 @@ def test_presets_and_table_5_1():
         preset("miracle")
 
 
-def test_opaque_pictures_are_trained_over_black(tmp_path, known_gaussians, write_dataset):
+def test_opaque_pictures_are_trained_over_black(opaque_dataset):
     """Pictures without alpha: the black sky is black for want of light, not for want of splats."""
-    dataset = write_dataset(tmp_path, known_gaussians)
-    for frame in dataset.frames:
-        rgba = Image.open(tmp_path / frame.file_path)
-        sky = Image.new("RGBA", rgba.size, (0, 0, 0, 255))
-        sky.alpha_composite(rgba)
-        sky.convert("RGB").save(tmp_path / frame.file_path)
-    trainer = Trainer(dataset, CONFIG)
+    trainer = Trainer(opaque_dataset, CONFIG)
     assert not trainer.background(3, trainer.views[0]).any()
     trainer.run(lambda progress: None, lambda: None)
-    assert psnr(trainer.gaussians, dataset) > 20
+    assert psnr(trainer.gaussians, opaque_dataset) > 20
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs processor affinity")
