@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image
 from splats import random_splats
 
 from spacesim.data.errors import InputError, WorkError
