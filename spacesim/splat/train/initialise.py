@@ -58,18 +58,26 @@ def surface_normals(means: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][:, :, 0]
 
 
+def spacing(means: np.ndarray) -> np.ndarray:
+    """[N] metres: the mean distance of each of points [N, 3] to its three nearest neighbours, 1e-6 at least; 0.01 of a
+    single one (Kerbl et al. 2023)."""
+    count = len(means)
+    neighbours = min(4, count)
+    if neighbours < 2:
+        return np.full(count, 0.01)
+    distances = cKDTree(means).query(means, k=neighbours)[0][:, 1:]
+    return np.maximum(distances.mean(axis=1), 1e-6)
+
+
 def gaussians_at(means: np.ndarray, colours: np.ndarray, sh_degree: int) -> Gaussians:
     """Gaussians at means [N, 3] metres with sRGB colours [N, 3] in [0, 1]; sh_degree -1: without harmonics."""
     count = len(means)
-    neighbours = min(4, count)
-    distances = cKDTree(means).query(means, k=neighbours)[0].reshape(count, neighbours)[:, 1:]
-    spacing = distances.mean(axis=1) if neighbours > 1 else np.full(count, 0.01)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
     sh[:, :1] = ((colours - 0.5) / SH_C0)[:, None]
     return Gaussians.from_numpy(
         {
             "means": means,
-            "log_scales": np.repeat(np.log(np.maximum(spacing, 1e-6))[:, None], 3, axis=1),
+            "log_scales": np.repeat(np.log(spacing(means))[:, None], 3, axis=1),
             "quaternions": np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
             "logit_opacities": np.full(count, np.log(OPACITY / (1 - OPACITY))),
             "sh": sh,

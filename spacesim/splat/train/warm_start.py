@@ -15,11 +15,11 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import luminance
 from spacesim.splat.cameras import NEAR, Pinhole
 from spacesim.splat.gaussians import Gaussians, numbers, triple
+from spacesim.splat.tiles import RECORDINGS
 from spacesim.splat.train.densify import raise_opacities
+from spacesim.splat.train.initialise import spacing
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.views import DEVICE_BYTES, TrainingViews, View
-
-RECORDINGS = 64
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,8 @@ class WarmStartConfig:
     rescue: float = 0.5  #: table 5.7, alpha_rescue
     rescue_every: int = 100  #: steps, chosen; a Gaussian that no view of them had in its picture is unseen
     least_seen: int = 16  #: Gaussians that make a visible cloud, chosen as table 5.3's least supported cloud
-    gather: bool = True  #: beyond the nearest camera is unseen, too; rescued Gaussians shrink as they close up, chosen
+    gather: bool = True  #: beyond the nearest camera is unseen, too, chosen
+    spacing: float = 1.0  #: widest a Gaussian is after a rescue, in mean distances to its three nearest, chosen; 0: any
     revive: float = 0.1  #: opacity to which fainter ones are raised at each rescue, chosen: that of the start; 0: none
     conservative: int = 1_000  #: table 5.7, steps after `steps` with a lower opacity threshold
     opacity_scale: float = 0.5  #: table 5.7, of that threshold
@@ -48,7 +49,9 @@ class WarmStartConfig:
         if min(counts) < 0 or min(self.downsampling, self.rescue_every) < 1:
             raise InputError(f"--warm-start: expected numbers of steps and pixels, found {self}")
         if not (
-            0 <= self.rescue <= 1 and self.reach > 0 and min(self.weight, self.projection_weight, self.travel) >= 0
+            0 <= self.rescue <= 1
+            and self.reach > 0
+            and min(self.weight, self.projection_weight, self.travel, self.spacing) >= 0
         ):
             raise InputError(f"--warm-start: expected weights of 0 or more and a rescue of 0 to 1, found {self}")
 
@@ -149,11 +152,13 @@ class WarmStart:
         return list(gradients)
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> None:
-        """Rescue the unseen (5.31) and revive the faint if it is time to, after `step` finished steps."""
+        """Rescue the unseen (5.31), narrow the wide and revive the faint if it is time to, after `step` finished
+        steps."""
         config = self.config
         if step > config.steps or step % config.rescue_every:
             return
         means = numbers(gaussians.means).astype(np.float64)
+        means[:, ~np.isfinite(means).all(axis=0)] = self.centre[:, None]
         unseen = np.array(self.state["framed"]) == 0
         if config.gather:
             unseen |= np.linalg.norm(means - self.centre[:, None], axis=0) > self.nearest
@@ -163,9 +168,9 @@ class WarmStart:
             target = means[:, ~unseen].mean(axis=1) if enough else self.centre
             means[:, unseen] += config.rescue * (target[:, None] - means[:, unseen])
             gaussians.means = triple(means)
-            if config.gather and config.rescue < 1:
-                gaussians.log_scales += ad.Float(np.where(unseen, np.log1p(-config.rescue), 0).astype(np.float32))
-                dr.eval(gaussians.log_scales)
+        if config.spacing > 0:
+            widest = np.log(config.spacing * spacing(means.T))
+            gaussians.log_scales = triple(np.minimum(numbers(gaussians.log_scales), widest))
         if config.revive > 0:
             raise_opacities(gaussians, optimizer, config.revive)
 
