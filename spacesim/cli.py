@@ -123,6 +123,9 @@ def _train(options: argparse.Namespace) -> None:
     )
     config = preset(options.preset, options.method, options.strategy)
     config = with_options(config, **{name: getattr(options, name) for name in names})
+    if options.prior is not None and not config.shape_terms:
+        expected = "--depth-weight or --normal-weight above 0, which say how much of it counts"
+        raise InputError(f"--prior {options.prior}: expected {expected}, found neither")
     if options.black_background:
         config = with_options(config, random_background=False)
     if options.antialiased:

@@ -337,6 +337,28 @@ def test_presets_and_table_5_7():
         WarmStartConfig(rescue=2.0)
 
 
+def test_a_training_that_ends_before_the_warm_start_does_is_told(spacesim, tiny_data, tmp_path, caplog):
+    """`demo` gathers for 500 and fades over 500; `remark` begins at their sum."""
+    table = WarmStartConfig(steps=20, decay=10)
+    assert [bool(table.remark(iterations)) for iterations in (5, 20, 30, 31)] == [True, True, True, False]
+    line = ["train", tiny_data, "--preset", "demo", "--init-count", "300", "--init", "random", "--warm-start"]
+    done = spacesim(*line, "--out", tmp_path / "short", "--iterations", "3")
+    assert done.code == 0
+    told = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    assert len(told) == 1
+    for word in ("--warm-start", "500 iterations", "more than 1000", "found 3"):
+        assert word in told[0]
+
+
+@pytest.mark.parametrize("prior", ["mesh", "truth"])
+def test_a_prior_that_nothing_uses_is_a_mistake(spacesim, tiny_data, tmp_path, prior):
+    line = ["train", tiny_data, "--preset", "demo", "--prior", prior, "--iterations", "2", "--out", tmp_path / "run"]
+    assert spacesim(*line).is_refusal(f"--prior {prior}", "--depth-weight", "--normal-weight")
+    assert spacesim(*line, "--normal-weight", "0").is_refusal(f"--prior {prior}", "--depth-weight", "--normal-weight")
+    assert not (tmp_path / "run").exists()
+    assert spacesim(*line, "--normal-weight", "0.1").code == 0
+
+
 # Depth, normals, discs
 
 

@@ -52,6 +52,8 @@ def train(
     elif holds_files(out) or (out.exists() and not out.is_dir()):
         raise InputError(f"{out}: expected an empty or new folder for the run, found other files in it")
 
+    if config.warm_start is not None and (remark := config.warm_start.remark(config.iterations)):
+        log.warning(remark)
     trainer = Trainer(dataset, config)
     write_json(out / "config.json", described)
     newest = max(_checkpoints(out), default=None)

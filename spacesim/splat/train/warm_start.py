@@ -55,6 +55,16 @@ class WarmStartConfig:
         ):
             raise InputError(f"--warm-start: expected weights of 0 or more and a rescue of 0 to 1, found {self}")
 
+    def remark(self, iterations: int) -> str:
+        """A sentence where training is over before the attraction is; "" where it is not."""
+        if iterations > self.steps + self.decay:
+            return ""
+        return (
+            f"--warm-start: gathers Gaussians for {self.steps} iterations and fades over {self.decay} more, expected a "
+            f"training of more than {self.steps + self.decay}, better of several times as many, found {iterations}: "
+            "what is gathered is hardly trained"
+        )
+
     def strength(self, step: int) -> float:
         """w_ws of 5.29 at `step`, the first of which is 0."""
         if step < self.steps:
