@@ -1,5 +1,6 @@
 """Geometry from Gaussians: normals as features to blend, the median depth of a pixel, the surface there."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -37,17 +38,33 @@ def unit(vector: Any) -> Any:
     return dr.select(known, vector * dr.rsqrt(dr.select(known, square, 1)), 0)
 
 
-def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> Any:
+@dataclass
+class Pixels:
+    """Of a picture, as arrays: in a recording neither its size nor the number of splats may be a constant.
+    index: UInt32 [height * width], 0, 1, 2, ...;  none: as many times N, which stands for no splat"""
+
+    index: Any
+    none: Any
+
+    @staticmethod
+    def of(width: int, height: int, count: int) -> "Pixels":
+        """For N = `count` splats."""
+        index = dr.arange(ad.UInt32, width * height)
+        dr.eval(index)
+        return Pixels(index, dr.opaque(ad.UInt32, count, width * height))
+
+
+def median_splat(splats: Splats, lists: TileLists, width: int, height: int, pixels: Pixels | None = None) -> Any:
     """UInt32 [height * width]: the splat behind which less than half of the light passes; N where there is none.
 
-    Walks each tile's list once more, a lane a pixel. Not differentiable.
+    Walks each tile's list once more, a lane a pixel. Not differentiable. pixels: an argument of a recording
     """
-    splats, count = dr.detach(splats), dr.width(splats.x)
-    pixel = dr.arange(ad.UInt32, width * height)
+    splats = dr.detach(splats)
+    pixels = pixels or Pixels.of(width, height, dr.width(splats.x))
+    pixel = pixels.index
     column, row = pixel % width, pixel // width
-    nothing = dr.opaque(ad.UInt32, count, width * height)
     if lists.capacity == 0:
-        return nothing
+        return pixels.none
     tile = (row // lists.shape.height) * lists.tiles_x + column // lists.shape.width
     px, py = ad.Float(column) + 0.5, ad.Float(row) + 0.5
     end = dr.gather(ad.UInt32, lists.end, tile)
@@ -65,7 +82,7 @@ def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> A
         transmittance *= 1 - dr.select(alpha >= ALPHA_MIN, alpha, 0)
         return k + 1, transmittance, dr.select(transmittance < 0.5, i, found)
 
-    state = dr.gather(ad.UInt32, lists.start, tile), dr.full(ad.Float, 1, width * height), nothing
+    state = dr.gather(ad.UInt32, lists.start, tile), ad.Float(1), pixels.none
     _, _, found = dr.while_loop(state, undecided, pass_splat, mode="symbolic", label="median")
     return found
 
@@ -76,15 +93,18 @@ def picked(values: Any, index: Any) -> Any:
     return dr.custom(_Pick, values, index)
 
 
-def surface_depth(gaussians: Gaussians, splats: Splats, index: Any, camera: Projection) -> Any:
+def surface_depth(
+    gaussians: Gaussians, splats: Splats, index: Any, camera: Projection, pixels: Pixels | None = None
+) -> Any:
     """Float [height * width], metres: depth of the splat `index` of each pixel (UInt32 [P], as of `median_splat`) where
     the ray meets it, not at its centre; 0 where the index is N.
 
     A ray d is deepest in a Gaussian at z = d'P m / d'P d, P its inverse covariance and m its centre in camera axes.
     That is taken as linear in the pixel about the centre, as in RaDe-GS (Zhang et al. 2024), and ends `REACH` standard
-    deviations of the longest axis before and behind it. Not differentiable.
+    deviations of the longest axis before and behind it. Not differentiable. pixels: an argument of a recording
     """
     splats = dr.detach(splats)
+    pixels = pixels or Pixels.of(camera.width, camera.height, dr.width(splats.depth))
     means, scales = dr.detach(gaussians.means), dr.detach(gaussians.log_scales)
     least = dr.minimum(scales[0], dr.minimum(scales[1], scales[2]))
     most = dr.maximum(scales[0], dr.maximum(scales[1], scales[2]))
@@ -100,9 +120,9 @@ def surface_depth(gaussians: Gaussians, splats: Splats, index: Any, camera: Proj
     reach = REACH * dr.exp(most)
 
     def of(values: Any) -> Any:
-        return dr.gather(ad.Float, values, index, index < dr.width(splats.depth))
+        return dr.gather(ad.Float, values, index, index < pixels.none)
 
-    pixel = dr.arange(ad.UInt32, camera.width * camera.height)
+    pixel = pixels.index
     x, y = ad.Float(pixel % camera.width) + 0.5, ad.Float(pixel // camera.width) + 0.5
     offset = of(across / (square * screen.scale_x)) * (of(splats.x) - x)
     offset += of(along / (square * screen.scale_y)) * (of(splats.y) - y)

@@ -8,6 +8,9 @@ import drjit as dr
 from spacesim.backend import ad
 from spacesim.splat.cameras import LARGEST, Orthographic
 from spacesim.splat.gaussians import Gaussians, principal_axes
+from spacesim.splat.project import DILATION
+
+STEEPEST = 0.05  #: sine of the Sun's elevation over a surface below which it counts as this, 2.9 degrees; chosen
 
 
 @dataclass
@@ -36,22 +39,25 @@ def receiver_bias(gaussians: Gaussians, sun: Any, strength: float = 10.0) -> Bia
     return Bias(shape.thickness, shape.alignment, shape.confidence, dr.minimum(bias, LARGEST))
 
 
-def grazing_bias(gaussians: Gaussians, camera: Orthographic, reach: float = 2.0, pixels: float = 1.0) -> Any:
+def grazing_bias(gaussians: Gaussians, camera: Orthographic, reach: float = 3.0) -> Any:
     """Float [N], metres: a bias that does not go to 0 where the Sun grazes a surface, as the thesis's b = 10 sigma^l nu
     gamma does; for `Bias.at_least`. Ours, no part of the thesis.
 
-    A flat surface that passes through a receiver differs from it in light depth, within what one light pixel blends:
-    by `reach` sigma^l, the distance along the light to neighbours whose footprints still cover the receiver's centre,
-    and by the slope across `pixels` light pixels, gamma (|n_x / n_z| / f_x + |n_y / n_z| / f_y) in light axes, which
-    is held within `reach` times the Gaussian's longest axis. So a shadow that touches its caster recedes along the
-    light by at most 2 `reach` standard deviations of the receiver, however low the Sun.
-    camera: the light camera;  reach, pixels: chosen by measurement (docs/shadows.md). May be part of a recording.
+    A flat surface that passes through a receiver has another light depth wherever its neighbours' footprints meet the
+    receiver's. Over a footprint's standard deviation that depth changes by sigma^l, if the light's picture shows the
+    Gaussian as it is; but it is drawn with a filter of `DILATION` pixels^2, so that no splat is thinner than a pixel,
+    and then by sqrt(sigma^l^2 + DILATION |g|^2) with g = (n_x / f_x, n_y / f_y) / n_z, the surface's slope a pixel, in
+    light axes. b is `reach` times that times gamma: in the light's picture a shadow that touches its caster recedes by
+    `reach` standard deviations of a splat as drawn, however low the Sun.
+    camera: the light camera;  reach: standard deviations, chosen by measurement (docs/shadows.md), as is the slope's
+    limit, |n_z| at least `STEEPEST`. May be part of a recording.
     """
     shape = _Shape.of(gaussians, -camera.row(2))
-    x, y, z = (dr.abs(dr.dot(camera.row(i), shape.normal)) for i in range(3))
-    slope = (x * dr.rcp(camera[12]) + y * dr.rcp(camera[13])) * dr.rcp(dr.maximum(z, 1e-6))
-    across = dr.minimum(pixels * slope, reach * shape.longest)
-    return dr.minimum(dr.fma(reach, shape.thickness, shape.confidence * across), LARGEST)
+    x, y, z = (dr.dot(camera.row(i), shape.normal) for i in range(3))
+    slope2 = dr.square(x * dr.rcp(camera[12])) + dr.square(y * dr.rcp(camera[13]))
+    slope2 *= dr.rcp(dr.square(dr.maximum(dr.abs(z), STEEPEST)))
+    drawn = dr.sqrt(dr.fma(DILATION, slope2, dr.square(shape.thickness)))
+    return dr.minimum(reach * shape.confidence * drawn, LARGEST)
 
 
 def lifted(gaussians: Gaussians, sun: Any, thickness: float = 3.0, width: float = 0.2) -> Any:

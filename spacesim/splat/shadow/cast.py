@@ -20,7 +20,7 @@ from spacesim.splat.shadow.sunlight import fit_camera
 from spacesim.splat.tiles import RECORDINGS
 
 METHODS = ("mapping", "splatting")
-GRAZING = ("none", "bias", "lift")
+GRAZING = ("none", "bias", "lift", "both")
 LARGEST = 8192  #: pixels of a side of the light's picture, chosen
 UNSEEN = -80.0  #: logit of an opacity that nothing draws
 
@@ -29,14 +29,16 @@ UNSEEN = -80.0  #: logit of an opacity that nothing draws
 class ShadowConfig:
     """method: "mapping" (4.3.1) or "splatting" (4.3.2);  size: pixels of each side of the light image, of which the
     thesis names none;  bias: lambda_b of 4.26, 0 for none;  grazing: what holds at a grazing Sun, too, where the
-    thesis's bias goes to 0: "bias" (`grazing_bias`) or "lift" (`lifted`);  softness: epsilon_s of 4.5 as
-    a share of the farthest training camera's distance;  mapping: how the light's picture is read;  gradients: of
-    training pass through the shadows to the Gaussians, with splatting only;  refine: the network of 4.3.3, or None."""
+    thesis's bias goes to 0: "bias" (`grazing_bias`), "lift" (`lifted`) or "both";  reach: of `grazing_bias`, standard
+    deviations;  softness: epsilon_s of 4.5 as a share of the farthest training camera's distance;  mapping: how the
+    light's picture is read;  gradients: of training pass through the shadows to the Gaussians, with splatting only;
+    refine: the network of 4.3.3, or None."""
 
     method: str = "mapping"
     size: int = 512
     bias: float = 10.0
     grazing: str = "none"
+    reach: float = 3.0
     softness: float = 1e-6
     mapping: MappingConfig = field(default_factory=MappingConfig)
     gradients: bool = False
@@ -51,6 +53,8 @@ class ShadowConfig:
             raise InputError(f"grazing: expected one of {', '.join(GRAZING)}, found {self.grazing!r}")
         if not 4 <= self.size <= LARGEST:
             raise InputError(f"--light-size: expected 4 to {LARGEST} pixels, found {self.size}")
+        if not 0 <= self.reach < math.inf:
+            raise InputError(f"reach: expected 0 or more standard deviations, found {self.reach}")
         if not (0 <= self.bias < math.inf and 0 < self.softness < math.inf):
             raise InputError(
                 f"--shadow-bias: expected 0 or more (and a softness above 0), found {self.bias} (and {self.softness})"
@@ -123,18 +127,18 @@ def cast_between(
 ) -> Any:
     """Float [M]: raw occlusion of the receivers by the casters, with light cameras fitted to the receivers, as many as
     it takes (4.3.5). direction: [3], towards the Sun;  distance, least_scale: as in `cast_shadows_adaptively`"""
-    rows, strength = between.whole.shape_rows(), dr.opaque(ad.Float, config.bias)
+    rows, numbers = between.whole.shape_rows(), _numbers(config)
     logit = dr.select(between.casts, rows[-1], UNSEEN)
     dr.eval(logit)
     blockers = Gaussians.from_rows([*rows[:-1], logit])
 
     def by_mapping(receivers: Gaussians, camera: Orthographic) -> Any:
-        bias, points = _receivers(receivers.shape_rows(), camera, strength, config.grazing)
+        bias, points = _receivers(receivers.shape_rows(), camera, *numbers, config.grazing)
         softness = config.softness * distance
         return occlusion_by_mapping(receivers, camera, bias.bias, softness, config.mapping, points, blockers)
 
     def by_splatting(_receiving: Gaussians, camera: Orthographic) -> Any:
-        bias, points = _receivers(rows, camera, strength, config.grazing)
+        bias, points = _receivers(rows, camera, *numbers, config.grazing)
         occlusion = occlusion_by_splatting(blockers, camera, bias.bias, points, receives=between.receives)
         return dr.gather(ad.Float, occlusion, between.members)
 
@@ -144,7 +148,7 @@ def cast_between(
 
 def _cast(gaussians: Gaussians, camera: Orthographic, config: ShadowConfig, distance: float) -> Shadows:
     rows = gaussians.shape_rows()
-    bias, points = _receivers(rows, camera, dr.opaque(ad.Float, config.bias), config.grazing)
+    bias, points = _receivers(rows, camera, *_numbers(config), config.grazing)
     if config.method == "mapping":
         softness = config.softness * distance
         occlusion = occlusion_by_mapping(gaussians, camera, bias.bias, softness, config.mapping, points)
@@ -153,17 +157,24 @@ def _cast(gaussians: Gaussians, camera: Orthographic, config: ShadowConfig, dist
     return Shadows(occlusion, rows, camera, bias, points)
 
 
+def _numbers(config: ShadowConfig) -> tuple[Any, Any]:
+    """Bias and reach as kernels read them."""
+    return dr.opaque(ad.Float, config.bias), dr.opaque(ad.Float, config.reach)
+
+
 def _trace_fit(rows: list[Any], light: Any, size: int) -> Orthographic:
     return fit_camera(Gaussians.from_rows(rows), light, size)
 
 
-def _trace_receivers(rows: list[Any], camera: Orthographic, strength: Any, grazing: str) -> tuple[Bias, Any]:
+def _trace_receivers(
+    rows: list[Any], camera: Orthographic, strength: Any, reach: Any, grazing: str
+) -> tuple[Bias, Any]:
     """(bias, points to test or None for the centres)."""
     gaussians, sun = Gaussians.from_rows(rows), -camera.row(2)
     bias = receiver_bias(gaussians, sun, strength)
-    if grazing == "bias":
-        bias = bias.at_least(grazing_bias(gaussians, camera))
-    return bias, lifted(gaussians, sun) if grazing == "lift" else None
+    if grazing in ("bias", "both"):
+        bias = bias.at_least(grazing_bias(gaussians, camera, reach))
+    return bias, lifted(gaussians, sun) if grazing in ("lift", "both") else None
 
 
 _fit = recorded(_trace_fit, RECORDINGS)

@@ -18,9 +18,10 @@ from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import Footprints, Splats, project
 from spacesim.splat.rasterize import forward
 from spacesim.splat.shadow.sunlight import drawable
-from spacesim.splat.tiles import RECORDINGS, bin_splats
+from spacesim.splat.surface import Pixels, median_splat, surface_depth
+from spacesim.splat.tiles import RECORDINGS, TileLists, bin_splats
 
-FILTERS = ("bilinear", "percentage-closer", "variance")
+FILTERS = ("bilinear", "percentage-closer", "variance", "median")
 SUN_RADIUS_DEG = 0.2666  #: angular radius of the Sun's disc at 1 au
 LARGEST_WINDOW = 16  #: pixels to either side that a filter may read; chosen
 
@@ -31,7 +32,9 @@ class MappingConfig:
 
     filter: "bilinear" is the thesis: one depth, interpolated, then one test (4.5). "percentage-closer" tests every
         pixel of a window, then averages (Reeves et al. 1987). "variance" averages depth and its square over the window
-        and bounds the lit share by Chebyshev's inequality (Donnelly and Lauritzen 2006).
+        and bounds the lit share by Chebyshev's inequality (Donnelly and Lauritzen 2006). "median" tests every pixel of
+        the window as "percentage-closer" does, against where half of the light is gone: a pixel that a body covers by
+        less than half shows what is behind it, and no depth is a mean of both (ours).
     radius: pixels, half the window's width, at least 1/2; chosen
     sun_radius_deg: with "percentage-closer", widens the window to the penumbra that a disc of this angular radius
         throws across the mean gap to the blockers (Fernando 2005); 0 does not; `SUN_RADIUS_DEG` is the Sun's
@@ -65,6 +68,7 @@ class LightMap:
     """What the Sun sees, planes [height * width], row by row.
 
     alpha: 1 - transmittance;  depth: sum of weight x z, metres;  square: of weight x z^2, metres^2, or None
+    For the filter "median" alpha is 1 where half of the light and more is gone, else 0, and depth is where.
     """
 
     alpha: Any
@@ -97,7 +101,10 @@ def occlusion_by_mapping(
     if gaussians.count == 0:
         return dr.zeros(ad.Float, 0)
     shown = gaussians if casters is None else casters
-    light = light_map(shown, camera, config.filter == "variance", config.antialiased)
+    if config.filter == "median":
+        light = median_map(shown, camera, config.antialiased)
+    else:
+        light = light_map(shown, camera, config.filter == "variance", config.antialiased)
     visible = drawable(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
     points = dr.detach(gaussians.means if points is None else points)
     softness = dr.opaque(ad.Float, max(softness, 1e-20))
@@ -112,6 +119,27 @@ def light_map(gaussians: Gaussians, camera: Orthographic, squares: bool = False,
     blended = forward(splats, moments, lists, camera.width, camera.height)
     depth, *square = blended.features
     return LightMap(1 - blended.transmittance, depth, square[0] if squares else None, camera.width, camera.height)
+
+
+def median_map(gaussians: Gaussians, camera: Orthographic, antialiased: bool = True) -> LightMap:
+    """Where half of the light is gone: the surface of the Gaussian that takes it. Detached."""
+    rows = [dr.detach(row) for row in gaussians.shape_rows()]
+    shape = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
+    splats, footprints, _ = _prepare(*dr.detach(shape), camera, False, antialiased)
+    lists = bin_splats(splats, footprints, camera.width, camera.height)
+    alpha, depth = _median(rows, splats, lists, camera, Pixels.of(camera.width, camera.height, gaussians.count))
+    return LightMap(alpha, depth, None, camera.width, camera.height)
+
+
+def _trace_median(
+    rows: list[Any], splats: Splats, lists: TileLists, camera: Orthographic, pixels: Pixels
+) -> tuple[Any, Any]:
+    """(is half of the light gone, 0 or 1, and at which depth, 0 where not), planes."""
+    found = median_splat(splats, lists, camera.width, camera.height, pixels)
+    dr.eval(found)
+    gone = found < pixels.none
+    depth = surface_depth(Gaussians.from_rows(rows), splats, found, camera, pixels)
+    return dr.select(gone, ad.Float(1), 0), dr.select(gone, depth, 0)
 
 
 def _trace_prepare(
@@ -258,4 +286,5 @@ def _overlap(pixel: Any, centre: Any, half: Any) -> Any:
 
 
 _prepare = recorded(_trace_prepare, RECORDINGS)
+_median = recorded(_trace_median, RECORDINGS)
 _look_up = recorded(_trace_look_up, RECORDINGS)

@@ -8,6 +8,7 @@ from spacesim.splat.appearance import FieldConfig
 from spacesim.splat.encoding import Encoding
 from spacesim.splat.light import LightConfig
 from spacesim.splat.shadow.cast import ShadowConfig
+from spacesim.splat.shadow.mapping import MappingConfig
 from spacesim.splat.shadow.refine import RefineConfig
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.strategies.mcmc import McmcConfig
@@ -218,7 +219,10 @@ def _light(name: str, method: str) -> LightConfig:
     kind = "mapping" if method == "shadow-map" else "splatting"
     if name == "thesis":
         return LightConfig(field, ShadowConfig(kind, image))
-    return LightConfig(field, ShadowConfig(kind, image, bias=5.0, grazing="lift", refine=RefineConfig(width=32)))
+    shadow = ShadowConfig(kind, image, bias=5.0, grazing="both", refine=RefineConfig(width=32))
+    if kind == "mapping":
+        shadow = replace(shadow, reach=2.0, mapping=MappingConfig("median"))
+    return LightConfig(field, shadow)
 
 
 def with_field(field: FieldConfig, kind: str) -> FieldConfig:

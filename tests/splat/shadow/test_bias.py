@@ -77,19 +77,33 @@ def test_lifted_by_hand(sun):
     assert points[1] == pytest.approx([0, 0, 0], abs=1e-6)
 
 
-@pytest.mark.parametrize("azimuth", [0, 90])
+@pytest.mark.parametrize("azimuth", [0, 30, 90])
 @pytest.mark.parametrize("elevation", [90, 45, 10, 1, 0])
 def test_grazing_bias_by_hand(elevation, azimuth):
-    """The disc's extent along the light, and its slope over one pixel of 4 mm x 8 mm, bounded by its width."""
+    """How much the depth of the disc's plane varies over its footprint, drawn with 0.3 pixels^2 of 4 mm x 8 mm: the
+    variance of a sum of two independent offsets, along the light and of the filter along the slope."""
     a, b = np.radians(elevation), np.radians(azimuth)
     sun = np.array([np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)])
     pose = look_at(sun, [0, 0, 0], up=[0, 0, 1] if elevation < 90 else [1, 0, 0])
     camera = Orthographic.of(OrthographicCamera(pose, 8, 8, 1 / 0.004, 1 / 0.008, 4, 4))
-    found = np.array(grazing_bias(Gaussians.from_numpy(disc()), camera, 2.0, 1.0))
+    found = np.array(grazing_bias(Gaussians.from_numpy(disc()), camera, 2.0))
     thickness = np.hypot(0.2 * np.cos(a), 0.002 * np.sin(a))
     # seen from the Sun the plate's depth changes upwards in the picture alone, where pixels are 8 mm high
-    slope = 0.008 / np.tan(a) if elevation else np.inf
-    assert found[0] == pytest.approx(2 * thickness + 0.99 * min(slope, 2 * 0.2), rel=1e-4, abs=1e-6)
+    slope = 0.008 * np.cos(a) / max(np.sin(a), 0.05)
+    assert found[0] == pytest.approx(2 * 0.99 * np.sqrt(thickness**2 + 0.3 * slope**2), rel=1e-4, abs=1e-6)
+
+
+def test_grazing_bias_is_the_depth_that_a_footprint_spans():
+    """Against points drawn from a tilted disc and moved by the filter: the plane's depth where they come to lie."""
+    turn, rng = Rotation.from_euler("yxz", [55, 20, 10], degrees=True), np.random.default_rng(0)
+    arrays = disc(flatness=1e-4, quaternion=turn.as_quat()[[3, 0, 1, 2]])
+    camera = Orthographic.of(OrthographicCamera(look_at([0, 0, 5], [0, 0, 0], up=[0, 1, 0]), 8, 8, 9.0, 6.0, 4, 4))
+    points = turn.apply(np.c_[rng.normal(size=(200_000, 2)) * 0.2, np.zeros(200_000)])[:, :2]
+    points += rng.normal(size=points.shape) * np.sqrt(0.3) / [9.0, 6.0]
+    normal = turn.apply([0, 0, 1])
+    depth = points @ normal[:2] / normal[2]
+    found = np.array(grazing_bias(Gaussians.from_numpy(arrays), camera, 1.0))[0]
+    assert found == pytest.approx(depth.std(), rel=0.01)
 
 
 def test_no_bias_is_below_its_floor():

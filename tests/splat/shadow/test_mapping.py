@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from splats import random_splats
-from walls import acne, plate, plate_occlusion, screen_shadow
+from walls import SHIPPED, acne, plate, plate_occlusion, screen_shadow
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at, quaternion_from_rotation
 from spacesim.splat.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.shadow import mapping
 from spacesim.splat.shadow.mapping import SUN_RADIUS_DEG, MappingConfig, occlusion_by_mapping
 from spacesim.splat.shadow.reference import camera_record, reference_bias, reference_occlusion
 from spacesim.splat.shadow.sunlight import fit_camera, light_rows
@@ -22,6 +23,7 @@ CONFIGS = {
     "closer": MappingConfig("percentage-closer", radius=1.3),
     "penumbra": MappingConfig("percentage-closer", sun_radius_deg=4.0, widest=5.0),
     "variance": MappingConfig("variance", radius=1.0),
+    "median": MappingConfig("median"),
     "dilated": MappingConfig(antialiased=False),
 }
 SOFTNESS = 1e-3
@@ -257,6 +259,24 @@ def test_hostile_gaussians_get_none_and_spoil_nothing(name):
     assert np.all((strange >= 0) & (strange <= 1))
 
 
+def test_medians_of_models_of_any_size(monkeypatch):
+    """One recording serves them all, and says what is computed without it."""
+    counts, suns = (700, 90, 2100, 700, 1), ([0.3, -0.5, 0.8], [0, 0, -1])
+
+    def found():
+        return [
+            occlusion(arrays, fit_camera(Gaussians.from_numpy(arrays), light_rows(sun), 32), config=CONFIGS["median"])
+            for arrays in (random_splats(count, seed=count) for count in counts)
+            for sun in suns
+        ]
+
+    recorded = found()
+    monkeypatch.setattr(mapping, "_median", mapping._trace_median)
+    for one, other in zip(recorded, found(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert 0.05 < recorded[0].mean() < 0.95
+
+
 @pytest.mark.parametrize("softness", [1e-30, 1e-6, 1e6])
 def test_any_softness_is_finite(softness):
     arrays = random_splats(50, seed=9)
@@ -293,8 +313,22 @@ def test_grazing_suns(elevation, most):
     assert foot < 3 * 0.031
 
 
+@pytest.mark.parametrize("method", SHIPPED)
+@pytest.mark.parametrize(
+    ("elevation", "most"), [(90, 0.001), (60, 0.001), (30, 0.001), (15, 0.005), (10, 0.01), (5, 0.1)]
+)
+def test_a_wall_as_shipped(method, elevation, most):
+    """With the shadows of the presets a wall is lit under every Sun, and keeps the shadow of what stands on it. At 5
+    degrees the plate's own bumps, of 1.2 mm and 3.4 degrees, have shadows."""
+    assert acne(elevation, method, 20_000) < most
+    if elevation < 90:
+        foot, tip = screen_shadow(elevation, method, 20_000)
+        assert foot < 0.04  # a little over three standard deviations of a disc
+        assert not tip > 0.03
+
+
 def test_a_face_along_the_light_stays_finite():
-    for bias in ("thesis", "grazing bias", "lifted"):
+    for bias in ("thesis", "grazing bias", "lifted", *SHIPPED):
         found = plate_occlusion(plate(500), 0.0, bias, size=64)
         assert np.all((found >= 0) & (found <= 1))
 
@@ -302,7 +336,7 @@ def test_a_face_along_the_light_stays_finite():
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [
-        ({"filter": "soft"}, "filter: expected one of bilinear, percentage-closer, variance, found 'soft'"),
+        ({"filter": "soft"}, "filter: expected one of bilinear, percentage-closer, variance, median, found 'soft'"),
         ({"radius": 0.2}, "radius: expected 0.5 to 16 pixels, found 0.2"),
         ({"widest": 99}, "widest: expected 0.5 to 16 pixels, found 99"),
         ({"sun_radius_deg": -1}, "--sun-radius: expected 0 to 45 degrees, found -1"),

@@ -1,15 +1,21 @@
 """Flat sheets of Gaussians, uneven as trained ones are, for tests and for the table of biases."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from spacesim.backend import ad
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.shadow.bias import grazing_bias, lifted, receiver_bias
+from spacesim.splat.shadow.cast import cast_shadows
 from spacesim.splat.shadow.mapping import MappingConfig, occlusion_by_mapping
 from spacesim.splat.shadow.sunlight import fit_camera, light_rows, towards_sun
+from spacesim.splat.train.config import preset
 
 SCREEN = 0.25  #: metres, height
 BIASES = ("none", "thesis", "grazing bias", "lifted")
+SHIPPED = ("shadow-map", "shadow-splat")  #: methods, with the shadows of the preset `fast`
+DISTANCE = 5.0  #: metres, of the farthest camera, on which the softness depends
 
 
 def sheet(corner, along, across, count: int, rng: np.random.Generator, width: float) -> dict[str, np.ndarray]:
@@ -42,9 +48,12 @@ def plate(count: int, screen: bool = False, seed: int = 0) -> dict[str, np.ndarr
 
 
 def plate_occlusion(arrays, elevation: float, bias: str, config: MappingConfig | None = None, size: int = 512):
-    """[N] occlusion, the Sun `elevation` degrees above the plate, towards -x."""
+    """[N] occlusion, the Sun `elevation` degrees above the plate, towards -x. bias: of BIASES, or of SHIPPED"""
     gaussians = Gaussians.from_numpy(arrays)
     light = light_rows([-np.cos(np.radians(elevation)), 0, np.sin(np.radians(elevation))])
+    if bias in SHIPPED:
+        shadow = replace(preset("fast", bias).light.shadow, size=size)
+        return np.array(cast_shadows(gaussians, light, shadow, DISTANCE).occlusion)
     camera = fit_camera(gaussians, light, size)
     biases = receiver_bias(gaussians, towards_sun(light))
     if bias == "grazing bias":
