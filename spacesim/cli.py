@@ -197,7 +197,8 @@ def _render(options: argparse.Namespace) -> None:
     sun = sun or sun_of_frame
     if sun is None and run.relightable:
         raise InputError("--sun: expected AZ,EL for a run that can be relit and a camera without a Sun, found none")
-    write_picture(run.predict(camera, sun, normals=options.kind == "normal"), options.kind, options.out)
+    seen = run.predict(camera, sun, normals=options.kind == "normal", exposure=options.exposure)
+    write_picture(seen, options.kind, options.out)
     ending.say(options.out)
 
 

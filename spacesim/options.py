@@ -121,10 +121,16 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--resume", action="store_true", help="go on from the newest checkpoint")
     lit = one.add_argument_group("light", "of the methods that learn it; see docs/relighting.md")
     lit.add_argument("--field", choices=("thesis", "surface"), help="what the appearance field is told")
-    lit.add_argument("--linear", action="store_true", help="blend colours in linear light, encode the picture")
+    lit.add_argument("--linear", action="store_true", help="blend colours in linear light, then use a tone curve")
+    lit.add_argument("--tone", choices=("srgb", "filmic"), help="curve of --linear (the dataset's own, else srgb)")
+    lit.add_argument(
+        "--exposure", type=float, metavar="EV", help="of the pictures, of --linear (the dataset's own, else 0)"
+    )
     lit.add_argument("--shadow-bias", type=float, metavar="X", help="strength of the receiver-depth bias; 0: none")
-    lit.add_argument("--grazing", choices=("none", "bias", "lift"), help="against acne where the Sun grazes")
-    lit.add_argument("--shadow-filter", choices=("bilinear", "percentage-closer", "variance"), help="of shadow maps")
+    lit.add_argument("--grazing", choices=("none", "bias", "lift", "both"), help="against acne where the Sun grazes")
+    lit.add_argument(
+        "--shadow-filter", choices=("bilinear", "percentage-closer", "variance", "median"), help="of shadow maps"
+    )
     lit.add_argument(
         "--sun-radius", type=float, metavar="DEG", help="penumbrae of such a disc (0.2666 at 1 au), percentage-closer"
     )
@@ -156,6 +162,7 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     _add_view(one)
     one.add_argument("--sun", type=_angles, metavar="AZ,EL", help="degrees; a vanilla run knows one light only")
     one.add_argument("--kind", choices=KINDS, default="rgb")
+    one.add_argument("--exposure", type=float, metavar="EV", help="of a run of --linear (that of its pictures)")
 
     one = command("sweep", "the Sun goes round a run: a contact sheet and a video")
     one.add_argument("path", type=Path, metavar="RUN")
@@ -238,6 +245,8 @@ def with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainConf
     names = (
         "field",
         "linear",
+        "tone",
+        "exposure",
         "shadow_bias",
         "grazing",
         "shadow_filter",
@@ -251,12 +260,13 @@ def with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainConf
         return config
     from spacesim.splat.train.config import with_field
 
-    light, option = config.light, "--" + named[0].replace("_", "-")
-    if light is None or (light.shadow is None and not set(named) <= {"field", "linear"}):
-        what = "that learns light" if light is None else "with shadows"
-        raise InputError(f"{option}: expected a method {what}, found {config.method}")
-    if options.linear:
-        light = replace(light, linear=True)
+    light = config.light
+    of_shadows = [name for name in named if name not in ("field", "linear", "tone", "exposure")]
+    if light is None or (light.shadow is None and of_shadows):
+        option, what = (named[0], "that learns light") if light is None else (of_shadows[0], "with shadows")
+        raise InputError(f"--{option.replace('_', '-')}: expected a method {what}, found {config.method}")
+    if options.linear or options.tone is not None or options.exposure is not None:
+        light = replace(light, linear=options.linear, tone=options.tone, exposure=options.exposure)
     if options.field is not None:
         light = replace(light, field=with_field(light.field, options.field))
     shadow = light.shadow

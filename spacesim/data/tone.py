@@ -1,11 +1,29 @@
 """The tone curve: from linear display values to the sRGB values of the 8-bit image."""
 
+import math
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from spacesim.data.images import srgb_from_linear
 
 TONES = ("srgb", "filmic")
+WHITES = {"srgb": 1.0, "filmic": (0.56 + math.sqrt(0.56**2 + 4 * 0.08 * 0.14)) / 0.16}
+"""Linear display value that each curve makes white: the least v with t(v) = 1, which is 7.24 for `filmic`."""
+STANDARD_EXPOSURE = math.pi / 1361.0
+"""Display value of a radiance of 1 W m^-2 sr^-1 at an exposure of 0 EV: a white Lambertian surface that faces the Sun
+at 1 au, whose irradiance is 1361 W m^-2 (IAU 2015 B3), shows 1."""
+
+
+def development(scene: Mapping[str, Any]) -> tuple[str, float] | None:
+    """(tone curve, exposure in EV) of a dataset's pictures, by its scene.json; None where that does not say."""
+    try:
+        tone, exposure = str(scene["config"]["camera"]["tone"]), float(scene["exposure"])
+        return (tone, math.log2(exposure / STANDARD_EXPOSURE)) if tone in TONES and exposure > 0 else None
+    except (KeyError, TypeError, ValueError):
+        return None
 
 
 def displayed(linear: np.ndarray, tone: str) -> np.ndarray:

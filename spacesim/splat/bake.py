@@ -8,7 +8,7 @@ from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.splat.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.gaussians import SH_C0, Gaussians
 from spacesim.splat.light import LightModel
-from spacesim.splat.tone import encoded
+from spacesim.splat.tone import picture_of
 
 VIEWS = 64  #: directions that the harmonics are fitted to, four times as many as degree 3 has terms
 
@@ -27,8 +27,8 @@ def baked(gaussians: Gaussians, light: LightModel, sun: np.ndarray, degree: int 
         # A camera of parallel rays sees every Gaussian in one direction; how far it is away makes no difference.
         camera = OrthographicCamera.from_extent(look_at(-direction, np.zeros(3)), 4, 4, 1.0)
         colours, _ = light.lit(gaussians, Orthographic.of(camera), sun)
-        if light.config.linear:
-            colours = [encoded(colour) for colour in colours]
+        if light.config.curve:
+            colours = [picture_of(colour, light.config.curve[0]) for colour in colours]
         for k in range(len(fit)):
             weight = ad.Float(np.array([fit[k, view]], dtype=np.float32))
             for channel in range(3):

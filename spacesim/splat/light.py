@@ -14,7 +14,9 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad, recorded, select
+from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
+from spacesim.data.tone import TONES
 from spacesim.splat import cooperative, mlp
 from spacesim.splat.appearance import FieldConfig, FieldInputs, by_normals, field_items, field_views
 from spacesim.splat.cameras import Projection
@@ -25,6 +27,7 @@ from spacesim.splat.shadow.refine import RefineConfig, refine_inputs, refined, r
 from spacesim.splat.shadow.sunlight import light_rows, towards_sun
 from spacesim.splat.tiles import RECORDINGS
 
+LARGEST_EV = 40  #: of an exposure, as large as a scene's camera can have; chosen
 SUNS = 4096  #: whose encodings are kept
 COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed by `cooperative` where that works
 
@@ -32,12 +35,30 @@ COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed 
 @dataclass(frozen=True)
 class LightConfig:
     """How light becomes colour. shadow: None leaves shadows to the field (the method `relight`);  linear: colours are
-    linear display values and blended as such, pictures are sRGB-encoded afterwards; else they are sRGB values, as in
-    the thesis (section 7.2 asks for the former)."""
+    linear, shares of what is white, and blended as such, and pictures go through the tone curve afterwards; else they
+    are sRGB values, as in the thesis (section 7.2 asks for the former);  tone: the curve, one of
+    `spacesim.data.tone.TONES`;  exposure: EV of the pictures trained on; both of linear colours alone, by default the
+    dataset's own, which `train` fills in ("srgb", 0 where it does not say)."""
 
     field: FieldConfig = field(default_factory=FieldConfig)
     shadow: ShadowConfig | None = None
     linear: bool = False
+    tone: str | None = None
+    exposure: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("tone", "exposure"):
+            if getattr(self, name) is not None and not self.linear:
+                raise InputError(f"--{name}: expected --linear beside it, found none")
+        if self.tone not in (None, *TONES):
+            raise InputError(f"--tone: expected one of {', '.join(TONES)}, found {self.tone!r}")
+        if self.exposure is not None and not abs(self.exposure) <= LARGEST_EV:
+            raise InputError(f"--exposure: expected -{LARGEST_EV} to {LARGEST_EV} EV, found {self.exposure}")
+
+    @property
+    def curve(self) -> tuple[str, float] | None:
+        """Tone curve and exposure (EV) of linear colours, None of others."""
+        return (self.tone or "srgb", self.exposure or 0.0) if self.linear else None
 
     @property
     def refine(self) -> RefineConfig | None:

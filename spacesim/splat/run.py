@@ -16,12 +16,12 @@ import numpy as np
 from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_json
-from spacesim.data.images import srgb_from_linear
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.light import LightModel
+from spacesim.splat.light import LARGEST_EV, LightModel
 from spacesim.splat.project import Pinhole, Projection
 from spacesim.splat.render import RenderOutput, render
+from spacesim.splat.tone import developed
 from spacesim.splat.train.checkpoint import read_tensors
 from spacesim.splat.train.config import TrainConfig
 
@@ -70,9 +70,21 @@ class Run:
         """Whether the Sun's direction changes what is predicted."""
         return self.light is not None
 
-    def predict(self, camera: Camera, sun: Sun | None = None, normals: bool = False) -> Prediction:
-        """Render one view. The method `vanilla` knows one light: `sun` changes nothing. Raises InputError where another
-        method is not told the Sun."""
+    @property
+    def curve(self) -> tuple[str, float] | None:
+        """Tone curve and exposure (EV) of colours that are blended in linear light; None where they are sRGB values."""
+        return self.light.config.curve if self.light else None
+
+    def predict(
+        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
+    ) -> Prediction:
+        """Render one view. The method `vanilla` knows one light: `sun` changes nothing. exposure: EV, of a model whose
+        colours are linear; by default that of its training pictures. Raises InputError where another method is not told
+        the Sun, and for an exposure of a model whose colours are sRGB values."""
+        if exposure is not None and not self.curve:
+            raise InputError(f"--exposure: expected a run trained with --linear, found {self.path}")
+        if exposure is not None and not abs(exposure) <= LARGEST_EV:
+            raise InputError(f"--exposure: expected -{LARGEST_EV} to {LARGEST_EV} EV, found {exposure}")
         names = ("alpha", "depth", *(("normal",) if normals else ()))
         if self.light is None:
             output = render(self.model, Pinhole.of(camera), outputs=(*names, "colour"), antialiased=self.antialiased)
@@ -86,7 +98,10 @@ class Run:
         visible = np.zeros_like(alpha)
         visibility = np.divide(drawn[..., 3], alpha, out=visible, where=alpha > 0) if drawn.shape[2] > 3 else None
         rgb = drawn[..., :3]
-        return _prediction(output, srgb_from_linear(rgb) if self.light.config.linear else rgb, visibility, normals)
+        if self.curve:
+            tone, taken = self.curve
+            rgb = developed(rgb, tone, 0.0 if exposure is None else exposure - taken)
+        return _prediction(output, rgb, visibility, normals)
 
 
 def draw_lit(

@@ -1,10 +1,42 @@
-"""The sRGB transfer function (IEC 61966-2-1) in Dr.Jit, differentiable: for colours blended in linear light."""
+"""Linear light to sRGB values and back in Dr.Jit, differentiable: for colours that are blended in linear light.
+
+A model's linear colours are in [0, 1]: shares of what its tone curve makes white (`spacesim.data.tone.WHITES`).
+"""
 
 from typing import Any
 
 import drjit as dr
+import numpy as np
+
+from spacesim.data.images import srgb_from_linear
+from spacesim.data.tone import WHITES, filmic
 
 _LINEAR_END, _ENCODED_END = 0.0031308, 0.04045
+
+
+def picture_of(light: Any, tone: str) -> Any:
+    """sRGB values in [0, 1] of linear colours, shares of white, by a tone curve. Arrays of any shape."""
+    if tone == "srgb":
+        return encoded(light)
+    v = WHITES[tone] * dr.clip(light, 0, 1)
+    return encoded(v * dr.fma(2.51, v, 0.03) / dr.fma(v, dr.fma(2.43, v, 0.59), 0.14))  # `filmic`
+
+
+def light_of(values: Any, tone: str) -> Any:
+    """The inverse: linear colours, shares of white, of sRGB values in [0, 1]."""
+    t = decoded(values)
+    if tone == "srgb":
+        return t
+    a, b = 2.51 - 2.43 * t, 0.03 - 0.59 * t  # a v^2 + b v - 0.14 t = 0
+    return dr.clip((dr.sqrt(dr.fma(b, b, 0.56 * a * t)) - b) / (2 * a) / WHITES[tone], 0, 1)
+
+
+def developed(light: np.ndarray, tone: str, stops: float = 0.0) -> np.ndarray:
+    """sRGB values in [0, 1] of a picture of such colours, exposed by `stops` (EV) more than those trained on."""
+    if tone == "srgb" and stops == 0:
+        return srgb_from_linear(light)
+    v = (WHITES[tone] * 2.0**stops) * light
+    return srgb_from_linear(filmic(v) if tone == "filmic" else v)
 
 
 def encoded(linear: Any) -> Any:

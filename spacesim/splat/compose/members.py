@@ -23,7 +23,7 @@ from spacesim.splat.render import view_colours
 from spacesim.splat.run import Run
 from spacesim.splat.shadow.cast import ShadowConfig, Shadows
 from spacesim.splat.tiles import RECORDINGS
-from spacesim.splat.tone import encoded
+from spacesim.splat.tone import picture_of
 
 PLAIN_SHADOWS = ShadowConfig(refine=None)
 """Of a run that was trained without any: a depth test (chosen)."""
@@ -78,9 +78,9 @@ class Member:
         return replace(self.shadow, bias=0.0, grazing="none", mapping=mapping)
 
     @property
-    def linear(self) -> bool:
-        """Whether its colours are linear display values."""
-        return self.run.light is not None and self.run.light.config.linear
+    def curve(self) -> tuple[str, float] | None:
+        """Of its linear colours, see `LightConfig.curve`; None where colours are sRGB values."""
+        return self.run.light.config.curve if self.run.light else None
 
     @property
     def has_shadows(self) -> bool:
@@ -172,9 +172,10 @@ class Ensemble:
         return ad.Bool(np.concatenate([np.full(m.count, f) for m, f in zip(self.members, flags, strict=True)]))
 
     @cached_property
-    def linear(self) -> bool:
-        """Whether the whole is blended in linear light: where all members are."""
-        return bool(self.members) and all(member.linear for member in self.members)
+    def curve(self) -> tuple[str, float] | None:
+        """Of the whole, which is blended in linear light where all members have one curve and exposure."""
+        curves = {member.curve for member in self.members}
+        return curves.pop() if len(curves) == 1 else None
 
     def placed(self, poses: Sequence[Pose]) -> Gaussians:
         """The set with a pose of each member, colours left out (3.11 to 3.13)."""
@@ -196,9 +197,10 @@ class Ensemble:
         return masks
 
 
-def display_colours(colours: list[Any], linear: bool, blended_linear: bool) -> list[Any]:
-    """Colours as they are blended: linear ones are sRGB-encoded first where not all members are linear."""
-    return [encoded(colour) for colour in colours] if linear and not blended_linear else colours
+def display_colours(colours: list[Any], own: tuple[str, float] | None, whole: tuple[str, float] | None) -> list[Any]:
+    """Colours as they are blended: linear ones become sRGB values first where not all are alike. own, whole: `curve` of
+    the member and of the ensemble"""
+    return [picture_of(colour, own[0]) for colour in colours] if own and not whole else colours
 
 
 def _trace_placed(rows: list[Any], owner: Any, table: Any) -> list[Any]:

@@ -19,7 +19,6 @@ from spacesim import backend
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
-from spacesim.data.images import srgb_from_linear
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose.members import Ensemble, Member, display_colours
@@ -28,7 +27,7 @@ from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.render import RenderOutput, render
 from spacesim.splat.run import Prediction, Run
 from spacesim.splat.shadow.cast import Between, cast_between
-from spacesim.splat.tone import encoded
+from spacesim.splat.tone import developed
 
 OUTPUTS = ("rgb", "alpha", "depth", "median_depth", "normal", "visibility", "id")
 SHADOWS = ("others", "ratio", "none")
@@ -75,13 +74,13 @@ class ComposedPrediction(Prediction):
 @dataclass
 class Drawn:
     """A view on the device. output: alpha, depth, ... and `features`, of which `planes` says what they are: "rgb" (3,
-    premultiplied, linear where `linear`), "visibility" (1, premultiplied), "id" (one a model, in the order of `order`)
-    """
+    premultiplied, linear where there is a `curve`), "visibility" (1, premultiplied), "id" (one a model, in the order of
+    `order`)"""
 
     output: RenderOutput
     planes: dict[str, list[Any]]
     order: list[int]
-    linear: bool
+    curve: tuple[str, float] | None
 
     def image(self, name: str) -> np.ndarray:
         """One of `OUTPUTS` that was asked for: rgb [H, W, 3] sRGB values over black, normal [H, W, 3], others [H, W];
@@ -94,7 +93,7 @@ class Drawn:
         planes = [np.array(plane, dtype=np.float32).reshape(shape) for plane in self.planes[name]]
         if name == "rgb":
             rgb = np.stack(planes, axis=-1)
-            return srgb_from_linear(rgb) if self.linear else rgb
+            return developed(rgb, self.curve[0]) if self.curve else rgb
         alpha = self.output.image("alpha")
         if name == "visibility":
             return np.divide(planes[0], alpha, out=np.zeros_like(alpha), where=alpha > 0)
@@ -224,14 +223,14 @@ class Composition:
         )
         drawn = iter(output.features or [])
         found = {name: [next(drawn) for _ in group] for name, group in planes.items()}
-        return Drawn(output, found, self._order(), self._ensemble.linear)
+        return Drawn(output, found, self._order(), self._ensemble.curve)
 
     def lit_gaussians(self, camera: Camera, sun: Sun | None) -> tuple[Gaussians, list[Any]]:
         """(the set in the world, its colours seen from the camera: three Floats [N], sRGB display values), to draw it
         in another way. Raises InputError where the Sun matters and none is told."""
         poses = [self.models[i].pose for i in self._order()]
         colours, _ = self._lit(poses, camera, sun)
-        return self._ensemble.placed(poses), [encoded(c) for c in colours] if self._ensemble.linear else colours
+        return self._ensemble.placed(poses), display_colours(colours, self._ensemble.curve, None)
 
     # ---- light ----
 
@@ -257,10 +256,9 @@ class Composition:
         members = self._ensemble.members
         parts = [self._part(k, poses[k], camera, direction) for k in range(len(poses))]
         parts = [_dimmed(part, share) for part, share in zip(parts, between, strict=True)]
-        linear = [member.linear for member in members]
-        colours = [
-            display_colours(part[0], own, self._ensemble.linear) for part, own in zip(parts, linear, strict=True)
-        ]
+        whole = self._ensemble.curve
+        pairs = zip(parts, members, strict=True)
+        colours = [display_colours(part[0], member.curve, whole) for part, member in pairs]
         joined = self._ensemble.joined(colours)
         if not self._shades and not any(member.has_shadows for member in members):
             return joined, None
@@ -360,8 +358,8 @@ def _tell(models: Sequence[Placed], ensemble: Ensemble) -> None:
             "others dim its colours",
             ", ".join(dict.fromkeys(fixed)),
         )
-    if len({member.linear for member in ensemble.members}) > 1:
-        log.info("colours in linear light stand beside sRGB values: all are blended as sRGB values")
+    if len({member.curve for member in ensemble.members}) > 1:
+        log.info("colours in linear light stand beside others or sRGB values: all are blended as sRGB values")
 
 
 def _bytes(direction: Array | None) -> bytes:

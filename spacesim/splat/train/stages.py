@@ -12,7 +12,7 @@ from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import Footprints, Splats, project
 from spacesim.splat.render import view_colours
 from spacesim.splat.surface import normals
-from spacesim.splat.tone import decoded, encoded
+from spacesim.splat.tone import light_of, picture_of
 from spacesim.splat.train.losses import depth_loss, normal_loss, photometric_loss, visibility_loss
 from spacesim.splat.train.optimizer import adam_step
 from spacesim.splat.train.warm_start import foreground_loss
@@ -54,15 +54,15 @@ class Target:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the terms;  scale: metres, the unit of depth;  linear: colours and background are blended in linear
-    light"""
+    """Weights of the terms;  scale: metres, the unit of depth;  tone: curve of colours that are blended, with the
+    background, in linear light, or None"""
 
     ssim: float
     visibility: float
     depth: float
     normal: float
     scale: float
-    linear: bool
+    tone: str | None
 
 
 def picture_loss(
@@ -72,15 +72,15 @@ def picture_loss(
     channels = [ad.Float((target.rgba >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24)]
     below = ad.Array3f([dr.gather(ad.Float, target.background, ad.UInt32(c)) for c in range(3)])
     straight = ad.Array3f(channels[:3])
-    if config.linear:
-        straight, below = decoded(straight), decoded(below)
+    if config.tone:
+        straight, below = light_of(straight, config.tone), light_of(below, config.tone)
     truth = straight * channels[3] + (1 - channels[3]) * below
     planes = {name: [ad.Float(plane) for plane in group] for name, group in planes.items()}
     transmittance = ad.Float(transmittance)
     dr.enable_grad(planes, transmittance)
     picture = dr.select(target.valid, ad.Array3f(planes["colour"]) + transmittance * below, truth)
-    if config.linear:
-        picture, truth = encoded(picture), encoded(truth)
+    if config.tone:
+        picture, truth = picture_of(picture, config.tone), picture_of(truth, config.tone)
     loss = photometric_loss(picture, truth, *size, ssim_weight=config.ssim)
     known, valid = target.truth, target.valid
     if "visibility" in planes:

@@ -7,6 +7,7 @@ import platform
 import shlex
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from spacesim import backend, ending
 from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, read_json, write_json
 from spacesim.data.records import Camera, Dataset
+from spacesim.data.tone import development
 from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.checkpoint import write_tensors
 from spacesim.splat.train.config import TrainConfig
@@ -42,7 +44,7 @@ def train(
     Ctrl-C on the command line leaves a checkpoint of the step that it came in. Raises InputError where `out` holds a
     run and `resume` is not asked for, or one of another configuration.
     """
-    out = Path(out)
+    out, config = Path(out), _with_development(config, dataset)
     described = {**config.to_json(), "data": _identity(dataset)}
     if (out / "config.json").exists():
         if _checkpoints(out) or (out / "model.safetensors").exists():  # else nothing is there that could be lost
@@ -86,6 +88,16 @@ def train(
     header = {"iteration": trainer.iteration, "config": config.to_json()}
     write_tensors(out / "model.safetensors", trainer.model_tensors(), header)
     return load_run(out)
+
+
+def _with_development(config: TrainConfig, dataset: Dataset) -> TrainConfig:
+    """Linear colours have the tone curve and the exposure of the dataset's pictures, where they were given none."""
+    light = config.light
+    if light is None or not light.linear:
+        return config
+    tone, exposure = development(dataset.scene) or ("srgb", 0.0)
+    light = replace(light, tone=light.tone or tone, exposure=exposure if light.exposure is None else light.exposure)
+    return replace(config, light=light)
 
 
 def versions() -> dict[str, str]:

@@ -84,7 +84,7 @@ class Trainer:
             config.depth_weight,
             config.normal_weight,
             self.scene_scale,
-            config.light is not None and config.light.linear,
+            config.light.curve[0] if config.light and config.light.curve else None,
         )
         self.history: list[dict[str, float]] = []
         self._project = recorded(project_views, RECORDINGS)
