@@ -6,7 +6,7 @@ as given, and so do shadows, as in the literature, unless `ShadowConfig.gradient
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -207,7 +207,8 @@ class LightModel:
         made under this Sun for an earlier picture. What the field's first layer
         makes of the features does not change with Sun or camera and stays for the next picture: as many numbers for
         each Gaussian as the layer has units."""
-        _, inputs = self._inputs(gaussians, camera, sun, adaptive, known)
+        of_any_size = replace(camera, width=1, height=1)  # directions do not depend on it: one recording for all sizes
+        _, inputs = self._inputs(gaussians, of_any_size, sun, adaptive, known)
         lanes = Lanes.of(gaussians.count, still=True)
         kept = self._kept_of(gaussians.features, lanes)
         colours, visibility = _lit(self.config, self.weights, inputs, lanes, kept.known, kept.packed)

@@ -5,6 +5,7 @@ fail in a handler with a traceback. Here only the few that the viewer's controls
 page of another site that a user has open may connect to a server on loopback, too; browsers say where a page is from.
 """
 
+import asyncio
 import logging
 import math
 from collections.abc import Callable, Coroutine
@@ -110,6 +111,24 @@ def guard(handler: Any) -> None:
             _log.debug("viewer: a message of client %s failed (%s)", client, error, exc_info=error)
 
     handler._handle_incoming_message = handle
+
+
+class _Alarm(asyncio.Event):
+    """Set from the event loop's thread alone. viser sets it at once from whichever thread has a message, then again on
+    that thread: the former may meet the loop in the middle of its list of those who wait, and fail."""
+
+    def set(self) -> None:
+        try:
+            asyncio.get_running_loop()
+        except RuntimeError:  # another thread
+            return
+        super().set()
+
+
+def wake_in_turn(handler: Any) -> None:
+    """From now on other threads may send through a server or a connection (viser's infra), one that nothing was sent
+    through yet, without harm to its event loop."""
+    handler.get_message_buffer().message_event = _Alarm()
 
 
 def is_foreign(headers: Any) -> bool:

@@ -11,10 +11,12 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 REST = 0.2  #: seconds without a new wish after which a view is at rest, chosen
 PATIENCE = 0.5  #: seconds that a view at rest waits for others that move, chosen
+TIDY = 20.0  #: seconds between two times that the loop tidies up while nothing is to be drawn, chosen
 
 _log = logging.getLogger(__name__)
 
@@ -28,10 +30,12 @@ class Wish:
 
 
 class RenderLoop:
-    """Draws what clients wish for, until `stop`."""
+    """Draws what clients wish for, until `stop`. tidy: called now and then after pictures, on the render thread: every
+    `every` seconds where there is a pause, or after twice as many where there is none"""
 
-    def __init__(self, rest: float = REST) -> None:
-        self._rest = rest
+    def __init__(self, rest: float = REST, tidy: Callable[[], Any] | None = None, every: float = TIDY) -> None:
+        self._rest, self._tidy, self._every = rest, tidy, every
+        self._tidy_at: float | None = None  # None where nothing was drawn since the last time
         self._wishes: OrderedDict[Hashable, tuple[Wish, bool]] = OrderedDict()
         self._resting: dict[Hashable, tuple[float, Wish]] = {}
         self._work: list[Callable[[], Any]] = []
@@ -75,7 +79,8 @@ class RenderLoop:
             with self._changed:
                 task = self._next()
                 while task is None and self._going:
-                    due = min((moment for moment, _ in self._resting.values()), default=None)
+                    moments = [moment for moment, _ in self._resting.values()]
+                    due = min(moments + ([] if self._tidy_at is None else [self._tidy_at]), default=None)
                     self._changed.wait(None if due is None else max(due - time.monotonic(), 0.0))
                     task = self._next()
                 if not self._going:
@@ -92,20 +97,31 @@ class RenderLoop:
         if self._work:
             return self._work.pop(0)
         now = time.monotonic()
-        late = self._rested(now - PATIENCE)
-        if late is not None:
-            return late
-        if self._wishes:
+        task = self._untidy(now - self._every) or self._rested(now - PATIENCE)
+        if task is None and self._wishes:
             client, (wish, moving) = self._wishes.popitem(last=False)
             if moving:
                 self._resting[client] = (now + self._rest, wish)
-            return lambda: wish.draw(not moving)
-        return self._rested(now)
+            task = self._drawing(partial(wish.draw, not moving))
+        return task or self._rested(now) or self._untidy(now)
 
     def _rested(self, now: float) -> Callable[[], Any] | None:
         """A picture in full resolution that was due before `now`. The lock is held."""
         for client, (moment, wish) in self._resting.items():
             if moment <= now:
                 del self._resting[client]
-                return lambda: wish.draw(True)
+                return self._drawing(partial(wish.draw, True))
         return None
+
+    def _drawing(self, draw: Callable[[], Any]) -> Callable[[], Any]:
+        """A picture, after which there may be something to tidy up. The lock is held."""
+        if self._tidy is not None and self._tidy_at is None:
+            self._tidy_at = time.monotonic() + self._every
+        return draw
+
+    def _untidy(self, now: float) -> Callable[[], Any] | None:
+        """Tidying that was due before `now`. The lock is held."""
+        if self._tidy_at is None or self._tidy_at > now:
+            return None
+        self._tidy_at = None
+        return self._tidy

@@ -20,9 +20,10 @@ from spacesim.data.records import Camera, Dataset
 from spacesim.viewer import address
 from spacesim.viewer.client import Client, fov_to_hold
 from spacesim.viewer.controls import ModelControls, SunControls
-from spacesim.viewer.gate import Quiet, guard, is_foreign
+from spacesim.viewer.gate import Quiet, guard, is_foreign, wake_in_turn
 from spacesim.viewer.handles import Gizmos, SunHandle
 from spacesim.viewer.loop import RenderLoop
+from spacesim.viewer.memory import give_back
 from spacesim.viewer.path import Path as CameraPath
 from spacesim.viewer.pathcontrols import FileControls, PathControls
 from spacesim.viewer.stage import Stage
@@ -57,7 +58,7 @@ class Viewer:
     def __init__(self, show: Show, host: str = "127.0.0.1", port: int = 8080) -> None:
         self.show = show
         self.shared = Shared(show.stand)
-        self.loop = RenderLoop()
+        self.loop = RenderLoop(tidy=give_back)
         self.clients: dict[int, Client] = {}
         self._lock = threading.Lock()
         self._truth = TruthService(show.data, show.dataset, show.stand)
@@ -207,9 +208,11 @@ def _serve(host: str, port: int) -> Any:
         server = viser.ViserServer(host=host, port=port, verbose=False)
     inner = server._websock_server
     guard(inner)
+    wake_in_turn(inner)
 
     async def admit(connection: Any) -> None:
         guard(connection)
+        wake_in_turn(connection)
         live = inner._live_connections.get(connection.client_id)
         headers = live.request.headers if live is not None and live.request is not None else {}
         if live is not None and is_foreign(headers):

@@ -1,10 +1,13 @@
 """Clients without a browser: pictures for them, nonsense from them, leaving in the middle, memory."""
 
+import gc
 import random
+import resource
 import threading
 import time
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +16,8 @@ from browser import wait_for
 from spacesim.data.geometry import look_at, quaternion_from_rotation
 from spacesim.data.records import Sun
 from spacesim.splat.compose.pose import LARGEST, SMALLEST, Pose
+from spacesim.viewer.client import Client
+from spacesim.viewer.memory import give_back
 from spacesim.viewer.state import Stand
 
 viser = pytest.importorskip("viser", reason="viser is not installed")
@@ -180,30 +185,57 @@ def test_the_page_is_served_and_nothing_else(viewer):
         urllib.request.urlopen(f"{viewer.url}/../../../etc/passwd", timeout=10)
 
 
-def test_looking_around_takes_no_memory(viewer, at_start):
-    """A few hundred pictures under changing Suns and poses, after as many to warm up."""
+def memory(viewer):
+    """Bytes of this process that are in memory once what is free has gone back to the system."""
+    done, found = threading.Event(), []
 
-    def resident():
+    def read():
+        gc.collect()
+        give_back()
         with open("/proc/self/statm") as file:
-            return int(file.read().split()[1]) * 4096
+            found.append(int(file.read().split()[1]) * resource.getpagesize())
+        done.set()
 
-    def look_around(socket, count):
-        for k in range(count):
-            socket.send(camera_message(0.02 * k))
-            viewer.put(Stand(at_start.poses, Sun.from_angles(3 * k % 360, 30)))
-            pictures(socket, 1)
+    viewer.loop.do(read)
+    assert done.wait(30)
+    return found[0]
 
-    try:
-        with open("/proc/self/statm"):
-            pass
-    except OSError:
-        pytest.skip("no /proc to read the memory from")
-    with connected(viewer) as socket:
-        look_around(socket, 60)
-        before = resident()
-        look_around(socket, 100)
-        grown = resident() - before
-    assert grown < 20 << 20, f"{grown / 2**20:.1f} MiB"
+
+def growth(viewer, stand):
+    """Bytes more in memory after 80 pictures under changing Suns for clients that come and go, after as many to warm
+    up."""
+
+    def look_around(rounds):
+        for k in range(rounds):
+            with connected(viewer) as socket:
+                for j in range(20):
+                    socket.send(camera_message(0.02 * j + k))
+                    viewer.put(Stand(stand.poses, Sun.from_angles(7 * j + 40 * k, 30)))
+                    pictures(socket, 1)
+        wait_for(lambda: not viewer.clients, "all to be gone")
+
+    look_around(4)
+    before = memory(viewer)
+    look_around(4)
+    return memory(viewer) - before
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc to read the memory from")
+@pytest.mark.parametrize("keeps", [False, True])
+def test_looking_around_takes_no_memory(viewer, at_start, monkeypatch, keeps):
+    """And a viewer that kept its pictures would be found out."""
+    kept, show = [], Client.show
+
+    def keep(self, picture, sharp):
+        kept.append(picture.copy())
+        show(self, picture, sharp)
+
+    monkeypatch.setattr("spacesim.viewer.frames.BUDGET", 1e9)  # all pictures in full resolution, however slow
+    if keeps:
+        monkeypatch.setattr(Client, "show", keep)
+    grown = growth(viewer, at_start)
+    pictured = 80 * 384 * 288 * 3  # bytes of the pictures
+    assert grown > 0.7 * pictured if keeps else grown < 0.25 * pictured, f"{grown / 2**20:.1f} MiB"
 
 
 def messages_of(data):

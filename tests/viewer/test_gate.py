@@ -2,11 +2,13 @@
 
 import asyncio
 import random
+import threading
 
 import pytest
+from browser import wait_for
 
 from spacesim.viewer.address import ATTEMPTS, free_port, is_loopback, url
-from spacesim.viewer.gate import admitted, guard, is_foreign
+from spacesim.viewer.gate import admitted, guard, is_foreign, wake_in_turn
 
 pytest.importorskip("viser", reason="viser is not installed")
 from viser import _messages as messages
@@ -144,3 +146,35 @@ def test_ports_and_hosts():
     ]
     assert url("0.0.0.0", 80) == "http://localhost:80"
     assert url("::1", 80) == "http://[::1]:80"
+
+
+def test_the_event_loop_is_woken_by_its_own_thread_alone():
+    """Another thread that goes through the list of those who wait meets changes in it: "deque mutated"."""
+    from viser.infra._async_message_buffer import AsyncMessageBuffer
+
+    loop = asyncio.new_event_loop()
+    buffer = AsyncMessageBuffer(loop, persistent_messages=True)
+    handler = type("Handler", (), {"get_message_buffer": lambda _: buffer})()
+    wake_in_turn(handler)
+    told = []
+
+    async def listen():
+        windows = buffer.window_generator(0)
+        while len(told) < 50:
+            told.extend(await anext(windows))
+        await windows.aclose()
+
+    def send():
+        for k in range(50):
+            buffer.push(messages.SetGuiPanelLabelMessage(str(k)) if k else GOOD[0])
+            wait_for(lambda k=k: len(told) > k, "each to be heard before the next", 20)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    loop.run_until_complete(asyncio.wait_for(listen(), 20))
+    thread.join()
+    loop.close()
+    assert [message.label for message in told[1:]] == [str(k) for k in range(1, 50)]
+    buffer.message_event.clear()
+    buffer.message_event.set()
+    assert not buffer.message_event.is_set()

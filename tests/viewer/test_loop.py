@@ -101,3 +101,34 @@ def test_a_picture_that_fails_ends_no_others(caplog):
     loop.stop()
     assert "out of memory" in caplog.text
     assert not loop._thread.is_alive()
+
+
+def test_it_tidies_up_in_pauses_once_after_pictures():
+    drawn, tidied = Drawn(), []
+    loop = RenderLoop(0.01, lambda: tidied.append((len(drawn.made), threading.current_thread().name)), 0.15)
+    loop.start()
+    time.sleep(0.4)
+    assert tidied == []  # nothing was drawn
+    loop.wish("a", drawn.wish(1))
+    wait_for(lambda: tidied, "the tidying")
+    time.sleep(0.4)
+    assert tidied == [(2, "render")]
+    loop.wish("a", drawn.wish(2), moving=False)
+    wait_for(lambda: len(tidied) == 2, "another one")
+    loop.stop()
+
+
+def test_it_tidies_up_between_pictures_that_never_end():
+    drawn, tidied = [], []
+    loop = RenderLoop(60, lambda: tidied.append(len(drawn)), 0.1)
+
+    def draw(_full):
+        time.sleep(0.002)
+        drawn.append(True)
+        loop.wish("a", Wish(draw))
+
+    loop.start()
+    loop.wish("a", Wish(draw))
+    wait_for(lambda: len(tidied) > 1, "the tidying")
+    loop.stop()
+    assert 0 < tidied[0] < tidied[1] <= len(drawn)

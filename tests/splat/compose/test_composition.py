@@ -11,6 +11,7 @@ from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.data.records import Camera, Sun
+from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose import ComposeConfig, Composition, Placed, Pose
 from spacesim.splat.compose.pose import rotation_about
 
@@ -295,6 +296,18 @@ def test_moving_anything_compiles_nothing_and_repeats_to_the_bit():
         same(one, other)
     fresh = Composition(scene.models)
     same(fresh.predict(EYE, SUN), scene.predict(EYE, SUN))  # what was kept was right
+
+
+@pytest.mark.parametrize("method", ["relight", "map", "linear", "surface"])
+def test_colours_are_recorded_once_for_pictures_of_all_sizes(method):
+    run = made_run(method, 4)
+    camera = Pinhole.of(EYE)
+    colours = [np.array(colour) for colour in run.light.lit(run.model, camera, SUN.direction)[0]]
+    warm = backend.recordings()
+    for size in (16, 50, 33):
+        other = run.light.lit(run.model, replace(camera, width=size, height=size + 9), SUN.direction)[0]
+        assert all(np.array_equal(one, np.array(two)) for one, two in zip(colours, other, strict=True))
+    assert backend.recordings() == warm
 
 
 def test_only_what_is_asked_for_is_computed(monkeypatch):
