@@ -1,30 +1,37 @@
-"""Prints the first table of docs/shadows.md's section on bias: python tests/splat/shadow/acne.py     5 seconds
+"""Prints the tables of a flat plate in docs/shadows.md: python tests/splat/shadow/acne.py     a minute
 
-Acne is the share of a bare plate's discs that count as shadowed; recession, how far the shadow of a screen that stands
-on it has withdrawn from its foot, and its tip from where it should be.
+Acne is the share of a bare plate's discs that count as shadowed (mapping), and their mean occlusion (splatting, which
+darkens by degrees), in percent; recession, how far the shadow of a screen that stands on it has withdrawn from its
+foot, and how far its tip is beyond where it should be, in millimetres.
 """
 
-from walls import BIASES, acne, screen_shadow
+import math
+from dataclasses import replace
 
+from walls import BIASES, acne, screen_shadow, way
+
+from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.shadow.mapping import MappingConfig
 
 COUNT = 20_000
+ELEVATIONS = (1, 2, 3, 5, 10, 15, 20, 30, 45, 60, 75, 90)
 
 
 def main() -> None:
-    print(f"| Sun [deg] | {' | '.join(BIASES)} | variance |")
-    for elevation in (1, 2, 3, 5, 10, 15, 20, 30, 45, 60, 75, 90):
-        cells = [cell(elevation, bias, None) for bias in BIASES]
-        cells.append(cell(elevation, "lifted", MappingConfig("variance")))
-        print(f"| {elevation} | {' | '.join(cells)} |", flush=True)
+    for method in ("mapping", "splatting"):
+        ways = {name: way(name, method) for name in (*BIASES, "shipped")}
+        if method == "mapping":
+            ways["lifted, variance"] = replace(ways["lifted"], mapping=MappingConfig("variance"))
+        print(f"\n| {method}: Sun [°] | {' | '.join(ways)} |")
+        for elevation in ELEVATIONS:
+            print(f"| {elevation} | {' | '.join(cell(elevation, config) for config in ways.values())} |", flush=True)
 
 
-def cell(elevation: float, bias: str, config: MappingConfig | None) -> str:
-    share = 100 * acne(elevation, bias, COUNT, config)
-    if elevation > 80:
-        return f"{share:.1f} % · – · –"
-    foot, tip = (f"{1000 * metres:.0f}" for metres in screen_shadow(elevation, bias, COUNT, config))
-    return f"{share:.1f} % · {foot} · {tip.replace('nan', '–')}"
+def cell(elevation: float, config: ShadowConfig) -> str:
+    mean, share = acne(elevation, config, COUNT)
+    found = (math.nan, math.nan) if elevation > 80 else screen_shadow(elevation, config, COUNT)
+    lengths = ["–" if math.isnan(metres) else f"{1000 * metres:.0f}" for metres in found]
+    return " · ".join([f"{100 * (share if config.method == 'mapping' else mean):.1f}", *lengths])
 
 
 if __name__ == "__main__":

@@ -1,44 +1,54 @@
 """Prints docs/shadows.md's table of raw shadows on a trained model: python tests/splat/shadow/against_truth.py RUN DATA
 
-RUN: a trained run (`spacesim train`), DATA: a dataset of the same object under many Suns. Visibility is drawn, and
-judged where the truth is lit or in cast shadow and the model is there (alpha above 1/2); at least one half is lit.
+RUN: a trained run (`spacesim train`), DATA: a dataset of the same object under many Suns, of which those are judged
+that no training frame has, if there are such. Visibility is drawn, and judged where the truth is lit or in cast shadow
+and the model is there (alpha above 1/2); at least one half is lit.
 """
 
 import argparse
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from spacesim.backend import ad
-from spacesim.data.records import Dataset
+from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_SELF_CAST, load_truth, read_dataset
+from spacesim.eval.suns import known_suns
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import Pinhole
 from spacesim.splat.render import render
-from spacesim.splat.shadow.bias import grazing_bias, lifted, receiver_bias
-from spacesim.splat.shadow.mapping import MappingConfig, occlusion_by_mapping
-from spacesim.splat.shadow.sunlight import fit_camera, light_rows, towards_sun
+from spacesim.splat.shadow.cast import ShadowConfig, cast_shadows
+from spacesim.splat.shadow.mapping import MappingConfig
+from spacesim.splat.shadow.sunlight import light_rows
 from spacesim.splat.train.checkpoint import read_tensors
+from spacesim.splat.train.config import preset
 
 EDGES = (0, 5, 10, 20, 40, 90)  #: degrees of the Sun above the surface
-VARIANCE = MappingConfig("variance")
-CLOSER = MappingConfig("percentage-closer", radius=1.0)
-#: name: (lambda_b, what else, filter)
-WAYS: dict[str, tuple[float, str, MappingConfig | None]] = {
-    "no bias": (0, "", None),
-    "thesis, λ = 3": (3, "", None),
-    "thesis, λ = 10": (10, "", None),
-    "thesis, λ = 30": (30, "", None),
-    "λ = 10, grazing bias": (10, "bias", None),
-    "λ = 5, lifted": (5, "lift", None),
-    "λ = 10, lifted": (10, "lift", None),
-    "λ = 10, percentage-closer": (10, "", CLOSER),
-    "λ = 10, variance": (10, "", VARIANCE),
-    "λ = 3, lifted, variance": (3, "lift", VARIANCE),
-    "λ = 10, lifted, variance": (10, "lift", VARIANCE),
-}
+VIEWS = 3  #: of each Sun
+
+
+def ways(size: int) -> dict[str, ShadowConfig]:
+    """Shadows by name."""
+    found: dict[str, ShadowConfig] = {}
+    for method in ("mapping", "splatting"):
+        for bias, grazing in ((0.0, "none"), (3.0, "none"), (10.0, "none"), (30.0, "none"), (10.0, "bias")):
+            what = {"none": "", "bias": ", grazing bias"}[grazing]
+            found[f"{method}, λ = {bias:g}{what}"] = ShadowConfig(method, size, bias, grazing)
+        for bias, grazing in ((5.0, "lift"), (10.0, "lift"), (5.0, "both")):
+            what = {"lift": "lifted", "both": "lifted, grazing bias"}[grazing]
+            found[f"{method}, λ = {bias:g}, {what}"] = ShadowConfig(method, size, bias, grazing)
+        if method == "mapping":
+            for name in ("percentage-closer", "variance", "median"):
+                reading = MappingConfig(name)
+                found[f"{method}, λ = 5, lifted, {name}"] = ShadowConfig(method, size, 5.0, "lift", mapping=reading)
+    for method, kind in (("mapping", "shadow-map"), ("splatting", "shadow-splat")):
+        light = preset("fast", kind).light
+        assert light is not None
+        assert light.shadow is not None
+        found[f"{method}, as shipped"] = light.shadow
+    return found
 
 
 def main() -> None:
@@ -49,32 +59,38 @@ def main() -> None:
     options = parser.parse_args()
     gaussians = Gaussians.from_numpy(read_tensors(options.run / "model.safetensors")[0])
     dataset = read_dataset(options.data)
+    frames = unseen(dataset)
+    distance = max(float(np.linalg.norm(frame.camera.position)) for frame in dataset.train)
+    print(f"{gaussians.count} Gaussians, {len(frames)} frames")
     grazing = " | ".join(f"{low}–{high}°" for low, high in itertools.pairwise(EDGES))
     print(f"| raw shadows | error | balanced | lit, but dark | cast, but lit | attached, but lit | dark at {grazing} |")
-    for name, way in WAYS.items():
-        shares = judged(gaussians, dataset, lambda sun, way=way: occlusion(gaussians, sun, options.size, *way))
+    for name, config in ways(options.size).items():
+
+        def occlude(sun: np.ndarray, config: ShadowConfig = config) -> np.ndarray:
+            return np.array(cast_shadows(gaussians, light_rows(sun), config, distance).occlusion)
+
+        shares = judged(gaussians, dataset, frames, occlude)
         print(f"| {name} | {' | '.join(f'{100 * share:.1f}' for share in shares)} |", flush=True)
 
 
-def occlusion(
-    gaussians: Gaussians, sun: np.ndarray, size: int, strength: float, more: str, config: MappingConfig | None
-) -> np.ndarray:
-    """[N] raw occlusion for a Sun in the direction `sun` [3]."""
-    light = light_rows(sun)
-    camera = fit_camera(gaussians, light, size)
-    bias = receiver_bias(gaussians, towards_sun(light), strength)
-    if more == "bias":
-        bias = bias.at_least(grazing_bias(gaussians, camera))
-    points = lifted(gaussians, towards_sun(light)) if more == "lift" else None
-    return np.array(occlusion_by_mapping(gaussians, camera, bias.bias, 1e-5, config, points))
+def unseen(dataset: Dataset) -> list[Frame]:
+    """At most VIEWS frames of each Sun that training has not seen, of each that it has where there is no other."""
+    known = known_suns(dataset.test, dataset.train)
+    frames = [frame for frame, seen in zip(dataset.test, known, strict=True) if seen is False] or dataset.frames
+    found: dict[tuple[float, ...], list[Frame]] = {}
+    for frame in frames:
+        found.setdefault(tuple(frame.sun.direction), []).append(frame)
+    return [frame for of_sun in found.values() for frame in of_sun[:VIEWS]]
 
 
-def judged(gaussians: Gaussians, dataset: Dataset, occlude: Callable[[np.ndarray], np.ndarray]) -> list[float]:
+def judged(
+    gaussians: Gaussians, dataset: Dataset, frames: Sequence[Frame], occlude: Callable[[np.ndarray], np.ndarray]
+) -> list[float]:
     """Error rate, balanced error rate, share of lit pixels that are dark, of those in cast and in attached shadow that
     are lit; then the share of lit pixels that are dark, by the Sun's elevation over the surface (`EDGES`)."""
     known: dict[tuple[float, ...], np.ndarray] = {}
     counts, attached = np.zeros((len(EDGES) - 1, 4)), np.zeros(2)
-    for frame in dataset.frames:
+    for frame in frames:
         truth = load_truth(dataset, frame)
         sun = tuple(frame.sun.direction)
         if sun not in known:

@@ -1,21 +1,33 @@
-"""Flat sheets of Gaussians, uneven as trained ones are, for tests and for the table of biases."""
+"""Flat sheets of Gaussians, uneven as trained ones are, for tests and for the tables of biases."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from spacesim.backend import ad
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.shadow.bias import grazing_bias, lifted, receiver_bias
-from spacesim.splat.shadow.cast import cast_shadows
-from spacesim.splat.shadow.mapping import MappingConfig, occlusion_by_mapping
-from spacesim.splat.shadow.sunlight import fit_camera, light_rows, towards_sun
+from spacesim.splat.shadow.cast import ShadowConfig, cast_shadows
+from spacesim.splat.shadow.mapping import MappingConfig
+from spacesim.splat.shadow.sunlight import light_rows
 from spacesim.splat.train.config import preset
 
 SCREEN = 0.25  #: metres, height
-BIASES = ("none", "thesis", "grazing bias", "lifted")
-SHIPPED = ("shadow-map", "shadow-splat")  #: methods, with the shadows of the preset `fast`
 DISTANCE = 5.0  #: metres, of the farthest camera, on which the softness depends
+SHIPPED = {"mapping": "shadow-map", "splatting": "shadow-splat"}  #: methods of `spacesim train`
+#: what is done against acne, beside the thesis's way to read the light's picture
+BIASES = {
+    "none": {"bias": 0.0},
+    "thesis": {"bias": 10.0},
+    "grazing bias": {"bias": 10.0, "grazing": "bias"},
+    "lifted": {"bias": 10.0, "grazing": "lift"},
+    "both": {"bias": 10.0, "grazing": "both"},
+}
+
+
+def way(name: str, method: str = "mapping", size: int = 512) -> ShadowConfig:
+    """Of BIASES, or "shipped": that of the presets `fast` and `demo`."""
+    if name == "shipped":
+        return replace(preset("fast", SHIPPED[method]).light.shadow, size=size)
+    return ShadowConfig(method, size, mapping=MappingConfig(), **BIASES[name])
 
 
 def sheet(corner, along, across, count: int, rng: np.random.Generator, width: float) -> dict[str, np.ndarray]:
@@ -47,41 +59,31 @@ def plate(count: int, screen: bool = False, seed: int = 0) -> dict[str, np.ndarr
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def plate_occlusion(arrays, elevation: float, bias: str, config: MappingConfig | None = None, size: int = 512):
-    """[N] occlusion, the Sun `elevation` degrees above the plate, towards -x. bias: of BIASES, or of SHIPPED"""
-    gaussians = Gaussians.from_numpy(arrays)
+def plate_occlusion(arrays: dict[str, np.ndarray], elevation: float, config: ShadowConfig) -> np.ndarray:
+    """[N], the Sun `elevation` degrees above the plate, towards -x."""
     light = light_rows([-np.cos(np.radians(elevation)), 0, np.sin(np.radians(elevation))])
-    if bias in SHIPPED:
-        shadow = replace(preset("fast", bias).light.shadow, size=size)
-        return np.array(cast_shadows(gaussians, light, shadow, DISTANCE).occlusion)
-    camera = fit_camera(gaussians, light, size)
-    biases = receiver_bias(gaussians, towards_sun(light))
-    if bias == "grazing bias":
-        biases = biases.at_least(grazing_bias(gaussians, camera))
-    depths = ad.Float(np.zeros(gaussians.count)) if bias == "none" else biases.bias
-    points = lifted(gaussians, towards_sun(light)) if bias == "lifted" else None
-    return np.array(occlusion_by_mapping(gaussians, camera, depths, 1e-5, config, points))
+    return np.array(cast_shadows(Gaussians.from_numpy(arrays), light, config, DISTANCE).occlusion)
 
 
-def acne(elevation: float, bias: str, count: int, config: MappingConfig | None = None) -> float:
-    """Share of the bare plate's discs that count as shadowed; a border of 5 cm is left out."""
+def acne(elevation: float, config: ShadowConfig, count: int) -> tuple[float, float]:
+    """(mean occlusion of the bare plate, which should be 0, share of its discs that count as shadowed); a border of
+    5 cm is left out."""
     arrays = plate(count)
     inner = np.all(np.abs(arrays["means"][:, :2]) < 0.95, axis=1)
-    return float((plate_occlusion(arrays, elevation, bias, config)[inner] > 0.5).mean())
+    occlusion = plate_occlusion(arrays, elevation, config)[inner]
+    return float(occlusion.mean()), float((occlusion > 0.5).mean())
 
 
-def screen_shadow(elevation: float, bias: str, count: int, config: MappingConfig | None = None) -> tuple[float, float]:
-    """(metres by which the screen's shadow recedes from its foot, those by which its tip is off): how much of a strip's
-    discs, from the foot to 10 cm before the tip, is lit, and from there to 10 cm behind it, dark, as lengths."""
+def screen_shadow(elevation: float, config: ShadowConfig, count: int) -> tuple[float, float]:
+    """(metres by which the screen's shadow recedes from its foot, those by which its tip is off, nan where it is not on
+    the plate): how much of a strip's discs, from the foot to 10 cm before the tip, is lit, and from there to 10 cm
+    behind it, dark, as lengths."""
     arrays = plate(count, screen=True)
     x, y = arrays["means"][:count, :2].T
-    dark = plate_occlusion(arrays, elevation, bias, config)[:count] > 0.5
+    dark = plate_occlusion(arrays, elevation, config)[:count] > 0.5
     strip, tip = np.abs(y) < 0.4, SCREEN / np.tan(np.radians(elevation))
-    foot_end = min(0.5 * tip, 0.5)
-    foot = strip & (x > 0) & (x < foot_end)
-    recedes = float((~dark[foot]).mean() * foot_end)
-    if tip + 0.1 > 0.95:
+    end, near, far = min(0.5 * tip, 0.5), max(tip - 0.1, 0.5 * tip), tip + 0.1
+    recedes = float((~dark[strip & (x > 0) & (x < end)]).mean() * end)
+    if far > 0.95:
         return recedes, float("nan")
-    near, far = max(tip - 0.1, 0.5 * tip), tip + 0.1
-    edge = strip & (x > near) & (x < far)
-    return recedes, float(near + dark[edge].mean() * (far - near) - tip)
+    return recedes, float(near + dark[strip & (x > near) & (x < far)].mean() * (far - near) - tip)
