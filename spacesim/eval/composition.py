@@ -9,6 +9,7 @@ from spacesim.data.records import Camera, Sun
 
 if TYPE_CHECKING:
     from spacesim.splat.compose import ComposedPrediction, Composition
+    from spacesim.splat.gaussians import Gaussians
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,16 @@ class ComposedRun:
     def relightable(self) -> bool:
         """Whether the Sun's direction changes what is predicted."""
         return self.composition.relightable
+
+    @property
+    def model(self) -> "Gaussians":
+        """All models' Gaussians where they stand, colours left out."""
+        return self.composition.in_world()
+
+    @property
+    def antialiased(self) -> Any:
+        """Whether they are drawn with the anti-aliasing filter: one for all, or of each."""
+        return self.composition.antialiased
 
     @cached_property
     def config(self) -> dict[str, Any]:

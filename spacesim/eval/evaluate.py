@@ -27,7 +27,7 @@ from spacesim.eval.judge import judge_picture, judge_visibility, light_of, tally
 from spacesim.eval.labels import GROUPS
 from spacesim.eval.notes import explain, explain_light, explain_objects
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
-from spacesim.eval.objects import judge_objects, object_names
+from spacesim.eval.objects import judge_object_shapes, judge_objects, object_names
 from spacesim.eval.relight import write_sweep
 from spacesim.eval.shape import write_shapes
 from spacesim.eval.suns import count_suns, known_suns, rounded_angles
@@ -92,7 +92,7 @@ def evaluate(
     sweep, no_sweep = write_sweep(run, dataset, frames, out)
     if progress:
         progress(len(frames), len(frames), "its shape" if config.geometry else "")
-    shape = _judge_shape(run, dataset, config.geometry)
+    shape, shapes = _judge_shapes(run, dataset, objects, config.geometry)
     write_shapes(out / "geometry", shape)
 
     method = str(run.config.get("method"))
@@ -110,7 +110,7 @@ def evaluate(
         },
         **_summaries(judged),
         "geometry": shape.values,
-        "objects": _by_object(judged, objects),
+        "objects": _by_object(judged, objects, shapes),
         "known_suns": _over([one for one in judged if one.known is True]),
         "unseen_suns": _over([one for one in judged if one.known is False]),
         "relight": sweep,
@@ -148,12 +148,15 @@ class Judgement:
     seconds: float
 
 
-def _judge_shape(run: "Run", dataset: Dataset, config: GeometryConfig | None) -> JudgedShape:
-    """A mesh that cannot be read, or a grid that does not fit, costs the shape's numbers and no others."""
+def _judge_shapes(
+    run: "Run", dataset: Dataset, objects: Mapping[int, str], config: GeometryConfig | None
+) -> tuple[JudgedShape, dict[int, dict[str, Any] | None]]:
+    """Of the whole, and of each object where models stand for them. A mesh that cannot be read, or a grid that does not
+    fit, costs the shape's numbers and no others."""
     try:
-        return judge_geometry(run, dataset, config)
+        return judge_geometry(run, dataset, config), judge_object_shapes(run, dataset, objects, config)
     except InputError as error:
-        return JudgedShape(None, f"Geometry is null: {error}.")
+        return JudgedShape(None, f"Geometry is null: {error}."), {}
 
 
 def _judge(
@@ -185,15 +188,18 @@ def _summaries(judged: Sequence[Judgement]) -> dict[str, Any]:
     return {**groups, "by_grazing_angle": grazing.summary(one.grazing for one in judged)}
 
 
-def _by_object(judged: Sequence[Judgement], names: Mapping[int, str]) -> list[dict[str, Any]] | None:
-    """Of each object that a frame shows: number, name, in how many frames, the groups over its pixels; None for data
-    with one object."""
+def _by_object(
+    judged: Sequence[Judgement], names: Mapping[int, str], shapes: Mapping[int, dict[str, Any] | None]
+) -> list[dict[str, Any]] | None:
+    """Of each object that a frame shows: number, name, in how many frames, the groups over its pixels, its shape; None
+    for data with one object."""
     found: list[dict[str, Any]] = []
     for number, name in names.items():
         records = [one.record["objects"][name] for one in judged if name in one.record["objects"]]
         if records:
             groups = {group: summary(record[group] for record in records) for group in OBJECT_GROUPS}
-            found.append({"id": number, "name": name, "frames": len(records), **groups})
+            own = {"id": number, "name": name, "frames": len(records), **groups, "geometry": shapes.get(number)}
+            found.append(own)
     return found or None
 
 

@@ -1,7 +1,7 @@
 """How far the shape of a run is from the true one: distances between samples of what can be seen of both surfaces, the
 overlap of what they fill, and how much of the run floats beside the object (thesis 2.3 and 5.2.3)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -11,13 +11,15 @@ from scipy.spatial import cKDTree
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.mesh import SignedDistance, read_mesh
-from spacesim.data.records import Dataset
+from spacesim.data.records import Camera, Dataset
+from spacesim.eval.composition import ComposedRun
 from spacesim.eval.exterior import Samples, exterior_samples
 from spacesim.eval.solid import filled
 from spacesim.splat.fusion import Grid
-from spacesim.splat.meshing import MeshConfig, RunMesh, mesh_of
+from spacesim.splat.meshing import MeshConfig, RunMesh, cameras_around, mesh_of
 
 if TYPE_CHECKING:
+    from spacesim.splat.gaussians import Gaussians
     from spacesim.splat.run import Run
 
 QUANTILE = 0.99  #: of the distances: the Hausdorff distance without its outliers
@@ -83,26 +85,39 @@ class JudgedShape:
 
 
 def judge_geometry(run: "Run", dataset: Dataset, config: GeometryConfig | None) -> JudgedShape:
-    """The shape of a run against the dataset's mesh. The views are the dataset's training cameras. config: None for no
-    judgement, only the sentence that says so.
+    """The shape of a run, or of a `ComposedRun` as a whole, against the dataset's mesh. The views are the dataset's
+    training cameras; around a composed scene cameras stand on a sphere. config: None for no judgement, only the
+    sentence that says so.
 
     Raises InputError where the file of the mesh is missing or holds none, or the grid does not fit into memory.
     """
     if config is None:
         return JudgedShape(None, "Geometry is null: it was not asked for.")
-    model = getattr(run, "model", None)
     if dataset.mesh_path is None:
         return JudgedShape(None, "Geometry is null: the data has no true mesh.")
-    if model is None:
-        return JudgedShape(None, "Geometry is null: it is measured of single runs.")
     path = dataset.root / dataset.mesh_path
     truth = read_mesh(path)
     try:
-        size = size_of(*truth)
+        size_of(*truth)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    cameras = [frame.camera for frame in dataset.train or dataset.frames]
-    found = mesh_of(model, cameras, config.mesh, run.antialiased)
+    model = run.model
+    if isinstance(run, ComposedRun):  # trained on other data: what this dataset looks at says nothing
+        cameras = cameras_around(model, config.mesh.views)
+    else:
+        cameras = [frame.camera for frame in dataset.train or dataset.frames]
+    return judge_shape(model, run.antialiased, cameras, truth, config)
+
+
+def judge_shape(
+    model: "Gaussians", antialiased: Any, cameras: Sequence[Camera], truth: Mesh, config: GeometryConfig
+) -> JudgedShape:
+    """The shape of Gaussians, as `cameras` see it, against a true mesh. antialiased: see `project`
+
+    Raises InputError where the truth is a point or the grid does not fit into memory.
+    """
+    size = size_of(*truth)
+    found = mesh_of(model, cameras, config.mesh, antialiased)
     answer = compare(truth, (found.vertices, found.faces), config) if len(found.faces) else NO_SURFACE
     compared = answer if isinstance(answer, Comparison) else None
     note = "" if compared else f"Geometry is null but for its floaters: {answer}."

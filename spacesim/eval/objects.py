@@ -1,4 +1,5 @@
-"""Each object of a scene judged on its own, over its pixels of the true picture (thesis 4.3.6, tables 4.6 and 4.7)."""
+"""Each object of a scene judged on its own, over its pixels of the true picture (thesis 4.3.6, tables 4.6 and 4.7), and
+by its shape."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -6,10 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from spacesim.data.errors import InputError
+from spacesim.data.exporters.objects import targets_of
 from spacesim.data.images import read_png
 from spacesim.data.records import Dataset, Frame
 from spacesim.eval import lpips
+from spacesim.eval.composition import ComposedRun
+from spacesim.eval.geometry import GeometryConfig, judge_shape
 from spacesim.eval.judge import Light, View, judge_picture, judge_visibility
+from spacesim.splat.meshing import cameras_around
 
 GROUPS = ("image", "shadow", "shadow_mask", "shadow_self_cast", "shadow_other_cast")
 """Of `labels.GROUPS`, those that have a meaning over one object's pixels."""
@@ -40,6 +46,30 @@ def judge_objects(
             alone = replace(view, silhouette=mask, valid=mask)
             record: dict[str, Any] = {**judge_picture(alone, network), **judge_visibility(light, alone)}
             found[name] = {group: record[group] for group in GROUPS}
+    return found
+
+
+def judge_object_shapes(
+    run: object, dataset: Dataset, names: Mapping[int, str], config: GeometryConfig | None
+) -> dict[int, dict[str, Any] | None]:
+    """{number: "geometry" as metrics.json has it} of a composed scene's models, each alone against its object's part of
+    the true mesh; {} of a run, whose Gaussians belong to no object, and where models or mesh cannot be told apart.
+
+    Raises InputError where the grid does not fit into memory.
+    """
+    if not isinstance(run, ComposedRun) or config is None or dataset.mesh_path is None or len(run.names) != len(names):
+        return {}
+    try:
+        targets = targets_of(dataset)
+    except InputError:
+        return {}
+    found = {}
+    for index, target in enumerate(targets):
+        turn, shift = target.world_from_object[:3, :3], target.world_from_object[:3, 3]
+        truth = target.vertices @ turn.T + shift, target.faces
+        model = run.composition.alone(index)
+        antialiased, cameras = run.composition.models[index].run.antialiased, cameras_around(model, config.mesh.views)
+        found[target.id] = judge_shape(model, antialiased, cameras, truth, config).values
     return found
 
 

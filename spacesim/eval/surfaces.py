@@ -56,18 +56,37 @@ def shapes(runs: Sequence[Judged]) -> str:
 
 
 def _table(runs: Sequence[Judged]) -> str:
-    """Two tables, a row a run, and what the columns mean."""
+    """Two tables, a row a run, over the whole and then over each object of a composed scene, and what the columns
+    mean."""
     factor, unit = _unit(max(run.metrics["geometry"]["size"] for run in runs))
-    named = {_distance(run.metrics["geometry"], factor, unit) for run in runs}
-    parts = [f'<p class="lead">The named distance is {escape(" or ".join(sorted(named)))}.</p>']
+    groups = _groups(runs)
+    named = dict.fromkeys(_distance(geometry, factor, unit) for _, group in groups for _, geometry in group)
+    parts = [f'<p class="lead">The named distance is {escape(" or ".join(named))}.</p>']
     for caption, keys in _TABLES.items():
         metrics = [metric for metric in NUMBERS if metric.key in keys]
-        columns = [best_in_bold(m, [_cell(run.metrics["geometry"], m, factor) for run in runs]) for m in metrics]
         head = ["", *(_heading(metric, unit) for metric in metrics)]
-        rows = [[run.label, *row] for run, *row in zip(runs, *columns, strict=True)]
+        bodies = [(title, _rows(group, metrics, factor)) for title, group in groups]
         meanings = "".join(f"<dt>{escape(m.label)}</dt><dd>{escape(m.meaning)}</dd>" for m in metrics)
-        parts.append(f"{table(caption, head, [('', rows)])}<dl>{meanings}</dl>")
+        parts.append(f"{table(caption, head, bodies)}<dl>{meanings}</dl>")
     return "".join(parts)
+
+
+def _groups(runs: Sequence[Judged]) -> list[tuple[str, list[tuple[str, Mapping[str, Any]]]]]:
+    """(title, rows), rows: (a run's label, its numbers), first of the whole, then of each object that has a shape."""
+    whole = [(run.label, run.metrics["geometry"]) for run in runs]
+    every = [(run.label, one) for run in runs for one in run.metrics.get("objects") or [] if one.get("geometry")]
+    found = []
+    for number in sorted({one["id"] for _, one in every}):
+        own = [(label, one) for label, one in every if one["id"] == number]
+        title = f"{' or '.join(dict.fromkeys(one['name'] for _, one in own))} alone"
+        found.append((title, [(label, one["geometry"]) for label, one in own]))
+    return [("All models" if found else "", whole), *found]
+
+
+def _rows(group: Sequence[tuple[str, Mapping[str, Any]]], metrics: Sequence[Metric], factor: float) -> list[list[str]]:
+    """A row of HTML for each (label, numbers)."""
+    columns = [best_in_bold(metric, [_cell(geometry, metric, factor) for _, geometry in group]) for metric in metrics]
+    return [[label, *row] for (label, _), *row in zip(group, *columns, strict=True)]
 
 
 def _heading(metric: Metric, unit: str) -> str:

@@ -5,6 +5,7 @@ Only what a view has seen is surface: where voxels were never in sight, the mesh
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import igl
@@ -72,10 +73,11 @@ def mesh_of(
     model: Gaussians,
     cameras: Sequence[Camera],
     config: MeshConfig | None = None,
-    antialiased: bool = False,
+    antialiased: Any = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RunMesh:
-    """The surface of Gaussians as `cameras` see it. progress: called with the steps done and all of them.
+    """The surface of Gaussians as `cameras` see it. antialiased: see `project`;  progress: called with the steps done
+    and all of them.
 
     Raises InputError where the grid does not fit into memory.
     """
@@ -127,7 +129,7 @@ def cameras_around(model: Gaussians, count: int) -> list[Camera]:
     return [Camera.from_fov(pose, SIDE, SIDE, FOV_DEG) for pose in poses]
 
 
-def depth_of(model: Gaussians, camera: Camera, kind: str = "surface", antialiased: bool = False) -> np.ndarray:
+def depth_of(model: Gaussians, camera: Camera, kind: str = "surface", antialiased: Any = False) -> np.ndarray:
     """[H, W] float32, metres, of one of `KINDS`: where the picture is opaque, else 0."""
     if model.count == 0:
         return np.zeros((camera.height, camera.width), np.float32)

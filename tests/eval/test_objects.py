@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 
 from spacesim.data.images import load_image, luminance, read_exr, write_exr
+from spacesim.data.store import read_dataset
 from spacesim.eval import image, shadow
 from spacesim.eval.composition import ComposedRun
-from spacesim.eval.evaluate import evaluate
+from spacesim.eval.evaluate import EvaluateConfig, evaluate
+from spacesim.eval.geometry import GeometryConfig
 from spacesim.eval.objects import GROUPS, object_names
 from spacesim.eval.report import write_report
+from spacesim.splat.compose.scenefile import load_scene
+from spacesim.splat.meshing import MeshConfig
 
 CUT = 24  #: column at which the second object begins
 
@@ -85,7 +89,7 @@ def test_values_are_those_of_each_objects_pixels(make_run, pair, tmp_path):
         found = [value for value in found if value is not None]  # where all is black, all is right
         assert one["image"]["psnr"] == {"mean": np.mean(found), "std": np.std(found), "count": len(found)}
         assert len(found) >= 2
-        assert set(one) == {"id", "name", "frames", *GROUPS}
+        assert set(one) == {"id", "name", "frames", "geometry", *GROUPS}
     first, second = (one["shadow_mask"]["error_rate"]["mean"] for one in metrics["objects"])
     assert first > 0  # columns 20 and 21 are lit, and predicted dark
     assert second == 0
@@ -144,9 +148,18 @@ def test_the_command_judges_a_scene(spacesim, tiny_run, tmp_path):
     model = f'[[models]]\nrun = "{tiny_run}"\n'
     text = f'{model}name = "a"\n{model}name = "b"\nposition = [-3, -3, -3]\n'
     (tmp_path / "pair.toml").write_text(text)
-    judged = spacesim("eval", tmp_path / "pair.toml", "--data", tmp_path / "pair", "--out", tmp_path / "eval", "--json")
+    line = ["eval", tmp_path / "pair.toml", "--data", tmp_path / "pair", "--out", tmp_path / "eval"]
+    judged = spacesim(*line, "--no-geometry", "--json")
     assert judged.code == 0, judged.errors
     assert '"name": "b"' in judged.output
     assert "Object by object" in (tmp_path / "eval" / "report.html").read_text()
     refused = spacesim("eval", tmp_path / "no.toml", "--data", tmp_path / "pair", "--out", tmp_path / "eval")
     assert refused.is_refusal("no.toml")
+
+    scene = ComposedRun(load_scene(tmp_path / "pair.toml").posed_at(0.0), tmp_path / "pair.toml")
+    small = GeometryConfig(samples=2000, voxels=32, mesh=MeshConfig(voxels=32, views=4))
+    metrics = evaluate(scene, read_dataset(tmp_path / "pair"), tmp_path / "shaped", EvaluateConfig(geometry=small))
+    assert metrics["geometry"]["chamfer"] > 0
+    assert [one["geometry"]["size"] for one in metrics["objects"]] == pytest.approx([6.19, 6.19], abs=0.01)
+    assert not any(note.startswith("Geometry") for note in metrics["notes"])
+    assert (tmp_path / "shaped" / "geometry" / "reconstruction.ply").exists()

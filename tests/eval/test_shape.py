@@ -12,13 +12,17 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
 from spacesim.data.mesh import SignedDistance, read_mesh, write_mesh
 from spacesim.data.store import read_dataset
+from spacesim.eval.composition import ComposedRun
 from spacesim.eval.exterior import Sight
-from spacesim.eval.geometry import COMPARED, GeometryConfig, judge_geometry
+from spacesim.eval.geometry import COMPARED, GeometryConfig, judge_geometry, judge_shape
+from spacesim.eval.objects import judge_object_shapes, object_names
 from spacesim.eval.report import write_report
 from spacesim.eval.shape import BACKGROUND, COLOURS, cameras_of, coloured, write_shapes
 from spacesim.eval.surfaces import value_of
+from spacesim.splat.compose import Composition, Placed, Pose
+from spacesim.splat.compose.pose import rotation_about
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.meshing import MeshConfig
+from spacesim.splat.meshing import MeshConfig, cameras_around
 from spacesim.splat.run import load_run
 from spacesim.splat.train.initialise import initial_gaussians
 
@@ -62,6 +66,81 @@ def test_better_shapes_have_better_numbers(tiny):
     assert bad["hausdorff99"] > good["hausdorff99"]
     assert bad["iou"] < good["iou"]
     assert good["floaters"]["outside"] < 0.01 < bad["floaters"]["outside"]
+
+
+# Composed scenes
+
+
+def placed_pair(run, dataset, folder):
+    """Two models of one run, the second turned, moved and twice as large, and data whose true mesh is theirs."""
+    poses = Pose(), Pose(rotation_about([0, 0, 1], 90), [9.0, 0, 2], 2.0)
+    scene = ComposedRun(Composition([Placed(run, pose, f"model {k}") for k, pose in enumerate(poses)]), folder)
+    vertices, faces = read_mesh(dataset.root / dataset.mesh_path)
+    second = 2 * vertices @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).T + [9, 0, 2]
+    write_mesh(folder / "pair.ply", np.concatenate([vertices, second]), np.concatenate([faces, faces + len(vertices)]))
+    matrices = [np.eye(4), np.array([[0.0, -2, 0, 9], [2, 0, 0, 0], [0, 0, 2, 2], [0, 0, 0, 1]])]
+    told = {
+        "objects": [{"id": k + 1, "name": "one", "world_from_object": m.tolist()} for k, m in enumerate(matrices)],
+        "mesh": [{"object": k + 1, "vertices": len(vertices), "faces": len(faces)} for k in range(2)],
+    }
+    return scene, replace(dataset, root=folder, mesh_path="pair.ply", scene={**dataset.scene, **told})
+
+
+def test_models_of_a_scene_have_the_shapes_of_their_runs(tiny, tmp_path):
+    """Twice as large: twice the lengths, four times the areas, all else as before."""
+    run, dataset = tiny
+    scene, pair = placed_pair(run, dataset, tmp_path)
+    names = object_names(pair, scene.names)
+    assert list(names.values()) == ["model 0", "model 1"]
+    cameras = cameras_around(run.model, SMALL.mesh.views)
+    alone = judge_shape(run.model, run.antialiased, cameras, read_mesh(dataset.root / dataset.mesh_path), SMALL)
+    first, second = judge_object_shapes(scene, pair, names, SMALL).values()
+    for key in ("chamfer", "hausdorff99", "iou", "size", "accuracy"):
+        assert first[key] == pytest.approx(alone.values[key], rel=1e-3)
+        factor = {"chamfer": 4, "iou": 1}.get(key, 2)
+        assert second[key] == pytest.approx(factor * first[key], rel=0.15), key  # other views, other voxels
+    assert second["floaters"]["inside"] == pytest.approx(first["floaters"]["inside"], abs=1e-3)
+
+    whole = judge_geometry(scene, pair, SMALL)
+    assert whole.note == ""
+    assert whole.values["mesh"]["views"] == SMALL.mesh.views
+    assert whole.values["floaters"]["inside"] == pytest.approx(first["floaters"]["inside"], abs=1e-3)
+    moved = replace(scene, composition=scene.composition.moved(1, Pose(translation=[9.0, 6.0, 2.0])))
+    assert judge_geometry(moved, pair, SMALL).values["chamfer"] > 10 * whole.values["chamfer"]
+    assert judge_object_shapes(moved, pair, names, SMALL)[1] == first
+
+
+def test_objects_without_a_shape_of_their_own(tiny, tmp_path):
+    """A run's Gaussians belong to no object; three models are not two objects; a mesh that is not told apart."""
+    run, dataset = tiny
+    scene, pair = placed_pair(run, dataset, tmp_path)
+    names = object_names(pair)
+    three = replace(scene, composition=Composition([*scene.composition.models, Placed(run)]))
+    less = {key: value for key, value in pair.scene.items() if key != "mesh"}
+    for who, what, config in (
+        (run, pair, SMALL),
+        (three, pair, SMALL),
+        (scene, replace(pair, scene=less), SMALL),
+        (scene, replace(pair, mesh_path=None), SMALL),
+        (scene, pair, None),
+    ):
+        assert judge_object_shapes(who, what, names, config) == {}
+
+
+def test_the_report_has_the_shape_of_each_object(tiny_eval, tmp_path):
+    metrics = json.loads((tiny_eval / "metrics.json").read_text())
+    shutil.copytree(tiny_eval, tmp_path / "pair")
+    entry = {"frames": 2, "image": None, "shadow": None, "shadow_mask": None}
+    shapes = [{**metrics["geometry"], "iou": iou} for iou in (0.1234, 0.4321)]
+    objects = [{"id": k, "name": f"model <{k}>", **entry, "geometry": shapes[k]} for k in range(2)]
+    (tmp_path / "pair" / "metrics.json").write_text(json.dumps({**metrics, "objects": objects}))
+    write_report([tmp_path / "pair"], tmp_path / "pair.html")
+    page = (tmp_path / "pair.html").read_text()
+    for words in ("All models", "model &lt;0&gt; alone", "model &lt;1&gt; alone", "0.1234", "0.4321"):
+        assert words in page
+
+
+# What cannot be judged
 
 
 def test_runs_without_a_surface_have_a_sentence(tiny):

@@ -155,6 +155,11 @@ class Composition:
         )
 
     @property
+    def antialiased(self) -> Any:
+        """Whether Gaussians are drawn with the anti-aliasing filter: one for all, or Bool [N] where runs differ."""
+        return self._ensemble.antialiased
+
+    @property
     def contents(self) -> list[str]:
         """A digest of what each model is made of, in their order."""
         return [member.key for member in self._members]
@@ -189,6 +194,10 @@ class Composition:
     def in_world(self) -> Gaussians:
         """All Gaussians, colours left out, in the order of `placed`."""
         return self._ensemble.placed([model.pose for model in self.placed])
+
+    def alone(self, index: int) -> Gaussians:
+        """Model `index` where it stands, colours left out."""
+        return Ensemble([self._members[index]]).placed([self.models[index].pose])
 
     def light_between(self, sun: Sun | None) -> list[Any]:
         """Of each model, in the order of `placed`, the share of sunlight that the others let through, v_inter of 4.15:
