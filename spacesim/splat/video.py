@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 INSTALL = "pip install 'spacesim[video]'"
+FASTEST_RATE = 10_000  #: pictures a second, chosen
+FINEST_RATE = 100_000  #: largest denominator of pictures a second, chosen: 24000/1001 is meant by 23.976023976
 QUALITY = "18"  #: x264's constant rate factor, chosen: artefacts are hard to see
 _BT709, _SRGB_TRANSFER = 1, 13  # numbers of ITU-T H.273
 
@@ -29,23 +31,26 @@ class Video:
     """A film in the making: `add` pictures, then take the file's `content`.
 
     width, height: pixels of every picture; an odd side gets one more row or column, as H.264 wants even ones
-    rate: pictures a second
-    Raises RuntimeError where there is no `encoder`.
+    rate: pictures a second; in the file it is the nearest fraction with a denominator of FINEST_RATE at most
+    Raises RuntimeError where there is no `encoder`, ValueError for a rate that is none.
     """
 
-    def __init__(self, width: int, height: int, rate: int) -> None:
+    def __init__(self, width: int, height: int, rate: float | Fraction) -> None:
         library = encoder()
         if library is None:
             raise RuntimeError(f"video: PyAV is not installed; type: {INSTALL}")
+        if not 1 / FINEST_RATE <= rate <= FASTEST_RATE:
+            raise ValueError(f"rate: expected {1 / FINEST_RATE:g} to {FASTEST_RATE} pictures a second, found {rate}")
+        exact = Fraction(rate).limit_denominator(FINEST_RATE)
         self._library = library
         self._shape = height, width, 3
         self._buffer = io.BytesIO()
         self._file = library.open(self._buffer, "w", format="mp4", options={"fflags": "+bitexact"})
         options = {"crf": QUALITY, "preset": "medium", "threads": "1", "flags": "+bitexact"}
-        self._stream: Any = self._file.add_stream("libx264", rate=Fraction(rate), options=options)
+        self._stream: Any = self._file.add_stream("libx264", rate=exact, options=options)
         self._stream.width, self._stream.height = width + width % 2, height + height % 2
         self._stream.pix_fmt = "yuv420p"
-        self._stream.gop_size = rate
+        self._stream.gop_size = max(1, round(exact))  # a picture that stands alone each second
         context = self._stream.codec_context
         context.color_primaries = context.colorspace = _BT709
         context.color_trc, context.color_range = _SRGB_TRANSFER, 1

@@ -36,16 +36,14 @@ def opened(path: Path, data: Path | None = None, out: Path | None = None) -> Sho
             folders = [dataset.root]
         elif folders[0] is not None:
             dataset = read_dataset(folders[0])
-    start = scene.at(0.0) if scene.camera is not None else None
-    poses = tuple(placed.pose for placed in (start.composition if start else composition).models)
-    sun = (start.sun if start else scene.sun) or _sun_of(dataset)
+    poses = tuple(placed.pose for placed in scene.posed_at(0.0).models)
     return Show(
         Stage(composition),
-        Stand(poses, sun),
+        Stand(poses, scene.sun_at(0.0) or _sun_of(dataset)),
         tuple(folders),
         dataset,
         out or Path(),
-        start.camera if start else None,
+        scene.at(0.0).camera if scene.camera is not None else None,
         path_of(scene),
     )
 

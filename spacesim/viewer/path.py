@@ -17,17 +17,21 @@ from spacesim.viewer.state import Stand, View
 RATE = 24.0  #: times a second that a path that is played moves the camera
 STEP = 2.0  #: seconds from one keyframe to the next at first, chosen
 MOST_KEYS = 1000
-REFERENCE = Camera(np.eye(4), 512, 512, 512.0, 512.0, 256.0, 256.0)  # whose pixels focal lengths of keyframes are in
+REFERENCE = Camera(np.eye(4), 512, 512, 512.0, 512.0, 256.0, 256.0)  #: of paths of scenes that name no camera
+UPRIGHT = 1e-3  #: sine of the angle of a line of sight to z, from which on z counts as up; chosen
 
 
-def place_of(view: View, centre: Array) -> Place:
-    """Where a view is taken from. Its target is the point of its axis nearest to `centre` [3], if that is ahead."""
+def place_of(view: View, centre: Array, image: Camera = REFERENCE) -> Place:
+    """Where a view is taken from. Its target is the point of its axis nearest to `centre` [3], if that is ahead. image:
+    in whose pixels focal lengths are"""
     pose = view.world_from_camera
-    ahead = float((centre - pose[:3, 3]) @ pose[:3, 2])
-    upright = abs(pose[2, 0]) < 1e-6  # else to look at the target would turn the camera about its axis
-    target = pose[:3, 3] + ahead * pose[:3, 2] if ahead > 0 and upright else None
-    focal = float(0.5 * REFERENCE.height / np.tan(0.5 * view.fov))
-    return Place(pose, target, (focal, focal))
+    position, across, above, axis = pose[:3, 3], pose[:3, 0], -pose[:3, 1], pose[:3, 2]
+    length = float(0.5 * image.height / np.tan(0.5 * view.fov))
+    ahead = float((centre - position) @ axis)
+    if ahead <= 0:
+        return Place(pose, None, (length, length))
+    upright = abs(across[2]) < 1e-6 and above[2] > UPRIGHT
+    return Place.towards(position, position + ahead * axis, (0.0, 0.0, 1.0) if upright else above, (length, length))
 
 
 def fov_of(camera: Camera) -> float:
@@ -37,70 +41,88 @@ def fov_of(camera: Camera) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """keyframes: at rising times, seconds, focal lengths in pixels of REFERENCE"""
+    """What changes with time. keyframes: at rising times, seconds;  camera: of the scene's file, whose image focal
+    lengths of keyframes are in pixels of, or None;  orbit: in place of the keyframes' cameras;  frames: pictures that
+    the file asks for, None for as many as the keyframes take;  fps: pictures a second"""
 
     keyframes: tuple[Keyframe, ...] = ()
+    camera: Camera | None = None
+    orbit: Orbit | None = None
+    frames: int | None = None
+    fps: float = FPS
+
+    @property
+    def image(self) -> Camera:
+        """In whose pixels focal lengths of keyframes are."""
+        return self.camera or REFERENCE
+
+    @property
+    def last(self) -> float:
+        """Of the last keyframe, seconds."""
+        return self.keyframes[-1].time if self.keyframes else 0.0
 
     @property
     def seconds(self) -> float:
-        """Until the last keyframe."""
-        return self.keyframes[-1].time if self.keyframes else 0.0
+        """That it takes to play: up to the last keyframe, or once through the orbit."""
+        return max(self.last, self.pictures / self.fps) if self.orbit else self.last
+
+    @property
+    def pictures(self) -> int:
+        """As many as it is saved with."""
+        if self.frames is not None:
+            return self.frames
+        return min(MOST_FRAMES, int(self.last * self.fps + 0.5) + 1) if self.keyframes else 1
 
     def added(self, place: Place, stand: Stand | None, names: list[str], step: float) -> "Path":
-        """With a keyframe `step` seconds after the last. stand: whose Sun and poses (by `names`) it holds, too, or
-        None."""
+        """With a keyframe `step` seconds after the last, and without an orbit. stand: whose Sun and poses (by `names`)
+        it holds, too, or None."""
         if len(self.keyframes) >= MOST_KEYS:
             return self
-        when = self.seconds + step if self.keyframes else 0.0
-        if stand is None:
-            return Path((*self.keyframes, Keyframe(when, view=place)))
-        poses = dict(zip(names, stand.poses, strict=True))
-        return Path((*self.keyframes, Keyframe(when, stand.sun, place, poses)))
+        when = self.last + step if self.keyframes else 0.0
+        key = Keyframe(when, view=place)
+        if stand is not None:
+            key = Keyframe(when, stand.sun, place, dict(zip(names, stand.poses, strict=True)))
+        return replace(self, keyframes=(*self.keyframes, key), orbit=None, frames=None)
 
     def shorter(self) -> "Path":
-        """Without the last keyframe."""
-        return Path(self.keyframes[:-1])
+        """Without the last keyframe; without the orbit where there is none."""
+        if self.keyframes:
+            return replace(self, keyframes=self.keyframes[:-1], frames=self.frames if self.orbit else None)
+        return self.cleared()
+
+    def cleared(self) -> "Path":
+        """Without anything that moves."""
+        return replace(self, keyframes=(), orbit=None, frames=None)
 
     def at(self, composition: Composition, when: float) -> Shot:
         """Camera, Sun (None where no keyframe names one) and poses at a time."""
-        return PosedScene(composition, camera=REFERENCE, keyframes=self.keyframes).at(when)
+        scene = PosedScene(composition, None, self.image, self.keyframes, self.orbit, self.pictures, self.fps)
+        return scene.at(when, min(when * self.fps / self.pictures, 1.0) if self.orbit else 0.0)
 
     @property
     def moves_camera(self) -> bool:
-        """Whether a keyframe says where the camera is."""
-        return any(key.view is not None for key in self.keyframes)
+        """Whether it says where the camera is."""
+        return self.orbit is not None or any(key.view is not None for key in self.keyframes)
 
     @property
     def moves_scene(self) -> bool:
         """Whether a keyframe says where the Sun or a model is."""
         return any(key.sun is not None or key.poses for key in self.keyframes)
 
-    def for_camera(self, old: Camera, new: Camera) -> "Path":
-        """The same with focal lengths in pixels of another image."""
-        scale = new.height / old.height
-        return Path(tuple(_scaled(key, scale) for key in self.keyframes))
-
-
-def _scaled(key: Keyframe, scale: float) -> Keyframe:
-    if key.view is None or key.view.focal is None:
-        return key
-    fx, fy = key.view.focal
-    return replace(key, view=replace(key.view, focal=(scale * fx, scale * fy)))
+    @property
+    def words(self) -> str:
+        """What it is, for the panel."""
+        count = len(self.keyframes)
+        parts = ["an orbit"] * (self.orbit is not None)
+        parts += [f"{count} keyframe{'s' * (count != 1)}"] * (count > 0 or self.orbit is None)
+        return f"{' and '.join(parts)}, {self.seconds:.4g} s"
 
 
 def path_of(scene: PosedScene) -> Path:
-    """The keyframes of a scene."""
-    if scene.camera is None or not scene.keyframes:
-        return Path()
-    camera = scene.camera
-    return Path(tuple(_with_focal(key, camera) for key in scene.keyframes)).for_camera(camera, REFERENCE)
-
-
-def _with_focal(key: Keyframe, camera: Camera) -> Keyframe:
-    """Where a keyframe leaves the focal length to the scene's camera: that."""
-    if key.view is None or key.view.focal is not None:
-        return key
-    return replace(key, view=replace(key.view, focal=(camera.fx, camera.fy)))
+    """What changes with time in a scene."""
+    still = not scene.keyframes and scene.orbit is None and scene.frames == 1
+    frames = None if still else scene.frames
+    return Path(tuple(scene.keyframes), scene.camera, scene.orbit, frames, scene.fps)
 
 
 def orbit_of(view: View, centre: Array) -> Orbit:
@@ -114,11 +136,22 @@ def orbit_of(view: View, centre: Array) -> Orbit:
 
 
 def scene_to_save(composition: Composition, stand: Stand, view: View, path: Path) -> PosedScene:
-    """What `spacesim compose` draws as the browser shows it: the view with square pixels, and the path."""
-    camera = view.camera(view.width, view.height)
-    keys = path.for_camera(REFERENCE, camera).keyframes
-    frames = min(MOST_FRAMES, int(path.seconds * FPS + 0.5) + 1) if keys else 1
-    return PosedScene(composition.posed(stand.poses), stand.sun, camera, keys, frames=frames)
+    """What `spacesim compose` draws: the path as it is played. Its image is that of the scene's file where that has one
+    and the camera moves, else the view as the browser shows it, with square pixels."""
+    camera, keys = path.camera, path.keyframes
+    if camera is None or not path.moves_camera:
+        camera = view.camera(view.width, view.height)
+        scale = camera.height / path.image.height
+        keys = tuple(_scaled(key, scale) for key in keys)
+    return PosedScene(composition.posed(stand.poses), stand.sun, camera, keys, path.orbit, path.pictures, path.fps)
+
+
+def _scaled(key: Keyframe, scale: float) -> Keyframe:
+    """With focal lengths in pixels of an image `scale` times as high."""
+    if key.view is None or key.view.focal is None:
+        return key
+    fx, fy = key.view.focal
+    return replace(key, view=replace(key.view, focal=(scale * fx, scale * fy)))
 
 
 class Player:

@@ -43,7 +43,7 @@ class PathControls:
             last, clear = gui.add_button("Remove the last"), gui.add_button("Remove all")
             self.time = gui.add_slider("Time", 0.0, 1.0, 0.005, 0.0, hint="share of the whole path")
             play, orbit = gui.add_button("Play / stop"), gui.add_button("Orbit / stop")
-            self.told = gui.add_markdown(self._words())
+            self.told = gui.add_markdown(path.words)
         for button, action in ((add, self._add), (last, self._remove), (clear, self._clear)):
             button.on_click(self.with_client(action))
         play.on_click(self.with_client(self._play))
@@ -62,10 +62,6 @@ class PathControls:
         for number in list(self._players):
             self.forget(number)
 
-    def _words(self) -> str:
-        count = len(self.path.keyframes)
-        return f"{count} keyframe{'s' * (count != 1)}, {self.path.seconds:.4g} s"
-
     def with_client(self, action: Callable[[int, Client], None]) -> Callable[[Any], Any]:
         async def called(event: Any) -> None:
             client = None if event.client is None else self._client(event.client_id)
@@ -77,13 +73,13 @@ class PathControls:
     def _change(self, path: Path) -> None:
         with self._lock:
             self.path = path
-        self.told.content = self._words()
+        self.told.content = path.words
 
     def _add(self, _number: int, client: Client) -> None:
         view = client.session.view
         if view is not None:
             stand = self._shared.stand
-            place = place_of(view, self._stage.bounds(stand)[0])
+            place = place_of(view, self._stage.bounds(stand)[0], self.path.image)
             names = [placed.name for placed in self._stage.composition.models]
             step = bounded(self.step.value, *STEPS, STEP)
             self._change(self.path.added(place, stand if self.whole.value else None, names, step))
@@ -92,16 +88,15 @@ class PathControls:
         self._change(self.path.shorter())
 
     def _clear(self, _number: int, _client: Client) -> None:
-        self._change(Path())
+        self._change(self.path.cleared())
 
     def _scrub(self, number: int, client: Client) -> None:
         self.forget(number)
-        if self.path.keyframes:
-            self._show(self.path, client, bounded(self.time.value, 0, 1, 0) * self.path.seconds)
+        self._show(self.path, client, bounded(self.time.value, 0, 1, 0) * self.path.seconds)
 
     def _play(self, number: int, client: Client) -> None:
         path = self.path
-        if not self._stopped(number) and len(path.keyframes) > 1:
+        if not self._stopped(number) and path.seconds > 0:
             self._start(number, lambda when: self._show(path, client, when), path.seconds)
 
     def _orbit(self, number: int, client: Client) -> None:

@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -245,6 +246,38 @@ def test_a_video_repeats_to_the_bit_and_shows_its_pictures():
     for frame, colour in zip(frames, colours, strict=True):
         assert (frame.width, frame.height) == (34, 18)
         assert np.abs(frame.to_ndarray(format="rgb24").reshape(-1, 3).mean(axis=0) - colour).max() < 4
+
+
+@with_video
+@pytest.mark.parametrize(
+    ("rate", "expected"),
+    [
+        (24, Fraction(24)),
+        (24000 / 1001, Fraction(24000, 1001)),
+        (Fraction(60000, 1001), Fraction(60000, 1001)),
+        (12.5, Fraction(25, 2)),
+        (1 / 3, Fraction(1, 3)),
+        (0.1, Fraction(1, 10)),
+        (1000.0, Fraction(1000)),
+    ],
+)
+def test_a_video_has_fractions_of_pictures_a_second(rate, expected):
+    import av
+
+    film = Video(16, 16, rate)
+    for k in range(4):
+        film.add(np.full((16, 16, 3), 60 * k, np.uint8))
+    with av.open(io.BytesIO(film.content())) as file:
+        assert file.streams.video[0].average_rate == expected
+        times = [Fraction(frame.pts) * frame.time_base for frame in file.decode(video=0)]
+    assert times == [k / expected for k in range(4)]
+
+
+@with_video
+@pytest.mark.parametrize("rate", [0, -1.0, 1e-9, float("nan"), float("inf")])
+def test_a_rate_that_is_none_is_named(rate):
+    with pytest.raises(ValueError, match="rate: expected"):
+        Video(16, 16, rate)
 
 
 @with_video

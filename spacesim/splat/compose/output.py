@@ -128,7 +128,7 @@ def _film(scene: PosedScene) -> Video | None:
     if encoder() is None:
         return None
     camera = scene.shot(0).camera
-    return Video(camera.width, camera.height, max(1, round(scene.fps)))
+    return Video(camera.width, camera.height, scene.fps)
 
 
 def _forget(out: Path, frames: int) -> None:

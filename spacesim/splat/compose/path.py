@@ -6,9 +6,10 @@ from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import Array, direction_from_angles, look_at
+from spacesim.data.geometry import Array, direction_from_angles, look_at, normalize
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose.pose import Pose, between, slerp, turned_between
 from spacesim.splat.compose.scene import Composition
@@ -24,11 +25,23 @@ T = TypeVar("T")
 class View:
     """Where a camera stands, and what it looks at. world_from_camera: [4, 4] OpenCV axes, metres;  target: [3] metres,
     a point that stays in the middle on the way to another view that has one, or None;  focal: (fx, fy) pixels, or None
-    for those of the scene's camera"""
+    for those of the scene's camera;  up: [3], a direction that the target's picture has upwards"""
 
     world_from_camera: Array
     target: Array | None = None
     focal: tuple[float, float] | None = None
+    up: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+
+    @staticmethod
+    def towards(
+        position: Array,
+        target: Array,
+        up: ArrayLike = (0.0, 0.0, 1.0),
+        focal: tuple[float, float] | None = None,
+    ) -> "View":
+        """From a position on a target, [3] metres each."""
+        up = np.asarray(up, np.float64)
+        return View(look_at(position, target, up), np.asarray(target, np.float64), focal, up)
 
     def focused(self, camera: Camera) -> "View":
         """With `camera`'s focal lengths where it names none."""
@@ -72,7 +85,7 @@ class Orbit:
         """After a share of the way, 0 to 1."""
         direction = direction_from_angles(self.azimuth_deg + 360 * self.turns * share, self.elevation_deg)
         centre = np.array(self.centre)
-        return View(look_at(centre + self.radius * direction, centre), centre)
+        return View.towards(centre + self.radius * direction, centre)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +129,11 @@ class PosedScene:
             told = self.composition.path or "scene"
             raise InputError(f"{told}: expected a camera, found none; add a table [camera]")
         view = self.orbit.view(share) if self.orbit else self._view(self.camera, time)
-        sun = self._track(lambda key: key.sun, sun_between, time) or self.sun
-        return Shot(time, self.posed_at(time), view.of(self.camera) if view else self.camera, sun)
+        return Shot(time, self.posed_at(time), view.of(self.camera) if view else self.camera, self.sun_at(time))
+
+    def sun_at(self, time: float) -> Sun | None:
+        """The Sun at a time, seconds; None where nobody has said."""
+        return self._track(lambda key: key.sun, sun_between, time) or self.sun
 
     def posed_at(self, time: float) -> Composition:
         """The models where they are at a time, seconds."""
@@ -181,16 +197,17 @@ def sun_between(one: Sun, other: Sun, share: float) -> Sun:
 
 
 def view_between(one: View, other: View, share: float) -> View:
-    """Position along a line; the target, where both have one, too, else the camera turns by the shortest way; focal
-    lengths by even factors, where both name them."""
+    """Position along a line; the target, where both have one, too, and what is up on the great circle, else the camera
+    turns by the shortest way; focal lengths by even factors, where both name them."""
     position = _line(one.world_from_camera[:3, 3], other.world_from_camera[:3, 3], share)
     focal = one.focal
     if one.focal is not None and other.focal is not None:
         focal = tuple(a ** (1 - share) * b**share for a, b in zip(one.focal, other.focal, strict=True))
     if one.target is not None and other.target is not None:
         target = _line(one.target, other.target, share)
+        up = slerp(normalize(one.up), normalize(other.up), share)
         if np.linalg.norm(target - position) > 0:
-            return View(look_at(position, target), target, focal)
+            return View.towards(position, target, up, focal)
     pose = np.eye(4)
     pose[:3, :3] = turned_between(one.world_from_camera[:3, :3], other.world_from_camera[:3, :3], share)
     pose[:3, 3] = position

@@ -23,6 +23,7 @@ from spacesim.splat.run import Run, load_run
 
 FOV_DEG = 35.0  #: of a camera where nothing is said, chosen
 RESOLUTION = (512, 512)  #: pixels, chosen
+FPS_RANGE = (1e-3, 1e3)  #: pictures a second, chosen
 RULES = Rules(spread=("resolution",))
 
 Vector = tuple[float, float, float]
@@ -138,8 +139,9 @@ class ViewEntry:
         if self.fov_deg is not None:
             length = float(0.5 * width / np.tan(0.5 * np.radians(self.fov_deg)))
             focal = length, length
-        target = None if self.look_at is None or self.up != (0.0, 0.0, 1.0) else np.array(self.look_at)
-        return None if self.place is None else View(self.place, target, focal)
+        if self.position is not None and self.look_at is not None:
+            return View.towards(np.array(self.position), np.array(self.look_at), self.up, focal)
+        return None if self.place is None else View(self.place, None, focal)
 
 
 @dataclass(frozen=True)
@@ -200,8 +202,9 @@ class SceneEntry:
             raise InputError("models: expected at least one, found none")
         if self.frames is not None and not 1 <= self.frames <= MOST_FRAMES:
             raise InputError(f"frames: expected 1 to {MOST_FRAMES}, found {self.frames}")
-        if not 0 < self.fps <= 1000:
-            raise InputError(f"fps: expected above 0 and at most 1000 pictures a second, found {self.fps}")
+        if not FPS_RANGE[0] <= self.fps <= FPS_RANGE[1]:
+            least, most = FPS_RANGE
+            raise InputError(f"fps: expected {least:g} to {most:g} pictures a second, found {self.fps}")
         ComposeConfig(self.shadows)
 
 
@@ -366,8 +369,10 @@ def _sun_values(sun: Sun) -> dict[str, Any]:
 def _view_values(view: View) -> dict[str, Any]:
     values: dict[str, Any] = {"transform_matrix": (view.world_from_camera @ OPENCV_FROM_OPENGL).tolist()}
     position = view.world_from_camera[:3, 3]
-    if view.target is not None and np.array_equal(look_at(position, view.target), view.world_from_camera):
+    if view.target is not None and np.array_equal(look_at(position, view.target, view.up), view.world_from_camera):
         values = {"position": position.tolist(), "look_at": view.target.tolist()}
+        if view.up.tolist() != list(ViewEntry.up):
+            values["up"] = view.up.tolist()
     return values | ({} if view.focal is None else {"focal": [float(length) for length in view.focal]})
 
 

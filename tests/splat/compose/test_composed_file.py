@@ -149,6 +149,32 @@ def test_a_camera_between_two_keeps_its_target_in_the_middle():
         np.testing.assert_allclose(view_between(one, other, share).world_from_camera, end.world_from_camera, atol=1e-12)
 
 
+def test_a_camera_between_two_keeps_its_target_where_other_things_are_up():
+    one = View.towards(np.array([4.0, 0, 0]), np.zeros(3), [0.0, 0, 2])
+    other = View.towards(np.array([0.0, 4, 2]), np.array([0.0, 0, 1]), [1.0, 0, 0])
+    for share in (0.25, 0.5, 0.75):
+        middle = view_between(one, other, share)
+        angle = 0.5 * np.pi * share  # from z to x, evenly
+        expected = look_at([4 - 4 * share, 4 * share, 2 * share], [0, 0, share], [np.sin(angle), 0, np.cos(angle)])
+        np.testing.assert_allclose(middle.world_from_camera, expected, atol=1e-12)
+    for share, end in ((0.0, one), (1.0, other)):
+        np.testing.assert_allclose(view_between(one, other, share).world_from_camera, end.world_from_camera, atol=1e-12)
+
+
+def test_what_is_up_stands_in_the_file(tmp_path):
+    keys = (
+        "[[keyframes]]\ntime = 0\ncamera = {position = [4, 0, 0], look_at = [0, 0, 0]}\n"
+        "[[keyframes]]\ntime = 1\ncamera = {position = [0, 4, 2], look_at = [0, 0, 1], up = [2, 0, 0]}\n"
+    )
+    scene = read(tmp_path, f"{HEAD}{SUN}{EYE}{keys}")
+    half = scene.shot(12).camera
+    np.testing.assert_allclose(half.world_from_camera, look_at([2, 2, 1], [0, 0, 0.5], [1, 0, 1]), atol=1e-12)
+    save_scene(tmp_path / "saved.toml", scene)
+    loaded = load_scene(tmp_path / "saved.toml")
+    for k in (0, 5, 12, 24):
+        assert np.array_equal(loaded.shot(k).camera.world_from_camera, scene.shot(k).camera.world_from_camera)
+
+
 def test_a_track_is_exact_at_its_keys():
     track = Track([0.0, 0.1, 0.3], [1.0, 2.0, 7.0], lambda a, b, share: a + share * (b - a))
     assert [track.at(t) for t in (-1, 0, 0.1, 0.3, 9)] == [1, 1, 2, 7, 7]
@@ -224,6 +250,7 @@ def test_a_saved_orbit_and_a_scene_without_camera_and_sun(tmp_path):
         (f"shadows = 'some'\n{HEAD}", "line 1: shadows"),
         (f"frames = 0\n{HEAD}", "line 1: frames"),
         (f"fps = 0\n{HEAD}", "line 1: fps"),
+        (f"fps = 1e-7\n{HEAD}", "line 1: fps: expected 0.001 to 1000"),
         (f"{HEAD}[camera]\nposition = [0, 0, 1]", "camera.position: expected with look_at"),
         (f"{HEAD}[camera]\nposition = [0, 0, 1]\nlook_at = [0, 0, 1]", "camera.look_at"),
         (f"{HEAD}{EYE}fov_deg = 180", "camera.fov_deg"),

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -112,6 +114,16 @@ def test_the_video_shows_the_frames(tmp_path):
         picture = read_png(tmp_path / f"out/rgb/{index:04d}.png").astype(float) / 255
         assert frame.shape == (48, 64, 3)
         assert np.abs(frame - picture[..., :3] * picture[..., 3:]).mean() < 0.03
+
+
+@with_video
+def test_the_video_has_the_scenes_pictures_a_second(tmp_path):
+    import av
+
+    done = compose(replace(scene(4, methods=("vanilla",)), fps=24000 / 1001), tmp_path / "out")
+    with av.open(str(done.video)) as file:
+        assert file.streams.video[0].average_rate == Fraction(24000, 1001)
+        assert [frame.pts * frame.time_base for frame in file.decode(video=0)][3] == Fraction(3 * 1001, 24000)
 
 
 def test_without_an_encoder_a_sentence(tmp_path, monkeypatch):
