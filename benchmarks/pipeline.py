@@ -35,9 +35,9 @@ class Pipeline:
         noise = np.random.default_rng(0).uniform(size=(3, camera.width * camera.height)).astype(np.float32)
         self.truth = list(ad.Array3f(noise))
         self.factors = ad.Float([1.0, 1.0, *[0.0] * len(self.gaussians.rows())])
-        dr.eval(self.gaussians.rows(), self.optimizer.first, self.optimizer.second, self.truth, self.factors)
+        dr.eval(self.gaussians.rows(), self.optimizer.arrays, self.truth, self.factors)
         self._project, self._loss = recorded(project_views, RECORDINGS), recorded(_loss, RECORDINGS)
-        self._update = Update(antialiased=False, scale=1.0, recordings=RECORDINGS)
+        self._update = Update(antialiased=False, scale=1.0)
         for stage in (self.project, self.bin, self.forward, self.loss, self.backward, self.update):
             stage()
 

@@ -79,6 +79,12 @@ class Gaussians:
             ad.Array3f(means), ad.Array3f(log_scales), ad.Array4f(quaternions), rows[10], ad.ArrayXf(sh), features
         )
 
+    def replace(self, rows: list[Any]) -> None:
+        """Take other parameters, `rows` of them as in `from_rows`."""
+        other = Gaussians.from_rows(rows)
+        for name in (*NAMES, "features"):
+            setattr(self, name, getattr(other, name))
+
     def to_numpy(self) -> dict[str, np.ndarray]:
         """{name: float32 array with N first}: means [N, 3], log_scales [N, 3], quaternions [N, 4],
         logit_opacities [N], sh [N, K, 3]; features [N, F] where there are any."""

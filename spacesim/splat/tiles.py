@@ -319,13 +319,14 @@ def _stable_order(keys: Any, bits: int) -> Any:
     goes through all 32 bits."""
     passes = -(-bits // DIGIT_BITS)
     digit_bits = -(-bits // passes)
-    order = dr.arange(ad.UInt32, dr.width(keys))
+    order = None
     for i in range(passes):
-        digit = (keys >> (i * digit_bits)) & ((1 << digit_bits) - 1)
-        dr.eval(digit, keys, order)
-        moved = dr.detail.block_mkperm(dr.detach(digit), dr.width(keys), 1 << digit_bits)
-        order = dr.gather(ad.UInt32, order, moved)
+        digit, last = (keys >> (i * digit_bits)) & ((1 << digit_bits) - 1), i == passes - 1
+        dr.eval(digit, order, None if last else keys)
+        moved = ad.UInt32(dr.detail.block_mkperm(dr.detach(digit), dr.width(keys), 1 << digit_bits))
+        order = moved if order is None else dr.gather(ad.UInt32, order, moved)
         keys = dr.gather(ad.UInt32, keys, moved)
+        del digit, moved  # what is over goes: memory is short here
     return order
 
 

@@ -9,7 +9,7 @@ from spacesim.backend import ad
 from spacesim.splat.gaussians import NAMES, Gaussians
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.densify import grow, limit_opacities, prune
-from spacesim.splat.train.optimizer import Adam, adam_step
+from spacesim.splat.train.optimizer import Adam, NetworkAdam, adam_step
 from spacesim.splat.train.strategies.default import DefaultStrategy, DefaultStrategyConfig
 
 
@@ -30,8 +30,8 @@ def optimizer_with_marks(model: Gaussians) -> Adam:
     """Moments that name their Gaussian: entry i of every row is i + 1."""
     optimizer = Adam(model.rows())
     marks = np.arange(1, model.count + 1, dtype=np.float32)
-    optimizer.first = [ad.Float(marks) for _ in optimizer.first]
-    optimizer.second = [ad.Float(10 * marks) for _ in optimizer.second]
+    rows = len(model.rows())
+    optimizer.put([marks] * rows, [10 * marks] * rows)
     return optimizer
 
 
@@ -39,7 +39,7 @@ def test_adam_matches_its_definition():
     rng = np.random.default_rng(0)
     value, rate = rng.normal(size=5), 0.1
     rows = [ad.Float(value.astype(np.float32))]
-    optimizer = Adam(rows)
+    optimizer = NetworkAdam(rows)
     m, v = np.zeros(5), np.zeros(5)
     for step in range(1, 6):
         gradient = rng.normal(size=5)
@@ -58,9 +58,9 @@ def test_prune_takes_moments_along():
     np.testing.assert_array_equal(kept, [0, 2, 5])
     for name in NAMES:
         np.testing.assert_array_equal(model.to_numpy()[name], before[name][kept])
-    for row in optimizer.first:
+    for row in optimizer.moments()[0]:
         np.testing.assert_array_equal(np.array(row), [1, 3, 6])
-    for row in optimizer.second:
+    for row in optimizer.moments()[1]:
         np.testing.assert_array_equal(np.array(row), [10, 30, 60])
 
 
@@ -80,9 +80,10 @@ def test_grow_duplicates_and_splits():
     distance = np.linalg.norm(after["means"][5:] - before["means"][source[5:]], axis=1)
     assert (distance > 0).all()
     assert (distance < 5 * np.exp(-5.0)).all()
-    for row in (*optimizer.first, *optimizer.second):
-        np.testing.assert_array_equal(np.array(row)[4:], 0)  # what is new starts without moments
-    np.testing.assert_array_equal(np.array(optimizer.first[0])[:4], [1, 2, 4, 5])
+    first, second = optimizer.moments()
+    for row in first + second:
+        np.testing.assert_array_equal(row[4:], 0)  # what is new starts without moments
+    np.testing.assert_array_equal(first[0][:4], [1, 2, 4, 5])
 
 
 def test_opacity_reset_limits_and_forgets():
@@ -92,8 +93,8 @@ def test_opacity_reset_limits_and_forgets():
     limit_opacities(model, optimizer, 0.1)
     opacity = 1 / (1 + np.exp(-np.array(model.logit_opacities)))
     np.testing.assert_allclose(opacity, np.minimum(1 / (1 + np.exp(-np.array([5, -9, 0, 1, 2, -3.0]))), 0.1), rtol=1e-5)
-    np.testing.assert_array_equal(np.array(optimizer.first[10]), 0)
-    np.testing.assert_array_equal(np.array(optimizer.first[0]), [1, 2, 3, 4, 5, 6])
+    np.testing.assert_array_equal(optimizer.moments()[0][10], 0)
+    np.testing.assert_array_equal(optimizer.moments()[0][0], [1, 2, 3, 4, 5, 6])
 
 
 def refine_once(

@@ -432,7 +432,8 @@ def mcmc(**changes) -> McmcStrategy:
 def test_dead_gaussians_move_to_live_ones():
     gaussians = model([0.0, 1.0, 2.0, 3.0], [0.8, 0.004, 0.001, 0.5])
     optimizer = Adam(gaussians.rows())
-    optimizer.first = [ad.Float([1, 2, 3, 4]) for _ in optimizer.first]
+    marks = [np.array([1, 2, 3, 4], np.float32)] * len(gaussians.rows())
+    optimizer.put(marks, marks)
     done = mcmc(growth=0.0).refine(STEP, gaussians, optimizer, np.random.default_rng(3))
     assert (done.relocated, done.added, gaussians.count) == (2, 0, 4)
     x = np.array(gaussians.means)[0]
@@ -441,7 +442,7 @@ def test_dead_gaussians_move_to_live_ones():
     for place, before in ((0.0, 0.8), (3.0, 0.5)):
         here = np.flatnonzero(x == place)
         assert 1 - np.prod(1 - opacity[here]) == pytest.approx(before, rel=1e-4)
-        moments = np.array(optimizer.first[0])[here]
+        moments = optimizer.moments()[0][0][here]
         assert (moments == (0 if len(here) > 1 else moments)).all()
 
 

@@ -281,7 +281,7 @@ def test_several_views_a_step_follow_their_mean_gradient(small_dataset):
         trainer = Trainer(small_dataset, replace(config, views_per_step=views_per_step))
         trainer.iteration = iteration
         trainer.step()
-        return np.stack([np.array(row) for row in trainer.optimizer.first])
+        return np.stack(trainer.optimizer.moments()[0])
 
     first, second, both = moments(1, 0), moments(1, 1), moments(2, 0)
     assert np.abs(first - second).max() > 0.1 * np.abs(first).max()

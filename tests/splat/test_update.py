@@ -59,17 +59,18 @@ def test_a_step_is_adams_by_the_gradient_of_the_mean_picture(degree, sides):
     live = [row < 11 + 3 * (degree + 1) ** 2 for row in range(len(before))]
     first = [scale * rng.normal(size=150) for scale in live]
     second = [scale * rng.uniform(0.1, 1, 150) for scale in live]
-    optimizer.first, optimizer.second = [ad.Float(row) for row in first], [ad.Float(row) for row in second]
+    optimizer.put([row.astype(np.float32) for row in first], [row.astype(np.float32) for row in second])
     gradients = [view_gradients(gaussians, view, weights, degree) for view in views]
     rates = rng.uniform(0.01, 0.1, len(before))
-    Update(False, 1.0, 4)(gaussians, optimizer, degree, gradients, ad.Float([1.5, 1.2, *rates]), {})
+    Update(False, 1.0)(gaussians, optimizer, degree, gradients, ad.Float([1.5, 1.2, *rates]), {})
+    found = optimizer.moments()
     for row, by_row in enumerate(picture_gradients(arrays, views, weights, degree)):
         m = BETA1 * first[row] + (1 - BETA1) * by_row
         v = BETA2 * second[row] + (1 - BETA2) * by_row**2
         moved = before[row] - rates[row] * 1.5 * m / (np.sqrt(1.2 * v) + EPSILON)
         scale = np.abs(by_row).max() + 1
-        np.testing.assert_allclose(np.array(optimizer.first[row]), m, atol=1e-4 * scale, err_msg=str(row))
-        np.testing.assert_allclose(np.array(optimizer.second[row]), v, atol=1e-4 * scale**2, err_msg=str(row))
+        np.testing.assert_allclose(found[0][row], m, atol=1e-4 * scale, err_msg=str(row))
+        np.testing.assert_allclose(found[1][row], v, atol=1e-4 * scale**2, err_msg=str(row))
         np.testing.assert_allclose(np.array(gaussians.rows()[row]), moved, atol=2e-4, err_msg=str(row))
     assert any(np.abs(row).max() > 0.1 for row in picture_gradients(arrays, views, weights, degree)[11:])
 
@@ -78,7 +79,7 @@ def test_harmonics_of_higher_degrees_stay_as_they_are():
     gaussians = Gaussians.from_numpy(random_splats(50))
     before, view = [np.array(row) for row in gaussians.rows()], Pinhole.of(camera(0.8))
     weights = [dr.ones(ad.Float, SIZE[0] * SIZE[1])] * 4
-    optimizer, update = Adam(gaussians.rows()), Update(False, 1.0, 4)
+    optimizer, update = Adam(gaussians.rows()), Update(False, 1.0)
     factors = ad.Float([1.0, 1.0, *[0.1] * len(before)])
     for degree, moved in ((0, 14), (1, 23), (2, 38), (3, 59)):
         update(gaussians, optimizer, degree, [view_gradients(gaussians, view, weights, degree)], factors, {})
@@ -96,12 +97,12 @@ def test_a_step_holds_few_rows_twice():
     gaussians = Gaussians.from_numpy(arrays)
     del arrays
     weights = [dr.ones(ad.Float, SIZE[0] * SIZE[1])] * 4
-    optimizer, update = Adam(gaussians.rows()), Update(False, 1.0, 4)
+    optimizer, update = Adam(gaussians.rows()), Update(False, 1.0)
     factors = ad.Float([1.0, 1.0, *[0.1] * 59])
     kind = dr.JitBackend.CUDA if select() == "cuda" else dr.JitBackend.LLVM
     for _ in range(3):
         gradients = [view_gradients(gaussians, view, weights, 3)]
-        dr.eval(gaussians.rows(), optimizer.first, optimizer.second)
+        dr.eval(gaussians.rows(), optimizer.arrays)
         dr.sync_thread()
         gc.collect()
         dr.flush_malloc_cache()

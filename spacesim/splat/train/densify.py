@@ -9,7 +9,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import rotation_from_quaternion
-from spacesim.splat.gaussians import NAMES, ROWS, Gaussians, entries, numbers, triple
+from spacesim.splat.gaussians import ROWS, Gaussians, entries, numbers, triple
 from spacesim.splat.train.optimizer import Adam
 
 SPLIT_SHRINK = 1.6  #: halves of a split are this much smaller (Kerbl et al. 2023, section 5.2)
@@ -30,11 +30,11 @@ class Refinement:
 def rearrange(gaussians: Gaussians, optimizer: Adam, index: np.ndarray, fresh: np.ndarray) -> None:
     """Gaussian i becomes a copy of Gaussian index[i]; its moments come along unless fresh[i]. index, fresh: [M]."""
     device_index = ad.UInt32(index.astype(np.uint32))
-    rows = [entries(row, device_index, gaussians.count) for row in gaussians.rows()]
-    dr.eval(rows)
-    moved = Gaussians.from_rows(rows)
-    for name in (*NAMES, "features"):
-        setattr(gaussians, name, getattr(moved, name))
+    count, rows = gaussians.count, [ad.Float(row) for row in gaussians.rows()]
+    for part in (*optimizer.slices, slice(optimizer.slices[-1].stop, None)):  # so that old ones go as new ones come
+        rows[part] = [entries(row, device_index, count) for row in rows[part]]
+        dr.eval(rows[part])
+        gaussians.replace(rows)
     optimizer.select(device_index, ad.Bool(fresh))
 
 
@@ -107,7 +107,7 @@ def raise_opacities(gaussians: Gaussians, optimizer: Adam, lowest: float) -> Non
 def _set_opacities(gaussians: Gaussians, optimizer: Adam, logits: Any) -> None:
     gaussians.logit_opacities = logits
     dr.eval(logits)
-    optimizer.forget(ROWS["logit_opacities"])
+    optimizer.forget(ROWS["logit_opacities"].start)
 
 
 def _logit(opacity: float) -> float:

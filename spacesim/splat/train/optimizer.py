@@ -1,53 +1,117 @@
 """Adam (Kingma & Ba 2015) over rows of parameters, whose moments follow when Gaussians come and go."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from spacesim.backend import ad
-from spacesim.splat.gaussians import entries
+from spacesim.splat.gaussians import ROWS, entries, uploaded
+from spacesim.splat.train.packing import Pack, load, packed, packs, store, unpacked, zeros
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
-AT_ONCE = 12  #: rows of moments that are rearranged at once, chosen
+OWN = ROWS["sh"].start  #: rows of place, shape and opacity; harmonics or features come behind
+CONSTANT = 3  #: rows of the constant harmonic, which are moved with them
+PART = 15  #: rows of harmonics that are moved at once: five coefficients
 
 
 class Adam:
-    """First and second moments of rows of parameters (`Gaussians.rows`, or the weights of networks)."""
+    """Moments of the rows of Gaussians (`Gaussians.rows`), part by part, those of a part in few arrays (`packing`).
+
+    slices: the rows of each part; features, a packed row, are none
+    layouts, arrays: how the moments of each part lie, and where;  features: their two moments [F * N], or none
+    """
 
     def __init__(self, rows: list[Any]) -> None:
-        self.first = [dr.zeros(ad.Float, dr.width(row)) for row in rows]
-        self.second = [dr.zeros(ad.Float, dr.width(row)) for row in rows]
         self.steps = 0
+        self.slices, count = parts(len(rows)), dr.width(rows[0])
+        self.arrays: list[list[Any]] = []
+        self.layouts: list[tuple[Pack, ...]] = []
+        self._lay_out(count)
+        self.arrays = [zeros(layout) for layout in self.layouts]
+        self.features = [dr.opaque(ad.Float, 0, dr.width(row)) for row in 2 * rows[self.slices[-1].stop :]]
 
     def corrections(self) -> tuple[float, float]:
         """Count a step; the factors that make the moments unbiased estimates."""
         self.steps += 1
-        return 1 / (1 - BETA1**self.steps), 1 / (1 - BETA2**self.steps)
-
-    def part(self, rows: slice) -> tuple[list[Any], list[Any]]:
-        """First and second moments of some rows."""
-        return self.first[rows], self.second[rows]
+        return _corrections(self.steps)
 
     def select(self, index: Any, fresh: Any) -> None:
-        """Entry i of each moment becomes entry index[i], or zero where `fresh[i]`. index, fresh: [M]. The first row is
-        of length N; longer ones are packed rows."""
-        count, chosen = dr.width(self.first[0]), dr.width(index)
+        """Entry i of each moment becomes entry index[i], or zero where `fresh[i]`. index, fresh: [M]."""
+        before, count, chosen = self.layouts, self.count, dr.width(index)
+        self._lay_out(chosen)
+        for number, (old, new) in enumerate(zip(before, self.layouts, strict=True)):
+            pairs = load(self.arrays[number], old, index)
+            one, two = ([dr.select(fresh, 0, moment) for moment in moments] for moments in pairs)
+            arrays = store(one, two, new)
+            dr.eval(arrays)
+            self.arrays[number] = arrays  # part by part, so that old ones go as new ones come
         size = dr.opaque(ad.UInt32, chosen)  # as a literal each size would be compiled
-        for moments in (self.first, self.second):
-            for start in range(0, len(moments), AT_ONCE):  # in parts, so that old ones go as new ones come
-                part = []
-                for moment in moments[start : start + AT_ONCE]:
-                    copies, forget = dr.width(moment) // count, fresh
-                    if copies > 1:
-                        forget = dr.gather(ad.Bool, fresh, dr.arange(ad.UInt32, copies * chosen) % size)
-                    part.append(dr.select(forget, 0, entries(moment, index, count)))
-                dr.eval(part)
-                moments[start : start + AT_ONCE] = part
+        for number, moment in enumerate(self.features):
+            copies = dr.width(moment) // count
+            forget = dr.gather(ad.Bool, fresh, dr.arange(ad.UInt32, copies * chosen) % size)
+            self.features[number] = dr.select(forget, 0, entries(moment, index, count))
+        dr.eval(self.features)
 
-    def forget(self, rows: slice) -> None:
-        """Set the moments of some rows to zero."""
-        for moments in (self.first, self.second):
-            moments[rows] = [dr.zeros(ad.Float, dr.width(m)) for m in moments[rows]]
+    def forget(self, row: int) -> None:
+        """Set the moments of a row to zero."""
+        number = next(i for i, rows in enumerate(self.slices) if rows.start <= row < rows.stop)
+        within, layout = row - self.slices[number].start, self.layouts[number]
+        first, second = load(self.arrays[number], layout, dr.arange(ad.UInt32, self.count))
+        first[within], second[within] = ad.Float(0), ad.Float(0)
+        self.arrays[number] = store(first, second, layout)
+        dr.eval(self.arrays[number])
+
+    def moments(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The first and the second moment of each row, float32 [N], and of the features [F * N]."""
+        first, second = list[np.ndarray](), list[np.ndarray]()
+        for arrays, layout in zip(self.arrays, self.layouts, strict=True):
+            one, two = unpacked(arrays, layout, self.count)
+            first, second = first + one, second + two
+        features = [np.array(moment) for moment in self.features]
+        return first + features[:1], second + features[1:]
+
+    def put(self, first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> None:
+        """The inverse of `moments`."""
+        for number, (rows, layout) in enumerate(zip(self.slices, self.layouts, strict=True)):
+            self.arrays[number] = packed(first[rows], second[rows], layout)
+        last = self.slices[-1].stop
+        self.features = [uploaded(moment) for moment in (*first[last:], *second[last:])]
+
+    def _lay_out(self, count: int) -> None:
+        self.count = count
+        self.layouts = [packs(rows.stop - rows.start, count) for rows in self.slices]
+
+
+class NetworkAdam:
+    """Moments of the weights of networks, arrays of any lengths."""
+
+    def __init__(self, weights: list[Any]) -> None:
+        self.first = [dr.zeros(ad.Float, dr.width(weight)) for weight in weights]
+        self.second = [dr.zeros(ad.Float, dr.width(weight)) for weight in weights]
+        self.steps = 0
+
+    def corrections(self) -> tuple[float, float]:
+        """See `Adam.corrections`."""
+        self.steps += 1
+        return _corrections(self.steps)
+
+    def moments(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The first and the second moment of each array."""
+        return [np.array(moment) for moment in self.first], [np.array(moment) for moment in self.second]
+
+    def put(self, first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> None:
+        """The inverse of `moments`."""
+        self.first, self.second = [ad.Float(moment) for moment in first], [ad.Float(moment) for moment in second]
+
+
+def parts(rows: int) -> list[slice]:
+    """Rows that are moved at once, of so many (`Gaussians.rows`) without features: those of place, shape and opacity
+    with the constant harmonic, where there are harmonics, then `PART` each."""
+    drawn = rows - (rows % 3 == 0)  # 11, and harmonics come in threes
+    first = min(OWN + CONSTANT, drawn)
+    return [slice(0, first), *(slice(start, min(start + PART, drawn)) for start in range(first, drawn, PART))]
 
 
 def adam_step(
@@ -71,3 +135,7 @@ def adam_step(
         first.append(m)
         second.append(v)
     return moved, first, second
+
+
+def _corrections(steps: int) -> tuple[float, float]:
+    return 1 / (1 - BETA1**steps), 1 / (1 - BETA2**steps)

@@ -16,11 +16,12 @@ import numpy as np
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Dataset
+from spacesim.splat.adjoint import SplatGradients
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.light import LightModel, TrainingFrame
-from spacesim.splat.project import Pinhole
+from spacesim.splat.project import Footprints, Pinhole
 from spacesim.splat.rasterize import backward, forward
-from spacesim.splat.tiles import bin_splats
+from spacesim.splat.tiles import RECORDINGS, bin_splats
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.initialise import (
@@ -31,7 +32,7 @@ from spacesim.splat.train.initialise import (
     scene_scale,
     surface_normals,
 )
-from spacesim.splat.train.optimizer import Adam
+from spacesim.splat.train.optimizer import Adam, NetworkAdam
 from spacesim.splat.train.prior import MeshPrior
 from spacesim.splat.train.stages import LossConfig, Target, on_screen, picture_loss, project_views, update_light
 from spacesim.splat.train.strategies.choose import strategy_of
@@ -40,7 +41,6 @@ from spacesim.splat.train.views import TrainingViews, View
 from spacesim.splat.train.warm_start import Attraction, WarmStart
 
 HISTORY_EVERY = 50  #: iterations between two entries of the history
-RECORDINGS = 64  #: of a stage that are kept: one for each size of picture and degree of harmonics
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Trainer:
         self.gaussians = initial_gaussians(dataset, config.init, *start)
         self.optimizer = Adam(self.gaussians.rows())
         self.light = self._initial_light(dataset)
-        self.light_optimizer = Adam(self.light.weights if self.light else [])
+        self.light_optimizer = NetworkAdam(self.light.weights if self.light else [])
         self.strategy = strategy_of(config, dataset, self.scene_scale, self.gaussians.count)
         self.warm_start: WarmStart | None = None
         if config.warm_start is not None:
@@ -89,7 +89,7 @@ class Trainer:
         self.history: list[dict[str, float]] = []
         self._project = recorded(project_views, RECORDINGS)
         self._loss = recorded(picture_loss, RECORDINGS)
-        self._update = Update(config.antialiased, self.scene_scale, RECORDINGS)
+        self._update = Update(config.antialiased, self.scene_scale)
         self._on_screen = recorded(on_screen, RECORDINGS)
         self._update_light = recorded(update_light, RECORDINGS)
 
@@ -165,21 +165,19 @@ class Trainer:
                 values["visibility"] = [shading.visibility]
         lists = bin_splats(splats, footprints, width, height)
         blended = forward(splats, [v for group in values.values() for v in group], lists, width, height, adjoint=True)
-        planes, attraction = iter(blended.features), self._attraction(view)
-        by_name = {name: [next(planes) for _ in group] for name, group in values.items()}
+        channels = {name: len(group) for name, group in values.items()}
+        del values  # all arrays go as soon as they have been read: memory is shortest here
+        attraction = self._attraction(view)
+        by_name = _named(blended.features, channels)
         target = self._target(number, view, attraction)
         loss, by_plane, by_transmittance = self._loss(by_name, blended.transmittance, target, size, self._terms)
         watched = self.strategy.watches(index + 1) and not self._warming(index)
         by_planes = [plane for group in by_plane.values() for plane in group]
         by_splat = backward(splats, blended, lists, size, by_planes, by_transmittance, absolute=watched)
+        del splats, lists, blended, by_name
+        by_value = _named(by_splat.features, channels)
         if watched:
-            sizes = ad.Float([0.5 * width, 0.5 * height, max(width, height)])
-            absolute = by_splat.absolute_x, by_splat.absolute_y
-            half = footprints.half_width, footprints.half_height
-            gradient, radius = self._on_screen(absolute, half, sizes)
-            self.strategy.observe(gradient, radius, footprints.visible)
-        found = iter(by_splat.features)
-        by_value = {name: [next(found) for _ in group] for name, group in values.items()}
+            self._observe(by_splat, footprints, size)
         by_rows = self.warm_start.pull(rows, camera, attraction, index) if self.warm_start and attraction else []
         if not shading or not self.light:
             return _Look(ViewGradients(camera, by_splat.splats, by_value, by_rows=by_rows), loss)
@@ -188,6 +186,13 @@ class Trainer:
         by_rows = _added(by_light.geometry, by_rows)
         gradients = ViewGradients(camera, by_splat.splats, by_value, by_light.features, by_rows)
         return _Look(gradients, loss, by_light.weights)
+
+    def _observe(self, by_splat: SplatGradients, footprints: Footprints, size: tuple[int, int]) -> None:
+        """Tell the strategy what refinement watches. size: the picture's, pixels"""
+        sizes = ad.Float([0.5 * size[0], 0.5 * size[1], max(size)])
+        absolute, half = (by_splat.absolute_x, by_splat.absolute_y), (footprints.half_width, footprints.half_height)
+        gradient, radius = self._on_screen(absolute, half, sizes)
+        self.strategy.observe(gradient, radius, footprints.visible)
 
     def _warming(self, index: int) -> bool:
         """Whether the warm start keeps refinement off in step number `index`, the first of which is 0."""
@@ -209,7 +214,7 @@ class Trainer:
 
     def _move_gaussians(self, degree: int, looks: list["_Look"]) -> None:
         factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
-        views = [look.gradients for look in looks]
+        views = [look.taken() for look in looks]
         self._update(self.gaussians, self.optimizer, degree, views, factors, self._penalties())
 
     def _penalties(self) -> dict[str, Any]:
@@ -237,9 +242,8 @@ class Trainer:
         """Write everything that the next step depends on."""
         tensors = self.model_tensors()
         for name, optimizer in (("adam", self.optimizer), ("adam.light", self.light_optimizer)):
-            for order in ("first", "second"):
-                moments = getattr(optimizer, order)
-                tensors |= {f"{name}.{order}.{i:02d}": np.array(moment) for i, moment in enumerate(moments)}
+            for order, moments in zip(("first", "second"), optimizer.moments(), strict=True):
+                tensors |= {f"{name}.{order}.{i:02d}": moment for i, moment in enumerate(moments)}
         tensors |= {f"strategy.{name}": np.array(value) for name, value in self.strategy.state.items()}
         if self.warm_start and self._warming(self.iteration):
             tensors |= {f"warm_start.{name}": np.array(value) for name, value in self.warm_start.state.items()}
@@ -256,7 +260,7 @@ class Trainer:
         try:
             gaussians = Gaussians.from_numpy(tensors)
             light = LightModel.from_tensors(self.config.light, tensors) if self.config.light else None
-            optimizer, light_optimizer = Adam(gaussians.rows()), Adam(light.weights if light else [])
+            optimizer, light_optimizer = Adam(gaussians.rows()), NetworkAdam(light.weights if light else [])
             _restore_moments(optimizer, tensors, "adam")
             _restore_moments(light_optimizer, tensors, "adam.light")
             state = {name: ad.Float(tensors[f"strategy.{name}"]) for name in self.strategy.state}
@@ -330,9 +334,21 @@ class Trainer:
 class _Look:
     """What a step has learned from one view: for the Gaussians, and for the weights of networks."""
 
-    gradients: ViewGradients
+    gradients: ViewGradients | None
     loss: Any
     by_weights: Any = None
+
+    def taken(self) -> ViewGradients:
+        """The gradients, which are not held any longer."""
+        assert self.gradients is not None
+        gradients, self.gradients = self.gradients, None
+        return gradients
+
+
+def _named(values: list[Any], counts: dict[str, int]) -> dict[str, list[Any]]:
+    """So many of the values, one after another, under each name."""
+    rest = iter(values)
+    return {name: [next(rest) for _ in range(count)] for name, count in counts.items()}
 
 
 def _added(one: list[Any], other: list[Any]) -> list[Any]:
@@ -348,12 +364,12 @@ def _views(dataset: Dataset, config: TrainConfig) -> TrainingViews:
     return TrainingViews(dataset, config.seed, config.light is not None, truth, prior)
 
 
-def _restore_moments(optimizer: Adam, tensors: Mapping[str, np.ndarray], name: str) -> None:
+def _restore_moments(optimizer: Adam | NetworkAdam, tensors: Mapping[str, np.ndarray], name: str) -> None:
     """Put moments from a checkpoint in place of fresh ones. Raises KeyError, or ValueError for another size."""
-    for order in ("first", "second"):
-        moments = getattr(optimizer, order)
-        for i, fresh in enumerate(moments):
-            key = f"{name}.{order}.{i:02d}"
-            if tensors[key].shape != (dr.width(fresh),):
-                raise ValueError(f"{key}: expected {dr.width(fresh)} numbers, found {tensors[key].shape}")
-            moments[i] = ad.Float(tensors[key])
+    found: list[list[np.ndarray]] = []
+    for order, moments in zip(("first", "second"), optimizer.moments(), strict=True):
+        found.append([tensors[f"{name}.{order}.{i:02d}"] for i in range(len(moments))])
+        for i, (fresh, stored) in enumerate(zip(moments, found[-1], strict=True)):
+            if stored.shape != fresh.shape:
+                raise ValueError(f"{name}.{order}.{i:02d}: expected {len(fresh)} numbers, found {stored.shape}")
+    optimizer.put(*found)

@@ -14,12 +14,12 @@ import numpy as np
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError
 from spacesim.splat.gaussians import Gaussians, numbers, uploaded
+from spacesim.splat.tiles import RECORDINGS
 from spacesim.splat.train.densify import Refinement, append_copies, grow, limit_opacities, prune
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.strategies.strategy import Strategy
 
 WINDOW = ("gradient", "seen", "radius")  #: statistics since the last refinement
-RECORDINGS = 64  #: of an observation that are kept
 
 
 @dataclass(frozen=True)

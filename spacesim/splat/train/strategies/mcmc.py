@@ -14,6 +14,7 @@ from scipy.special import comb
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError
 from spacesim.splat.gaussians import Gaussians, numbers, opacities, principal_axes, triple, uploaded
+from spacesim.splat.tiles import RECORDINGS
 from spacesim.splat.train.densify import Refinement, rearrange
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig
@@ -136,4 +137,4 @@ def _trace_jittered(rows: list[Any], values: Any, streams: Any) -> list[Any]:
     return list(moved)
 
 
-_jittered = recorded(_trace_jittered, 64)
+_jittered = recorded(_trace_jittered, RECORDINGS)

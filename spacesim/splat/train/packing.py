@@ -1,0 +1,118 @@
+"""Pairs of rows in few arrays that fill the memory that Dr.Jit takes for them.
+
+Dr.Jit gives an array the next power of two of bytes: 20,000 numbers take as much as 32,768. Fifteen pairs of such rows
+in one array take as much as 16 would of 20,000 * 16 / 15. So pairs are dealt to arrays that are nearly full, and a lane
+reads and writes those of its Gaussian by packets, which costs no more than plain rows do (docs/performance.md).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim.backend import ad, select
+from spacesim.splat.gaussians import uploaded
+from spacesim.splat.records import packet
+
+SHARES = (15, 14, 12, 8, 4, 3, 2, 1)  #: pairs of an array, chosen: few, since each is compiled, and near powers of two
+
+
+@dataclass(frozen=True)
+class Pack:
+    """An array for `pairs` pairs of rows: `size` numbers, a power of two, for up to `room` Gaussians.
+
+    So it stays the same array, to recordings and compiled kernels, while the number of Gaussians changes a little.
+    """
+
+    pairs: int
+    size: int
+
+    @property
+    def room(self) -> int:
+        """How many Gaussians find place."""
+        return self.size // (2 * self.pairs)
+
+    def packets(self) -> Iterator[tuple[int, int]]:
+        """(numbers of a packet, number of the first Gaussian's packet of that size), packet by packet. Those of all
+        Gaussians stand together: pairs of rows, side by side."""
+        largest, done = 4 if select() == "cuda" else 8, 0
+        for size in (8, 4, 2):
+            while size <= largest and 2 * self.pairs - done >= size:
+                yield size, done * self.room // size
+                done += size
+
+
+@lru_cache(maxsize=1024)
+def packs(pairs: int, count: int) -> tuple[Pack, ...]:
+    """The arrays for `pairs` pairs of rows of `count` Gaussians that take the least memory, large ones first; of equals
+    the fewest."""
+    if pairs == 0:
+        return ()
+    found = []
+    for share in SHARES:
+        if share <= pairs:
+            size = 1 << (2 * share * max(count, 1) - 1).bit_length()
+            found.append((Pack(share, size), *packs(pairs - share, count)))
+    return min(found, key=lambda several: (sum(pack.size for pack in several), len(several)))
+
+
+def zeros(layout: tuple[Pack, ...]) -> list[Any]:
+    """Arrays of nothing but zeros, in memory of their own."""
+    return [dr.opaque(ad.Float, 0, pack.size) for pack in layout]
+
+
+def load(arrays: list[Any], layout: tuple[Pack, ...], index: Any) -> tuple[list[Any], list[Any]]:
+    """The first and the second row of each pair, at entries `index`."""
+    numbers: list[Any] = []
+    for array, pack in zip(arrays, layout, strict=True):
+        for size, first in pack.packets():
+            numbers += _gather(array, index + first, size)
+    return numbers[::2], numbers[1::2]
+
+
+def store(one: list[Any], two: list[Any], layout: tuple[Pack, ...]) -> list[Any]:
+    """New arrays with such rows, of one width: `load`'s inverse. To be evaluated with what else comes of the same
+    numbers; entries beyond the rows have no meaning."""
+    numbers = [row for pair in zip(one, two, strict=True) for row in pair]
+    index, arrays, done = dr.arange(ad.UInt32, dr.width(one[0])), [], 0
+    for pack in layout:
+        array = dr.empty(ad.Float, pack.size)
+        for size, first in pack.packets():
+            values = packet(numbers[done : done + size])
+            dr.scatter(array, values, index + first, mode=dr.ReduceMode.NoConflicts)  # all in one kernel
+            done += size
+        arrays.append(array)
+    return arrays
+
+
+def unpacked(arrays: list[Any], layout: tuple[Pack, ...], count: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """`load` of the first `count` entries, without Dr.Jit: float32 [count] each."""
+    numbers: list[np.ndarray] = []
+    for array, pack in zip(arrays, layout, strict=True):
+        values = np.array(array)
+        for size, first in pack.packets():
+            numbers += list(values[first * size : (first + count) * size].reshape(count, size).T.copy())
+    return numbers[::2], numbers[1::2]
+
+
+def packed(one: Sequence[np.ndarray], two: Sequence[np.ndarray], layout: tuple[Pack, ...]) -> list[Any]:
+    """`store` without Dr.Jit: of float32 [N] each."""
+    numbers = [row for pair in zip(one, two, strict=True) for row in pair]
+    arrays, done, count = [], 0, len(one[0]) if one else 0
+    for pack in layout:
+        values = np.zeros(pack.size, np.float32)
+        for size, first in pack.packets():
+            values[first * size : (first + count) * size] = np.stack(numbers[done : done + size], axis=-1).ravel()
+            done += size
+        arrays.append(uploaded(values))
+    return arrays
+
+
+def _gather(array: Any, index: Any, size: int) -> list[Any]:
+    """A packet of `size` numbers."""
+    if size == 8:
+        return list(dr.gather(ad.ArrayXf, array, index, shape=(size, dr.width(index))))
+    return list(dr.gather(ad.Array4f if size == 4 else ad.Array2f, array, index))
