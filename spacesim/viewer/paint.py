@@ -1,13 +1,13 @@
 """Planes of numbers to pictures for people: a colour map for each mode, the truth beside the prediction, a scale."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from spacesim.data.sheet import font
-from spacesim.data.tone import as_bytes
 from spacesim.eval.pictures import error_colours
 from spacesim.splat.picture import LIT, SHADOWED
 
@@ -21,6 +21,7 @@ ERROR_SCALE = 0.25  #: mean absolute error of the channels at the bright end, as
 SURFACE = 0.5  #: alpha from which a pixel shows a surface, of depth's range and of ids
 UNKNOWN = (38, 38, 42)  #: sRGB colour of where the truth is not known
 _LINE = (255, 255, 255)
+_SHADES = 1024  # of the colour map of depths
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,30 +63,62 @@ def depth_range(planes: Planes) -> tuple[float, float] | None:
 
 def painted(planes: Planes, mode: str, depths: tuple[float, float] | None = None) -> Bytes | None:
     """[H, W, 3] of the planes in a mode; None where the plane that it shows is not there. depths: of the colour map's
-    ends, metres."""
+    ends, metres. What is no number is 0. Done for every frame of a view that moves: single precision, few copies."""
     values = getattr(planes, NEEDED[mode])
     if values is None:
         return None
-    values = np.nan_to_num(values)
-    alpha = np.clip(np.nan_to_num(planes.alpha), 0, 1)
-    if mode == "depth":
-        near, far = depths or depth_range(planes) or (0.0, 1.0)
-        share = np.clip((values - near) / max(far - near, 1e-9), 0, 1)
-        picture = error_colours(1 - (1 - FARTHEST_SHADE) * share)
-        return np.where((values > 0)[..., None], (picture * alpha[..., None]).astype(np.uint8), np.uint8(0))
-    if mode == "accumulation":
-        return np.repeat(as_bytes(alpha)[..., None], 3, axis=-1)
-    if mode == "visibility":
-        lit, shadowed = (np.array(colour, np.float32) / 255 for colour in (LIT, SHADOWED))
-        seen = (np.clip(values, 0, 1) * alpha)[..., None]
-        return as_bytes(alpha[..., None] * shadowed + seen * (lit - shadowed))
-    if mode == "normals":
-        surface = (values[..., 0] != 0) | (values[..., 1] != 0) | (values[..., 2] != 0)
-        return as_bytes((0.5 + 0.5 * values) * (alpha * surface)[..., None])
-    if mode == "object id":
-        colours = np.array([(0, 0, 0), *PALETTE], np.uint8)
-        return colours[np.where(values > 0, 1 + (values.astype(int) - 1) % len(PALETTE), 0)]
-    return as_bytes(values)
+    with np.errstate(invalid="ignore", over="ignore"):
+        if NEEDED[mode] == "rgb":
+            return _bytes(_unit(values))
+        if mode == "object id":
+            return _identified(values)
+        alpha = _unit(planes.alpha)
+        if mode == "accumulation":
+            return np.repeat(_bytes(alpha)[..., None], 3, axis=-1)
+        if mode == "depth":
+            near, far = depths or depth_range(planes) or (0.0, 1.0)
+            share = _unit((values - np.float32(near)) * np.float32(1 / max(far - near, 1e-9)))
+            share *= np.float32(_SHADES - 1)
+            alpha *= values > 0
+            picture = _depth_shades().take(np.rint(share, out=share).astype(np.intp), axis=0)
+            picture *= alpha[..., None]
+            return picture.astype(np.uint8)
+        picture = np.empty((*alpha.shape, 3), np.float32)
+        if mode == "visibility":
+            seen = _unit(values) * alpha
+            for c, (lit, shadowed) in enumerate(zip(LIT, SHADOWED, strict=True)):
+                picture[..., c] = alpha * np.float32(shadowed / 255) + seen * np.float32((lit - shadowed) / 255)
+        else:
+            alpha *= (values[..., 0] != 0) | (values[..., 1] != 0) | (values[..., 2] != 0)
+            alpha *= np.float32(0.5)
+            for c in range(3):
+                picture[..., c] = (1 + values[..., c]) * alpha
+        return _bytes(_unit(picture))
+
+
+def _identified(numbers: np.ndarray) -> Bytes:
+    """The colours of objects [H, W]."""
+    every = np.arange(int(numbers.max(initial=0)) + 1)
+    colours = np.array([(0, 0, 0), *PALETTE], np.uint8)[np.where(every > 0, 1 + (every - 1) % len(PALETTE), 0)]
+    return colours.take(numbers, axis=0, mode="clip")
+
+
+@cache
+def _depth_shades() -> np.ndarray:
+    """[_SHADES, 3] float32: the colour map of depths from the nearest to the farthest."""
+    return error_colours(1 - (1 - FARTHEST_SHADE) * np.linspace(0, 1, _SHADES)).astype(np.float32)
+
+
+def _unit(values: np.ndarray) -> np.ndarray:
+    """Clipped to [0, 1], 0 where they are no numbers: a new float32 array."""
+    result = np.fmax(values, np.float32(0), dtype=np.float32)
+    return np.minimum(result, np.float32(1), out=result)
+
+
+def _bytes(values: np.ndarray) -> Bytes:
+    """8-bit numbers of float32 values in [0, 1], which are lost."""
+    values *= np.float32(255)
+    return np.rint(values, out=values).astype(np.uint8)
 
 
 def compared(picture: Bytes, truth: Bytes, known: NDArray[np.bool_], how: str, wipe: float) -> Bytes:

@@ -6,9 +6,11 @@ import pytest
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
+from spacesim.eval.pictures import error_colours
 from spacesim.splat.compose import Pose
+from spacesim.splat.picture import LIT, SHADOWED
 from spacesim.viewer.frames import BUDGET, LEAST, SHARES, STEP, WARM, Pace, draw, sides
-from spacesim.viewer.paint import PALETTE, Planes, compared, depth_range, painted, with_scale
+from spacesim.viewer.paint import FARTHEST_SHADE, NEEDED, PALETTE, Planes, compared, depth_range, painted, with_scale
 from spacesim.viewer.state import MODES, Look, Stand, View, bounded, changed_pose, view_of
 
 
@@ -260,3 +262,43 @@ def test_a_scene_that_cannot_be_drawn_is_black_and_says_why(stage, stand, view):
     assert not frame.picture.any()
     assert frame.note.startswith("no picture: ")
     assert "Sun" in frame.note
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_pictures_are_what_their_formulas_say(mode):
+    """In double precision, pixel by pixel."""
+    rng = np.random.default_rng(3)
+    shape = 24, 40
+    alpha = np.where(rng.random(shape) < 0.3, 0, rng.uniform(-0.1, 1.1, shape)).astype(np.float32)
+    depth = np.where(rng.random(shape) < 0.3, 0, rng.uniform(2, 9, shape)).astype(np.float32)
+    normal = rng.normal(size=(*shape, 3)).astype(np.float32)
+    normal[rng.random(shape) < 0.3] = 0
+    planes = Planes(
+        alpha,
+        rgb=rng.uniform(-0.2, 1.3, (*shape, 3)).astype(np.float32),
+        depth=depth,
+        visibility=rng.uniform(-0.2, 1.3, shape).astype(np.float32),
+        normal=normal,
+        object_id=rng.integers(0, 20, shape).astype(np.int32),
+    )
+    near, far = 3.0, 7.0
+    picture = painted(planes, mode, (near, far))
+    assert (picture.shape, picture.dtype) == ((*shape, 3), np.uint8)
+    for i, j in np.ndindex(shape):
+        cover, value = min(max(float(alpha[i, j]), 0), 1), getattr(planes, NEEDED[mode])[i, j]
+        if mode in ("colour", "ellipsoids"):
+            expected = 255 * np.clip(value.astype(float), 0, 1)
+        elif mode == "accumulation":
+            expected = np.full(3, 255 * cover)
+        elif mode == "depth":
+            share = min(max((float(value) - near) / (far - near), 0), 1)
+            expected = cover * (value > 0) * error_colours(np.array(1 - (1 - FARTHEST_SHADE) * share)).astype(float)
+        elif mode == "visibility":
+            seen = min(max(float(value), 0), 1)
+            expected = cover * (seen * np.array(LIT, float) + (1 - seen) * np.array(SHADOWED, float))
+        elif mode == "normals":
+            expected = np.clip(255 * cover * (0.5 + 0.5 * value.astype(float)) * value.any(), 0, 255)
+        else:
+            expected = np.array(PALETTE[(value - 1) % 7] if value else (0, 0, 0))
+        levels = 6 if mode == "depth" else 1  # both colour maps have steps
+        assert np.abs(picture[i, j] - expected).max() <= levels, (i, j)
