@@ -325,7 +325,8 @@ def _stable_order(keys: Any, bits: int) -> Any:
         dr.eval(digit, order, None if last else keys)
         moved = ad.UInt32(dr.detail.block_mkperm(dr.detach(digit), dr.width(keys), 1 << digit_bits))
         order = moved if order is None else dr.gather(ad.UInt32, order, moved)
-        keys = dr.gather(ad.UInt32, keys, moved)
+        if not last:
+            keys = dr.gather(ad.UInt32, keys, moved)
         del digit, moved  # what is over goes: memory is short here
     return order
 

@@ -56,7 +56,7 @@ def penalty(name: str, gaussians: Gaussians) -> Any:
     if name == "opacity":
         return opacities(gaussians.logit_opacities)
     if name == "scale":
-        return dr.mean(scales)
+        return dr.sum(scales) / 3
     if name == "flatten":
         first = dr.detach((scales[0] <= scales[1]) & (scales[0] <= scales[2]))
         return dr.select(first, scales[0], dr.select(dr.detach(scales[1] <= scales[2]), scales[1], scales[2]))
@@ -68,6 +68,6 @@ def anisotropy(log_scales: Any) -> Any:
     section 3.3.3; the weight of the sum is the caller's). Within `ROUND` of the mean a scale counts as the mean: else
     the last bit of a round Gaussian would decide the sign of its gradient."""
     scales = dr.exp(log_scales)
-    mean = dr.mean(scales)
+    mean = dr.sum(scales) / 3  # dr.mean puts N into the kernel: a replay rounded by another N
     distances = [dr.abs(scales[i] - mean) for i in range(3)]
     return sum((dr.select(d > ROUND * mean, d, 0) for d in distances), type(mean)(0)) / 3

@@ -208,7 +208,7 @@ class Trainer:
         if self.warm_start and attraction:
             truth = {
                 **truth,
-                "foreground": [attraction.mask, ad.Float(self.warm_start.config.strength(self.iteration))],
+                "foreground": [attraction.mask, dr.opaque(ad.Float, self.warm_start.config.strength(self.iteration))],
             }
         return Target(rgba, ad.Float(self.background(number, view)), valid, truth)
 
@@ -226,7 +226,7 @@ class Trainer:
             "flatten": config.flatten_weight / unit,
             "opacity": config.opacity_weight,
         }
-        return {name: ad.Float(weight / count) for name, weight in weights.items() if weight > 0}
+        return {name: dr.opaque(ad.Float, weight / count) for name, weight in weights.items() if weight > 0}
 
     def _move_light(self, light: LightModel, looks: list["_Look"]) -> None:
         optimizer, rates, done = self.light_optimizer, self.config.rates, self.iteration / self.config.iterations
