@@ -39,7 +39,7 @@ def receiver_bias(gaussians: Gaussians, sun: Any, strength: float = 10.0) -> Bia
     return Bias(shape.thickness, shape.alignment, shape.confidence, dr.minimum(bias, LARGEST))
 
 
-def grazing_bias(gaussians: Gaussians, camera: Orthographic, reach: float = 3.0) -> Any:
+def grazing_bias(gaussians: Gaussians, camera: Orthographic, reach: float = 2.0) -> Any:
     """Float [N], metres: a bias that does not go to 0 where the Sun grazes a surface, as the thesis's b = 10 sigma^l nu
     gamma does; for `Bias.at_least`. Ours, no part of the thesis.
 

@@ -38,7 +38,7 @@ class ShadowConfig:
     size: int = 512
     bias: float = 10.0
     grazing: str = "none"
-    reach: float = 3.0
+    reach: float = 2.0
     softness: float = 1e-6
     mapping: MappingConfig = field(default_factory=MappingConfig)
     gradients: bool = False

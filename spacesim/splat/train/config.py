@@ -221,7 +221,7 @@ def _light(name: str, method: str) -> LightConfig:
         return LightConfig(field, ShadowConfig(kind, image))
     shadow = ShadowConfig(kind, image, bias=5.0, grazing="both", refine=RefineConfig(width=32))
     if kind == "mapping":
-        shadow = replace(shadow, reach=2.0, mapping=MappingConfig("median"))
+        shadow = replace(shadow, mapping=MappingConfig("median"))
     return LightConfig(field, shadow)
 
 

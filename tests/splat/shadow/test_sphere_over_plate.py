@@ -98,35 +98,33 @@ def edge(beyond: np.ndarray, visibility: np.ndarray) -> float:
 
 
 def check(
-    arrays: dict[str, np.ndarray], ball: int, sun: Array, seen: tuple[np.ndarray, np.ndarray], most: float
+    arrays: dict[str, np.ndarray],
+    ball: int,
+    sun: Array,
+    seen: tuple[np.ndarray, np.ndarray],
+    most: float,
+    least: float = 0.9,
 ) -> None:
-    """Dark within the umbra, lit outside, and the edge between within `most` pixels all around."""
+    """Dark within the umbra, lit by at least `least` outside, and the edge between within `most` pixels all around."""
     visibility, scale = seen
     beyond, angle = beyond_umbra(arrays["means"][ball:], sun, scale)
     visibility = visibility[ball:]
     assert visibility[beyond < -4].max() < 0.02
-    assert visibility[beyond > 4].min() > 0.9
+    assert visibility[beyond > 4].min() > least
     for quadrant in range(4):
         part = np.floor(angle / (np.pi / 2)) + 2 == quadrant
         assert abs(edge(beyond[part], visibility[part])) < most, quadrant
 
 
 @pytest.mark.parametrize("elevation", ELEVATIONS)
-@pytest.mark.parametrize(
-    ("preset_name", "method", "most"),
-    [
-        ("fast", "shadow-map", 1.5),
-        ("fast", "shadow-splat", 2),
-        ("demo", "shadow-map", 1.5),
-        ("demo", "shadow-splat", 2),
-    ],
-)
-def test_as_shipped_the_shadow_ends_where_the_umbra_does(preset_name, method, most, elevation):
+@pytest.mark.parametrize("preset_name", ["fast", "demo"])
+@pytest.mark.parametrize(("method", "most", "least"), [("shadow-map", 1.5, 0.95), ("shadow-splat", 2, 0.8)])
+def test_as_shipped_the_shadow_ends_where_the_umbra_does(preset_name, method, most, least, elevation):
     sun = direction_from_angles(30, elevation)
     arrays, ball = scene(sun, elevation)
     light = preset(preset_name, method).light
     visibility, scale = occlude(light.shadow, arrays, sun)
-    check(arrays, ball, sun, (visibility, scale), most)
+    check(arrays, ball, sun, (visibility, scale), most, least)
     towards = (arrays["means"][:ball] - [0, 0, HEIGHT]) @ sun / RADIUS
     assert visibility[:ball][towards > 0.2].mean() > 0.95  # the sphere does not darken its own sunlit side
     assert visibility[:ball][towards < -0.2].mean() < 0.1
