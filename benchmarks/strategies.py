@@ -240,7 +240,7 @@ def figure(dataset: Dataset, options: argparse.Namespace) -> dict[str, Any]:
     table = WarmStartConfig()
     shorter = min(1.0, options.figure_steps / 5_000)
     table = replace(table, steps=int(shorter * table.steps), decay=int(shorter * table.decay))
-    plain = replace(table, travel=0.0, gather=False, revive=0.0)
+    plain = replace(table, travel=0.0, gather=False, spacing=0.0, revive=0.0)
     starts = dict(zip(CURVES, (None, table, plain), strict=True))
     found = {}
     for name, warm_start in starts.items():

@@ -278,6 +278,16 @@ def test_it_pulls_gaussians_into_the_object_and_keeps_their_number(meshed):
     assert found[1] > 3 * max(found[0], start)
 
 
+def test_what_it_gathers_becomes_a_good_model(meshed):
+    """From a box of ten times the object's size; as wide as they start, Gaussians would hide the object for good."""
+    config = replace(BASE, init_box=10.0, refinement=replace(REFINEMENT, reset_every=10**6, max_gaussians=3000))
+    losses = []
+    for spacing in (1.0, 0.0):
+        trainer = Trainer(meshed, replace(config, warm_start=replace(WARM, steps=60, spacing=spacing)))
+        losses.append(np.mean([float(trainer.step()[0]) for _ in range(220)][-40:]))
+    assert losses[0] < 0.4 * losses[1]
+
+
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_refinement_waits_and_resume_goes_on_as_if_never_stopped(meshed, tmp_path, strategy):
     config = replace(BASE, warm_start=WARM, strategy=strategy, init_box=3.0)
