@@ -96,7 +96,10 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     mapped, splatted = preset(size, "shadow-map"), preset(size, "shadow-splat")
     yield "map, surface", mapped
     yield "splat, surface", splatted
-    yield "map, surface, thesis's bias", with_shadow(mapped, bias=10.0, grazing="none")
+    yield "map, surface, thesis's shadows", with_shadow(mapped, bias=10.0, grazing="none", mapping=MappingConfig())
+    yield "map, surface, bilinear", with_shadow(mapped, mapping=MappingConfig())
+    yield "map, surface, lifted alone", with_shadow(mapped, grazing="lift")
+    yield "splat, surface, lifted alone", with_shadow(splatted, grazing="lift")
     yield "map, surface, no refinement", with_shadow(mapped, refine=None)
     closer = MappingConfig("percentage-closer", sun_radius_deg=SUN_RADIUS_DEG)
     yield "map, surface, percentage-closer", with_shadow(mapped, mapping=closer)
@@ -105,6 +108,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "splat, surface, supervised", replace(splatted, visibility_weight=0.1)
     yield "map, surface, light of twice the size", with_shadow(mapped, size=2 * shadow_of(mapped).size)
     yield "map, surface, linear", replace(mapped, light=replace(mapped.light, linear=True))
+    yield "map, surface, linear, filmic", replace(mapped, light=replace(mapped.light, linear=True, tone="filmic"))
     yield "splat, surface, gradients", with_shadow(splatted, gradients=True)
     yield "splat, surface, supervised, gradients", with_shadow(replace(splatted, visibility_weight=0.1), gradients=True)
 
@@ -113,7 +117,8 @@ def as_thesis(config: TrainConfig) -> TrainConfig:
     """The field and the shadows as the thesis has them, in networks of the preset's size."""
     assert config.light is not None
     config = replace(config, light=replace(config.light, field=with_field(config.light.field, "thesis")))
-    return with_shadow(config, bias=10.0, grazing="none") if config.light.shadow else config
+    shadow = {"bias": 10.0, "grazing": "none", "mapping": MappingConfig()}
+    return with_shadow(config, **shadow) if config.light.shadow else config
 
 
 def with_shadow(config: TrainConfig, **changes: Any) -> TrainConfig:
