@@ -40,7 +40,7 @@ class RenderLoop:
         self._resting: dict[Hashable, tuple[float, Wish]] = {}
         self._work: list[Callable[[], Any]] = []
         self._changed = threading.Condition()
-        self._going = True
+        self._going, self._busy = True, False
         self._thread = threading.Thread(target=self._run, name="render", daemon=True)
 
     def start(self) -> None:
@@ -66,6 +66,12 @@ class RenderLoop:
             self._work.append(work)
             self._changed.notify()
 
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is drawn or waits to be."""
+        with self._changed:
+            return not (self._busy or self._wishes or self._resting or self._work)
+
     def stop(self, patience: float = 5.0) -> None:
         """End after the picture that is being drawn."""
         with self._changed:
@@ -77,12 +83,14 @@ class RenderLoop:
     def _run(self) -> None:
         while True:
             with self._changed:
+                self._busy = False
                 task = self._next()
                 while task is None and self._going:
                     moments = [moment for moment, _ in self._resting.values()]
                     due = min(moments + ([] if self._tidy_at is None else [self._tidy_at]), default=None)
                     self._changed.wait(None if due is None else max(due - time.monotonic(), 0.0))
                     task = self._next()
+                self._busy = task is not None
                 if not self._going:
                     return
             assert task is not None

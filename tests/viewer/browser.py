@@ -29,7 +29,7 @@ FLAGS = (
     "--no-first-run",
     "--remote-debugging-port=0",
 )
-PATIENCE = 40.0  #: seconds until what is waited for counts as never coming
+PATIENCE = 120.0  #: seconds until what is waited for counts as never coming
 
 
 def wait_for(condition: Callable[[], Any], what: str, patience: float = PATIENCE) -> Any:
@@ -110,6 +110,11 @@ class Page:
         data = base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
+    def frames(self, count: int = 2) -> None:
+        """Wait until the tab has drawn so often, however slow it is; a second where it draws nothing."""
+        step = "const step = () => count-- ? requestAnimationFrame(step) : done();"
+        self.evaluate(f"new Promise(done => {{ let count = {count}; {step} step(); setTimeout(done, 1000); }})")
+
     def mouse(self, kind: str, x: float, y: float, buttons: int = 0) -> None:
         """One event of the mouse: mousePressed, mouseMoved or mouseReleased."""
         pressed = {} if kind == "mouseMoved" else {"button": "left", "clickCount": 1}
@@ -118,19 +123,19 @@ class Page:
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8) -> None:
         """With the left button from one point to another, pixels."""
         self.mouse("mouseMoved", *start)
-        time.sleep(0.2)  # what is under the pointer is found out in the next frame
+        self.frames(8)  # what is under the pointer is found out in the next frames
         self.mouse("mousePressed", *start, buttons=1)
         for k in range(1, steps + 1):
             share = k / steps
             point = [(1 - share) * a + share * b for a, b in zip(start, end, strict=True)]
             self.mouse("mouseMoved", *point, buttons=1)
-            time.sleep(0.06)
+            self.frames(3)
         self.mouse("mouseReleased", *end)
 
     def click(self, x: float, y: float) -> None:
         """With the left button."""
         self.mouse("mouseMoved", x, y)
-        time.sleep(0.2)
+        self.frames(8)
         self.mouse("mousePressed", x, y, buttons=1)
         self.mouse("mouseReleased", x, y)
 

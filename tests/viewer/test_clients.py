@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import wait_for
+from browser import PATIENCE, wait_for
 
 from spacesim.data.geometry import look_at, quaternion_from_rotation
 from spacesim.data.records import Sun
@@ -31,7 +31,12 @@ pytestmark = pytest.mark.filterwarnings(r"ignore:(Queued a |\[viser\])")  # as t
 def connected(viewer):
     url = viewer.url.replace("http", "ws")
     return client.connect(
-        url, subprotocols=[f"viser-v{viser.__version__}"], compression=None, max_size=None, close_timeout=0.5
+        url,
+        subprotocols=[f"viser-v{viser.__version__}"],
+        compression=None,
+        max_size=None,
+        open_timeout=PATIENCE,
+        close_timeout=0.5,
     )
 
 
@@ -53,7 +58,7 @@ def camera_message(angle=0.0, **changes):
     return msgspec.msgpack.encode({**message, **changes})
 
 
-def pictures(socket, count, patience=20.0):
+def pictures(socket, count, patience=PATIENCE):
     """Messages until so many background pictures have come."""
 
     found, deadline = 0, time.monotonic() + patience
@@ -143,7 +148,7 @@ def test_pages_of_other_sites_are_refused(viewer):
 
         def listen():
             for _ in range(100):
-                socket.recv(timeout=10)
+                socket.recv(timeout=PATIENCE)
 
         with pytest.raises(websockets.exceptions.ConnectionClosed):
             listen()
@@ -179,10 +184,10 @@ def test_clients_that_leave_in_the_middle(viewer, at_start):
 
 
 def test_the_page_is_served_and_nothing_else(viewer):
-    with urllib.request.urlopen(viewer.url, timeout=10) as answer:
+    with urllib.request.urlopen(viewer.url, timeout=PATIENCE) as answer:
         assert b"<html" in answer.read()[:500].lower()
     with pytest.raises(urllib.error.HTTPError):
-        urllib.request.urlopen(f"{viewer.url}/../../../etc/passwd", timeout=10)
+        urllib.request.urlopen(f"{viewer.url}/../../../etc/passwd", timeout=PATIENCE)
 
 
 def memory(viewer):
@@ -197,7 +202,7 @@ def memory(viewer):
         done.set()
 
     viewer.loop.do(read)
-    assert done.wait(30)
+    assert done.wait(PATIENCE)
     return found[0]
 
 
@@ -212,7 +217,7 @@ def growth(viewer, stand):
                     socket.send(camera_message(0.02 * j + k))
                     viewer.put(Stand(stand.poses, Sun.from_angles(7 * j + 40 * k, 30)))
                     pictures(socket, 1)
-        wait_for(lambda: not viewer.clients, "all to be gone")
+        wait_for(lambda: not viewer.clients and viewer.loop.idle, "all to be gone")
 
     look_around(4)
     before = memory(viewer)
@@ -272,9 +277,9 @@ def test_a_picture_is_sent_as_a_png(viewer, at_start):
         pictures(socket, 1)
         (number,) = set(viewer.clients) - before or set(viewer.clients)
         press(socket, button(viewer, "Picture (PNG)", viewer.clients[number]))
-        content, name, deadline = b"", None, time.monotonic() + 20
+        content, name, deadline = b"", None, time.monotonic() + PATIENCE
         while not content and time.monotonic() < deadline:
-            messages, buffers = messages_of(socket.recv(timeout=20))
+            messages, buffers = messages_of(socket.recv(timeout=PATIENCE))
             for message in messages:
                 if message["type"] == "FileTransferStartDownload":
                     name = message["filename"]
@@ -297,15 +302,15 @@ def test_a_path_is_played_by_the_camera_of_who_asks(viewer, at_start):
         wait_for(lambda: len(viewer.paths.path.keyframes) == 1, "a keyframe")
         socket.send(camera_message(np.pi / 2))
         pictures(socket, 1)
-        press(socket, viewer.paths.step, 0.5)
-        wait_for(lambda: viewer.paths.step.value == 0.5, "the time")
+        press(socket, viewer.paths.step, 3.0)
+        wait_for(lambda: viewer.paths.step.value == 3.0, "the time")
         press(socket, button(viewer, "Add this view"))
         wait_for(lambda: len(viewer.paths.path.keyframes) == 2, "another keyframe")
-        assert viewer.paths.path.seconds == 0.5
+        assert viewer.paths.path.seconds == 3.0
         press(socket, button(viewer, "Play / stop"))
-        places, deadline = [], time.monotonic() + 20
+        places, deadline = [], time.monotonic() + PATIENCE
         while (not places or np.abs(np.array(places[-1]) - [7, 0, 1]).max() > 1e-3) and time.monotonic() < deadline:
-            messages, _ = messages_of(socket.recv(timeout=20))
+            messages, _ = messages_of(socket.recv(timeout=PATIENCE))
             places += [m["position"] for m in messages if m["type"] == "SetCameraPositionMessage"]
         assert len(places) > 3
         assert places[0][1] < -3  # near where the first keyframe is
@@ -315,7 +320,7 @@ def test_a_path_is_played_by_the_camera_of_who_asks(viewer, at_start):
         moved = []
         other.send(camera_message(0.2))
         for _ in range(2):
-            messages, _ = messages_of(other.recv(timeout=20))
+            messages, _ = messages_of(other.recv(timeout=PATIENCE))
             moved += [m for m in messages if m["type"] == "SetCameraPositionMessage" and not m["initial"]]
         assert moved == []
 
@@ -328,9 +333,9 @@ def test_a_click_on_a_camera_of_the_data_looks_from_there(viewer, at_start):
         pictures(socket, 1)
         client = viewer.clients[next(iter(set(viewer.clients) - before))]
         press(socket, button(viewer, "Cameras", client))
-        names, owner, place, deadline = set(), "", None, time.monotonic() + 20
+        names, owner, place, deadline = set(), "", None, time.monotonic() + PATIENCE
         while place is None and time.monotonic() < deadline:
-            for message in messages_of(socket.recv(timeout=20))[0]:
+            for message in messages_of(socket.recv(timeout=PATIENCE))[0]:
                 if message["type"] == "CameraFrustumMessage":
                     names.add(message["name"])
                     owner = message["owner"]

@@ -9,6 +9,7 @@ import sys
 import urllib.request
 
 import pytest
+from browser import PATIENCE
 
 
 @pytest.fixture(autouse=True)
@@ -44,11 +45,11 @@ def test_it_says_where_to_look_and_ends_quietly(tiny_run):
     try:
         assert f":{port}" not in url
         assert any(str(port) in line and "taken" in line for line in lines)
-        with urllib.request.urlopen(url, timeout=20) as answer:
+        with urllib.request.urlopen(url, timeout=PATIENCE) as answer:
             assert answer.status == 200
     finally:
         process.send_signal(signal.SIGINT)
-        output, errors = process.communicate(timeout=20)
+        output, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
     assert output == ""
     assert [line for line in errors.splitlines() if "cannot be relit" not in line] == []  # a vanilla run's sentence

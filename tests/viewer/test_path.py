@@ -5,6 +5,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
+from browser import PATIENCE
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
@@ -180,13 +181,13 @@ def test_an_orbit_starts_where_the_view_is():
 def test_a_player_ends_at_the_end_and_when_it_is_told():
     seen, ended = [], []
     player = Player(seen.append, 0.3, lambda: ended.append(True))
-    player._thread.join(5)
+    player._thread.join(PATIENCE)
     assert ended == [True]
     assert seen[-1] == 0.3
     assert seen == sorted(seen)
     long = Player(seen.append, 60.0, lambda: ended.append(True))
     long.stop()
-    long._thread.join(5)
+    long._thread.join(PATIENCE)
     assert ended == [True, True]
 
 
