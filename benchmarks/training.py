@@ -33,7 +33,8 @@ from synthetic import NEVER, STILL, still_trainer, write_dataset
 from spacesim import backend
 from spacesim.data.images import load_image
 
-MEMORY_SIZES = "16384x64,17000x64,20000x64,24000x64,30000x64,40000x64"  #: a power of two, and above one
+MEMORY_SIZES = "16384x64,16385x64,20000x64,21846x64,30000x64,32769x64,43691x64,65537x64,87382x64,131073x64,200000x64"
+"""A power of two; just above one and above 4/3 of one, where a Gaussian takes most; others."""
 SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "30000x256"}
 ROUNDS = 3  #: of ours and OpenSplat in turn
 WARM_UP = 20  #: steps: all degrees of harmonics are recorded, all pictures decoded

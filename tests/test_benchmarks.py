@@ -132,10 +132,13 @@ def test_training_tells_a_step_and_what_was_not_measured():
 
 
 def test_memory_counts_the_parameters_and_their_moments():
-    report = json.loads(call("training.py", "--sizes", "512x32", "--memory", "--json"))
+    """8,193 rows are just above a power of two, to which Dr.Jit rounds: the most that so many ever take."""
+    report = json.loads(call("training.py", "--sizes", "512x32,8193x32", "--memory", "--json"))
+    few, many = (row["bytes a Gaussian"] for row in report["memory"])
     parameters = 59 * 4
     # values and two moments are there before and after an update; gradients and statistics beside them
-    assert 3 * parameters < report["memory"][0]["bytes a Gaussian"] < 12 * parameters
+    assert 3 * parameters < few < 12 * parameters
+    assert 3 * parameters < many <= 1536
 
 
 def test_shadows_compares_methods_and_goes_on_where_it_stopped(small_lit, tmp_path):

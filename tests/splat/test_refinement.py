@@ -1,14 +1,16 @@
 """Adam, the moves of refinement, and the default strategy's decisions."""
 
+import gc
 from dataclasses import replace
 
+import drjit as dr
 import numpy as np
 import pytest
 
-from spacesim.backend import ad
+from spacesim.backend import ad, select
 from spacesim.splat.gaussians import NAMES, Gaussians
 from spacesim.splat.train.config import preset
-from spacesim.splat.train.densify import grow, limit_opacities, prune
+from spacesim.splat.train.densify import grow, limit_opacities, prune, rearrange
 from spacesim.splat.train.optimizer import Adam, NetworkAdam, adam_step
 from spacesim.splat.train.strategies.default import DefaultStrategy, DefaultStrategyConfig
 
@@ -171,3 +173,25 @@ def test_growth_stops_at_the_maximum_and_prefers_the_largest_gradients():
     _, _, _, moves = refine_once(1100, config, gradient=[0.01, 0.02, 0.0, 0.0, 0.0, 0.0])
     assert moves == (0, 1, 1)
     assert refine_once(1100, DefaultStrategyConfig(max_gaussians=6), gradient=GRADIENT)[3] == (0, 0, 1)
+
+
+def test_refinement_over_a_power_of_two_does_not_keep_both_sizes():
+    """Where all rows would be held as they were and as they become, half as much again would be needed."""
+    kind = dr.JitBackend.CUDA if select() == "cuda" else dr.JitBackend.LLVM
+
+    def held() -> int:
+        dr.sync_thread()
+        gc.collect()
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        return int(dr.detail.malloc_watermark(kind))
+
+    before, model = held(), gaussians(2**14 - 50)
+    model.sh = ad.ArrayXf([ad.Float(row) for row in np.zeros((48, model.count), np.float32)])
+    optimizer, index = Adam(model.rows()), np.arange(2**14 + 50) % model.count
+    dr.eval(model.rows())
+    held()
+    rearrange(model, optimizer, index, np.arange(len(index)) >= model.count)
+    peak = int(dr.detail.malloc_watermark(kind)) - before
+    assert model.count == optimizer.count == len(index)
+    assert peak < 1.25 * (held() - before)

@@ -11,6 +11,7 @@ from spacesim.data.errors import WorkError
 from spacesim.data.geometry import rotation_from_quaternion
 from spacesim.splat.gaussians import ROWS, Gaussians, entries, numbers, triple
 from spacesim.splat.train.optimizer import Adam
+from spacesim.splat.train.packing import release
 
 SPLIT_SHRINK = 1.6  #: halves of a split are this much smaller (Kerbl et al. 2023, section 5.2)
 SPLIT_COUNT = 2
@@ -35,6 +36,7 @@ def rearrange(gaussians: Gaussians, optimizer: Adam, index: np.ndarray, fresh: n
         rows[part] = [entries(row, device_index, count) for row in rows[part]]
         dr.eval(rows[part])
         gaussians.replace(rows)
+        release(count, len(index))
     optimizer.select(device_index, ad.Bool(fresh))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from spacesim.backend import ad
 from spacesim.splat.gaussians import ROWS, entries, uploaded
-from spacesim.splat.train.packing import Pack, load, packed, packs, store, unpacked, zeros
+from spacesim.splat.train.packing import Pack, load, packed, packs, release, store, unpacked, zeros
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 OWN = ROWS["sh"].start  #: rows of place, shape and opacity; harmonics or features come behind
@@ -47,6 +47,8 @@ class Adam:
             arrays = store(one, two, new)
             dr.eval(arrays)
             self.arrays[number] = arrays  # part by part, so that old ones go as new ones come
+            del pairs, one, two, arrays
+            release(count, chosen)
         size = dr.opaque(ad.UInt32, chosen)  # as a literal each size would be compiled
         for number, moment in enumerate(self.features):
             copies = dr.width(moment) // count

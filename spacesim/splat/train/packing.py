@@ -111,6 +111,13 @@ def packed(one: Sequence[np.ndarray], two: Sequence[np.ndarray], layout: tuple[P
     return arrays
 
 
+def release(before: int, after: int) -> None:
+    """Give back to the system what was freed, where rows of `after` numbers take another size of memory than rows of
+    `before`: Dr.Jit keeps freed arrays by their size, and nothing would ever use those again."""
+    if (before - 1).bit_length() != (after - 1).bit_length():
+        dr.flush_malloc_cache()
+
+
 def _gather(array: Any, index: Any, size: int) -> list[Any]:
     """A packet of `size` numbers."""
     if size == 8:
