@@ -132,8 +132,11 @@ def _train(options: argparse.Namespace) -> None:
         config = with_options(config, antialiased=True)
     if options.warm_start:
         config = with_options(config, warm_start=warm_start(options.preset))
-    if options.max_gaussians is not None:
-        config = with_options(config, refinement=replace(config.refinement, max_gaussians=options.max_gaussians))
+    if options.prune_opacity is not None and config.strategy == "mcmc":
+        raise InputError("--prune-opacity: expected a strategy that prunes, found mcmc, which moves what is faint")
+    bounds = {"max_gaussians": options.max_gaussians, "prune_opacity": options.prune_opacity}
+    told = {name: value for name, value in bounds.items() if value is not None}
+    config = replace(config, refinement=replace(config.refinement, **told))
     config = with_light(config, options)
     dataset = read_dataset(options.data)
     with reporting("train", "iterations") as report:

@@ -96,6 +96,7 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--method", default="vanilla", help="vanilla (default), relight, shadow-map, shadow-splat or park")
     one.add_argument("--strategy", default="default", help="default, mesh-aware, support-aware or mcmc")
     one.add_argument("--max-gaussians", type=int, metavar="N", help="refinement makes no more (250,000)")
+    one.add_argument("--prune-opacity", type=float, metavar="O", help="refinement prunes what is fainter (0.05)")
     one.add_argument("--init", help="mesh, points or random (default: points, else mesh, else random)")
     one.add_argument("--init-count", type=int, metavar="N", help="Gaussians at the start, at most")
     one.add_argument("--views-per-step", type=int, metavar="N", help="views whose mean gradient a step follows (1)")

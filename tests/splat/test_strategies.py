@@ -9,6 +9,7 @@ from scipy.integrate import quad
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.files import read_json
 from spacesim.data.mesh import SignedDistance
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.train.config import STRATEGIES, TrainConfig, preset
@@ -389,6 +390,19 @@ def test_lenient_culling_halves_the_opacity_threshold(kind):
             strategy = support_aware(3)
         refine(strategy, gaussians, leniency=leniency)
         assert gaussians.count == left
+
+
+def test_what_is_too_faint_is_an_option(spacesim, tiny_data, tmp_path):
+    for least, left in ((0.05, 1), (0.03, 2), (0.005, 3)):
+        gaussians = model([0.3, 0.3, 0.3], [0.9, 0.04, 0.02])
+        refine(DefaultStrategy(DefaultStrategyConfig(prune_opacity=least), 1.0, 3), gaussians)
+        assert gaussians.count == left
+    line = ["train", tiny_data, "--preset", "demo", "--init-count", 50, "--iterations", 1, "--out", tmp_path / "run"]
+    for wrong in ("0", "0.5", "nan"):
+        assert spacesim(*line, "--prune-opacity", wrong).is_refusal("--prune-opacity", "below 0.5", wrong)
+    assert spacesim(*line, "--prune-opacity", 0.01, "--strategy", "mcmc").is_refusal("--prune-opacity", "mcmc")
+    assert spacesim(*line, "--prune-opacity", 0.01).code == 0
+    assert TrainConfig.from_json(read_json(tmp_path / "run" / "config.json")).refinement.prune_opacity == 0.01
 
 
 @pytest.mark.parametrize("count", [1, 2])

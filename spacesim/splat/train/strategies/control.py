@@ -43,6 +43,8 @@ class DefaultStrategyConfig:
     def __post_init__(self) -> None:
         if self.max_gaussians < 1:
             raise InputError(f"--max-gaussians: expected at least 1, found {self.max_gaussians}")
+        if not 0 < self.prune_opacity < 0.5:  # a reset lowers to twice as much
+            raise InputError(f"--prune-opacity: expected above 0 and below 0.5, found {self.prune_opacity}")
 
 
 @dataclass(frozen=True, eq=False)
