@@ -94,12 +94,12 @@ class SunTerms:
 
 @dataclass
 class _Inputs:
-    """What shading depends on beside weights and camera. raw: occlusion, normal alignment, light extent and bias, [N]
-    each, or nothing;  place: Float [4], centre and scale of the training frame"""
+    """What shading depends on beside weights. camera: None where visibility alone is wanted;  raw: occlusion, normal
+    alignment, light extent and bias, [N] each, or nothing;  place: Float [4], centre and scale of the training frame"""
 
     features: Any
     means: Any
-    camera: Projection
+    camera: Projection | None
     raw: list[Any]
     sun: SunTerms
     place: Any
@@ -190,10 +190,20 @@ class LightModel:
     def shade(self, gaussians: Gaussians, camera: Projection, sun: np.ndarray, adaptive: bool = False) -> Shading:
         """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes.
         adaptive: see `shadows`."""
-        shadows, inputs = self._inputs(gaussians, camera, sun, adaptive)
+        shadows = self.shadows(gaussians, sun, adaptive)
+        inputs = self._inputs(gaussians, camera, sun, shadows)
         lanes = Lanes.of(gaussians.count)
         colours, visibility, tape = _shade(self.config, self.weights, inputs, lanes)
         return Shading(colours, visibility[0] if visibility else None, shadows, inputs, lanes, tape)
+
+    def visibility(self, gaussians: Gaussians, sun: np.ndarray, adaptive: bool = False) -> Any:
+        """Of `shade`, for pictures: Float [N], which no camera changes; None for a model without shadows."""
+        shadows = self.shadows(gaussians, sun, adaptive)
+        if shadows is None:
+            return None
+        lanes = Lanes.of(gaussians.count, still=True)
+        _, of_refine = _split(self.config, self.weights)
+        return _visible(self.config, of_refine, self._inputs(gaussians, None, sun, shadows), lanes)
 
     def lit(
         self,
@@ -201,18 +211,19 @@ class LightModel:
         camera: Projection,
         sun: np.ndarray,
         adaptive: bool = False,
-        known: Shadows | None = None,
+        known: Any = None,
     ) -> tuple[list[Any], Any]:
-        """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. known: what `shadows` has
-        made under this Sun for an earlier picture. What the field's first layer
-        makes of the features does not change with Sun or camera and stays for the next picture: as many numbers for
-        each Gaussian as the layer has units."""
+        """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. known: `visibility` under
+        this Sun, of an earlier picture. What the field's first layer makes of the features does not change with Sun or
+        camera and stays for the next picture: as many numbers for each Gaussian as the layer has units."""
+        visibility = self.visibility(gaussians, sun, adaptive) if known is None else known
         of_any_size = replace(camera, width=1, height=1)  # directions do not depend on it: one recording for all sizes
-        _, inputs = self._inputs(gaussians, of_any_size, sun, adaptive, known)
+        inputs = self._inputs(gaussians, of_any_size, sun, None)
         lanes = Lanes.of(gaussians.count, still=True)
         kept = self._kept_of(gaussians.features, lanes)
-        colours, visibility = _lit(self.config, self.weights, inputs, lanes, kept.known, kept.packed)
-        return colours, visibility[0] if visibility else None
+        of_field, _ = _split(self.config, self.weights)
+        seen = [] if visibility is None else [visibility]
+        return _lit(self.config, of_field, inputs, lanes, kept.known, kept.packed, seen), visibility
 
     def adjoint(self, shading: Shading, by_colour: list[Any], by_visibility: Any = None) -> "LightGradients":
         """From the gradients of the dimmed colours (3 arrays [N]) and, where visibility is seen on its own, of the
@@ -242,17 +253,10 @@ class LightModel:
         return model
 
     def _inputs(
-        self,
-        gaussians: Gaussians,
-        camera: Projection,
-        sun: np.ndarray,
-        adaptive: bool,
-        known: Shadows | None = None,
-    ) -> tuple[Shadows | None, _Inputs]:
-        shadows = known or self.shadows(gaussians, sun, adaptive)
+        self, gaussians: Gaussians, camera: Projection | None, sun: np.ndarray, shadows: Shadows | None
+    ) -> _Inputs:
         raw = [shadows.occlusion, *shadows.info] if shadows else []
-        terms = self.sun_terms(sun)
-        return shadows, _Inputs(gaussians.features, gaussians.means, camera, raw, terms, self._place)
+        return _Inputs(gaussians.features, gaussians.means, camera, raw, self.sun_terms(sun), self._place)
 
     def _kept_of(self, features: Any, lanes: Lanes) -> _Kept:
         """Made anew where features or weights have changed. Copies hold what was read: a number of Dr.Jit's that is in
@@ -289,14 +293,14 @@ def _trace_shade(
 
 def _trace_lit(
     config: LightConfig,
-    weights: list[Any],
+    of_field: list[Any],
     inputs: _Inputs,
     lanes: Lanes,
     known: mlp.Known | None,
     packed: list[Any],
-) -> tuple[list[Any], list[Any]]:
-    """(dimmed colours, [visibility] or []); known, packed: see `_Kept`"""
-    of_field, of_refine = _split(config, weights)
+    visibility: list[Any],
+) -> list[Any]:
+    """Dimmed colours. known, packed: see `_Kept`;  visibility: [N] in a list, or nothing"""
     field = config.field
     rows = field_views(field, _field_inputs(inputs), lanes)
     if known:
@@ -306,9 +310,18 @@ def _trace_lit(
     else:
         rows = lanes.block(inputs.features, 0, field.features) + rows
         outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field)
+    seen = [lanes.padded(value) for value in visibility]
     colours = [_sigmoid(value) for value in outputs]
-    shown, visibility, _, _ = _dimmed(config, of_refine, inputs, lanes, colours)
-    return shown, visibility
+    shown = [colour * seen[0] if seen else colour for colour in colours]
+    dr.eval(shown)
+    return lanes.narrowed(shown, inputs.means.x)
+
+
+def _trace_visible(config: LightConfig, of_refine: list[Any], inputs: _Inputs, lanes: Lanes) -> Any:
+    """The refined visibility [N]."""
+    visibility = [1 - value for value in _occluded(config, of_refine, inputs, lanes)[0]]
+    dr.eval(visibility)
+    return lanes.narrowed(visibility, inputs.means.x)[0]
 
 
 def _trace_known(field: FieldConfig, weights: list[Any], features: Any, lanes: Lanes) -> mlp.Known:
@@ -320,17 +333,22 @@ def _dimmed(
     config: LightConfig, of_refine: list[Any], inputs: _Inputs, lanes: Lanes, colours: list[Any]
 ) -> tuple[list[Any], list[Any], list[Any], list[Any]]:
     """(dimmed colours [N], [visibility [N]] or [], refined occlusion, tape of the refinement) of colours [M]."""
-    occlusion = [lanes.padded(row) for row in inputs.raw[:1]]
-    refine_tape: list[Any] = []
-    if config.refine:
-        items = _refine_items(config, config.refine, inputs, lanes)
-        output, refine_tape = mlp.forward(config.refine.shape, of_refine, items, inputs.sun.refine)
-        occlusion = [refined(occlusion[0], lanes.row(output, 0))]
+    occlusion, refine_tape = _occluded(config, of_refine, inputs, lanes)
     visibility = [1 - value for value in occlusion]
     shown = [colour * visibility[0] if visibility else colour for colour in colours] + visibility
     dr.eval(shown, colours, occlusion)
     *shown, last = lanes.narrowed(shown, inputs.means.x)
     return (shown, [last], occlusion, refine_tape) if visibility else ([*shown, last], [], occlusion, refine_tape)
+
+
+def _occluded(config: LightConfig, of_refine: list[Any], inputs: _Inputs, lanes: Lanes) -> tuple[list[Any], list[Any]]:
+    """([refined occlusion [M]] or [], tape of the refinement)."""
+    occlusion = [lanes.padded(row) for row in inputs.raw[:1]]
+    if not config.refine:
+        return occlusion, []
+    items = _refine_items(config, config.refine, inputs, lanes)
+    output, tape = mlp.forward(config.refine.shape, of_refine, items, inputs.sun.refine)
+    return [refined(occlusion[0], lanes.row(output, 0))], tape
 
 
 def _trace_adjoint(
@@ -382,6 +400,7 @@ def _refine_items(config: LightConfig, refine: RefineConfig, inputs: _Inputs, la
 
 
 def _field_inputs(inputs: _Inputs) -> FieldInputs:
+    assert inputs.camera is not None
     return FieldInputs(inputs.features, inputs.means, inputs.camera, towards_sun(inputs.sun.light))
 
 
@@ -397,5 +416,6 @@ def _sigmoid(value: Any) -> Any:
 
 _shade = recorded(_trace_shade, RECORDINGS)
 _lit = recorded(_trace_lit, RECORDINGS)
+_visible = recorded(_trace_visible, RECORDINGS)
 _known = recorded(_trace_known, RECORDINGS)
 _adjoint = recorded(_trace_adjoint, RECORDINGS)

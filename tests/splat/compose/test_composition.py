@@ -14,6 +14,7 @@ from spacesim.data.records import Camera, Sun
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose import ComposeConfig, Composition, Placed, Pose
 from spacesim.splat.compose.pose import rotation_about
+from spacesim.splat.light import LightModel
 
 SUN = Sun.from_angles(40, 35)
 EYE = seen_from([3.0, -2.0, 1.5])
@@ -321,6 +322,29 @@ def test_only_what_is_asked_for_is_computed(monkeypatch):
             drawn.image(name)
     with pytest.raises(ValueError, match="outputs"):
         scene.draw(EYE, SUN, ["colour"])
+
+
+def test_what_a_change_leaves_as_it_was_is_not_computed_again(monkeypatch):
+    """A camera that moves leaves all visibility; a model that moves with the world's Sun, that of the others."""
+    asked = []
+    visibility = LightModel.visibility
+
+    def counted(self, *arguments, **named):
+        asked.append(self)
+        return visibility(self, *arguments, **named)
+
+    monkeypatch.setattr(LightModel, "visibility", counted)
+    one, other = made_run("map", 1), made_run("splat", 2)
+    scene = Composition([Placed(one), Placed(other, Pose(translation=[0.6, 0.5, 0.5]))])
+    scene.predict(EYE, SUN)
+    assert asked == [one.light, other.light] or asked == [other.light, one.light]
+    scene.predict(seen_from([2.0, 2.0, 1.5]), SUN)
+    scene.moved(1, Pose(translation=[0.7, 0.5, 0.5])).predict(EYE, SUN)  # the Sun is at infinity
+    assert len(asked) == 2
+    scene.moved(1, Pose(rotation_about([0, 0, 1], 30), [0.7, 0.5, 0.5])).predict(EYE, SUN)
+    assert asked[2:] == [other.light]
+    scene.predict(EYE, Sun.from_angles(50, 35))
+    assert len(asked) == 5
 
 
 # ---- what cannot be ----
