@@ -70,10 +70,10 @@ class Member:
     @property
     def received(self) -> ShadowConfig:
         """How shadows of other models fall on it: as its own, but where the Sun's picture shows the others alone, a
-        depth test must know how much of a pixel they cover, as a faint rim is no wall, and neither bias nor lifted
-        points are needed, as no surface is tested against itself."""
+        depth test must know how much of a pixel they cover, as a faint rim is no wall and a veil lets light through.
+        Neither bias nor lifted points are needed, as no surface is tested against itself."""
         mapping = self.shadow.mapping
-        if mapping.filter == "bilinear":
+        if mapping.filter in ("bilinear", "median"):
             mapping = replace(mapping, filter="percentage-closer", radius=0.5)
         return replace(self.shadow, bias=0.0, grazing="none", mapping=mapping)
 

@@ -16,6 +16,7 @@ from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
 from spacesim.splat.run import Run
 from spacesim.splat.shadow.cast import ShadowConfig
+from spacesim.splat.shadow.mapping import MappingConfig
 from spacesim.splat.shadow.refine import RefineConfig
 
 FIELD = FieldConfig(features=5, width=12, layers=3, sun=Encoding("harmonics", 2), view=Encoding("harmonics", 2))
@@ -26,7 +27,10 @@ CONFIGS = {
     "map": LightConfig(FIELD, MAP),
     "splat": LightConfig(FIELD, ShadowConfig("splatting", 64, refine=REFINE)),
     "linear": LightConfig(FIELD, MAP, linear=True),
-    "surface": LightConfig(replace(FIELD, features=7, surface=True), replace(MAP, grazing="lift", size=96)),
+    "surface": LightConfig(  # shadows as in `fast`
+        replace(FIELD, features=7, surface=True),
+        replace(MAP, bias=5.0, grazing="both", size=96, mapping=MappingConfig("median")),
+    ),
     "park": LightConfig(
         FIELD,
         ShadowConfig(
