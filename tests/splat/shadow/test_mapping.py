@@ -290,8 +290,9 @@ def test_one_none_and_invisible():
     assert occlusion(one, camera)[0] == pytest.approx(0.5)  # it is its own reference
     assert occlusion(one, camera, [0.01])[0] < 1e-4
     assert len(occlusion({key: values[:0] for key, values in one.items()}, camera)) == 0
-    assert occlusion(splats([[0, 0, 0]], 0.1, 0.001), camera)[0] == 0
-    assert occlusion(splats([[50, 0, 0]], 0.1), camera)[0] == 0
+    for name in ("bilinear", "median"):
+        assert occlusion(splats([[0, 0, 0]], 0.1, 0.001), camera, config=CONFIGS[name])[0] == 0
+        assert occlusion(splats([[50, 0, 0]], 0.1), camera, config=CONFIGS[name])[0] == 0
 
 
 @pytest.mark.parametrize("elevation", [30, 60, 90])
