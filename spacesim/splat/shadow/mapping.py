@@ -127,6 +127,9 @@ def median_map(gaussians: Gaussians, camera: Orthographic, antialiased: bool = T
     shape = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
     splats, footprints, _ = _prepare(*dr.detach(shape), camera, False, antialiased)
     lists = bin_splats(splats, footprints, camera.width, camera.height)
+    if lists.capacity == 0:  # zeros that are no constants of the kernels that read them
+        alpha, depth = (dr.opaque(ad.Float, 0, camera.width * camera.height) for _ in range(2))
+        return LightMap(alpha, depth, None, camera.width, camera.height)
     alpha, depth = _median(rows, splats, lists, camera, Pixels.of(camera.width, camera.height, gaussians.count))
     return LightMap(alpha, depth, None, camera.width, camera.height)
 
