@@ -132,8 +132,8 @@ def test_training_tells_a_step_and_what_was_not_measured():
 
 
 def test_memory_counts_the_parameters_and_their_moments():
-    """8,193 rows are just above a power of two, to which Dr.Jit rounds: the most that so many ever take."""
-    report = json.loads(call("training.py", "--sizes", "512x32,8193x32", "--memory", "--json"))
+    """16,385 rows are just above a power of two, to which Dr.Jit rounds: the most that so many ever take."""
+    report = json.loads(call("training.py", "--sizes", "512x32,16385x32", "--memory", "--json"))
     few, many = (row["bytes a Gaussian"] for row in report["memory"])
     parameters = 59 * 4
     # values and two moments are there before and after an update; gradients and statistics beside them

@@ -17,7 +17,8 @@ from spacesim.backend import ad, select
 from spacesim.splat.gaussians import uploaded
 from spacesim.splat.records import packet
 
-SHARES = (15, 14, 12, 8, 4, 3, 2, 1)  #: pairs of an array, chosen: few, since each is compiled, and near powers of two
+SMALL = 2**14  #: Gaussians, chosen: so few take little anyway, and each way to deal their rows is compiled on its own
+SHARES = (15, 14, 12, 8, 4, 3, 2, 1)  #: pairs of an array, chosen: few, and most near powers of two
 
 
 @dataclass(frozen=True)
@@ -48,12 +49,12 @@ class Pack:
 @lru_cache(maxsize=1024)
 def packs(pairs: int, count: int) -> tuple[Pack, ...]:
     """The arrays for `pairs` pairs of rows of `count` Gaussians that take the least memory, large ones first; of equals
-    the fewest."""
+    the fewest. Up to `SMALL` Gaussians the same for all up to a power of two, as large as single rows would be."""
     if pairs == 0:
         return ()
     found = []
     for share in SHARES:
-        if share <= pairs:
+        if share <= pairs and (count > SMALL or share.bit_count() == 1):
             size = 1 << (2 * share * max(count, 1) - 1).bit_length()
             found.append((Pack(share, size), *packs(pairs - share, count)))
     return min(found, key=lambda several: (sum(pack.size for pack in several), len(several)))
