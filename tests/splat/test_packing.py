@@ -9,17 +9,7 @@ from spacesim.splat.gaussians import uploaded
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.packing import Pack, load, packed, packs, store, unpacked, zeros
 
-LAYOUTS = [
-    (15, 16_400),
-    (15, 17_500),
-    (15, 19_000),
-    (15, 22_000),
-    (14, 17_500),
-    (11, 16_400),
-    (15, 1030),
-    (9, 1024),
-    (3, 1),
-]
+LAYOUTS = [(15, 16_400), (15, 17_500), (15, 19_000), (15, 22_000), (14, 17_500), (11, 1030), (9, 1024), (3, 1)]
 
 
 def rows(pairs: int, count: int, seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -35,7 +25,7 @@ def numbers(found: tuple[list, list]) -> np.ndarray:
 def test_rows_come_back_in_every_order(pairs, count):
     layout, given = packs(pairs, count), rows(pairs, count)
     assert sum(pack.pairs for pack in layout) == pairs
-    index = np.random.default_rng(1).integers(0, count, 3 * count + 7).astype(np.uint32)
+    index = np.random.default_rng(1).integers(0, count, 2 * count + 7).astype(np.uint32)
     by_numpy = packed(*given, layout)
     by_drjit = store([ad.Float(row) for row in given[0]], [ad.Float(row) for row in given[1]], layout)
     dr.eval(by_drjit)
@@ -48,7 +38,7 @@ def test_rows_come_back_in_every_order(pairs, count):
 
 def test_no_two_numbers_share_a_place():
     for pairs in (1, 3, 11, 14, 15):
-        for count in (1, 3, 1025, 2048, 16_385, 17_480, 18_730, 21_850, 32_768):
+        for count in (1, 3, 1025, 2048, 16_385, 17_480, 18_730, 21_850):
             for pack in packs(pairs, count):
                 assert pack.room >= count
                 places = [
@@ -57,7 +47,9 @@ def test_no_two_numbers_share_a_place():
                     for part in range(size)
                 ]
                 assert len(places) == 2 * pack.pairs
-                assert len(np.unique(places)) == 2 * pack.pairs * pack.room <= pack.size
+                taken = np.bincount(np.concatenate(places))
+                assert taken.max() == 1
+                assert taken.sum() == 2 * pack.pairs * pack.room <= pack.size
 
 
 def test_packets_are_of_the_sizes_that_the_backend_reads_at_once():
@@ -72,7 +64,7 @@ def allocated(numbers: int) -> int:
 def test_moments_fill_what_is_allocated_for_them():
     """118 rows take as much as 118 arrays just below a power of two, and little more than their numbers above one."""
     worst = {}
-    for count in range(20_000, 200_000, 37):
+    for count in range(20_000, 200_000, 151):
         optimizer_bytes = sum(4 * pack.size for pairs in (14, 15, 15, 15) for pack in packs(pairs, count))
         plain = 118 * allocated(count)
         assert optimizer_bytes <= plain
@@ -84,8 +76,8 @@ def test_moments_fill_what_is_allocated_for_them():
 
 
 def test_few_gaussians_have_one_layout_up_to_each_power_of_two():
-    assert len({packs(15, count) for count in range(2**13 + 1, 2**14 + 1)}) == 1
-    assert len({packs(15, count) for count in range(2**14 + 1, 2**15 + 1)}) == 4
+    assert len({packs(15, count) for count in [*range(2**13 + 1, 2**14, 61), 2**14]}) == 1
+    assert len({packs(15, count) for count in [*range(2**14 + 1, 2**15, 61), 2**15]}) == 4
 
 
 def test_adam_holds_what_its_layouts_say():
