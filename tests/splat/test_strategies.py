@@ -360,7 +360,7 @@ def test_state_follows_duplicates_halves_and_what_is_pruned(kind):
     scales = np.full((3, 6), TINY, np.float32)
     scales[:, 3] = LARGE
     gaussians.log_scales = ad.Array3f(scales)
-    config = DefaultStrategyConfig(prune_opacity=0.5)
+    config = DefaultStrategyConfig(prune_opacity=0.499)
     if kind == "mesh-aware":
         strategy: Strategy = MeshAwareStrategy(config, replace(MESH, exterior_margin=0.0), Height(), 1.0, 6)
     else:

@@ -149,7 +149,7 @@ def test_the_run_says_how_it_was_made(finished):
 
 
 def test_refinement_that_leaves_nothing_is_said(small_dataset):
-    trainer = Trainer(small_dataset, replace(CONFIG, refinement=replace(REFINEMENT, prune_opacity=0.999)))
+    trainer = Trainer(small_dataset, replace(CONFIG, refinement=replace(REFINEMENT, prune_opacity=0.499)))
     with pytest.raises(WorkError, match="prune every Gaussian"):
         trainer.run(lambda progress: None, lambda: None)
 
