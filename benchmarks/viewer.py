@@ -6,14 +6,18 @@ Without a run the scene is the sphere of random splats of the other benchmarks, 
 a picture in full resolution under another camera, or another Sun or pose, numpy and colour map included; "frames/s" is
 what a client over a websocket gets that moves its camera as soon as a picture has come, and the resolution that the
 viewer has chosen by then. Then, for --seconds, clients of another process (`visitor.py`) use every control, turn round
-the scene, leave without a word and come back. Memory is what the viewer's process has in memory: the median of each
-tenth of the time, and the growth by a line through the second half. `--seconds 0` leaves that out.
+the scene, leave without a word and come back. Memory is what the viewer's process has in memory, files apart: the most
+of all, and after each tenth of the time what is left when free memory has gone back to the system; growth is by a line
+through the second half of these. Recordings are Dr.Jit's, one for each size of picture and of its lists. `--seconds 0`
+leaves all that out.
 """
 
+import gc
 import itertools
 import json
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -33,6 +37,7 @@ from spacesim.splat.light import LightModel, TrainingFrame
 from spacesim.splat.run import Run
 from spacesim.splat.train.config import preset
 from spacesim.viewer.frames import draw
+from spacesim.viewer.memory import give_back
 from spacesim.viewer.opened import opened
 from spacesim.viewer.server import Show, Viewer
 from spacesim.viewer.stage import Stage
@@ -145,39 +150,49 @@ def look_around(viewer: Viewer, lasts: float, clients: int, side: int) -> common
     """Memory and frames a second of clients that do all that can be done, in a process of their own."""
     command = [sys.executable, str(Path(__file__).with_name("visitor.py")), viewer.url]
     command += ["--seconds", str(lasts), "--clients", str(clients), "--side", str(side)]
-    start, moments, sizes = time.monotonic(), [], []
+    start, sizes, kept = time.monotonic(), [], list[tuple[float, float, int]]()
     with subprocess.Popen(command, stdout=subprocess.PIPE) as visitors, reporting("look around", "seconds") as report:
         while visitors.poll() is None and (now := time.monotonic() - start) < lasts + PATIENCE:
-            moments.append(now)
-            sizes.append(_resident())
+            sizes.append(_megabytes())
+            if now >= lasts * (len(kept) + 1) / 10:
+                kept.append((now, _kept(viewer), backend.recordings()))
             report(min(int(now), int(lasts)), int(lasts), f"{sizes[-1]:.0f} MiB")
             time.sleep(min(EVERY, lasts / 20))
         told, _ = visitors.communicate(timeout=PATIENCE)
-    frames = json.loads(told)["pictures"]
-    minutes = [float(np.median(_between(moments, sizes, k * lasts / 10, (k + 1) * lasts / 10))) for k in range(10)]
-    half = [k for k, moment in enumerate(moments) if moment >= lasts / 2]
-    slope = 60 * float(np.polyfit([moments[k] for k in half], [sizes[k] for k in half], 1)[0])
+    half = kept[len(kept) // 2 :]
+    slope = 60 * float(np.polyfit([now for now, _, _ in half], [size for _, size, _ in half], 1)[0])
     return {
         "seconds": round(lasts),
         "clients": clients,
-        "frames": sum(frames),
-        "MiB in each tenth": ", ".join(f"{size:.0f}" for size in minutes),
-        "at most": round(max(sizes)),
+        "frames": sum(json.loads(told)["pictures"]),
+        "MiB at most": round(max(sizes)),
+        "MiB kept after each tenth": ", ".join(f"{size:.0f}" for _, size, _ in kept),
+        "recordings": ", ".join(str(count) for _, _, count in kept),
         "MiB a minute in the second half": round(slope, 2),
-        "recordings": backend.recordings(),
     }
 
 
-def _between(moments: list[float], sizes: list[float], start: float, end: float) -> list[float]:
-    return [size for moment, size in zip(moments, sizes, strict=True) if start <= moment < end] or sizes[-1:]
+def _kept(viewer: Viewer) -> float:
+    """MiB once what is free has gone back to the system."""
+    found, done = [], threading.Event()
+
+    def read() -> None:
+        gc.collect()
+        give_back()
+        found.append(_megabytes())
+        done.set()
+
+    viewer.loop.do(read)
+    done.wait(PATIENCE)
+    return found[0]
 
 
-def _resident() -> float:
-    """MiB of this process that are in memory."""
+def _megabytes() -> float:
+    """MiB of this process that are in memory, files that it reads apart."""
     try:
-        with open("/proc/self/statm") as file:
-            return int(file.read().split()[1]) * 4096 / 2**20
-    except OSError:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("RssAnon:"))
+    except (OSError, StopIteration):
         raise InputError("--seconds: expected 0 where there is no /proc to read the memory from") from None
 
 

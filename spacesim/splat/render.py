@@ -142,7 +142,7 @@ class Blend:
 
 def blend(splats: Splats, footprints: Footprints, features: Sequence[Any], camera: Projection) -> Blend:
     """Stages 2 and 3 for any number of features (Floats [N]) and any sign of depth. Differentiable."""
-    lists = bin_splats(splats, footprints, camera.width, camera.height)
+    lists = bin_splats(splats, footprints, camera.width, camera.height, few_sizes=True)
     passes = [list(features[i : i + CHANNELS]) for i in range(0, len(features), CHANNELS)] or [[]]
     planes: list[Any] = []
     transmittance: Any = None

@@ -25,6 +25,8 @@ DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters
 LONGEST = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long
 PACKET = 16  #: lanes that run together on a CPU with AVX-512; elsewhere fewer
 HANDS = 64  #: at most, chosen: no fewer than the parts into which Dr.Jit divides a launch, two a thread, as a rule
+STEPS, FEW = 8, 2  #: sizes of arrays from one power of two to the next, as a rule, and of the lists of pictures
+LONG = 2**22  #: pairs from which on lists of pictures have no more room than others, chosen: a gigabyte
 LARGEST_PAIRS = 0.9 * 2**30  #: records hold four numbers a pair, and Dr.Jit's arrays at most 2^32
 BYTES_A_PAIR = 200  #: of lists, sorting and blending on LLVM, 100 to 210 measured; gradients take as much again
 BYTES_A_PIXEL = 85  #: of colour, transmittance and what blending keeps of them, measured on LLVM; others beside
@@ -109,9 +111,10 @@ class _Boxes:
     upto: Any
 
 
-def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) -> TileLists:
+def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int, few_sizes: bool = False) -> TileLists:
     """Sort splats [N] into the tiles of a width x height image. Raises WorkError for more pairs than can be
-    sorted or held in memory.
+    sorted or held in memory. few_sizes: of lists, for pictures from all over, each of which has another number of
+    pairs; lists are up to half as long again.
 
     Between its two parts, both recorded, the host waits for the number of pairs, which says how large arrays must be.
     """
@@ -128,7 +131,8 @@ def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int) 
     if pairs == 0:
         none, of_splats = dr.zeros(ad.UInt32, tiles[0] * tiles[1]), dr.zeros(ad.UInt32, max(count, 1))
         return TileLists(none, none, none, none, of_splats, of_splats, 0, *tiles, shape)
-    lists: TileLists = lists_of(splats, footprints, boxes, room(pairs), capacity, tiles, shape)
+    steps = FEW if few_sizes and pairs < LONG else STEPS
+    lists: TileLists = lists_of(splats, footprints, boxes, room(pairs, steps), capacity, tiles, shape)
     return lists
 
 
@@ -144,12 +148,13 @@ def _check_room(pairs: int, pixels: int) -> None:
         )
 
 
-def room(count: int) -> int:
+def room(count: int, steps: int = STEPS) -> int:
     """`count` rounded up by about an eighth at most: few sizes are few recordings and, on LLVM, where the size of what
-    is scattered into is part of a kernel's text, few kernels to compile.
+    is scattered into is part of a kernel's text, few kernels to compile. steps: sizes from one power of two to the
+    next, itself one
 
     Never `count` itself: a recording in which the two are one takes the size of the room from the number of splats."""
-    step = max(1024, 1 << max(0, count.bit_length() - 4))
+    step = max(1024, (1 << max(0, count.bit_length() - 1)) // steps)
     return (count // step + 1) * step
 
 

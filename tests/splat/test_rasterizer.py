@@ -234,6 +234,22 @@ def test_recordings_serve_models_of_any_size():
         np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=2e-5)
 
 
+def test_pictures_have_lists_of_few_sizes():
+    """Two from one power of two to the next; a model that is seen from all over then has few recordings."""
+    counts = range(2**13, 2**17, 61)
+    sizes = {tiles.room(count, tiles.FEW) for count in counts}
+    assert len(sizes) <= 9
+    assert len({tiles.room(count) for count in counts}) > 30
+    assert all(count < tiles.room(count, tiles.FEW) <= 1.5 * count + 1 for count in counts)
+    arrays = random_splats(600, seed=5, degree=0)
+    splats, footprints = project(Gaussians.from_numpy(arrays), Pinhole.of(camera(64, 48)))
+    few, many = (tiles.bin_splats(splats, footprints, 64, 48, few_sizes=flag) for flag in (True, False))
+    assert few.pairs == many.pairs > 100
+    for name in ("start", "end"):
+        assert np.array_equal(np.array(getattr(few, name)), np.array(getattr(many, name)))
+    assert np.array_equal(np.array(few.splat)[: few.pairs], np.array(many.splat)[: many.pairs])
+
+
 @pytest.mark.parametrize("first", [1024, 2048])
 def test_a_recording_of_as_many_splats_as_its_room_holds_serves_fewer(first):
     """Where count and room were one, a replay would take the room's size from the next, smaller number of splats."""
