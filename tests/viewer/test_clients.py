@@ -17,7 +17,7 @@ from spacesim.data.records import Sun
 from spacesim.splat.compose.pose import LARGEST, SMALLEST, Pose
 from spacesim.viewer.client import Client
 from spacesim.viewer.memory import give_back
-from spacesim.viewer.state import Stand
+from spacesim.viewer.state import FARTHEST, Stand
 
 viser = pytest.importorskip("viser", reason="viser is not installed")
 msgspec, zstandard = (pytest.importorskip(name) for name in ("msgspec", "zstandard"))  # which it brings
@@ -162,6 +162,44 @@ def test_models_of_any_size_that_the_panel_takes_are_drawn(viewer, at_start, cap
         viewer.put(Stand(tuple(poses), at_start.sun))
         pictures(socket, 2)  # while it changes, and at rest
     assert "a picture failed" not in caplog.text
+    viewer.put(at_start)
+
+
+def test_wild_values_that_are_admitted_fail_no_picture(viewer, at_start, caplog):
+    """Of one client, while another one looks: places, sizes, Suns and cameras at and within the bounds."""
+    rng = np.random.default_rng(5)
+
+    def size(least, most):
+        return float(rng.choice([least, most, np.exp(rng.uniform(np.log(least), np.log(most)))]))
+
+    def turn():
+        return (lambda q: (q / np.linalg.norm(q)).tolist())(rng.normal(size=4))
+
+    def place():
+        return (rng.choice([-1, 0, 1], 3) * size(1e-3, FARTHEST)).tolist()
+
+    scales = viewer._models.scales
+    with connected(viewer) as wild, connected(viewer) as good:
+        before = set(viewer.clients)
+        good.send(camera_message(0.1))
+        pictures(good, 1)
+        (number,) = set(viewer.clients) - before
+        for k in range(25):
+            model = int(rng.integers(2))
+            handle = {"type": "TransformControlsUpdateMessage", "name": f"/models/{model}", "owner": ""}
+            wild.send(msgspec.msgpack.encode({**handle, "wxyz": turn(), "position": place()}))
+            press(wild, scales[model], size(SMALLEST, LARGEST))
+            press(wild, viewer._sun.azimuth, float(rng.uniform(0, 360)))
+            press(wild, viewer._sun.elevation, float(rng.choice([-90, 90, 0])))
+            width, height = (round(size(1, 8192)) for _ in range(2))
+            sight = {"fov": size(2e-4, 2.9), "image_width": width, "image_height": height, "position": place()}
+            wild.send(camera_message(**sight, wxyz=turn()))
+            good.send(camera_message(0.1 * k + 0.2))
+            pictures(good, 1)
+            wait_for(lambda: viewer.loop.idle, "all pictures")
+            assert "no picture" not in viewer.clients[number].controls.status.content
+    assert "a picture failed" not in caplog.text
+    assert any(pose.key != old.key for pose, old in zip(viewer.shared.stand.poses, at_start.poses, strict=True))
     viewer.put(at_start)
 
 
