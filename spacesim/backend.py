@@ -193,7 +193,11 @@ def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
     import drjit as dr
 
     now = _Arguments()
-    frozen = dr.freeze(lambda _, arrays: function(*_joined(now.arguments, iter(arrays))), limit=limit, warn_after=limit)
+    frozen = dr.freeze(
+        lambda _, arrays: function(*_joined(now.arguments, iter(arrays))),
+        limit=limit,
+        warn_after=2**31 - 1,  # who looks around for hours makes more recordings than are kept, and need not hear of it
+    )
     _recorded.add(frozen)
 
     def call(*arguments: Any) -> Any:

@@ -263,7 +263,7 @@ def memory(viewer):
 @pytest.mark.skipif(mallinfo() is None, reason="the C library does not tell how much memory is in use")
 def test_looking_around_takes_no_memory(viewer, at_start, monkeypatch):
     """60 pictures under some Suns for clients that come and go, after as many to warm up; and a viewer that kept its
-    pictures would be found out."""
+    pictures would be found out. What is in use goes up and down by some MiB as Dr.Jit's recordings come and go."""
     kept, show = [], Client.show
     monkeypatch.setattr("spacesim.viewer.frames.BUDGET", 1e9)  # all pictures in full resolution, however slow
 
@@ -286,8 +286,8 @@ def test_looking_around_takes_no_memory(viewer, at_start, monkeypatch):
     leaking = look_around()
     pictured = 60 * 384 * 288 * 3  # bytes of the pictures
     told = f"{(clean - warm) / 2**20:.1f} MiB, {(leaking - clean) / 2**20:.1f} MiB with all pictures kept"
-    assert clean - warm < 0.1 * pictured, told
-    assert leaking - clean > 0.9 * pictured, told
+    assert clean - warm < 0.5 * pictured, told
+    assert leaking - clean > 0.5 * pictured, told
 
 
 def messages_of(data):
