@@ -375,7 +375,9 @@ def _print_headline(metrics: dict[str, Any]) -> None:
     ending.say(f"shadows: BER {show('shadow', 'ber', 4)}, boundary MAE {show('shadow', 'boundary_mae', 4)}")
     if metrics.get("shadow_mask"):
         share, balanced = show("shadow_mask", "error_rate", 4), show("shadow_mask", "balanced_error_rate", 4)
-        ending.say(f"shadow masks: error rate {share}, balanced {balanced}")
+        pooled = metrics["shadow_mask"]["error_rate"]
+        whole = "" if pooled is None else f" ({pooled['pooled']:.4f} over the pixels of all frames)"
+        ending.say(f"shadow masks: error rate {share}{whole}, balanced {balanced}")
     if metrics.get("known_suns") and metrics.get("unseen_suns"):
         known, unseen = (_mean(metrics[part], "image", "psnr", 2) for part in ("known_suns", "unseen_suns"))
         ending.say(f"silhouette PSNR: {known} dB under known Suns, {unseen} dB under Suns never seen")

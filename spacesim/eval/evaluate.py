@@ -21,7 +21,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import write_json
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset, Frame
-from spacesim.eval import grazing, lpips
+from spacesim.eval import grazing, lpips, shadow
 from spacesim.eval.geometry import GeometryConfig, JudgedShape, judge_geometry
 from spacesim.eval.judge import judge_picture, judge_visibility, light_of, tally_grazing, view_of, write_pictures
 from spacesim.eval.labels import GROUPS
@@ -236,17 +236,20 @@ def frame_names(frames: Sequence[Frame]) -> list[str]:
 def summary(records: Iterable[Mapping[str, float | None] | None]) -> dict[str, Any] | None:
     """{metric: {"mean", "std" of the population, "count" of frames that have it}, None if no frame has}.
 
+    Where records tell their `pixels`, measures over pixels have "pooled", too: over the pixels of all frames at once.
     None where every record is None: the group was not measured at all.
     """
     present = [record for record in records if record is not None]
     if not present:
         return None
-    result: dict[str, Any] = {}
-    for metric in present[0]:
-        values = [value for record in present if (value := record[metric]) is not None]
-        result[metric] = (
-            {"mean": float(np.mean(values)), "std": float(np.std(values)), "count": len(values)} if values else None
-        )
+    result: dict[str, Any] = {metric: None for metric in present[0] if metric != "pixels"}
+    for metric in result:
+        pairs = [(value, record.get("pixels")) for record in present if (value := record[metric]) is not None]
+        if pairs:
+            values, pixels = np.array(pairs, float).T
+            result[metric] = {"mean": float(values.mean()), "std": float(values.std()), "count": len(values)}
+            if metric in shadow.OVER_PIXELS and "pixels" in present[0]:
+                result[metric]["pooled"] = float(np.average(values, weights=pixels))
     return result
 
 

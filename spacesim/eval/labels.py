@@ -72,8 +72,10 @@ SHADOW = (
     ),
 )  # fmt: skip
 
+POOLED = "; mean of the frames, and pooled: over the pixels of all frames, whose number differs"
+
 SHADOW_MASK = (
-    Metric("error_rate", "Error rate", "", LOWER, 4, "Share of lit and cast-shadow pixels put wrong."),
+    Metric("error_rate", "Error rate", "", LOWER, 4, f"Share of lit and cast-shadow pixels put wrong{POOLED}."),
     Metric(
         "balanced_error_rate", "Balanced error rate", "", LOWER, 4,
         "Mean of the error rates of truly shadowed and truly lit pixels.",
@@ -86,7 +88,7 @@ SHADOW_MASK = (
     ),
     Metric(
         "visibility_mae", "Visibility MAE", "", LOWER, 4,
-        "Mean absolute error of the visible fraction of the solar disc.",
+        f"Mean absolute error of the visible fraction of the solar disc{POOLED}.",
     ),
 )  # fmt: skip
 

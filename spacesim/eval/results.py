@@ -90,7 +90,10 @@ def summary_cell(run: Judged, group: str, metric: Metric, suns: str = "") -> Cel
 def _cell(value: dict[str, Any] | None, metric: Metric) -> Cell:
     if value is None:
         return None, _NONE, ""
-    return value["mean"], f"{value['mean']:.{metric.digits}f}", f"± {value['std']:.{metric.digits}f}"
+    spread = f"± {value['std']:.{metric.digits}f}"
+    if "pooled" in value:
+        spread += f", pooled {value['pooled']:.{metric.digits}f}"
+    return value["mean"], f"{value['mean']:.{metric.digits}f}", spread
 
 
 def best_in_bold(metric: Metric, cells: Sequence[Cell]) -> list[str]:

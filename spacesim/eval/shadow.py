@@ -23,6 +23,9 @@ KINDS = {
 }
 """First and last class (`spacesim.data.store.SHADOW_*`) of each kind of shadow, by its group in metrics.json."""
 
+OVER_PIXELS = ("error_rate", "visibility_mae")
+"""Measures of visibility that are means over pixels, and so can be taken over those of many frames at once."""
+
 Metrics = dict[str, float | None]
 
 
@@ -65,7 +68,8 @@ def visibility_metrics(prediction: np.ndarray, truth: np.ndarray, mask: Mask) ->
     """Predicted against path-traced visibility, [H, W] in [0, 1], over `mask`: lit and cast-shadow pixels.
 
     At least one half is lit. error_rate: wrong pixels by all;  balanced_error_rate: mean of the error rates
-    of truly shadowed and truly lit pixels;  iou: of the shadows;  visibility_mae: mean |prediction - truth|.
+    of truly shadowed and truly lit pixels;  iou: of the shadows;  visibility_mae: mean |prediction - truth|;
+    pixels: how many are judged.
     """
     predicted, shadowed = prediction < 0.5, truth < 0.5
     missed, invented = _mean(~predicted, mask & shadowed), _mean(predicted, mask & ~shadowed)
@@ -74,6 +78,7 @@ def visibility_metrics(prediction: np.ndarray, truth: np.ndarray, mask: Mask) ->
         "balanced_error_rate": None if missed is None or invented is None else 0.5 * (missed + invented),
         "iou": _mean(predicted & shadowed, mask & (predicted | shadowed)),
         "visibility_mae": _mean(np.abs(np.asarray(prediction, np.float64) - truth), mask),
+        "pixels": int(mask.sum()),
     }
 
 

@@ -316,3 +316,10 @@ def test_summary():
         "b": None,
     }
     assert summary([None, None]) is None
+
+
+def test_a_frame_of_one_pixel_hardly_moves_what_is_pooled():
+    frames = [{"error_rate": 1.0, "iou": 0.0, "pixels": 1}, {"error_rate": 0.1, "iou": 0.5, "pixels": 99}]
+    means = summary([*frames, {"error_rate": None, "iou": None, "pixels": 0}])
+    assert means["error_rate"] == {"mean": 0.55, "std": 0.45, "count": 2, "pooled": pytest.approx(0.109)}
+    assert means["iou"] == {"mean": 0.25, "std": 0.25, "count": 2}

@@ -75,7 +75,7 @@ def test_nothing_to_measure_is_none():
         "boundary_mae": None,
         "sharpness_ratio": None,
     }
-    assert set(shadow.visibility_metrics(step(4), step(4), empty).values()) == {None}
+    assert set(shadow.visibility_metrics(step(4), step(4), empty).values()) == {None, 0}
 
 
 def test_one_row_has_metrics():
@@ -101,7 +101,7 @@ def test_visibility_of_one_half_is_lit():
 def test_visibility_without_shadows():
     lit = np.ones((6, 10))
     metrics = shadow.visibility_metrics(lit, lit, EVERYWHERE)
-    assert metrics == {"error_rate": 0, "balanced_error_rate": None, "iou": None, "visibility_mae": 0}
+    assert metrics == {"error_rate": 0, "balanced_error_rate": None, "iou": None, "visibility_mae": 0, "pixels": 60}
 
 
 def test_kinds_of_shadow_are_judged_apart():
@@ -117,6 +117,7 @@ def test_kinds_of_shadow_are_judged_apart():
         "balanced_error_rate": pytest.approx(0.5 * (1 / 3 + 1 / 5)),
         "iou": pytest.approx(2 / 4),
         "visibility_mae": pytest.approx(2 / 8),
+        "pixels": 8,
     }
     assert kinds["shadow_self_cast"]["recall"] == pytest.approx(1 / 2)
     assert kinds["shadow_self_cast"]["error_rate"] == pytest.approx(2 / 7)
