@@ -16,6 +16,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image as PillowImage
+from PIL import UnidentifiedImageError
 from scipy.ndimage import map_coordinates
 
 from spacesim.data.errors import InputError
@@ -61,10 +62,12 @@ def read_png(path: Path) -> np.ndarray:
     """Pixels of an image file: [H, W], [H, W, 3] or [H, W, 4] uint8, or [H, W] uint16 for 16-bit grey.
 
     Takes what Pillow reads (JPEG, TIFF, ... too). Palettes and grey with alpha become RGB or RGBA. Raises
-    InputError where the file is missing, broken or no image.
+    InputError where the file is missing, broken, no image, or one of floating-point numbers, which have no range.
     """
     try:
         with PillowImage.open(path) as picture:
+            if picture.mode == "F":
+                raise InputError(f"{path}: expected whole numbers of 8 or 16 bits a channel, found floating-point ones")
             if picture.mode in _GREY_16:
                 return np.clip(np.asarray(picture), 0, 65535).astype(np.uint16)
             has_alpha = "A" in picture.getbands() or "transparency" in picture.info
@@ -155,22 +158,27 @@ def load_image(dataset: Dataset, frame: Frame) -> Image:
     if frame.mask_path is not None:
         valid = _read_grey(dataset.root / frame.mask_path, frame.camera) > 0
     rgb = np.ascontiguousarray(np.broadcast_to(values[..., :3], (*alpha.shape, 3)))
-    rgb, alpha = np.where(valid[..., None], rgb, np.float32(0)), np.where(valid, alpha, np.float32(1))
-    image = Image(rgb, alpha, valid)
+    image = Image(*_without_ignored(rgb, alpha, valid), valid)
     return undistort(image, frame.camera, frame.distortion) if any(frame.distortion) else image
 
 
 def undistort(image: Image, camera: Camera, distortion: tuple[float, ...]) -> Image:
-    """`image` as the pinhole `camera` sees it, resampled bilinearly; what comes from outside is not valid.
+    """`image` as the pinhole `camera` sees it, resampled bilinearly. What comes from outside is not valid.
 
-    distortion: see `distorted`. Colours are weighted by alpha, so that none bleeds in from where alpha is 0.
+    distortion: see `distorted`. Colours are weighted by alpha, so that none bleeds in from where alpha is 0. Pixels
+    that are not valid are opaque black.
     """
     source = Undistortion(camera, distortion)
     alpha = source.linear(image.alpha)
     weighted = source.linear(image.rgb * image.alpha[..., None])
     rgb = np.clip(weighted / np.where(alpha > 0, alpha, 1)[..., None], 0, 1)
     valid = source.inside & (source.linear(image.valid.astype(np.float32)) > 0.999)  # no ignored pixel takes part
-    return Image(rgb, alpha, valid)
+    return Image(*_without_ignored(rgb, alpha, valid), valid)
+
+
+def _without_ignored(rgb: np.ndarray, alpha: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(rgb, alpha), opaque black where not `valid`."""
+    return np.where(valid[..., None], rgb, np.float32(0)), np.where(valid, alpha, np.float32(1))
 
 
 class Undistortion:
@@ -259,8 +267,12 @@ def _as_float(values: ArrayLike) -> Float:
 
 
 def _describe_failure(path: Path, error: BaseException) -> str:
+    if isinstance(error, InputError):
+        return str(error)
     if isinstance(error, FileNotFoundError):
         return f"{path}: expected a file, found none"
+    if isinstance(error, UnidentifiedImageError):  # EXR among them
+        return f"{path}: expected PNG, JPEG or another image that Pillow reads, found a damaged or another file"
     return f"{path}: expected a readable image, found a file that is broken or cut off ({error})"
 
 
