@@ -25,12 +25,12 @@ from spacesim.eval import grazing, lpips, shadow
 from spacesim.eval.geometry import GeometryConfig, JudgedShape, judge_geometry
 from spacesim.eval.judge import judge_picture, judge_visibility, light_of, tally_grazing, view_of, write_pictures
 from spacesim.eval.labels import GROUPS
-from spacesim.eval.notes import explain, explain_light, explain_objects
+from spacesim.eval.notes import MODELS_OF_A_SCENE, explain, explain_light, explain_objects
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
 from spacesim.eval.objects import judge_object_shapes, judge_objects, object_names
 from spacesim.eval.relight import write_sweep
 from spacesim.eval.shape import write_shapes
-from spacesim.eval.suns import count_suns, known_suns, rounded_angles
+from spacesim.eval.suns import count_suns, known_suns, rounded_angles, trained_on
 
 if TYPE_CHECKING:
     from spacesim.splat.run import Run
@@ -82,14 +82,15 @@ def evaluate(
     _prepare(out)
     run.predict(frames[0].camera, frames[0].sun)  # compiles the kernels
     models: list[str] | None = getattr(run, "names", None)  # of a composed scene, which was not trained on this dataset
+    trained, untold = trained_on(run.config, dataset) if models is None else ((), MODELS_OF_A_SCENE)
     objects = object_names(dataset, models or ())
-    known_of = known_suns(frames, dataset.train if models is None else ())
+    known_of = known_suns(frames, trained)
     judged: list[Judgement] = []
     for name, frame, known in zip(frame_names(frames), frames, known_of, strict=True):
         if progress:
             progress(len(judged), len(frames), frame.file_path)
         judged.append(_judge(run, dataset, frame, known, network, out / "frames" / name, objects))
-    sweep, no_sweep = write_sweep(run, dataset, frames, out)
+    sweep, no_sweep = write_sweep(run, dataset, frames, trained, out)
     if progress:
         progress(len(frames), len(frames), "its shape" if config.geometry else "")
     shape, shapes = _judge_shapes(run, dataset, objects, config.geometry)
@@ -121,7 +122,7 @@ def evaluate(
                 [one.known for one in judged],
                 any(one.grazing is not None for one in judged),
                 no_sweep,
-                models is not None,
+                untold,
             ),
             *explain_objects(objects, records, models),
         ],

@@ -5,6 +5,8 @@ from typing import Any
 
 from spacesim.eval.labels import GROUPS
 
+MODELS_OF_A_SCENE = "the models of a scene were trained on other data"
+
 _STAND_INS = {
     "alpha": "the silhouette is where the image's alpha is at least one half",
     "frame": "the silhouette is the whole frame, as the data has neither silhouette nor alpha",
@@ -33,15 +35,14 @@ def explain(records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips:
     return notes + _explain_kinds(records)
 
 
-def explain_light(
-    known: Sequence[bool | None], by_grazing_angle: bool, no_sweep: str, composed: bool = False
-) -> list[str]:
+def explain_light(known: Sequence[bool | None], by_grazing_angle: bool, no_sweep: str, untold: str = "") -> list[str]:
     """Sentences where what is said of the light is null.
 
     known: of each frame, whether training has seen its Sun, or None; by_grazing_angle: whether there are numbers;
-    no_sweep: why one view under many Suns is null, "" where it is not;  composed: the models of a scene were judged
+    no_sweep: why one view under many Suns is null, "" where it is not;  untold: why it is not known what training has
+    seen, "" where it is
     """
-    notes = _explain_suns(known, composed)
+    notes = _explain_suns(known, untold)
     if not by_grazing_angle:
         notes.append("by_grazing_angle is null: the data has no path-traced truth.")
     return [*notes, no_sweep] if no_sweep else notes
@@ -66,11 +67,10 @@ def explain_objects(
     ]
 
 
-def _explain_suns(known: Sequence[bool | None], composed: bool) -> list[str]:
+def _explain_suns(known: Sequence[bool | None], untold: str) -> list[str]:
     told = [one for one in known if one is not None]
     if not told:
-        reason = "no judged frame or no training frame says where its Sun is"
-        reason = "the models of a scene were trained on other data" if composed else reason
+        reason = untold or "no judged frame or no training frame says where its Sun is"
         return [f"known_suns and unseen_suns are null: {reason}."]
     notes = []
     if len(told) < len(known):

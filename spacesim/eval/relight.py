@@ -74,9 +74,11 @@ def phase_deg(camera: Camera, lit_as: Frame) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def write_sweep(run: "Run", dataset: Dataset, judged: Sequence[Frame], out: Path) -> tuple[dict[str, Any] | None, str]:
+def write_sweep(
+    run: "Run", dataset: Dataset, judged: Sequence[Frame], trained: Sequence[Frame], out: Path
+) -> tuple[dict[str, Any] | None, str]:
     """Write the pictures below `out`, in place of earlier ones. What metrics.json says of them, None where there are
-    none, and then a sentence why."""
+    none, and then a sentence why. trained: the frames that the run was trained on"""
     shutil.rmtree(out / "relight", ignore_errors=True)
     sweep = plan_sweep(judged, dataset.frames)
     if sweep is None:
@@ -84,7 +86,7 @@ def write_sweep(run: "Run", dataset: Dataset, judged: Sequence[Frame], out: Path
     predictions = [run.predict(sweep.view.camera, frame.sun) for frame in sweep.lit_as]
     if all(np.array_equal(predictions[0].rgb, one.rgb) for one in predictions[1:]):
         return None, "relight is null: the run shows the same picture under every Sun."
-    known = known_suns(sweep.lit_as, dataset.train)
+    known = known_suns(sweep.lit_as, trained)
     steps = []
     for index, frame in enumerate(sweep.lit_as):
         truth, prediction = sweep.truths[index], predictions[index]

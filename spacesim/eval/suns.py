@@ -1,15 +1,41 @@
 """Which judged frames are lit by a Sun that training has seen."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from spacesim.data.records import Frame
+from spacesim.data.errors import InputError
+from spacesim.data.records import Dataset, Frame
+from spacesim.data.store import read_dataset
 
 SAME_SUN_DEG = 0.01
 """Degrees between two directions that still count as one Sun (chosen: files keep directions far better than that, and
 the Suns of a dataset stand degrees apart)."""
+
+
+def trained_on(config: Mapping[str, Any], dataset: Dataset) -> tuple[Sequence[Frame], str]:
+    """The frames that a run was trained on, and "": those of the judged `dataset` if it is the run's own, else those of
+    the dataset that the run names. () where that one is gone or has changed, and why nothing can be said then.
+
+    config: the run's
+    """
+    told = config.get("data") or {}
+    if "digest" not in told:
+        return dataset.train, ""
+    path = Path(told["path"])
+    found = _digest(dataset)
+    if found == told["digest"] or (found is None and path == dataset.root.resolve()):
+        return dataset.train, ""
+    try:
+        own = read_dataset(path)
+    except InputError:
+        return (), f"the run was trained on other data, {path}, which is gone"
+    if _digest(own) != told["digest"]:
+        return (), f"the run was trained on other data, and {path} has changed since"
+    return own.train, ""
 
 
 def known_suns(frames: Sequence[Frame], training: Sequence[Frame]) -> list[bool | None]:
@@ -28,6 +54,16 @@ def known_suns(frames: Sequence[Frame], training: Sequence[Frame]) -> list[bool 
 def rounded_angles(frame: Frame) -> list[float] | None:
     """[azimuth, elevation] of the Sun, degrees, to 1e-4."""
     return None if frame.sun is None else [round(angle, 4) for angle in frame.sun.angles]
+
+
+def _digest(dataset: Dataset) -> str | None:
+    """As training has told it; None where pictures of it are missing."""
+    from spacesim.splat.train.train import digest
+
+    try:
+        return digest(dataset)
+    except OSError:
+        return None
 
 
 def count_suns(frames: Sequence[Frame]) -> int:

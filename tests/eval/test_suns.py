@@ -1,6 +1,8 @@
 """Known and unseen Suns, errors by grazing angle, one view under many Suns."""
 
+import json
 import math
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,10 +10,12 @@ import numpy as np
 import pytest
 
 from spacesim.data.geometry import look_at
-from spacesim.data.images import read_png
+from spacesim.data.images import read_png, write_png
 from spacesim.data.records import Camera, Frame, Sun
+from spacesim.data.store import read_dataset
 from spacesim.eval import grazing, relight
-from spacesim.eval.suns import count_suns, known_suns
+from spacesim.eval.suns import count_suns, known_suns, trained_on
+from spacesim.splat.train.train import digest
 
 FAR = Camera.from_fov(look_at([10.0, 0, 0], [0, 0, 0]), 16, 12, 30)
 """Looks along -x."""
@@ -29,6 +33,45 @@ def test_a_sun_is_known_within_a_hundredth_of_a_degree():
     assert known_suns(judged, [frame()]) == [None] * 7
     assert known_suns(judged, []) == [None] * 7
     assert count_suns([frame((30, 20)), frame((390, 20)), frame((30, 20.01)), frame()]) == 2
+
+
+def lit_by(root, *suns):
+    """A dataset of one training frame for each Sun."""
+    frames = [
+        {
+            "file_path": f"{k}.png",
+            "transform_matrix": np.eye(4).tolist(),
+            "sun_direction": Sun.from_angles(*sun).direction,
+        }
+        for k, sun in enumerate(suns)
+    ]
+    for one in frames:
+        write_png(root / one["file_path"], np.zeros((2, 2, 3), np.uint8))
+        one["sun_direction"] = one["sun_direction"].tolist()
+    names = [one["file_path"] for one in frames]
+    record = {"w": 2, "h": 2, "fl_x": 2.0, "train_filenames": names, "test_filenames": [], "frames": frames}
+    (root / "transforms.json").write_text(json.dumps(record))
+    return read_dataset(root)
+
+
+def test_known_suns_are_those_of_the_runs_own_data(tmp_path):
+    own, other = lit_by(tmp_path / "own", (30, 20)), lit_by(tmp_path / "other", (200, -40))
+    config = {"data": {"path": str(own.root.resolve()), "digest": digest(own)}}
+
+    def known(dataset):
+        trained, why = trained_on(config, dataset)
+        return known_suns([frame((30, 20)), frame((200, -40))], trained), why
+
+    assert known(own) == ([True, False], "")
+    assert known(other) == ([True, False], "")  # not what the judged data would say
+    shutil.copytree(own.root, tmp_path / "moved")
+    shutil.rmtree(own.root)
+    assert known(read_dataset(tmp_path / "moved")) == ([True, False], "")
+    assert known(other) == ([None, None], f"the run was trained on other data, {own.root.resolve()}, which is gone")
+    changed = lit_by(own.root, (30, 20), (1, 2))
+    assert known(other)[0] == known(changed)[0] == [None, None]
+    assert "has changed since" in known(changed)[1]
+    assert trained_on({"method": "vanilla"}, other) == (other.train, "")
 
 
 def by_hand(truth, predicted, true, visibility, mask):
@@ -133,7 +176,7 @@ def test_write_sweep(relightable, tmp_path):
     run, dataset = relightable(change=lambda rgb: rgb + 0.1)
     (tmp_path / "relight").mkdir()
     (tmp_path / "relight" / "old.png").touch()
-    found, reason = relight.write_sweep(run, dataset, dataset.test, tmp_path)
+    found, reason = relight.write_sweep(run, dataset, dataset.test, dataset.train, tmp_path)
     assert reason == ""
     assert found["visibility"]
     assert {tuple(one["sun"]) for one in found["suns"]} == {(30, 20), (200, -10)}
@@ -149,9 +192,9 @@ def test_write_sweep(relightable, tmp_path):
 
 
 def test_a_run_that_knows_one_light_is_not_swept(make_run, dataset, tmp_path):
-    found, reason = relight.write_sweep(make_run(), dataset, dataset.test, tmp_path)
+    found, reason = relight.write_sweep(make_run(), dataset, dataset.test, (), tmp_path)
     assert found is None
     assert reason == "relight is null: the run shows the same picture under every Sun."
     one = replace(dataset, test=dataset.test[:1])
-    assert "fewer than two Suns" in relight.write_sweep(make_run(), one, one.test, tmp_path)[1]
+    assert "fewer than two Suns" in relight.write_sweep(make_run(), one, one.test, (), tmp_path)[1]
     assert not (tmp_path / "relight").exists()

@@ -119,13 +119,13 @@ def _identity(dataset: Dataset) -> dict[str, Any]:
     """What a run remembers of its data: enough to find it again and to notice another one in its place."""
     return {
         "path": str(dataset.root.resolve()),
-        "digest": _digest(dataset),
+        "digest": digest(dataset),
         "train_frames": len(dataset.train),
         "test_frames": len(dataset.test),
     }
 
 
-def _digest(dataset: Dataset) -> str:
+def digest(dataset: Dataset) -> str:
     """Of the training frames: names and sizes of the files, poses, intrinsics, Suns."""
     told = [
         (f.file_path, (dataset.root / f.file_path).stat().st_size, _numbers(f.camera), f.sun and f.sun.angles)
