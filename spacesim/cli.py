@@ -216,7 +216,7 @@ def _sweep(options: argparse.Namespace) -> None:
     if options.size is not None:
         camera = resized(camera, options.size)
     with reporting("sweep", "frames") as report:
-        done = sweep(run, camera, suns, options.out, options.kind, options.keep_frames, report)
+        done = sweep(run, camera, suns, options.out, options.kind, options.keep_frames, report, options.exposure)
     if done.note is not None:
         print(done.note, file=sys.stderr)
     ending.say(" ".join(str(path) for path in (done.sheet, done.video) if path is not None))

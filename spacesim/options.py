@@ -174,6 +174,7 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     path.add_argument("--azimuth", type=float, metavar="DEG", help="the Sun rises at this azimuth and goes overhead")
     one.add_argument("--frames", type=int, metavar="N", help="Suns, evenly around the circle (72)")
     one.add_argument("--kind", choices=("rgb", "shadow"), default="rgb")
+    one.add_argument("--exposure", type=float, metavar="EV", help="of a run of --linear (that of its pictures)")
     one.add_argument("--size", type=_resolution, metavar="PX", help="pixels of the longer side, or WIDTHxHEIGHT")
     one.add_argument("--keep-frames", action="store_true", help="write every picture into DIR/frames, too")
 

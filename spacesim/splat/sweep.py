@@ -90,13 +90,14 @@ def sweep(
     kind: str = "rgb",
     keep_frames: bool = False,
     report: Callable[[int, int], None] | None = None,
+    exposure: float | None = None,
 ) -> Swept:
     """Render `run` from `camera` under each of `suns` and write the files named above.
 
     kind: "rgb", over black, or "shadow": how much of the Sun is seen, from SHADOWED to LIT;  keep_frames: write every
-    picture, too;  report: told (pictures done, of all)
-    Raises InputError for another kind, a run that no Sun relights, a run without shadows where these are asked for, a
-    folder that cannot be made, and one of frames that holds some already.
+    picture, too;  report: told (pictures done, of all);  exposure: EV, see `Run.predict`
+    Raises InputError for another kind, a run that no Sun relights, a run without shadows where these are asked for, an
+    exposure of one whose colours are sRGB values, a folder that cannot be made, and one of frames that holds some.
     """
     out = Path(out)
     if kind not in KINDS:
@@ -110,13 +111,14 @@ def sweep(
         )
     if keep_frames and holds_files(out / FRAMES_NAME):
         raise InputError(f"{out / FRAMES_NAME}: expected an empty folder for the frames, found files in it")
+    first = _picture(run, camera, suns[0], kind, exposure)  # what does not fit the run shows before there is a folder
     _make_folder(out)
     film = _Film(camera) if encoder() else None
     count = min(MOST_TILES, len(suns))
     shown = {k * len(suns) // count for k in range(count)}
     tiles = []
     for k, sun in enumerate(suns):
-        picture = _picture(run, camera, sun, kind)
+        picture = first if k == 0 else _picture(run, camera, sun, kind, exposure)
         if keep_frames:
             write_png(out / FRAMES_NAME / f"{k:04d}.png", picture, durable=False)
         if film is not None:
@@ -151,16 +153,16 @@ def sky_mark(sun: Sun, side: int = TEXT - 4) -> np.ndarray:
 
 
 def _make_folder(out: Path) -> None:
-    """Before the work, not after it."""
+    """Before most of the work, not after it."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{out}: expected a folder that can be written, found none ({error.strerror})") from None
 
 
-def _picture(run: Run, camera: Camera, sun: Sun, kind: str) -> np.ndarray:
+def _picture(run: Run, camera: Camera, sun: Sun, kind: str, exposure: float | None) -> np.ndarray:
     """[H, W, 3] uint8."""
-    prediction = run.predict(camera, sun)
+    prediction = run.predict(camera, sun, exposure=exposure)
     if kind == "rgb":
         return as_bytes(np.clip(np.nan_to_num(prediction.rgb), 0, 1))
     if prediction.visibility is None:

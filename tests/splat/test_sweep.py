@@ -37,9 +37,9 @@ class Lit:
     config: dict[str, Any] = field(default_factory=lambda: {"method": "shadow-map"})
     relightable: bool = True
 
-    def predict(self, camera, sun=None, normals=False):
+    def predict(self, camera, sun=None, normals=False, exposure=None):
         shape = camera.height, camera.width
-        rgb = np.broadcast_to(0.5 + 0.5 * sun.direction, (*shape, 3)).astype(np.float32)
+        rgb = 2 ** (exposure or 0) * np.broadcast_to(0.5 + 0.5 * sun.direction, (*shape, 3)).astype(np.float32)
         visibility, alpha = np.zeros(shape, np.float32), np.ones(shape, np.float32)
         visibility[:, : camera.width // 2] = 1
         alpha[: camera.height // 2, : camera.width // 2] = 0
@@ -124,6 +124,14 @@ def test_the_sheet_shows_every_sun_of_few_and_the_frames_are_kept(tmp_path, monk
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frames", "sweep.png"]
 
 
+def test_a_sweep_is_exposed_as_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "encoder", lambda: None)
+    sun = suns_around(1, 10)
+    sweep(Lit(), CAMERA, sun, tmp_path, keep_frames=True, exposure=-2.0)
+    quarter = np.rint(255 * (0.5 + 0.5 * sun[0].direction) / 4)
+    assert np.abs(read_png(tmp_path / "frames" / "0000.png") - quarter).max() <= 1
+
+
 def test_the_sheet_shows_some_of_many_evenly(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "encoder", lambda: None)
     suns = suns_around(72)
@@ -151,14 +159,15 @@ def test_a_run_that_cannot_and_a_folder_that_is_full_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"some/lit.*vanilla"):
         sweep(Lit(config={"method": "vanilla"}, relightable=False), CAMERA, suns, tmp_path)
     with pytest.raises(InputError, match=r"some/lit.*--kind shadow.*relight"):
-        sweep(Lit(config=NO_SHADOWS), CAMERA, suns, tmp_path, "shadow")
+        sweep(Lit(config=NO_SHADOWS), CAMERA, suns, tmp_path / "nothing", "shadow")
+    assert not (tmp_path / "nothing").exists()
     with pytest.raises(InputError, match="--kind"):
         sweep(Lit(), CAMERA, suns, tmp_path, "depth")
     with pytest.raises(InputError, match="suns"):
         sweep(Lit(), CAMERA, [], tmp_path)
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(InputError, match=r"file: expected a folder"):
-        sweep(Lit(), CAMERA, suns, tmp_path / "file", report=lambda *_: pytest.fail("rendered for nothing"))
+        sweep(Lit(), CAMERA, suns, tmp_path / "file", report=lambda *_: pytest.fail("rendered more than one"))
     (tmp_path / "frames").mkdir()
     (tmp_path / "frames" / "0099.png").write_bytes(b"")
     with pytest.raises(InputError, match="frames"):
