@@ -1,17 +1,29 @@
 """Geometry from Gaussians: normals as features to blend, the median depth of a pixel, the surface there."""
 
-from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import drjit as dr
 
-from spacesim.backend import ad
+from spacesim.backend import ad, recorded
 from spacesim.splat.cameras import Projection
 from spacesim.splat.gaussians import Gaussians, principal_axes
-from spacesim.splat.project import ALPHA_MIN, Splats
-from spacesim.splat.rasterize import ALPHA_MAX
-from spacesim.splat.tiles import TileLists
+from spacesim.splat.project import Splats
+from spacesim.splat.records import (
+    ALPHA_MAX,
+    POWER_MIN,
+    exp2,
+    exponents,
+    lane_pixels,
+    list_records,
+    load,
+    packets,
+    store,
+    tiled_index,
+)
+from spacesim.splat.tiles import RECORDINGS, TileLists, room
 
+NONE = 2**32 - 1  #: in place of a splat's number
 REACH = 2.0  #: standard deviations to which a Gaussian's surface reaches (docs/geometry.md)
 
 
@@ -38,73 +50,57 @@ def unit(vector: Any) -> Any:
     return dr.select(known, vector * dr.rsqrt(dr.select(known, square, 1)), 0)
 
 
-@dataclass
-class Pixels:
-    """Of a picture, as arrays: in a recording neither its size nor the number of splats may be a constant.
-    index: UInt32 [height * width], 0, 1, 2, ...;  none: as many times N, which stands for no splat"""
+def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> Any:
+    """UInt32 [height * width]: the splat behind which less than half of the light passes; `NONE` where there is none.
 
-    index: Any
-    none: Any
-
-    @staticmethod
-    def of(width: int, height: int, count: int) -> "Pixels":
-        """For N = `count` splats."""
-        index = dr.arange(ad.UInt32, width * height)
-        dr.eval(index)
-        return Pixels(index, dr.opaque(ad.UInt32, count, width * height))
-
-
-def median_splat(splats: Splats, lists: TileLists, width: int, height: int, pixels: Pixels | None = None) -> Any:
-    """UInt32 [height * width]: the splat behind which less than half of the light passes; N where there is none.
-
-    Walks each tile's list once more, a lane a pixel. Not differentiable. pixels: an argument of a recording
+    Walks each tile's list once more, until that is known of all pixels of a lane. Not differentiable.
     """
-    splats = dr.detach(splats)
-    pixels = pixels or Pixels.of(width, height, dr.width(splats.x))
-    pixel = pixels.index
-    column, row = pixel % width, pixel // width
     if lists.capacity == 0:
-        return pixels.none
-    tile = (row // lists.shape.height) * lists.tiles_x + column // lists.shape.width
-    px, py = ad.Float(column) + 0.5, ad.Float(row) + 0.5
-    end = dr.gather(ad.UInt32, lists.end, tile)
+        return dr.opaque(ad.UInt32, NONE, width * height)
+    walk = _walk if width * height > 1 else _trace_walk  # a recording gives a plane of one pixel another size
+    return walk(dr.detach(splats), lists, width, height, room(dr.width(splats.x)))
 
-    def undecided(k: Any, transmittance: Any, _found: Any) -> Any:
-        return (k < end) & (transmittance >= 0.5)
 
-    def pass_splat(k: Any, transmittance: Any, found: Any) -> Any:
-        i = dr.gather(ad.UInt32, lists.splat, k)
-        x, y, a, b, c, opacity = (
-            dr.gather(ad.Float, getattr(splats, name), i) for name in ("x", "y", "a", "b", "c", "opacity")
-        )
-        dx, dy = px - x, py - y
-        alpha = dr.minimum(opacity * dr.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy), ALPHA_MAX)
-        transmittance *= 1 - dr.select(alpha >= ALPHA_MIN, alpha, 0)
-        return k + 1, transmittance, dr.select(transmittance < 0.5, i, found)
+def _trace_walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: int) -> Any:
+    records, lane, pixels = list_records(splats, [], lists, capacity), lane_pixels(lists), lists.shape.pixels
 
-    state = dr.gather(ad.UInt32, lists.start, tile), ad.Float(1), pixels.none
-    _, _, found = dr.while_loop(state, undecided, pass_splat, mode="symbolic", label="median")
-    return found
+    def undecided(k: Any, end: Any, transmittance: list[Any], _place: Any) -> Any:
+        return (k < end) & (reduce(dr.maximum, transmittance) >= 0.5)
+
+    def pass_splat(k: Any, end: Any, transmittance: list[Any], place: list[Any]) -> Any:
+        transmittance, place = list(transmittance), list(place)
+        powers = exponents(load(records, k, lists.capacity), lane.x, lane.y, lists.shape)
+        for p in range(pixels):
+            passing = transmittance[p] >= 0.5
+            alpha = dr.select(powers[p] >= POWER_MIN, dr.minimum(exp2(powers[p]), ALPHA_MAX), 0)
+            transmittance[p] -= alpha * transmittance[p]
+            place[p] = dr.select(passing & (transmittance[p] < 0.5), k, place[p])
+        return k + 1, end, transmittance, place
+
+    start, end = (dr.gather(ad.UInt32, bound, lane.tile) for bound in (lists.start, lists.end))
+    state = start, end, [ad.Float(1) for _ in range(pixels)], [ad.UInt32(NONE) for _ in range(pixels)]
+    *_, place = dr.while_loop(state, undecided, pass_splat, mode="symbolic", label="median")
+    tiled = store(list(place), lane.place, lists.tiles_x * lists.tiles_y * lists.shape.lanes)
+    dr.eval(tiled)
+    place = dr.gather(ad.UInt32, tiled, tiled_index(lists, width, height))
+    return dr.select(place != NONE, dr.gather(ad.UInt32, lists.splat, place, place != NONE), NONE)
 
 
 def picked(values: Any, index: Any) -> Any:
-    """values[index], Float [P] of values [N] and index UInt32 [P]; 0 where the index is N. Differentiable, and its
-    gradients are the same to the bit in every run: they are added up as integers, in which order does not matter."""
+    """values[index], Float [P] of values [N] and index UInt32 [P]; 0 where the index is N or more. Differentiable, and
+    its gradients are the same to the bit in every run: added up as integers, in which order does not matter."""
     return dr.custom(_Pick, values, index)
 
 
-def surface_depth(
-    gaussians: Gaussians, splats: Splats, index: Any, camera: Projection, pixels: Pixels | None = None
-) -> Any:
+def surface_depth(gaussians: Gaussians, splats: Splats, index: Any, camera: Projection, capacity: int) -> Any:
     """Float [height * width], metres: depth of the splat `index` of each pixel (UInt32 [P], as of `median_splat`) where
-    the ray meets it, not at its centre; 0 where the index is N.
+    the ray meets it, not at its centre; 0 where the index is `NONE`.
 
     A ray d is deepest in a Gaussian at z = d'P m / d'P d, P its inverse covariance and m its centre in camera axes.
     That is taken as linear in the pixel about the centre, as in RaDe-GS (Zhang et al. 2024), and ends `REACH` standard
-    deviations of the longest axis before and behind it. Not differentiable. pixels: an argument of a recording
+    deviations of the longest axis before and behind it. Not differentiable. capacity: room for the N splats (`room`)
     """
     splats = dr.detach(splats)
-    pixels = pixels or Pixels.of(camera.width, camera.height, dr.width(splats.depth))
     means, scales = dr.detach(gaussians.means), dr.detach(gaussians.log_scales)
     least = dr.minimum(scales[0], dr.minimum(scales[1], scales[2]))
     most = dr.maximum(scales[0], dr.maximum(scales[1], scales[2]))
@@ -117,17 +113,19 @@ def surface_depth(
         part = dr.exp(2 * (least - scale)) * share
         across, along, square = across + part * turned.x, along + part * turned.y, square + part * share
     screen = camera.screen(camera.transform(means))
-    reach = REACH * dr.exp(most)
+    slopes = [across / (square * screen.scale_x), along / (square * screen.scale_y)]
+    numbers = [splats.x, splats.y, *slopes, splats.depth, REACH * dr.exp(most)]
+    lane = dr.arange(ad.UInt32, dr.width(splats.depth))
+    packed = [store(values, lane, capacity) for values in packets(numbers)]
+    dr.eval(packed)
 
-    def of(values: Any) -> Any:
-        return dr.gather(ad.Float, values, index, index < pixels.none)
-
-    pixel = pixels.index
-    x, y = ad.Float(pixel % camera.width) + 0.5, ad.Float(pixel // camera.width) + 0.5
-    offset = of(across / (square * screen.scale_x)) * (of(splats.x) - x)
-    offset += of(along / (square * screen.scale_y)) * (of(splats.y) - y)
-    offset = dr.clip(offset, -of(reach), of(reach))
-    return of(splats.depth) + dr.select(dr.isfinite(offset), offset, 0)
+    known = index != NONE
+    x, y, slope_x, slope_y, depth, reach, *_ = load(packed, index, capacity, known)
+    pixel = dr.arange(ad.UInt32, camera.width * camera.height)
+    offset = slope_x * (x - 0.5 - ad.Float(pixel % camera.width))
+    offset += slope_y * (y - 0.5 - ad.Float(pixel // camera.width))
+    offset = dr.clip(offset, -reach, reach)
+    return dr.select(known, depth + dr.select(dr.isfinite(offset), offset, 0), 0)
 
 
 class _Pick(dr.CustomOp):
@@ -148,3 +146,6 @@ class _Pick(dr.CustomOp):
 
     def name(self) -> str:
         return "pick"
+
+
+_walk = recorded(_trace_walk, RECORDINGS)

@@ -18,8 +18,8 @@ from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import Footprints, Splats, project
 from spacesim.splat.rasterize import forward
 from spacesim.splat.shadow.sunlight import drawable
-from spacesim.splat.surface import Pixels, median_splat, surface_depth
-from spacesim.splat.tiles import RECORDINGS, TileLists, bin_splats
+from spacesim.splat.surface import NONE, median_splat, surface_depth
+from spacesim.splat.tiles import RECORDINGS, bin_splats, room
 
 FILTERS = ("bilinear", "percentage-closer", "variance", "median")
 SUN_RADIUS_DEG = 0.2666  #: angular radius of the Sun's disc at 1 au
@@ -130,19 +130,15 @@ def median_map(gaussians: Gaussians, camera: Orthographic, antialiased: bool = T
     if lists.capacity == 0:  # zeros that are no constants of the kernels that read them
         alpha, depth = (dr.opaque(ad.Float, 0, camera.width * camera.height) for _ in range(2))
         return LightMap(alpha, depth, None, camera.width, camera.height)
-    alpha, depth = _median(rows, splats, lists, camera, Pixels.of(camera.width, camera.height, gaussians.count))
+    found = median_splat(splats, lists, camera.width, camera.height)
+    alpha, depth = _surface(rows, splats, found, camera, room(gaussians.count))
     return LightMap(alpha, depth, None, camera.width, camera.height)
 
 
-def _trace_median(
-    rows: list[Any], splats: Splats, lists: TileLists, camera: Orthographic, pixels: Pixels
-) -> tuple[Any, Any]:
-    """(is half of the light gone, 0 or 1, and at which depth, 0 where not), planes."""
-    found = median_splat(splats, lists, camera.width, camera.height, pixels)
-    dr.eval(found)
-    gone = found < pixels.none
-    depth = surface_depth(Gaussians.from_rows(rows), splats, found, camera, pixels)
-    return dr.select(gone, ad.Float(1), 0), dr.select(gone, depth, 0)
+def _trace_surface(rows: list[Any], splats: Splats, found: Any, camera: Orthographic, capacity: int) -> tuple[Any, Any]:
+    """(is half of the light gone, 0 or 1, and at which depth, 0 where not), planes; found: of `median_splat`"""
+    depth = surface_depth(Gaussians.from_rows(rows), splats, found, camera, capacity)
+    return dr.select(found != NONE, ad.Float(1), 0), depth
 
 
 def _trace_prepare(
@@ -289,5 +285,5 @@ def _overlap(pixel: Any, centre: Any, half: Any) -> Any:
 
 
 _prepare = recorded(_trace_prepare, RECORDINGS)
-_median = recorded(_trace_median, RECORDINGS)
+_surface = recorded(_trace_surface, RECORDINGS)
 _look_up = recorded(_trace_look_up, RECORDINGS)

@@ -11,6 +11,7 @@ from walls import BIASES, SHIPPED, acne, plate, plate_occlusion, screen_shadow, 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at, quaternion_from_rotation
+from spacesim.splat import surface
 from spacesim.splat.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.shadow import mapping
@@ -260,7 +261,7 @@ def test_hostile_gaussians_get_none_and_spoil_nothing(name):
 
 
 def test_medians_of_models_of_any_size(monkeypatch):
-    """One recording serves them all, and says what is computed without it."""
+    """Few recordings serve them all, and say what is computed without it."""
     counts, suns = (700, 90, 2100, 700, 1), ([0.3, -0.5, 0.8], [0, 0, -1])
 
     def found():
@@ -271,7 +272,8 @@ def test_medians_of_models_of_any_size(monkeypatch):
         ]
 
     recorded = found()
-    monkeypatch.setattr(mapping, "_median", mapping._trace_median)
+    monkeypatch.setattr(surface, "_walk", surface._trace_walk)
+    monkeypatch.setattr(mapping, "_surface", mapping._trace_surface)
     for one, other in zip(recorded, found(), strict=True):
         np.testing.assert_array_equal(one, other)
     assert 0.05 < recorded[0].mean() < 0.95
