@@ -8,7 +8,7 @@ from spacesim.data.mesh import SignedDistance
 from spacesim.eval.exterior import Sight
 from spacesim.splat.fusion import Grid
 
-PROBES = 64  #: voxels of a region that tell of all of it, where they agree
+PROBES = 64  #: voxels of a region that are asked whether anything far away sees it
 
 
 def filled(vertices: Array, faces: np.ndarray, grid: Grid) -> np.ndarray:
@@ -18,7 +18,7 @@ def filled(vertices: Array, faces: np.ndarray, grid: Grid) -> np.ndarray:
 
     vertices: [V, 3] metres;  faces: [F, 3];  grid: what lies beyond it does not count
     """
-    distance, sight = SignedDistance(vertices, faces), Sight(vertices, faces)
+    distance, sight, closed = SignedDistance(vertices, faces), Sight(vertices, faces), _closed(vertices, faces)
     near = _near(vertices[faces], grid)
     regions, count = ndimage.label(~near)
     outside = np.zeros(count + 1, bool)
@@ -31,11 +31,10 @@ def filled(vertices: Array, faces: np.ndarray, grid: Grid) -> np.ndarray:
     hidden = np.zeros(count + 1, bool)
     for region in range(1, count + 1):
         members = order[ends[region - 1] : ends[region]]
-        probes = _centres(members[np.linspace(0, len(members) - 1, min(PROBES, len(members))).astype(np.intp)], grid)
-        answers = distance.inside(probes)
-        hidden[region] = not (answers.all() or outside[region] or sight.seen(probes).any())
-        agreed = hidden[region] or answers.all() or not answers.any()
-        full[members] = hidden[region] or answers[0] if agreed else distance.inside(_centres(members, grid))
+        inside = distance.inside(_centres(members[:1] if closed else members, grid))
+        probes = members[np.linspace(0, len(members) - 1, min(PROBES, len(members))).astype(np.intp)]
+        hidden[region] = not (inside.all() or outside[region] or sight.seen(_centres(probes, grid)).any())
+        full[members] = hidden[region] or inside
     layer = np.flatnonzero(near)
     full[layer] = distance.inside(_centres(layer, grid))
     if hidden.any():
@@ -43,6 +42,15 @@ def filled(vertices: Array, faces: np.ndarray, grid: Grid) -> np.ndarray:
         beside = layer[(around.ravel() & ~full)[layer]]
         full[beside] = ~sight.seen(_centres(beside, grid))
     return full.reshape(near.shape)
+
+
+def _closed(vertices: Array, faces: np.ndarray) -> bool:
+    """Whether every edge is passed as often one way as the other: then winding numbers are the same all over a region
+    that no face cuts. Corners in one place are one."""
+    corner = np.unique(vertices, axis=0, return_inverse=True)[1].ravel()[faces]
+    ends = np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1).reshape(-1, 2)
+    edge = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)[1].ravel()
+    return not np.bincount(edge, np.sign(ends[:, 1] - ends[:, 0])).any()
 
 
 def _near(corners: Array, grid: Grid) -> np.ndarray:

@@ -172,6 +172,19 @@ def test_a_cup_is_not_full():
     assert volume < 0.6 * outer.volume
 
 
+def test_a_small_open_ball_in_a_large_grid_is_full():
+    vertices, faces = parts(trimesh.creation.icosphere(subdivisions=3, radius=0.3))
+    opened = vertices, faces[vertices[faces].mean(axis=1)[:, 2] < 0.28]  # 0.9 % of the grid, all of it open to outside
+    rods = [
+        (cube()[0] * sides + at, cube()[1])
+        for sides, at in (((2, 0.02, 0.02), (0, 3, 0)), ((0.02, 2, 0.02), (2, 0, 0)))
+    ]
+    mesh = joined(opened, *rods)
+    grid = Grid.around(mesh[0].min(axis=0), mesh[0].max(axis=0), 0.039, 0.1)
+    volume = filled(*mesh, grid).sum() * grid.voxel**3
+    assert volume == pytest.approx(4 / 3 * np.pi * 0.3**3, rel=0.04)
+
+
 def test_overlap_ignores_what_is_far_away():
     far = joined(cube(), cube(0.1, at=(1e5, 0, 0)))
     assert overlap(cube(), far, 0.04) == pytest.approx(1, abs=0.02)
