@@ -15,6 +15,8 @@ from spacesim.scenes.config import ObjectConfig, SceneConfig
 from spacesim.scenes.scenefile import RULES
 from spacesim.splat.compose.pose import Pose
 
+SAME_PLACE = 1e-4  #: metres, or that share of a distance, of a scale and of axes, that count as none; chosen
+
 
 def recorded_scene(data: Path) -> SceneConfig:
     """What scene.json of a dataset says of its scene; mesh files as absolute paths. Raises InputError where there is
@@ -48,6 +50,32 @@ def composed_scene(scenes: Sequence[SceneConfig], poses: Sequence[Pose]) -> Scen
         materials |= {renamed[name]: material for name, material in scene.materials.items()}
         objects += [_posed(one, pose, renamed) for one in scene.objects]
     return replace(first, objects=tuple(objects), materials=materials)
+
+
+def posed_objects(scenes: Sequence[SceneConfig], poses: Sequence[Pose]) -> list[ObjectConfig]:
+    """Where the objects of the models' scenes are; of what they are made stays as each scene names it."""
+    return [_posed(one, pose, {}) for scene, pose in zip(scenes, poses, strict=True) for one in scene.objects]
+
+
+def same_objects(some: Sequence[ObjectConfig], others: Sequence[ObjectConfig]) -> bool:
+    """Whether two scenes have the same things in the same places, in whatever order."""
+    left = list(others)
+    for one in some:
+        found = next((other for other in left if _same_object(one, other)), None)
+        if found is None:
+            return False
+        left.remove(found)
+    return not left
+
+
+def _same_object(one: ObjectConfig, other: ObjectConfig) -> bool:
+    kinds = [(each.spacecraft, Path(each.mesh).name, each.units) for each in (one, other)]
+    if kinds[0] != kinds[1]:
+        return False
+    a, b = (Pose(np.array(each.rotation_wxyz), np.array(each.position), each.scale) for each in (one, other))
+    reach = SAME_PLACE * max(1.0, float(np.abs(b.translation).max()))
+    near = np.abs(a.translation - b.translation).max() <= reach and np.isclose(a.scale, b.scale, rtol=SAME_PLACE)
+    return bool(near and np.allclose(a.rotation, b.rotation, rtol=0, atol=SAME_PLACE))
 
 
 def _posed(one: ObjectConfig, pose: Pose, renamed: Mapping[str, str]) -> ObjectConfig:

@@ -7,25 +7,27 @@ from typing import Any
 
 from spacesim.data.errors import InputError
 from spacesim.data.records import Dataset
+from spacesim.splat.compose.pose import Pose
 from spacesim.splat.run import Run
 from spacesim.viewer.frames import sides
 from spacesim.viewer.session import Session
 from spacesim.viewer.state import Look, Stand, View
 from spacesim.viewer.tracer import Answer, Request
 from spacesim.viewer.truth import SIDE, Truth, TruthDesk, frame_at, stored_truth
-from spacesim.viewer.truthscene import composed_scene, recorded_scene
+from spacesim.viewer.truthscene import composed_scene, posed_objects, recorded_scene, same_objects
 
 
 class TruthService:
     """Truth for sessions.
 
-    data: of each model, the folder of the dataset that its scene is recorded in, or None;  dataset: whose frames show
-    the scene as `start` has it, or None
+    data: of each model, the folder of the dataset that its scene is recorded in, or None;  dataset: whose frames are
+    truth where its scene is the one that is shown, or None;  start: which a dataset that tells no scene shows
     """
 
     def __init__(self, data: Sequence[Path | None], dataset: Dataset | None, start: Stand) -> None:
         self._data, self._dataset, self._start = data, dataset, start
         self._scenes: list[Any] | str | None = None
+        self._whole: Any = None  # the dataset's own scene
         self._lock = threading.Lock()
         self._desk = TruthDesk(self._answered)
 
@@ -58,10 +60,18 @@ class TruthService:
 
     def _frame(self, view: View, stand: Stand) -> int | None:
         """Number of the frame that shows this."""
-        as_recorded = [pose.key for pose in stand.poses] == [pose.key for pose in self._start.poses]
-        if self._dataset is None or not as_recorded:
+        if self._dataset is None or not self._as_recorded(stand):
             return None
         return frame_at(self._dataset, view, stand)
+
+    def _as_recorded(self, stand: Stand) -> bool:
+        """Whether the models stand where the dataset's objects do. Where scenes are not known: as at the start, or, of
+        one model, where it was trained."""
+        scenes = self._recorded()
+        if not isinstance(scenes, str) and self._whole is not None:
+            return same_objects(posed_objects(scenes, stand.poses), self._whole.objects)
+        start = self._start.poses if len(self._start.poses) > 1 else (Pose(),)
+        return [pose.key for pose in stand.poses] == [pose.key for pose in start]
 
     def _recorded(self) -> list[Any] | str:
         """The scenes of the models' data, or why they are not known; looked up once."""
@@ -69,8 +79,9 @@ class TruthService:
             if self._scenes is None:
                 try:
                     self._scenes = [self._scene(path) for path in self._data]
+                    self._whole = self._scene(self._dataset.root) if self._dataset else None
                 except InputError as error:
-                    self._scenes = str(error)
+                    self._scenes = self._scenes or str(error)
             return self._scenes
 
     @staticmethod

@@ -1,5 +1,7 @@
 """Truth in the right place: of the recorded scene, posed as the models are, on the pixels of the view."""
 
+import json
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,10 +14,11 @@ from spacesim.data.records import Camera, Sun
 from spacesim.data.store import read_dataset
 from spacesim.splat.compose import Pose
 from spacesim.viewer.paint import painted
-from spacesim.viewer.state import Stand, View
+from spacesim.viewer.state import Look, Stand, View
 from spacesim.viewer.tracer import PASS, Request, Tracer
 from spacesim.viewer.truth import fitted, frame_at, stored_truth
 from spacesim.viewer.truthscene import composed_scene, recorded_scene
+from spacesim.viewer.truthsource import TruthService
 
 TURN = Pose(np.array([0.8, 0.0, 0.0, 0.6]), np.array([1.0, -2.0, 0.5]), 1.5)
 
@@ -114,14 +117,39 @@ def test_scenes_of_models_become_one(scene):
         composed_scene([scene, other], [Pose(), Pose()])
 
 
+def test_frames_are_the_truth_of_what_they_show_alone(tiny_data, tmp_path, scene):
+    """Of one model where it was trained, of several where the dataset's objects are; else the scene is traced."""
+    dataset = read_dataset(tiny_data)
+    view, sun, look = view_of_frame(dataset, 2), dataset.frames[2].sun, Look()
+
+    def source(start, stand, folders, data=dataset):
+        """Of the truth of a stand, in a scene that was opened as `start`."""
+        service = TruthService(folders, data, Stand(start, sun))
+        service._desk = SimpleNamespace(ask=lambda *_: 7)
+        found = service.truth(None, view, Stand(stand, sun), look)
+        return found if isinstance(found, int) else getattr(found, "source", found)
+
+    assert source((Pose(),), (Pose(),), [tiny_data]) == "the dataset's frame 2"
+    assert source((TURN,), (TURN,), [tiny_data]) == 7  # posed by its scene file
+    assert source((TURN,), (Pose(),), [tiny_data]) == "the dataset's frame 2"
+    assert source((Pose(), TURN), (Pose(), TURN), [tiny_data, tiny_data]) == 7  # data of one of both
+    pair = tmp_path / "pair"
+    shutil.copytree(tiny_data, pair)
+    both = composed_scene([scene, scene], [TURN, Pose()])
+    (pair / "scene.json").write_text(json.dumps({**dataset.scene, "config": both.to_json()}))
+    for poses in ((Pose(), TURN), (TURN, Pose())):
+        assert source((Pose(), Pose()), poses, [tiny_data, tiny_data], read_dataset(pair)) == "the dataset's frame 2"
+    untold = "the data that a model was trained on are not where they were; name them with --data"
+    assert source((TURN,), (TURN,), [None]) == untold
+    assert source((Pose(), TURN), (Pose(), TURN), [None, None]) == "the dataset's frame 2"
+
+
 def test_a_dataset_without_a_scene_says_so(tmp_path, scene):
     with pytest.raises(InputError, match=r"scene\.json"):
         recorded_scene(tmp_path)
     (tmp_path / "scene.json").write_text("[1]")
     with pytest.raises(InputError, match="config"):
         recorded_scene(tmp_path)
-    import json
-
     config = scene.to_json()
     config["objects"] = [{**config["objects"][0], "spacecraft": "", "mesh": "gone.obj"}]
     (tmp_path / "scene.json").write_text(json.dumps({"config": config}))
