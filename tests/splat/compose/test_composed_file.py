@@ -1,6 +1,7 @@
 """Scene files: what they say, what is wrong with them, that a saved scene is the same one; keyframes and orbits."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -216,6 +217,9 @@ def test_a_saved_orbit_and_a_scene_without_camera_and_sun(tmp_path):
     save_scene(tmp_path / "orbit.toml", orbit)
     loaded = load_scene(tmp_path / "orbit.toml")
     assert loaded.orbit == orbit.orbit
+    for still in (replace(orbit, frames=1), replace(whole_scene(tmp_path), frames=1)):
+        save_scene(tmp_path / "still.toml", still)
+        assert load_scene(tmp_path / "still.toml").frames == 1
     for index in (0, 3):
         pair = orbit.shot(index).camera, loaded.shot(index).camera
         assert np.array_equal(*(camera.world_from_camera for camera in pair))
@@ -262,6 +266,7 @@ def test_a_saved_orbit_and_a_scene_without_camera_and_sun(tmp_path):
         (f"{HEAD}[camera]\norbit = {{radius = 0}}", "camera.orbit.radius"),
         (f"{HEAD}[camera]\norbit = {{elevation_deg = 3}}", "camera.orbit.radius"),
         (f"{HEAD}[camera]\nresolution = 0", "camera.resolution"),
+        (f"{HEAD}[camera]\nresolution = 100_000", "line 4: camera.resolution: expected at most"),
         (f"{HEAD}[camera]\ntransform_matrix = [[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]", "camera.transform_matrix"),
         (f"{HEAD}{EYE}[[keyframes]]\ntime = 1\n[[keyframes]]\ntime = 1", "line 10: keyframes[1].time"),
         (f"{HEAD}{EYE}[[keyframes]]\nmodels.map.scale = 2", "keyframes[0].time"),
