@@ -17,7 +17,8 @@ import drjit as dr
 import numpy as np
 
 from spacesim import backend
-from spacesim.data.errors import InputError
+from spacesim.backend import BackendError
+from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera
 
@@ -53,10 +54,18 @@ def arguments(text: str, sizes: str | None = None) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", choices=backend.NAMES, default="auto")
     parser.add_argument("--sizes", default=sizes, help="GAUSSIANSxPIXELS,... (pictures are square)")
-    parser.add_argument("--repeats", type=int, default=30, help="timed calls of each (default 30)")
+    parser.add_argument("--repeats", type=positive, default=30, help="timed calls of each (default 30)")
     parser.add_argument("--json", nargs="?", const=Path("-"), type=Path, metavar="FILE", help="to FILE or the screen")
     parser.add_argument("--markdown", action="store_true", help="tables in Markdown")
     return parser
+
+
+def positive(text: str) -> int:
+    """A whole number of at least 1, for argparse."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"expected at least 1, found {number}")
+    return number
 
 
 def parse_sizes(text: str) -> list[tuple[int, int]]:
@@ -71,12 +80,12 @@ def parse_sizes(text: str) -> list[tuple[int, int]]:
 
 
 def told(main: Callable[[], None]) -> None:
-    """Run a benchmark; what its user can mend ends it with a sentence and code 2."""
+    """Run a benchmark; what its user can mend ends it with a sentence and code 2, what cannot be done with code 1."""
     try:
         main()
-    except InputError as error:
+    except (InputError, BackendError, WorkError) as error:
         print(error, file=sys.stderr)
-        sys.exit(2)
+        sys.exit(2 if isinstance(error, InputError) else 1)
 
 
 def row_names(text: str) -> list[str]:

@@ -18,6 +18,7 @@ from spacesim.splat.train.trainer import Trainer
 
 SCENE = 2_000, 64  #: Gaussians and pixels of the run over many steps
 MOST = 6_000  #: Gaussians that refinement may reach in it
+LEAST_STEPS = 200  #: of `over_steps`: ten before each mark are under the kernel history, the others are timed
 UNSEEN = -20.0  #: logit of an opacity too faint to be drawn
 
 

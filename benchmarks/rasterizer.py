@@ -148,4 +148,4 @@ def peer_row(result: dict[str, Any]) -> common.Row:
 
 
 if __name__ == "__main__":
-    main()
+    common.told(main)

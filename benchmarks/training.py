@@ -51,6 +51,10 @@ def main() -> None:
     parser.add_argument("--memory", action="store_true", help="bytes a Gaussian")
     parser.add_argument("--steps", type=int, metavar="N", help="counters over N steps with refinement")
     options = parser.parse_args()
+    if options.steps is not None and options.steps < counters.LEAST_STEPS:
+        raise SystemExit(f"--steps: expected at least {counters.LEAST_STEPS}, found {options.steps}")
+    if options.opensplat and not options.opensplat.is_file():
+        raise SystemExit(f"--opensplat: expected OpenSplat's binary, found no file {options.opensplat}")
     name = backend.select(options.backend)
     usual = MEMORY_SIZES if options.memory else (growth.SIZES if options.growth else SIZES)[name]
     sizes = common.parse_sizes(options.sizes or usual)
@@ -145,4 +149,4 @@ def has_fused_ssim() -> bool:
 
 
 if __name__ == "__main__":
-    main()
+    common.told(main)

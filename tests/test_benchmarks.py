@@ -97,6 +97,24 @@ def test_sizes_that_are_none_are_refused(text):
         common.parse_sizes(text)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--repeats", "0"], "expected at least 1, found 0"),
+        (["--steps", "100"], "--steps: expected at least 200, found 100"),
+        (["--opensplat", "/nowhere"], "--opensplat: expected OpenSplat's binary, found no file /nowhere"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(arguments, sentence, monkeypatch, capsys):
+    import common
+    import training
+
+    monkeypatch.setattr(sys, "argv", ["training.py", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        common.told(training.main)
+    assert sentence in capsys.readouterr().err + str(ended.value)
+
+
 def test_opensplat_is_timed_without_its_start(tmp_path):
     """A program that needs half a second to start and 5 ms a step."""
     import peer_opensplat
