@@ -115,7 +115,7 @@ class Session:
                 self._told, self._asked = f"no truth: {answer.error}", None
             else:
                 height, width = answer.planes.alpha.shape
-                source = f"path-traced, {answer.samples} samples a pixel"
+                source = f"path-traced, {answer.samples} sample{'s' * (answer.samples != 1)} a pixel"
                 self._told = f"truth: {source}" + ("" if answer.done else ", more to come")
                 self._truth = Truth(answer.planes, self._view.camera(width, height), source)
         self._wish(moving=False)
@@ -171,6 +171,8 @@ class Session:
 
     def _with_truth(self, frame: Frame, view: View, stand: Stand, look: Look) -> Bytes:
         with self._lock:
+            if not self._wanted(view, stand, look):
+                return frame.picture
             if self._truth is None and self._asked is None and not self._told:
                 found = self._source.truth(self, view, stand, look)
                 if isinstance(found, Truth):
@@ -189,6 +191,11 @@ class Session:
         height, width = frame.picture.shape[:2]
         there, known = fitted(picture, truth.camera, view.camera(width, height), smooth=mode != "object id")
         return compared(frame.picture, there, known, look.compare, look.wipe)
+
+    def _wanted(self, view: View, stand: Stand, look: Look) -> bool:
+        """Whether a picture is still of what the client looks at; else the next one asks for truth. The lock is held."""
+        as_asked = (look.mode, look.samples, look.compare) == (self._look.mode, self._look.samples, self._look.compare)
+        return view is self._view and stand.same(self._shared.stand) and as_asked
 
     def _tell(self, frame: Frame, full: bool) -> None:
         now = time.monotonic()

@@ -6,6 +6,7 @@ from browser import wait_for
 
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Sun
+from spacesim.viewer.frames import draw
 from spacesim.viewer.loop import RenderLoop
 from spacesim.viewer.paint import Planes
 from spacesim.viewer.session import Session
@@ -120,6 +121,34 @@ def test_truth_goes_where_the_view_or_the_scene_changes(made):
     assert source.dropped == 3
     session.answer(Answer(7, Planes(np.ones((8, 8)), rgb=np.ones((8, 8, 3))), 4, True))
     assert at_rest(screen)[20, 20].max() < 255
+
+
+@pytest.mark.parametrize("change", ["view", "scene", "mode"])
+def test_a_change_while_a_picture_is_drawn_gets_a_truth_of_its_own(made, stand, monkeypatch, change):
+    session, screen, source, shared = made
+    session.moved(view_from(-5, 0))
+    at_rest(screen)
+    source.truth = lambda _session, view, stand, look: source.asked.append((view, stand, look.mode)) or 7
+    changes = {
+        "view": lambda: session.moved(view_from(-6, 0)),
+        "scene": lambda: shared.change(lambda stand: Stand(stand.poses[::-1], stand.sun)),
+        "mode": lambda: session.set(mode="depth"),
+    }
+    during = [changes[change]]
+
+    def slow(*arguments):
+        frame = draw(*arguments)
+        if during:
+            during.pop()()
+        return frame
+
+    monkeypatch.setattr("spacesim.viewer.session.draw", slow)
+    session.set(compare="wipe", side=512)
+    wait_for(lambda: source.asked and session._loop.idle, "the request")
+    assert not during
+    assert [(view is session.view, now is shared.stand, mode) for view, now, mode in source.asked] == [
+        (True, True, session.look.mode)
+    ]
 
 
 def test_why_there_is_no_truth_is_said(made):
