@@ -258,7 +258,7 @@ def _compose(options: argparse.Namespace) -> None:
 
     scene = load_scene(options.scene)
     with reporting("compose", "frames") as report:
-        done = compose(scene, options.out, options.size, report)
+        done = compose(scene, options.out, options.size, report, options.exposure)
     written = [done.sheet, done.video]
     if options.ply is not None:
         first = scene.shot(0)

@@ -189,6 +189,7 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("scene", type=Path, metavar="SCENE.toml", help="runs, poses, Sun, camera: docs/composition.md")
     one.add_argument("--out", type=Path, required=True, metavar="DIR")
     one.add_argument("--size", type=_resolution, metavar="PX", help="pixels of the longer side, or WIDTHxHEIGHT")
+    one.add_argument("--exposure", type=float, metavar="EV", help="of runs of --linear (that of their pictures)")
     one.add_argument("--ply", type=Path, metavar="FILE", help="write the scene as plain Gaussians, too")
     one.add_argument("--resume", action="store_true", help="go on where an earlier call stopped: it does so anyway")
 

@@ -81,10 +81,7 @@ class Run:
         """Render one view. The method `vanilla` knows one light: `sun` changes nothing. exposure: EV, of a model whose
         colours are linear; by default that of its training pictures. Raises InputError where another method is not told
         the Sun, and for an exposure of a model whose colours are sRGB values."""
-        if exposure is not None and not self.curve:
-            raise InputError(f"--exposure: expected a run trained with --linear, found {self.path}")
-        if exposure is not None and not abs(exposure) <= LARGEST_EV:
-            raise InputError(f"--exposure: expected -{LARGEST_EV} to {LARGEST_EV} EV, found {exposure}")
+        more = stops(self.curve, exposure, str(self.path))
         names = ("alpha", "depth", *(("normal",) if normals else ()))
         if self.light is None:
             output = render(self.model, Pinhole.of(camera), outputs=(*names, "colour"), antialiased=self.antialiased)
@@ -99,9 +96,20 @@ class Run:
         visibility = np.divide(drawn[..., 3], alpha, out=visible, where=alpha > 0) if drawn.shape[2] > 3 else None
         rgb = drawn[..., :3]
         if self.curve:
-            tone, taken = self.curve
-            rgb = developed(rgb, tone, 0.0 if exposure is None else exposure - taken)
+            rgb = developed(rgb, self.curve[0], more)
         return _prediction(output, rgb, visibility, normals)
+
+
+def stops(curve: tuple[str, float] | None, exposure: float | None, found: str) -> float:
+    """By how many EV a picture is exposed more than those of training: none where no `exposure` is asked for. curve: as
+    `Run.curve`;  found: whose it is. Raises InputError for colours that are sRGB values, and for no such exposure."""
+    if exposure is None:
+        return 0.0
+    if curve is None:
+        raise InputError(f"--exposure: expected a run trained with --linear, found {found}")
+    if not abs(exposure) <= LARGEST_EV:
+        raise InputError(f"--exposure: expected -{LARGEST_EV} to {LARGEST_EV} EV, found {exposure}")
+    return exposure - curve[1]
 
 
 def draw_lit(

@@ -57,12 +57,15 @@ def compose(
     out: Path,
     size: int | tuple[int, int] | None = None,
     report: Callable[[int, int], None] | None = None,
+    exposure: float | None = None,
 ) -> Composed:
     """Render every frame of a scene into `out`. Frames that are there already and show the same, from an earlier call
     that was interrupted or before something else was changed, are kept.
 
     size: pixels of the longer side, or (width, height), in place of the camera's;  report: told (frames done, of all)
-    Raises InputError where the scene lacks a camera or a Sun that it needs, or the folder holds other files.
+    exposure: EV, see `Composition.stops`
+    Raises InputError where the scene lacks a camera or a Sun that it needs, an exposure does not fit its models, or the
+    folder holds other files.
     """
     out = Path(out)
     if holds_files(out) and not (out / SHOTS).is_dir():
@@ -75,13 +78,16 @@ def compose(
     if shot.sun is None and shot.composition.relightable:
         told = scene.composition.path or "scene"
         raise InputError(f"{told}: expected the Sun's direction for a scene that it changes, found none; add [sun]")
+    shot.composition.stops(exposure)
     with locked(out):
         _make(out)
         remove_leftovers(out)
-        return _rendered(scene, out, report)
+        return _rendered(scene, out, report, exposure)
 
 
-def _rendered(scene: PosedScene, out: Path, report: Callable[[int, int], None] | None) -> Composed:
+def _rendered(
+    scene: PosedScene, out: Path, report: Callable[[int, int], None] | None, exposure: float | None
+) -> Composed:
     many = scene.frames > 1
     film = _film(scene) if many else None
     count = min(MOST_TILES, scene.frames)
@@ -91,9 +97,9 @@ def _rendered(scene: PosedScene, out: Path, report: Callable[[int, int], None] |
     _forget(out, scene.frames)
     for index in range(scene.frames):
         shot = scene.shot(index)
-        what = _described(shot)
+        what = _described(shot, exposure)
         if not _is_there(out, index, what):
-            _write(out, index, shot, what)
+            _write(out, index, shot, what, exposure)
             rendered += 1
         if film is not None or index in shown:
             picture = read_png(out / "rgb" / f"{index:04d}.png")
@@ -140,7 +146,7 @@ def _forget(out: Path, frames: int) -> None:
                 (out / kind / f"{shot.stem}{suffix}").unlink(missing_ok=True)
 
 
-def _described(shot: Shot) -> dict[str, Any]:
+def _described(shot: Shot, exposure: float | None) -> dict[str, Any]:
     """What a frame shows: as shots/*.json has it, with a digest of all that the pictures depend on."""
     camera = shot.camera
     values: dict[str, Any] = {
@@ -159,7 +165,9 @@ def _described(shot: Shot) -> dict[str, Any]:
         ],
     }
     composition = shot.composition
-    made_by = [__version__, backend.select(), composition.config.shadows, composition.contents]
+    made_by: list[Any] = [__version__, backend.select(), composition.config.shadows, composition.contents]
+    if exposure is not None:
+        made_by.append(exposure)
     text = json.dumps([values, made_by], sort_keys=True)
     return {"digest": hashlib.sha256(text.encode()).hexdigest(), **values}
 
@@ -175,11 +183,11 @@ def _is_there(out: Path, index: int, what: dict[str, Any]) -> bool:
     return all(is_whole(out / kind / f"{index:04d}{PICTURES[kind]}") for kind in told.get("pictures", PICTURES))
 
 
-def _write(out: Path, index: int, shot: Shot, what: dict[str, Any]) -> None:
+def _write(out: Path, index: int, shot: Shot, what: dict[str, Any], exposure: float | None) -> None:
     """The pictures of a frame, then its shots/*.json; while they are written, an earlier one is gone."""
     record = out / SHOTS / f"{index:04d}.json"
     record.unlink(missing_ok=True)
-    prediction = shot.composition.predict(shot.camera, shot.sun)
+    prediction = shot.composition.predict(shot.camera, shot.sun, exposure=exposure)
     planes = _planes(prediction)
     write_picture(prediction, "rgb", out / "rgb" / f"{index:04d}.png")
     write_exr(out / "depth" / f"{index:04d}.exr", {"depth": prediction.depth, "alpha": prediction.alpha})

@@ -25,7 +25,7 @@ from spacesim.splat.compose.members import Ensemble, Member, display_colours
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.render import RenderOutput, render
-from spacesim.splat.run import Prediction, Run
+from spacesim.splat.run import Prediction, Run, stops
 from spacesim.splat.shadow.cast import Between, cast_between
 from spacesim.splat.tone import developed
 
@@ -82,9 +82,10 @@ class Drawn:
     order: list[int]
     curve: tuple[str, float] | None
 
-    def image(self, name: str) -> np.ndarray:
+    def image(self, name: str, more: float = 0.0) -> np.ndarray:
         """One of `OUTPUTS` that was asked for: rgb [H, W, 3] sRGB values over black, normal [H, W, 3], others [H, W];
-        float32, id int32. Raises ValueError for what was not."""
+        float32, id int32. more: EV by which linear colours are exposed more than in training. Raises ValueError for
+        what was not asked for."""
         if name not in ("rgb", "visibility", "id"):
             return self.output.image(name)
         if name not in self.planes:
@@ -93,7 +94,7 @@ class Drawn:
         planes = [np.array(plane, dtype=np.float32).reshape(shape) for plane in self.planes[name]]
         if name == "rgb":
             rgb = np.stack(planes, axis=-1)
-            return developed(rgb, self.curve[0]) if self.curve else rgb
+            return developed(rgb, self.curve[0], more) if self.curve else rgb
         alpha = self.output.image("alpha")
         if name == "visibility":
             return np.divide(planes[0], alpha, out=np.zeros_like(alpha), where=alpha > 0)
@@ -143,13 +144,24 @@ class Composition:
         """Whether the Sun's direction changes what is predicted."""
         return self._shades or any(model.run.relightable for model in self.models)
 
-    def predict(self, camera: Camera, sun: Sun | None = None, normals: bool = False) -> ComposedPrediction:
-        """Render one view. Raises InputError where the Sun matters and none is told."""
+    def stops(self, exposure: float | None) -> float:
+        """By how many EV pictures are exposed more than those of training. exposure: EV, or None for theirs. Raises
+        InputError where not all models are linear, of one tone curve and exposure, and for no such exposure."""
+        curve = self._ensemble.curve
+        if exposure is not None and curve is None and any(member.curve for member in self._ensemble.members):
+            raise InputError("--exposure: expected models of one tone curve and exposure, found several")
+        return stops(curve, exposure, str(self.path or self.models[0].run.path))
+
+    def predict(
+        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
+    ) -> ComposedPrediction:
+        """Render one view. exposure: see `stops`. Raises InputError where the Sun matters and none is told."""
+        more = self.stops(exposure)
         names = [name for name in OUTPUTS if name not in ("median_depth", "normal")]
         drawn = self.draw(camera, sun, [*names, *(("normal",) if normals else ())])
         visibility = drawn.image("visibility") if "visibility" in drawn.planes else None
         normal = drawn.image("normal") if normals else None
-        rgb = np.ascontiguousarray(drawn.image("rgb"))
+        rgb = np.ascontiguousarray(drawn.image("rgb", more))
         return ComposedPrediction(
             rgb, drawn.image("alpha"), drawn.image("depth"), visibility, normal, drawn.image("id")
         )

@@ -10,7 +10,7 @@ import pytest
 from posed import made_run, seen_from
 
 from spacesim.data.errors import InputError
-from spacesim.data.images import read_exr, read_png
+from spacesim.data.images import linear_from_srgb, read_exr, read_png
 from spacesim.data.lock import locked
 from spacesim.data.records import Sun
 from spacesim.splat.compose import Composition, Keyframe, Placed, Pose, PosedScene
@@ -79,6 +79,24 @@ def test_only_what_is_missing_or_changed_is_rendered(tmp_path, monkeypatch):
     compose(scene(2), out)
     assert sorted(path.name for path in (out / "rgb").iterdir()) == ["0000.png", "0001.png"]
     assert sorted(path.name for path in (out / "shots").iterdir()) == ["0000.json", "0001.json"]
+
+
+def test_pictures_of_linear_models_are_exposed_as_asked_for(tmp_path):
+    linear = scene(1, methods=("linear", "linear"))
+    shot = linear.shot(0)
+    once, doubled = (shot.composition.predict(shot.camera, SUN, exposure=ev).rgb for ev in (None, 1.0))
+    np.testing.assert_allclose(linear_from_srgb(doubled), np.minimum(2 * linear_from_srgb(once), 1), atol=1e-4)
+    compose(linear, tmp_path / "out")
+    before = read_png(tmp_path / "out/rgb/0000.png")
+    assert compose(linear, tmp_path / "out", exposure=1.0).rendered == 1
+    assert compose(linear, tmp_path / "out", exposure=1.0).rendered == 0
+    assert read_png(tmp_path / "out/rgb/0000.png")[..., :3].mean() > 1.1 * before[..., :3].mean()
+    for methods, named in ((("map",), "--linear"), (("linear", "map"), "of one tone curve")):
+        with pytest.raises(InputError, match=f"--exposure: expected .*{named}"):
+            compose(scene(1, methods=methods), tmp_path / "none", exposure=1.0)
+    with pytest.raises(InputError, match="-40 to 40 EV"):
+        compose(linear, tmp_path / "none", exposure=float("inf"))
+    assert not (tmp_path / "none").exists()
 
 
 def test_an_interrupted_call_goes_on(tmp_path):
