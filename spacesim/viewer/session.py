@@ -193,7 +193,7 @@ class Session:
         return compared(frame.picture, there, known, look.compare, look.wipe)
 
     def _wanted(self, view: View, stand: Stand, look: Look) -> bool:
-        """Whether a picture is still of what the client looks at; else the next one asks for truth. The lock is held."""
+        """Whether a picture is still of what the client looks at; else the next one asks. The lock is held."""
         as_asked = (look.mode, look.samples, look.compare) == (self._look.mode, self._look.samples, self._look.compare)
         return view is self._view and stand.same(self._shared.stand) and as_asked
 
