@@ -171,14 +171,54 @@ def mitsuba() -> ModuleType:
 
 
 def free_memory() -> int | None:
-    """Bytes that arrays may still take on the chosen backend; None where the system does not say (CUDA, not Linux)."""
-    if select() != "llvm":
-        return None
+    """Bytes that arrays may still take on the chosen backend; None where the system does not say (CUDA, not Linux).
+
+    What the machine has free, or less where a container or a batch system allows the process less.
+    """
+    return None if select() != "llvm" else _free_memory(Path("/"))
+
+
+def _free_memory(root: Path) -> int | None:
+    """`free_memory` of a machine whose files are below `root`."""
+    free = _known_numbers(root / "proc/meminfo").get("MemAvailable:")
+    return None if free is None else min([1024 * free, *_left_by_groups(root)])
+
+
+def _left_by_groups(root: Path) -> Iterator[int]:
+    """Bytes that each control group of this process leaves (cgroups(7), both versions). Files that were read once, and
+    that the kernel drops when memory is short, do not count as used."""
     try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:
-        return None
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
+        return
+    first = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
+    second = "memory.max", "memory.current", "inactive_file"
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers not in ("", "memory"):
+            continue
+        mount = root / "sys/fs/cgroup" / controllers
+        most, used, dropped = first if controllers else second
+        for group in (
+            mount / path.strip("/"),
+            *(mount / path.strip("/")).parents,
+        ):  # in a container its own is the root
+            if not group.is_relative_to(mount):
+                break
+            try:
+                left = int((group / most).read_text()) - int((group / used).read_text())
+            except (OSError, ValueError):  # no such group here, or no limit
+                continue
+            yield max(left + _known_numbers(group / "memory.stat").get(dropped, 0), 0)
+
+
+def _known_numbers(path: Path) -> dict[str, int]:
+    """{name: number} of a file with a name and a number in each line; {} where it cannot be read."""
+    try:
+        rows = [line.split() for line in path.read_text().splitlines()]
+    except OSError:
+        return {}
+    return {row[0]: int(row[1]) for row in rows if len(row) > 1 and row[1].isdigit()}
 
 
 def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:

@@ -262,3 +262,36 @@ def test_recorded_functions_get_what_they_are_called_with():
     assert len(seen) == 1
     things, (pair,) = seen[0]
     assert (things["n"], type(things["rows"][0]), pair.one[::2]) == (None, tuple, (3, "a"))
+
+
+@pytest.mark.parametrize(
+    ("files", "left"),
+    [
+        ({}, 8_000_000_000),
+        ({"proc/self/cgroup": "0::/\n", "sys/fs/cgroup/memory.max": "max\n"}, 8_000_000_000),
+        (  # a container with control groups of version 2: a gigabyte, 600 MB of it used, 100 MB of these a file's
+            {
+                "proc/self/cgroup": "0::/\n",
+                "sys/fs/cgroup/memory.max": "1000000000\n",
+                "sys/fs/cgroup/memory.current": "600000000\n",
+                "sys/fs/cgroup/memory.stat": "anon 500000000\ninactive_file 100000000\n",
+            },
+            500_000_000,
+        ),
+        (  # a job of a batch system, whose limit is that of the group above
+            {
+                "proc/self/cgroup": "5:cpu:/\n4:memory:/slurm/job_7/step_0\n0::/\n",
+                "sys/fs/cgroup/memory/slurm/job_7/step_0/memory.limit_in_bytes": "9223372036854771712\n",
+                "sys/fs/cgroup/memory/slurm/job_7/step_0/memory.usage_in_bytes": "200000000\n",
+                "sys/fs/cgroup/memory/slurm/job_7/memory.limit_in_bytes": "2000000000\n",
+                "sys/fs/cgroup/memory/slurm/job_7/memory.usage_in_bytes": "300000000\n",
+            },
+            1_700_000_000,
+        ),
+    ],
+)
+def test_free_memory_is_what_the_control_groups_leave(tmp_path, files, left):
+    for name, content in {"proc/meminfo": "MemTotal: 16000000 kB\nMemAvailable: 7812500 kB\n", **files}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(content)
+    assert backend._free_memory(tmp_path) == left
