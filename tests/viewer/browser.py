@@ -111,9 +111,10 @@ class Page:
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
     def frames(self, count: int = 2) -> None:
-        """Wait until the tab has drawn so often, however slow it is; a second where it draws nothing."""
-        step = "const step = () => count-- ? requestAnimationFrame(step) : done();"
-        self.evaluate(f"new Promise(done => {{ let count = {count}; {step} step(); setTimeout(done, 1000); }})")
+        """Wait until the tab has drawn so often, however slow it is; 2 s where it draws nothing."""
+        watch = "clearTimeout(end); end = setTimeout(done, 2000);"
+        step = f"const step = () => {{ {watch} count-- ? requestAnimationFrame(step) : done(); }};"
+        self.evaluate(f"new Promise(done => {{ let count = {count}, end; {step} step(); }})")
 
     def mouse(self, kind: str, x: float, y: float, buttons: int = 0) -> None:
         """One event of the mouse: mousePressed, mouseMoved or mouseReleased."""

@@ -5,7 +5,7 @@ import random
 import threading
 
 import pytest
-from browser import wait_for
+from browser import PATIENCE, wait_for
 
 from spacesim.viewer.address import ATTEMPTS, free_port, is_loopback, url
 from spacesim.viewer.gate import admitted, guard, is_foreign, wake_in_turn
@@ -167,11 +167,11 @@ def test_the_event_loop_is_woken_by_its_own_thread_alone():
     def send():
         for k in range(50):
             buffer.push(messages.SetGuiPanelLabelMessage(str(k)) if k else GOOD[0])
-            wait_for(lambda k=k: len(told) > k, "each to be heard before the next", 20)
+            wait_for(lambda k=k: len(told) > k, "each to be heard before the next")
 
     thread = threading.Thread(target=send)
     thread.start()
-    loop.run_until_complete(asyncio.wait_for(listen(), 20))
+    loop.run_until_complete(asyncio.wait_for(listen(), PATIENCE))
     thread.join()
     loop.close()
     assert [message.label for message in told[1:]] == [str(k) for k in range(1, 50)]

@@ -2,9 +2,12 @@
 
 import threading
 import time
+from types import SimpleNamespace
 
+import pytest
 from browser import PATIENCE, wait_for
 
+from spacesim.viewer.loop import PATIENCE as PATIENCE_AT_REST
 from spacesim.viewer.loop import RenderLoop, Wish
 
 
@@ -42,32 +45,40 @@ def test_only_the_newest_wish_of_a_client_is_drawn():
     assert threading.get_ident() not in drawn.threads
 
 
-def test_full_resolution_comes_at_rest_and_once():
+@pytest.fixture
+def clock(monkeypatch):
+    """The loop's time, which passes as a test says: tasks are taken from the loop without its thread."""
+    now = SimpleNamespace(seconds=100.0)
+    monkeypatch.setattr("spacesim.viewer.loop.time", SimpleNamespace(monotonic=lambda: now.seconds))
+    return now
+
+
+def test_full_resolution_comes_at_rest_and_once(clock):
     loop, drawn = RenderLoop(rest=1.0), Drawn()
     loop.wish("a", drawn.wish(1))
     loop.wish("b", drawn.wish(2), moving=False)
     assert not loop.idle
-    loop.start()
-    wait_for(lambda: loop.idle, "all pictures")
-    loop.stop()
+    for _ in range(2):
+        loop._next()()
+    for seconds in (0.5, 0.4):
+        clock.seconds += seconds
+        assert loop._next() is None
+    clock.seconds += 0.2
+    loop._next()()
     assert drawn.made == [(1, False), (2, True), (1, True)]
+    assert loop.idle
 
 
-def test_a_view_at_rest_is_not_kept_waiting_by_one_that_moves_for_ever():
+def test_a_view_at_rest_is_not_kept_waiting_by_one_that_moves_for_ever(clock):
     loop, drawn = RenderLoop(rest=0.05), Drawn()
-    loop.start()
     loop.wish("still", drawn.wish("still"))
-
-    def draw(_full):
-        time.sleep(0.01)
-        drawn.made.append(("moving", False))
-        if len(drawn.made) < 400:
-            loop.wish("moving", Wish(draw))
-
-    loop.wish("moving", Wish(draw))
-    wait_for(lambda: ("still", True) in drawn.made, "the picture at rest")
-    loop.stop()
-    assert 5 < drawn.made.index(("still", True)) < 400
+    for _ in range(100):
+        loop.wish("moving", drawn.wish("moving"))
+        loop._next()()
+        clock.seconds += 0.01
+    assert drawn.made[0] == ("still", False)
+    assert drawn.made.index(("still", True)) == pytest.approx((0.05 + PATIENCE_AT_REST) / 0.01, abs=2)
+    assert drawn.made.count(("moving", False)) == 98  # it never rests
 
 
 def test_a_client_that_has_gone_gets_nothing():
@@ -103,23 +114,32 @@ def test_a_picture_that_fails_ends_no_others(caplog):
     assert not loop._thread.is_alive()
 
 
-def test_it_tidies_up_in_pauses_once_after_pictures():
+def test_it_tidies_up_in_pauses_once_after_pictures(clock):
     drawn, tidied = Drawn(), []
-    loop = RenderLoop(0.01, lambda: tidied.append((len(drawn.made), threading.current_thread().name)), 0.5)
-    loop.start()
-    assert loop._tidy_at is None  # nothing was drawn
+    loop = RenderLoop(0.2, lambda: tidied.append(len(drawn.made)), 20.0)
+
+    def pass_by(seconds):
+        """All that is to do, every tenth of a second."""
+        for _ in range(round(10 * seconds)):
+            clock.seconds += 0.1
+            while (task := loop._next()) is not None:
+                task()
+
+    pass_by(50)
+    assert tidied == []  # nothing was drawn
     loop.wish("a", drawn.wish(1))
-    wait_for(lambda: tidied, "the tidying")
-    time.sleep(1.2)
-    assert tidied == [(2, "render")]
+    pass_by(19.5)
+    assert tidied == []
+    pass_by(100)
+    assert tidied == [2]
     loop.wish("a", drawn.wish(2), moving=False)
-    wait_for(lambda: len(tidied) == 2, "another one")
-    loop.stop()
+    pass_by(100)
+    assert tidied == [2, 3]
 
 
-def test_it_tidies_up_between_pictures_that_never_end():
+def test_it_tidies_up_on_its_thread_between_pictures_that_never_end():
     drawn, tidied = [], []
-    loop = RenderLoop(60, lambda: tidied.append(len(drawn)), 0.1)
+    loop = RenderLoop(60, lambda: tidied.append((len(drawn), threading.current_thread().name)), 0.1)
 
     def draw(_full):
         time.sleep(0.002)
@@ -130,4 +150,6 @@ def test_it_tidies_up_between_pictures_that_never_end():
     loop.wish("a", Wish(draw))
     wait_for(lambda: len(tidied) > 1, "the tidying")
     loop.stop()
-    assert 0 < tidied[0] < tidied[1] <= len(drawn)
+    (first, thread), (second, _) = tidied[:2]
+    assert 0 < first < second <= len(drawn)
+    assert thread == "render"

@@ -99,7 +99,7 @@ def test_truth_is_asked_for_once_and_shown_as_it_comes(made):
     wait_for(lambda: screen.pictures[-1][0][20, 20].min() == 255, "the truth")
     picture = screen.pictures[-1][0]
     assert (picture[:, 140:] == plain[:, 140:]).all()
-    assert "4 samples a pixel, more to come" in screen.told[-1].status
+    wait_for(lambda: "4 samples a pixel, more to come" in screen.told[-1].status, "a word about it")
     session.set(wipe=0.0)
     wait_for(lambda: (screen.pictures[-1][0] == plain).all(), "no truth")
     assert source.asked == ["colour"]
@@ -176,7 +176,7 @@ def test_stored_truth_is_shown_at_once(made):
     source.found = Truth(white, view.camera(64, 64), "the dataset's frame 3")
     session.set(compare="wipe", wipe=1.0)
     wait_for(lambda: screen.pictures[-1][0].min() == 255, "the truth")
-    assert screen.told[-1].status == "truth: the dataset's frame 3"
+    wait_for(lambda: screen.told[-1].status == "truth: the dataset's frame 3", "a word about it")
 
 
 def test_a_session_that_is_closed_draws_no_more(made):
