@@ -13,6 +13,7 @@ from spacesim.splat.mlp import MlpShape
 
 LOBES = (8, 32, 128, 512)  #: exponents of n . h, from satin to mirror, chosen: each is the one before to the fourth
 COSINES = 4 + len(LOBES)  #: numbers that `surface_cosines` gives
+TURNED = 0.4  #: a learned normal with n . s of at most -TURNED is turned away from the Sun; chosen (docs/relighting.md)
 
 
 @dataclass(frozen=True)
@@ -54,10 +55,9 @@ class FieldInputs:
     sun: Any
 
 
-def field_items(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:
-    """Items of the network (4.2): TensorXf [B, C, m]."""
-    rows = [*lanes.block(inputs.features, 0, config.features), *field_views(config, inputs, lanes)]
-    return lanes.matrix(rows, config.shape.rows)
+def field_items(config: FieldConfig, features: Any, views: list[Any], lanes: Lanes) -> Any:
+    """Items of the network (4.2): TensorXf [B, C, m]. features: packed;  views: of `field_views`"""
+    return lanes.matrix([*lanes.block(features, 0, config.features), *views], config.shape.rows)
 
 
 def field_views(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> list[Any]:
@@ -69,14 +69,22 @@ def field_views(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> list[
     return rows
 
 
-def by_normals(config: FieldConfig, inputs: FieldInputs, by_items: Any, lanes: Lanes) -> Any:
-    """TensorXf [B, 3, m]: gradient of the normals, from that of the network's items."""
+def facing(config: FieldConfig, views: list[Any]) -> list[Any]:
+    """Float [M] in [0, 1] in a list: does the side that is seen face the Sun? 1 where its learned normal does, 1/2 at
+    n . s = -TURNED / 2, as normals are not exact. Nothing of a field without them. views: of `field_views`"""
+    return [_faces(views[config.view.size])] if config.surface else []
+
+
+def by_normals(config: FieldConfig, inputs: FieldInputs, by_items: Any, by_facing: list[Any], lanes: Lanes) -> Any:
+    """TensorXf [B, 3, m]: gradient of the normals, from that of the network's items and, if any, of `facing`."""
     normals = _normals(config, inputs, lanes)
     dr.enable_grad(normals)
     direction = inputs.camera.directions_to(lanes.spread(inputs.means))
     cosines = surface_cosines(normals, direction, inputs.sun)
     first = config.features + config.view.size
     along = sum((cosine * lanes.row(by_items, first + i) for i, cosine in enumerate(cosines)), ad.Float(0))
+    for gradient in by_facing:
+        along += gradient * _faces(cosines[0])
     dr.backward(along)
     return lanes.matrix(list(dr.grad(normals)))
 
@@ -101,6 +109,10 @@ def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
     for _ in LOBES[1:]:
         lobes.append(dr.square(dr.square(lobes[-1])))
     return [lambert, dr.maximum(lambert, 0), -dr.dot(seen, direction), halfway, *lobes]
+
+
+def _faces(lambert: Any) -> Any:
+    return dr.clip(1 + lambert / TURNED, 0, 1)
 
 
 def _normals(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:

@@ -18,7 +18,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.tone import TONES
 from spacesim.splat import cooperative, mlp
-from spacesim.splat.appearance import FieldConfig, FieldInputs, by_normals, field_items, field_views
+from spacesim.splat.appearance import FieldConfig, FieldInputs, by_normals, facing, field_items, field_views
 from spacesim.splat.cameras import Projection
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.lanes import Lanes, aligned
@@ -108,18 +108,20 @@ class _Inputs:
 @dataclass
 class _Tape:
     """What the adjoint needs of the forward pass. colours: 3 arrays [M] before they are dimmed;  occlusion: the refined
-    one [M] in a list, or nothing"""
+    one [M] in a list, or nothing;  faces: of `facing`, or nothing"""
 
     field: list[Any]
     refine: list[Any]
     colours: list[Any]
     occlusion: list[Any]
+    faces: list[Any]
 
 
 @dataclass
 class Shading:
-    """colours: 3 arrays [N], display values that visibility has dimmed (4.17);  visibility: Float [N] in [0, 1], or
-    None;  shadows: raw, or None;  inputs, lanes, tape: what `LightModel.adjoint` wants"""
+    """colours: 3 arrays [N], display values that visibility has dimmed (4.17);  visibility: Float [N] in [0, 1] as
+    pictures show it, so times `facing`, which colours do without, or None;  shadows: raw, or None;
+    inputs, lanes, tape: what `LightModel.adjoint` wants"""
 
     colours: list[Any]
     visibility: Any
@@ -197,7 +199,7 @@ class LightModel:
         return Shading(colours, visibility[0] if visibility else None, shadows, inputs, lanes, tape)
 
     def visibility(self, gaussians: Gaussians, sun: np.ndarray, adaptive: bool = False) -> Any:
-        """Of `shade`, for pictures: Float [N], which no camera changes; None for a model without shadows."""
+        """What dims colours (4.17): Float [N], which no camera changes; None for a model without shadows."""
         shadows = self.shadows(gaussians, sun, adaptive)
         if shadows is None:
             return None
@@ -223,7 +225,8 @@ class LightModel:
         kept = self._kept_of(gaussians.features, lanes)
         of_field, _ = _split(self.config, self.weights)
         seen = [] if visibility is None else [visibility]
-        return _lit(self.config, of_field, inputs, lanes, kept.known, kept.packed, seen), visibility
+        *colours, shown = [*_lit(self.config, of_field, inputs, lanes, kept.known, kept.packed, seen), None][:4]
+        return colours, shown
 
     def adjoint(self, shading: Shading, by_colour: list[Any], by_visibility: Any = None) -> "LightGradients":
         """From the gradients of the dimmed colours (3 arrays [N]) and, where visibility is seen on its own, of the
@@ -284,11 +287,16 @@ def _trace_shade(
 ) -> tuple[list[Any], list[Any], _Tape]:
     """(dimmed colours, [visibility] or [], tape)."""
     of_field, of_refine = _split(config, weights)
-    items = field_items(config.field, _field_inputs(inputs), lanes)
+    views = field_views(config.field, _field_inputs(inputs), lanes)
+    items = field_items(config.field, inputs.features, views, lanes)
     output, field_tape = mlp.forward(config.field.shape, of_field, items, inputs.sun.field)
     colours = [_sigmoid(lanes.row(output, i)) for i in range(3)]
-    shown, visibility, occlusion, refine_tape = _dimmed(config, of_refine, inputs, lanes, colours)
-    return shown, visibility, _Tape(field_tape, refine_tape, colours, occlusion)
+    occlusion, refine_tape = _occluded(config, of_refine, inputs, lanes)
+    faces = facing(config.field, views) if occlusion else []
+    shown = _dimmed(colours, [1 - value for value in occlusion], faces)
+    dr.eval(shown, colours, occlusion, faces)
+    shown = lanes.narrowed(shown, inputs.means.x)
+    return shown[:3], shown[3:], _Tape(field_tape, refine_tape, colours, occlusion, faces)
 
 
 def _trace_lit(
@@ -300,19 +308,19 @@ def _trace_lit(
     packed: list[Any],
     visibility: list[Any],
 ) -> list[Any]:
-    """Dimmed colours. known, packed: see `_Kept`;  visibility: [N] in a list, or nothing"""
+    """Dimmed colours, and visibility as it is shown. known, packed: see `_Kept`;  visibility: [N] in a list, or
+    nothing"""
     field = config.field
-    rows = field_views(field, _field_inputs(inputs), lanes)
+    views = field_views(field, _field_inputs(inputs), lanes)
     if known:
-        items = lanes.matrix(rows, aligned(len(rows)))
+        items = lanes.matrix(views, aligned(len(views)))
         output, _ = mlp.forward(field.shape, of_field, items, inputs.sun.field, known)
         outputs = [lanes.row(output, i) for i in range(3)]
     else:
-        rows = lanes.block(inputs.features, 0, field.features) + rows
+        rows = lanes.block(inputs.features, 0, field.features) + views
         outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field)
-    seen = [lanes.padded(value) for value in visibility]
     colours = [_sigmoid(value) for value in outputs]
-    shown = [colour * seen[0] if seen else colour for colour in colours]
+    shown = _dimmed(colours, [lanes.padded(value) for value in visibility], facing(field, views))
     dr.eval(shown)
     return lanes.narrowed(shown, inputs.means.x)
 
@@ -329,16 +337,16 @@ def _trace_known(field: FieldConfig, weights: list[Any], features: Any, lanes: L
     return mlp.known(field.shape, weights, items, field.features)
 
 
-def _dimmed(
-    config: LightConfig, of_refine: list[Any], inputs: _Inputs, lanes: Lanes, colours: list[Any]
-) -> tuple[list[Any], list[Any], list[Any], list[Any]]:
-    """(dimmed colours [N], [visibility [N]] or [], refined occlusion, tape of the refinement) of colours [M]."""
-    occlusion, refine_tape = _occluded(config, of_refine, inputs, lanes)
-    visibility = [1 - value for value in occlusion]
-    shown = [colour * visibility[0] if visibility else colour for colour in colours] + visibility
-    dr.eval(shown, colours, occlusion)
-    *shown, last = lanes.narrowed(shown, inputs.means.x)
-    return (shown, [last], occlusion, refine_tape) if visibility else ([*shown, last], [], occlusion, refine_tape)
+def _dimmed(colours: list[Any], visibility: list[Any], faces: list[Any]) -> list[Any]:
+    """Colours [M] dimmed by visibility ([M] in a list, or nothing), then that as it is shown. faces: of `facing`"""
+    if not visibility:
+        return colours
+    return [colour * visibility[0] for colour in colours] + [_shown(visibility[0], faces)]
+
+
+def _shown(visibility: Any, faces: list[Any]) -> Any:
+    """A picture's: what is turned away from the Sun does not see it."""
+    return visibility * faces[0] if faces else visibility
 
 
 def _occluded(config: LightConfig, of_refine: list[Any], inputs: _Inputs, lanes: Lanes) -> tuple[list[Any], list[Any]]:
@@ -367,9 +375,11 @@ def _trace_adjoint(
     by_output = lanes.matrix([g * visibility * c * (1 - c) for g, c in pairs])
     by_weights, by_items = mlp.backward(config.field.shape, of_field, tape.field, inputs.sun.field, by_output)
     parts = [(by_items, 0, config.field.features)]
+    by_shown = [lanes.padded(gradient) for gradient in by_visibility]
     if config.field.surface:
-        parts.append((by_normals(config.field, _field_inputs(inputs), by_items, lanes), 0, 3))
-    by_raw: Any = -sum((g * c for g, c in pairs), sum(map(lanes.padded, by_visibility), ad.Float(0)))
+        by_facing = [gradient * visibility for gradient in by_shown]
+        parts.append((by_normals(config.field, _field_inputs(inputs), by_items, by_facing, lanes), 0, 3))
+    by_raw: Any = -sum((g * c for g, c in pairs), sum((_shown(g, tape.faces) for g in by_shown), ad.Float(0)))
     if config.refine:
         occlusion = tape.occlusion[0]
         by_logit = by_raw * occlusion * (1 - occlusion)

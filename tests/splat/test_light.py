@@ -134,7 +134,8 @@ def cosines(normal: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray]) -> tuple:
-    """(colours [N, 3], visibility [N]) of 4.2, 4.11 to 4.14 and 4.17; raw: occlusion and bias info as given."""
+    """(colours [N, 3], visibility [N] as it is shown) of 4.2, 4.11 to 4.14 and 4.17; raw: occlusion and bias info as
+    given."""
     config, field = light.config, light.config.field
     direction = arrays["means"] - np.array([0, -6, 1.0])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -143,6 +144,7 @@ def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[n
     if field.surface:
         normal = features[:, field.features : field.stored]
         items = np.concatenate([items, cosines(normal, direction)], axis=1)
+    faces = np.interp(cosines(normal, direction)[:, 0], [-0.4, 0], [0, 1]) if field.surface else 1
     colour = sigmoid(network(field.shape, weights[:split], items, encoded(field.sun, SUN[None])[0]))
     if not raw:
         return colour, np.ones(len(colour))
@@ -163,7 +165,7 @@ def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[n
         correction = network(refine.shape, weights[split:], items, encoded(refine.sun, SUN[None])[0])[:, 0]
         sure = np.clip(occlusion, 0.02, 0.98)
         occlusion = sigmoid(np.log(sure / (1 - sure)) + correction)
-    return colour * (1 - occlusion)[:, None], 1 - occlusion
+    return colour * (1 - occlusion)[:, None], (1 - occlusion) * faces
 
 
 @pytest.mark.parametrize("name", CONFIGS)
