@@ -10,7 +10,7 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import Array
 from spacesim.data.images import load_image, luminance, read_png, write_png
 from spacesim.data.records import Dataset, Frame, Truth
-from spacesim.data.store import SHADOW_LIT, SHADOW_NONE, SHADOW_SELF_CAST, load_truth
+from spacesim.data.store import SHADOW_NONE, SHADOW_SELF_CAST, load_truth
 from spacesim.eval import grazing, image, lpips, pictures, shadow
 from spacesim.eval.image import Mask
 
@@ -116,7 +116,7 @@ def write_pictures(folder: Path, view: View, light: Light) -> None:
         classes = light.truth.shadow
         mask = view.valid & (classes != SHADOW_NONE)
         made["mask_truth"] = pictures.kinds_picture(classes, mask)
-        made["mask_prediction"] = pictures.shadow_picture(light.visibility < 0.5, classes != SHADOW_LIT, mask)
+        made["mask_prediction"] = pictures.mask_picture(light.visibility < 0.5, classes, mask)
         made["visibility"] = pictures.visibility_picture(light.visibility, light.alpha)
     for name, picture in made.items():
         write_png(folder / f"{name}.png", picture)

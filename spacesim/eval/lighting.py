@@ -10,10 +10,13 @@ from spacesim.eval.gallery import MISTAKES, Panels, css, strips, sun_of, swatche
 from spacesim.eval.judged import Judged, legend
 from spacesim.eval.labels import LOWER
 from spacesim.eval.page import escape, picture, table
-from spacesim.eval.pictures import ATTACHED, LIT, OTHER_CAST, SELF_CAST, SHADOWED
+from spacesim.eval.pictures import ATTACHED, ATTACHED_LIT, LIT, OTHER_CAST, SELF_CAST, SHADOWED
 
 MOST_PAIRS = 24
 """Frames whose masks stand side by side in small (chosen); of more, evenly picked ones."""
+
+FEWEST = 0.1
+"""Lit and cast-shadow pixels of a frame that can be best or worst, as a share of the median frame's (chosen)."""
 
 _PANELS: Panels = {
     "truth": "Truth",
@@ -23,6 +26,7 @@ _PANELS: Panels = {
     "visibility": "Predicted visibility",
 }
 _KINDS = {"lit": LIT, "faces away": ATTACHED, "cast by itself": SELF_CAST, "cast by another": OTHER_CAST}
+_PREDICTED = {**MISTAKES, "faces away: dark": ATTACHED, "faces away, but lit": ATTACHED_LIT}
 _BIN_COLUMNS = {
     "luminance_mae": "Luminance MAE",
     "visibility_mae": "Visibility MAE",
@@ -95,16 +99,19 @@ def shadow_masks(runs: Sequence[Judged]) -> str:
     if not predicting:
         return ""
 
+    frames = [frame for run in predicting for frame in run.frames.values() if frame["shadow_mask"] is not None]
+    least = FEWEST * float(np.median([_rate(frame, "pixels") or 0 for frame in frames]))
+
     def score(frame: Mapping[str, Any]) -> float | None:
         value = _rate(frame, "balanced_error_rate")
-        return None if value is None else -value
+        return None if value is None or (_rate(frame, "pixels") or 0) < least else -value
 
     def words(frame: Mapping[str, Any]) -> str:
         value = _rate(frame, "balanced_error_rate")
         return "" if value is None else f"balanced error rate {value:.4f}"
 
     keys = f'<p class="key"><span>Truth:</span>{swatches(_KINDS)}</p>'
-    keys += f'<p class="key"><span>Prediction:</span>{swatches(MISTAKES)}</p>{_visibility_bar()}'
+    keys += f'<p class="key"><span>Prediction:</span>{swatches(_PREDICTED)}</p>{_visibility_bar()}'
     shown = strips(predicting, _PANELS, "mask_prediction", score, words)
     return keys + shown + "".join(_pairs(run, named=len(runs) > 1) for run in predicting)
 

@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 
 from spacesim.data.images import srgb_from_linear
+from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT
 from spacesim.data.tone import as_bytes
 from spacesim.eval.image import Mask
 from spacesim.eval.shadow import KINDS
@@ -18,6 +19,10 @@ WRONGLY_SHADOWED, WRONGLY_LIT = (213, 94, 0), (86, 180, 233)
 
 ATTACHED, SELF_CAST, OTHER_CAST = (124, 130, 142), SHADOWED, (122, 78, 132)
 """sRGB colours of the kinds of true shadow."""
+
+ATTACHED_LIT = (176, 202, 216)
+"""sRGB colour of a surface that faces away from the Sun and is predicted to see it: paler than mistakes, as masks are
+judged where a surface faces the Sun."""
 
 
 def error_picture(prediction: np.ndarray, truth: np.ndarray, valid: Mask) -> np.ndarray:
@@ -39,6 +44,16 @@ def shadow_picture(predicted: Mask, shadowed: Mask, mask: Mask) -> np.ndarray:
     picture[mask & predicted & shadowed] = SHADOWED
     picture[mask & predicted & ~shadowed] = WRONGLY_SHADOWED
     picture[mask & ~predicted & shadowed] = WRONGLY_LIT
+    return picture
+
+
+def mask_picture(predicted: Mask, classes: np.ndarray, mask: Mask) -> np.ndarray:
+    """[H, W, 3] uint8: the pixels of `mask` as predicted, mistakes in their colours by the true shadow class [H, W];
+    what faces away from the Sun in colours of its own. predicted: [H, W], in shadow"""
+    picture = shadow_picture(predicted, classes != SHADOW_LIT, mask)
+    attached = mask & (classes == SHADOW_ATTACHED)
+    picture[attached & predicted] = ATTACHED
+    picture[attached & ~predicted] = ATTACHED_LIT
     return picture
 
 

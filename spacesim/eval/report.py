@@ -54,7 +54,8 @@ def _content(runs: Sequence[Judged]) -> str:
             "Shadow masks",
             shadow_masks(runs),
             "Where the Sun is seen, by the path tracer and by the run: best, median and worst by balanced error rate "
-            "over lit and cast-shadow pixels. Half of the solar disc or more is lit.",
+            "over lit and cast-shadow pixels, of the frames that show enough of these. Half of the solar disc or "
+            "more is lit.",
         ),
         section("Results", results(runs), "Mean ± population standard deviation over the frames."),
         _section(
@@ -132,7 +133,9 @@ def _headlines(runs: Sequence[Judged]) -> str:
     for metric in (_GAUSSIANS, _RENDER):
         cards.append(_card(metric, runs, [_model_cell(run, metric) for run in runs]))
     many = " many" if len(runs) > 1 else " more" if len(cards) > 6 else ""
-    lead = "Image and shadow numbers are means over the frames, taken over the object's silhouette."
+    lead = "Image and shadow numbers are means over the frames, taken over the object's silhouette"
+    masks = any(group == "shadow_mask" for group, _ in chosen)
+    lead += "; shadow masks over lit and cast-shadow pixels." if masks else "."
     return f'<div class="cards{many}">{"".join(cards)}</div><p class="lead">{lead}</p>'
 
 

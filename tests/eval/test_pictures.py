@@ -33,6 +33,14 @@ def test_shadow_picture_tells_mistakes():
     assert picture[0].tolist() == [list(colour) for colour in expected]
 
 
+def test_mask_picture_keeps_what_faces_away_apart():
+    classes = np.array([[0, 85, 85, 170, 171, 255, 255]], np.uint8)
+    predicted = np.array([[True, True, False, True, False, True, False]])
+    expected = [(0, 0, 0), pictures.ATTACHED, pictures.ATTACHED_LIT, pictures.SHADOWED, pictures.WRONGLY_LIT]
+    expected += [pictures.WRONGLY_SHADOWED, pictures.LIT]
+    assert pictures.mask_picture(predicted, classes, classes > 0)[0].tolist() == [list(colour) for colour in expected]
+
+
 def test_bytes_are_rounded_and_clipped():
     assert pictures.as_bytes(np.array([-1, 0.4999 / 255, 0.5001 / 255, 1, 2])).tolist() == [0, 0, 1, 255, 255]
 

@@ -186,6 +186,15 @@ def test_masks_and_the_relit_view_are_the_folders(lit):
     assert "no truth" not in text
 
 
+def test_a_frame_of_a_few_pixels_is_not_the_best_by_masks(lit):
+    def few(metrics):
+        metrics["frames"][2]["shadow_mask"] |= {"balanced_error_rate": 0.0, "pixels": pixels}
+
+    for pixels, found in ((3, False), (3000, True)):
+        text = "".join(page_of(another(lit, f"few{pixels}", few)).text)
+        assert ("balanced error rate 0.0000" in text) is found
+
+
 def test_suns_without_truth_are_said_to_have_none(lit):
     def forget(metrics):
         metrics["relight"]["suns"][1] |= {"truth": None, "psnr": None}
