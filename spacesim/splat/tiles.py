@@ -28,8 +28,9 @@ HANDS = 64  #: at most, chosen: no fewer than the parts into which Dr.Jit divide
 STEPS, FEW = 8, 2  #: sizes of arrays from one power of two to the next, as a rule, and of the lists of pictures
 LONG = 2**22  #: pairs from which on lists of pictures have no more room than others, chosen: a gigabyte
 LARGEST_PAIRS = 0.9 * 2**30  #: records hold four numbers a pair, and Dr.Jit's arrays at most 2^32
-BYTES_A_PAIR = 200  #: of lists, sorting and blending on LLVM, 100 to 210 measured; gradients take as much again
-BYTES_A_PIXEL = 85  #: of colour, transmittance and what blending keeps of them, measured on LLVM; others beside
+PICTURE_BYTES = 200, 85  #: a pair (lists, sorting, blending), a pixel (colour, transmittance and what blending keeps of
+#: them): measured on LLVM, 90 to 210 a pair, as the rounding of arrays has it
+TRAINING_BYTES = 300, 280  #: the same of a training step, with gradients and the loss; 140 to 280 a pair measured
 
 
 @dataclass(frozen=True)
@@ -111,10 +112,17 @@ class _Boxes:
     upto: Any
 
 
-def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int, few_sizes: bool = False) -> TileLists:
+def bin_splats(
+    splats: Splats,
+    footprints: Footprints,
+    width: int,
+    height: int,
+    few_sizes: bool = False,
+    training: bool = False,
+) -> TileLists:
     """Sort splats [N] into the tiles of a width x height image. Raises WorkError for more pairs than can be
     sorted or held in memory. few_sizes: of lists, for pictures from all over, each of which has another number of
-    pairs; lists are up to half as long again.
+    pairs; lists are up to half as long again. training: a training step has to find place in memory, not a picture.
 
     Between its two parts, both recorded, the host waits for the number of pairs, which says how large arrays must be.
     """
@@ -127,7 +135,7 @@ def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int, 
         capacity = room(count)
         boxes: _Boxes = boxes_of(splats, footprints, dr.opaque(ad.UInt32, count), capacity, tiles, shape)
         pairs = int(boxes.upto[capacity - 1])
-    _check_room(pairs, width * height)
+    _check_room(pairs, width * height, *(TRAINING_BYTES if training else PICTURE_BYTES))
     if pairs == 0:
         none, of_splats = dr.zeros(ad.UInt32, tiles[0] * tiles[1]), dr.zeros(ad.UInt32, max(count, 1))
         return TileLists(none, none, none, none, of_splats, of_splats, 0, *tiles, shape)
@@ -136,8 +144,8 @@ def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int, 
     return lists
 
 
-def _check_room(pairs: int, pixels: int) -> None:
-    needed = pairs * BYTES_A_PAIR + pixels * BYTES_A_PIXEL
+def _check_room(pairs: int, pixels: int, bytes_a_pair: int, bytes_a_pixel: int) -> None:
+    needed = pairs * bytes_a_pair + pixels * bytes_a_pixel
     if pairs > LARGEST_PAIRS:
         raise WorkError(f"rasterizer: {pairs:.3g} pairs of tile and splat, at most {LARGEST_PAIRS:.3g} can be sorted")
     free = free_memory() if needed > 2**28 else None

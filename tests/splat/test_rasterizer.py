@@ -16,6 +16,8 @@ from spacesim.splat.gaussians import NAMES, Gaussians
 from spacesim.splat.project import Pinhole, project
 from spacesim.splat.reference import real_spherical_harmonics, render_reference
 from spacesim.splat.render import render
+from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.trainer import Trainer
 
 SIZE = (40, 28)
 
@@ -280,6 +282,18 @@ def test_a_picture_larger_than_memory_is_a_sentence(monkeypatch):
     arrays["means"] += 1e4
     with pytest.raises(WorkError, match=r"0 pairs of tile and splat on 1.68e\+07"):
         render(Gaussians.from_numpy(arrays), Pinhole.of(view))
+
+
+def test_a_training_step_needs_more_than_a_picture(monkeypatch, small_dataset):
+    monkeypatch.setattr(tiles, "free_memory", lambda: 2 * 10**9)
+    view = camera(4096, 4096)
+    splats, footprints = project(Gaussians.from_numpy(random_splats(1)), Pinhole.of(view))
+    assert tiles.bin_splats(splats, footprints, 4096, 4096).pairs > 0
+    with pytest.raises(WorkError, match=r"need about 4.71 GB of memory, 2 GB are free"):
+        tiles.bin_splats(splats, footprints, 4096, 4096, training=True)
+    monkeypatch.setattr(tiles, "TRAINING_BYTES", (0, 10**7))
+    with pytest.raises(WorkError, match="2 GB are free"):
+        Trainer(small_dataset, TrainConfig()).step()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (16, 8), (17, 9)])

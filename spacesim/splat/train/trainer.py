@@ -163,7 +163,7 @@ class Trainer:
             values["colour"] = shading.colours
             if config.visibility_weight > 0:
                 values["visibility"] = [shading.visibility]
-        lists = bin_splats(splats, footprints, width, height)
+        lists = bin_splats(splats, footprints, width, height, training=True)
         blended = forward(splats, [v for group in values.values() for v in group], lists, width, height, adjoint=True)
         channels = {name: len(group) for name, group in values.items()}
         del values  # all arrays go as soon as they have been read: memory is shortest here
