@@ -540,6 +540,9 @@ def test_a_mesh_that_is_missing_or_elsewhere_is_told(small_dataset, tmp_path):
     trainer = Trainer(far, config_of("mesh-aware"))
     with pytest.raises(WorkError, match=r"mesh\.ply"):
         trainer.run(lambda progress: None, lambda: None)
+    trimesh.creation.box((1e3, 1e3, 1e3)).export(tmp_path / "millimetres.ply")
+    with pytest.raises(InputError, match="--strategy mesh-aware expects a mesh in the place and unit"):
+        Trainer(replace(small_dataset, mesh_path=str(tmp_path / "millimetres.ply")), config_of("mesh-aware"))
 
 
 def test_a_configuration_tells_of_its_own_strategy_alone():

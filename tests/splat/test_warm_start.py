@@ -423,7 +423,7 @@ def test_mesh_prior_of_a_ball_is_a_closed_form(ball_prior):
 def test_mesh_prior_agrees_with_the_path_tracers_labels(small_lit_dataset):
     frame = small_lit_dataset.train[0]
     truth = load_truth(small_lit_dataset, frame)
-    depth, normal = MeshPrior.of(small_lit_dataset.root, small_lit_dataset.mesh_path)(frame.camera)
+    depth, normal = MeshPrior.of(small_lit_dataset)(frame.camera)
     both = (depth > 0) & (truth.depth > 0)
     assert ((depth > 0) == (truth.depth > 0)).mean() > 0.98
     assert np.median(np.abs(depth - truth.depth)[both]) < 1e-3
@@ -480,6 +480,14 @@ def test_what_is_missing_for_them_is_told(small_dataset):
         replace(BASE, prior="rumours")
     with pytest.raises(InputError, match="--flatten"):
         replace(BASE, flatten_weight=-1.0)
+
+
+@pytest.mark.parametrize(("scale", "shift", "said"), [(1, 1e3, "none sees"), (1e3, 0, "inside of it")])
+def test_a_prior_that_is_out_of_place_is_told(small_dataset, tmp_path, scale, shift, said):
+    trimesh.creation.box((scale,) * 3).apply_translation((shift, 0, 0)).export(tmp_path / "mesh.ply")
+    elsewhere = replace(small_dataset, mesh_path=str(tmp_path / "mesh.ply"))
+    with pytest.raises(InputError, match=f"--prior mesh expects a mesh .*{said}"):
+        Trainer(elsewhere, replace(BASE, depth_weight=1.0, prior="mesh"))
 
 
 def test_methods_of_light_take_them_all(small_lit_dataset):

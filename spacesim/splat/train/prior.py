@@ -8,8 +8,8 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.mesh import read_mesh
-from spacesim.data.records import Camera
+from spacesim.data.mesh import SignedDistance, read_mesh
+from spacesim.data.records import Camera, Dataset
 
 
 class MeshPrior:
@@ -27,11 +27,14 @@ class MeshPrior:
         self._scene: Any = mi.load_dict({"type": "scene", "mesh": mesh})
 
     @staticmethod
-    def of(root: Path, mesh_path: str | None) -> "MeshPrior":
-        """Of a dataset's mesh. Raises InputError where it has none."""
-        if mesh_path is None:
-            raise InputError(f"{root}: --prior mesh expects a mesh.ply, found none")
-        return MeshPrior(root / mesh_path)
+    def of(dataset: Dataset) -> "MeshPrior":
+        """Of a dataset's mesh. Raises InputError where it has none, or one that is not where its pictures show it."""
+        path = dataset.root / known_mesh(dataset, "--prior mesh")
+        check_outside(SignedDistance.of(path), dataset, "--prior mesh")
+        prior = MeshPrior(path)
+        if dataset.train and not any(prior(frame.camera)[0].any() for frame in dataset.train):
+            raise InputError(f"{path}: --prior mesh expects a mesh that training cameras see, found one that none sees")
+        return prior
 
     def __call__(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """(depth [H, W] along the optical axis, metres; normal [H, W, 3], unit, world axes, towards the camera); 0
@@ -50,3 +53,20 @@ class MeshPrior:
         normals = np.array(dr.select(hit, normal, 0), np.float32).T
         shape = camera.height, camera.width
         return depth.reshape(shape), np.ascontiguousarray(normals).reshape(*shape, 3)
+
+
+def known_mesh(dataset: Dataset, option: str) -> str:
+    """The path of a dataset's mesh below its root. Raises InputError, in the name of the option, where it has none."""
+    if dataset.mesh_path is None:
+        raise InputError(f"{dataset.root}: {option} expects a mesh.ply, found none")
+    return dataset.mesh_path
+
+
+def check_outside(surface: SignedDistance, dataset: Dataset, option: str) -> None:
+    """Raises InputError, in the name of the option, where all training cameras are inside the dataset's mesh."""
+    positions = np.array([frame.camera.position for frame in dataset.train])
+    if len(positions) and surface.inside(positions).all():
+        raise InputError(
+            f"{dataset.root}: {option} expects a mesh in the place and unit of the poses, found all training cameras "
+            "inside of it"
+        )

@@ -360,7 +360,7 @@ def _added(one: list[Any], other: list[Any]) -> list[Any]:
 def _views(dataset: Dataset, config: TrainConfig) -> TrainingViews:
     """The training pictures with the truth that the loss asks for."""
     truth = config.shape_terms + (("visibility",) if config.visibility_weight > 0 else ())
-    prior = MeshPrior.of(dataset.root, dataset.mesh_path) if config.shape_terms and config.prior == "mesh" else None
+    prior = MeshPrior.of(dataset) if config.shape_terms and config.prior == "mesh" else None
     return TrainingViews(dataset, config.seed, config.light is not None, truth, prior)
 
 

@@ -2,9 +2,9 @@
 
 from typing import TYPE_CHECKING
 
-from spacesim.data.errors import InputError
 from spacesim.data.mesh import SignedDistance
 from spacesim.data.records import Dataset
+from spacesim.splat.train.prior import check_outside, known_mesh
 from spacesim.splat.train.strategies.default import DefaultStrategy
 from spacesim.splat.train.strategies.mcmc import McmcStrategy
 from spacesim.splat.train.strategies.mesh_aware import MeshAwareStrategy
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 def strategy_of(config: "TrainConfig", dataset: Dataset, scene_scale: float, count: int) -> Strategy:
-    """For `count` Gaussians at the start. Raises InputError where the dataset lacks the mesh that it needs."""
+    """For `count` Gaussians at the start. Raises InputError where the dataset lacks the mesh that it needs, or
+    has one that is out of place."""
     if config.strategy == "mesh-aware":
-        if dataset.mesh_path is None:
-            raise InputError(f"{dataset.root}: --strategy mesh-aware expects a mesh.ply, found none")
-        distance = SignedDistance.of(dataset.root / dataset.mesh_path)
+        distance = SignedDistance.of(dataset.root / known_mesh(dataset, "--strategy mesh-aware"))
+        check_outside(distance, dataset, "--strategy mesh-aware")
         return MeshAwareStrategy(config.refinement, config.mesh_aware, distance, scene_scale, count)
     if config.strategy == "support-aware":
         return SupportAwareStrategy(config.refinement, config.support_aware, scene_scale, count)
