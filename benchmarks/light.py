@@ -122,4 +122,4 @@ def measure_step(count: int, pixels: int, method: str, options: Any) -> common.R
 
 
 if __name__ == "__main__":
-    main()
+    common.told(main)
