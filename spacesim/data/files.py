@@ -31,7 +31,9 @@ def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
         os.replace(temporary, path)
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise WorkError(f"{path}: the disk is full; free space and run again, with --resume if the command has it") from error
+            raise WorkError(
+                f"{path}: the disk is full; free space and run again, with --resume if the command has it"
+            ) from error
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
         if temporary is not None:
