@@ -12,6 +12,7 @@ from splats import random_splats
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image
+from spacesim.data.lock import locked
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.ply import read_ply, write_ply
 from spacesim.splat.project import Pinhole
@@ -94,6 +95,7 @@ def test_checkpoints_that_do_not_fit_are_refused(small_dataset, tmp_path):
         ({name: value for name, value in tensors.items() if name != "adam.second.10"}, header),
         ({**tensors, "strategy.seen": tensors["strategy.seen"][1:]}, header),
         ({name: value for name, value in tensors.items() if name != "means"}, header),
+        ({**tensors, "sh": tensors["sh"][:, :1]}, header),
         (tensors, {**header, "iteration": 10**6}),
         (tensors, {**header, "iteration": "many"}),
         (tensors, {**header, "history": None}),
@@ -132,6 +134,18 @@ train(read_dataset(Path({str(small_dataset.root)!r})), Path({str(tmp_path / "run
     resumed = train(small_dataset, tmp_path / "run", CONFIG, resume=True)
     name = "model.safetensors"
     assert (resumed.path / name).read_bytes() == (finished.path / name).read_bytes()
+
+
+def test_one_training_at_a_time_in_a_folder(small_dataset, tmp_path):
+    """Two would mix the configuration of one with the checkpoints of the other."""
+    run, config = tmp_path / "run", replace(CONFIG, iterations=2)
+    with locked(run), pytest.raises(InputError, match="run: expected no other run at work in the folder"):
+        train(small_dataset, run, config)
+    assert not list(run.iterdir())
+    leftover = run / ".config.json.0123.part"  # of a process that was killed while it wrote
+    leftover.write_bytes(b"half a file")
+    assert train(small_dataset, run, config).gaussians > 0
+    assert not leftover.exists()
 
 
 def test_a_finished_run_is_left_alone_by_resume(small_dataset, finished):

@@ -17,7 +17,8 @@ import numpy as np
 import spacesim
 from spacesim import backend, ending
 from spacesim.data.errors import InputError
-from spacesim.data.files import holds_files, read_json, write_json
+from spacesim.data.files import holds_files, read_json, remove_leftovers, write_json
+from spacesim.data.lock import locked
 from spacesim.data.records import Camera, Dataset
 from spacesim.data.tone import development
 from spacesim.splat.run import Run, load_run
@@ -42,22 +43,26 @@ def train(
     same result to the bit; a finished run is returned as it is. command: what the user typed, for the report.
 
     Ctrl-C on the command line leaves a checkpoint of the step that it came in. Raises InputError where `out` holds a
-    run and `resume` is not asked for, or one of another configuration.
+    run and `resume` is not asked for, or one of another configuration, or where another training is at work in it.
     """
     out, config = Path(out), _with_development(config, dataset)
     described = {**config.to_json(), "data": _identity(dataset)}
-    if (out / "config.json").exists():
-        if _checkpoints(out) or (out / "model.safetensors").exists():  # else nothing is there that could be lost
-            _check_resumable(out, described, resume)
-        if (out / "model.safetensors").exists():
-            return load_run(out)
-    elif holds_files(out) or (out.exists() and not out.is_dir()):
-        raise InputError(f"{out}: expected an empty or new folder for the run, found other files in it")
-
+    _check_folder(out, described, resume)
+    if (out / "model.safetensors").exists():
+        return load_run(out)
     if config.warm_start is not None and (remark := config.warm_start.remark(config.iterations)):
         log.warning(remark)
     trainer = Trainer(dataset, config)
-    write_json(out / "config.json", described)
+    with locked(out):
+        _check_folder(out, described, resume)  # again: another training may have come and gone
+        remove_leftovers(out)
+        write_json(out / "config.json", described)
+        _train(trainer, out, on_progress, command)
+    return load_run(out)
+
+
+def _train(trainer: Trainer, out: Path, on_progress: Callable[[Progress], None], command: Sequence[str]) -> None:
+    """From the newest checkpoint in `out` to the end, and write the run."""
     newest = max(_checkpoints(out), default=None)
     if newest is not None:
         trainer.restore(newest)
@@ -85,9 +90,17 @@ def train(
             "versions": versions(),
         },
     )
-    header = {"iteration": trainer.iteration, "config": config.to_json()}
+    header = {"iteration": trainer.iteration, "config": trainer.config.to_json()}
     write_tensors(out / "model.safetensors", trainer.model_tensors(), header)
-    return load_run(out)
+
+
+def _check_folder(out: Path, described: dict[str, Any], resume: bool) -> None:
+    """Raises InputError where a run that is so described cannot be written to `out`, or completed in it."""
+    if (out / "config.json").exists():
+        if _checkpoints(out) or (out / "model.safetensors").exists():  # else nothing is there that could be lost
+            _check_resumable(out, described, resume)
+    elif holds_files(out) or (out.exists() and not out.is_dir()):
+        raise InputError(f"{out}: expected an empty or new folder for the run, found other files in it")
 
 
 def _with_development(config: TrainConfig, dataset: Dataset) -> TrainConfig:

@@ -272,6 +272,9 @@ class Trainer:
                 warm, state_sizes = {}, {dr.width(row) for row in state.values()}
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {error}") from None
+        looks, expected = ((g.sh_degree, g.feature_count) for g in (gaussians, self.gaussians))
+        if looks != expected:
+            raise InputError(f"{path}: expected Gaussians with the colours of this method, found others")
         if not state_sizes <= {gaussians.count}:
             raise InputError(f"{path}: expected statistics of {gaussians.count} Gaussians, found others")
         if not 0 <= iteration <= self.config.iterations:
