@@ -206,7 +206,7 @@ def _schedule(name: str) -> TrainConfig:
 
 def _light(name: str, method: str) -> LightConfig:
     """Networks and shadows of a preset: `thesis` as in tables 4.1 to 4.3; `fast` and `demo` smaller, and with what we
-    found better (docs/relighting.md)."""
+    found better (docs/relighting.md, docs/ablations.md)."""
     features, width, image = {"thesis": (128, 256, 1024), "fast": (32, 64, 512)}.get(name, (16, 64, 256))
     if method == "park":
         encoding = Encoding("positional", 4)
