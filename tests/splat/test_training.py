@@ -18,9 +18,10 @@ from spacesim.splat.ply import read_ply, write_ply
 from spacesim.splat.project import Pinhole
 from spacesim.splat.render import render
 from spacesim.splat.run import load_run
+from spacesim.splat.train import views
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig, preset, with_options
-from spacesim.splat.train.initialise import focus_point, initial_gaussians, scene_scale
+from spacesim.splat.train.initialise import focus_point, initial_gaussians, scene_scale, small_remark
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
@@ -206,6 +207,18 @@ def test_scene_scale_and_focus(small_dataset):
     assert scene_scale(small_dataset) == pytest.approx(np.abs(centers - centers.mean(0)).max())
 
 
+def test_poses_in_kilometres_are_told(small_dataset):
+    def scaled(factor):
+        cameras = [replace(f.camera, world_from_camera=f.camera.world_from_camera.copy()) for f in small_dataset.train]
+        for camera in cameras:
+            camera.world_from_camera[:3, 3] *= factor
+        pairs = zip(small_dataset.train, cameras, strict=True)
+        return replace(small_dataset, train=tuple(replace(frame, camera=camera) for frame, camera in pairs))
+
+    assert small_remark(small_dataset) == small_remark(scaled(1e-2)) == small_remark(scaled(1e4)) == ""
+    assert "expected poses in metres, found training cameras 0.003 m from" in small_remark(scaled(1e-3))
+
+
 def test_ply_round_trip(finished, tmp_path):
     write_ply(finished.model, tmp_path / "model.ply")
     ours, back = finished.model.to_numpy(), read_ply(tmp_path / "model.ply").to_numpy()
@@ -300,6 +313,20 @@ def test_several_views_a_step_follow_their_mean_gradient(small_dataset):
     first, second, both = moments(1, 0), moments(1, 1), moments(2, 0)
     assert np.abs(first - second).max() > 0.1 * np.abs(first).max()
     np.testing.assert_allclose(both, (first + second) / 2, rtol=1e-4, atol=1e-6 * np.abs(first).max())
+
+
+def test_where_memory_is_short_pictures_are_read_again(small_dataset, monkeypatch):
+    kept = Trainer(small_dataset, CONFIG)
+    monkeypatch.setattr(views, "main_memory", lambda: 4 * 10**9)
+    monkeypatch.setattr(views, "free_memory", lambda: 4 * 10**9)
+    assert views.kept_bytes() == (10**9, 5 * 10**8)
+    monkeypatch.setattr(views, "main_memory", lambda: 0)
+    monkeypatch.setattr(views, "free_memory", lambda: 0)
+    read_again = Trainer(small_dataset, CONFIG)
+    for _ in range(3):
+        assert float(read_again.step()[0]) == float(kept.step()[0])
+    assert read_again.views._cached.cache_info().currsize == read_again.views._uploaded.cache_info().currsize == 1
+    assert kept.views._cached.cache_info().currsize == 3
 
 
 def test_training_on_several_views_a_step_learns_and_resumes(small_dataset, tmp_path):

@@ -9,6 +9,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.mesh import read_mesh
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_points
+from spacesim.splat.cameras import NEAR
 from spacesim.splat.gaussians import SH_C0, Gaussians
 
 OPACITY = 0.1  #: of every Gaussian at the start (Kerbl et al. 2023)
@@ -89,6 +90,18 @@ def scene_scale(dataset: Dataset) -> float:
     """Metres: largest coordinate of the training cameras about their mean, Nerfstudio's unit of length."""
     centers = np.array([frame.camera.position for frame in dataset.train])
     return float(max(np.abs(centers - centers.mean(axis=0)).max(), 1e-6)) if len(centers) > 1 else 1.0
+
+
+def small_remark(dataset: Dataset) -> str:
+    """A sentence where the cameras stand so near to each other and to what they look at that little of it can be drawn,
+    as with poses in kilometres; "" where they do not."""
+    distance = nearest_camera(dataset, focus_point(dataset))
+    if max(distance, scene_scale(dataset)) >= 2 * NEAR:
+        return ""
+    return (
+        f"{dataset.root}: expected poses in metres, found training cameras {distance:.2g} m from what they look at: "
+        f"what is nearer to a camera than {NEAR} m is not drawn"
+    )
 
 
 def _from_points(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
