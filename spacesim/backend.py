@@ -171,15 +171,16 @@ def mitsuba() -> ModuleType:
 
 
 def free_memory() -> int | None:
-    """Bytes that arrays may still take on the chosen backend; None where the system does not say (CUDA, not Linux).
+    """Bytes that arrays may still take on the chosen backend; None where the system does not say (CUDA, not Linux)."""
+    return None if select() != "llvm" else main_memory()
 
-    What the machine has free, or less where a container or a batch system allows the process less.
+
+def main_memory(root: Path = Path("/")) -> int | None:
+    """Bytes of main memory that the process may still take; None where the system does not say (not Linux).
+
+    What the machine has free, or less where a container or a batch system allows the process less. root: where the
+    machine's files are
     """
-    return None if select() != "llvm" else _free_memory(Path("/"))
-
-
-def _free_memory(root: Path) -> int | None:
-    """`free_memory` of a machine whose files are below `root`."""
     free = _known_numbers(root / "proc/meminfo").get("MemAvailable:")
     return None if free is None else min([1024 * free, *_left_by_groups(root)])
 
@@ -227,8 +228,10 @@ def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
     At most `limit` recordings are kept. Arguments may be arrays, numbers and texts, and tuples, lists, dicts and
     dataclasses of them. Dr.Jit 1.5 takes long to walk through these, knows an argument that occurs twice in a call by
     identity, and takes f(1, 2, 1) for f(1, 2, 2): it gets a flat list of the arrays and one text of all the rest. No
-    array may stand in two places. Python's garbage collector waits during a call: arrays that it frees in the middle
-    of a recording end the process.
+    array may stand in two places. What Dr.Jit's LLVM backend makes of a numpy array is numpy's own memory, whose
+    kernels and recordings differ by whether it happens to begin at a multiple of 64 bytes: make arguments of lists, or
+    copy them (`gaussians.uploaded`). Python's garbage collector waits during a call: arrays that it frees in the
+    middle of a recording end the process.
     """
     import drjit as dr
 

@@ -290,8 +290,8 @@ def test_recorded_functions_get_what_they_are_called_with():
         ),
     ],
 )
-def test_free_memory_is_what_the_control_groups_leave(tmp_path, files, left):
+def test_main_memory_is_what_the_control_groups_leave(tmp_path, files, left):
     for name, content in {"proc/meminfo": "MemTotal: 16000000 kB\nMemAvailable: 7812500 kB\n", **files}.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(content)
-    assert backend._free_memory(tmp_path) == left
+    assert backend.main_memory(tmp_path) == left

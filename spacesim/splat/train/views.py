@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from spacesim.backend import ad
+from spacesim.backend import ad, free_memory, main_memory
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
 
-CACHE_BYTES = 6 * 2**30
-DEVICE_BYTES = 2 * 2**30  #: of pictures that stay on the device, chosen: 512 of 1024 x 1024
+CACHE_BYTES = 6 * 2**30  #: of decoded pictures, at most, chosen
+DEVICE_BYTES = 2 * 2**30  #: of pictures that stay on the device, at most, chosen: 512 of 1024 x 1024
+SHARES = 4, 8  #: a fourth and an eighth of the memory that is free are not exceeded, chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,8 @@ class View:
 
 
 class TrainingViews:
-    """Views of a dataset's training frames by index, decoded at first use and kept while `CACHE_BYTES` last.
+    """Views of a dataset's training frames by index, decoded at first use and kept while there is room, see
+    `kept_bytes`.
 
     suns: every frame must name its Sun;  truth: path-traced planes that it must have, by name
     surface: gives depth and normals of a camera, in place of the path-traced ones; see `prior.MeshPrior`
@@ -57,8 +59,9 @@ class TrainingViews:
         self.most_pixels = max(f.camera.width * f.camera.height for f in dataset.train)
         largest = 4 * self.most_pixels * (1 + sum(3 if name == "normal" else 1 for name in truth))
         self._order = lru_cache(maxsize=1)(self._shuffle)
-        self._cached = lru_cache(maxsize=max(1, CACHE_BYTES // largest))(self._load)
-        self._uploaded = lru_cache(maxsize=max(1, DEVICE_BYTES // largest))(self._upload)
+        cached, uploaded = kept_bytes()
+        self._cached = lru_cache(maxsize=max(1, cached // largest))(self._load)
+        self._uploaded = lru_cache(maxsize=max(1, uploaded // largest))(self._upload)
 
     def __len__(self) -> int:
         return len(self.dataset.train)
@@ -112,6 +115,16 @@ class TrainingViews:
         planes |= {"depth": depth[..., None], "normal": normal}
         wanted = {name: np.moveaxis(planes[name], -1, 0).astype(np.float32) for name in self.truth}
         return {name: [np.ascontiguousarray(plane).ravel() for plane in group] for name, group in wanted.items()}
+
+
+def kept_bytes() -> tuple[int, int]:
+    """How many bytes of pictures are kept in main memory, and on the device."""
+    free = main_memory(), free_memory()
+    most, device = (
+        largest if one is None else min(largest, one // share)
+        for largest, one, share in zip((CACHE_BYTES, DEVICE_BYTES), free, SHARES, strict=True)
+    )
+    return most, device
 
 
 def _check_known(dataset: Dataset, suns: bool, traced: Sequence[str]) -> None:
