@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A frame's pictures. prediction, truth: [H, W, 3] sRGB values in [0, 1] over black
+    """A frame's pictures. prediction, truth: [H, W, 3] sRGB values in [0, 1] over black, black where not valid
     valid: [H, W] bool, pixels that are not to be ignored;  silhouette: [H, W] bool, the object's among them
     """
 
@@ -59,7 +59,7 @@ def view_of(dataset: Dataset, frame: Frame, prediction: "Prediction") -> tuple[V
     else:
         silhouette = loaded.alpha >= 0.5
         source = "frame" if np.all(loaded.alpha == 1) else "alpha"
-    shown = np.clip(prediction.rgb, 0, 1), loaded.over(np.zeros(3))
+    shown = np.where(loaded.valid[..., None], np.clip(prediction.rgb, 0, 1), np.float32(0)), loaded.over(np.zeros(3))
     return View(*shown, silhouette & loaded.valid, loaded.valid), source
 
 
