@@ -10,10 +10,11 @@ from spacesim.splat.cameras import Projection
 from spacesim.splat.encoding import Encoding
 from spacesim.splat.lanes import Lanes
 from spacesim.splat.mlp import MlpShape
+from spacesim.splat.surface import shortest_axis
 
 LOBES = (8, 32, 128, 512)  #: exponents of n . h, from satin to mirror, chosen: each is the one before to the fourth
 COSINES = 4 + len(LOBES)  #: numbers that `surface_cosines` gives
-TURNED = 0.4  #: a learned normal with n . s of at most -TURNED is turned away from the Sun; chosen (docs/relighting.md)
+TURNED = 0.2  #: a surface with n . s of at most -TURNED is turned away from the Sun; chosen (docs/shadows.md)
 
 
 @dataclass(frozen=True)
@@ -47,10 +48,12 @@ class FieldConfig:
 @dataclass
 class FieldInputs:
     """What the field reads of the world. features: Float, packed [F * N], `FieldConfig.stored` of them the field's;
-    means: Array3f [3, N], metres;  sun: Array3f of width 1, unit, towards the Sun"""
+    means: Array3f [3, N], metres;  turns: (quaternions, log scales) of the Gaussians;  sun: Array3f of width 1, unit,
+    towards the Sun"""
 
     features: Any
     means: Any
+    turns: tuple[Any, Any]
     camera: Projection
     sun: Any
 
@@ -69,10 +72,11 @@ def field_views(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> list[
     return rows
 
 
-def facing(config: FieldConfig, views: list[Any]) -> list[Any]:
-    """Float [M] in [0, 1] in a list: does the side that is seen face the Sun? 1 where its learned normal does, 1/2 at
-    n . s = -TURNED / 2, as normals are not exact. Nothing of a field without them. views: of `field_views`"""
-    return [_faces(views[config.view.size])] if config.surface else []
+def facing(config: FieldConfig, inputs: FieldInputs, views: list[Any], lanes: Lanes) -> list[Any]:
+    """Float [M] in [0, 1] in a list: does the side that is seen face the Sun? 1 where its learned normal or the
+    Gaussian's shortest axis does, 1/2 at n . s = -TURNED / 2, as neither is exact. Nothing of a field without normals.
+    views: of `field_views`"""
+    return [_faces(views[config.view.size], inputs, lanes)] if config.surface else []
 
 
 def by_normals(config: FieldConfig, inputs: FieldInputs, by_items: Any, by_facing: list[Any], lanes: Lanes) -> Any:
@@ -84,7 +88,7 @@ def by_normals(config: FieldConfig, inputs: FieldInputs, by_items: Any, by_facin
     first = config.features + config.view.size
     along = sum((cosine * lanes.row(by_items, first + i) for i, cosine in enumerate(cosines)), ad.Float(0))
     for gradient in by_facing:
-        along += gradient * _faces(cosines[0])
+        along += gradient * _faces(cosines[0], inputs, lanes)
     dr.backward(along)
     return lanes.matrix(list(dr.grad(normals)))
 
@@ -111,8 +115,11 @@ def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
     return [lambert, dr.maximum(lambert, 0), -dr.dot(seen, direction), halfway, *lobes]
 
 
-def _faces(lambert: Any) -> Any:
-    return dr.clip(1 + lambert / TURNED, 0, 1)
+def _faces(lambert: Any, inputs: FieldInputs, lanes: Lanes) -> Any:
+    """Of n . s of the learned normals."""
+    axis = shortest_axis(*(lanes.spread(dr.detach(turn)) for turn in inputs.turns))
+    towards, away = dr.dot(axis, inputs.sun), dr.dot(axis, inputs.camera.directions_to(lanes.spread(inputs.means)))
+    return dr.clip(1 + dr.maximum(lambert, dr.select(away > 0, -towards, towards)) / TURNED, 0, 1)
 
 
 def _normals(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:

@@ -20,7 +20,7 @@ from spacesim.data.tone import TONES
 from spacesim.splat import cooperative, mlp
 from spacesim.splat.appearance import FieldConfig, FieldInputs, by_normals, facing, field_items, field_views
 from spacesim.splat.cameras import Projection
-from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.gaussians import Gaussians, uploaded
 from spacesim.splat.lanes import Lanes, aligned
 from spacesim.splat.shadow.cast import ShadowConfig, Shadows, cast_shadows, cast_shadows_adaptively
 from spacesim.splat.shadow.refine import RefineConfig, refine_inputs, refined, refined_slope
@@ -94,11 +94,13 @@ class SunTerms:
 
 @dataclass
 class _Inputs:
-    """What shading depends on beside weights. camera: None where visibility alone is wanted;  raw: occlusion, normal
-    alignment, light extent and bias, [N] each, or nothing;  place: Float [4], centre and scale of the training frame"""
+    """What shading depends on beside weights. turns: quaternions and log scales;  camera: None where visibility alone
+    is wanted;  raw: occlusion, normal alignment, light extent and bias, [N] each, or nothing;  place: Float [4], centre
+    and scale of the training frame"""
 
     features: Any
     means: Any
+    turns: tuple[Any, Any]
     camera: Projection | None
     raw: list[Any]
     sun: SunTerms
@@ -252,14 +254,15 @@ class LightModel:
             weight = tensors[f"light.weight.{i:02d}"]
             if np.shape(weight) != (dr.width(like),):
                 raise ValueError(f"light.weight.{i:02d}: expected {dr.width(like)} numbers, found {np.shape(weight)}")
-            model.weights[i] = ad.Float(weight.astype(np.float32))
+            model.weights[i] = uploaded(weight)
         return model
 
     def _inputs(
         self, gaussians: Gaussians, camera: Projection | None, sun: np.ndarray, shadows: Shadows | None
     ) -> _Inputs:
         raw = [shadows.occlusion, *shadows.info] if shadows else []
-        return _Inputs(gaussians.features, gaussians.means, camera, raw, self.sun_terms(sun), self._place)
+        turns = gaussians.quaternions, gaussians.log_scales
+        return _Inputs(gaussians.features, gaussians.means, turns, camera, raw, self.sun_terms(sun), self._place)
 
     def _kept_of(self, features: Any, lanes: Lanes) -> _Kept:
         """Made anew where features or weights have changed. Copies hold what was read: a number of Dr.Jit's that is in
@@ -287,12 +290,13 @@ def _trace_shade(
 ) -> tuple[list[Any], list[Any], _Tape]:
     """(dimmed colours, [visibility] or [], tape)."""
     of_field, of_refine = _split(config, weights)
-    views = field_views(config.field, _field_inputs(inputs), lanes)
+    field_inputs = _field_inputs(inputs)
+    views = field_views(config.field, field_inputs, lanes)
     items = field_items(config.field, inputs.features, views, lanes)
     output, field_tape = mlp.forward(config.field.shape, of_field, items, inputs.sun.field)
     colours = [_sigmoid(lanes.row(output, i)) for i in range(3)]
     occlusion, refine_tape = _occluded(config, of_refine, inputs, lanes)
-    faces = facing(config.field, views) if occlusion else []
+    faces = facing(config.field, field_inputs, views, lanes) if occlusion else []
     shown = _dimmed(colours, [1 - value for value in occlusion], faces)
     dr.eval(shown, colours, occlusion, faces)
     shown = lanes.narrowed(shown, inputs.means.x)
@@ -310,8 +314,8 @@ def _trace_lit(
 ) -> list[Any]:
     """Dimmed colours, and visibility as it is shown. known, packed: see `_Kept`;  visibility: [N] in a list, or
     nothing"""
-    field = config.field
-    views = field_views(field, _field_inputs(inputs), lanes)
+    field, field_inputs = config.field, _field_inputs(inputs)
+    views = field_views(field, field_inputs, lanes)
     if known:
         items = lanes.matrix(views, aligned(len(views)))
         output, _ = mlp.forward(field.shape, of_field, items, inputs.sun.field, known)
@@ -320,7 +324,7 @@ def _trace_lit(
         rows = lanes.block(inputs.features, 0, field.features) + views
         outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field)
     colours = [_sigmoid(value) for value in outputs]
-    shown = _dimmed(colours, [lanes.padded(value) for value in visibility], facing(field, views))
+    shown = _dimmed(colours, [lanes.padded(value) for value in visibility], facing(field, field_inputs, views, lanes))
     dr.eval(shown)
     return lanes.narrowed(shown, inputs.means.x)
 
@@ -411,7 +415,7 @@ def _refine_items(config: LightConfig, refine: RefineConfig, inputs: _Inputs, la
 
 def _field_inputs(inputs: _Inputs) -> FieldInputs:
     assert inputs.camera is not None
-    return FieldInputs(inputs.features, inputs.means, inputs.camera, towards_sun(inputs.sun.light))
+    return FieldInputs(inputs.features, inputs.means, inputs.turns, inputs.camera, towards_sun(inputs.sun.light))
 
 
 def _split(config: LightConfig, weights: list[Any]) -> tuple[list[Any], list[Any]]:

@@ -35,12 +35,17 @@ def normals(gaussians: Gaussians, camera: Projection, axes: str = "world") -> An
     """
     if axes not in ("world", "camera"):
         raise ValueError(f'axes: expected "world" or "camera", found {axes!r}')
-    columns, scales = principal_axes(gaussians.quaternions), dr.detach(gaussians.log_scales)
-    first = (scales[0] <= scales[1]) & (scales[0] <= scales[2])
-    normal = dr.select(first, columns[0], dr.select(scales[1] <= scales[2], columns[1], columns[2]))
+    normal = shortest_axis(gaussians.quaternions, gaussians.log_scales)
     away = dr.detach(dr.dot(normal, camera.rays_to(gaussians.means))) > 0
     normal = dr.select(away, -normal, normal)
     return normal if axes == "world" else ad.Array3f([dr.dot(camera.row(i), normal) for i in range(3)])
+
+
+def shortest_axis(quaternions: Any, log_scales: Any) -> Any:
+    """Array3f [3, N], unit, of either sign; differentiable by the quaternions. Among equal scales the first counts."""
+    columns, scales = principal_axes(quaternions), dr.detach(log_scales)
+    first = (scales[0] <= scales[1]) & (scales[0] <= scales[2])
+    return dr.select(first, columns[0], dr.select(scales[1] <= scales[2], columns[1], columns[2]))
 
 
 def unit(vector: Any) -> Any:

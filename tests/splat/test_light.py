@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import drjit as dr
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 from splats import random_splats
 
@@ -133,6 +134,11 @@ def cosines(normal: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return np.stack([lambert, np.maximum(lambert, 0), -(normal * direction).sum(axis=1), halfway, *lobes], axis=1)
 
 
+def shortest_axes(arrays: dict) -> np.ndarray:
+    turns = Rotation.from_quat(arrays["quaternions"], scalar_first=True).as_matrix()
+    return turns[np.arange(len(turns)), :, arrays["log_scales"].argmin(axis=1)]
+
+
 def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray]) -> tuple:
     """(colours [N, 3], visibility [N] as it is shown) of 4.2, 4.11 to 4.14 and 4.17; raw: occlusion and bias info as
     given."""
@@ -144,7 +150,10 @@ def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[n
     if field.surface:
         normal = features[:, field.features : field.stored]
         items = np.concatenate([items, cosines(normal, direction)], axis=1)
-    faces = np.interp(cosines(normal, direction)[:, 0], [-0.4, 0], [0, 1]) if field.surface else 1
+    faces = 1
+    if field.surface:
+        learned, of_shape = (cosines(n, direction)[:, 0] for n in (normal, shortest_axes(arrays)))
+        faces = np.interp(np.maximum(learned, of_shape), [-0.2, 0], [0, 1])
     colour = sigmoid(network(field.shape, weights[:split], items, encoded(field.sun, SUN[None])[0]))
     if not raw:
         return colour, np.ones(len(colour))
