@@ -121,8 +121,8 @@ class Projection(ABC):
             raise InputError(
                 f"crop: expected a part of the {self.width}x{self.height} pixels, found {width}x{height} at ({x}, {y})"
             )
-        shift = np.zeros(dr.width(self.values), dtype=np.float32)
-        shift[16:18] = x, y
+        shift = [0.0] * dr.width(self.values)
+        shift[16:18] = float(x), float(y)
         return replace(self, values=self.values + ad.Float(shift), width=width, height=height)
 
     def moved(self: Self, twist: Any) -> Self:
@@ -219,5 +219,5 @@ class Orthographic(Projection):
 
 
 def _upload(camera_from_world: Array, intrinsics: tuple[float, ...], more: tuple[float, ...]) -> Any:
-    numbers = [*camera_from_world[:3].ravel(), *intrinsics, 0, 0, *more]
-    return ad.Float(np.asarray(numbers, dtype=np.float32))
+    numbers = [*camera_from_world[:3].ravel().tolist(), *map(float, intrinsics), 0.0, 0.0, *map(float, more)]
+    return ad.Float(numbers)  # no numpy array: see `backend.recorded`

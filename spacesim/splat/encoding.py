@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
@@ -47,6 +46,6 @@ class Encoding:
 
     def of_one(self, vector: Any) -> Any:
         """Float [size] of one vector, three numbers. They are no constants of a kernel: others compile nothing."""
-        numbers = ad.Float(np.asarray(vector, dtype=np.float32))
+        numbers = ad.Float([float(number) for number in vector])  # no numpy array: see `backend.recorded`
         point = ad.Array3f([dr.gather(ad.Float, numbers, ad.UInt32(i)) for i in range(3)])
         return dr.concat([ad.Float(term) for term in self(point)])

@@ -119,9 +119,9 @@ class Gaussians:
             means=ad.Array3f(rows["means"]),
             log_scales=ad.Array3f(rows["log_scales"]),
             quaternions=ad.Array4f(rows["quaternions"]),
-            logit_opacities=ad.Float(np.ascontiguousarray(rows["logit_opacities"])),
+            logit_opacities=uploaded(rows["logit_opacities"]),
             sh=ad.ArrayXf(np.ascontiguousarray(harmonics.T)) if sh.shape[1] else ad.ArrayXf([]),
-            features=None if features is None else ad.Float(np.ascontiguousarray(features.T, np.float32).ravel()),
+            features=None if features is None else uploaded(np.asarray(features).T.ravel()),
         )
 
 
@@ -135,10 +135,15 @@ def triple(rows: np.ndarray) -> Any:
     return ad.Array3f(*(uploaded(row) for row in rows))
 
 
-def uploaded(values: np.ndarray) -> Any:
-    """Float [N] in memory of Dr.Jit's own: numpy's may lie otherwise, and each way to lie is recorded anew."""
-    found = dr.opaque(ad.Float, 0, len(values))
-    dr.scatter(found, ad.Float(np.ascontiguousarray(values, np.float32)), dr.arange(ad.UInt32, len(values)))
+def uploaded(values: np.ndarray, kind: Any = None) -> Any:
+    """Float [N], or UInt32 or Bool as `kind` says, in memory of Dr.Jit's own: numpy's may lie otherwise, and each way
+    to lie is recorded anew, and compiled on LLVM."""
+    kind = ad.Float if kind is None else kind
+    values = np.ascontiguousarray(values, {ad.Float: np.float32, ad.UInt32: np.uint32, ad.Bool: bool}[kind])
+    if not len(values):
+        return kind([])
+    found = dr.opaque(kind, 0, len(values))
+    dr.scatter(found, kind(values), dr.arange(ad.UInt32, len(values)))
     dr.eval(found)
     return found
 

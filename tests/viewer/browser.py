@@ -111,7 +111,7 @@ class Page:
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
     def frames(self, count: int = 2) -> None:
-        """Wait until the tab, in front of others, has drawn so often, however slow it is; 2 s where it draws nothing."""
+        """Wait until the tab, in front of others, has drawn so often, however slow; 2 s where it draws nothing."""
         self.send("Page.bringToFront")  # others draw nothing
         watch = "clearTimeout(end); end = setTimeout(done, 2000);"
         step = f"const step = () => {{ {watch} count-- ? requestAnimationFrame(step) : done(); }};"

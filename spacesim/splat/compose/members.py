@@ -132,14 +132,13 @@ class Ensemble:
     @cached_property
     def owner(self) -> Any:
         """UInt32 [N]: whose each Gaussian is."""
-        numbers = [np.full(member.count, k, np.uint32) for k, member in enumerate(self.members)]
-        return ad.UInt32(np.concatenate(numbers))
+        return ad.UInt32([k for k, member in enumerate(self.members) for _ in range(member.count)])
 
     @cached_property
     def indices(self) -> list[Any]:
         """UInt32 of each member: where its Gaussians stand in the set."""
         pairs = zip(self.starts, self.members, strict=True)
-        return [ad.UInt32(np.arange(start, start + member.count, dtype=np.uint32)) for start, member in pairs]
+        return [ad.UInt32(list(range(start, start + member.count))) for start, member in pairs]
 
     @cached_property
     def shares(self) -> list[Any]:
@@ -183,7 +182,7 @@ class Ensemble:
             none = [ad.Float([]) for _ in range(11)]
             return Gaussians.from_rows(none)
         numbers = [[*p.rotation.ravel(), *p.translation, p.scale, np.log(p.scale), *p.quaternion] for p in poses]
-        table = ad.Float(np.array(numbers, dtype=np.float32).ravel())
+        table = ad.Float([float(number) for row in numbers for number in row])
         run = _placed if self.count > 1 else _trace_placed  # a recording takes one number for a constant
         return Gaussians.from_rows([*run(self.rows[:10], self.owner, table), self.rows[10]])
 
