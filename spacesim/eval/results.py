@@ -92,7 +92,7 @@ def _cell(value: dict[str, Any] | None, metric: Metric) -> Cell:
         return None, _NONE, ""
     spread = f"± {value['std']:.{metric.digits}f}"
     if "pooled" in value:
-        spread += f", pooled {value['pooled']:.{metric.digits}f}"
+        spread += f"<br>pooled {value['pooled']:.{metric.digits}f}"
     return value["mean"], f"{value['mean']:.{metric.digits}f}", spread
 
 
