@@ -5,6 +5,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from spacesim.data.records import Camera, Sun
 
 if TYPE_CHECKING:
@@ -25,6 +27,11 @@ class ComposedRun:
     def names(self) -> list[str]:
         """Of the models, in their order, which is that of the dataset's objects."""
         return [model.name for model in self.composition.models]
+
+    @property
+    def places(self) -> list[np.ndarray]:
+        """Where the middle of each model is, [3] metres."""
+        return self.composition.places
 
     @property
     def gaussians(self) -> int:

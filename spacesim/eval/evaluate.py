@@ -27,7 +27,7 @@ from spacesim.eval.judge import judge_picture, judge_visibility, light_of, tally
 from spacesim.eval.labels import GROUPS
 from spacesim.eval.notes import MODELS_OF_A_SCENE, explain, explain_light, explain_objects
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
-from spacesim.eval.objects import judge_object_shapes, judge_objects, object_names
+from spacesim.eval.objects import judge_object_shapes, judge_objects, object_names, other_order
 from spacesim.eval.relight import write_sweep
 from spacesim.eval.shape import write_shapes
 from spacesim.eval.suns import count_suns, known_suns, rounded_angles, trained_on
@@ -124,7 +124,7 @@ def evaluate(
                 no_sweep,
                 untold,
             ),
-            *explain_objects(objects, records, models),
+            *explain_objects(objects, records, models, other_order(run, dataset)),
         ],
         "dataset": _describe(dataset, frames),
         "config": dict(run.config),

@@ -49,16 +49,24 @@ def explain_light(known: Sequence[bool | None], by_grazing_angle: bool, no_sweep
 
 
 def explain_objects(
-    names: Mapping[int, str], records: Sequence[dict[str, Any]], models: Sequence[str] | None
+    names: Mapping[int, str],
+    records: Sequence[dict[str, Any]],
+    models: Sequence[str] | None,
+    nearest: Sequence[int] = (),
 ) -> list[str]:
     """Sentences about objects that are judged on their own. names: of the data's objects, {} where it has one;
-    models: names of a composed scene's, None for a run"""
+    models: names of a composed scene's, None for a run;  nearest: objects that its models stand at, where these are
+    others than those that they are judged as"""
     if not names:
         return ["objects is null: the data does not say of more than one object."]
     notes = []
     if models is not None and len(models) != len(names):
         have = f"The scene has {len(models)} models, the data {len(names)} objects"
         notes.append(f"{have}: objects have the data's names.")
+    if models is not None and nearest:
+        found, wanted = ", ".join(map(str, nearest)), ", ".join(map(str, names))
+        stand = f"{', '.join(models)} stand where objects {found} of the data are"
+        notes.append(f"{stand} and are judged as objects {wanted}: put the models in the objects' order.")
     counts = {name: sum(name in record["objects"] for record in records) for name in names.values()}
     return notes + [
         f"{name} is in {count} of {len(records)} frames; its numbers are over these."

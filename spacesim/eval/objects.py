@@ -49,6 +49,22 @@ def judge_objects(
     return found
 
 
+def other_order(run: object, dataset: Dataset) -> list[int]:
+    """Numbers of the objects that a scene's models stand nearest to, in the models' order, where that is not the
+    objects' own: each model is judged as another one then. [] of a run, where all is in order, or cannot be told."""
+    try:
+        targets = targets_of(dataset) if isinstance(run, ComposedRun) else []
+    except InputError:
+        return []
+    if len(targets) < 2 or not isinstance(run, ComposedRun) or len(run.names) != len(targets):
+        return []
+    bounds = [(target.vertices.min(axis=0), target.vertices.max(axis=0)) for target in targets]
+    middles = [t.world_from_object[:3] @ [*(0.5 * (a + b)), 1] for t, (a, b) in zip(targets, bounds, strict=True)]
+    nearest = [int(np.linalg.norm(middles - place, axis=1).argmin()) for place in run.places]
+    own = list(range(len(targets)))
+    return [targets[k].id for k in nearest] if nearest != own and sorted(nearest) == own else []
+
+
 def judge_object_shapes(
     run: object, dataset: Dataset, names: Mapping[int, str], config: GeometryConfig | None
 ) -> dict[int, dict[str, Any] | None]:

@@ -12,7 +12,8 @@ from spacesim.eval import image, shadow
 from spacesim.eval.composition import ComposedRun
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.geometry import GeometryConfig
-from spacesim.eval.objects import GROUPS, object_names
+from spacesim.eval.notes import explain_objects
+from spacesim.eval.objects import GROUPS, object_names, other_order
 from spacesim.eval.report import write_report
 from spacesim.splat.compose.scenefile import load_scene
 from spacesim.splat.meshing import MeshConfig
@@ -161,5 +162,9 @@ def test_the_command_judges_a_scene(spacesim, tiny_run, tmp_path):
     metrics = evaluate(scene, read_dataset(tmp_path / "pair"), tmp_path / "shaped", EvaluateConfig(geometry=small))
     assert metrics["geometry"]["chamfer"] > 0
     assert [one["geometry"]["size"] for one in metrics["objects"]] == pytest.approx([6.19, 6.19], abs=0.01)
-    assert not any(note.startswith("Geometry") for note in metrics["notes"])
+    assert not any(note.startswith("Geometry") or "order" in note for note in metrics["notes"])
+    swapped = ComposedRun(scene.composition.posed([one.pose for one in scene.composition.models[::-1]]), scene.path)
+    assert other_order(swapped, read_dataset(tmp_path / "pair")) == [2, 1]
+    (note,) = explain_objects({1: "a", 2: "b"}, [], ["a", "b"], [2, 1])[:1]
+    assert note.startswith("a, b stand where objects 2, 1 of the data are and are judged as objects 1, 2")
     assert (tmp_path / "shaped" / "geometry" / "reconstruction.ply").exists()

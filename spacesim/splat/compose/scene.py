@@ -199,6 +199,11 @@ class Composition:
         return other
 
     @property
+    def places(self) -> list[Array]:
+        """Where the middle of each model is, world, [3] metres."""
+        return [placed.pose.points(m.centre) for placed, m in zip(self.models, self._members, strict=True)]
+
+    @property
     def placed(self) -> list[Placed]:
         """The models that have Gaussians, in the order in which these stand in the set."""
         return [self.models[i] for i in self._order()]
