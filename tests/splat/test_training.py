@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from splats import random_splats
 
+from spacesim.backend import recordings
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image
 from spacesim.data.lock import locked
@@ -327,6 +328,26 @@ def test_where_memory_is_short_pictures_are_read_again(small_dataset, monkeypatc
         assert float(read_again.step()[0]) == float(kept.step()[0])
     assert read_again.views._cached.cache_info().currsize == read_again.views._uploaded.cache_info().currsize == 1
     assert kept.views._cached.cache_info().currsize == 3
+
+
+def test_where_numpy_has_a_picture_in_memory_records_nothing_anew(small_dataset):
+    trainer = Trainer(small_dataset, CONFIG)
+    load, offset = trainer.views._load, [0]
+
+    def at_offset(index: int) -> views.View:
+        view = load(index)
+        memory = np.empty(view.rgba.size + 32, np.uint32)
+        first = -memory.ctypes.data // 4 % 16 + offset[0]
+        memory[first : first + view.rgba.size] = view.rgba
+        return replace(view, rgba=memory[first : first + view.rgba.size])
+
+    trainer.views._cached = at_offset
+    for _ in range(4):
+        trainer.step()
+    known, offset[0] = recordings(), 1
+    for _ in range(4):
+        trainer.step()
+    assert recordings() == known
 
 
 def test_training_on_several_views_a_step_learns_and_resumes(small_dataset, tmp_path):

@@ -4,13 +4,12 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.mesh import read_mesh
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_points
 from spacesim.splat.cameras import NEAR
-from spacesim.splat.gaussians import SH_C0, Gaussians
+from spacesim.splat.gaussians import SH_C0, Gaussians, uploaded
 
 OPACITY = 0.1  #: of every Gaussian at the start (Kerbl et al. 2023)
 NEIGHBOURS = 12  #: points that a normal is estimated from, chosen
@@ -46,7 +45,7 @@ def initial_gaussians(
     gaussians = gaussians_at(means, colours, -1 if features else sh_degree)
     if features:
         values = FEATURES * rng.standard_normal((features, gaussians.count))
-        gaussians.features = ad.Float(values.astype(np.float32).ravel())
+        gaussians.features = uploaded(values.ravel())
     return gaussians
 
 

@@ -105,7 +105,7 @@ class NetworkAdam:
 
     def put(self, first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> None:
         """The inverse of `moments`."""
-        self.first, self.second = [ad.Float(moment) for moment in first], [ad.Float(moment) for moment in second]
+        self.first, self.second = [uploaded(moment) for moment in first], [uploaded(moment) for moment in second]
 
 
 def parts(rows: int) -> list[slice]:

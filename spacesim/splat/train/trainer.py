@@ -17,7 +17,7 @@ from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Dataset
 from spacesim.splat.adjoint import SplatGradients
-from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.gaussians import Gaussians, uploaded
 from spacesim.splat.light import LightModel, TrainingFrame
 from spacesim.splat.project import Footprints, Pinhole
 from spacesim.splat.rasterize import backward, forward
@@ -210,7 +210,7 @@ class Trainer:
                 **truth,
                 "foreground": [attraction.mask, dr.opaque(ad.Float, self.warm_start.config.strength(self.iteration))],
             }
-        return Target(rgba, ad.Float(self.background(number, view)), valid, truth)
+        return Target(rgba, ad.Float(self.background(number, view).tolist()), valid, truth)
 
     def _move_gaussians(self, degree: int, looks: list["_Look"]) -> None:
         factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
@@ -263,10 +263,10 @@ class Trainer:
             optimizer, light_optimizer = Adam(gaussians.rows()), NetworkAdam(light.weights if light else [])
             _restore_moments(optimizer, tensors, "adam")
             _restore_moments(light_optimizer, tensors, "adam.light")
-            state = {name: ad.Float(tensors[f"strategy.{name}"]) for name in self.strategy.state}
+            state = {name: uploaded(tensors[f"strategy.{name}"]) for name in self.strategy.state}
             iteration, steps, history = int(header["iteration"]), int(header["adam_steps"]), list(header["history"])
             if self.warm_start and self._warming(iteration):
-                warm = {name: ad.Float(tensors[f"warm_start.{name}"]) for name in self.warm_start.state}
+                warm = {name: uploaded(tensors[f"warm_start.{name}"]) for name in self.warm_start.state}
                 state_sizes = {dr.width(row) for row in (*state.values(), *warm.values())}
             else:
                 warm, state_sizes = {}, {dr.width(row) for row in state.values()}
@@ -320,7 +320,7 @@ class Trainer:
         if field.surface:
             features = self.gaussians.to_numpy()["features"]
             features[:, field.features : field.stored] = surface_normals(means)
-            self.gaussians.features = ad.Float(np.ascontiguousarray(features.T).ravel())
+            self.gaussians.features = uploaded(features.T.ravel())
         frame = TrainingFrame(centre, self.scene_scale, farthest_camera(dataset, centre), radius)
         return LightModel.initial(self.config.light, frame, self.config.seed)
 

@@ -12,6 +12,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
+from spacesim.splat.gaussians import uploaded
 
 CACHE_BYTES = 6 * 2**30  #: of decoded pictures, at most, chosen
 DEVICE_BYTES = 2 * 2**30  #: of pictures that stay on the device, at most, chosen: 512 of 1024 x 1024
@@ -81,9 +82,9 @@ class TrainingViews:
 
     def _upload(self, index: int) -> tuple[Any, Any, dict[str, list[Any]]]:
         view = self[index]
-        valid = ad.Bool(True) if view.valid is None else ad.Bool(view.valid)
-        truth = {name: [ad.Float(plane) for plane in planes] for name, planes in view.truth.items()}
-        return ad.UInt32(view.rgba), valid, truth
+        valid = ad.Bool(True) if view.valid is None else uploaded(view.valid, ad.Bool)
+        truth = {name: [uploaded(plane) for plane in planes] for name, planes in view.truth.items()}
+        return uploaded(view.rgba, ad.UInt32), valid, truth
 
     def _shuffle(self, epoch: int) -> np.ndarray:
         return np.random.default_rng([self.seed, 1, epoch]).permutation(len(self))

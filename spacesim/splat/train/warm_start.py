@@ -14,7 +14,7 @@ from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError
 from spacesim.data.images import luminance
 from spacesim.splat.cameras import NEAR, Pinhole
-from spacesim.splat.gaussians import Gaussians, numbers, triple
+from spacesim.splat.gaussians import Gaussians, numbers, triple, uploaded
 from spacesim.splat.tiles import RECORDINGS
 from spacesim.splat.train.densify import raise_opacities
 from spacesim.splat.train.initialise import spacing
@@ -187,7 +187,7 @@ class WarmStart:
     def _attraction(self, index: int) -> Attraction:
         mask = foreground(self.views[index], self.config)
         image = distance_image(mask, self.config)
-        return Attraction(ad.Bool(mask.ravel()), ad.Float(image.ravel()), (image.shape[1], image.shape[0]))
+        return Attraction(uploaded(mask.ravel(), ad.Bool), uploaded(image.ravel()), (image.shape[1], image.shape[0]))
 
 
 def projected_loss(means: Any, camera: Pinhole, image: Any, size: tuple[int, int], step: int) -> tuple[Any, Any]:
