@@ -50,8 +50,10 @@ class MeshConfig:
     def __post_init__(self) -> None:
         if self.voxel is not None and not (np.isfinite(self.voxel) and self.voxel > 0):
             raise InputError(f"voxel: expected a positive number of metres, found {self.voxel}")
-        if self.voxels < 2 or self.views < 1:
-            raise InputError(f"mesh: expected at least 2 voxels and 1 view, found {self.voxels} and {self.views}")
+        if self.voxels < 2:
+            raise InputError(f"voxels: expected at least 2, found {self.voxels}")
+        if self.views < 1:
+            raise InputError(f"views: expected at least 1, found {self.views}")
         if not (np.isfinite(self.truncation) and self.truncation >= 1):
             raise InputError(f"truncation: expected at least 1 voxel, found {self.truncation}")
         if self.depth not in KINDS:

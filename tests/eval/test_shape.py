@@ -264,7 +264,7 @@ def test_export_where_the_data_is_gone(spacesim, tiny_run, tmp_path):
         ("--mesh OUT/a.ply --voxel 0", ("voxel",)),
         ("--mesh OUT/a.ply --voxel 1e-5", ("voxel", "GB")),
         ("--mesh OUT/a.ply --truncation 0", ("truncation",)),
-        ("--mesh OUT/a.ply --views 0", ("view",)),
+        ("--mesh OUT/a.ply --views 0", ("views: expected at least 1",)),
         ("--mesh OUT/a.ply --data OUT", ("transforms.json",)),
         ("--ply OUT/a.ply --voxel 1", ("--voxel", "--mesh")),
     ],
