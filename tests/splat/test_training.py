@@ -150,6 +150,13 @@ def test_one_training_at_a_time_in_a_folder(small_dataset, tmp_path):
     assert not leftover.exists()
 
 
+def test_a_run_is_not_resumed_through_another_lens(small_dataset, finished):
+    lens = (0.1, 0.0, 0.0, 0.0, 0.0)
+    other = replace(small_dataset, train=tuple(replace(f, distortion=lens) for f in small_dataset.train))
+    with pytest.raises(InputError, match=r"was started with data\.digest"):
+        train(other, finished.path, CONFIG, resume=True)
+
+
 def test_a_finished_run_is_left_alone_by_resume(small_dataset, finished):
     before = (finished.path / "model.safetensors").stat().st_mtime_ns
     train(small_dataset, finished.path, CONFIG, resume=True)

@@ -19,7 +19,7 @@ from spacesim import backend, ending
 from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, read_json, remove_leftovers, write_json
 from spacesim.data.lock import locked
-from spacesim.data.records import Camera, Dataset
+from spacesim.data.records import Dataset, Frame
 from spacesim.data.tone import development
 from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.checkpoint import write_tensors
@@ -142,16 +142,18 @@ def _identity(dataset: Dataset) -> dict[str, Any]:
 
 
 def digest(dataset: Dataset) -> str:
-    """Of the training frames: names and sizes of the files, poses, intrinsics, Suns."""
+    """Of the training frames: names and sizes of the files, poses, intrinsics, lenses, Suns."""
     told = [
-        (f.file_path, (dataset.root / f.file_path).stat().st_size, _numbers(f.camera), f.sun and f.sun.angles)
+        (f.file_path, (dataset.root / f.file_path).stat().st_size, _numbers(f), f.sun and f.sun.angles)
         for f in dataset.train
     ]
     return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
 
-def _numbers(camera: Camera) -> list[float]:
-    return [*camera.opengl.ravel().tolist(), camera.fx, camera.fy, camera.cx, camera.cy]
+def _numbers(frame: Frame) -> list[float]:
+    camera = frame.camera
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    return [*camera.opengl.ravel().tolist(), *intrinsics, *frame.distortion]
 
 
 def _check_resumable(out: Path, described: dict[str, Any], resume: bool) -> None:
