@@ -3,7 +3,6 @@
 EVAL/relight/prediction_KK.png, visibility_KK.png where the method predicts it, truth_KK.png where there is one.
 """
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,7 +78,7 @@ def write_sweep(
 ) -> tuple[dict[str, Any] | None, str]:
     """Write the pictures below `out`, in place of earlier ones. What metrics.json says of them, None where there are
     none, and then a sentence why. trained: the frames that the run was trained on"""
-    shutil.rmtree(out / "relight", ignore_errors=True)
+    _forget(out / "relight")
     sweep = plan_sweep(judged, dataset.frames)
     if sweep is None:
         return None, "relight is null: the data has fewer than two Suns."
@@ -105,6 +104,13 @@ def write_sweep(
         steps.append(step)
     visible = predictions[0].visibility is not None
     return {"view": sweep.view.file_path, "visibility": visible, "suns": steps}, ""
+
+
+def _forget(folder: Path) -> None:
+    """Take away the pictures of an earlier call, and nothing else: the folder may be a run that is called like it."""
+    for kind in ("prediction", "visibility", "truth"):
+        for path in folder.glob(f"{kind}_[0-9][0-9].png"):
+            path.unlink(missing_ok=True)
 
 
 def _write_prediction(folder: Path, index: int, prediction: "Prediction") -> None:
