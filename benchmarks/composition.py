@@ -24,7 +24,7 @@ import shadows
 from spacesim import backend
 from spacesim.data.store import read_dataset
 from spacesim.eval.composition import ComposedRun
-from spacesim.eval.evaluate import evaluate
+from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report import write_report
 from spacesim.progress import reporting, tell_training
 from spacesim.splat.compose import ComposeConfig, Composition, Placed, Pose, PosedScene, load_scene, save_scene
@@ -70,6 +70,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, metavar="N")
     parser.add_argument("--rows", default=",".join(ROWS), help="of thesis,ours, or names of single rows")
     parser.add_argument("--run", action="append", default=[], metavar="NAME=RUN", help="take this run; repeatable")
+    parser.add_argument("--no-geometry", action="store_true", help="do not judge shapes")
     parser.add_argument("--markdown", action="store_true")
     parser.add_argument("--json", nargs="?", const=Path("-"), type=Path, metavar="FILE")
     options = parser.parse_args()
@@ -79,6 +80,10 @@ def main() -> None:
         item.split("=", 1) if "=" in item else sys.exit(f"--run: expected NAME=RUN, found {item!r}")
         for item in options.run
     )
+    unknown = [name for name in given if name not in {row.run for row in rows}]
+    if unknown:
+        known = " | ".join(dict.fromkeys(row.run for row in rows))
+        sys.exit(f"--run: expected NAME to be one of {known}, found {unknown[0]!r}")
     data = options.data
     pair = read_dataset(options.pair or make_pair(options.out / "pair", options.resolution, options.views))
     results: dict[str, dict[str, Any]] = {}
@@ -88,7 +93,7 @@ def main() -> None:
         else:
             data = data or make_data(options.out / "data", options.resolution)
             run = trained(row, with_options(row.config, iterations=options.iterations), data, options.out)
-        results[row.name] = judged(row, run, pair, options.out)
+        results[row.name] = judged(row, run, pair, options.out, not options.no_geometry)
     write_report([options.out / "pairs" / name for name in results], options.out / "pairs/report.html")
     tables = {
         f"The {which} boxsat, Sun ({SUN[0]:g}, {SUN[1]:g})": [
@@ -158,14 +163,15 @@ def trained(row: Row, config: TrainConfig, data: Path, out: Path) -> Run:
         return train(read_dataset(data), out / row.run / "run", config, resume=True, on_progress=tell_training(report))
 
 
-def judged(row: Row, run: Run, pair: Any, out: Path) -> dict[str, Any]:
+def judged(row: Row, run: Run, pair: Any, out: Path, shapes: bool) -> dict[str, Any]:
     """metrics.json of the scene with this run twice."""
+    config = EvaluateConfig() if shapes else EvaluateConfig(geometry=None)
     file, folder = out / "pairs" / f"{row.name}.toml", out / "pairs" / row.name
     models = [Placed(run, Pose(translation=place), which) for which, place in PLACES.items()]
     save_scene(file, PosedScene(Composition(models, ComposeConfig(row.shadows))))
     scene = ComposedRun(load_scene(file).composition, file)
     with reporting(f"evaluate {row.name}", "frames") as report:
-        metrics: dict[str, Any] = evaluate(scene, pair, folder, progress=report)  # type: ignore[arg-type]
+        metrics: dict[str, Any] = evaluate(scene, pair, folder, config, report)  # type: ignore[arg-type]
     write_report([folder], folder / "report.html")
     return metrics
 

@@ -55,6 +55,14 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=600, help="of looking around (600)")
     parser.add_argument("--clients", type=int, default=2, help="that look around at once (2)")
     options = parser.parse_args()
+    for name, least, most in (
+        ("gaussians", 2, 10**8),
+        ("side", 16, SIDES[-1]),
+        ("clients", 1, 100),
+        ("seconds", 0, 1e6),
+    ):
+        if not least <= getattr(options, name) <= most:
+            sys.exit(f"--{name}: expected {least} to {most:g}, found {getattr(options, name)}")
     backend.select(options.backend)
     show = opened(options.path) if options.path else spheres(options.gaussians)
     rows = draws(show, options.side, options.repeats)
@@ -197,4 +205,4 @@ def _megabytes() -> float:
 
 
 if __name__ == "__main__":
-    main()
+    common.told(main)

@@ -1,5 +1,7 @@
-"""benchmarks/composition.py: its rows, its verdicts, and a whole run of it on almost nothing."""
+"""benchmarks/composition.py: its rows, its verdicts, and a whole run of it on almost nothing; what it and viewer.py
+refuse."""
 
+import importlib
 import json
 import subprocess
 import sys
@@ -54,7 +56,17 @@ def test_verdicts():
 
 def test_it_runs_and_says_both_tables(tiny_run, tmp_path):
     command = [sys.executable, str(FOLDER / "composition.py"), "--backend", "llvm", "--out", str(tmp_path / "runs")]
-    command += ["--rows", "none,none-shaded", "--run", f"none={tiny_run}", "--views", "2", "--resolution", "32"]
+    command += [
+        "--rows",
+        "none,none-shaded",
+        "--run",
+        f"none={tiny_run}",
+        "--views",
+        "2",
+        "--resolution",
+        "32",
+        "--no-geometry",
+    ]
     done = subprocess.run([*command, "--json", str(tmp_path / "found.json")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "found.json").read_text())
@@ -65,3 +77,22 @@ def test_it_runs_and_says_both_tables(tiny_run, tmp_path):
     assert float(second[1]["PSNR"]) > float(second[0]["PSNR"])
     assert "map" in done.stdout
     assert (tmp_path / "runs/pairs/report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("benchmark", "arguments", "sentence"),
+    [
+        ("composition", ["--rows", "none", "--run", "nune=x"], "--run: expected NAME to be one of none, found 'nune'"),
+        ("viewer", ["/nowhere"], "/nowhere: expected the folder of a run or a scene file (.toml), found nothing"),
+        ("viewer", ["--clients", "0"], "--clients: expected 1 to 100, found 0"),
+    ],
+)
+def test_what_cannot_be_is_refused(benchmark, arguments, sentence, monkeypatch, capsys):
+    import common
+
+    monkeypatch.setattr(sys, "argv", [f"{benchmark}.py", *arguments, *(["--out", "x"] * (benchmark == "composition"))])
+    if benchmark == "viewer":
+        pytest.importorskip("viser", reason="viser is not installed")
+    with pytest.raises(SystemExit) as ended:
+        common.told(importlib.import_module(benchmark).main)
+    assert sentence in capsys.readouterr().err + str(ended.value)
