@@ -68,7 +68,8 @@ class SignedDistance:
         self.lowest, self.highest = used.min(axis=0), used.max(axis=0)
         self._tree, self._winding = igl.AABB(), igl.FastWindingNumberBVH()
         self._tree.init(self.vertices, self.faces)
-        self._winding.init(self.vertices, self.faces)
+        self._centre = _middle(self.vertices[self.faces])
+        self._winding.init(self.vertices - self._centre, self.faces)  # which adds up in single precision
 
     @staticmethod
     def of(path: Path) -> "SignedDistance":
@@ -97,8 +98,18 @@ class SignedDistance:
         found = np.zeros(len(points), bool)
         within = np.flatnonzero(((points >= self.lowest) & (points <= self.highest)).all(axis=1))
         if len(within):
-            found[within] = np.abs(self._winding.winding_number(points[within])) >= 0.5
+            found[within] = np.abs(self._winding.winding_number(points[within] - self._centre)) >= 0.5
         return found
+
+
+def _middle(corners: Array) -> Array:
+    """[3] with half of the area of triangles [F, 3, 3] below it along each axis, wherever some of them have strayed."""
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    places = corners.mean(axis=1)
+    order = np.argsort(places, axis=0)
+    below = np.cumsum(area[order], axis=0)
+    half = (below < 0.5 * below[-1]).sum(axis=0)
+    return places[order[half, range(3)], range(3)]
 
 
 def _drawable(vertices: Array, faces: np.ndarray) -> np.ndarray:

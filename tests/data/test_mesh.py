@@ -77,6 +77,13 @@ def test_sign_is_that_of_exact_winding_numbers(kind):
     assert (found < 0).sum() > 50
 
 
+def test_a_mesh_far_from_the_origin_has_the_same_inside():
+    ball, far = trimesh.creation.icosphere(subdivisions=3), np.array([1e7, -1e7, 5e6])
+    points = np.random.default_rng(0).uniform(-1.2, 1.2, (2000, 3)) + far
+    near = SignedDistance(ball.vertices, ball.faces)(points - far)
+    np.testing.assert_allclose(SignedDistance(ball.vertices + far, ball.faces)(points), near, atol=1e-7)
+
+
 def test_nested_and_missing_points():
     distance = of(trimesh.creation.box((1, 1, 1)))
     assert len(distance(np.zeros((0, 3)))) == 0

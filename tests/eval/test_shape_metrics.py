@@ -187,7 +187,7 @@ def test_a_small_open_ball_in_a_large_grid_is_full():
 
 def test_overlap_ignores_what_is_far_away():
     far = joined(cube(), cube(0.1, at=(1e5, 0, 0)))
-    assert overlap(cube(), far, 0.04) == pytest.approx(1, abs=0.02)
+    assert overlap(cube(), far, 0.043) == pytest.approx(1, abs=0.02)  # no centre of a voxel is on a face
 
 
 def test_precision_and_recall():
