@@ -22,7 +22,7 @@ from spacesim.splat.run import load_run
 from spacesim.splat.train import views
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig, preset, with_options
-from spacesim.splat.train.initialise import focus_point, initial_gaussians, scene_scale, small_remark
+from spacesim.splat.train.initialise import far_remark, focus_point, initial_gaussians, scene_scale, small_remark
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
@@ -215,16 +215,26 @@ def test_scene_scale_and_focus(small_dataset):
     assert scene_scale(small_dataset) == pytest.approx(np.abs(centers - centers.mean(0)).max())
 
 
-def test_poses_in_kilometres_are_told(small_dataset):
-    def scaled(factor):
-        cameras = [replace(f.camera, world_from_camera=f.camera.world_from_camera.copy()) for f in small_dataset.train]
-        for camera in cameras:
-            camera.world_from_camera[:3, 3] *= factor
-        pairs = zip(small_dataset.train, cameras, strict=True)
-        return replace(small_dataset, train=tuple(replace(frame, camera=camera) for frame, camera in pairs))
+def placed(dataset, factor=1.0, shift=0.0):
+    """The dataset with other positions of its training cameras."""
+    cameras = [replace(f.camera, world_from_camera=f.camera.world_from_camera.copy()) for f in dataset.train]
+    for camera in cameras:
+        camera.world_from_camera[:3, 3] = factor * camera.world_from_camera[:3, 3] + shift
+    return replace(dataset, train=tuple(replace(f, camera=c) for f, c in zip(dataset.train, cameras, strict=True)))
 
-    assert small_remark(small_dataset) == small_remark(scaled(1e-2)) == small_remark(scaled(1e4)) == ""
-    assert "expected poses in metres, found training cameras 0.003 m from" in small_remark(scaled(1e-3))
+
+def test_poses_in_kilometres_are_told(small_dataset):
+    assert small_remark(small_dataset) == small_remark(placed(small_dataset, 1e-2)) == ""
+    assert small_remark(placed(small_dataset, 1e4)) == ""
+    assert "expected poses in metres, found training cameras 0.003 m from" in small_remark(placed(small_dataset, 1e-3))
+
+
+def test_poses_far_from_the_origin_are_told(small_dataset):
+    assert far_remark(small_dataset) == far_remark(placed(small_dataset, shift=1e3)) == ""
+    assert far_remark(placed(small_dataset, 1e4, 1e6)) == ""
+    assert "found it 1.2e+07 m away, where single precision has steps of 0.5 m" in far_remark(
+        placed(small_dataset, shift=7e6)
+    )
 
 
 def test_ply_round_trip(finished, tmp_path):

@@ -24,7 +24,7 @@ from spacesim.data.tone import development
 from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.checkpoint import write_tensors
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.initialise import small_remark
+from spacesim.splat.train.initialise import far_remark, small_remark
 from spacesim.splat.train.trainer import Progress, Trainer
 
 KEEP_CHECKPOINTS = 2
@@ -54,7 +54,7 @@ def train(
     if config.warm_start is not None and (remark := config.warm_start.remark(config.iterations)):
         log.warning(remark)
     trainer = Trainer(dataset, config)
-    if remark := small_remark(dataset):
+    for remark in filter(None, (small_remark(dataset), far_remark(dataset))):
         log.warning(remark)
     with locked(out):
         _check_folder(out, described, resume)  # again: another training may have come and gone
