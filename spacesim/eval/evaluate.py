@@ -52,7 +52,7 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         if self.split not in ("test", "train", "all"):
-            raise InputError(f"split: expected test, train or all, found {self.split!r}")
+            raise InputError(f"--split: expected test, train or all, found {self.split!r}")
 
 
 def evaluate(

@@ -143,8 +143,12 @@ def load_run(path: Path) -> Run:
     config, training = _read_keys(path / "config.json", "data"), _read_keys(path / "training.json", "history")
     tensors, _ = read_tensors(model_path)
     try:
-        model = Gaussians.from_numpy(tensors)
         light_config = TrainConfig.from_json(config).light
+    except InputError as error:
+        expected = f"{path / 'config.json'}: expected a configuration of this version"
+        raise InputError(f"{expected}, found another ({error})") from None
+    try:
+        model = Gaussians.from_numpy(tensors)
         light = LightModel.from_tensors(light_config, tensors) if light_config else None
         if light_config and (model.count == 0 or model.feature_count != light_config.features):
             found = f"{model.count} with {model.feature_count if model.count else 0}"

@@ -478,6 +478,11 @@ def test_models_that_do_not_fit_their_networks_are_refused(small_lit_dataset, tm
     write_tensors(run.path / "model.safetensors", tensors, {k: v for k, v in header.items() if k != "format"})
     with pytest.raises(InputError, match=r"model\.safetensors"):
         load_run(run.path)
+    config = json.loads((run.path / "config.json").read_text())
+    config["light"]["shadow"]["grazing"] = "somehow"  # of another version
+    (run.path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(InputError, match=r"config\.json: expected a configuration of this version.*somehow"):
+        load_run(run.path)
 
 
 def test_a_run_that_never_began_can_be_started_otherwise(small_lit_dataset, tmp_path, monkeypatch):
