@@ -40,6 +40,7 @@ from spacesim.eval.report import write_report
 from spacesim.progress import reporting, tell_training
 from spacesim.splat.train.config import METHODS, TrainConfig, preset, with_options
 from spacesim.splat.train.config import warm_start as warm_start_of
+from spacesim.splat.train.prior import known_mesh
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
@@ -74,7 +75,7 @@ def main() -> None:
     wanted = common.row_names(options.rows)
     unknown = [name for name in wanted if name not in (*KINDS, *table)]
     if unknown:
-        sys.exit(f"--rows: expected some of {', '.join((*KINDS, *table))}, found {unknown[0]!r}")
+        sys.exit(f"--rows: expected some of {'; '.join((*KINDS, *table))}, found {unknown[0]!r}")
     dataset = read_dataset(options.data or make_data(options))
     chosen = {name: config for name, (kind, config) in table.items() if kind in wanted or name in wanted}
     results = {name: measure(name, config, dataset, options.out) for name, config in chosen.items()}
@@ -234,7 +235,7 @@ def size(found: dict[str, Any]) -> common.Row:
 
 def figure(dataset: Dataset, options: argparse.Namespace) -> dict[str, Any]:
     """{name: {"gaussians": N, "inside": [(step, share)]}} of figure 5.5; without culling and densification, too."""
-    surface = SignedDistance.of(dataset.root / str(dataset.mesh_path))
+    surface = SignedDistance.of(dataset.root / known_mesh(dataset, "--rows figure"))
     base = preset(options.preset, options.method, "support-aware")
     still = DefaultStrategyConfig(refine_start=NEVER, refine_stop=NEVER + 1)
     base = replace(base, iterations=max(SCHEDULE, options.figure_steps), refinement=still)
