@@ -92,8 +92,8 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
             yield f"{name}, no refinement", with_shadow(whole, refine=None)
         yield "park", preset(size, "park")
         return
-    yield "none, surface", preset(size, "relight")
-    mapped, splatted = preset(size, "shadow-map"), preset(size, "shadow-splat")
+    relit, mapped, splatted = (as_ours(preset(size, method)) for method in ("relight", "shadow-map", "shadow-splat"))
+    yield "none, surface", relit
     yield "map, surface", mapped
     yield "splat, surface", splatted
     yield "map, surface, thesis's shadows", with_shadow(mapped, bias=10.0, grazing="none", mapping=MappingConfig())
@@ -104,7 +104,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     closer = MappingConfig("percentage-closer", sun_radius_deg=SUN_RADIUS_DEG)
     yield "map, surface, percentage-closer", with_shadow(mapped, mapping=closer)
     yield "map, surface, variance", with_shadow(mapped, mapping=MappingConfig("variance"))
-    yield "none, surface, anti-aliased", replace(preset(size, "relight"), antialiased=True)
+    yield "none, surface, anti-aliased", replace(relit, antialiased=True)
     yield "map, surface, anti-aliased", replace(mapped, antialiased=True)
     yield "splat, surface, anti-aliased", replace(splatted, antialiased=True)
     yield "map, surface, supervised", replace(mapped, visibility_weight=0.1)
@@ -122,6 +122,16 @@ def as_thesis(config: TrainConfig) -> TrainConfig:
     config = replace(config, light=replace(config.light, field=with_field(config.light.field, "thesis")))
     shadow = {"bias": 10.0, "grazing": "none", "mapping": MappingConfig()}
     return with_shadow(config, **shadow) if config.light.shadow else config
+
+
+def as_ours(config: TrainConfig) -> TrainConfig:
+    """The field and the shadows as `fast` has them, in networks of the preset's size."""
+    assert config.light is not None
+    config = replace(config, light=replace(config.light, field=with_field(config.light.field, "surface")))
+    if config.light.shadow is None:
+        return config
+    ours = shadow_of(preset("fast", config.method))
+    return with_shadow(config, bias=ours.bias, grazing=ours.grazing, mapping=ours.mapping)
 
 
 def with_shadow(config: TrainConfig, **changes: Any) -> TrainConfig:

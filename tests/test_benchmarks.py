@@ -10,6 +10,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from spacesim.splat.train.config import PRESETS, preset
+
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 
 
@@ -157,6 +159,19 @@ def test_memory_counts_the_parameters_and_their_moments():
     # values and two moments are there before and after an update; gradients and statistics beside them
     assert 3 * parameters < few < 12 * parameters
     assert 3 * parameters < many <= 1536
+
+
+@pytest.mark.parametrize("size", PRESETS)
+def test_rows_of_shadows_are_what_they_are_called(size):
+    import shadows
+
+    rows = {name: config for kind in shadows.ROWS for name, config in shadows.configurations(kind, size)}
+    lit = {name: config for name, config in rows.items() if config.light}
+    assert {name for name, config in lit.items() if config.light.field.surface} == {n for n in rows if "surface" in n}
+    assert len({repr(config) for config in rows.values()}) == len(rows)
+    if size != "thesis":
+        assert rows["map, surface"] == preset(size, "shadow-map")
+        assert rows["splat, surface"] == preset(size, "shadow-splat")
 
 
 def test_shadows_compares_methods_and_goes_on_where_it_stopped(small_lit, tmp_path):
