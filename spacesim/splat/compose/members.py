@@ -17,7 +17,7 @@ from spacesim.backend import ad, recorded
 from spacesim.data.geometry import Array
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.gaussians import Gaussians, uploaded
 from spacesim.splat.project import ALPHA_MIN
 from spacesim.splat.render import view_colours
 from spacesim.splat.run import Run
@@ -132,13 +132,14 @@ class Ensemble:
     @cached_property
     def owner(self) -> Any:
         """UInt32 [N]: whose each Gaussian is."""
-        return ad.UInt32([k for k, member in enumerate(self.members) for _ in range(member.count)])
+        numbers = [np.full(member.count, k, np.uint32) for k, member in enumerate(self.members)]
+        return uploaded(np.concatenate(numbers), ad.UInt32)
 
     @cached_property
     def indices(self) -> list[Any]:
         """UInt32 of each member: where its Gaussians stand in the set."""
         pairs = zip(self.starts, self.members, strict=True)
-        return [ad.UInt32(list(range(start, start + member.count))) for start, member in pairs]
+        return [uploaded(np.arange(start, start + member.count), ad.UInt32) for start, member in pairs]
 
     @cached_property
     def shares(self) -> list[Any]:
@@ -168,7 +169,8 @@ class Ensemble:
         flags = [member.run.antialiased for member in self.members]
         if len(set(flags)) < 2:
             return any(flags)
-        return ad.Bool(np.concatenate([np.full(m.count, f) for m, f in zip(self.members, flags, strict=True)]))
+        of_each = [np.full(m.count, f) for m, f in zip(self.members, flags, strict=True)]
+        return uploaded(np.concatenate(of_each), ad.Bool)
 
     @cached_property
     def curve(self) -> tuple[str, float] | None:
