@@ -124,9 +124,14 @@ def test_gradients_match_central_differences_on_placed_splats():
         np.testing.assert_allclose(ours[name], twin[name], rtol=1e-3, atol=1e-4 * scale, err_msg=name)
 
 
+@cache
+def differences() -> dict[str, np.ndarray]:
+    return central_differences(random_splats(25, seed=11, degree=1), camera(24, 17), step=1e-7)
+
+
 def test_gradients_match_central_differences_on_a_random_scene():
     arrays, view = random_splats(25, seed=11, degree=1), camera(24, 17)
-    ours, twin = gradients(arrays, view), central_differences(arrays, view, step=1e-7)
+    ours, twin = gradients(arrays, view), differences()
     for name in NAMES:
         error = np.linalg.norm(ours[name] - twin[name]) / np.linalg.norm(twin[name])
         assert error < 1e-3, (name, error)
@@ -386,11 +391,6 @@ def test_any_tile_shape_blends_the_same(shape, monkeypatch):
     for name in NAMES:
         error = np.linalg.norm(slope[name] - expected[name]) / np.linalg.norm(expected[name])
         assert error < 1e-3, (name, error)
-
-
-@cache
-def differences() -> dict[str, np.ndarray]:
-    return central_differences(random_splats(25, seed=11, degree=1), camera(24, 17), step=1e-7)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
