@@ -36,7 +36,7 @@ def filmic(linear: np.ndarray) -> np.ndarray:
 
     K. Narkowicz, "ACES Filmic Tone Mapping Curve", 2016: a rational fit to the ACES reference and output transforms.
     """
-    x = np.maximum(linear, 0)
+    x = np.clip(linear, 0, 8)  # white already; the square of what is far beyond would not be finite
     return np.minimum(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1).astype(np.asarray(linear).dtype)
 
 

@@ -71,6 +71,13 @@ def test_more_exposure_is_more_light(tone):
 
 
 @pytest.mark.parametrize("tone", TONES)
+def test_any_exposure_ends_at_white(tone):
+    light = np.array([0, 1e-6, 0.5, 1], np.float32)
+    np.testing.assert_allclose(developed(light, tone, 80.0), [0, 1, 1, 1], atol=1e-6)
+    assert developed(light, tone, -80.0).max() < 1e-6
+
+
+@pytest.mark.parametrize("tone", TONES)
 def test_loss_blends_light_and_compares_pictures(tone):
     """A picture that is half covered by a known colour, over a known background: no loss where light is mixed as it
     should be, and a loss where sRGB values would have been mixed."""
