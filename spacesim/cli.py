@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from spacesim.splat.run import Run
 
 KNOWS_ONE_LIGHT = "a vanilla run knows the light that it was trained under only; --sun changes nothing"
+WANTS_FILTER = "the run is --antialiased: viewers without Mip-Splatting's 2D filter draw thin splats wider"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -314,6 +315,8 @@ def _export_ply(options: argparse.Namespace) -> None:
     elif options.sun is not None:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
     write_ply(model, options.ply)
+    if run.antialiased:
+        print(WANTS_FILTER, file=sys.stderr)
     ending.say(f"{options.ply}: {run.gaussians} Gaussians")
 
 

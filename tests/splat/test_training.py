@@ -11,6 +11,7 @@ import pytest
 from splats import random_splats
 
 from spacesim.backend import recordings
+from spacesim.cli import main
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image
 from spacesim.data.lock import locked
@@ -61,7 +62,7 @@ def test_same_seed_same_model_to_the_bit(small_dataset, finished, tmp_path):
     assert not np.array_equal(other.model.to_numpy()["means"][:10], finished.model.to_numpy()["means"][:10])
 
 
-def test_a_run_trained_with_the_filter_is_drawn_with_it(small_dataset, tmp_path):
+def test_a_run_trained_with_the_filter_is_drawn_with_it(small_dataset, tmp_path, capsys):
     run = train(small_dataset, tmp_path / "run", replace(CONFIG, iterations=60, antialiased=True))
     plain = train(small_dataset, tmp_path / "plain", replace(CONFIG, iterations=60))
     assert not np.array_equal(run.model.to_numpy()["means"][:20], plain.model.to_numpy()["means"][:20])
@@ -70,6 +71,9 @@ def test_a_run_trained_with_the_filter_is_drawn_with_it(small_dataset, tmp_path)
     np.testing.assert_array_equal(load_run(run.path).predict(camera).rgb, drawn.image("colour"))
     unfiltered = render(run.model, Pinhole.of(camera), outputs=("colour",)).image("colour")
     assert not np.array_equal(drawn.image("colour"), unfiltered)
+    for exported, told in ((run, True), (plain, False)):  # other viewers draw as they do
+        assert main(["export", str(exported.path), "--ply", str(tmp_path / "model.ply")]) == 0
+        assert ("--antialiased" in capsys.readouterr().err) == told
 
 
 @pytest.mark.parametrize("stop", [50, 100])
