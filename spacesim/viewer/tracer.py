@@ -5,7 +5,7 @@ every few samples a pixel; a newer request, or None, ends the one before. Where 
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -25,7 +25,7 @@ NICENESS = 10  #: less urgent than the viewer's own pictures
 @dataclass(frozen=True, eq=False)
 class Request:
     """What to trace. number: given back with answers;  scene: a `SceneConfig`;  samples: a pixel;  mode: whose planes:
-    "colour" asks for paths, the others for labels"""
+    "colour" asks for paths, the others for labels;  models: see `numbered`"""
 
     number: int
     scene: Any
@@ -33,6 +33,7 @@ class Request:
     sun: Sun
     samples: int
     mode: str
+    models: Sequence[int] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,7 @@ class Tracer:
         camera, sun, config = request.camera, request.sun, request.scene.camera
         if request.mode not in ("colour", "ellipsoids", "accumulation"):
             labels = renderer.labels(camera, sun)
-            yield Answer(request.number, _label_planes(labels), 1, True)
+            yield Answer(request.number, _label_planes(labels, request.models), 1, True)
             return
         total, weight, done = 0.0, 0.0, 0
         while done < request.samples:
@@ -90,14 +91,20 @@ def _picture(radiance: np.ndarray, alpha: np.ndarray, config: Any) -> Planes:
     return Planes(alpha.astype(np.float32), rgb=rgb.astype(np.float32))
 
 
-def _label_planes(labels: dict[str, np.ndarray]) -> Planes:
+def numbered(objects: np.ndarray, models: Sequence[int]) -> np.ndarray:
+    """Numbers of objects [H, W] as those of the models that they are part of. models: of each object the number of its
+    model, from 1; nothing where they are the same"""
+    return np.array([0, *models], objects.dtype).take(objects, mode="clip") if models else objects
+
+
+def _label_planes(labels: dict[str, np.ndarray], models: Sequence[int]) -> Planes:
     surface = (labels["object_id"] > 0).astype(np.float32)
     return Planes(
         surface,
         depth=labels["depth"],
         visibility=labels["sun_visibility"],
         normal=labels["normal"],
-        object_id=labels["object_id"],
+        object_id=numbered(labels["object_id"], models),
     )
 
 

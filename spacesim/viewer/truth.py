@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
@@ -24,7 +24,7 @@ from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
 from spacesim.viewer.paint import Bytes, Planes
 from spacesim.viewer.state import Stand, View
-from spacesim.viewer.tracer import Answer, Request
+from spacesim.viewer.tracer import Answer, Request, numbered
 
 SIDE = 512  #: pixels of the longer side of what is path-traced, at most; chosen
 SAME_DIRECTION = 1e-4  #: radians between two Suns or two axes that count as one, chosen
@@ -63,8 +63,8 @@ def _near(one: np.ndarray, other: np.ndarray) -> bool:
     return float(np.linalg.norm(one - other)) < SAME_DIRECTION
 
 
-def stored_truth(dataset: Dataset, number: int, mode: str) -> Truth | None:
-    """What the dataset holds of a frame for a mode; None where it does not."""
+def stored_truth(dataset: Dataset, number: int, mode: str, models: Sequence[int] = ()) -> Truth | None:
+    """What the dataset holds of a frame for a mode; None where it does not. models: see `numbered`"""
     frame = dataset.frames[number]
     source = f"the dataset's frame {number}"
     try:
@@ -72,13 +72,13 @@ def stored_truth(dataset: Dataset, number: int, mode: str) -> Truth | None:
             image = load_image(dataset, frame)
             rgb = image.over(np.zeros(3)).astype(np.float32)
             return Truth(Planes(image.alpha, rgb=rgb), frame.camera, source)
-        return Truth(_labels(dataset, frame), frame.camera, source)
+        return Truth(_labels(dataset, frame, models), frame.camera, source)
     except InputError as error:
         _log.debug("viewer: no truth of frame %d is stored (%s)", number, error)
         return None
 
 
-def _labels(dataset: Dataset, frame: Frame) -> Planes:
+def _labels(dataset: Dataset, frame: Frame, models: Sequence[int]) -> Planes:
     truth = load_truth(dataset, frame)
     surface = (truth.object_id > 0).astype(np.float32)
     return Planes(
@@ -86,7 +86,7 @@ def _labels(dataset: Dataset, frame: Frame) -> Planes:
         depth=truth.depth,
         visibility=truth.sun_visibility,
         normal=truth.normal,
-        object_id=truth.object_id,
+        object_id=numbered(truth.object_id, models),
     )
 
 

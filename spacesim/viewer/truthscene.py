@@ -57,15 +57,21 @@ def posed_objects(scenes: Sequence[SceneConfig], poses: Sequence[Pose]) -> list[
     return [_posed(one, pose, {}) for scene, pose in zip(scenes, poses, strict=True) for one in scene.objects]
 
 
-def same_objects(some: Sequence[ObjectConfig], others: Sequence[ObjectConfig]) -> bool:
-    """Whether two scenes have the same things in the same places, in whatever order."""
-    left = list(others)
-    for one in some:
-        found = next((other for other in left if _same_object(one, other)), None)
-        if found is None:
-            return False
-        left.remove(found)
-    return not left
+def models_of(scenes: Sequence[SceneConfig]) -> list[int]:
+    """Of each object of a composed scene, in its order, the number of the model whose scene it is from, from 1."""
+    return [number for number, scene in enumerate(scenes, start=1) for _ in scene.objects]
+
+
+def places_among(some: Sequence[ObjectConfig], others: Sequence[ObjectConfig]) -> list[int] | None:
+    """Of each of `others`, which of `some` is the same thing in the same place; None where they are not the same."""
+    left, found = list(range(len(some))), []
+    for other in others:
+        place = next((k for k in left if _same_object(some[k], other)), None)
+        if place is None:
+            return None
+        left.remove(place)
+        found.append(place)
+    return None if left else found
 
 
 def _same_object(one: ObjectConfig, other: ObjectConfig) -> bool:

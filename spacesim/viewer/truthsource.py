@@ -14,7 +14,7 @@ from spacesim.viewer.session import Session
 from spacesim.viewer.state import Look, Stand, View
 from spacesim.viewer.tracer import Answer, Request
 from spacesim.viewer.truth import SIDE, Truth, TruthDesk, frame_at, stored_truth
-from spacesim.viewer.truthscene import composed_scene, posed_objects, recorded_scene, same_objects
+from spacesim.viewer.truthscene import composed_scene, models_of, places_among, posed_objects, recorded_scene
 
 
 class TruthService:
@@ -33,9 +33,10 @@ class TruthService:
 
     def truth(self, session: Session, view: View, stand: Stand, look: Look) -> Truth | int | str:
         """See `TruthSource`."""
-        number = self._frame(view, stand)
-        if number is not None and self._dataset is not None:
-            stored = stored_truth(self._dataset, number, look.mode)
+        models = self._models(stand)
+        if self._dataset is not None and models is not None:
+            number = frame_at(self._dataset, view, stand)
+            stored = None if number is None else stored_truth(self._dataset, number, look.mode, models)
             if stored is not None:
                 return stored
         if stand.sun is None:
@@ -48,7 +49,8 @@ class TruthService:
         except InputError as error:
             return str(error)
         camera = view.camera(*sides(view, min(SIDE, look.side)))
-        return self._desk.ask(session, Request(0, scene, camera, stand.sun, look.samples, look.mode))
+        request = Request(0, scene, camera, stand.sun, look.samples, look.mode, models_of(scenes))
+        return self._desk.ask(session, request)
 
     def no_truth(self, session: Session) -> None:
         """See `TruthSource`."""
@@ -58,20 +60,16 @@ class TruthService:
         """End the process that traces."""
         self._desk.stop()
 
-    def _frame(self, view: View, stand: Stand) -> int | None:
-        """Number of the frame that shows this."""
-        if self._dataset is None or not self._as_recorded(stand):
-            return None
-        return frame_at(self._dataset, view, stand)
-
-    def _as_recorded(self, stand: Stand) -> bool:
-        """Whether the models stand where the dataset's objects do. Where scenes are not known: as at the start, or, of
-        one model, where it was trained."""
+    def _models(self, stand: Stand) -> list[int] | None:
+        """Of each object of the dataset the number of the model that it is part of, where the models stand as the
+        objects do, else None. Where scenes are not known: an empty list where they stand as at the start, or, of one
+        model, where it was trained."""
         scenes = self._recorded()
         if not isinstance(scenes, str) and self._whole is not None:
-            return same_objects(posed_objects(scenes, stand.poses), self._whole.objects)
+            places = places_among(posed_objects(scenes, stand.poses), self._whole.objects)
+            return None if places is None else [models_of(scenes)[place] for place in places]
         start = self._start.poses if len(self._start.poses) > 1 else (Pose(),)
-        return [pose.key for pose in stand.poses] == [pose.key for pose in start]
+        return [] if [pose.key for pose in stand.poses] == [pose.key for pose in start] else None
 
     def _recorded(self) -> list[Any] | str:
         """The scenes of the models' data, or why they are not known; looked up once."""

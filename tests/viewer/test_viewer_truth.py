@@ -81,6 +81,18 @@ def test_the_tracer_renders_what_the_data_hold(tiny_data, scene):
     assert 0 < errors[2] < errors[1] < errors[0]
 
 
+def test_objects_have_the_numbers_of_their_models(tiny_data, scene):
+    frame = read_dataset(tiny_data).frames[0]
+    both = composed_scene([scene, scene], [Pose(), Pose(translation=[0.5, 0.5, 2.0])])
+    traced = [
+        next(Tracer().answers(Request(1, both, frame.camera, frame.sun, 1, "object id", models))).planes.object_id
+        for models in ((), (1, 1), (2, 1))
+    ]
+    assert set(np.unique(traced[0])) == {0, 1, 2}
+    assert np.array_equal(traced[1], np.minimum(traced[0], 1))
+    assert np.array_equal(traced[2], np.where(traced[0] > 0, 3 - traced[0], 0))
+
+
 def test_a_posed_scene_shows_what_a_posed_camera_sees(tiny_data, scene):
     """The object moved, turned and scaled, against the camera moved the other way."""
     frame = read_dataset(tiny_data).frames[0]
@@ -137,8 +149,11 @@ def test_frames_are_the_truth_of_what_they_show_alone(tiny_data, tmp_path, scene
     shutil.copytree(tiny_data, pair)
     both = composed_scene([scene, scene], [TURN, Pose()])
     (pair / "scene.json").write_text(json.dumps({**dataset.scene, "config": both.to_json()}))
-    for poses in ((Pose(), TURN), (TURN, Pose())):
+    for poses, models in (((Pose(), TURN), [2, 1]), ((TURN, Pose()), [1, 2])):
         assert source((Pose(), Pose()), poses, [tiny_data, tiny_data], read_dataset(pair)) == "the dataset's frame 2"
+        service = TruthService([tiny_data, tiny_data], read_dataset(pair), Stand(poses, sun))
+        assert service._models(Stand(poses, sun)) == models
+    assert TruthService([pair], read_dataset(pair), Stand((Pose(),), sun))._models(Stand((Pose(),), sun)) == [1, 1]
     untold = "the data that a model was trained on are not where they were; name them with --data"
     assert source((TURN,), (TURN,), [None]) == untold
     assert source((Pose(), TURN), (Pose(), TURN), [None, None]) == "the dataset's frame 2"
