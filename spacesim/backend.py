@@ -274,7 +274,11 @@ def _split(value: Any, arrays: list[Any]) -> Any:
         arrays.extend(value)
         return kind, len(value)
     if kind is list or kind is tuple:
-        return kind, _split_each(value, arrays)
+        told = _split_each(value, arrays)
+        met_now = kind is list and all(
+            part is ... for part in told
+        )  # arrays of a type that is in `_leaves` from now on
+        return kind, len(told) if met_now else told
     if kind is dict:
         return kind, list(value), _split_each(value.values(), arrays)
     names = _names(kind)  # type: ignore[arg-type]

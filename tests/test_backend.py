@@ -236,6 +236,14 @@ def test_constants_are_all_that_is_no_array():
     assert told((x, 1)) == told((x + 1, 1))
 
 
+def test_the_first_arrays_of_a_type_are_told_as_the_next_are(monkeypatch):
+    """Else the second call of a program would record anew."""
+    monkeypatch.setattr(backend, "_leaves", set())
+    x = backend.ad.Float(1.0, 2.0)
+    first, second = (repr(backend._split(([x, x], {"a": [x]}, (x,), [[x], []]), [])) for _ in range(2))
+    assert first == second
+
+
 @dataclass(frozen=True)
 class _Pair:
     one: object
