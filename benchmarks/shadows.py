@@ -113,7 +113,9 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, linear", replace(mapped, light=replace(mapped.light, linear=True))
     yield "map, surface, linear, filmic", replace(mapped, light=replace(mapped.light, linear=True, tone="filmic"))
     yield "splat, surface, gradients", with_shadow(splatted, gradients=True)
-    yield "splat, surface, supervised, gradients", with_shadow(replace(splatted, visibility_weight=0.1), gradients=True)
+    both = with_shadow(replace(splatted, visibility_weight=0.1), gradients=True)
+    yield "splat, surface, supervised, gradients", both
+    yield "splat, surface, supervised, gradients, anti-aliased", replace(both, antialiased=True)
 
 
 def as_thesis(config: TrainConfig) -> TrainConfig:
