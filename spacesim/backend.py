@@ -275,10 +275,8 @@ def _split(value: Any, arrays: list[Any]) -> Any:
         return kind, len(value)
     if kind is list or kind is tuple:
         told = _split_each(value, arrays)
-        met_now = kind is list and all(
-            part is ... for part in told
-        )  # arrays of a type that is in `_leaves` from now on
-        return kind, len(told) if met_now else told
+        new = kind is list and all(part is ... for part in told)  # of a type that is in `_leaves` from now on
+        return kind, len(told) if new else told
     if kind is dict:
         return kind, list(value), _split_each(value.values(), arrays)
     names = _names(kind)  # type: ignore[arg-type]
