@@ -113,6 +113,26 @@ def test_exterior_of_a_closed_box_with_content():
     assert counts == pytest.approx(5000 / 12, rel=0.25)
 
 
+@pytest.mark.parametrize("opened", [False, True])
+def test_much_that_is_hidden_is_not_asked_for_again_and_again(monkeypatch, opened):
+    """A cube with 20 balls in each other has 12 % of its area outside; what half of an open side shows stays."""
+    asked, sides = [], Sight.sides
+    monkeypatch.setattr(Sight, "sides", lambda self, *points: asked.append(len(points[0])) or sides(self, *points))
+    balls = [parts(trimesh.creation.icosphere(subdivisions=2, radius=r)) for r in np.linspace(0.35, 0.45, 20)]
+    vertices, faces = cube()
+    found = exterior_samples(*joined((vertices, faces[opened:]), *balls), 8000, 0)
+    assert sum(asked) < 3 * 8000  # all at random, 66,000 would be needed
+    on_hull = np.abs(found.points).max(axis=1) > 0.4999
+    balls_seen = np.linalg.norm(found.points[~on_hull], axis=1)
+    if opened:
+        assert 0.02 < np.mean(~on_hull) < 0.5
+        assert balls_seen[balls_seen < 0.49].min() > 0.44  # the outermost one, and the sides of the cube within
+    else:
+        assert on_hull.all()
+        sides_hit = np.bincount(np.abs(found.points).argmax(axis=1), minlength=3)
+        assert sides_hit / 8000 == pytest.approx(1 / 3, abs=0.02)
+
+
 def test_what_a_hole_shows_is_exterior():
     vertices, faces = joined(cube(1.0), cube(0.4))
     top = np.flatnonzero(np.all(vertices[faces][..., 2] == 0.5, axis=1))
