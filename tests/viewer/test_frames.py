@@ -7,10 +7,11 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.eval.pictures import error_colours
-from spacesim.splat.compose import Pose
+from spacesim.splat.compose import Composition, Pose
 from spacesim.splat.picture import LIT, SHADOWED
 from spacesim.viewer.frames import BUDGET, LEAST, SHARES, STEP, WARM, Pace, draw, sides
 from spacesim.viewer.paint import FARTHEST_SHADE, NEEDED, PALETTE, Planes, compared, depth_range, painted, with_scale
+from spacesim.viewer.stage import Stage
 from spacesim.viewer.state import MODES, Look, Stand, View, bounded, changed_pose, view_of
 
 
@@ -107,13 +108,8 @@ def test_every_mode_has_a_picture_from_anywhere(stage, stand, mode):
         assert frame.picture.dtype == np.uint8
 
 
-def test_what_nobody_predicts_is_told(stand, view):
-    from conftest import ball_run
-
-    from spacesim.splat.compose import Composition, Placed
-    from spacesim.viewer.stage import Stage
-
-    alone = Stage(Composition([Placed(ball_run("red", (0.9, 0.1, 0.1)))]))
+def test_what_nobody_predicts_is_told(stage, stand, view):
+    alone = Stage(Composition(stage.composition.models[:1]))
     frame = draw(alone, Stand(stand.poses[:1], stand.sun), view, Look("visibility", side=256))
     assert "no visibility" in frame.note
     assert not frame.picture.any()
