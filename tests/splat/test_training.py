@@ -337,6 +337,18 @@ def test_several_views_a_step_follow_their_mean_gradient(small_dataset):
     np.testing.assert_allclose(both, (first + second) / 2, rtol=1e-4, atol=1e-6 * np.abs(first).max())
 
 
+def test_views_of_which_nothing_counts_are_told_once(small_dataset, caplog):
+    """Their loss is 0, whatever is drawn: as if all were well."""
+    first = replace(small_dataset.train[0], distortion=(1e30, 0.0, 0.0, 0.0, 0.0))
+    trainer = Trainer(replace(small_dataset, train=(first,)), CONFIG)
+    for _ in range(2):
+        assert float(trainer.step()[0]) < 1e-7
+        trainer.views._cached.cache_clear()
+    assert [r.message for r in caplog.records] == [
+        f"{first.file_path}: no pixel of it counts, by its mask or by its lens distortion"
+    ]
+
+
 def test_where_memory_is_short_pictures_are_read_again(small_dataset, monkeypatch):
     kept = Trainer(small_dataset, CONFIG)
     monkeypatch.setattr(views, "main_memory", lambda: 4 * 10**9)

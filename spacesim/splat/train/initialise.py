@@ -110,11 +110,12 @@ def far_remark(dataset: Dataset) -> str:
     focus = focus_point(dataset)
     step = float(np.spacing(np.float32(np.abs(focus).max())))
     camera = min((f.camera for f in dataset.train), key=lambda c: float(np.linalg.norm(c.position - focus)))
-    pixel = max(float(np.linalg.norm(camera.position - focus)), 1e-6) / max(camera.fx, camera.fy)
-    if step < COARSE * pixel:
+    distance, away = float(np.linalg.norm(camera.position - focus)), float(np.linalg.norm(focus))
+    pixel = max(distance, 1e-6) / max(camera.fx, camera.fy)
+    if step < COARSE * pixel or away < distance:
         return ""
     return (
-        f"{dataset.root}: expected poses about an origin near the object, found it {np.linalg.norm(focus):.2g} m away, "
+        f"{dataset.root}: expected poses about an origin near the object, found it {away:.2g} m away, "
         f"where single precision has steps of {step:.2g} m, {step / pixel:.2g} pixels: move the poses"
     )
 

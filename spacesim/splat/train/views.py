@@ -1,5 +1,6 @@
 """The training pictures: decoded once, kept packed in memory, handed out in a seeded order."""
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,6 +14,8 @@ from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
 from spacesim.splat.gaussians import uploaded
+
+log = logging.getLogger(__name__)
 
 CACHE_BYTES = 6 * 2**30  #: of decoded pictures, at most, chosen
 DEVICE_BYTES = 2 * 2**30  #: of pictures that stay on the device, at most, chosen: 512 of 1024 x 1024
@@ -59,6 +62,7 @@ class TrainingViews:
         self.dataset, self.seed, self.truth, self.surface = dataset, seed, tuple(truth), surface
         self.most_pixels = max(f.camera.width * f.camera.height for f in dataset.train)
         largest = 4 * self.most_pixels * (1 + sum(3 if name == "normal" else 1 for name in truth))
+        self._empty: set[int] = set()  # views that have been told to show nothing
         self._order = lru_cache(maxsize=1)(self._shuffle)
         cached, uploaded = kept_bytes()
         self._cached = lru_cache(maxsize=max(1, cached // largest))(self._load)
@@ -95,6 +99,9 @@ class TrainingViews:
         rgba = np.concatenate([image.rgb, image.alpha[..., None]], axis=-1)
         bytes_ = np.ascontiguousarray(np.rint(rgba * 255).astype(np.uint8)).reshape(-1, 4)
         valid = None if image.valid.all() else image.valid.ravel()
+        if not image.valid.any() and index not in self._empty:
+            self._empty.add(index)
+            log.warning("%s: no pixel of it counts, by its mask or by its lens distortion", frame.file_path)
         sun = None if frame.sun is None else frame.sun.direction
         opaque = bool((image.alpha == 1).all())
         return View(index, frame.camera, sun, bytes_.view("<u4").ravel(), valid, opaque, self._planes(frame))
