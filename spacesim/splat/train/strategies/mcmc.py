@@ -74,7 +74,7 @@ class McmcStrategy(Strategy):
         factor = self.mcmc.noise * rate / self.scene_scale**2
         streams = np.random.SeedSequence([seed, 5, step]).generate_state(1, np.uint64)
         values = ad.Float([factor, self.mcmc.min_opacity])
-        gaussians.means = ad.Array3f(_jittered(gaussians.shape_rows(), values, ad.UInt64(streams)))
+        gaussians.means = ad.Array3f(_jittered(gaussians.shape_rows(), values, ad.UInt64(streams.tolist())))
 
     def refine(
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator, leniency: float = 1.0
