@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (KeyboardInterrupt, Exception) as error:
         if ending.is_interrupt(error):
             ending.tell(ending.stopped())
-            return ending.STOPPED_CODE
+            return ending.exit_code()
         if not isinstance(error, RuntimeError | OSError):
             raise
         logging.getLogger("spacesim").debug("traceback", exc_info=error)

@@ -15,7 +15,6 @@ from types import FrameType
 from spacesim.data.errors import WorkError
 
 STOPPED = "stopped"
-STOPPED_CODE = 130  #: of a process that Ctrl-C ended, as shells have it: 128 + SIGINT
 
 _SHOW_CURSOR = "\x1b[?25h\n"  # which a bar of progress hides (ECMA-48 private mode 25)
 _OWN = os.path.join(os.path.dirname(os.path.abspath(__file__)), "cli.py")
@@ -23,6 +22,7 @@ _OWN = os.path.join(os.path.dirname(os.path.abspath(__file__)), "cli.py")
 _is_command = os.path.basename(sys.argv[0]) in ("spacesim", "spacesim.exe") or os.path.abspath(sys.argv[0]) == _OWN
 _at_work = False
 _goes_on = ""
+_ended_by: int = signal.SIGINT
 
 
 @contextmanager
@@ -45,23 +45,32 @@ def working() -> Iterator[None]:
 
 @contextmanager
 def postponed() -> Iterator[Callable[[], bool]]:
-    """Around work that has something to save when Ctrl-C comes: the first is not raised but told by what is yielded, a
-    second one is raised. Where the process is not the command, Ctrl-C is raised as ever."""
+    """Around work that has something to save when Ctrl-C comes, or SIGTERM, by which batch systems and containers end
+    a process: the first is not raised but told by what is yielded, a second one ends the work as ever. Where the
+    process is not the command, both do what they always do."""
     asked = False
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
-    def ask(_signal: int, _frame: FrameType | None) -> None:
+    def ask(number: int, _frame: FrameType | None) -> None:
         nonlocal asked
         asked = True
-        signal.signal(signal.SIGINT, _interrupted)
+        global _ended_by
+        _ended_by = number
+        restore()
 
-    ours = signal.getsignal(signal.SIGINT) is _interrupted
-    if ours:
-        signal.signal(signal.SIGINT, ask)
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    if before[signal.SIGINT] is not _interrupted or before[signal.SIGTERM] is not signal.SIG_DFL:
+        before = {}
+    for number in before:
+        signal.signal(number, ask)
     try:
         yield lambda: asked
     finally:
-        if ours and signal.getsignal(signal.SIGINT) is ask:
-            signal.signal(signal.SIGINT, _interrupted)
+        if not asked:
+            restore()
 
 
 def resumed_by(words: str) -> None:
@@ -70,8 +79,13 @@ def resumed_by(words: str) -> None:
     _goes_on = words
 
 
+def exit_code() -> int:
+    """Exit code of a command that Ctrl-C has ended, or SIGTERM, as shells have it: 128 + the signal's number."""
+    return 128 + _ended_by
+
+
 def stopped() -> str:
-    """The sentence of a command that Ctrl-C has ended."""
+    """The sentence of such a command."""
     return f"{STOPPED}; what was finished is kept, {_goes_on} goes on from there" if _goes_on else STOPPED
 
 
@@ -112,7 +126,7 @@ def _interrupted(_signal: int, frame: FrameType | None) -> None:
     with suppress(OSError):
         cursor = _SHOW_CURSOR if os.isatty(2) else ""
         os.write(2, f"{cursor}spacesim: {stopped()}\n".encode())
-    os._exit(STOPPED_CODE)
+    os._exit(exit_code())
 
 
 def _imports(frame: FrameType | None) -> bool:

@@ -116,16 +116,18 @@ def test_an_unfinished_run_is_refused(spacesim, tiny_run, tiny_data, tmp_path):
 # --- Ctrl-C ----------------------------------------------------------------------------------------------------------
 
 
-def test_ctrl_c_during_training(spacesim, tiny_data, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_during_training(spacesim, tiny_data, tmp_path, number):
     arguments = ("train", tiny_data, "--out", tmp_path / "run", "--preset", "demo", "--init-count", 200)
     command = [sys.executable, "-m", "spacesim.cli", *map(str, arguments), "--iterations", "150"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     first = process.stderr.readline()
     assert PROGRESS.match(first), first
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     output, errors = process.communicate(timeout=60)
     stopped = outcome(process.returncode, output, errors)
-    assert stopped.code == 130, stopped
+    assert stopped.code == 128 + number, stopped
+    assert list((tmp_path / "run/checkpoints").iterdir())
     assert len(stopped.errors) == 1
     assert "--resume" in stopped.errors[0]
     done = spacesim(*arguments, "--iterations", 150, "--resume")
