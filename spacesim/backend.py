@@ -200,10 +200,8 @@ def _left_by_groups(root: Path) -> Iterator[int]:
             continue
         mount = root / "sys/fs/cgroup" / controllers
         most, used, dropped = first if controllers else second
-        for group in (
-            mount / path.strip("/"),
-            *(mount / path.strip("/")).parents,
-        ):  # in a container its own is the root
+        own = mount / path.strip("/")  # in a container that is the mount itself, whatever its path outside
+        for group in (own, *own.parents):
             if not group.is_relative_to(mount):
                 break
             try:

@@ -15,9 +15,7 @@ DIRECTIONS = 128  #: from which a point may be seen; on boxsat 64 find what 4096
 LIFT = 1e-4  #: of the box's diagonal: how far from the surface rays start
 LEAST_SHARE = 1e-3  #: of the area that must be visible; with less, sampling would go on for ever
 LOW_SHARE = 0.5  #: with less of it visible, whole pieces of the surface are looked for that are not
-HIDDEN = (
-    300  #: points of a piece, none of them visible, after which it has no more: misses 0.1 % of its area on average
-)
+HIDDEN = 300  #: points of a piece, none of them visible, after which none is drawn from it: chosen
 
 
 @dataclass(frozen=True, eq=False)
