@@ -33,7 +33,7 @@ from spacesim.splat.train.train import train
 SCENE = {"suns": 16, "views": 40, "test_suns": 8, "test_views": 5, "resolution": 256, "spp": 64}
 ROWS = ("thesis", "ours")
 SUNS = {"known": "known_suns", "unseen": "unseen_suns"}
-COLUMNS = (  # heading, group, metric
+COLUMNS = (  # heading, group, metric, and what of it if not the mean
     ("MAE", "image", "mae"),
     ("RMSE", "image", "rmse"),
     ("PSNR", "image", "psnr"),
@@ -44,6 +44,8 @@ COLUMNS = (  # heading, group, metric
     ("boundary MAE", "shadow", "boundary_mae"),
     ("sharpness", "shadow", "sharpness_ratio"),
     ("mask error", "shadow_mask", "error_rate"),
+    ("pooled", "shadow_mask", "error_rate", "pooled"),
+    ("facing away, pooled", "shadow_attached", "error_rate", "pooled"),
     ("balanced", "shadow_mask", "balanced_error_rate"),
     ("IoU", "shadow_mask", "iou"),
 )
@@ -172,9 +174,10 @@ def measure(name: str, config: TrainConfig, data: Path, out: Path) -> dict[str, 
 def row(name: str, metrics: dict[str, Any], part: str) -> common.Row:
     """Means over the frames of known or unseen Suns."""
     found: common.Row = {"method": name, "Gaussians": metrics["model"]["gaussians"]}
-    for heading, group, metric in COLUMNS:
+    for heading, group, metric, *what in COLUMNS:
         value = ((metrics.get(part) or {}).get(group) or {}).get(metric)
-        found[heading] = "" if value is None else f"{value['mean']:.{2 if metric == 'psnr' else 4}f}"
+        number = None if value is None else value[what[0] if what else "mean"]
+        found[heading] = "" if number is None else f"{number:.{2 if metric == 'psnr' else 4}f}"
     return found
 
 
