@@ -1,14 +1,16 @@
-"""Prints docs/shadows.md's table of raw shadows on a trained model: python tests/splat/shadow/against_truth.py RUN DATA
+"""Prints docs/shadows.md's tables of shadows on a trained model: python tests/splat/shadow/against_truth.py RUN DATA
 
 RUN: a trained run (`spacesim train`), DATA: a dataset of the same object under many Suns, of which those are judged
-that no training frame has, if there are such. Visibility is drawn, and judged where the truth is lit or in cast shadow
-and the model is there (alpha above 1/2); at least one half is lit.
+that no training frame has, if there are such. Visibility is drawn, and judged where the model is there (alpha above
+1/2); at least one half is lit. First raw shadows of many kinds; then, of a run with shadows, its own refined ones, and
+these as pictures show them, without what faces away (`--own`: these alone).
 """
 
 import argparse
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,14 +21,17 @@ from spacesim.eval.suns import known_suns
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import Pinhole
 from spacesim.splat.render import render
+from spacesim.splat.run import Run, load_run
 from spacesim.splat.shadow.cast import ShadowConfig, cast_shadows
 from spacesim.splat.shadow.mapping import MappingConfig
 from spacesim.splat.shadow.sunlight import light_rows
-from spacesim.splat.train.checkpoint import read_tensors
 from spacesim.splat.train.config import preset
 
 EDGES = (0, 5, 10, 20, 40, 90)  #: degrees of the Sun above the surface
 VIEWS = 3  #: of each Sun
+
+Visibility = Callable[[Frame], Any]
+"""Of each Gaussian in a frame, Float [N]."""
 
 
 def ways(size: int) -> dict[str, ShadowConfig]:
@@ -56,21 +61,40 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--own", action="store_true")
     options = parser.parse_args()
-    gaussians = Gaussians.from_numpy(read_tensors(options.run / "model.safetensors")[0])
-    dataset = read_dataset(options.data)
+    run, dataset = load_run(options.run), read_dataset(options.data)
     frames = unseen(dataset)
-    distance = max(float(np.linalg.norm(frame.camera.position)) for frame in dataset.train)
-    print(f"{gaussians.count} Gaussians, {len(frames)} frames")
+    print(f"{run.model.count} Gaussians, {len(frames)} frames")
     grazing = " | ".join(f"{low}–{high}°" for low, high in itertools.pairwise(EDGES))
-    print(f"| raw shadows | error | balanced | lit, but dark | cast, but lit | attached, but lit | dark at {grazing} |")
-    for name, config in ways(options.size).items():
-
-        def occlude(sun: np.ndarray, config: ShadowConfig = config) -> np.ndarray:
-            return np.array(cast_shadows(gaussians, light_rows(sun), config, distance).occlusion)
-
-        shares = judged(gaussians, dataset, frames, occlude)
+    classes = "lit, but dark | cast, but lit | attached, but lit | all of the model"
+    print(f"| shadows | error | balanced | {classes} | dark at {grazing} |")
+    raw = () if options.own else raw_shadows(run.model, dataset, options.size)
+    for name, visibility in itertools.chain(raw, own_shadows(run)):
+        shares = judged(run.model, dataset, frames, visibility)
         print(f"| {name} | {' | '.join(f'{100 * share:.1f}' for share in shares)} |", flush=True)
+
+
+def raw_shadows(gaussians: Gaussians, dataset: Dataset, size: int) -> Iterator[tuple[str, Visibility]]:
+    distance = max(float(np.linalg.norm(frame.camera.position)) for frame in dataset.train)
+    for name, config in ways(size).items():
+        known: dict[tuple[float, ...], Any] = {}
+
+        def visibility(frame: Frame, config: ShadowConfig = config, known: dict = known) -> Any:
+            sun = tuple(frame.sun.direction)
+            if sun not in known:
+                known[sun] = 1 - cast_shadows(gaussians, light_rows(sun), config, distance).occlusion
+            return known[sun]
+
+        yield name, visibility
+
+
+def own_shadows(run: Run) -> Iterator[tuple[str, Visibility]]:
+    light = run.light
+    if light is None or light.config.shadow is None:
+        return
+    yield "refined", lambda frame: light.visibility(run.model, frame.sun.direction, adaptive=True)
+    yield "shown", lambda frame: light.lit(run.model, Pinhole.of(frame.camera), frame.sun.direction, adaptive=True)[1]
 
 
 def unseen(dataset: Dataset) -> list[Frame]:
@@ -83,19 +107,14 @@ def unseen(dataset: Dataset) -> list[Frame]:
     return [frame for of_sun in found.values() for frame in of_sun[:VIEWS]]
 
 
-def judged(
-    gaussians: Gaussians, dataset: Dataset, frames: Sequence[Frame], occlude: Callable[[np.ndarray], np.ndarray]
-) -> list[float]:
-    """Error rate, balanced error rate, share of lit pixels that are dark, of those in cast and in attached shadow that
-    are lit; then the share of lit pixels that are dark, by the Sun's elevation over the surface (`EDGES`)."""
-    known: dict[tuple[float, ...], np.ndarray] = {}
+def judged(gaussians: Gaussians, dataset: Dataset, frames: Sequence[Frame], visibility: Visibility) -> list[float]:
+    """Of lit and cast-shadow pixels the error rate and the balanced one; share of lit pixels that are dark, of those in
+    cast and in attached shadow that are lit, of all that are wrong; then the share of lit pixels that are dark, by the
+    Sun's elevation over the surface (`EDGES`)."""
     counts, attached = np.zeros((len(EDGES) - 1, 4)), np.zeros(2)
     for frame in frames:
         truth = load_truth(dataset, frame)
-        sun = tuple(frame.sun.direction)
-        if sun not in known:
-            known[sun] = occlude(np.array(sun))
-        seen = render(gaussians, Pinhole.of(frame.camera), outputs=("alpha",), features=[1 - ad.Float(known[sun])])
+        seen = render(gaussians, Pinhole.of(frame.camera), outputs=("alpha",), features=[ad.Float(visibility(frame))])
         alpha = seen.image("alpha")
         bright = seen.image("features")[..., 0] >= 0.5 * alpha
         lit = (truth.shadow == SHADOW_LIT) & (alpha > 0.5)
@@ -109,7 +128,8 @@ def judged(
     lit, lit_dark, cast, cast_lit = counts.sum(axis=0)
     dark, leaks = lit_dark / lit, cast_lit / cast
     error, through = (lit_dark + cast_lit) / (lit + cast), attached[1] / attached[0]
-    return [error, (dark + leaks) / 2, dark, leaks, through, *(counts[:, 1] / counts[:, 0])]
+    wrong = (lit_dark + cast_lit + attached[1]) / (lit + cast + attached[0])
+    return [error, (dark + leaks) / 2, dark, leaks, through, wrong, *(counts[:, 1] / counts[:, 0])]
 
 
 if __name__ == "__main__":
