@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from spacesim.data.errors import InputError
+from spacesim.data.identity import training_digest
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import read_dataset
 
@@ -58,10 +59,8 @@ def rounded_angles(frame: Frame) -> list[float] | None:
 
 def _digest(dataset: Dataset) -> str | None:
     """As training has told it; None where pictures of it are missing."""
-    from spacesim.splat.train.train import digest
-
     try:
-        return digest(dataset)
+        return training_digest(dataset)
     except OSError:
         return None
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from spacesim.data.geometry import look_at
+from spacesim.data.identity import training_digest
 from spacesim.data.images import read_png, write_png
 from spacesim.data.records import Camera, Frame, Sun
 from spacesim.data.store import read_dataset
 from spacesim.eval import grazing, relight
 from spacesim.eval.suns import count_suns, known_suns, trained_on
-from spacesim.splat.train.train import digest
 
 FAR = Camera.from_fov(look_at([10.0, 0, 0], [0, 0, 0]), 16, 12, 30)
 """Looks along -x."""
@@ -56,7 +56,7 @@ def lit_by(root, *suns):
 
 def test_known_suns_are_those_of_the_runs_own_data(tmp_path):
     own, other = lit_by(tmp_path / "own", (30, 20)), lit_by(tmp_path / "other", (200, -40))
-    config = {"data": {"path": str(own.root.resolve()), "digest": digest(own)}}
+    config = {"data": {"path": str(own.root.resolve()), "digest": training_digest(own)}}
 
     def known(dataset):
         trained, why = trained_on(config, dataset)

@@ -1,6 +1,5 @@
 """`train`: a dataset and a configuration to a run on disk, resumable at any time."""
 
-import hashlib
 import logging
 import os
 import platform
@@ -18,8 +17,9 @@ import spacesim
 from spacesim import backend, ending
 from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, read_json, remove_leftovers, write_json
+from spacesim.data.identity import training_digest
 from spacesim.data.lock import locked
-from spacesim.data.records import Dataset, Frame
+from spacesim.data.records import Dataset
 from spacesim.data.tone import development
 from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.checkpoint import write_tensors
@@ -135,25 +135,10 @@ def _identity(dataset: Dataset) -> dict[str, Any]:
     """What a run remembers of its data: enough to find it again and to notice another one in its place."""
     return {
         "path": str(dataset.root.resolve()),
-        "digest": digest(dataset),
+        "digest": training_digest(dataset),
         "train_frames": len(dataset.train),
         "test_frames": len(dataset.test),
     }
-
-
-def digest(dataset: Dataset) -> str:
-    """Of the training frames: names and sizes of the files, poses, intrinsics, lenses, Suns."""
-    told = [
-        (f.file_path, (dataset.root / f.file_path).stat().st_size, _numbers(f), f.sun and f.sun.angles)
-        for f in dataset.train
-    ]
-    return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
-
-
-def _numbers(frame: Frame) -> list[float]:
-    camera = frame.camera
-    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
-    return [*camera.opengl.ravel().tolist(), *intrinsics, *frame.distortion]
 
 
 def _check_resumable(out: Path, described: dict[str, Any], resume: bool) -> None:
