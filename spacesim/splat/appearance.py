@@ -103,7 +103,7 @@ def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
     length2 = dr.squared_norm(normals)
     known = dr.detach(length2) > 1e-12
     unit = dr.select(known, normals, ad.Array3f(0, 0, 1)) * dr.rsqrt(dr.select(known, length2, 1))
-    seen = dr.select(dr.detach(dr.dot(unit, direction)) > 0, -unit, unit)
+    seen = _seen(unit, direction)
     half = sun - direction
     half2 = dr.squared_norm(half)
     half *= dr.select(half2 > 1e-12, dr.rsqrt(dr.maximum(half2, 1e-12)), 0)
@@ -118,8 +118,13 @@ def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
 def _faces(lambert: Any, inputs: FieldInputs, lanes: Lanes) -> Any:
     """Of n . s of the learned normals."""
     axis = shortest_axis(*(lanes.spread(dr.detach(turn)) for turn in inputs.turns))
-    towards, away = dr.dot(axis, inputs.sun), dr.dot(axis, inputs.camera.directions_to(lanes.spread(inputs.means)))
-    return dr.clip(1 + dr.maximum(lambert, dr.select(away > 0, -towards, towards)) / TURNED, 0, 1)
+    axis = _seen(axis, inputs.camera.directions_to(lanes.spread(inputs.means)))
+    return dr.clip(1 + dr.maximum(lambert, dr.dot(axis, inputs.sun)) / TURNED, 0, 1)
+
+
+def _seen(normals: Any, direction: Any) -> Any:
+    """Normals of the side that is seen. direction: from the camera"""
+    return dr.select(dr.detach(dr.dot(normals, direction)) > 0, -normals, normals)
 
 
 def _normals(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:

@@ -227,8 +227,8 @@ class LightModel:
         kept = self._kept_of(gaussians.features, lanes)
         of_field, _ = _split(self.config, self.weights)
         seen = [] if visibility is None else [visibility]
-        *colours, shown = [*_lit(self.config, of_field, inputs, lanes, kept.known, kept.packed, seen), None][:4]
-        return colours, shown
+        shown = _lit(self.config, of_field, inputs, lanes, kept.known, kept.packed, seen)
+        return shown[:3], shown[3] if seen else None
 
     def adjoint(self, shading: Shading, by_colour: list[Any], by_visibility: Any = None) -> "LightGradients":
         """From the gradients of the dimmed colours (3 arrays [N]) and, where visibility is seen on its own, of the

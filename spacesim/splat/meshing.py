@@ -143,8 +143,10 @@ def depth_of(model: Gaussians, camera: Camera, kind: str = "surface", antialiase
         depth = blended.planes[0] * dr.rcp(dr.maximum(alpha, OPAQUE))
     else:
         index = median_splat(splats, blended.lists, seen.width, seen.height)
-        surface = kind == "surface"
-        depth = surface_depth(model, splats, index, seen, model.count) if surface else picked(splats.depth, index)
+        if kind == "surface":
+            depth = surface_depth(model, splats, index, seen, model.count)
+        else:
+            depth = picked(splats.depth, index)
     depth = dr.select((alpha >= OPAQUE) & dr.isfinite(depth) & (depth > 0), depth, 0)
     return np.array(depth, np.float32).reshape(camera.height, camera.width)
 
