@@ -52,11 +52,13 @@ def judge_objects(
 def other_order(run: object, dataset: Dataset) -> list[int]:
     """Numbers of the objects that a scene's models stand nearest to, in the models' order, where that is not the
     objects' own: each model is judged as another one then. [] of a run, where all is in order, or cannot be told."""
+    if not isinstance(run, ComposedRun):
+        return []
     try:
-        targets = targets_of(dataset) if isinstance(run, ComposedRun) else []
+        targets = targets_of(dataset)
     except InputError:
         return []
-    if len(targets) < 2 or not isinstance(run, ComposedRun) or len(run.names) != len(targets):
+    if len(targets) < 2 or len(run.names) != len(targets):
         return []
     bounds = [(target.vertices.min(axis=0), target.vertices.max(axis=0)) for target in targets]
     middles = [t.world_from_object[:3] @ [*(0.5 * (a + b)), 1] for t, (a, b) in zip(targets, bounds, strict=True)]

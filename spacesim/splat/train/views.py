@@ -64,9 +64,9 @@ class TrainingViews:
         largest = 4 * self.most_pixels * (1 + sum(3 if name == "normal" else 1 for name in truth))
         self._empty: set[int] = set()  # views that have been told to show nothing
         self._order = lru_cache(maxsize=1)(self._shuffle)
-        cached, uploaded = kept_bytes()
-        self._cached = lru_cache(maxsize=max(1, cached // largest))(self._load)
-        self._uploaded = lru_cache(maxsize=max(1, uploaded // largest))(self._upload)
+        in_memory, on_device = kept_bytes()
+        self._cached = lru_cache(maxsize=max(1, in_memory // largest))(self._load)
+        self._uploaded = lru_cache(maxsize=max(1, on_device // largest))(self._upload)
 
     def __len__(self) -> int:
         return len(self.dataset.train)
