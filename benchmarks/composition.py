@@ -152,7 +152,7 @@ def make_pair(out: Path, resolution: int, views: int) -> Path:
     """Both boxsats under one Sun."""
     from spacesim.scenes import generate, read_scene
 
-    size = {"views": 1, "test_suns": 0, "test_views": views, "resolution": resolution, "spp": 64}
+    size = {"views": 1, "test_suns": 0, "test_views": views, "resolution": resolution, "test_spp": 1024}
     with reporting("generate the pair", "frames") as report:
         generate(read_scene("boxsat-pair", sun=[SUN], **size), out, resume=True, progress=report)
     return out

@@ -30,7 +30,7 @@ from spacesim.splat.shadow.mapping import SUN_RADIUS_DEG, MappingConfig
 from spacesim.splat.train.config import TrainConfig, preset, with_field, with_options
 from spacesim.splat.train.train import train
 
-SCENE = {"suns": 16, "views": 40, "test_suns": 8, "test_views": 5, "resolution": 256, "spp": 64}
+SCENE = {"suns": 16, "views": 40, "test_suns": 8, "test_views": 5, "resolution": 256, "spp": 64, "test_spp": 1024}
 ROWS = ("thesis", "ours")
 SUNS = {"known": "known_suns", "unseen": "unseen_suns"}
 COLUMNS = (  # heading, group, metric, and what of it if not the mean

@@ -46,7 +46,7 @@ from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 from spacesim.splat.train.warm_start import WarmStartConfig
 
-SCENE = {"views": 40, "test_suns": 0, "test_views": 5, "spp": 64}
+SCENE = {"views": 40, "test_suns": 0, "test_views": 5, "spp": 64, "test_spp": 1024}
 KINDS = ("thesis", "field", "ours", "start", "figure")
 BOX = 10.0  #: sizes of the object
 NEVER = 10**9

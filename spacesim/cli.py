@@ -85,7 +85,7 @@ def _demo(options: argparse.Namespace) -> None:
 
 _SCENE_OPTIONS = (
     *("suns", "views", "test_suns", "test_views", "known_test_views", "shared_test_views", "sun", "distance"),
-    *("resolution", "exposure", "spp", "seed", "units", "up"),
+    *("resolution", "exposure", "spp", "test_spp", "seed", "units", "up"),
 )
 
 

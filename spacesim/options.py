@@ -78,6 +78,7 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--fov", type=float, metavar="DEG", help="angle that the image's width covers")
     one.add_argument("--exposure", type=float, metavar="X", help="display value of a radiance of 1 W/m2/sr")
     one.add_argument("--spp", type=int, metavar="N", help="samples a pixel")
+    one.add_argument("--test-spp", type=int, metavar="N", help="of test views (four times as many)")
     one.add_argument("--seed", type=int, metavar="N")
     one.add_argument("--units", metavar="UNIT", help="of a mesh file: m (default), cm, mm, km, in or ft")
     one.add_argument("--up", metavar="AXIS", help="of a mesh file: x, y or z (default: the format's own)")

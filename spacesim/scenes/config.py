@@ -89,18 +89,27 @@ class MaterialConfig:
 
 @dataclass(frozen=True)
 class QualityConfig:
-    """spp: samples a pixel; max_depth: longest light path in edges, 2 is direct light alone; points: surface samples in
+    """spp: samples a pixel; test_spp: of test views, whose noise counts as an error of whatever is judged by them, None
+    for four times as many; max_depth: longest light path in edges, 2 is direct light alone; points: surface samples in
     points.ply. Raises InputError for a value out of range; the upper limits are chosen."""
 
     spp: int = 64
+    test_spp: int | None = None
     max_depth: int = 6
     points: int = 20_000
 
     def __post_init__(self) -> None:
-        limits = {"spp": (1, 1_000_000), "max_depth": (2, 1000), "points": (1, 10_000_000)}
+        samples = (1, 1_000_000)
+        limits = {"spp": samples, "test_spp": samples, "max_depth": (2, 1000), "points": (1, 10_000_000)}
         for name, (lowest, highest) in limits.items():
-            expect(getattr(self, name) >= lowest, name, f"at least {lowest}", getattr(self, name))
-            expect(getattr(self, name) <= highest, name, f"at most {highest:,}", getattr(self, name))
+            value = getattr(self, name)
+            expect(value is None or value >= lowest, name, f"at least {lowest}", value)
+            expect(value is None or value <= highest, name, f"at most {highest:,}", value)
+
+    @property
+    def judged_spp(self) -> int:
+        """Samples a pixel of test views."""
+        return self.test_spp or 4 * self.spp
 
 
 @dataclass(frozen=True)

@@ -47,15 +47,15 @@ def samples(shots: Sequence[Shot]) -> list[Shot]:
     return [shots[i * len(shots) // count] for i in range(count)]
 
 
-def measure(maker: FrameMaker, shots: Sequence[Shot], left: int, root: Path) -> Estimate:
-    """Make `shots` and reckon from them what `left` frames in `root` take."""
+def measure(maker: FrameMaker, shots: Sequence[Shot], left: Sequence[Shot], root: Path) -> Estimate:
+    """Make `shots` and reckon from them what those that are `left` in `root` take: time by samples, disk by frames."""
     list(maker.make(shots[:1]))
     start = time.monotonic()
     list(maker.make(shots[1:]))
-    seconds = (time.monotonic() - start) / max(1, len(shots) - 1)
+    seconds = (time.monotonic() - start) / max(1, sum(shot.spp for shot in shots[1:]))
     stored = sum(_stored(path) for shot in shots for path in maker.root.glob(f"*/{shot.name}*"))
     free = shutil.disk_usage(existing_parent(root)).free
-    return Estimate(left, left * seconds, left * stored // len(shots), free)
+    return Estimate(len(left), seconds * sum(shot.spp for shot in left), len(left) * stored // len(shots), free)
 
 
 def _stored(path: Path) -> int:

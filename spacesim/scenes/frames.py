@@ -28,12 +28,14 @@ BYTES_A_PIXEL = 72
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One frame to render. index: among all frames of the dataset, it makes the noise; name: e.g. "train_00012"."""
+    """One frame to render. index: among all frames of the dataset, it makes the noise; name: e.g. "train_00012";
+    spp: samples a pixel."""
 
     index: int
     name: str
     camera: Camera
     sun: Sun
+    spp: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +104,7 @@ class FrameMaker:
                         continue
                     while waiting and (waiting[0].done() or len(waiting) >= self._most):
                         yield waiting.popleft().result()
-                    truth = self._renderer.render(shot.camera, shot.sun, (self._job.seed, shot.index))
+                    truth = self._renderer.render(shot.camera, shot.sun, (self._job.seed, shot.index), shot.spp)
                     waiting.append(pool.submit(self._write, shot, truth))
                 while waiting:
                     yield waiting.popleft().result()

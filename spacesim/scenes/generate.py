@@ -104,7 +104,7 @@ def estimate(config: SceneConfig, out: Path) -> Estimate:
     left = [shot for shot in sweep.shots if not there.has(shot.name)]
     with TemporaryDirectory(prefix="spacesim-") as folder:
         maker = FrameMaker(replace(sweep.job, root=Path(folder)), sweep.renderer)
-        return measure(maker, samples(left or sweep.shots), len(left), there.root)
+        return measure(maker, samples(left or sweep.shots), left, there.root)
 
 
 @contextmanager
@@ -128,7 +128,7 @@ def _made(make: Crew, job: Job, shots: Sequence[Shot], renderer: Renderer) -> It
     names: set[str] = set()
     if len(shots) > LONG:
         first = samples(shots)
-        found = measure(FrameMaker(job, renderer), first, len(shots), job.root)
+        found = measure(FrameMaker(job, renderer), first, shots, job.root)
         _log.info("generate: %s", found)
         found.check(job.root)
         names = {shot.name for shot in first}
@@ -144,7 +144,8 @@ class _Sweep:
         self.train, self.test = plan_views(self.scene, config)
         quality = config.quality
         self.renderer = Renderer(self.scene, quality.spp, quality.max_depth, config.camera.distortion)
-        self.shots = [Shot(i, name, view.camera, view.sun) for i, (name, view) in enumerate(self.train + self.test)]
+        views = [(quality.spp, *one) for one in self.train] + [(quality.judged_spp, *one) for one in self.test]
+        self.shots = [Shot(i, name, view.camera, view.sun, spp) for i, (spp, name, view) in enumerate(views)]
         self.job = Job(self.scene, config.camera, quality, config.seed, Path(), writing_threads(1))
         inside = self.renderer.inside(np.stack([shot.camera.position for shot in self.shots]))
         if inside.any():
@@ -171,6 +172,7 @@ def describe(scene: Scene, config: SceneConfig, train: Named, test: Named) -> di
         "exposure": config.camera.exposure,
         "seed": config.seed,
         "spp": config.quality.spp,
+        "test_spp": config.quality.judged_spp,
         "config": config.to_json(),
         "backend": backend.select(),
         "versions": versions(),

@@ -38,8 +38,8 @@ _DIRECTIONS = fibonacci_sphere(64)
 class Renderer:
     """A scene loaded once, from which frames are rendered under any Sun.
 
-    spp: samples a pixel; max_depth: longest path in edges from camera to source (2 is direct light only);
-    distortion: Brown-Conrady k1, k2, p1, p2, k3 of the lens, () none.
+    spp: samples a pixel, where a frame does not say; max_depth: longest path in edges from camera to source (2 is
+    direct light only); distortion: Brown-Conrady k1, k2, p1, p2, k3 of the lens, () none.
     """
 
     def __init__(self, scene: Scene, spp: int, max_depth: int = 6, distortion: Sequence[float] = ()) -> None:
@@ -53,25 +53,27 @@ class Renderer:
         self._labeller = Labeller(scene, self._loaded, distortion)
         self._sums = replayed(self._trace_paths)
 
-    def render(self, camera: Camera, sun: Sun, seed: Sequence[int]) -> Truth:
-        """What `camera` sees under `sun`; `seed` makes the noise."""
+    def render(self, camera: Camera, sun: Sun, seed: Sequence[int], spp: int | None = None) -> Truth:
+        """What `camera` sees under `sun` by `spp` samples a pixel; `seed` makes the noise."""
+        spp = spp or self.spp
         self._loaded.point(sun)
-        sunlight = self._launched(self._loaded.sunlit, camera, seed)
-        earthlight = self._launched(self._loaded.earthlit, camera, (*seed, _EARTH)) if self._loaded.earthlit else None
+        sunlight = self._launched(self._loaded.sunlit, camera, seed, spp)
+        earthlit = self._loaded.earthlit
+        earthlight = self._launched(earthlit, camera, (*seed, _EARTH), spp) if earthlit else None
         labels = self._labeller.labels(camera, sun)  # while the device traces paths
-        radiance, alpha = self._means(sunlight, camera)
+        radiance, alpha = _means(sunlight, camera, spp)
         if earthlight is None:
             return Truth(radiance=radiance, alpha=alpha, **labels)
-        earth, _ = self._means(earthlight, camera)
+        earth, _ = _means(earthlight, camera, spp)
         return Truth(radiance=radiance + earth, alpha=alpha, **labels, radiance_earth=earth)
 
     def radiance(self, camera: Camera, sun: Sun, seed: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """(radiance [H, W, 3] from all sources, alpha [H, W]) of what `render` returns, without the labels."""
         self._loaded.point(sun)
-        radiance, alpha = self._means(self._launched(self._loaded.sunlit, camera, seed), camera)
+        radiance, alpha = _means(self._launched(self._loaded.sunlit, camera, seed, self.spp), camera, self.spp)
         if self._loaded.earthlit is not None:
-            earth = self._launched(self._loaded.earthlit, camera, (*seed, _EARTH))
-            radiance = radiance + self._means(earth, camera)[0]
+            earth = self._launched(self._loaded.earthlit, camera, (*seed, _EARTH), self.spp)
+            radiance = radiance + _means(earth, camera, self.spp)[0]
         return radiance, alpha
 
     def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
@@ -79,22 +81,16 @@ class Renderer:
         self._loaded.point(sun)
         return self._labeller.labels(camera, sun)
 
-    def _launched(self, scene: Any, camera: Camera, seed: Sequence[int]) -> list[Any]:
+    def _launched(self, scene: Any, camera: Camera, seed: Sequence[int], spp: int) -> list[Any]:
         """Sums over samples, as `_trace_paths` returns them, of each pass; the device may still be at work on them."""
         uint, view = backend.mitsuba().UInt32, View.of(camera, self._loaded.units)
-        passes = min(self.spp, -(-self.spp * view.width * view.height // MAX_WAVEFRONT))
+        passes = min(spp, -(-spp * view.width * view.height // MAX_WAVEFRONT))
         seeds = [dr.opaque(uint, int(state)) for state in np.random.SeedSequence(seed).generate_state(passes)]
-        firsts = [self.spp * i // passes for i in range(passes + 1)]
+        firsts = [spp * i // passes for i in range(passes + 1)]
         return [
             self._sums(scene, view, _Noise(seeds[i], seeds[0], dr.opaque(uint, firsts[i])), firsts[i + 1] - firsts[i])
             for i in range(passes)
         ]
-
-    def _means(self, sums: Sequence[Any], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Radiance from one source [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
-        total: np.ndarray = sum(values.numpy() for values in sums) / np.float32(self.spp)
-        shape = camera.height, camera.width
-        return total[: -math.prod(shape)].reshape(*shape, 3), total[-math.prod(shape) :].reshape(shape)
 
     def _trace_paths(self, scene: Any, view: View, noise: "_Noise", spp: int) -> Any:
         """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]."""
@@ -146,6 +142,13 @@ class _Noise:
     sampler: Any
     shift: Any
     first: Any
+
+
+def _means(sums: Sequence[Any], camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance from one source [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
+    total: np.ndarray = sum(values.numpy() for values in sums) / np.float32(spp)
+    shape = camera.height, camera.width
+    return total[: -math.prod(shape)].reshape(*shape, 3), total[-math.prod(shape) :].reshape(shape)
 
 
 def _pixel_offsets(pixel: Any, sample: Any, seed: Any) -> Any:
