@@ -45,11 +45,8 @@ def test_dataset_is_whole(made):
 def test_test_views_have_four_times_the_samples_unless_told_otherwise(made, tmp_path):
     cleaner = tmp_path / "cleaner"
     generate(boxsat(spp=16, test_spp=16), cleaner)
-    same = [
-        (made / path).read_bytes() == (cleaner / path).read_bytes()
-        for path in ("gt/test_00000.exr", "gt/test_00001.exr")
-    ]
-    assert all(same)
+    for name in ("gt/test_00000.exr", "gt/test_00001.exr"):
+        assert (made / name).read_bytes() == (cleaner / name).read_bytes()
     assert (made / "gt/train_00000.exr").read_bytes() != (cleaner / "gt/train_00000.exr").read_bytes()
     scene = json.loads((made / "scene.json").read_text())
     assert (scene["spp"], scene["test_spp"]) == (4, 16)
