@@ -19,6 +19,7 @@ import numpy as np
 from spacesim import backend
 from spacesim.backend import BackendError
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.files import write_bytes
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera
 
@@ -235,10 +236,10 @@ def emit(report: dict[str, Any], tables: Mapping[str, Sequence[Row]], options: a
     if options.json is not None and str(options.json) == "-":
         print(text)
         return
-    if options.json is not None:
-        options.json.write_text(text + "\n")
     facts = ", ".join(f"{key} {value}" for key, value in report["machine"].items())
     print(f"`{report['command']}`\n\n{facts}" if options.markdown else f"{report['command']}\n{facts}")
     for title, rows in tables.items():
         if rows:
             print(f"\n{title}\n\n{table(rows, options.markdown)}")
+    if options.json is not None:  # last: what was measured is on the screen where a file cannot be written
+        write_bytes(options.json, f"{text}\n".encode())

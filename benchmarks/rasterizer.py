@@ -20,6 +20,7 @@ import growth
 from pipeline import Pipeline, arguments_of
 
 from spacesim import backend
+from spacesim.data.files import write_bytes
 
 STAGES = ("project", "bin", "forward", "backward", "frame")
 DIRECTION = 4, 1, 1  #: of the camera from the sphere
@@ -50,9 +51,9 @@ def main() -> None:
         points = [growth.Point(r["gaussians"], r["pixels"], r["pairs"], r["least kernels"]) for r in results]
         report["growth"] = growth.summary(points)
         tables["Growth of the kernels (project + bin + forward + backward, the least of several)"] = [report["growth"]]
-        if options.plot:
-            options.plot.write_text(growth.plot("project + bin + forward + backward, kernels", points))
     common.emit(report, tables, options)
+    if options.plot:
+        write_bytes(options.plot, growth.plot("project + bin + forward + backward, kernels", points).encode())
 
 
 def load_peer(wanted: str | None, name: str) -> Any:

@@ -31,6 +31,7 @@ from rasterizer import load_peer
 from synthetic import NEVER, STILL, still_trainer, write_dataset
 
 from spacesim import backend
+from spacesim.data.files import write_bytes
 from spacesim.data.images import load_image
 
 MEMORY_SIZES = "16384x64,16385x64,20000x64,21846x64,30000x64,32769x64,43691x64,65537x64,87382x64,131073x64,200000x64"
@@ -79,9 +80,9 @@ def main() -> None:
         points = [growth.Point(r["gaussians"], r["pixels"], r["pairs"], r["clock"]["spacesim"].least) for r in results]
         report["growth"] = growth.summary(points)
         tables["Growth of the step on the clock, the least of several"] = [report["growth"]]
-        if options.plot:
-            options.plot.write_text(growth.plot("training step on the clock", points))
     common.emit(report, tables, options)
+    if options.plot:
+        write_bytes(options.plot, growth.plot("training step on the clock", points).encode())
 
 
 def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:

@@ -117,6 +117,21 @@ def test_what_cannot_be_measured_is_refused(arguments, sentence, monkeypatch, ca
     assert sentence in capsys.readouterr().err + str(ended.value)
 
 
+def test_what_was_measured_is_told_before_a_file_that_cannot_be_written(tmp_path, monkeypatch, capsys):
+    import common
+    import rasterizer
+
+    (tmp_path / "file").write_text("")
+    for option in ("--json", "--plot"):
+        where = str(tmp_path / "file" / "x")
+        monkeypatch.setattr(sys, "argv", ["rasterizer.py", "--sizes", "100x16", "--repeats", "1", option, where])
+        with pytest.raises(SystemExit, match="2"):
+            common.told(rasterizer.main)
+        told = capsys.readouterr()
+        assert "Kernels, ms" in told.out
+        assert f"{where}: cannot be written" in told.err
+
+
 def test_opensplat_is_timed_without_its_start(tmp_path):
     """A program that needs half a second to start and 5 ms a step."""
     import peer_opensplat
