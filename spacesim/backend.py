@@ -8,12 +8,14 @@ whole process: so the package, when it is imported, has `name_llvm` put a good o
 import ctypes
 import gc
 import importlib
+import itertools
 import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,7 +23,9 @@ from weakref import WeakSet
 
 NAMES = ("auto", "cuda", "llvm")
 _PLAIN = frozenset((int, float, bool, str, type(None)))
+_EQUAL_TO_INTEGERS = frozenset((float, bool))  # 1, 1.0 and True are one key of a dictionary, 0.0 and -0.0 too
 MINIMUM_LLVM = 19
+MOST_KEYS = 2**14  # that are remembered of what is not an array, chosen
 INSTALL_LLVM = "sudo apt-get install libllvm19"
 INSTALL_ATOMIC = "sudo apt-get install libatomic1"
 
@@ -38,6 +42,7 @@ _LIBRARY_PLACES = (
 
 _selected: str | None = None
 _recorded: WeakSet[Any] = WeakSet()
+_constants: dict[int, tuple[Any, Any]] = {}  # frozen dataclasses without arrays, by `id`: what `_split` told of them
 _leaves: set[type] = set()  # types of arguments that Dr.Jit is left to look into
 
 
@@ -225,7 +230,7 @@ def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
 
     At most `limit` recordings are kept. Arguments may be arrays, numbers and texts, and tuples, lists, dicts and
     dataclasses of them. Dr.Jit 1.5 takes long to walk through these, knows an argument that occurs twice in a call by
-    identity, and takes f(1, 2, 1) for f(1, 2, 2): it gets a flat list of the arrays and one text of all the rest. No
+    identity, and takes f(1, 2, 1) for f(1, 2, 2): it gets a flat list of the arrays and one text for all the rest. No
     array may stand in two places. What Dr.Jit's LLVM backend makes of a numpy array is numpy's own memory, whose
     kernels and recordings differ by whether it happens to begin at a multiple of 64 bytes: make arguments of lists, or
     copy them (`gaussians.uploaded`). Python's garbage collector waits during a call: arrays that it frees in the
@@ -233,7 +238,7 @@ def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
     """
     import drjit as dr
 
-    now = _Arguments()
+    now, names = _Arguments(), _Names()
     frozen = dr.freeze(
         lambda _, arrays: function(*_joined(now.arguments, iter(arrays))),
         limit=limit,
@@ -243,12 +248,12 @@ def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
 
     def call(*arguments: Any) -> Any:
         arrays: list[Any] = []
-        told = repr(_split(arguments, arrays))
+        name = names[_split(arguments, arrays)]
         now.arguments = arguments
         collecting = gc.isenabled()
         gc.disable()
         try:
-            return frozen(told, arrays)
+            return frozen(name, arrays)
         finally:
             now.arguments = ()
             if collecting:
@@ -263,9 +268,28 @@ class _Arguments:
     arguments: tuple[Any, ...] = ()
 
 
+class _Names(dict[Any, str]):
+    """A text for each value of `_split`, short and never given twice; the values that came are forgotten when they are
+    very many."""
+
+    def __init__(self) -> None:
+        self._numbers = itertools.count()
+
+    def __missing__(self, told: Any) -> str:
+        if len(self) >= MOST_KEYS:
+            self.clear()
+        name = self[told] = str(next(self._numbers))
+        return name
+
+
+_names_of_constants = _Names()
+
+
 def _split(value: Any, arrays: list[Any]) -> Any:
-    """All of `value` that is no array, to be told by `repr`; its arrays are added to a list."""
+    """All of `value` that is no array, as a key of dictionaries; its arrays are added to a list."""
     kind = type(value)
+    if kind in _EQUAL_TO_INTEGERS:
+        return kind, repr(value)
     if kind in _PLAIN:
         return value
     if kind is list and _leaves.issuperset(map(type, value)):
@@ -276,25 +300,37 @@ def _split(value: Any, arrays: list[Any]) -> Any:
         new = kind is list and all(part is ... for part in told)  # of a type that is in `_leaves` from now on
         return kind, len(told) if new else told
     if kind is dict:
-        return kind, list(value), _split_each(value.values(), arrays)
-    names = _names(kind)  # type: ignore[arg-type]
-    if names is not None:
-        return kind, _split_each([getattr(value, name) for name in names], arrays)
+        return kind, tuple(value), _split_each(value.values(), arrays)
+    known = _constants.get(id(value))
+    if known is not None:
+        return known[1]
+    fields_of = _fields(kind)  # type: ignore[arg-type]
+    if fields_of is not None:
+        before = len(arrays)
+        told = _split_each(fields_of(value), arrays)
+        if len(arrays) > before or not kind.__dataclass_params__.frozen:
+            return kind, told
+        if len(_constants) >= MOST_KEYS:
+            _constants.clear()
+        _constants[id(value)] = value, (kind, _names_of_constants[told])
+        return _constants[id(value)][1]
     _leaves.add(kind)
     arrays.append(value)
     return ...
 
 
-def _split_each(values: Iterable[Any], arrays: list[Any]) -> list[Any]:
+def _split_each(values: Iterable[Any], arrays: list[Any]) -> tuple[Any, ...]:
     told = []
     for value in values:
         kind = type(value)
         if kind in _leaves:  # as most are
             arrays.append(value)
             told.append(...)
+        elif kind is int:
+            told.append(value)
         else:
-            told.append(value if kind in _PLAIN else _split(value, arrays))
-    return told
+            told.append(_split(value, arrays))
+    return tuple(told)
 
 
 def _joined(value: Any, arrays: Iterator[Any]) -> Any:
@@ -316,9 +352,20 @@ def _joined(value: Any, arrays: Iterator[Any]) -> Any:
 
 
 @cache
-def _names(kind: type) -> tuple[str, ...] | None:
+def _names(kind: Any) -> tuple[str, ...] | None:
     """Of a dataclass's fields; None for any other type."""
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else None
+
+
+@cache
+def _fields(kind: Any) -> Callable[[Any], tuple[Any, ...]] | None:
+    """Takes the values of all fields of a dataclass; None for any other type."""
+    names = _names(kind)
+    if not names:
+        return None if names is None else lambda _: ()
+    if len(names) > 1:
+        return attrgetter(*names)
+    return lambda value: (getattr(value, names[0]),)
 
 
 def recordings() -> int:

@@ -42,7 +42,7 @@ def forward(
 
     adjoint: keep what the backend's fastest `backward` reads; it costs memory, and can do without.
     """
-    run = _forward if width * height > 1 else _trace_forward  # a recording gives a plane of one pixel another size
+    run = _forward if width * height > 1 else trace_forward  # a recording gives a plane of one pixel another size
     bucket = _bucket(lists, len(features)) if adjoint else 0
     blended: Blended = run(splats, features, lists, width, height, room(dr.width(splats.x)), bucket)
     return blended
@@ -55,9 +55,11 @@ def _bucket(lists: TileLists, channels: int) -> int:
     return BUCKET if select() == "cuda" and lists.capacity > 0 and needed <= CHECKPOINT_BYTES else 0
 
 
-def _trace_forward(
+def trace_forward(
     splats: Splats, features: list[Any], lists: TileLists, width: int, height: int, capacity: int, bucket: int
 ) -> Blended:
+    """`forward` as a part of recordings. capacity: room for the N splats;  bucket: pairs of a bucket of the adjoint, 0
+    for none"""
     shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
     channels, pixels = len(features), lists.shape.pixels
     turn = min(BUCKET_TURN, bucket) if bucket else 1
@@ -196,6 +198,6 @@ def rasterize(splats: Splats, features: list[Any], lists: TileLists, width: int,
     return outputs[:-1], outputs[-1]
 
 
-_forward = recorded(_trace_forward, RECORDINGS)
+_forward = recorded(trace_forward, RECORDINGS)
 _backward_by_tiles = recorded(by_tiles, RECORDINGS)
 _backward_by_buckets = recorded(by_buckets, RECORDINGS)

@@ -97,20 +97,23 @@ def render(
     prepare = _trace_prepare if dr.grad_enabled(rows, camera.values) else _prepare
     splats, footprints, wanted = prepare(rows, camera, sh_degree, tuple(outputs), antialiased)
     if features is not None:
-        wanted["features"] = [_finite(feature + dr.zeros(ad.Float, gaussians.count)) for feature in own]
+        wanted["features"] = _cleaned(own, gaussians.count)
 
     blended = blend(splats, footprints, [f for group in wanted.values() for f in group], camera)
     planes, found = iter(blended.planes), dict[str, list[Any]]()
     for name, group in wanted.items():
         found[name] = [next(planes) for _ in group]
+    one_pixel = camera.width * camera.height == 1  # a recording gives a plane of one pixel another size
+    finish = _trace_finish if one_pixel or dr.grad_enabled(blended.planes, blended.transmittance) else _finish
+    alpha, depth, normal = finish(blended.transmittance, found.get("depth", []), found.get("normal", []))
     return RenderOutput(
         colour=ad.Array3f(found["colour"]) if "colour" in found else None,
-        alpha=1 - blended.transmittance,
-        depth=_expected(found["depth"][0], blended.transmittance) if "depth" in found else None,
+        alpha=alpha,
+        depth=depth,
         width=camera.width,
         height=camera.height,
         median_depth=median_depth(splats, blended.lists, camera) if "median_depth" in outputs else None,
-        normal=unit(ad.Array3f(found["normal"])) if "normal" in found else None,
+        normal=normal,
         features=found.get("features"),
     )
 
@@ -129,6 +132,26 @@ def _trace_prepare(
     if "normal" in outputs:
         wanted["normal"] = list(normals(gaussians, camera))
     return splats, footprints, wanted
+
+
+def _cleaned(features: list[Any], count: int) -> list[Any]:
+    """The user's features as Floats [count], finite."""
+    features = [feature if dr.width(feature) == count else feature + dr.zeros(ad.Float, count) for feature in features]
+    alike = len({feature.index for feature in features}) < len(features)  # no array may stand twice in a recorded call
+    clean = _trace_clean if not features or count == 1 or alike or dr.grad_enabled(features) else _clean
+    cleaned: list[Any] = clean(features)
+    return cleaned
+
+
+def _trace_clean(features: list[Any]) -> list[Any]:
+    return [_finite(feature) for feature in features]
+
+
+def _trace_finish(transmittance: Any, depth: list[Any], normal: list[Any]) -> tuple[Any, Any, Any]:
+    """(alpha, expected depth, unit normals) of blended planes, None for those that were not blended."""
+    alpha = 1 - transmittance
+    expected = _expected(depth[0], alpha) if depth else None
+    return alpha, expected, unit(ad.Array3f(normal)) if normal else None
 
 
 @dataclass
@@ -177,9 +200,8 @@ def _nothing(camera: Projection, outputs: Sequence[str], channels: int | None) -
     )
 
 
-def _expected(weighted: Any, transmittance: Any) -> Any:
+def _expected(weighted: Any, alpha: Any) -> Any:
     """Blended values divided by the alpha; 0 where that is 0."""
-    alpha = 1 - transmittance
     covered = alpha > 0
     return dr.select(covered, weighted / dr.select(covered, alpha, 1), 0)
 
@@ -217,3 +239,5 @@ def shown(total: Any) -> Any:
 
 
 _prepare = recorded(_trace_prepare, RECORDINGS)
+_clean = recorded(_trace_clean, RECORDINGS)
+_finish = recorded(_trace_finish, RECORDINGS)

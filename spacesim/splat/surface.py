@@ -62,11 +62,12 @@ def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> A
     """
     if lists.capacity == 0:
         return dr.opaque(ad.UInt32, NONE, width * height)
-    walk = _walk if width * height > 1 else _trace_walk  # a recording gives a plane of one pixel another size
+    walk = _walk if width * height > 1 else trace_walk  # a recording gives a plane of one pixel another size
     return walk(dr.detach(splats), lists, width, height, room(dr.width(splats.x)))
 
 
-def _trace_walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: int) -> Any:
+def trace_walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: int) -> Any:
+    """`median_splat` as a part of recordings. capacity: room for the N splats"""
     records, lane, pixels = list_records(splats, [], lists, capacity), lane_pixels(lists), lists.shape.pixels
 
     def undecided(k: Any, end: Any, transmittance: list[Any], _place: Any) -> Any:
@@ -153,4 +154,4 @@ class _Pick(dr.CustomOp):
         return "pick"
 
 
-_walk = recorded(_trace_walk, RECORDINGS)
+_walk = recorded(trace_walk, RECORDINGS)

@@ -2,6 +2,7 @@
 
 import io
 import threading
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -78,8 +79,11 @@ class Client:
         if self._dataset is None or not 0 <= frame < len(self._dataset.frames):
             return
         found = self._dataset.frames[frame]
-        if found.sun is not None and self._sun is not None:
-            self._sun.drag(found.sun)
+        sun = found.sun
+        if sun is not None and self._sun is not None:
+            self._sun.drag(sun)
+        elif sun is not None:  # no model can be relit, but the truth is of that Sun
+            self._shared.change(lambda stand: replace(stand, sun=sun))
         view = self.session.view
         aspect = view.width / view.height if view else 1.0
         self.look_from(found.camera.world_from_camera, fov_to_hold(found.camera, aspect))

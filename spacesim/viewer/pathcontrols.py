@@ -119,11 +119,13 @@ class PathControls:
 
     def _start(self, number: int, step: Callable[[float], None], seconds: float) -> None:
         with self._lock:
-            self._players[number] = Player(step, seconds, lambda: self._ended(number))
+            player = Player(step, seconds, lambda: self._ended(number, player))
+            self._players[number] = player
 
-    def _ended(self, number: int) -> None:
+    def _ended(self, number: int, player: Player) -> None:
         with self._lock:
-            self._players.pop(number, None)
+            if self._players.get(number) is player:  # not one that was started since
+                del self._players[number]
 
     def _show(self, path: Path, client: Client, when: float) -> None:
         """A moment of the path: the client's camera, and the scene where keyframes say how it stands."""

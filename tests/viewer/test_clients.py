@@ -18,7 +18,7 @@ from spacesim.data.records import Sun
 from spacesim.splat.compose.pose import LARGEST, SMALLEST, Pose
 from spacesim.viewer.client import Client
 from spacesim.viewer.memory import give_back
-from spacesim.viewer.state import FARTHEST, Stand
+from spacesim.viewer.state import FARTHEST, Shared, Stand
 
 viser = pytest.importorskip("viser", reason="viser is not installed")
 msgspec, zstandard = (pytest.importorskip(name) for name in ("msgspec", "zstandard"))  # which it brings
@@ -449,3 +449,27 @@ def test_only_the_render_thread_asks_dr_jit(viewer, at_start, monkeypatch):
         pictures(socket, 1)
     viewer.paths.stop()
     assert asked == {"render"}
+
+
+def test_a_player_that_was_stopped_does_not_end_the_next(viewer):
+    """Two clicks in a row: what plays then can be stopped, too."""
+    paths = viewer.paths
+    paths._start(-1, lambda when: None, 60.0)
+    first = paths._players[-1]
+    paths.forget(-1)
+    paths._start(-1, lambda when: None, 60.0)
+    first._thread.join(PATIENCE)
+    assert paths._stopped(-1)
+    wait_for(lambda: not paths._players, "the end")
+
+
+def test_a_frame_brings_its_sun_where_no_model_can_be_relit(viewer, at_start):
+    """As its truth is of that Sun, though the models' colours are not."""
+    dataset, shared = viewer.show.dataset, Shared(at_start)
+    number = next(k for k, frame in enumerate(dataset.frames) if not np.allclose(frame.sun.direction, at_start.sun.direction))
+    session = SimpleNamespace(view=None)
+    one = SimpleNamespace(
+        _dataset=dataset, _sun=None, _shared=shared, session=session, look_from=lambda pose, fov: None
+    )
+    Client.jump(one, number)
+    assert shared.stand.sun is dataset.frames[number].sun

@@ -229,7 +229,7 @@ def load_scene(path: Path) -> PosedScene:
     keyframes = [_keyframe(one, k, entry, models, width, document) for k, one in enumerate(entry.keyframes)]
     orbit = entry.camera.orbit if entry.camera else None
     sun = entry.sun.sun if entry.sun else None
-    return PosedScene(composition, sun, camera, keyframes, orbit, _frames(entry), entry.fps)
+    return PosedScene(composition, sun, camera, keyframes, orbit, _frames(entry, document), entry.fps)
 
 
 def save_scene(path: Path, scene: PosedScene) -> None:
@@ -338,12 +338,18 @@ def _keyframe(
     return Keyframe(one.time, one.sun.sun if one.sun else None, view, poses)
 
 
-def _frames(entry: SceneEntry) -> int:
-    """Where none is said: up to the last keyframe, or an orbit's."""
+def _frames(entry: SceneEntry, document: toml.Document) -> int:
+    """Where none is said: up to the last keyframe, or an orbit's. Raises InputError, with the line, where those are too
+    many."""
     if entry.frames is not None:
         return entry.frames
     if entry.keyframes:
-        return min(MOST_FRAMES, max(0, int(entry.keyframes[-1].time * entry.fps + 0.5)) + 1)
+        last = entry.keyframes[-1].time
+        if last * entry.fps >= MOST_FRAMES - 0.5:
+            label = document.label(("keyframes", len(entry.keyframes) - 1, "time"))
+            most = f"{MOST_FRAMES:,} pictures at {entry.fps:g} a second, or frames to say how many"
+            raise InputError(f"{label}: expected a time within {most}, found {last} seconds")
+        return max(0, int(last * entry.fps + 0.5)) + 1
     return ORBIT_FRAMES if entry.camera and entry.camera.orbit else 1
 
 

@@ -16,10 +16,10 @@ from spacesim.data.errors import InputError
 from spacesim.splat.cameras import Orthographic
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import Footprints, Splats, project
-from spacesim.splat.rasterize import forward
+from spacesim.splat.rasterize import trace_forward
 from spacesim.splat.shadow.sunlight import drawable
-from spacesim.splat.surface import NONE, median_splat, surface_depth
-from spacesim.splat.tiles import RECORDINGS, bin_splats, room
+from spacesim.splat.surface import NONE, surface_depth, trace_walk
+from spacesim.splat.tiles import RECORDINGS, TileLists, bin_splats, room
 
 FILTERS = ("bilinear", "percentage-closer", "variance", "median")
 SUN_RADIUS_DEG = 0.2666  #: angular radius of the Sun's disc at 1 au
@@ -100,65 +100,77 @@ def occlusion_by_mapping(
         raise ValueError(f"softness: expected a positive number of metres, found {softness}")
     if gaussians.count == 0:
         return dr.zeros(ad.Float, 0)
-    shown = gaussians if casters is None else casters
-    if config.filter == "median":
-        light = median_map(shown, camera, config.antialiased)
-    else:
-        light = light_map(shown, camera, config.filter == "variance", config.antialiased)
-    visible = drawable(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
-    points = dr.detach(gaussians.means if points is None else points)
-    softness = dr.opaque(ad.Float, max(softness, 1e-20))
-    return _look_up(points, visible, dr.detach(bias), light, camera, softness, config)
-
-
-def light_map(gaussians: Gaussians, camera: Orthographic, squares: bool = False, antialiased: bool = True) -> LightMap:
-    """What the Sun sees of the Gaussians, with the second moments of depth if `squares`. Detached."""
-    shape = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
-    splats, footprints, moments = _prepare(*dr.detach(shape), camera, squares, antialiased)
-    lists = bin_splats(splats, footprints, camera.width, camera.height)
-    blended = forward(splats, moments, lists, camera.width, camera.height)
-    depth, *square = blended.features
-    return LightMap(1 - blended.transmittance, depth, square[0] if squares else None, camera.width, camera.height)
-
-
-def median_map(gaussians: Gaussians, camera: Orthographic, antialiased: bool = True) -> LightMap:
-    """Where half of the light is gone: the surface of the Gaussian that takes it. Detached."""
     rows = [dr.detach(row) for row in gaussians.shape_rows()]
-    shape = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
-    splats, footprints, _ = _prepare(*dr.detach(shape), camera, False, antialiased)
+    casting = [] if casters is None else [dr.detach(row) for row in casters.shape_rows()]
+    splats, footprints = _prepare(casting or rows, camera, config.antialiased)
     lists = bin_splats(splats, footprints, camera.width, camera.height)
-    if lists.capacity == 0:  # zeros that are no constants of the kernels that read them
-        alpha, depth = (dr.opaque(ad.Float, 0, camera.width * camera.height) for _ in range(2))
-        return LightMap(alpha, depth, None, camera.width, camera.height)
-    found = median_splat(splats, lists, camera.width, camera.height)
-    alpha, depth = _surface(rows, splats, found, camera, room(gaussians.count))
+    if lists.capacity == 0:
+        return dr.opaque(ad.Float, 0, gaussians.count)
+    points, bias = None if points is None else dr.detach(points), dr.detach(bias)
+    test = _Test(rows, points, bias, dr.opaque(ad.Float, max(softness, 1e-20)))
+    surfaces = casting if config.filter == "median" else []  # other filters read the splats alone
+    return _tested(test, surfaces, splats, lists, camera, config, room(dr.width(splats.x)))
+
+
+@dataclass
+class _Test:
+    """Receivers. rows: the shape of the Gaussians;  points: where they are tested, None for their centres;  bias, Float
+    [N], and softness, metres"""
+
+    rows: list[Any]
+    points: Any
+    bias: Any
+    softness: Any
+
+
+def _trace_tested(
+    test: _Test,
+    casting: list[Any],
+    splats: Splats,
+    lists: TileLists,
+    camera: Orthographic,
+    config: MappingConfig,
+    capacity: int,
+) -> Any:
+    """Draws the light's picture and looks the receivers up in it. casting: rows of what the splats are; none: those of
+    the receivers"""
+    if config.filter == "median":
+        light = _median_map(Gaussians.from_rows(casting or test.rows), splats, lists, camera, capacity)
+    else:
+        light = _light_map(splats, lists, camera, config.filter == "variance", capacity)
+    return _look_up(test, light, camera, config)
+
+
+def _light_map(splats: Splats, lists: TileLists, camera: Orthographic, squares: bool, capacity: int) -> LightMap:
+    """What the Sun sees of the Gaussians, with the second moments of depth if `squares`."""
+    moments = [splats.depth, splats.depth * splats.depth] if squares else [splats.depth]
+    blended = trace_forward(splats, moments, lists, camera.width, camera.height, capacity, 0)
+    depth, *square = blended.features
+    alpha = 1 - blended.transmittance
+    dr.eval(alpha, depth, square)
+    return LightMap(alpha, depth, square[0] if squares else None, camera.width, camera.height)
+
+
+def _median_map(
+    gaussians: Gaussians, splats: Splats, lists: TileLists, camera: Orthographic, capacity: int
+) -> LightMap:
+    """Where half of the light is gone: the surface of the Gaussian that takes it."""
+    found = trace_walk(splats, lists, camera.width, camera.height, capacity)
+    dr.eval(found)
+    depth = surface_depth(gaussians, splats, found, camera, capacity)
+    alpha = dr.select(found != NONE, ad.Float(1), 0)
+    dr.eval(alpha, depth)
     return LightMap(alpha, depth, None, camera.width, camera.height)
 
 
-def _trace_surface(rows: list[Any], splats: Splats, found: Any, camera: Orthographic, capacity: int) -> tuple[Any, Any]:
-    """(is half of the light gone, 0 or 1, and at which depth, 0 where not), planes; found: of `median_splat`"""
-    depth = surface_depth(Gaussians.from_rows(rows), splats, found, camera, capacity)
-    return dr.select(found != NONE, ad.Float(1), 0), depth
+def _trace_prepare(rows: list[Any], camera: Orthographic, antialiased: bool) -> tuple[Splats, Footprints]:
+    return project(Gaussians.from_rows(rows), camera, antialiased)
 
 
-def _trace_prepare(
-    means: Any, log_scales: Any, quaternions: Any, logits: Any, camera: Orthographic, squares: bool, antialiased: bool
-) -> tuple[Splats, Footprints, list[Any]]:
-    """Splats, footprints, and the moments of depth to blend."""
-    splats, footprints = project(Gaussians(means, log_scales, quaternions, logits, None), camera, antialiased)
-    return splats, footprints, [splats.depth, splats.depth * splats.depth] if squares else [splats.depth]
-
-
-def _trace_look_up(
-    points: Any,
-    visible: Any,
-    bias: Any,
-    light: LightMap,
-    camera: Orthographic,
-    softness: Any,
-    config: MappingConfig,
-) -> Any:
-    center = camera.transform(points)
+def _look_up(test: _Test, light: LightMap, camera: Orthographic, config: MappingConfig) -> Any:
+    gaussians, bias, softness = Gaussians.from_rows(test.rows), test.bias, test.softness
+    visible = drawable(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
+    center = camera.transform(gaussians.means if test.points is None else test.points)
     screen = camera.screen(center)
     x, y = screen.x, screen.y
     seen = visible & camera.in_reach(center) & (x >= 0) & (x < light.width) & (y >= 0) & (y < light.height)
@@ -285,5 +297,4 @@ def _overlap(pixel: Any, centre: Any, half: Any) -> Any:
 
 
 _prepare = recorded(_trace_prepare, RECORDINGS)
-_surface = recorded(_trace_surface, RECORDINGS)
-_look_up = recorded(_trace_look_up, RECORDINGS)
+_tested = recorded(_trace_tested, RECORDINGS)

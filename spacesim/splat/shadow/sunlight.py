@@ -4,6 +4,7 @@ A Sun enters the kernels as an array of nine numbers, so another Sun compiles no
 Gaussians are, so that no step waits for the host.
 """
 
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
@@ -21,6 +22,7 @@ SUPPORT = 3.0  #: standard deviations of a single Gaussian that its light camera
 REACH = 4.0  #: standard deviations of the whole, on either side of its mean, that a light camera holds at most; chosen
 MARGIN = 1.0  #: pixels left free along each border; chosen
 UPRIGHT = 1e-10  #: radians off the vertical that are rounding of angles; chosen
+SUNS = 4096  #: whose axes are kept, chosen
 NARROWEST = 1e-3  #: least extent of the image, as a share of its larger one; chosen
 
 
@@ -42,7 +44,13 @@ def light_axes(direction: ArrayLike) -> Array:
 
 
 def light_rows(direction: ArrayLike) -> Any:
-    """`light_axes` for the kernels: Float [9], the light camera's x, y and z axes one after another."""
+    """`light_axes` for the kernels: Float [9], the light camera's x, y and z axes one after another. Kept for the next
+    picture under this Sun."""
+    return _rows(*np.asarray(direction, dtype=np.float64).tolist())
+
+
+@lru_cache(maxsize=SUNS)
+def _rows(*direction: float) -> Any:
     return ad.Float(light_axes(direction).T.ravel().tolist())
 
 

@@ -269,6 +269,7 @@ def test_a_saved_orbit_and_a_scene_without_camera_and_sun(tmp_path):
         (f"{HEAD}[camera]\nresolution = 100_000", "line 4: camera.resolution: expected at most"),
         (f"{HEAD}[camera]\ntransform_matrix = [[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]", "camera.transform_matrix"),
         (f"{HEAD}{EYE}[[keyframes]]\ntime = 1\n[[keyframes]]\ntime = 1", "line 10: keyframes[1].time"),
+        (f"{HEAD}{EYE}[[keyframes]]\ntime = 1e300", "line 8: keyframes[0].time: expected a time within 100,000"),
         (f"{HEAD}{EYE}[[keyframes]]\nmodels.map.scale = 2", "keyframes[0].time"),
         (f"{HEAD}{EYE}[[keyframes]]\ntime = 1\nmodels.mapp.scale = 2", "line 9: keyframes[0].models.mapp"),
         (f"{HEAD}{EYE}[[keyframes]]\ntime = 1\ncamera = {{fov_deg = 3}}", "line 9: keyframes[0].camera"),

@@ -11,7 +11,6 @@ from walls import BIASES, SHIPPED, acne, plate, plate_occlusion, screen_shadow, 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at, quaternion_from_rotation
-from spacesim.splat import surface
 from spacesim.splat.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.shadow import mapping
@@ -260,23 +259,23 @@ def test_hostile_gaussians_get_none_and_spoil_nothing(name):
     assert np.all((strange >= 0) & (strange <= 1))
 
 
-def test_medians_of_models_of_any_size(monkeypatch):
-    """Few recordings serve them all, and say what is computed without it."""
+@pytest.mark.parametrize("name", ["median", "bilinear"])
+def test_models_of_any_size(name, monkeypatch):
+    """Few recordings serve them all, and say what is computed without them."""
     counts, suns = (700, 90, 2100, 700, 1), ([0.3, -0.5, 0.8], [0, 0, -1])
 
     def found():
         return [
-            occlusion(arrays, fit_camera(Gaussians.from_numpy(arrays), light_rows(sun), 32), config=CONFIGS["median"])
+            occlusion(arrays, fit_camera(Gaussians.from_numpy(arrays), light_rows(sun), 32), config=CONFIGS[name])
             for arrays in (random_splats(count, seed=count) for count in counts)
             for sun in suns
         ]
 
     recorded = found()
-    monkeypatch.setattr(surface, "_walk", surface._trace_walk)
-    monkeypatch.setattr(mapping, "_surface", mapping._trace_surface)
+    monkeypatch.setattr(mapping, "_tested", mapping._trace_tested)
     for one, other in zip(recorded, found(), strict=True):
         np.testing.assert_array_equal(one, other)
-    assert 0.05 < recorded[0].mean() < 0.95
+    assert 0.05 < recorded[0].mean() < 0.99
 
 
 @pytest.mark.parametrize("softness", [1e-30, 1e-6, 1e6])
