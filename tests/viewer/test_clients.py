@@ -466,7 +466,8 @@ def test_a_player_that_was_stopped_does_not_end_the_next(viewer):
 def test_a_frame_brings_its_sun_where_no_model_can_be_relit(viewer, at_start):
     """As its truth is of that Sun, though the models' colours are not."""
     dataset, shared = viewer.show.dataset, Shared(at_start)
-    number = next(k for k, frame in enumerate(dataset.frames) if not np.allclose(frame.sun.direction, at_start.sun.direction))
+    before = at_start.sun.direction
+    number = next(k for k, frame in enumerate(dataset.frames) if not np.allclose(frame.sun.direction, before))
     session = SimpleNamespace(view=None)
     one = SimpleNamespace(
         _dataset=dataset, _sun=None, _shared=shared, session=session, look_from=lambda pose, fov: None
