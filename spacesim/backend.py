@@ -175,9 +175,34 @@ def mitsuba() -> ModuleType:
     return mi
 
 
-def free_memory() -> int | None:
-    """Bytes that arrays may still take on the chosen backend; None where the system does not say (CUDA, not Linux)."""
-    return None if select() != "llvm" else main_memory()
+def free_memory(wanted: int = 0) -> int | None:
+    """Bytes that arrays may still take on the chosen backend; None where the system does not say. Where fewer than
+    `wanted` are free, what Dr.Jit keeps of freed arrays, each for others of its size, goes back to the system first."""
+    asked = main_memory if select() == "llvm" else device_memory
+    free = asked()
+    if free is not None and free < wanted:
+        dr = _load_drjit()
+        dr.sync_thread()
+        dr.flush_malloc_cache()
+        free = asked()
+    return free
+
+
+def device_memory() -> int | None:
+    """Bytes free on the first CUDA device, which Dr.Jit uses, by the driver; None where that does not say."""
+    try:
+        driver = ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+    except OSError:
+        return None
+    context, free, total = ctypes.c_void_p(), ctypes.c_size_t(), ctypes.c_size_t()
+    if driver.cuInit(0) or driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), 0):
+        return None
+    failed = driver.cuCtxPushCurrent_v2(context)
+    if not failed:
+        failed = driver.cuMemGetInfo_v2(ctypes.byref(free), ctypes.byref(total))
+        driver.cuCtxPopCurrent_v2(ctypes.byref(ctypes.c_void_p()))
+    driver.cuDevicePrimaryCtxRelease_v2(0)
+    return None if failed else free.value
 
 
 def main_memory(root: Path = Path("/")) -> int | None:

@@ -305,3 +305,31 @@ def test_main_memory_is_what_the_control_groups_leave(tmp_path, files, left):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(content)
     assert backend.main_memory(tmp_path) == left
+
+
+def test_freed_arrays_are_given_back_before_memory_counts_as_short(monkeypatch):
+    import drjit as dr
+
+    given_back: list[bool] = []
+    asked = "device_memory" if backend.select() == "cuda" else "main_memory"
+    monkeypatch.setattr(backend, asked, lambda: 500 if given_back else 100)
+    monkeypatch.setattr(dr, "flush_malloc_cache", lambda: given_back.append(True))
+    assert (backend.free_memory(), backend.free_memory(100), given_back) == (100, 100, [])
+    assert (backend.free_memory(101), given_back) == (500, [True])
+
+
+@pytest.mark.gpu
+def test_device_memory_falls_with_what_is_taken():
+    if backend.select() != "cuda":
+        pytest.skip("needs a CUDA device")
+    import drjit as dr
+
+    before = backend.free_memory(10**18)
+    array = dr.opaque(backend.ad.Float, 0, 2**28)
+    dr.eval(array)
+    dr.sync_thread()
+    left = backend.device_memory()
+    assert left is not None
+    assert before - left >= 2**30 - 2**20
+    del array
+    assert backend.free_memory(10**18) > left + 2**29

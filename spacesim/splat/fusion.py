@@ -102,7 +102,7 @@ def fuse(
 
 def check_memory(grid: Grid) -> None:
     """Raises InputError where the voxels of `grid` do not fit into memory, with the size that would."""
-    free = backend.free_memory()
+    free = backend.free_memory(int(BYTES * grid.count / 0.8))
     most = MOST_VOXELS if free is None else min(MOST_VOXELS, int(0.8 * free / BYTES))
     if grid.count > most:
         sides = "x".join(map(str, grid.shape))

@@ -148,7 +148,7 @@ def _check_room(pairs: int, pixels: int, bytes_a_pair: int, bytes_a_pixel: int) 
     needed = pairs * bytes_a_pair + pixels * bytes_a_pixel
     if pairs > LARGEST_PAIRS:
         raise WorkError(f"rasterizer: {pairs:.3g} pairs of tile and splat, at most {LARGEST_PAIRS:.3g} can be sorted")
-    free = free_memory() if needed > 2**28 else None
+    free = free_memory(needed) if needed > 2**28 else None
     if free is not None and needed > free:
         raise WorkError(
             f"rasterizer: {pairs:.3g} pairs of tile and splat on {pixels:.3g} pixels need about {needed / 1e9:.3g} GB "

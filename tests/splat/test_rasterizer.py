@@ -270,7 +270,7 @@ def test_a_recording_of_as_many_splats_as_its_room_holds_serves_fewer(first):
 @pytest.mark.parametrize(("count", "sentence"), [(40_000, "GB are free"), (150_000, "can be sorted")])
 def test_more_pairs_than_memory_holds_are_a_sentence(count, sentence, monkeypatch):
     """Splats that cover all tiles of a large picture."""
-    monkeypatch.setattr(tiles, "free_memory", lambda: 10**9)
+    monkeypatch.setattr(tiles, "free_memory", lambda _: 10**9)
     arrays = random_splats(count, degree=0)
     arrays["log_scales"][:] = 3.0
     arrays["logit_opacities"][:] = 5.0
@@ -280,7 +280,7 @@ def test_more_pairs_than_memory_holds_are_a_sentence(count, sentence, monkeypatc
 
 def test_a_picture_larger_than_memory_is_a_sentence(monkeypatch):
     """Also of a single splat, and of none in sight."""
-    monkeypatch.setattr(tiles, "free_memory", lambda: 10**9)
+    monkeypatch.setattr(tiles, "free_memory", lambda _: 10**9)
     arrays, view = random_splats(1), camera(4096, 4096)
     with pytest.raises(WorkError, match=r"on 1.68e\+07 pixels need about 1.43 GB of memory, 1 GB are free"):
         render(Gaussians.from_numpy(arrays), Pinhole.of(view))
@@ -290,7 +290,7 @@ def test_a_picture_larger_than_memory_is_a_sentence(monkeypatch):
 
 
 def test_a_training_step_needs_more_than_a_picture(monkeypatch, small_dataset):
-    monkeypatch.setattr(tiles, "free_memory", lambda: 2 * 10**9)
+    monkeypatch.setattr(tiles, "free_memory", lambda _: 2 * 10**9)
     view = camera(4096, 4096)
     splats, footprints = project(Gaussians.from_numpy(random_splats(1)), Pinhole.of(view))
     assert tiles.bin_splats(splats, footprints, 4096, 4096).pairs > 0

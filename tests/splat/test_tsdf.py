@@ -153,7 +153,7 @@ def test_surface_of_any_field_is_closed():
 
 
 def test_memory_is_told_in_a_sentence(monkeypatch):
-    monkeypatch.setattr(backend, "free_memory", lambda: 10_000_000)
+    monkeypatch.setattr(backend, "free_memory", lambda _: 10_000_000)
     with pytest.raises(InputError, match=r"voxel: .* 101x101x101 voxels take .* GB; take at least 0\.0\d+ m"):
         fuse([], Grid.around(np.zeros(3), np.ones(3), 0.01, 0))
 
