@@ -95,6 +95,11 @@ def test_ctrl_c_in_training_loses_no_step(tiny_data, tmp_path):
     assert resumed == whole
 
 
+def test_ctrl_c_after_the_last_step_waits_for_the_model(tiny_data, tmp_path):
+    done = run("-c", PRESSED, "call:versions", "train", tiny_data, "--out", tmp_path, *TRAIN, stdout=subprocess.PIPE)
+    assert (done.returncode, (tmp_path / "model.safetensors").exists()) == (0, True), done.stderr
+
+
 def test_a_second_ctrl_c_ends_a_step_that_takes_long(tiny_data, tmp_path):
     done = run(
         "-c", PRESSED, "call:bin_splats:1:2", "train", tiny_data, "--out", tmp_path, *TRAIN, stdout=subprocess.PIPE

@@ -78,13 +78,18 @@ def _train(trainer: Trainer, out: Path, on_progress: Callable[[Progress], None],
         for old in _checkpoints(out)[:-KEEP_CHECKPOINTS]:
             old.unlink(missing_ok=True)
 
-    with ending.postponed() as asked_to_stop:
+    with ending.postponed() as asked_to_stop:  # the writing, too: the last steps may have no checkpoint yet
         trainer.run(on_progress, checkpoint, asked_to_stop)
+        _write(trainer, out, seconds.total(), command)
+
+
+def _write(trainer: Trainer, out: Path, seconds: float, command: Sequence[str]) -> None:
+    """What a finished run says of itself, then the model."""
     write_json(
         out / "training.json",
         {
             "history": trainer.history,
-            "seconds": round(seconds.total(), 3),
+            "seconds": round(seconds, 3),
             "refinement_seconds": round(trainer.refinement_seconds, 3),
             "gaussians": trainer.gaussians.count,
             "backend": backend.select(),
