@@ -276,7 +276,11 @@ def test_ply_of_no_gaussians(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("iterations", 0), ("method", "magic"), ("init", "dreams"), ("seed", -1), ("sh_degree", 4)]
+    ("option", "value"),
+    [
+        *(("iterations", 0), ("method", "magic"), ("init", "dreams"), ("seed", -1), ("sh_degree", 4)),
+        *(("views_per_step", 0), ("views_per_step", 65)),
+    ],
 )
 def test_configurations_that_cannot_be(option, value):
     with pytest.raises(InputError, match=option.replace("_", "-")):
