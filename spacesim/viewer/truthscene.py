@@ -52,6 +52,15 @@ def composed_scene(scenes: Sequence[SceneConfig], poses: Sequence[Pose]) -> Scen
     return replace(first, objects=tuple(objects), materials=materials)
 
 
+def parted(scene: SceneConfig, poses: Sequence[Pose]) -> list[SceneConfig] | None:
+    """The scene of each model alone, in its own frame, of one that shows them all, each as the object of its number;
+    None where there are not as many. poses: of the models, where they stand as the objects do"""
+    if len(scene.objects) != len(poses):
+        return None
+    pairs = zip(scene.objects, poses, strict=True)
+    return [replace(scene, objects=(_posed(one, pose.inverse(), {}),)) for one, pose in pairs]
+
+
 def posed_objects(scenes: Sequence[SceneConfig], poses: Sequence[Pose]) -> list[ObjectConfig]:
     """Where the objects of the models' scenes are; of what they are made stays as each scene names it."""
     return [_posed(one, pose, {}) for scene, pose in zip(scenes, poses, strict=True) for one in scene.objects]

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Hashable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from spacesim.viewer.session import Session
 from spacesim.viewer.state import Look, Stand, View
 from spacesim.viewer.tracer import Answer, Request
 from spacesim.viewer.truth import SIDE, Truth, TruthDesk, frame_at, stored_truth
-from spacesim.viewer.truthscene import composed_scene, models_of, places_among, posed_objects, recorded_scene
+from spacesim.viewer.truthscene import composed_scene, models_of, parted, places_among, posed_objects, recorded_scene
 
 
 class TruthService:
@@ -75,17 +76,23 @@ class TruthService:
         """The scenes of the models' data, or why they are not known; looked up once."""
         with self._lock:
             if self._scenes is None:
+                with suppress(InputError):
+                    self._whole = self._scene(self._dataset.root) if self._dataset else None
                 try:
                     self._scenes = [self._scene(path) for path in self._data]
-                    self._whole = self._scene(self._dataset.root) if self._dataset else None
                 except InputError as error:
-                    self._scenes = self._scenes or str(error)
+                    self._scenes = self._parts() or str(error)
             return self._scenes
 
-    @staticmethod
-    def _scene(path: Path | None) -> Any:
+    def _parts(self) -> list[Any] | None:
+        """The scenes of several models by the dataset's own, which shows all of them as they stand at the start."""
+        several = self._whole is not None and len(self._data) > 1
+        return parted(self._whole, self._start.poses) if several else None
+
+    def _scene(self, path: Path | None) -> Any:
         if path is None:
-            raise InputError("the data that a model was trained on are not where they were; name them with --data")
+            others = "them" if len(self._data) == 1 else "data of the whole scene, an object for each model,"
+            raise InputError(f"the data that a model was trained on are not where they were; name {others} with --data")
         return recorded_scene(path)
 
     @staticmethod

@@ -159,6 +159,27 @@ def test_frames_are_the_truth_of_what_they_show_alone(tiny_data, tmp_path, scene
     assert source((Pose(), TURN), (Pose(), TURN), [None, None]) == "the dataset's frame 2"
 
 
+def test_data_of_a_whole_scene_tell_what_its_models_are(tiny_data, tmp_path, scene):
+    """Where those of the runs are gone: each object goes where the model of its number goes."""
+    dataset, pair, asked = read_dataset(tiny_data), tmp_path / "pair", []
+    shutil.copytree(tiny_data, pair)
+    whole = composed_scene([scene, scene], [Pose(), TURN])
+    (pair / "scene.json").write_text(json.dumps({**dataset.scene, "config": whole.to_json()}))
+    view, sun, there = view_of_frame(dataset, 2), dataset.frames[2].sun, (Pose(), TURN)
+    service = TruthService([None, tiny_data], read_dataset(pair), Stand(there, sun))
+    service._desk = SimpleNamespace(ask=lambda _, request: asked.append(request) or 7)
+    assert service.truth(None, view, Stand(there, sun), Look()).source == "the dataset's frame 2"
+    moved = Pose(translation=np.array([0.0, 0.0, 3.0])), TURN
+    assert service.truth(None, view, Stand(moved, sun), Look()) == 7
+    expected = composed_scene([scene, scene], moved).objects
+    for one, other in zip(asked[0].scene.objects, expected, strict=True):
+        assert one.position == pytest.approx(other.position, abs=1e-9)
+        assert one.rotation_wxyz == pytest.approx(other.rotation_wxyz)
+        assert one.scale == pytest.approx(other.scale)
+    service = TruthService([None, None], None, Stand(there, sun))
+    assert "name data of the whole scene" in service.truth(None, view, Stand(there, sun), Look())
+
+
 def test_a_dataset_without_a_scene_says_so(tmp_path, scene):
     with pytest.raises(InputError, match=r"scene\.json"):
         recorded_scene(tmp_path)
