@@ -265,6 +265,9 @@ def _compose(options: argparse.Namespace) -> None:
         first = scene.shot(0)
         write_ply(gathered(first.composition, first.sun), options.ply)
         written.append(options.ply)
+        for model in scene.composition.models:
+            if model.run.antialiased:
+                print(f"{model.name}: {WANTS_FILTER}", file=sys.stderr)
     if done.note is not None:
         print(done.note, file=sys.stderr)
     ending.say(" ".join(str(path) for path in written if path is not None))
