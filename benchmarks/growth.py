@@ -15,7 +15,7 @@ SIZES = {
 }
 WIDTH, HEIGHT = 640, 400
 LEFT, RIGHT, TOP, BOTTOM = 62, 18, 44, 52
-SLOPE_ONE = "#5a6472"
+SLOPE_ONE, OTHER = "#5a6472", "#1b2027"
 COLOURS = {"gaussians": "#2a66ad", "pixels": "#b9560f"}
 
 
@@ -61,8 +61,10 @@ def summary(points: list[Point]) -> dict[str, float]:
 
 def plot(title: str, points: list[Point]) -> str:
     """SVG that stands alone: milliseconds against pairs, both logarithmic. A series varies the Gaussians, another the
-    pixels; a dashed line has slope 1."""
+    pixels, what is in neither is a mark of its own; a dashed line has slope 1."""
     series = {"gaussians": common_side(points), "pixels": common_count(points)}
+    series = {name: chosen for name, chosen in series.items() if len(chosen) > 1}
+    others = [p for p in points if not any(p in chosen for chosen in series.values())]
     xs, ys = [p.pairs for p in points], [p.milliseconds for p in points]
     (left, right), (low, high) = decades(xs), decades(ys)
 
@@ -89,13 +91,18 @@ def plot(title: str, points: list[Point]) -> str:
     marks.append(f'<path d="M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" stroke="{SLOPE_ONE}" stroke-dasharray="5 4"/>')
     legend = [(SLOPE_ONE, "slope 1")]
     for name, chosen in series.items():
-        if len(chosen) < 2:
-            continue
         where = [place(p.pairs, p.milliseconds) for p in chosen]
         path = "L".join(f"{x:.1f} {y:.1f}" for x, y in where)
         marks.append(f'<path d="M{path}" fill="none" stroke="{COLOURS[name]}" stroke-width="2"/>')
-        marks += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{COLOURS[name]}"/>' for x, y in where]
+        marks += [dot(x, y, COLOURS[name]) for x, y in where]
         legend.append((COLOURS[name], f"{describe(name, chosen)}: slope {slope(chosen):.2f}"))
+    for point in others:
+        x, y = place(point.pairs, point.milliseconds)
+        words = f"{compact(point.gaussians)} on {point.pixels}²"
+        marks += [
+            dot(x, y, OTHER),
+            text(x - 7, y - 6, words, "end") if x > WIDTH / 2 else text(x + 7, y + 14, words, "start"),
+        ]
     for row, (colour, words) in enumerate(reversed(legend)):
         at = TOP + 16 + 18 * row
         dashes = ' stroke-dasharray="5 4"' if colour == SLOPE_ONE else ' stroke-width="2"'
@@ -103,6 +110,10 @@ def plot(title: str, points: list[Point]) -> str:
         marks.append(text(LEFT + 42, at, words, "start"))
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}"'
     return f'{head} role="img" aria-label="{escape(title)}" font-family="sans-serif">{"".join(marks)}</svg>\n'
+
+
+def dot(x: float, y: float, colour: str) -> str:
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"/>'
 
 
 def common_side(points: list[Point]) -> list[Point]:

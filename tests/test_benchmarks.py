@@ -78,6 +78,9 @@ def test_plot_has_a_mark_for_each_measurement():
     assert len(circles) == 3 + 2  # three on 64 pixels, two of 10,000 Gaussians; one is both
     rise = [(y1 - y0) / (x1 - x0) for (x0, y0), (x1, y1) in pairwise(circles[:3])]
     assert max(rise) == pytest.approx(min(rise), abs=0.01)  # a power is a straight line
+    lone = growth.plot("time", [growth.Point(10, 16, 30, 1.0), growth.Point(20, 32, 80, 2.0)])
+    assert lone.count("<circle") == 2  # of no series
+    assert "20 on 32²" in lone
 
 
 def test_quartiles_and_tables():
