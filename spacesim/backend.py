@@ -184,6 +184,7 @@ def free_memory(wanted: int = 0) -> int | None:
         dr = _load_drjit()
         dr.sync_thread()
         dr.flush_malloc_cache()
+        dr.sync_thread()  # only then CUDA lets go of it
         free = asked()
     return free
 
@@ -208,11 +209,22 @@ def device_memory() -> int | None:
 def main_memory(root: Path = Path("/")) -> int | None:
     """Bytes of main memory that the process may still take; None where the system does not say (not Linux).
 
-    What the machine has free, or less where a container or a batch system allows the process less. root: where the
-    machine's files are
+    What the machine has free, or less where a container, a batch system or `ulimit -v` allows the process less. root:
+    where the machine's files are
     """
     free = _known_numbers(root / "proc/meminfo").get("MemAvailable:")
-    return None if free is None else min([1024 * free, *_left_by_groups(root)])
+    return None if free is None else min([1024 * free, *_left_by_groups(root), *_left_by_limit(root)])
+
+
+def _left_by_limit(root: Path) -> Iterator[int]:
+    """Bytes that the limit of the address space leaves, if there is one."""
+    if os.name != "posix":
+        return
+    import resource
+
+    most, taken = resource.getrlimit(resource.RLIMIT_AS)[0], _known_numbers(root / "proc/self/status").get("VmSize:")
+    if most != resource.RLIM_INFINITY and taken is not None:
+        yield max(most - 1024 * taken, 0)
 
 
 def _left_by_groups(root: Path) -> Iterator[int]:

@@ -307,6 +307,18 @@ def test_main_memory_is_what_the_control_groups_leave(tmp_path, files, left):
     assert backend.main_memory(tmp_path) == left
 
 
+@pytest.mark.skipif(os.name != "posix", reason="other systems have no such limit")
+def test_main_memory_is_no_more_than_the_address_space_that_is_left(tmp_path, monkeypatch):
+    import resource
+
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/meminfo").write_text("MemAvailable: 7812500 kB\n")
+    (tmp_path / "proc/self/status").write_text("Name:\tpython\nVmSize:\t 1000000 kB\n")
+    for limit, left in ((resource.RLIM_INFINITY, 8 * 10**9), (4 * 10**9, 4 * 10**9 - 1_024_000_000), (10**9, 0)):
+        monkeypatch.setattr(resource, "getrlimit", lambda _, most=limit: (most, most))
+        assert backend.main_memory(tmp_path) == left
+
+
 def test_freed_arrays_are_given_back_before_memory_counts_as_short(monkeypatch):
     import drjit as dr
 

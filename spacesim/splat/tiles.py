@@ -27,10 +27,11 @@ PACKET = 16  #: lanes that run together on a CPU with AVX-512; elsewhere fewer
 HANDS = 64  #: at most, chosen: no fewer than the parts into which Dr.Jit divides a launch, two a thread, as a rule
 STEPS, FEW = 8, 2  #: sizes of arrays from one power of two to the next, as a rule, and of the lists of pictures
 LONG = 2**22  #: pairs from which on lists of pictures have no more room than others, chosen: a gigabyte
-LARGEST_PAIRS = 0.9 * 2**30  #: records hold four numbers a pair, and Dr.Jit's arrays at most 2^32
+LARGEST_PAIRS = {"cuda": 0.9 * 2**30, "llvm": 0.9 * 2**29}  #: records hold four or eight numbers a pair, arrays 2^32
 PICTURE_BYTES = 200, 85  #: a pair (lists, sorting, blending), a pixel (colour, transmittance and what blending keeps of
 #: them): measured on LLVM, 90 to 210 a pair, as the rounding of arrays has it
-TRAINING_BYTES = 300, 280  #: the same of a training step, with gradients and the loss; 140 to 280 a pair measured
+TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a training step, with gradients and the loss;
+#: 140 to 280 a pair measured on LLVM; on CUDA, which keeps pixels' states for the adjoint, up to 430
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ def bin_splats(
         capacity = room(count)
         boxes: _Boxes = boxes_of(splats, footprints, dr.opaque(ad.UInt32, count), capacity, tiles, shape)
         pairs = int(boxes.upto[capacity - 1])
-    _check_room(pairs, width * height, *(TRAINING_BYTES if training else PICTURE_BYTES))
+    _check_room(pairs, width * height, *(TRAINING_BYTES[select()] if training else PICTURE_BYTES))
     if pairs == 0:
         none, of_splats = dr.zeros(ad.UInt32, tiles[0] * tiles[1]), dr.zeros(ad.UInt32, max(count, 1))
         return TileLists(none, none, none, none, of_splats, of_splats, 0, *tiles, shape)
@@ -146,8 +147,9 @@ def bin_splats(
 
 def _check_room(pairs: int, pixels: int, bytes_a_pair: int, bytes_a_pixel: int) -> None:
     needed = pairs * bytes_a_pair + pixels * bytes_a_pixel
-    if pairs > LARGEST_PAIRS:
-        raise WorkError(f"rasterizer: {pairs:.3g} pairs of tile and splat, at most {LARGEST_PAIRS:.3g} can be sorted")
+    most = LARGEST_PAIRS[select()]
+    if pairs > most:
+        raise WorkError(f"rasterizer: {pairs:.3g} pairs of tile and splat, at most {most:.3g} can be sorted")
     free = free_memory(needed) if needed > 2**28 else None
     if free is not None and needed > free:
         raise WorkError(

@@ -267,7 +267,7 @@ def test_a_recording_of_as_many_splats_as_its_room_holds_serves_fewer(first):
         np.testing.assert_allclose(picture(arrays, camera())["alpha"], twin.alpha, atol=1e-5)
 
 
-@pytest.mark.parametrize(("count", "sentence"), [(40_000, "GB are free"), (150_000, "can be sorted")])
+@pytest.mark.parametrize(("count", "sentence"), [(20_000, "GB are free"), (150_000, "can be sorted")])
 def test_more_pairs_than_memory_holds_are_a_sentence(count, sentence, monkeypatch):
     """Splats that cover all tiles of a large picture."""
     monkeypatch.setattr(tiles, "free_memory", lambda _: 10**9)
@@ -294,9 +294,9 @@ def test_a_training_step_needs_more_than_a_picture(monkeypatch, small_dataset):
     view = camera(4096, 4096)
     splats, footprints = project(Gaussians.from_numpy(random_splats(1)), Pinhole.of(view))
     assert tiles.bin_splats(splats, footprints, 4096, 4096).pairs > 0
-    with pytest.raises(WorkError, match=r"need about 4.71 GB of memory, 2 GB are free"):
+    with pytest.raises(WorkError, match=r"need about (2.68|4.71) GB of memory, 2 GB are free"):
         tiles.bin_splats(splats, footprints, 4096, 4096, training=True)
-    monkeypatch.setattr(tiles, "TRAINING_BYTES", (0, 10**7))
+    monkeypatch.setattr(tiles, "TRAINING_BYTES", dict.fromkeys(("cuda", "llvm"), (0, 10**7)))
     with pytest.raises(WorkError, match="2 GB are free"):
         Trainer(small_dataset, TrainConfig()).step()
 
