@@ -401,3 +401,10 @@ def test_unwritable_output_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tin
     refused = spacesim(*words)
     assert refused.is_refusal(place), refused
     assert (tmp_path / "file").read_text() == "a file, no folder"
+
+
+def test_the_package_is_a_program_too():
+    done = subprocess.run(
+        [sys.executable, "-m", "spacesim", "--version"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout.split()[:1]) == (0, ["spacesim"]), done.stderr
