@@ -168,6 +168,12 @@ def test_the_reset_comes_every_thirty_refinements():
         assert (np.array(model.logit_opacities).max() < 0) == reset
 
 
+def test_no_reset_whose_pause_outlasts_refinement():
+    for stop, reset in ((3900, False), (4000, True)):
+        _, model, _, _ = refine_once(3000, DefaultStrategyConfig(refine_stop=stop))
+        assert (np.array(model.logit_opacities).max() < 0) == reset
+
+
 def test_growth_stops_at_the_maximum_and_prefers_the_largest_gradients():
     config = DefaultStrategyConfig(max_gaussians=7)
     _, _, _, moves = refine_once(1100, config, gradient=[0.01, 0.02, 0.0, 0.0, 0.0, 0.0])

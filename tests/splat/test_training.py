@@ -62,6 +62,16 @@ def test_same_seed_same_model_to_the_bit(small_dataset, finished, tmp_path):
     assert not np.array_equal(other.model.to_numpy()["means"][:10], finished.model.to_numpy()["means"][:10])
 
 
+def test_no_training_ends_with_a_refinement_that_nothing_follows(small_dataset):
+    """Step 80 resets opacities to at most 0.1, but not as the last one."""
+    for steps in (80, 81):
+        trainer = Trainer(small_dataset, replace(CONFIG, iterations=steps))
+        trainer.gaussians.logit_opacities += 3
+        trainer.iteration = 79  # finished
+        trainer.step()
+        assert (np.array(trainer.gaussians.logit_opacities).max() > 0) == (steps == 80)
+
+
 def test_a_run_trained_with_the_filter_is_drawn_with_it(small_dataset, tmp_path, capsys):
     run = train(small_dataset, tmp_path / "run", replace(CONFIG, iterations=60, antialiased=True))
     plain = train(small_dataset, tmp_path / "plain", replace(CONFIG, iterations=60))

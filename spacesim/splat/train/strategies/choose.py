@@ -1,5 +1,6 @@
 """The strategy that a configuration names."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from spacesim.data.mesh import SignedDistance
@@ -16,14 +17,16 @@ if TYPE_CHECKING:
 
 
 def strategy_of(config: "TrainConfig", dataset: Dataset, scene_scale: float, count: int) -> Strategy:
-    """For `count` Gaussians at the start. Raises InputError where the dataset lacks the mesh that it needs, or
-    has one that is out of place."""
+    """For `count` Gaussians at the start. Refinement is over before the last step: what it changes is to be trained.
+
+    Raises InputError where the dataset lacks the mesh that it needs, or has one that is out of place."""
+    schedule = replace(config.refinement, refine_stop=min(config.refinement.refine_stop, config.iterations))
     if config.strategy == "mesh-aware":
         distance = SignedDistance.of(dataset.root / known_mesh(dataset, "--strategy mesh-aware"))
         check_outside(distance, dataset, "--strategy mesh-aware")
-        return MeshAwareStrategy(config.refinement, config.mesh_aware, distance, scene_scale, count)
+        return MeshAwareStrategy(schedule, config.mesh_aware, distance, scene_scale, count)
     if config.strategy == "support-aware":
-        return SupportAwareStrategy(config.refinement, config.support_aware, scene_scale, count)
+        return SupportAwareStrategy(schedule, config.support_aware, scene_scale, count)
     if config.strategy == "mcmc":
-        return McmcStrategy(config.refinement, config.mcmc, scene_scale)
-    return DefaultStrategy(config.refinement, scene_scale, count)
+        return McmcStrategy(schedule, config.mcmc, scene_scale)
+    return DefaultStrategy(schedule, scene_scale, count)

@@ -37,7 +37,7 @@ class DefaultStrategyConfig:
     grow_gradient: float = 0.0008  #: absolute screen-space gradient, half images per unit of loss
     duplicate_scale: float = 0.01  #: larger Gaussians are split, smaller ones duplicated
     refine_start: int = 500  #: iterations
-    refine_stop: int = 15_000  #: iterations
+    refine_stop: int = 15_000  #: iterations, at most those of the training; a reset's pause is over by then
     screen_size_stop: int = 15_000  #: iterations; until then screen sizes split and, after the first reset, prune
 
     def __post_init__(self) -> None:
@@ -116,7 +116,7 @@ class DensityControl(Strategy):
                 done = self._grow_and_prune(step, gaussians, optimizer, rng, leniency)
             elif self._outside_is_due(step):
                 done = self._prune_outside(step, gaussians, optimizer, rng)
-        if active and since_reset == 0:
+        if active and since_reset == 0 and step + config.pause_after_reset <= config.refine_stop:
             limit_opacities(gaussians, optimizer, 2 * config.prune_opacity)
         return done
 
