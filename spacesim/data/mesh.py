@@ -53,7 +53,7 @@ class SignedDistance:
 
     Inside is where the generalised winding number (Jacobson et al. 2013; Barill et al. 2018 for its fast sum, as libigl
     has it) is at least one half, or at most minus one half: so holes close smoothly, parts may overlap or be open, and
-    a mesh turned inside out counts like any other. A sheet has no inside.
+    a mesh turned inside out counts like any other, as does one of which some faces are. A sheet has no inside.
     """
 
     def __init__(self, vertices: Array, faces: np.ndarray) -> None:
@@ -64,6 +64,7 @@ class SignedDistance:
         self.faces = np.ascontiguousarray(_drawable(self.vertices, np.asarray(faces, np.int64).reshape(-1, 3)))
         if len(self.faces) == 0:
             raise InputError("signed distance: expected a mesh, found no face with finite corners")
+        self.faces = _consistent(self.vertices, self.faces)
         used = self.vertices[self.faces.ravel()]
         self.lowest, self.highest = used.min(axis=0), used.max(axis=0)
         self._tree, self._winding = igl.AABB(), igl.FastWindingNumberBVH()
@@ -102,9 +103,30 @@ class SignedDistance:
         return found
 
 
+def _consistent(vertices: Array, faces: np.ndarray) -> np.ndarray:
+    """Faces [F, 3] of which neighbours turn the same way: across edges that are in two faces, the smaller part by area
+    of what hangs together is turned. Corners in one place are one."""
+    import igl
+
+    corner = np.unique(vertices, axis=0, return_inverse=True)[1].ravel()[faces]
+    oriented, piece = igl.bfs_orient(np.ascontiguousarray(corner, np.int64))
+    turned = (oriented != corner).any(axis=1)
+    if not turned.any():
+        return faces
+    area = _doubled_area(vertices[faces])
+    more = 2 * np.bincount(piece, area * turned) > np.bincount(piece, area)
+    return np.ascontiguousarray(np.where((turned ^ more[piece])[:, None], faces[:, ::-1], faces))
+
+
+def _doubled_area(corners: Array) -> Array:
+    """[F], of triangles [F, 3, 3]."""
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(np.linalg.norm(across, axis=1))
+
+
 def _middle(corners: Array) -> Array:
     """[3] with half of the area of triangles [F, 3, 3] below it along each axis, wherever some of them have strayed."""
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = _doubled_area(corners)
     places = corners.mean(axis=1)
     order = np.argsort(places, axis=0)
     below = np.cumsum(area[order], axis=0)

@@ -77,6 +77,30 @@ def test_sign_is_that_of_exact_winding_numbers(kind):
     assert (found < 0).sum() > 50
 
 
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.8])
+@pytest.mark.parametrize("apart", [False, True])
+def test_faces_that_turn_the_wrong_way_change_nothing(share, apart):
+    """As winding numbers alone would. apart: no corners are shared."""
+    ball, cavity = trimesh.creation.icosphere(2, 1.5), trimesh.creation.icosphere(2, 0.7)
+    hollow = trimesh.util.concatenate([ball, trimesh.Trimesh(cavity.vertices, cavity.faces[:, ::-1], process=False)])
+    turned = np.random.default_rng(1).random(len(hollow.faces)) < share
+    faces = np.where(turned[:, None], hollow.faces[:, ::-1], hollow.faces)
+    places = hollow.vertices
+    if apart:
+        places, faces = places[faces.ravel()], np.arange(3 * len(faces)).reshape(-1, 3)
+    points = queries(1500)
+    found = SignedDistance(places, faces).inside(points)
+    assert 0.1 < found.mean() < 0.3
+    np.testing.assert_array_equal(found, of(hollow).inside(points))
+
+
+def test_faces_without_area_turn_nothing():
+    box = trimesh.creation.box((2, 2, 2))
+    faces = np.concatenate([box.faces, [[0, 0, 0], [0, 0, 1], [3, 1, 3]], box.faces[:1], box.faces[:1, ::-1]])
+    points = queries(500)
+    np.testing.assert_array_equal(SignedDistance(box.vertices, faces).inside(points), np.abs(points).max(axis=1) < 1)
+
+
 def test_a_mesh_far_from_the_origin_has_the_same_inside():
     ball, far = trimesh.creation.icosphere(subdivisions=3), np.array([1e7, -1e7, 5e6])
     points = np.random.default_rng(0).uniform(-1.2, 1.2, (2000, 3)) + far
