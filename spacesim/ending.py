@@ -17,9 +17,9 @@ from spacesim.data.errors import WorkError
 STOPPED = "stopped"
 
 _SHOW_CURSOR = "\x1b[?25h\n"  # which a bar of progress hides (ECMA-48 private mode 25)
-_OWN = os.path.join(os.path.dirname(os.path.abspath(__file__)), "cli.py")
+_OWN = [os.path.join(os.path.dirname(os.path.abspath(__file__)), name) for name in ("__main__.py", "cli.py")]
 
-_is_command = os.path.basename(sys.argv[0]) in ("spacesim", "spacesim.exe") or os.path.abspath(sys.argv[0]) == _OWN
+_is_command = os.path.basename(sys.argv[0]) in ("spacesim", "spacesim.exe") or os.path.abspath(sys.argv[0]) in _OWN
 _at_work = False
 _goes_on = ""
 _ended_by: int = signal.SIGINT
@@ -47,9 +47,11 @@ def working() -> Iterator[None]:
 def postponed() -> Iterator[Callable[[], bool]]:
     """Around work that has something to save when Ctrl-C comes, or SIGTERM, by which batch systems and containers end
     a process: the first is not raised but told by what is yielded, a second one ends the work as ever. Where the
-    process is not the command, both do what they always do."""
+    process is not the command, both do what they always do; one that is ignored stays so, as shells start commands with
+    `&`: Ctrl-C is not theirs."""
     asked = False
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    ends = ((signal.SIGINT, _interrupted), (signal.SIGTERM, signal.SIG_DFL)) if _is_command else ()
+    before = {number: handler for number, handler in ends if signal.getsignal(number) is handler}
 
     def ask(number: int, _frame: FrameType | None) -> None:
         nonlocal asked
@@ -62,8 +64,6 @@ def postponed() -> Iterator[Callable[[], bool]]:
         for number, handler in before.items():
             signal.signal(number, handler)
 
-    if before[signal.SIGINT] is not _interrupted or before[signal.SIGTERM] is not signal.SIG_DFL:
-        before = {}
     for number in before:
         signal.signal(number, ask)
     try:

@@ -116,11 +116,22 @@ def test_an_unfinished_run_is_refused(spacesim, tiny_run, tiny_data, tmp_path):
 # --- Ctrl-C ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_during_training(spacesim, tiny_data, tmp_path, number):
+# What batch scripts start with `&` ignores SIGINT.
+@pytest.mark.parametrize(
+    ("program", "number", "ignored"),
+    [
+        ("spacesim.cli", signal.SIGINT, ()),
+        ("spacesim", signal.SIGINT, ()),
+        ("spacesim", signal.SIGTERM, (signal.SIGINT,)),
+    ],
+)
+def test_ctrl_c_during_training(spacesim, tiny_data, tmp_path, program, number, ignored):
     arguments = ("train", tiny_data, "--out", tmp_path / "run", "--preset", "demo", "--init-count", 200)
-    command = [sys.executable, "-m", "spacesim.cli", *map(str, arguments), "--iterations", "150"]
+    command = [sys.executable, "-m", program, *map(str, arguments), "--iterations", "150"]
+    before = {one: signal.signal(one, signal.SIG_IGN) for one in ignored}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    for one, handler in before.items():
+        signal.signal(one, handler)
     first = process.stderr.readline()
     assert PROGRESS.match(first), first
     process.send_signal(number)
