@@ -278,6 +278,14 @@ def test_it_pulls_gaussians_into_the_object_and_keeps_their_number(meshed):
     assert found[1] > 3 * max(found[0], start)
 
 
+def test_without_attraction_those_in_a_picture_are_still_not_rescued(meshed):
+    trainer = Trainer(meshed, replace(BASE, warm_start=replace(WARM, weight=0.0), init="points"))
+    spread = trainer.gaussians.to_numpy()["means"].std(axis=0)
+    for _ in range(30):
+        trainer.step()
+    assert (trainer.gaussians.to_numpy()["means"].std(axis=0) > 0.8 * spread).all()
+
+
 def test_what_it_gathers_becomes_a_good_model(meshed):
     """From a box of ten times the object's size; as wide as they start, Gaussians would hide the object for good."""
     config = replace(BASE, init_box=10.0, refinement=replace(REFINEMENT, reset_every=10**6, max_gaussians=3000))

@@ -106,7 +106,7 @@ def cast_shadows_adaptively(
         return casts[-1].occlusion
 
     occlusion = occlusion_in_clusters(gaussians, direction, config.size, least_scale, occlude)
-    return replace(casts[0], occlusion=occlusion)
+    return replace(casts[min(1, len(casts) - 1)], occlusion=occlusion)  # the first is the one camera of a compact set
 
 
 @dataclass

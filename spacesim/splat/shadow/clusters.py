@@ -47,17 +47,18 @@ def occlusion_in_clusters(
     cameras at most, K of algorithm 3
 
     A set that fits one image, but for a share of `STRAYS` beyond it, has the one camera of `fit_camera`, as in
-    training: that costs one transfer of four numbers. Else the largest cluster goes first. Another cluster gets an
-    image only for those of its Gaussians that no image before has covered at `least_scale` (4.3.5), fitted to these
-    alone.
+    training, which is tried first: whether it suffices is four numbers that are there by then. Else the largest cluster
+    goes first. Another cluster gets an image only for those of its Gaussians that no image before has covered at
+    `least_scale` (4.3.5), fitted to these alone.
     Raises ValueError for a size, scale or number of cameras that is not positive.
     """
     _check(size, least_scale, most)
     if gaussians.count == 0:
         return dr.zeros(ad.Float, 0)
     camera, coverage = _fitted(_shapes(gaussians), light_rows(direction), size)
+    occlusion = occlude(gaussians, camera)
     if _suffices(coverage, least_scale):
-        return occlude(gaussians, camera)
+        return occlusion
     axes = light_axes(direction)
     cameras, receivers = assign(light_supports(gaussians, direction), axes, size, least_scale, most)
     camera_of = np.zeros(gaussians.count, np.uint32)

@@ -199,9 +199,10 @@ class Trainer:
         return self.warm_start is not None and self.warm_start.active(index)
 
     def _attraction(self, view: View) -> Attraction | None:
-        """What the warm start pulls with in this step, if it still does."""
-        warm = self.warm_start
-        return warm.attraction(view) if warm and warm.config.strength(self.iteration) > 0 else None
+        """What the warm start pulls with in this step, if it still does or counts who is in the picture."""
+        warm, index = self.warm_start, self.iteration
+        pulls = warm is not None and (warm.active(index) or warm.config.strength(index) > 0)
+        return warm.attraction(view) if warm and pulls else None
 
     def _target(self, number: int, view: View, attraction: Attraction | None) -> Target:
         rgba, valid, truth = self.views.pixels(view)
