@@ -289,6 +289,8 @@ def _verify(options: argparse.Namespace) -> None:
 def _export(options: argparse.Namespace) -> None:
     if options.object is not None and options.speedplus is None:
         raise InputError("--object: expected with --speedplus, found without it")
+    if options.sun is not None and options.ply is None:
+        raise InputError("--sun: expected with --ply, found without it")
     for name in ("data", "views", "voxel", "truncation"):
         if getattr(options, name) is not None and options.mesh is None:
             raise InputError(f"--{name}: expected with --mesh, found without it")

@@ -7,6 +7,7 @@ Each voxel is a lane of its own and takes the views in their order: the same inp
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import drjit as dr
@@ -23,6 +24,7 @@ STEP = 2.0  #: voxels; between pixels whose depths differ by more, depth is not 
 BATCH = 16  #: views in one kernel
 BYTES = 32  #: a voxel takes at most, while views are fused and the surface is looked for: 23 to 30 were seen
 MOST_VOXELS = 2**31  #: what 32-bit indices reach
+MOST_SIDE = 1e15  #: voxels along a side, that they can be counted
 NEAR = 1e-6  #: metres; nearer voxels are behind the camera
 
 
@@ -38,13 +40,14 @@ class Grid:
     @property
     def count(self) -> int:
         """Number of voxels."""
-        return int(np.prod(self.shape, dtype=np.int64))
+        return prod(self.shape)
 
     @staticmethod
     def around(low: Array, high: Array, voxel: float, margin: float) -> "Grid":
         """Voxels of side `voxel` that hold the box from `low` to `high` [3] and `margin` metres around it."""
         low, high = np.asarray(low) - margin, np.asarray(high) + margin
-        shape = np.maximum(np.ceil((high - low) / voxel), 1).astype(np.int64) + 1
+        sides = np.ceil(np.minimum((high - low) / voxel, MOST_SIDE))
+        shape = np.maximum(sides, 1).astype(np.int64) + 1
         x, y, z = (int(side) for side in shape)
         return Grid(0.5 * (low + high) - 0.5 * voxel * (shape - 1), float(voxel), (x, y, z))
 

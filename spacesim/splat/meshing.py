@@ -28,6 +28,7 @@ KINDS = ("surface", "median", "expected")
 OPAQUE = 0.5  #: alpha from which on a pixel shows a surface
 FOV_DEG, SIDE = 40.0, 256  #: of cameras that stand in for missing ones (chosen), pixels a side
 MOST_PIXELS = 512  #: of a picture's longer side; larger ones are rendered smaller (chosen)
+MOST_TRUNCATION = 100  #: voxels, chosen: the grid has as many around the object
 OUTLIERS = 1e-3  #: share of the points seen, at each end of each axis, that does not decide how large the object is
 MARGIN = 0.1  #: of the size so found, around it, in which outliers still count
 PIECE = 1e-3  #: of the largest piece's area: smaller ones are dropped
@@ -54,8 +55,8 @@ class MeshConfig:
             raise InputError(f"voxels: expected at least 2, found {self.voxels}")
         if self.views < 1:
             raise InputError(f"views: expected at least 1, found {self.views}")
-        if not (np.isfinite(self.truncation) and self.truncation >= 1):
-            raise InputError(f"truncation: expected at least 1 voxel, found {self.truncation}")
+        if not 1 <= self.truncation <= MOST_TRUNCATION:
+            raise InputError(f"truncation: expected 1 to {MOST_TRUNCATION} voxels, found {self.truncation}")
         if self.depth not in KINDS:
             raise InputError(f"depth: expected {' or '.join(KINDS)}, found {self.depth!r}")
 
