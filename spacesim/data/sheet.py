@@ -39,6 +39,7 @@ class Tile:
 
 
 TEXT = 40  #: pixels of a label's height
+LEAST = 110  #: pixels of a place's width: room for the names
 
 
 @cache
@@ -73,18 +74,20 @@ def contact_sheet(
     columns: int | None = None,
     side: int = 176,
     page: Page = WHITE_PAGE,
+    least: int = LEAST,
 ) -> np.ndarray:
     """[H, W, 3] uint8: the title, and `count` tiles row by row, over black where a picture is smaller than its place.
 
     aspect: height of a place by its width;  columns: tiles a row, `columns_for` by default;  side: pixels of the longer
-    side of a place
+    side of a place;  least: pixels that a place is wide, at least, for its label
     """
     columns = columns or columns_for(count)
     head = 52
     wide, high = (side, max(1, round(side * aspect))) if aspect <= 1 else (max(1, round(side / aspect)), side)
-    wide = max(wide, 110)  # room for the names
+    wide = max(wide, least)
     rows = math.ceil(count / columns)
-    size = max(GAP + columns * (wide + GAP), 560), head + rows * (high + TEXT + GAP)
+    told = math.ceil(font(20).getlength(title)) + 2 * GAP
+    size = max(GAP + columns * (wide + GAP), 560, told), head + rows * (high + TEXT + GAP)
     picture = Image.new("RGB", size, page.paper)
     draw = ImageDraw.Draw(picture)
     draw.text((GAP, head / 2), title, page.ink, font(20), anchor="lm")

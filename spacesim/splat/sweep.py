@@ -18,7 +18,7 @@ from spacesim.data.files import holds_files, write_bytes
 from spacesim.data.geometry import direction_from_angles
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Sun
-from spacesim.data.sheet import DARK_PAGE, DETAIL, TEXT, Tile, contact_sheet, fitted, font
+from spacesim.data.sheet import DARK_PAGE, DETAIL, LEAST, TEXT, Tile, contact_sheet, fitted, font
 from spacesim.data.tone import as_bytes
 from spacesim.splat.picture import shadow_colours
 from spacesim.splat.run import Run
@@ -185,7 +185,7 @@ def _sheet(run: Run, camera: Camera, suns: Sequence[Sun], kind: str, tiles: Sequ
         parts += [f"{len(tiles)} shown"]
     columns = math.ceil(len(tiles) / math.ceil(len(tiles) / COLUMNS))
     aspect = camera.height / camera.width
-    return contact_sheet("; ".join(parts), tiles, len(tiles), aspect, columns, SIDE, DARK_PAGE)
+    return contact_sheet("; ".join(parts), tiles, len(tiles), aspect, columns, SIDE, DARK_PAGE, LEAST + TEXT)
 
 
 def _degrees(angle: float) -> str:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from spacesim.data.sheet import DARK_PAGE, GAP, TEXT, Tile, columns_for, contact_sheet, fitted
+from spacesim.data.sheet import DARK_PAGE, GAP, LEAST, TEXT, Tile, columns_for, contact_sheet, fitted
 
 HEAD = 52
 
@@ -31,6 +31,16 @@ def test_a_label_is_in_its_colours_below_its_picture():
     name, detail = picture[HEAD + 176 + 2 : HEAD + 176 + 20], picture[HEAD + 176 + 21 : HEAD + 176 + TEXT]
     assert name.max(axis=(0, 1)).tolist() == list(DARK_PAGE.ink)
     assert 100 < detail.max() < 180
+
+
+def test_titles_and_labels_of_narrow_pictures_are_whole():
+    mark = np.full((TEXT - 4, TEXT - 4, 3), 99, np.uint8)
+    tall = Tile(np.zeros((40, 10), np.uint8), "azimuth 210.5°", "elevation -77.1°", mark)
+    picture = contact_sheet("a title as long as a run's name can be " * 3, [tall], 1, 4.0, 1, least=LEAST + TEXT)
+    assert (picture[:HEAD, -GAP:] == 255).all()
+    gap = picture[-TEXT - GAP :, GAP + LEAST : GAP + LEAST + 4]
+    assert (gap == 255).all()  # between the words and the mark
+    assert (picture[-TEXT - GAP + 4 : -GAP, GAP + LEAST + 4 : GAP + LEAST + TEXT] == 99).all()
 
 
 def test_fitted_keeps_shape_and_blends_over_black():
