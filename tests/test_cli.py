@@ -54,6 +54,7 @@ def test_no_bias_is_no_bias(spacesim, tiny_data, tmp_path):
         ("--method shadow-map --linear --exposure -1.5", "light exposure", -1.5),
         ("--method shadow-map --shadow-filter median", "light shadow mapping filter", "median"),
         ("--method shadow-map --field thesis", "light field surface", False),
+        ("--method park --field thesis", "light field view kind", "positional"),
         ("--method shadow-map --grazing bias", "light shadow grazing", "bias"),
         ("--method shadow-map --light-size 24", "light shadow size", 24),
         ("--method shadow-map --shadow-filter variance", "light shadow mapping filter", "variance"),

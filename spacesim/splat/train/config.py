@@ -227,7 +227,10 @@ def _light(name: str, method: str) -> LightConfig:
 
 
 def with_field(field: FieldConfig, kind: str) -> FieldConfig:
-    """The field told what the thesis tells it, or the cosines about a learned normal in place of the directions."""
+    """The field told what the thesis tells it, which of `park` is its own encoding, or the cosines about a learned
+    normal in place of the directions."""
+    if kind == "thesis" and not field.surface:
+        return field
     encoding = Encoding("harmonics", 0 if kind == "surface" else 4)
     return replace(field, surface=kind == "surface", sun=encoding, view=encoding)
 
