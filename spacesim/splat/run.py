@@ -41,7 +41,8 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A trained model with its history. bytes: size of the model's file."""
+    """A trained model with its history. bytes: size of the model's file. It predicts on one thread at a time, and no
+    other may use Dr.Jit meanwhile: they would wait for each other for ever, or recordings fail (Dr.Jit 1.5)."""
 
     path: Path
     config: dict[str, Any]
