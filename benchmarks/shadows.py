@@ -92,7 +92,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
             yield name, whole
             yield f"{name}, no bias", with_shadow(whole, bias=0.0)
             yield f"{name}, no refinement", with_shadow(whole, refine=None)
-        yield "park", preset(size, "park")
+        yield "park", replace(preset(size, "park"), antialiased=False)
         return
     relit, mapped, splatted = (as_ours(preset(size, method)) for method in ("relight", "shadow-map", "shadow-splat"))
     yield "none, surface", relit
@@ -106,9 +106,9 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     closer = MappingConfig("percentage-closer", sun_radius_deg=SUN_RADIUS_DEG)
     yield "map, surface, percentage-closer", with_shadow(mapped, mapping=closer)
     yield "map, surface, variance", with_shadow(mapped, mapping=MappingConfig("variance"))
-    yield "none, surface, anti-aliased", replace(relit, antialiased=True)
-    yield "map, surface, anti-aliased", replace(mapped, antialiased=True)
-    yield "splat, surface, anti-aliased", replace(splatted, antialiased=True)
+    yield "none, surface, unfiltered", replace(relit, antialiased=False)
+    yield "map, surface, unfiltered", replace(mapped, antialiased=False)
+    yield "splat, surface, unfiltered", replace(splatted, antialiased=False)
     yield "map, surface, supervised", replace(mapped, visibility_weight=0.1)
     yield "splat, surface, supervised", replace(splatted, visibility_weight=0.1)
     yield "map, surface, light of twice the size", with_shadow(mapped, size=2 * shadow_of(mapped).size)
@@ -117,21 +117,23 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "splat, surface, gradients", with_shadow(splatted, gradients=True)
     both = with_shadow(replace(splatted, visibility_weight=0.1), gradients=True)
     yield "splat, surface, supervised, gradients", both
-    yield "splat, surface, supervised, gradients, anti-aliased", replace(both, antialiased=True)
+    yield "splat, surface, lifted alone, supervised, gradients", with_shadow(both, grazing="lift")
 
 
 def as_thesis(config: TrainConfig) -> TrainConfig:
-    """The field and the shadows as the thesis has them, in networks of the preset's size."""
+    """The field, the shadows and the splats as the thesis has them, in networks of the preset's size."""
     assert config.light is not None
     config = replace(config, light=replace(config.light, field=with_field(config.light.field, "thesis")))
+    config = replace(config, antialiased=False)
     shadow = {"bias": 10.0, "grazing": "none", "mapping": MappingConfig()}
     return with_shadow(config, **shadow) if config.light.shadow else config
 
 
 def as_ours(config: TrainConfig) -> TrainConfig:
-    """The field and the shadows as `fast` has them, in networks of the preset's size."""
+    """The field, the shadows and the splats as `fast` has them, in networks of the preset's size."""
     assert config.light is not None
     config = replace(config, light=replace(config.light, field=with_field(config.light.field, "surface")))
+    config = replace(config, antialiased=preset("fast", config.method).antialiased)
     if config.light.shadow is None:
         return config
     ours = shadow_of(preset("fast", config.method))

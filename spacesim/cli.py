@@ -120,7 +120,7 @@ def _train(options: argparse.Namespace) -> None:
 
     names = (
         *("init", "init_count", "init_box", "views_per_step", "iterations", "seed", "visibility_weight"),
-        *("flatten_weight", "depth_weight", "normal_weight", "prior"),
+        *("flatten_weight", "depth_weight", "normal_weight", "prior", "antialiased"),
     )
     config = preset(options.preset, options.method, options.strategy)
     config = with_options(config, **{name: getattr(options, name) for name in names})
@@ -129,8 +129,6 @@ def _train(options: argparse.Namespace) -> None:
         raise InputError(f"--prior {options.prior}: expected {expected}, found neither")
     if options.black_background:
         config = with_options(config, random_background=False)
-    if options.antialiased:
-        config = with_options(config, antialiased=True)
     if options.warm_start:
         config = with_options(config, warm_start=warm_start(options.preset))
     if options.prune_opacity is not None and config.strategy == "mcmc":

@@ -105,7 +105,10 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
         "--flatten", type=float, dest="flatten_weight", metavar="W", help="weight that makes Gaussians discs (0)"
     )
     one.add_argument(
-        "--antialiased", action="store_true", help="with Mip-Splatting's 2D filter: pictures hold at other distances"
+        "--antialiased",
+        action=argparse.BooleanOptionalAction,
+        help="Mip-Splatting's 2D filter: sharper edges, pictures that hold at other distances (on for methods of light "
+        "but with --preset thesis)",
     )
     one.add_argument(
         "--init-box", type=float, metavar="X", help="--init random in a cube X times as wide as the object"

@@ -166,7 +166,9 @@ def preset(name: str, method: str = "vanilla", strategy: str = "default") -> Tra
     isotropy = ISOTROPY if method == "park" else 0.0
     penalty = MCMC_PENALTY if strategy == "mcmc" else 0.0
     config = replace(_schedule(name), method=method, light=light, isotropy_weight=isotropy, strategy=strategy)
-    return replace(config, opacity_weight=penalty, scale_weight=penalty)
+    # A vanilla run's PLY is for other viewers, too, which have no such filter.
+    antialiased = light is not None and name != "thesis"
+    return replace(config, antialiased=antialiased, opacity_weight=penalty, scale_weight=penalty)
 
 
 def warm_start(name: str) -> WarmStartConfig:
