@@ -345,7 +345,7 @@ def _split(value: Any, arrays: list[Any]) -> Any:
     if fields_of is not None:
         before = len(arrays)
         told = _split_each(fields_of(value), arrays)
-        if len(arrays) > before or not kind.__dataclass_params__.frozen:
+        if len(arrays) > before or not _is_constant(value):
             return kind, told
         if len(_constants) >= MOST_KEYS:
             _constants.clear()
@@ -354,6 +354,15 @@ def _split(value: Any, arrays: list[Any]) -> Any:
     _leaves.add(kind)
     arrays.append(value)
     return ...
+
+
+def _is_constant(value: Any) -> bool:
+    """A dataclass whose fields stay as they are: frozen, and without lists and dicts."""
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return bool(type(value).__dataclass_params__.frozen)
 
 
 def _split_each(values: Iterable[Any], arrays: list[Any]) -> tuple[Any, ...]:

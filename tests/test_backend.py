@@ -236,6 +236,10 @@ def test_constants_are_all_that_is_no_array():
     assert len({told(value) for value in kinds}) == len(kinds)
     assert told((x, 1)) == told((x + 1, 1))
     assert told(_Pair(1, "a")) == told(_Pair(1, "a")) != told(_Pair(1, "b"))
+    changing = _Pair([1])  # frozen itself, what it holds is not
+    before = told(changing)
+    changing.one.append(2)
+    assert told(changing) != before
 
 
 def test_the_first_arrays_of_a_type_are_told_as_the_next_are(monkeypatch):
