@@ -110,10 +110,10 @@ def mesh_of(
 
 
 def chosen_views(cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """At most `most` of the cameras, evenly chosen among those that stand at different places, as large as
-    `MOST_PIXELS`."""
-    poses = {camera.world_from_camera.tobytes(): camera for camera in cameras}
-    different = list(poses.values())
+    """At most `most` of the cameras, evenly chosen among those that see something else: under several Suns many are the
+    same. As large as `MOST_PIXELS`."""
+    views = {(c.world_from_camera.tobytes(), c.width, c.height, c.fx, c.fy, c.cx, c.cy): c for c in cameras}
+    different = list(views.values())
     places = np.unique(np.linspace(0, len(different) - 1, min(most, len(different))).round().astype(int))
     return [_within(different[place], MOST_PIXELS) for place in places]
 

@@ -1,5 +1,7 @@
 """Fused depth and the meshes taken from it, against closed forms; the depth of Gaussians against float64."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -255,6 +257,8 @@ def test_views_are_even_and_of_different_places():
     assert len(chosen) == 10
     assert len({camera.world_from_camera.tobytes() for camera in chosen}) == 10
     assert {camera.width for camera in chosen} == {512}
+    near = [replace(camera, fx=9 * camera.fx, fy=9 * camera.fy) for camera in all_of_them]
+    assert len(chosen_views([*all_of_them, *near], 60)) == 60  # one lens does not stand for another
 
 
 def test_cameras_around_see_all_of_the_model():
