@@ -98,7 +98,8 @@ class Scene:
         Badoiu and Clarkson, "Smaller core-sets for balls", 2003: step ever less towards the farthest point.
         """
         try:
-            points = self.mesh.convex_hull.vertices
+            with np.errstate(invalid="ignore"):  # of the volume of a hull that is nearly flat
+                points = self.mesh.convex_hull.vertices
         except QhullError:  # all in a plane
             points = self.mesh.vertices
         centre = points.mean(axis=0)
