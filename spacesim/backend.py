@@ -15,7 +15,6 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
-from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -341,10 +340,10 @@ def _split(value: Any, arrays: list[Any]) -> Any:
     known = _constants.get(id(value))
     if known is not None:
         return known[1]
-    fields_of = _fields(kind)  # type: ignore[arg-type]
-    if fields_of is not None:
+    names = _names(kind)  # type: ignore[arg-type]
+    if names is not None:
         before = len(arrays)
-        told = _split_each(fields_of(value), arrays)
+        told = _split_each([getattr(value, name) for name in names], arrays)
         if len(arrays) > before or not _is_constant(value):
             return kind, told
         if len(_constants) >= MOST_KEYS:
@@ -401,17 +400,6 @@ def _joined(value: Any, arrays: Iterator[Any]) -> Any:
 def _names(kind: Any) -> tuple[str, ...] | None:
     """Of a dataclass's fields; None for any other type."""
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else None
-
-
-@cache
-def _fields(kind: Any) -> Callable[[Any], tuple[Any, ...]] | None:
-    """Takes the values of all fields of a dataclass; None for any other type."""
-    names = _names(kind)
-    if not names:
-        return None if names is None else lambda _: ()
-    if len(names) > 1:
-        return attrgetter(*names)
-    return lambda value: (getattr(value, names[0]),)
 
 
 def recordings() -> int:

@@ -23,6 +23,7 @@ TRUNCATION = 2.0  #: voxels (docs/geometry.md says what was tried)
 STEP = 2.0  #: voxels; between pixels whose depths differ by more, depth is not interpolated (chosen)
 BATCH = 16  #: views in one kernel
 BYTES = 32  #: a voxel takes at most, while views are fused and the surface is looked for: 23 to 30 were seen
+USED = 0.8  #: share of the free memory that a grid may take, chosen
 MOST_VOXELS = 2**31  #: what 32-bit indices reach
 MOST_SIDE = 1e15  #: voxels along a side, that they can be counted
 NEAR = 1e-6  #: metres; nearer voxels are behind the camera
@@ -105,8 +106,8 @@ def fuse(
 
 def check_memory(grid: Grid) -> None:
     """Raises InputError where the voxels of `grid` do not fit into memory, with the size that would."""
-    free = backend.free_memory(int(BYTES * grid.count / 0.8))
-    most = MOST_VOXELS if free is None else min(MOST_VOXELS, int(0.8 * free / BYTES))
+    free = backend.free_memory(int(BYTES * grid.count / USED))
+    most = MOST_VOXELS if free is None else min(MOST_VOXELS, int(USED * free / BYTES))
     if grid.count > most:
         sides = "x".join(map(str, grid.shape))
         least = grid.voxel * (grid.count / most) ** (1 / 3)

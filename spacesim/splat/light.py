@@ -24,11 +24,10 @@ from spacesim.splat.gaussians import Gaussians, uploaded
 from spacesim.splat.lanes import Lanes, aligned
 from spacesim.splat.shadow.cast import ShadowConfig, Shadows, cast_shadows, cast_shadows_adaptively
 from spacesim.splat.shadow.refine import RefineConfig, refine_inputs, refined, refined_slope
-from spacesim.splat.shadow.sunlight import light_rows, towards_sun
+from spacesim.splat.shadow.sunlight import SUNS, light_rows, towards_sun
 from spacesim.splat.tiles import RECORDINGS
 
 LARGEST_EV = 40  #: of an exposure, as large as a scene's camera can have; chosen
-SUNS = 4096  #: whose encodings are kept
 COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed by `cooperative` where that works
 
 

@@ -106,7 +106,8 @@ def cast_shadows_adaptively(
         return casts[-1].occlusion
 
     occlusion = occlusion_in_clusters(gaussians, direction, config.size, least_scale, occlude)
-    return replace(casts[min(1, len(casts) - 1)], occlusion=occlusion)  # the first is the one camera of a compact set
+    primary, *_ = casts[1:] or casts  # the one camera of a compact set is tried first
+    return replace(primary, occlusion=occlusion)
 
 
 @dataclass

@@ -22,7 +22,7 @@ SUPPORT = 3.0  #: standard deviations of a single Gaussian that its light camera
 REACH = 4.0  #: standard deviations of the whole, on either side of its mean, that a light camera holds at most; chosen
 MARGIN = 1.0  #: pixels left free along each border; chosen
 UPRIGHT = 1e-10  #: radians off the vertical that are rounding of angles; chosen
-SUNS = 4096  #: whose axes are kept, chosen
+SUNS = 4096  #: whose axes and encodings are kept, chosen
 NARROWEST = 1e-3  #: least extent of the image, as a share of its larger one; chosen
 
 
