@@ -118,6 +118,15 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     both = with_shadow(replace(splatted, visibility_weight=0.1), gradients=True)
     yield "splat, surface, supervised, gradients", both
     yield "splat, surface, lifted alone, supervised, gradients", with_shadow(both, grazing="lift")
+    yield "none, surface, finer", finer(relit)
+    yield "splat, surface, finer", finer(splatted)
+    yield "splat, surface, finer, supervised, gradients", finer(both)
+
+
+def finer(config: TrainConfig) -> TrainConfig:
+    """More and smaller Gaussians: split at half of the size, and kept while they are faint."""
+    size = 0.5 * config.refinement.split_screen_size
+    return replace(config, refinement=replace(config.refinement, split_screen_size=size, prune_opacity=0.005))
 
 
 def as_thesis(config: TrainConfig) -> TrainConfig:

@@ -133,8 +133,10 @@ def _train(options: argparse.Namespace) -> None:
         config = with_options(config, warm_start=warm_start(options.preset))
     if options.prune_opacity is not None and config.strategy == "mcmc":
         raise InputError("--prune-opacity: expected a strategy that prunes, found mcmc, which moves what is faint")
-    bounds = {"max_gaussians": options.max_gaussians, "prune_opacity": options.prune_opacity}
-    told = {name: value for name, value in bounds.items() if value is not None}
+    if options.split_screen_size is not None and config.strategy == "mcmc":
+        raise InputError("--split-screen-size: expected a strategy that splits, found mcmc, which copies")
+    bounds = "max_gaussians", "prune_opacity", "split_screen_size"
+    told = {name: getattr(options, name) for name in bounds if getattr(options, name) is not None}
     config = replace(config, refinement=replace(config.refinement, **told))
     config = with_light(config, options)
     dataset = read_dataset(options.data)

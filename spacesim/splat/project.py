@@ -13,9 +13,10 @@ from spacesim.backend import ad
 from spacesim.splat.cameras import LARGEST, NEAR, Orthographic, Pinhole, Projection
 from spacesim.splat.gaussians import Gaussians, opacities, principal_axes
 
-__all__ = ["ALPHA_MIN", "DILATION", "NEAR", "Footprints", "Orthographic", "Pinhole", "Splats", "project"]
+__all__ = ["ALPHA_MIN", "DILATION", "NEAR", "PIXEL", "Footprints", "Orthographic", "Pinhole", "Splats", "project"]
 
 DILATION = 0.3  #: pixels^2 added to the screen-space covariance, so that no splat is thinner than a pixel
+PIXEL = 1 / 12  #: pixels^2 added in its place where splats are anti-aliased: the variance of a pixel's square
 ALPHA_MIN = 1 / 255  #: fainter contributions are not blended
 
 
@@ -45,8 +46,9 @@ class Footprints:
 def project(gaussians: Gaussians, camera: Projection, antialiased: Any = False) -> tuple[Splats, Footprints]:
     """Project N Gaussians. Returns `Splats` (differentiable) and `Footprints`, all [N].
 
-    antialiased: what the dilation adds to a splat's area is taken from its opacity (Yu et al. 2024, Mip-Splatting's 2D
-    filter): a splat thinner than a pixel fades instead of growing. True, False, or Bool [N]: of which Gaussians.
+    antialiased: splats are spread by a pixel's own width (`PIXEL`) and not to a pixel's (`DILATION`), and what that
+    adds to a splat's area is taken from its opacity (Yu et al. 2024, Mip-Splatting's 2D filter, with 1/10): a splat
+    thinner than a pixel fades instead of growing. True, False, or Bool [N]: of which Gaussians.
     """
     means, log_scales, quaternions = gaussians.means, gaussians.log_scales, gaussians.quaternions
     logits = gaussians.logit_opacities
@@ -83,8 +85,9 @@ def project(gaussians: Gaussians, camera: Projection, antialiased: Any = False) 
     # The determinant as a sum of squares (Lagrange's identity) cannot cancel to zero or below.
     xx, yy, xy = dr.squared_norm(m_x), dr.squared_norm(m_y), dr.dot(m_x, m_y)
     own_determinant = dr.squared_norm(dr.cross(m_x, m_y))
-    determinant = own_determinant + DILATION * (xx + yy) + DILATION * DILATION
-    xx, yy = xx + DILATION, yy + DILATION
+    spread = _spread(antialiased)
+    determinant = own_determinant + spread * (xx + yy) + spread * spread
+    xx, yy = xx + spread, yy + spread
     inverse_determinant = dr.rcp(determinant)
     if antialiased is not False:
         kept = _compensation(own_determinant * inverse_determinant)
@@ -103,8 +106,15 @@ def project(gaussians: Gaussians, camera: Projection, antialiased: Any = False) 
     return splats, _footprints(splats, xx, yy, order, sane, camera)
 
 
+def _spread(antialiased: Any) -> Any:
+    """pixels^2, a number or Float [N]."""
+    if isinstance(antialiased, bool):
+        return PIXEL if antialiased else DILATION
+    return dr.select(antialiased, ad.Float(PIXEL), DILATION)
+
+
 def _compensation(ratio: Any) -> Any:
-    """sqrt(det Sigma / det(Sigma + 0.3 I)) [N]; 0 with no gradient where the splat would be invisible anyway."""
+    """sqrt(det Sigma / det(Sigma + PIXEL I)) [N]; 0 with no gradient where the splat would be invisible anyway."""
     positive = dr.detach(ratio) > 1e-10
     return dr.select(positive, dr.sqrt(dr.select(positive, ratio, 1)), 0)
 

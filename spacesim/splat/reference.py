@@ -14,6 +14,8 @@ from spacesim.data.geometry import rotation_from_quaternion
 from spacesim.data.records import Camera
 from spacesim.splat.cameras import OrthographicCamera
 
+DILATION, PIXEL = 0.3, 1 / 12  #: pixels^2 added to covariances, and to those of anti-aliased splats
+
 
 @dataclass(frozen=True, eq=False)
 class ReferenceOutput:
@@ -58,7 +60,7 @@ def render_reference(
         (x, y), J = _linearized(centers[i], camera)
         axes = rotation_from_quaternion(arrays["quaternions"][i])
         covariance = J @ R @ axes @ np.diag(np.exp(2 * arrays["log_scales"][i])) @ axes.T @ R.T @ J.T
-        dilated = covariance + 0.3 * np.eye(2)
+        dilated = covariance + (PIXEL if antialiased else DILATION) * np.eye(2)
         share = np.sqrt(np.linalg.det(covariance) / np.linalg.det(dilated)) if antialiased else 1.0
         inverse = np.linalg.inv(dilated)
         dx, dy = columns - x, rows - y

@@ -9,8 +9,8 @@ import numpy as np
 
 from spacesim.data.geometry import rotation_from_quaternion
 from spacesim.splat.cameras import OrthographicCamera
+from spacesim.splat.reference import DILATION, PIXEL
 
-DILATION = 0.3  #: pixels^2, as in pictures
 ALPHA_MIN, ALPHA_MAX = 1 / 255, 0.999
 
 
@@ -27,14 +27,14 @@ def occlusion_reference(
     arrays = {name: np.asarray(value, dtype=np.float64) for name, value in gaussians.items() if name != "sh"}
     R, t = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
     centers = arrays["means"] @ R.T + t
-    falloff, share = _footprints(arrays, centers, R, camera)
+    falloff, share = _footprints(arrays, centers, R, camera, PIXEL if antialiased else DILATION)
     opacity = share if antialiased else 1.0
     opacity = opacity / (1 + np.exp(-arrays["logit_opacities"]))
     alpha = np.minimum(opacity[:, None] * falloff, ALPHA_MAX)
     passed = np.log1p(-np.where(alpha >= ALPHA_MIN, alpha, 0))  # [N, P], ln(1 - alpha)
     received = centers if points is None else points @ R.T + t
-    if points is not None:
-        falloff, _ = _footprints(arrays, received, R, camera)
+    if points is not None or antialiased:
+        falloff, _ = _footprints(arrays, received, R, camera, DILATION)
     beta = np.where(falloff >= beta_min, falloff, 0)
     occlusion = np.zeros(len(centers))
     for i, depth in enumerate(received[:, 2]):
@@ -45,16 +45,16 @@ def occlusion_reference(
 
 
 def _footprints(
-    arrays: Mapping[str, np.ndarray], centers: np.ndarray, R: np.ndarray, camera: OrthographicCamera
+    arrays: Mapping[str, np.ndarray], centers: np.ndarray, R: np.ndarray, camera: OrthographicCamera, spread: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(exp(-d^T Sigma^-1 d / 2) [N, H W] at the pixel centres (4.7), sqrt(det Sigma / det(Sigma + 0.3 I)) [N])."""
+    """(exp(-d^T Sigma^-1 d / 2) [N, H W] at the pixel centres (4.7), sqrt(det Sigma / det(Sigma + spread I)) [N])."""
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     J = np.diag([camera.scale_x, camera.scale_y]) @ R[:2]
     falloff, share = np.zeros((len(centers), columns.size)), np.zeros(len(centers))
     for i, center in enumerate(centers):
         axes = rotation_from_quaternion(arrays["quaternions"][i])
         covariance = J @ axes @ np.diag(np.exp(2 * arrays["log_scales"][i])) @ axes.T @ J.T
-        dilated = covariance + DILATION * np.eye(2)
+        dilated = covariance + spread * np.eye(2)
         inverse = np.linalg.inv(dilated)
         dx = columns.ravel() - (camera.scale_x * center[0] + camera.cx)
         dy = rows.ravel() - (camera.scale_y * center[1] + camera.cy)

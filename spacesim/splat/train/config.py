@@ -24,6 +24,7 @@ ISOTROPY = 1e-2  #: weight of the isotropy term of `park`, chosen
 MARGIN = (
     1e-3  #: to the exterior, of `fast` and `demo`: at few pixels 1e-4 prunes half of the surface (docs/strategies.md)
 )
+LIT_SCREEN_SIZE = 0.03  #: above it methods of light split, but in `thesis`, chosen: a Gaussian has one visibility
 MCMC_PENALTY = 1e-2  #: weights of the penalties on opacity and scale of `mcmc` (Kheradmand et al. 2024)
 PRIORS = ("truth", "mesh")
 MOST_VIEWS = 64  #: of a step, chosen: one kernel reads the gradients of all; for 64 two cores compile about 11 s
@@ -166,9 +167,10 @@ def preset(name: str, method: str = "vanilla", strategy: str = "default") -> Tra
     isotropy = ISOTROPY if method == "park" else 0.0
     penalty = MCMC_PENALTY if strategy == "mcmc" else 0.0
     config = replace(_schedule(name), method=method, light=light, isotropy_weight=isotropy, strategy=strategy)
-    # A vanilla run's PLY is for other viewers, too, which have no such filter.
-    antialiased = light is not None and name != "thesis"
-    return replace(config, antialiased=antialiased, opacity_weight=penalty, scale_weight=penalty)
+    config = replace(config, opacity_weight=penalty, scale_weight=penalty)
+    if light is None or name == "thesis":
+        return config  # a vanilla run's PLY is for other viewers, too, which have no such filter
+    return replace(config, antialiased=True, refinement=replace(config.refinement, split_screen_size=LIT_SCREEN_SIZE))
 
 
 def warm_start(name: str) -> WarmStartConfig:
@@ -211,6 +213,8 @@ def _light(name: str, method: str) -> LightConfig:
     """Networks and shadows of a preset: `thesis` as in tables 4.1 to 4.3; `fast` and `demo` smaller, and with what we
     found better (docs/relighting.md, docs/ablations.md)."""
     features, width, image = {"thesis": (128, 256, 1024), "fast": (32, 64, 512)}.get(name, (16, 64, 256))
+    if method != "shadow-map" and name != "thesis":
+        image *= 2  # splatting reads whole pixels
     if method == "park":
         encoding = Encoding("positional", 4)
         field = FieldConfig(72 if name == "thesis" else features, width, 3, encoding, encoding)

@@ -139,7 +139,7 @@ def test_blockers_smaller_than_a_pixel_blend(antialiased):
     """One of a tenth of a pixel darkens its pixel as its dilated splat covers it, or, anti-aliased, by the area that it
     has of that, and no more."""
     pixel, width = 2 / 64, 0.3
-    kept = width**2 / (width**2 + 0.3) if antialiased else 1
+    kept = width**2 / (width**2 + 1 / 12) if antialiased else 1
     arrays = joined(
         splats([[pixel / 2, pixel / 2, 0.5]], width * pixel, 0.9), splats([[pixel / 2, pixel / 2, 0]], 1e-4, 0.004)
     )
@@ -259,8 +259,8 @@ def test_hostile_gaussians_get_none_and_spoil_nothing(name):
     assert np.all((strange >= 0) & (strange <= 1))
 
 
-@pytest.mark.parametrize(("name", "most"), [("median", 0.95), ("bilinear", 0.99)])
-def test_models_of_any_size(name, most, monkeypatch):
+@pytest.mark.parametrize("name", ["median", "bilinear"])
+def test_models_of_any_size(name, monkeypatch):
     """Few recordings serve them all, and say what is computed without them."""
     counts, suns = (700, 90, 2100, 700, 1), ([0.3, -0.5, 0.8], [0, 0, -1])
 
@@ -275,7 +275,7 @@ def test_models_of_any_size(name, most, monkeypatch):
     monkeypatch.setattr(mapping, "_tested", mapping._trace_tested)
     for one, other in zip(recorded, found(), strict=True):
         np.testing.assert_array_equal(one, other)
-    assert 0.05 < recorded[0].mean() < most
+    assert 0.05 < recorded[0].mean() < 0.99
 
 
 @pytest.mark.parametrize("softness", [1e-30, 1e-6, 1e6])

@@ -45,6 +45,8 @@ class DefaultStrategyConfig:
             raise InputError(f"--max-gaussians: expected at least 1, found {self.max_gaussians}")
         if not 0 < self.prune_opacity < 0.5:  # a reset lowers to twice as much
             raise InputError(f"--prune-opacity: expected above 0 and below 0.5, found {self.prune_opacity}")
+        if not 0 < self.split_screen_size < float("inf"):
+            raise InputError(f"--split-screen-size: expected a number above 0, found {self.split_screen_size}")
 
 
 @dataclass(frozen=True, eq=False)
