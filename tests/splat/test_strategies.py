@@ -405,6 +405,17 @@ def test_what_is_too_faint_is_an_option(spacesim, tiny_data, tmp_path):
     assert TrainConfig.from_json(read_json(tmp_path / "run" / "config.json")).refinement.prune_opacity == 0.01
 
 
+def test_what_is_too_wide_is_an_option(spacesim, tiny_data, tmp_path):
+    """Methods of light split at a smaller size by themselves: a Gaussian has one visibility."""
+    assert preset("fast", "shadow-map").refinement.split_screen_size < preset("fast").refinement.split_screen_size
+    line = ["train", tiny_data, "--preset", "demo", "--init-count", 50, "--iterations", 1, "--out", tmp_path / "run"]
+    for wrong in ("0", "-0.1", "nan", "inf"):
+        assert spacesim(*line, "--split-screen-size", wrong).is_refusal("--split-screen-size", "above 0", wrong)
+    assert spacesim(*line, "--split-screen-size", 0.01, "--strategy", "mcmc").is_refusal("--split-screen-size", "mcmc")
+    assert spacesim(*line, "--split-screen-size", 0.01).code == 0
+    assert TrainConfig.from_json(read_json(tmp_path / "run" / "config.json")).refinement.split_screen_size == 0.01
+
+
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("kind", ["default", "mesh-aware", "support-aware", "mcmc"])
 def test_one_gaussian_is_refined_like_many(kind, count):
