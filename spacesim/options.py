@@ -102,8 +102,8 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
         "--split-screen-size",
         type=float,
         metavar="S",
-        help="refinement splits what is wider, a share of the picture (0.03 of methods of light, vanilla 0.1, thesis "
-        "0.01): less makes shadows sharper and Gaussians more",
+        help="refinement splits what is wider, a share of the picture (0.1; of methods of light 0.03, with --preset "
+        "demo 0.06; --preset thesis 0.01): less makes shadows sharper and Gaussians more",
     )
     one.add_argument("--init", help="mesh, points or random (default: points, else mesh, else random)")
     one.add_argument("--init-count", type=int, metavar="N", help="Gaussians at the start, at most")

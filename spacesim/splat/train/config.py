@@ -24,7 +24,7 @@ ISOTROPY = 1e-2  #: weight of the isotropy term of `park`, chosen
 MARGIN = (
     1e-3  #: to the exterior, of `fast` and `demo`: at few pixels 1e-4 prunes half of the surface (docs/strategies.md)
 )
-LIT_SCREEN_SIZE = 0.03  #: above it methods of light split, but in `thesis`, chosen: a Gaussian has one visibility
+LIT_SCREEN_SIZES = {"demo": 0.06, "fast": 0.03}  #: above which methods of light split: a Gaussian has one visibility
 MCMC_PENALTY = 1e-2  #: weights of the penalties on opacity and scale of `mcmc` (Kheradmand et al. 2024)
 PRIORS = ("truth", "mesh")
 MOST_VIEWS = 64  #: of a step, chosen: one kernel reads the gradients of all; for 64 two cores compile about 11 s
@@ -170,7 +170,8 @@ def preset(name: str, method: str = "vanilla", strategy: str = "default") -> Tra
     config = replace(config, opacity_weight=penalty, scale_weight=penalty)
     if light is None or name == "thesis":
         return config  # a vanilla run's PLY is for other viewers, too, which have no such filter
-    return replace(config, antialiased=True, refinement=replace(config.refinement, split_screen_size=LIT_SCREEN_SIZE))
+    refinement = replace(config.refinement, split_screen_size=LIT_SCREEN_SIZES[name])
+    return replace(config, antialiased=True, refinement=refinement)
 
 
 def warm_start(name: str) -> WarmStartConfig:
