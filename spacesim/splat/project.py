@@ -86,7 +86,7 @@ def project(gaussians: Gaussians, camera: Projection, antialiased: Any = False) 
     xx, yy, xy = dr.squared_norm(m_x), dr.squared_norm(m_y), dr.dot(m_x, m_y)
     own_determinant = dr.squared_norm(dr.cross(m_x, m_y))
     spread = _spread(antialiased)
-    determinant = own_determinant + spread * (xx + yy) + spread * spread
+    determinant = own_determinant + spread * (xx + yy + spread)
     xx, yy = xx + spread, yy + spread
     inverse_determinant = dr.rcp(determinant)
     if antialiased is not False:

@@ -255,7 +255,7 @@ def test_zooming_out_keeps_the_mean_of_the_antialiased_picture(view):
 
 
 def test_compensation_is_the_ratio_of_areas():
-    """A ball of s pixels keeps s^2 / (s^2 + 0.3) of its opacity; one with no area fades away, without NaN."""
+    """A ball of s pixels keeps s^2 / (s^2 + 1/12) of its opacity; one with no area fades away, without NaN."""
     view = OrthographicCamera(np.eye(4), 16, 16, 1.0, 1.0, 8.0, 8.0)
     sizes = np.array([5.0, 1.0, 0.3, 0.1, 1e-2, 1e-20])
     arrays = {name: np.repeat(value[:1], 6, axis=0) for name, value in random_splats(1).items()}
@@ -264,10 +264,10 @@ def test_compensation_is_the_ratio_of_areas():
     dr.enable_grad(gaussians.log_scales)
     splats, _ = project(gaussians, Orthographic.of(view), antialiased=True)
     opacity = 1 / (1 + np.exp(-arrays["logit_opacities"]))
-    np.testing.assert_allclose(np.array(splats.opacity), opacity * sizes**2 / (sizes**2 + 0.3), rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(np.array(splats.opacity), opacity * sizes**2 / (sizes**2 + 1 / 12), rtol=1e-4, atol=1e-9)
     dr.backward(dr.sum(splats.opacity))
     slope = np.array(dr.grad(gaussians.log_scales)).sum(axis=0)
-    np.testing.assert_allclose(slope, opacity * 0.6 * sizes**2 / (sizes**2 + 0.3) ** 2, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(slope, opacity / 6 * sizes**2 / (sizes**2 + 1 / 12) ** 2, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("view", VIEWS)

@@ -259,8 +259,8 @@ def test_hostile_gaussians_get_none_and_spoil_nothing(name):
     assert np.all((strange >= 0) & (strange <= 1))
 
 
-@pytest.mark.parametrize("name", ["median", "bilinear"])
-def test_models_of_any_size(name, monkeypatch):
+@pytest.mark.parametrize(("name", "most"), [("median", 0.96), ("bilinear", 0.99)])
+def test_models_of_any_size(name, most, monkeypatch):
     """Few recordings serve them all, and say what is computed without them."""
     counts, suns = (700, 90, 2100, 700, 1), ([0.3, -0.5, 0.8], [0, 0, -1])
 
@@ -275,7 +275,7 @@ def test_models_of_any_size(name, monkeypatch):
     monkeypatch.setattr(mapping, "_tested", mapping._trace_tested)
     for one, other in zip(recorded, found(), strict=True):
         np.testing.assert_array_equal(one, other)
-    assert 0.05 < recorded[0].mean() < 0.99
+    assert 0.05 < recorded[0].mean() < most
 
 
 @pytest.mark.parametrize("softness", [1e-30, 1e-6, 1e6])
