@@ -47,8 +47,9 @@ def grazing_bias(gaussians: Gaussians, camera: Orthographic, reach: float = 2.0)
     receiver's. Over a footprint's standard deviation that depth changes by sigma^l, if the light's picture shows the
     Gaussian as it is; but it is drawn with a filter of `DILATION` pixels^2, so that no splat is thinner than a pixel,
     and then by sqrt(sigma^l^2 + DILATION |g|^2) with g = (n_x / f_x, n_y / f_y) / n_z, the surface's slope a pixel, in
-    light axes. b is `reach` times that times gamma: in the light's picture a shadow that touches its caster recedes by
-    `reach` standard deviations of a splat as drawn, however low the Sun.
+    light axes (anti-aliased splats have less of a filter, and a wider bias than they need). b is `reach` times that
+    times gamma: in the light's picture a shadow that touches its caster recedes by `reach` standard deviations of a
+    splat as drawn, however low the Sun.
     camera: the light camera;  reach: standard deviations, chosen by measurement (docs/shadows.md), as is the slope's
     limit, |n_z| at least `STEEPEST`. May be part of a recording.
     """
