@@ -120,7 +120,7 @@ def _train(options: argparse.Namespace) -> None:
 
     names = (
         *("init", "init_count", "init_box", "views_per_step", "iterations", "seed", "visibility_weight"),
-        *("flatten_weight", "depth_weight", "normal_weight", "prior", "antialiased"),
+        *("flatten_weight", "depth_weight", "normal_weight", "prior", "antialiased", "supersample"),
     )
     config = preset(options.preset, options.method, options.strategy)
     config = with_options(config, **{name: getattr(options, name) for name in names})

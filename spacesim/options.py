@@ -118,6 +118,12 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
         "but with --preset thesis)",
     )
     one.add_argument(
+        "--supersample",
+        type=int,
+        metavar="N",
+        help="draw pictures N times as wide, a pixel is the mean light of N x N: sharper edges, slower steps (1)",
+    )
+    one.add_argument(
         "--init-box", type=float, metavar="X", help="--init random in a cube X times as wide as the object"
     )
     one.add_argument("--warm-start", action="store_true", help="pull Gaussians to the foreground before refinement")

@@ -8,6 +8,7 @@ RUN/training.json      history, time, backend, versions
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.light import LARGEST_EV, LightModel
-from spacesim.splat.project import Pinhole, Projection
+from spacesim.splat.project import Projection
 from spacesim.splat.render import RenderOutput, render
+from spacesim.splat.supersample import supersampled
 from spacesim.splat.tone import developed
 from spacesim.splat.train.checkpoint import read_tensors
 from spacesim.splat.train.config import TrainConfig
@@ -67,6 +69,11 @@ class Run:
         return bool(self.config.get("antialiased", False))
 
     @property
+    def supersample(self) -> int:
+        """Places on a side of each pixel, whose mean light it is, in training and in what is predicted."""
+        return int(self.config.get("supersample", 1))
+
+    @property
     def relightable(self) -> bool:
         """Whether the Sun's direction changes what is predicted."""
         return self.light is not None
@@ -85,13 +92,15 @@ class Run:
         more = stops(self.curve, exposure, str(self.path))
         names = ("alpha", "depth", *(("normal",) if normals else ()))
         if self.light is None:
-            output = render(self.model, Pinhole.of(camera), outputs=(*names, "colour"), antialiased=self.antialiased)
+            plain = partial(render, self.model, outputs=(*names, "colour"), antialiased=self.antialiased)
+            output = supersampled(plain, camera, self.supersample)
             return _prediction(output, output.image("colour"), None, normals)
         if sun is None:
             raise InputError(
                 f"{self.path}: expected the Sun's direction for a run of {self.config['method']}, found none"
             )
-        output = draw_lit(self.model, self.light, Pinhole.of(camera), sun.direction, names, self.antialiased)
+        lit = partial(draw_lit, self.model, self.light, sun=sun.direction, outputs=names, antialiased=self.antialiased)
+        output = supersampled(lit, camera, self.supersample, colours=3, linear=self.curve is not None)
         drawn, alpha = output.image("features"), output.image("alpha")
         visible = np.zeros_like(alpha)
         visibility = np.divide(drawn[..., 3], alpha, out=visible, where=alpha > 0) if drawn.shape[2] > 3 else None

@@ -41,7 +41,11 @@ def developed(light: np.ndarray, tone: str, stops: float = 0.0) -> np.ndarray:
 
 def encoded(linear: Any) -> Any:
     """sRGB values in [0, 1] of linear ones, clipped to [0, 1]. Arrays of any shape."""
-    linear = dr.clip(linear, 0, 1)
+    return encoded_unclipped(dr.clip(linear, 0, 1))
+
+
+def encoded_unclipped(linear: Any) -> Any:
+    """sRGB values of linear ones, 0 or more, beyond 1 by the same curve. Arrays of any shape."""
     curve = 1.055 * dr.power(dr.maximum(linear, _LINEAR_END), 1 / 2.4) - 0.055
     return dr.select(linear <= _LINEAR_END, 12.92 * linear, curve)
 

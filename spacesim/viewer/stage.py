@@ -70,7 +70,7 @@ class Stage:
             return Planes(1 - np.array(blended.transmittance).reshape(shape), rgb=rgb)
         wanted = {"rgb": "rgb", "depth": "depth", "visibility": "visibility", "normal": "normal", "object_id": "id"}
         name = NEEDED[mode]
-        drawn = scene.draw(camera, stand.sun, [wanted[name]] if name in wanted else [])
+        drawn = scene.draw(camera, stand.sun, [wanted[name]] if name in wanted else [], supersample=1)
         alpha = drawn.image("alpha")
         if name not in wanted or (name == "visibility" and "visibility" not in drawn.planes):
             return Planes(alpha)

@@ -226,7 +226,8 @@ def _trace_harmonic_colours(rows: list[Any], camera: Pinhole) -> Any:
 
 def _digest(run: Run) -> str:
     """Of everything that a picture of the run depends on."""
-    digest = hashlib.sha256(repr((run.antialiased, run.light.config if run.light else None)).encode())
+    drawn = run.antialiased, run.supersample, run.light.config if run.light else None
+    digest = hashlib.sha256(repr(drawn).encode())
     tensors = run.model.to_numpy() | (run.light.tensors() if run.light else {})
     for name in sorted(tensors):
         digest.update(f"{name}{tensors[name].shape}".encode())

@@ -9,6 +9,7 @@ Then its Gaussians go to the world (3.11 to 3.13).
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.render import RenderOutput, render
 from spacesim.splat.run import Prediction, Run, stops
 from spacesim.splat.shadow.cast import Between, cast_between
+from spacesim.splat.supersample import supersampled
 from spacesim.splat.tone import developed
 
 OUTPUTS = ("rgb", "alpha", "depth", "median_depth", "normal", "visibility", "id")
@@ -172,6 +174,11 @@ class Composition:
         return self._ensemble.antialiased
 
     @property
+    def supersample(self) -> int:
+        """Places on a side of each pixel of what is predicted: the most that a model was trained with."""
+        return max(model.run.supersample for model in self.models)
+
+    @property
     def contents(self) -> list[str]:
         """A digest of what each model is made of, in their order."""
         return [member.key for member in self._members]
@@ -221,9 +228,12 @@ class Composition:
         Float [N of it], or None where no other can be before the Sun."""
         return self._between([model.pose for model in self.placed], None if sun is None else sun.direction)
 
-    def draw(self, camera: Camera, sun: Sun | None, outputs: Sequence[str] = ("rgb",)) -> Drawn:
+    def draw(
+        self, camera: Camera, sun: Sun | None, outputs: Sequence[str] = ("rgb",), supersample: int | None = None
+    ) -> Drawn:
         """A view on the device: of `OUTPUTS` those asked for, and alpha. Visibility is left out where no model knows
-        any. Raises ValueError for another output, InputError where the Sun matters and none is told."""
+        any. supersample: places on a side of each pixel, by default as many as the models were trained with. Raises
+        ValueError for another output, InputError where the Sun matters and none is told."""
         unknown = [name for name in outputs if name not in OUTPUTS]
         if unknown:
             raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
@@ -239,17 +249,19 @@ class Composition:
             planes["id"] = self._ensemble.shares
         names = [name for name in outputs if name in ("depth", "median_depth", "normal")]
         features = [plane for group in planes.values() for plane in group]
-        antialiased = self._ensemble.antialiased
-        output = render(
-            self._ensemble.placed(poses),
-            Pinhole.of(camera),
+        ensemble, times = self._ensemble, self.supersample if supersample is None else supersample
+        plain = partial(
+            render,
+            ensemble.placed(poses),
             outputs=("alpha", *names),
             features=features,
-            antialiased=antialiased,
+            antialiased=ensemble.antialiased,
         )
+        linear = ensemble.curve is not None
+        output = supersampled(plain, camera, times, len(planes.get("rgb", [])), linear)
         drawn = iter(output.features or [])
         found = {name: [next(drawn) for _ in group] for name, group in planes.items()}
-        return Drawn(output, found, self._order(), self._ensemble.curve)
+        return Drawn(output, found, self._order(), ensemble.curve)
 
     def lit_gaussians(self, camera: Camera, sun: Sun | None) -> tuple[Gaussians, list[Any]]:
         """(the set in the world, its colours seen from the camera: three Floats [N], sRGB display values), to draw it

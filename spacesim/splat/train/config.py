@@ -10,6 +10,7 @@ from spacesim.splat.light import LightConfig
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.shadow.mapping import MappingConfig
 from spacesim.splat.shadow.refine import RefineConfig
+from spacesim.splat.supersample import MOST
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.strategies.mcmc import McmcConfig
 from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig
@@ -71,6 +72,7 @@ class TrainConfig:
     ssim_weight: float = 0.2  #: lambda of thesis 2.8
     random_background: bool = True  #: train against alpha; False: over black, as the thesis
     antialiased: bool = False  #: with Mip-Splatting's 2D filter, in training and in the run's pictures; see `project`
+    supersample: int = 1  #: places on a side of each pixel, whose mean light it is, in training and the run's pictures
     light: LightConfig | None = None  #: how the Sun makes colours; None for `vanilla`, whose colours are fixed
     visibility_weight: float = 0.0  #: of the mean error of blended visibility against the path-traced one
     isotropy_weight: float = 0.0  #: of the scales' mean distance from a Gaussian's mean scale, per scene scale (`park`)
@@ -109,6 +111,8 @@ class TrainConfig:
             raise InputError(f"--init-count: expected at least 1, found {self.init_count}")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"--sh-degree: expected 0 to 3, found {self.sh_degree}")
+        if not 1 <= self.supersample <= MOST:
+            raise InputError(f"--supersample: expected 1 to {MOST}, found {self.supersample}")
         if self.seed < 0:
             raise InputError(f"--seed: expected 0 or more, found {self.seed}")
         if (self.light is None) != (self.method == "vanilla"):

@@ -11,6 +11,7 @@ from spacesim.splat.cameras import Pinhole
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.project import Footprints, Splats, project
 from spacesim.splat.render import view_colours
+from spacesim.splat.supersample import pixel_means
 from spacesim.splat.surface import normals
 from spacesim.splat.tone import light_of, picture_of
 from spacesim.splat.train.losses import depth_loss, normal_loss, photometric_loss, visibility_loss
@@ -55,7 +56,7 @@ class Target:
 @dataclass(frozen=True)
 class LossConfig:
     """Weights of the terms;  scale: metres, the unit of depth;  tone: curve of colours that are blended, with the
-    background, in linear light, or None"""
+    background, in linear light, or None;  supersample: places on a side of each pixel, see `pixel_means`"""
 
     ssim: float
     visibility: float
@@ -63,12 +64,14 @@ class LossConfig:
     normal: float
     scale: float
     tone: str | None
+    supersample: int = 1
 
 
 def picture_loss(
     planes: dict[str, list[Any]], transmittance: Any, target: Target, size: tuple[int, int], config: LossConfig
 ) -> tuple[Any, dict[str, list[Any]], Any]:
-    """Loss of a picture over the target's background, and its gradients by its planes (by name) and transmittance."""
+    """Loss of a picture over the target's background, and its gradients by its planes (by name) and transmittance.
+    size: width and height of the target, pixels"""
     channels = [ad.Float((target.rgba >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24)]
     below = ad.Array3f([dr.gather(ad.Float, target.background, ad.UInt32(c)) for c in range(3)])
     straight = ad.Array3f(channels[:3])
@@ -78,6 +81,9 @@ def picture_loss(
     planes = {name: [ad.Float(plane) for plane in group] for name, group in planes.items()}
     transmittance = ad.Float(transmittance)
     dr.enable_grad(planes, transmittance)
+    drawn, places = planes, transmittance
+    if config.supersample > 1:
+        planes, transmittance = pixel_means(planes, transmittance, size, config.supersample, config.tone is not None)
     picture = dr.select(target.valid, ad.Array3f(planes["colour"]) + transmittance * below, truth)
     if config.tone:
         picture, truth = picture_of(picture, config.tone), picture_of(truth, config.tone)
@@ -95,8 +101,8 @@ def picture_loss(
         mask, weight = known["foreground"]
         loss += weight * foreground_loss(transmittance, mask)
     dr.backward(loss)
-    by_plane = {name: [dr.grad(plane) for plane in group] for name, group in planes.items()}
-    return dr.detach(loss), by_plane, dr.grad(transmittance)
+    by_plane = {name: [dr.grad(plane) for plane in group] for name, group in drawn.items()}
+    return dr.detach(loss), by_plane, dr.grad(places)
 
 
 def on_screen(absolute: tuple[Any, Any], half: tuple[Any, Any], sizes: Any) -> tuple[Any, Any]:

@@ -21,6 +21,7 @@ from spacesim.splat.gaussians import Gaussians, uploaded
 from spacesim.splat.light import LightModel, TrainingFrame
 from spacesim.splat.project import Footprints, Pinhole
 from spacesim.splat.rasterize import backward, forward
+from spacesim.splat.supersample import finer
 from spacesim.splat.tiles import RECORDINGS, bin_splats
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
@@ -85,6 +86,7 @@ class Trainer:
             config.normal_weight,
             self.scene_scale,
             config.light.curve[0] if config.light and config.light.curve else None,
+            config.supersample,
         )
         self.history: list[dict[str, float]] = []
         self._project = recorded(project_views, RECORDINGS)
@@ -153,7 +155,7 @@ class Trainer:
     def _look(self, rows: list[Any], degree: int, number: int) -> "_Look":
         """Blend view `number` of the training, compare, and go back."""
         config, view, index = self.config, self.views.at_step(number), self.iteration
-        camera = Pinhole.of(view.camera)
+        camera = Pinhole.of(finer(view.camera, config.supersample))
         size = width, height = camera.width, camera.height
         splats, footprints, values = self._project(
             rows, camera, degree, config.antialiased, config.shape_terms, self.scene_scale
@@ -170,7 +172,8 @@ class Trainer:
         attraction = self._attraction(view)
         by_name = _named(blended.features, channels)
         target = self._target(number, view, attraction)
-        loss, by_plane, by_transmittance = self._loss(by_name, blended.transmittance, target, size, self._terms)
+        picture = view.camera.width, view.camera.height
+        loss, by_plane, by_transmittance = self._loss(by_name, blended.transmittance, target, picture, self._terms)
         watched = self.strategy.watches(index + 1) and not self._warming(index)
         by_planes = [plane for group in by_plane.values() for plane in group]
         by_splat = backward(splats, blended, lists, size, by_planes, by_transmittance, absolute=watched)
@@ -178,7 +181,7 @@ class Trainer:
         by_value = _named(by_splat.features, channels)
         if watched:
             self._observe(by_splat, footprints, size)
-        by_rows = self.warm_start.pull(rows, camera, attraction, index) if self.warm_start and attraction else []
+        by_rows = self._pull(rows, view, attraction) if attraction else []
         if not shading or not self.light:
             return _Look(ViewGradients(camera, by_splat.splats, by_value, by_rows=by_rows), loss)
         of_visibility = by_value.pop("visibility", [None])[0]
@@ -203,6 +206,11 @@ class Trainer:
         warm, index = self.warm_start, self.iteration
         pulls = warm is not None and (warm.active(index) or warm.config.strength(index) > 0)
         return warm.attraction(view) if warm and pulls else None
+
+    def _pull(self, rows: list[Any], view: View, attraction: Attraction) -> list[Any]:
+        """What the warm start adds to the gradients of the rows."""
+        assert self.warm_start is not None
+        return self.warm_start.pull(rows, Pinhole.of(view.camera), attraction, self.iteration)
 
     def _target(self, number: int, view: View, attraction: Attraction | None) -> Target:
         rgba, valid, truth = self.views.pixels(view)
