@@ -27,6 +27,7 @@ from spacesim.progress import reporting, tell_training
 from spacesim.splat.light import LightConfig
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.shadow.mapping import SUN_RADIUS_DEG, MappingConfig
+from spacesim.splat.shadow.refine import RefineConfig
 from spacesim.splat.train.config import TrainConfig, preset, with_field, with_options
 from spacesim.splat.train.train import train
 
@@ -118,6 +119,18 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     both = with_shadow(replace(splatted, visibility_weight=0.1), gradients=True)
     yield "splat, surface, supervised, gradients", both
     yield "splat, surface, lifted alone, supervised, gradients", with_shadow(both, grazing="lift")
+    yield "none, surface, bounce", with_bounce(relit, splatted.light.bounce)
+    yield "map, surface, no bounce", with_bounce(mapped, 0)
+    yield "splat, surface, no bounce", with_bounce(splatted, 0)
+    told = RefineConfig(width=refine_of(splatted).width)
+    yield "splat, surface, refinement told the Sun", with_shadow(splatted, refine=told)
+    yield "splat, surface, no bounce, refinement told the Sun", with_bounce(with_shadow(splatted, refine=told), 0)
+    if splatted.supersample == 1:
+        yield "none, surface, pixels of four", replace(relit, supersample=2)
+        yield "splat, surface, pixels of four", replace(splatted, supersample=2)
+    else:
+        yield "none, surface, pixels of one", replace(relit, supersample=1)
+        yield "splat, surface, pixels of one", replace(splatted, supersample=1)
     yield "none, surface, finer", finer(relit)
     yield "splat, surface, finer", finer(splatted)
     yield "splat, surface, finer, supervised, gradients", finer(both)
@@ -129,12 +142,20 @@ def finer(config: TrainConfig) -> TrainConfig:
     return replace(config, refinement=replace(config.refinement, split_screen_size=size, prune_opacity=0.005))
 
 
+def with_bounce(config: TrainConfig, emitters: int) -> TrainConfig:
+    """`config` with one bounce of light from so many Gaussians."""
+    assert config.light is not None
+    return replace(config, light=replace(config.light, bounce=emitters))
+
+
 def as_thesis(config: TrainConfig) -> TrainConfig:
     """The field, the shadows and the splats as the thesis has them, in networks of the preset's size."""
     assert config.light is not None
-    config = replace(config, light=replace(config.light, field=with_field(config.light.field, "thesis")))
-    config = replace(config, antialiased=False)
-    shadow = {"bias": 10.0, "grazing": "none", "mapping": MappingConfig()}
+    config = replace(config, light=replace(config.light, field=with_field(config.light.field, "thesis"), bounce=0))
+    config = replace(config, antialiased=False, supersample=1)
+    shadow: dict[str, Any] = {"bias": 10.0, "grazing": "none", "mapping": MappingConfig()}
+    if config.light.shadow:
+        shadow["refine"] = RefineConfig(width=refine_of(config).width)
     return with_shadow(config, **shadow) if config.light.shadow else config
 
 
@@ -145,8 +166,11 @@ def as_ours(config: TrainConfig) -> TrainConfig:
     config = replace(config, antialiased=preset("fast", config.method).antialiased)
     if config.light.shadow is None:
         return config
-    ours = shadow_of(preset("fast", config.method))
-    return with_shadow(config, bias=ours.bias, grazing=ours.grazing, mapping=ours.mapping)
+    fast = preset("fast", config.method)
+    ours, refine = shadow_of(fast), replace(refine_of(fast), width=refine_of(config).width)
+    bounce = config.light.bounce or fast.light.bounce
+    config = replace(config, light=replace(config.light, bounce=bounce))
+    return with_shadow(config, bias=ours.bias, grazing=ours.grazing, mapping=ours.mapping, refine=refine)
 
 
 def with_shadow(config: TrainConfig, **changes: Any) -> TrainConfig:
@@ -160,6 +184,12 @@ def shadow_of(config: TrainConfig) -> ShadowConfig:
     assert config.light is not None
     assert config.light.shadow is not None
     return config.light.shadow
+
+
+def refine_of(config: TrainConfig) -> RefineConfig:
+    refine = shadow_of(config).refine
+    assert refine is not None
+    return refine
 
 
 def make_data(out: Path) -> Path:

@@ -103,7 +103,7 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
         type=float,
         metavar="S",
         help="refinement splits what is wider, a share of the picture (0.1; of methods of light 0.03, with --preset "
-        "demo 0.06; --preset thesis 0.01): less makes shadows sharper and Gaussians more",
+        "demo 0.06, fine 0.015; --preset thesis 0.01): less makes shadows sharper and Gaussians more",
     )
     one.add_argument("--init", help="mesh, points or random (default: points, else mesh, else random)")
     one.add_argument("--init-count", type=int, metavar="N", help="Gaussians at the start, at most")
@@ -121,7 +121,8 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
         "--supersample",
         type=int,
         metavar="N",
-        help="draw pictures N times as wide, a pixel is the mean light of N x N: sharper edges, slower steps (1)",
+        help="draw pictures N times as wide, a pixel is the mean light of N x N: sharper edges, slower steps (1; 2 of "
+        "methods of light with --preset fine)",
     )
     one.add_argument(
         "--init-box", type=float, metavar="X", help="--init random in a cube X times as wide as the object"
@@ -130,7 +131,7 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--depth-weight", type=float, metavar="W", help="learn depth from the truth, too (0)")
     one.add_argument("--normal-weight", type=float, metavar="W", help="learn normals from the truth, too (0)")
     one.add_argument("--prior", choices=("truth", "mesh"), help="whose depth and normals: truth (default) or mesh")
-    one.add_argument("--preset", default="fast", help="demo, fast (default) or thesis")
+    one.add_argument("--preset", default="fast", help="demo, fast (default), fine or thesis")
     one.add_argument("--iterations", type=int, metavar="N")
     one.add_argument("--seed", type=int, metavar="N")
     one.add_argument(
@@ -139,6 +140,12 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--resume", action="store_true", help="go on from the newest checkpoint")
     lit = one.add_argument_group("light", "of the methods that learn it; see docs/relighting.md")
     lit.add_argument("--field", choices=("thesis", "surface"), help="what the appearance field is told")
+    lit.add_argument(
+        "--bounce",
+        type=int,
+        metavar="N",
+        help="so many Gaussians scatter sunlight onto all (256 of methods with shadows, --preset fine 1024)",
+    )
     lit.add_argument("--linear", action="store_true", help="blend colours in linear light, then use a tone curve")
     lit.add_argument("--tone", choices=("srgb", "filmic"), help="curve of --linear (the dataset's own, else srgb)")
     lit.add_argument(
@@ -264,6 +271,7 @@ def with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainConf
     """`config` with what the options say of fields and shadows. Raises InputError where the method has none of them."""
     names = (
         "field",
+        "bounce",
         "linear",
         "tone",
         "exposure",
@@ -281,14 +289,17 @@ def with_light(config: "TrainConfig", options: argparse.Namespace) -> "TrainConf
     from spacesim.splat.train.config import with_field
 
     light = config.light
-    of_shadows = [name for name in named if name not in ("field", "linear", "tone", "exposure")]
+    of_shadows = [name for name in named if name not in ("field", "bounce", "linear", "tone", "exposure")]
     if light is None or (light.shadow is None and of_shadows):
         option, what = (named[0], "that learns light") if light is None else (of_shadows[0], "with shadows")
         raise InputError(f"--{option.replace('_', '-')}: expected a method {what}, found {config.method}")
     if options.linear or options.tone is not None or options.exposure is not None:
         light = replace(light, linear=options.linear, tone=options.tone, exposure=options.exposure)
     if options.field is not None:
-        light = replace(light, field=with_field(light.field, options.field))
+        bounce = light.bounce if options.field == "surface" else 0
+        light = replace(light, field=with_field(light.field, options.field), bounce=bounce)
+    if options.bounce is not None:
+        light = replace(light, bounce=options.bounce)
     shadow = light.shadow
     if shadow is not None:
         given = {"bias": options.shadow_bias, "grazing": options.grazing, "size": options.light_size}

@@ -93,6 +93,12 @@ def by_normals(config: FieldConfig, inputs: FieldInputs, by_items: Any, by_facin
     return lanes.matrix(list(dr.grad(normals)))
 
 
+def turned_over(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:
+    """Bool [M]: is the side seen to which the learned normal does not point?"""
+    direction = inputs.camera.directions_to(lanes.spread(inputs.means))
+    return dr.dot(_normals(config, inputs, lanes), direction) > 0
+
+
 def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
     """n . s, max(n . s, 0), n . v, n . h, and powers of the last: what a reflectance model of an isotropic surface
     depends on (Blinn 1977), [M] each. A network of few units makes no lobe as narrow as a glint out of n . h alone.

@@ -23,11 +23,11 @@ def baked(gaussians: Gaussians, light: LightModel, sun: np.ndarray, degree: int 
     columns = [np.broadcast_to(np.array(term), VIEWS) for term in _harmonics(directions, degree)]
     fit = np.linalg.pinv(np.stack(columns, axis=1).astype(np.float64))  # [terms, VIEWS]
     coefficients = [ad.Float(0) for _ in range(3 * len(fit))]
-    visibility = light.visibility(gaussians, sun)  # from all around the same
+    sunlight = light.sunlight(gaussians, sun)  # from all around the same
     for view, direction in enumerate(directions):
         # A camera of parallel rays sees every Gaussian in one direction; how far it is away makes no difference.
         camera = OrthographicCamera.from_extent(look_at(-direction, np.zeros(3)), 4, 4, 1.0)
-        colours, _ = light.lit(gaussians, Orthographic.of(camera), sun, known=visibility)
+        colours, _ = light.lit(gaussians, Orthographic.of(camera), sun, known=sunlight)
         if light.config.curve:
             colours = [picture_of(colour, light.config.curve[0]) for colour in colours]
         for k in range(len(fit)):

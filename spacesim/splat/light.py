@@ -18,7 +18,16 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.tone import TONES
 from spacesim.splat import cooperative, mlp
-from spacesim.splat.appearance import FieldConfig, FieldInputs, by_normals, facing, field_items, field_views
+from spacesim.splat.appearance import (
+    FieldConfig,
+    FieldInputs,
+    by_normals,
+    facing,
+    field_items,
+    field_views,
+    turned_over,
+)
+from spacesim.splat.bounce import MOST_EMITTERS, Scatterers, brightened, brightened_slopes, irradiance
 from spacesim.splat.cameras import Projection
 from spacesim.splat.gaussians import Gaussians, uploaded
 from spacesim.splat.lanes import Lanes, aligned
@@ -33,7 +42,8 @@ COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed 
 
 @dataclass(frozen=True)
 class LightConfig:
-    """How light becomes colour. shadow: None leaves shadows to the field (the method `relight`);  linear: colours are
+    """How light becomes colour. shadow: None leaves shadows to the field (the method `relight`);  bounce: so
+    many of the Gaussians scatter sunlight onto all (`bounce.irradiance`), 0 for none;  linear: colours are
     linear, shares of what is white, and blended as such, and pictures go through the tone curve afterwards; else they
     are sRGB values, as in the thesis (section 7.2 asks for the former);  tone: the curve, one of
     `spacesim.data.tone.TONES`;  exposure: EV of the pictures trained on; both of linear colours alone, by default the
@@ -41,11 +51,16 @@ class LightConfig:
 
     field: FieldConfig = field(default_factory=FieldConfig)
     shadow: ShadowConfig | None = None
+    bounce: int = 0
     linear: bool = False
     tone: str | None = None
     exposure: float | None = None
 
     def __post_init__(self) -> None:
+        if not 0 <= self.bounce <= MOST_EMITTERS:
+            raise InputError(f"--bounce: expected 0 to {MOST_EMITTERS}, found {self.bounce}")
+        if self.bounce and not self.field.surface:
+            raise InputError("--bounce: expected --field surface, whose normals it needs, found another")
         for name in ("tone", "exposure"):
             if getattr(self, name) is not None and not self.linear:
                 raise InputError(f"--{name}: expected --linear beside it, found none")
@@ -66,7 +81,12 @@ class LightConfig:
 
     @property
     def features(self) -> int:
-        """F: numbers that each Gaussian has for the field, then for the refinement of shadows."""
+        """F: numbers that each Gaussian has for the field, then for the refinement of shadows, then of its albedo."""
+        return self.albedos + 3 * (self.bounce > 0)
+
+    @property
+    def albedos(self) -> int:
+        """Which of these numbers are the logits of the albedo (RGB) that one bounce needs: this and the next two."""
         return self.field.stored + (self.refine.features if self.refine else 0)
 
 
@@ -93,13 +113,14 @@ class SunTerms:
 
 @dataclass
 class _Inputs:
-    """What shading depends on beside weights. turns: quaternions and log scales;  camera: None where visibility alone
-    is wanted;  raw: occlusion, normal alignment, light extent and bias, [N] each, or nothing;  place: Float [4], centre
-    and scale of the training frame"""
+    """What shading depends on beside weights. turns: quaternions and log scales;  logits: of opacities;  camera: None
+    where the Sun's light alone is wanted;  raw: occlusion, normal alignment, light extent and bias, [N] each, or
+    nothing;  place: Float [4], centre and scale of the training frame"""
 
     features: Any
     means: Any
     turns: tuple[Any, Any]
+    logits: Any
     camera: Projection | None
     raw: list[Any]
     sun: SunTerms
@@ -109,13 +130,24 @@ class _Inputs:
 @dataclass
 class _Tape:
     """What the adjoint needs of the forward pass. colours: 3 arrays [M] before they are dimmed;  occlusion: the refined
-    one [M] in a list, or nothing;  faces: of `facing`, or nothing"""
+    one [M] in a list, or nothing;  faces: of `facing`, or nothing;  bounced: 3 arrays [M], light at the side that is
+    seen, or nothing"""
 
     field: list[Any]
     refine: list[Any]
     colours: list[Any]
     occlusion: list[Any]
     faces: list[Any]
+    bounced: list[Any]
+
+
+@dataclass
+class Sunlight:
+    """What of a Sun's light no camera changes. visibility: Float [N], what dims colours (4.17), or None of a model
+    without shadows;  bounced: of `bounce.irradiance`, Floats [N], or nothing"""
+
+    visibility: Any
+    bounced: list[Any]
 
 
 @dataclass
@@ -199,14 +231,15 @@ class LightModel:
         colours, visibility, tape = _shade(self.config, self.weights, inputs, lanes)
         return Shading(colours, visibility[0] if visibility else None, shadows, inputs, lanes, tape)
 
-    def visibility(self, gaussians: Gaussians, sun: np.ndarray, adaptive: bool = False) -> Any:
-        """What dims colours (4.17): Float [N], which no camera changes; None for a model without shadows."""
+    def sunlight(self, gaussians: Gaussians, sun: np.ndarray, adaptive: bool = False) -> Sunlight:
+        """For pictures under one Sun. Arguments as those of `shadows`."""
         shadows = self.shadows(gaussians, sun, adaptive)
-        if shadows is None:
-            return None
+        if shadows is None and not self.config.bounce:
+            return Sunlight(None, [])
         lanes = Lanes.of(gaussians.count, still=True)
         _, of_refine = _split(self.config, self.weights)
-        return _visible(self.config, of_refine, self._inputs(gaussians, None, sun, shadows), lanes)
+        visibility, bounced = _sunlit(self.config, of_refine, self._inputs(gaussians, None, sun, shadows), lanes)
+        return Sunlight(visibility[0] if visibility else None, bounced)
 
     def lit(
         self,
@@ -214,19 +247,19 @@ class LightModel:
         camera: Projection,
         sun: np.ndarray,
         adaptive: bool = False,
-        known: Any = None,
+        known: Sunlight | None = None,
     ) -> tuple[list[Any], Any]:
-        """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. known: `visibility` under
-        this Sun, of an earlier picture. What the field's first layer makes of the features does not change with Sun or
+        """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. known: `sunlight` of this
+        Sun, of an earlier picture. What the field's first layer makes of the features does not change with Sun or
         camera and stays for the next picture: as many numbers for each Gaussian as the layer has units."""
-        visibility = self.visibility(gaussians, sun, adaptive) if known is None else known
+        light = self.sunlight(gaussians, sun, adaptive) if known is None else known
         of_any_size = replace(camera, width=1, height=1)  # directions do not depend on it: one recording for all sizes
         inputs = self._inputs(gaussians, of_any_size, sun, None)
         lanes = Lanes.of(gaussians.count, still=True)
         kept = self._kept_of(gaussians.features, lanes)
         of_field, _ = _split(self.config, self.weights)
-        seen = [] if visibility is None else [visibility]
-        shown = _lit(self.config, of_field, inputs, lanes, kept.known, kept.packed, seen)
+        seen = [] if light.visibility is None else [light.visibility]
+        shown = _lit(self.config, of_field, inputs, lanes, kept.known, kept.packed, seen, light.bounced)
         return shown[:3], shown[3] if seen else None
 
     def adjoint(self, shading: Shading, by_colour: list[Any], by_visibility: Any = None) -> "LightGradients":
@@ -261,7 +294,10 @@ class LightModel:
     ) -> _Inputs:
         raw = [shadows.occlusion, *shadows.info] if shadows else []
         turns = gaussians.quaternions, gaussians.log_scales
-        return _Inputs(gaussians.features, gaussians.means, turns, camera, raw, self.sun_terms(sun), self._place)
+        logits = gaussians.logit_opacities
+        return _Inputs(
+            gaussians.features, gaussians.means, turns, logits, camera, raw, self.sun_terms(sun), self._place
+        )
 
     def _kept_of(self, features: Any, lanes: Lanes) -> _Kept:
         """Made anew where features or weights have changed. Copies hold what was read: a number of Dr.Jit's that is in
@@ -298,8 +334,14 @@ def _trace_shade(
     faces = facing(config.field, field_inputs, views, lanes) if occlusion else []
     shown = _dimmed(colours, [1 - value for value in occlusion], faces)
     dr.eval(shown, colours, occlusion, faces)
+    bounced = []
+    if config.bounce:
+        both = irradiance(_scatterers(config, inputs), config.bounce, [1 - value for value in occlusion], lanes)
+        bounced = _on_seen_side(config, field_inputs, both, lanes)
+        shown = _brightened(config, inputs, shown, bounced, lanes)
+        dr.eval(shown, bounced)
     shown = lanes.narrowed(shown, inputs.means.x)
-    return shown[:3], shown[3:], _Tape(field_tape, refine_tape, colours, occlusion, faces)
+    return shown[:3], shown[3:], _Tape(field_tape, refine_tape, colours, occlusion, faces, bounced)
 
 
 def _trace_lit(
@@ -310,9 +352,10 @@ def _trace_lit(
     known: mlp.Known | None,
     packed: list[Any],
     visibility: list[Any],
+    bounced: list[Any],
 ) -> list[Any]:
     """Dimmed colours, and visibility as it is shown. known, packed: see `_Kept`;  visibility: [N] in a list, or
-    nothing"""
+    nothing;  bounced: see `Sunlight`"""
     field, field_inputs = config.field, _field_inputs(inputs)
     views = field_views(field, field_inputs, lanes)
     if known:
@@ -324,15 +367,23 @@ def _trace_lit(
         outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field)
     colours = [_sigmoid(value) for value in outputs]
     shown = _dimmed(colours, [lanes.padded(value) for value in visibility], facing(field, field_inputs, views, lanes))
+    if bounced:
+        seen = _on_seen_side(config, field_inputs, [lanes.padded(light) for light in bounced], lanes)
+        shown = _brightened(config, inputs, shown, seen, lanes)
     dr.eval(shown)
     return lanes.narrowed(shown, inputs.means.x)
 
 
-def _trace_visible(config: LightConfig, of_refine: list[Any], inputs: _Inputs, lanes: Lanes) -> Any:
-    """The refined visibility [N]."""
+def _trace_sunlit(
+    config: LightConfig, of_refine: list[Any], inputs: _Inputs, lanes: Lanes
+) -> tuple[list[Any], list[Any]]:
+    """([refined visibility [N]] or [], light that bounces, see `Sunlight`)."""
     visibility = [1 - value for value in _occluded(config, of_refine, inputs, lanes)[0]]
     dr.eval(visibility)
-    return lanes.narrowed(visibility, inputs.means.x)[0]
+    bounced = irradiance(_scatterers(config, inputs), config.bounce, visibility, lanes) if config.bounce else []
+    dr.eval(bounced)
+    shown = lanes.narrowed([*visibility, *bounced], inputs.means.x)
+    return shown[: len(visibility)], shown[len(visibility) :]
 
 
 def _trace_known(field: FieldConfig, weights: list[Any], features: Any, lanes: Lanes) -> mlp.Known:
@@ -374,7 +425,12 @@ def _trace_adjoint(
     """(gradient of the features, gradients of the weights, [gradient of the raw occlusion] where it is asked for)."""
     of_field, of_refine = _split(config, weights)
     visibility = 1 - tape.occlusion[0] if tape.occlusion else 1
-    pairs = [(lanes.padded(gradient), colour) for gradient, colour in zip(by_colour, tape.colours, strict=True)]
+    gradients = [lanes.padded(gradient) for gradient in by_colour]
+    by_albedo: list[Any] = []
+    if tape.bounced:
+        dimmed = [colour * visibility for colour in tape.colours]
+        gradients, by_albedo = _before_bounce(config, inputs, gradients, dimmed, tape.bounced, lanes)
+    pairs = list(zip(gradients, tape.colours, strict=True))
     by_output = lanes.matrix([g * visibility * c * (1 - c) for g, c in pairs])
     by_weights, by_items = mlp.backward(config.field.shape, of_field, tape.field, inputs.sun.field, by_output)
     parts = [(by_items, 0, config.field.features)]
@@ -393,6 +449,8 @@ def _trace_adjoint(
         by_raw = by_logit * refined_slope(lanes.padded(inputs.raw[0])) + lanes.row(by_items, 0)
         if config.refine.bias_info:  # it is told 1 - occlusion, too, before the other three
             by_raw -= lanes.row(by_items, config.refine.shape.inputs - 4)
+    if by_albedo:
+        parts.append((lanes.matrix(by_albedo), 0, 3))
     wanted = [by_raw] if config.shadow and config.shadow.gradients else []
     dr.eval(wanted)
     return lanes.packed(parts, inputs.features), by_weights, lanes.narrowed(wanted, inputs.means.x)
@@ -417,6 +475,38 @@ def _field_inputs(inputs: _Inputs) -> FieldInputs:
     return FieldInputs(inputs.features, inputs.means, inputs.turns, inputs.camera, towards_sun(inputs.sun.light))
 
 
+def _scatterers(config: LightConfig, inputs: _Inputs) -> Scatterers:
+    rows = inputs.features, config.field.features, config.albedos
+    return Scatterers(*rows, inputs.means, inputs.turns[1], inputs.logits, towards_sun(inputs.sun.light))
+
+
+def _on_seen_side(config: LightConfig, inputs: FieldInputs, bounced: list[Any], lanes: Lanes) -> list[Any]:
+    """Three Floats [M] of the six of `irradiance`."""
+    over = turned_over(config.field, inputs, lanes)
+    return [dr.select(over, bounced[3 + c], bounced[c]) for c in range(3)]
+
+
+def _brightened(config: LightConfig, inputs: _Inputs, shown: list[Any], bounced: list[Any], lanes: Lanes) -> list[Any]:
+    """Dimmed colours [M] with the light that bounces, what else is in `shown` as it was."""
+    albedo = _scatterers(config, inputs).albedo(lanes)
+    rows = zip(shown[:3], albedo, bounced, strict=True)
+    return [brightened(colour, rho * light, config.linear) for colour, rho, light in rows] + shown[3:]
+
+
+def _before_bounce(
+    config: LightConfig, inputs: _Inputs, gradients: list[Any], dimmed: list[Any], bounced: list[Any], lanes: Lanes
+) -> tuple[list[Any], list[Any]]:
+    """Gradients [M] of the dimmed colours and of the albedos' logits. What bounces counts as given, as it is small."""
+    by_dimmed, by_albedo = [], []
+    for gradient, colour, rho, light in zip(
+        gradients, dimmed, _scatterers(config, inputs).albedo(lanes), bounced, strict=True
+    ):
+        of_colour, of_light = brightened_slopes(colour, rho * light, config.linear)
+        by_dimmed.append(gradient * of_colour)
+        by_albedo.append(gradient * of_light * light * rho * (1 - rho))
+    return by_dimmed, by_albedo
+
+
 def _split(config: LightConfig, weights: list[Any]) -> tuple[list[Any], list[Any]]:
     """Weights of the field, of the refinement."""
     count = 1 + 2 * config.field.layers
@@ -429,6 +519,6 @@ def _sigmoid(value: Any) -> Any:
 
 _shade = recorded(_trace_shade, RECORDINGS)
 _lit = recorded(_trace_lit, RECORDINGS)
-_visible = recorded(_trace_visible, RECORDINGS)
+_sunlit = recorded(_trace_sunlit, RECORDINGS)
 _known = recorded(_trace_known, RECORDINGS)
 _adjoint = recorded(_trace_adjoint, RECORDINGS)

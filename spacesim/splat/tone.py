@@ -50,6 +50,18 @@ def encoded_unclipped(linear: Any) -> Any:
     return dr.select(linear <= _LINEAR_END, 12.92 * linear, curve)
 
 
+def encoded_slope(linear: Any) -> Any:
+    """d `encoded_unclipped`. Arrays of any shape."""
+    curve = 1.055 / 2.4 * dr.power(dr.maximum(linear, _LINEAR_END), 1 / 2.4 - 1)
+    return dr.select(linear <= _LINEAR_END, 12.92, curve)
+
+
+def decoded_slope(values: Any) -> Any:
+    """d `decoded`. Arrays of any shape."""
+    curve = 2.4 / 1.055 * dr.power((dr.maximum(values, _ENCODED_END) + 0.055) / 1.055, 1.4)
+    return dr.select(values <= _ENCODED_END, 1 / 12.92, curve)
+
+
 def decoded(values: Any) -> Any:
     """Linear values of sRGB ones in [0, 1]. Arrays of any shape."""
     curve = dr.power((dr.maximum(values, _ENCODED_END) + 0.055) / 1.055, 2.4)

@@ -49,6 +49,8 @@ CONFIGS = {
     "linear": LightConfig(FIELD, linear=True),
     "gradients": LightConfig(FIELD, ShadowConfig("splatting", 32, refine=REFINE, gradients=True)),
     "surface": LightConfig(replace(FIELD, surface=True), ShadowConfig("mapping", 32, grazing="lift", refine=REFINE)),
+    "bounce": LightConfig(replace(FIELD, surface=True), ShadowConfig("splatting", 32, refine=REFINE), bounce=7),
+    "bounce, linear": LightConfig(replace(FIELD, surface=True), bounce=5, linear=True),
     "park": LightConfig(
         FIELD,
         ShadowConfig(
@@ -139,9 +141,39 @@ def shortest_axes(arrays: dict) -> np.ndarray:
     return turns[np.arange(len(turns)), :, arrays["log_scales"].argmin(axis=1)]
 
 
-def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray]) -> tuple:
-    """(colours [N, 3], visibility [N] as it is shown) of 4.2, 4.11 to 4.14 and 4.17; raw: occlusion and bias info as
-    given."""
+def bounced(light: LightModel, arrays: dict, visibility: np.ndarray) -> np.ndarray:
+    """[N, 3] light of the emitters at the side that is seen: discs of Wallace et al. (1989), one pair after another."""
+    config, count = light.config, len(arrays["means"])
+    features, first = arrays["features"].astype(np.float64), config.field.features
+    normals = features[:, first : first + 3] / np.linalg.norm(features[:, first : first + 3], axis=1, keepdims=True)
+    albedo, found = sigmoid(features[:, config.albedos :]), np.zeros((count, 3))
+    for i in range(count):
+        towards = np.array([0, -6, 1.0]) - arrays["means"][i]
+        seen = normals[i] * np.sign(normals[i] @ towards)
+        for number in range(config.bounce):
+            k = int((number + 0.5) * count / config.bounce)
+            away = arrays["means"][k] - arrays["means"][i]
+            square = away @ away
+            if square == 0:
+                continue
+            lit = normals[k] * np.sign(normals[k] @ SUN)
+            long = np.sort(np.exp(arrays["log_scales"][k]))[1:].prod()
+            area = 0.3 * count / config.bounce * 2 * np.pi * long * sigmoid(arrays["logit_opacities"][k])
+            cosines = max(seen @ away, 0) * max(-lit @ away, 0) / square
+            found[i] += albedo[k] * visibility[k] * (lit @ SUN) * area * cosines / (np.pi * square + area)
+    return found
+
+
+def brightened(light: LightModel, colour: np.ndarray, more: np.ndarray) -> np.ndarray:
+    if light.config.linear:
+        return colour + more
+    value = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4) + more
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.maximum(value, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray], given=None) -> tuple:
+    """(colours [N, 3], visibility [N] as it is shown, light that bounces) of 4.2, 4.11 to 4.14 and 4.17; raw: occlusion
+    and bias info as given; given: light that bounces, instead of that of these numbers."""
     config, field = light.config, light.config.field
     direction = arrays["means"] - np.array([0, -6, 1.0])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -156,7 +188,9 @@ def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[n
         faces = np.interp(np.maximum(learned, of_shape), [-0.2, 0], [0, 1])
     colour = sigmoid(network(field.shape, weights[:split], items, encoded(field.sun, SUN[None])[0]))
     if not raw:
-        return colour, np.ones(len(colour))
+        visible = np.ones(len(colour))
+        colour, given = with_bounce(light, arrays, colour, visible, given)
+        return colour, visible, given
     occlusion, alignment, thickness, bias = raw
     if config.refine:
         refine = config.refine
@@ -165,7 +199,7 @@ def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[n
             axes = numbers(light.sun_terms(SUN).light).reshape(3, 3)
             np.testing.assert_allclose(axes[2], -SUN, atol=1e-6)
             position = position @ axes.T
-        told = [occlusion[:, None], features[:, field.stored :]]
+        told = [occlusion[:, None], features[:, field.stored : config.albedos]]
         told.append(encoded(Encoding("positional", refine.positional), position))
         if refine.bias_info:
             scale = light.frame.scale
@@ -174,7 +208,17 @@ def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[n
         correction = network(refine.shape, weights[split:], items, encoded(refine.sun, SUN[None])[0])[:, 0]
         sure = np.clip(occlusion, 0.02, 0.98)
         occlusion = sigmoid(np.log(sure / (1 - sure)) + correction)
-    return colour * (1 - occlusion)[:, None], (1 - occlusion) * faces
+    colour, given = with_bounce(light, arrays, colour * (1 - occlusion)[:, None], 1 - occlusion, given)
+    return colour, (1 - occlusion) * faces, given
+
+
+def with_bounce(light: LightModel, arrays: dict, colour: np.ndarray, visible: np.ndarray, given) -> tuple:
+    """(colours, light that bounces): as they are for a model without."""
+    if not light.config.bounce:
+        return colour, None
+    given = bounced(light, arrays, visible) if given is None else given
+    albedo = sigmoid(arrays["features"].astype(np.float64)[:, light.config.albedos :])
+    return brightened(light, colour, albedo * given), given
 
 
 @pytest.mark.parametrize("name", CONFIGS)
@@ -186,7 +230,8 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name):
     shadows = light.shadows(splats, SUN)
     raw = [numbers(row) for row in (shadows.occlusion, *shadows.info)] if shadows else []
     shading = light.shade(splats, eye(), SUN)
-    colour, visibility = twin(light, arrays, weights, raw)
+    colour, visibility, given_light = twin(light, arrays, weights, raw)
+    assert given_light is None or np.abs(given_light).max() > 0.01
     np.testing.assert_allclose(np.stack([numbers(c) for c in shading.colours], axis=1), colour, atol=3e-5)
     assert (shading.visibility is None) == (light.config.shadow is None)
     if shading.visibility is not None:
@@ -200,7 +245,7 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name):
     back = light.adjoint(shading, [ad.Float(column) for column in by_colour.T], given)
 
     def loss(arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray] = raw) -> float:
-        colour, visibility = twin(light, arrays, weights, raw)
+        colour, visibility, _ = twin(light, arrays, weights, raw, given_light)
         return float((by_colour * colour).sum() + by_visibility @ visibility)
 
     for _ in range(6):  # along random directions, all numbers at once

@@ -18,6 +18,7 @@ from spacesim.data.geometry import Array
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.gaussians import Gaussians, uploaded
+from spacesim.splat.light import Sunlight
 from spacesim.splat.project import ALPHA_MIN
 from spacesim.splat.render import view_colours
 from spacesim.splat.run import Run
@@ -87,20 +88,20 @@ class Member:
         """Whether its method knows visibility."""
         return self.run.light is not None and self.run.light.config.shadow is not None
 
-    def own_visibility(self, sun: Array | None) -> Any:
-        """Of the Sun, Float [N], in its own shadows; None for a run without. sun: [3] in the model's frame"""
+    def sunlight(self, sun: Array | None) -> Sunlight | None:
+        """In its own shadows; None for a run that no Sun relights. sun: [3] in the model's frame"""
         light = self.run.light
-        return None if light is None or sun is None else light.visibility(self.run.model, sun, adaptive=True)
+        return None if light is None or sun is None else light.sunlight(self.run.model, sun, adaptive=True)
 
-    def shade(self, camera: Pinhole, sun: Array | None, visibility: Any) -> tuple[list[Any], Any]:
+    def shade(self, camera: Pinhole, sun: Array | None, sunlight: Sunlight | None) -> tuple[list[Any], Any]:
         """(colours, three Floats [N], visibility of the Sun [N] or None) as the run alone has them. camera, sun: in the
-        model's frame, the latter unused by a run that knows one light;  visibility: `own_visibility` under this Sun"""
+        model's frame, the latter unused by a run that knows one light;  sunlight: `sunlight` of this Sun"""
         run = self.run
         if run.light is None:
             colours = _harmonic_colours if self.count > 1 else _trace_harmonic_colours
             return list(colours(run.model.rows(), camera)), None
         assert sun is not None, "the scene asks for a Sun first"
-        return run.light.lit(run.model, camera, sun, adaptive=True, known=visibility)
+        return run.light.lit(run.model, camera, sun, adaptive=True, known=sunlight)
 
 
 @dataclass(frozen=True, eq=False)

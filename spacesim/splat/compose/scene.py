@@ -311,10 +311,10 @@ class Composition:
         member = self._ensemble.members[k]
         near, towards = pose.camera_in_model(camera), None if sun is None else pose.direction_in_model(sun)
         light = _bytes(towards)
-        visibility = self._kept.get(("visibility", k), light, lambda: member.own_visibility(towards))
+        sunlight = self._kept.get(("sunlight", k), light, lambda: member.sunlight(towards))
         key = near.world_from_camera.tobytes(), light
         part: tuple[list[Any], Any] = self._kept.get(
-            ("light", k), key, lambda: member.shade(Pinhole.of(near), towards, visibility)
+            ("light", k), key, lambda: member.shade(Pinhole.of(near), towards, sunlight)
         )
         return part
 

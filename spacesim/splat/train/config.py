@@ -20,12 +20,14 @@ from spacesim.splat.train.warm_start import WarmStartConfig
 METHODS = ("vanilla", "relight", "shadow-map", "shadow-splat", "park")
 STRATEGIES = ("default", "mesh-aware", "support-aware", "mcmc")
 INITS = ("mesh", "points", "random")
-PRESETS = ("demo", "fast", "thesis")
+PRESETS = ("demo", "fast", "fine", "thesis")
 ISOTROPY = 1e-2  #: weight of the isotropy term of `park`, chosen
 MARGIN = (
     1e-3  #: to the exterior, of `fast` and `demo`: at few pixels 1e-4 prunes half of the surface (docs/strategies.md)
 )
-LIT_SCREEN_SIZES = {"demo": 0.06, "fast": 0.03}  #: above which methods of light split: a Gaussian has one visibility
+LIT_SCREEN_SIZES = {"demo": 0.06, "fast": 0.03, "fine": 0.015}
+"""Above which methods of light split, a share of the picture: a Gaussian has one visibility."""
+EMITTERS = {"demo": 256, "fast": 256, "fine": 1024}  #: of one bounce of light, of methods with shadows
 MCMC_PENALTY = 1e-2  #: weights of the penalties on opacity and scale of `mcmc` (Kheradmand et al. 2024)
 PRIORS = ("truth", "mesh")
 MOST_VIEWS = 64  #: of a step, chosen: one kernel reads the gradients of all; for 64 two cores compile about 11 s
@@ -34,6 +36,10 @@ WEIGHTS = (
     *("depth_weight", "normal_weight"),
 )
 
+
+SUNLESS = RefineConfig(width=32, sun=Encoding("harmonics", 0), positions="world")
+"""Told nothing that changes with the Sun but raw shadows: told more, it learns the Suns of training by heart."""
+FINE_OPACITY = 0.005  #: below it methods of light prune in `fine`; chosen (docs/ablations.md)
 
 _CHOICES = (("method", METHODS), ("strategy", STRATEGIES), ("preset", (None, *PRESETS)), ("prior", PRIORS))
 
@@ -159,9 +165,10 @@ def _record(kind: Any, values: dict[str, Any]) -> Any:
 
 def preset(name: str, method: str = "vanilla", strategy: str = "default") -> TrainConfig:
     """`thesis`: the schedule of section 4.3.6 and tables 4.1 to 5.1 as they stand; `fast`: half a minute on a GPU,
-    minutes on two CPU cores; `demo`: a minute on two CPU cores.
+    minutes on two CPU cores; `fine`: the most exact light that we know, ten minutes on a GPU; `demo`: a minute on two
+    CPU cores.
 
-    The last two are for pictures of some hundred pixels. Table 5.1 splits what is wider than a hundredth of the
+    All but the first are for pictures of some hundred pixels. Table 5.1 splits what is wider than a hundredth of the
     picture: at 256 pixels that is every splat, and the maximum of 250,000 is reached for nothing (docs/performance.md).
     Raises InputError for another name, method or strategy.
     """
@@ -175,14 +182,16 @@ def preset(name: str, method: str = "vanilla", strategy: str = "default") -> Tra
     if light is None or name == "thesis":
         return config  # a vanilla run's PLY is for other viewers, too, which have no such filter
     refinement = replace(config.refinement, split_screen_size=LIT_SCREEN_SIZES[name])
-    return replace(config, antialiased=True, refinement=refinement)
+    if name != "fine":
+        return replace(config, antialiased=True, refinement=refinement)
+    return replace(config, antialiased=True, supersample=2, refinement=replace(refinement, prune_opacity=FINE_OPACITY))
 
 
 def warm_start(name: str) -> WarmStartConfig:
     """Of a preset: `thesis` as in table 5.7, the others shorter, as their training is (chosen)."""
     if name == "thesis":
         return WarmStartConfig()
-    if name == "fast":
+    if name in ("fast", "fine"):
         return WarmStartConfig(steps=1_000, decay=1_000, conservative=500)
     return WarmStartConfig(steps=500, decay=500, conservative=250)
 
@@ -197,10 +206,11 @@ def _schedule(name: str) -> TrainConfig:
             refinement=DefaultStrategyConfig(refine_stop=150_000, screen_size_stop=150_000),
         )
     gentle = DefaultStrategyConfig(prune_screen_size=0.5, split_screen_size=0.1)
-    if name == "fast":
+    if name in ("fast", "fine"):
         refinement = replace(gentle, refine_stop=5_000)
         mesh_aware = MeshAwareConfig(cull_every=500, exterior_margin=MARGIN)
-        return TrainConfig(preset=name, refinement=refinement, mesh_aware=mesh_aware)
+        iterations = 7_000 if name == "fast" else 20_000
+        return TrainConfig(preset=name, iterations=iterations, refinement=refinement, mesh_aware=mesh_aware)
     if name == "demo":
         return TrainConfig(
             preset=name,
@@ -217,8 +227,9 @@ def _schedule(name: str) -> TrainConfig:
 def _light(name: str, method: str) -> LightConfig:
     """Networks and shadows of a preset: `thesis` as in tables 4.1 to 4.3; `fast` and `demo` smaller, and with what we
     found better (docs/relighting.md, docs/ablations.md)."""
-    features, width, image = {"thesis": (128, 256, 1024), "fast": (32, 64, 512)}.get(name, (16, 64, 256))
-    if method != "shadow-map" and name != "thesis":
+    sizes = {"thesis": (128, 256, 1024), "fast": (32, 64, 512), "fine": (32, 64, 1024), "demo": (16, 64, 256)}
+    features, width, image = sizes[name]
+    if method != "shadow-map" and name in ("demo", "fast"):
         image *= 2  # splatting reads whole pixels
     if method == "park":
         encoding = Encoding("positional", 4)
@@ -231,10 +242,10 @@ def _light(name: str, method: str) -> LightConfig:
     kind = "mapping" if method == "shadow-map" else "splatting"
     if name == "thesis":
         return LightConfig(field, ShadowConfig(kind, image))
-    shadow = ShadowConfig(kind, image, bias=5.0, grazing="both", refine=RefineConfig(width=32))
+    shadow = ShadowConfig(kind, image, bias=5.0, grazing="both", refine=SUNLESS)
     if kind == "mapping":
         shadow = replace(shadow, mapping=MappingConfig("median"))
-    return LightConfig(field, shadow)
+    return LightConfig(field, shadow, bounce=EMITTERS[name])
 
 
 def with_field(field: FieldConfig, kind: str) -> FieldConfig:

@@ -17,6 +17,7 @@ from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Dataset
 from spacesim.splat.adjoint import SplatGradients
+from spacesim.splat.bounce import ALBEDO
 from spacesim.splat.gaussians import Gaussians, uploaded
 from spacesim.splat.light import LightModel, TrainingFrame
 from spacesim.splat.project import Footprints, Pinhole
@@ -327,8 +328,9 @@ class Trainer:
         radius = max(float(np.linalg.norm(means - centre, axis=1).max()), 1e-6)
         field = self.config.light.field
         if field.surface:
-            features = self.gaussians.to_numpy()["features"]
+            features, light = self.gaussians.to_numpy()["features"], self.config.light
             features[:, field.features : field.stored] = surface_normals(means)
+            features[:, light.albedos :] = ALBEDO
             self.gaussians.features = uploaded(features.T.ravel())
         frame = TrainingFrame(centre, self.scene_scale, farthest_camera(dataset, centre), radius)
         return LightModel.initial(self.config.light, frame, self.config.seed)

@@ -93,7 +93,7 @@ def own_shadows(run: Run) -> Iterator[tuple[str, Visibility]]:
     light = run.light
     if light is None or light.config.shadow is None:
         return
-    yield "refined", lambda frame: light.visibility(run.model, frame.sun.direction, adaptive=True)
+    yield "refined", lambda frame: light.sunlight(run.model, frame.sun.direction, adaptive=True).visibility
     yield "shown", lambda frame: light.lit(run.model, Pinhole.of(frame.camera), frame.sun.direction, adaptive=True)[1]
 
 
