@@ -106,7 +106,8 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, no refinement", with_shadow(mapped, refine=None)
     closer = MappingConfig("percentage-closer", sun_radius_deg=SUN_RADIUS_DEG)
     yield "map, surface, percentage-closer", with_shadow(mapped, mapping=closer)
-    yield "map, surface, variance", with_shadow(mapped, mapping=MappingConfig("variance"))
+    other = "median" if shadow_of(mapped).mapping.filter == "variance" else "variance"
+    yield f"map, surface, {other}", with_shadow(mapped, mapping=MappingConfig(other))
     yield "none, surface, unfiltered", replace(relit, antialiased=False)
     yield "map, surface, unfiltered", replace(mapped, antialiased=False)
     yield "splat, surface, unfiltered", replace(splatted, antialiased=False)
@@ -160,8 +161,11 @@ def as_thesis(config: TrainConfig) -> TrainConfig:
 
 
 def as_ours(config: TrainConfig) -> TrainConfig:
-    """The field, the shadows and the splats as `fast` has them, in networks of the preset's size."""
+    """The field, the shadows and the splats as `fast` has them, in networks of the preset's size: all but `thesis` have
+    their own."""
     assert config.light is not None
+    if config.preset != "thesis":
+        return config
     config = replace(config, light=replace(config.light, field=with_field(config.light.field, "surface")))
     config = replace(config, antialiased=preset("fast", config.method).antialiased)
     if config.light.shadow is None:

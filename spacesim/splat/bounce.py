@@ -17,6 +17,7 @@ from spacesim.splat.tone import decoded, decoded_slope, encoded_slope, encoded_u
 
 ALBEDO = -1.0  #: logit of the albedos at the start: 0.27, chosen
 OVERLAP = 0.3  #: share of the Gaussians' areas that is surface: they overlap; chosen, albedos learn the rest
+LARGEST_AREA = 1e12  #: bound on an emitter's area, m^2: products stay finite in float32
 MOST_EMITTERS = 2**14  #: chosen
 
 
@@ -60,7 +61,7 @@ def irradiance(scatterers: Scatterers, emitters: int, visibility: list[Any], lan
         square = dr.squared_norm(away)
         away *= dr.rsqrt(dr.maximum(square, 1e-12))
         here, there = dr.dot(normals, away), dr.maximum(-dr.dot(ad.Array3f(nx, ny, nz), away), 0)
-        share = area * there / dr.fma(dr.pi, square, area)
+        share = area * there / dr.maximum(dr.fma(dr.pi, square, area), 1e-20)
         sides = share * dr.maximum(here, 0), share * dr.maximum(-here, 0)
         return k + 1, [dr.fma(side, light[c], sums[3 * i + c]) for i, side in enumerate(sides) for c in range(3)]
 
@@ -105,7 +106,9 @@ def _emitters(scatterers: Scatterers, emitters: int, visibility: list[Any], lane
     if visibility:
         seen *= dr.gather(ad.Float, visibility[0], k)
     light = [seen * _sigmoid(logit) for logit in rows(scatterers.albedos)]
-    return [*place, *dr.select(cosine < 0, -normal, normal), area, *light]
+    numbers = [*place, *dr.select(cosine < 0, -normal, normal), dr.minimum(area, LARGEST_AREA), *light]
+    sound = dr.isfinite(sum(numbers, ad.Float(0)))  # one that is not would reach all others
+    return [dr.select(sound, number, 0) for number in numbers]
 
 
 def _unit(rows: list[Any]) -> Any:

@@ -244,7 +244,7 @@ def _light(name: str, method: str) -> LightConfig:
         return LightConfig(field, ShadowConfig(kind, image))
     shadow = ShadowConfig(kind, image, bias=5.0, grazing="both", refine=SUNLESS)
     if kind == "mapping":
-        shadow = replace(shadow, mapping=MappingConfig("median"))
+        shadow = replace(shadow, mapping=MappingConfig("variance" if name == "fine" else "median"))
     return LightConfig(field, shadow, bounce=EMITTERS[name])
 
 

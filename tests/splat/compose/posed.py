@@ -31,6 +31,7 @@ CONFIGS = {
         replace(FIELD, features=7, surface=True),
         replace(MAP, bias=5.0, grazing="both", size=96, mapping=MappingConfig("median")),
     ),
+    "bounce": LightConfig(replace(FIELD, features=7, surface=True), replace(MAP, size=96), bounce=20),
     "park": LightConfig(
         FIELD,
         ShadowConfig(

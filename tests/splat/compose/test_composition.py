@@ -353,13 +353,13 @@ def test_only_what_is_asked_for_is_computed(monkeypatch):
 def test_what_a_change_leaves_as_it_was_is_not_computed_again(monkeypatch):
     """A camera that moves leaves all visibility; a model that moves with the world's Sun, that of the others."""
     asked = []
-    visibility = LightModel.visibility
+    sunlight = LightModel.sunlight
 
     def counted(self, *arguments, **named):
         asked.append(self)
-        return visibility(self, *arguments, **named)
+        return sunlight(self, *arguments, **named)
 
-    monkeypatch.setattr(LightModel, "visibility", counted)
+    monkeypatch.setattr(LightModel, "sunlight", counted)
     one, other = made_run("map", 1), made_run("splat", 2)
     scene = Composition([Placed(one), Placed(other, Pose(translation=[0.6, 0.5, 0.5]))])
     scene.predict(EYE, SUN)
