@@ -117,8 +117,12 @@ def check(
 
 
 @pytest.mark.parametrize("elevation", ELEVATIONS)
-@pytest.mark.parametrize("preset_name", ["fast", "demo"])
-@pytest.mark.parametrize(("method", "most", "least"), [("shadow-map", 1, 0.95), ("shadow-splat", 2, 0.8)])
+@pytest.mark.parametrize(
+    ("preset_name", "method", "most", "least"),
+    [(name, "shadow-map", 1, 0.95) for name in ("fast", "demo")]
+    + [(name, "shadow-splat", 2, 0.8) for name in ("fast", "demo", "fine")]
+    + [("fine", "shadow-map", 1.1, 0.95)],
+)
 def test_as_shipped_the_shadow_ends_where_the_umbra_does(preset_name, method, most, least, elevation):
     sun = direction_from_angles(30, elevation)
     arrays, ball = scene(sun, elevation)
@@ -127,7 +131,8 @@ def test_as_shipped_the_shadow_ends_where_the_umbra_does(preset_name, method, mo
     check(arrays, ball, sun, (visibility, scale), most, least)
     towards = (arrays["means"][:ball] - [0, 0, HEIGHT]) @ sun / RADIUS
     assert visibility[:ball][towards > 0.2].mean() > 0.95  # the sphere does not darken its own sunlit side
-    assert visibility[:ball][towards < -0.2].mean() < 0.1
+    bleeds = light.shadow.mapping.filter == "variance" and elevation < 10  # over a plate 9 m behind (docs/shadows.md)
+    assert visibility[:ball][towards < -0.2].mean() < (0.3 if bleeds else 0.1)
 
 
 def test_the_thesis_leaves_the_plate_dark_at_five_degrees():
