@@ -93,7 +93,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
             yield name, whole
             yield f"{name}, no bias", with_shadow(whole, bias=0.0)
             yield f"{name}, no refinement", with_shadow(whole, refine=None)
-        yield "park", replace(preset(size, "park"), antialiased=False)
+        yield "park", replace(preset(size, "park"), antialiased=False, supersample=1)
         return
     relit, mapped, splatted = (as_ours(preset(size, method)) for method in ("relight", "shadow-map", "shadow-splat"))
     yield "none, surface", relit

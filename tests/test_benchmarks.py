@@ -187,6 +187,8 @@ def test_rows_of_shadows_are_what_they_are_called(size):
     lit = {name: config for name, config in rows.items() if config.light}
     assert {name for name, config in lit.items() if config.light.field.surface} == {n for n in rows if "surface" in n}
     assert len({repr(config) for config in rows.values()}) == len(rows)
+    of_thesis = [config for name, config in lit.items() if "surface" not in name]
+    assert {(config.supersample, config.antialiased, config.light.bounce) for config in of_thesis} == {(1, False, 0)}
     if size != "thesis":
         assert rows["map, surface"] == preset(size, "shadow-map")
         assert rows["splat, surface"] == preset(size, "shadow-splat")

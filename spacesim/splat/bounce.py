@@ -42,7 +42,7 @@ class Scatterers:
 
 def irradiance(scatterers: Scatterers, emitters: int, visibility: list[Any], lanes: Lanes) -> list[Any]:
     """Light that arrives at each Gaussian: three Floats [M] at the side to which its normal points, three at the other;
-    1 is that of a white surface around which all is as bright as a white one under the Sun.
+    1 where all around is as bright as a white surface under the Sun, as far as areas add up to surfaces (`OVERLAP`).
 
     emitters: how many of the Gaussians scatter, evenly chosen by number, each in place of N / emitters;
     visibility: [M], evaluated, in a list, or nothing for 1

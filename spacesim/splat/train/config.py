@@ -165,13 +165,15 @@ def _record(kind: Any, values: dict[str, Any]) -> Any:
 
 def preset(name: str, method: str = "vanilla", strategy: str = "default") -> TrainConfig:
     """`thesis`: the schedule of section 4.3.6 and tables 4.1 to 5.1 as they stand; `fast`: half a minute on a GPU,
-    minutes on two CPU cores; `fine`: the most exact light that we know, ten minutes on a GPU; `demo`: a minute on two
+    minutes on two CPU cores; `fine`: the most exact light that we know, minutes on a GPU; `demo`: a minute on two
     CPU cores.
 
     All but the first are for pictures of some hundred pixels. Table 5.1 splits what is wider than a hundredth of the
     picture: at 256 pixels that is every splat, and the maximum of 250,000 is reached for nothing (docs/performance.md).
     Raises InputError for another name, method or strategy.
     """
+    if name not in PRESETS:
+        raise InputError(f"--preset: expected one of {', '.join(PRESETS)}, found {name!r}")
     if method not in METHODS:
         raise InputError(f"--method: expected one of {', '.join(METHODS)}, found {method!r}")
     light = None if method == "vanilla" else _light(name, method)
@@ -211,17 +213,15 @@ def _schedule(name: str) -> TrainConfig:
         mesh_aware = MeshAwareConfig(cull_every=500, exterior_margin=MARGIN)
         iterations = 7_000 if name == "fast" else 20_000
         return TrainConfig(preset=name, iterations=iterations, refinement=refinement, mesh_aware=mesh_aware)
-    if name == "demo":
-        return TrainConfig(
-            preset=name,
-            iterations=3_000,
-            init_count=8_000,
-            sh_every=600,
-            refinement=replace(gentle, refine_start=300, refine_stop=2_000, pause_after_reset=0),
-            mesh_aware=MeshAwareConfig(cull_every=500, exterior_margin=MARGIN, min_gaussians=8_000),
-            support_aware=SupportAwareConfig(warm_up=300, backfill_start=400, min_gaussians=8_000),
-        )
-    raise InputError(f"--preset: expected one of {', '.join(PRESETS)}, found {name!r}")
+    return TrainConfig(
+        preset=name,
+        iterations=3_000,
+        init_count=8_000,
+        sh_every=600,
+        refinement=replace(gentle, refine_start=300, refine_stop=2_000, pause_after_reset=0),
+        mesh_aware=MeshAwareConfig(cull_every=500, exterior_margin=MARGIN, min_gaussians=8_000),
+        support_aware=SupportAwareConfig(warm_up=300, backfill_start=400, min_gaussians=8_000),
+    )
 
 
 def _light(name: str, method: str) -> LightConfig:

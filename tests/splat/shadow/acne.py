@@ -19,8 +19,9 @@ ELEVATIONS = (1, 2, 3, 5, 10, 15, 20, 30, 45, 60, 75, 90)
 
 def main() -> None:
     for method in ("mapping", "splatting"):
-        ways = {name: way(name, method) for name in (*BIASES, "shipped")}
+        ways = {name: way(name, method) for name in (*BIASES, "fast")}
         if method == "mapping":
+            ways["fine"] = way("fine", method)  # splatting's are alike
             ways["lifted, variance"] = replace(ways["lifted"], mapping=MappingConfig("variance"))
         print(f"\n| {method}: Sun [°] | {' | '.join(ways)} |")
         for elevation in ELEVATIONS:

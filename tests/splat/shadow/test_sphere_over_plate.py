@@ -22,6 +22,7 @@ SPACING, WIDE, THIN = 0.03, 0.02, 5e-4  # of the discs, and their standard devia
 SIZE = 192  # pixels of the light image
 DISTANCE = 5.0  # of the farthest camera, metres, on which the softness depends
 ELEVATIONS = (5, 15, 30, 60, 90)
+BLEEDS = {5: 0.3, 15: 0.06}  # light that a variance filter lets through to the sphere's back (docs/shadows.md)
 SLOPE = 4.0  # pixels of the light image over which the plate's own depth must not count: footprints of two Gaussians
 
 
@@ -131,8 +132,9 @@ def test_as_shipped_the_shadow_ends_where_the_umbra_does(preset_name, method, mo
     check(arrays, ball, sun, (visibility, scale), most, least)
     towards = (arrays["means"][:ball] - [0, 0, HEIGHT]) @ sun / RADIUS
     assert visibility[:ball][towards > 0.2].mean() > 0.95  # the sphere does not darken its own sunlit side
-    bleeds = light.shadow.mapping.filter == "variance" and elevation < 10  # over a plate 9 m behind (docs/shadows.md)
-    assert visibility[:ball][towards < -0.2].mean() < (0.3 if bleeds else 0.1)
+    bleeds = method == "shadow-map" and light.shadow.mapping.filter == "variance"
+    lit = BLEEDS.get(elevation, 0.03) if bleeds else 0.001 if method == "shadow-map" else 0.1
+    assert visibility[:ball][towards < -0.2].mean() < lit
 
 
 def test_the_thesis_leaves_the_plate_dark_at_five_degrees():

@@ -24,9 +24,9 @@ BIASES = {
 
 
 def way(name: str, method: str = "mapping", size: int = 512) -> ShadowConfig:
-    """Of BIASES, or "shipped": that of the presets `fast` and `demo`."""
-    if name == "shipped":
-        return replace(preset("fast", SHIPPED[method]).light.shadow, size=size)
+    """Of BIASES, or of a preset: `fast`, as `demo`, or `fine`."""
+    if name not in BIASES:
+        return replace(preset(name, SHIPPED[method]).light.shadow, size=size)
     return ShadowConfig(method, size, mapping=MappingConfig(), **BIASES[name])
 
 
