@@ -172,8 +172,7 @@ def as_ours(config: TrainConfig) -> TrainConfig:
         return config
     fast = preset("fast", config.method)
     ours, refine = shadow_of(fast), replace(refine_of(fast), width=refine_of(config).width)
-    bounce = config.light.bounce or fast.light.bounce
-    config = replace(config, light=replace(config.light, bounce=bounce))
+    config = with_bounce(config, fast.light.bounce)
     return with_shadow(config, bias=ours.bias, grazing=ours.grazing, mapping=ours.mapping, refine=refine)
 
 

@@ -97,7 +97,12 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
     one.add_argument("--method", default="vanilla", help="vanilla (default), relight, shadow-map, shadow-splat or park")
     one.add_argument("--strategy", default="default", help="default, mesh-aware, support-aware or mcmc")
     one.add_argument("--max-gaussians", type=int, metavar="N", help="refinement makes no more (250,000)")
-    one.add_argument("--prune-opacity", type=float, metavar="O", help="refinement prunes what is fainter (0.05)")
+    one.add_argument(
+        "--prune-opacity",
+        type=float,
+        metavar="O",
+        help="refinement prunes what is fainter (0.05; fine, of light, 0.005)",
+    )
     one.add_argument(
         "--split-screen-size",
         type=float,
@@ -144,7 +149,8 @@ def parser(run: Mapping[str, Callable[[argparse.Namespace], None]]) -> argparse.
         "--bounce",
         type=int,
         metavar="N",
-        help="so many Gaussians scatter sunlight onto all (256 of methods with shadows, --preset fine 1024)",
+        help="so many Gaussians scatter sunlight onto all (256 of shadow-map and shadow-splat, --preset fine 1024; 0 "
+        "with --preset thesis or --field thesis)",
     )
     lit.add_argument("--linear", action="store_true", help="blend colours in linear light, then use a tone curve")
     lit.add_argument("--tone", choices=("srgb", "filmic"), help="curve of --linear (the dataset's own, else srgb)")

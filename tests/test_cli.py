@@ -66,11 +66,16 @@ def test_no_bias_is_no_bias(spacesim, tiny_data, tmp_path):
         ("--method shadow-map --no-refinement", "light shadow refine", None),
         ("--method shadow-splat --shadow-gradients", "light shadow gradients", True),
         ("--method shadow-splat --visibility-weight 0.3", "visibility_weight", 0.3),
+        ("--method shadow-map --bounce 7", "light bounce", 7),
+        ("--method relight --bounce 7", "light bounce", 7),
+        ("--method shadow-map --bounce 0", "light bounce", 0),
+        ("--method shadow-map --supersample 2", "supersample", 2),
+        ("--method vanilla --supersample 3", "supersample", 3),
     ],
 )
 def test_options_of_light_reach_the_run(spacesim, tiny_data, tmp_path, words, keys, value):
     small = "--preset", "demo", "--iterations", 1, "--init-count", 50
-    size = () if "--light-size" in words else ("--light-size", 16)
+    size = ("--light-size", 16) if "shadow" in words and "--light-size" not in words else ()
     assert spacesim("train", tiny_data, "--out", tmp_path / "run", *small, *size, *words.split()).code == 0
     found = json.loads((tmp_path / "run/config.json").read_text())
     for key in keys.split():

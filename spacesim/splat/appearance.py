@@ -95,8 +95,7 @@ def by_normals(config: FieldConfig, inputs: FieldInputs, by_items: Any, by_facin
 
 def turned_over(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:
     """Bool [M]: is the side seen to which the learned normal does not point?"""
-    direction = inputs.camera.directions_to(lanes.spread(inputs.means))
-    return dr.dot(_normals(config, inputs, lanes), direction) > 0
+    return _points_away(_normals(config, inputs, lanes), inputs.camera.directions_to(lanes.spread(inputs.means)))
 
 
 def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
@@ -106,10 +105,7 @@ def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
     normals: Array3f [3, M], of any length; the side that is seen counts, n . v >= 0;  direction: Array3f [3, M], unit,
     from the camera;  sun: Array3f, unit, towards the Sun;  h: halfway between the Sun and the viewer, v = -direction
     """
-    length2 = dr.squared_norm(normals)
-    known = dr.detach(length2) > 1e-12
-    unit = dr.select(known, normals, ad.Array3f(0, 0, 1)) * dr.rsqrt(dr.select(known, length2, 1))
-    seen = _seen(unit, direction)
+    seen = _seen(unit_normals(normals), direction)
     half = sun - direction
     half2 = dr.squared_norm(half)
     half *= dr.select(half2 > 1e-12, dr.rsqrt(dr.maximum(half2, 1e-12)), 0)
@@ -121,6 +117,13 @@ def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
     return [lambert, dr.maximum(lambert, 0), -dr.dot(seen, direction), halfway, *lobes]
 
 
+def unit_normals(normals: Any) -> Any:
+    """Array3f [3, M] of unit length; (0, 0, 1) in place of what has no direction."""
+    length2 = dr.squared_norm(normals)
+    known = dr.detach(length2) > 1e-12
+    return dr.select(known, normals, ad.Array3f(0, 0, 1)) * dr.rsqrt(dr.select(known, length2, 1))
+
+
 def _faces(lambert: Any, inputs: FieldInputs, lanes: Lanes) -> Any:
     """Of n . s of the learned normals."""
     axis = shortest_axis(*(lanes.spread(dr.detach(turn)) for turn in inputs.turns))
@@ -130,7 +133,11 @@ def _faces(lambert: Any, inputs: FieldInputs, lanes: Lanes) -> Any:
 
 def _seen(normals: Any, direction: Any) -> Any:
     """Normals of the side that is seen. direction: from the camera"""
-    return dr.select(dr.detach(dr.dot(normals, direction)) > 0, -normals, normals)
+    return dr.select(_points_away(normals, direction), -normals, normals)
+
+
+def _points_away(normals: Any, direction: Any) -> Any:
+    return dr.detach(dr.dot(normals, direction)) > 0
 
 
 def _normals(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:

@@ -1,4 +1,4 @@
-"""One bounce: sunlight that some Gaussians scatter onto all others, where nothing stands in between.
+"""One bounce: sunlight that some Gaussians scatter onto all others, as if nothing stood in between.
 
 What faces away from the Sun, or lies in a shadow, is not black beside a lit surface: one that a path tracer or a camera
 sees. A field that is told the cosines of one Gaussian cannot know which of its neighbours are lit; visibility does.
@@ -10,8 +10,10 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
+from spacesim.splat.appearance import unit_normals
 from spacesim.splat.gaussians import opacities
 from spacesim.splat.lanes import Lanes
+from spacesim.splat.mlp import sigmoid
 from spacesim.splat.records import load, packets, store
 from spacesim.splat.tone import decoded, decoded_slope, encoded_slope, encoded_unclipped
 
@@ -35,17 +37,13 @@ class Scatterers:
     logit_opacities: Any
     sun: Any
 
-    def albedo(self, lanes: Lanes) -> list[Any]:
-        """Three Floats [M] in (0, 1)."""
-        return [_sigmoid(row) for row in lanes.block(self.features, self.albedos, 3)]
-
 
 def irradiance(scatterers: Scatterers, emitters: int, visibility: list[Any], lanes: Lanes) -> list[Any]:
     """Light that arrives at each Gaussian: three Floats [M] at the side to which its normal points, three at the other;
     1 where all around is as bright as a white surface under the Sun, as far as areas add up to surfaces (`OVERLAP`).
 
     emitters: how many of the Gaussians scatter, evenly chosen by number, each in place of N / emitters;
-    visibility: [M], evaluated, in a list, or nothing for 1
+    visibility: [M] in a list, or nothing for 1
 
     Sum over emitters k of rho_k v_k |n_k . s| F with F = A cos_i cos_k / (pi r^2 + A), the disc of Wallace et al.
     (1989), A its area: 2 pi s_1 s_2 opacity, its two longer axes', times N / emitters, times `OVERLAP`.
@@ -53,7 +51,8 @@ def irradiance(scatterers: Scatterers, emitters: int, visibility: list[Any], lan
     numbers = _emitters(scatterers, emitters, visibility, lanes)
     packed = [store(values, dr.arange(ad.UInt32, emitters), emitters) for values in packets(numbers)]
     dr.eval(packed)
-    means, normals = lanes.spread(scatterers.means), _unit(lanes.block(scatterers.features, scatterers.normals, 3))
+    means = lanes.spread(scatterers.means)
+    normals = unit_normals(ad.Array3f(lanes.block(scatterers.features, scatterers.normals, 3)))
 
     def received(k: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
         x, y, z, nx, ny, nz, area, *light = load(packed, k, emitters)[:10]
@@ -97,7 +96,7 @@ def _emitters(scatterers: Scatterers, emitters: int, visibility: list[Any], lane
         return [dr.gather(ad.Float, scatterers.features, (first + i) * lanes.count + k) for i in range(3)]
 
     place, log_scales = (dr.gather(ad.Array3f, of, k) for of in (scatterers.means, scatterers.log_scales))
-    normal = _unit(rows(scatterers.normals))
+    normal = unit_normals(ad.Array3f(rows(scatterers.normals)))
     cosine = dr.dot(normal, scatterers.sun)
     least = dr.minimum(log_scales[0], dr.minimum(log_scales[1], log_scales[2]))
     opacity = opacities(dr.gather(ad.Float, scatterers.logit_opacities, k))
@@ -105,19 +104,7 @@ def _emitters(scatterers: Scatterers, emitters: int, visibility: list[Any], lane
     seen = dr.abs(cosine)
     if visibility:
         seen *= dr.gather(ad.Float, visibility[0], k)
-    light = [seen * _sigmoid(logit) for logit in rows(scatterers.albedos)]
+    light = [seen * sigmoid(logit) for logit in rows(scatterers.albedos)]
     numbers = [*place, *dr.select(cosine < 0, -normal, normal), dr.minimum(area, LARGEST_AREA), *light]
-    sound = dr.isfinite(sum(numbers, ad.Float(0)))  # one that is not would reach all others
+    sound = dr.isfinite(sum(numbers, ad.Float(0))) & ~dr.isnan(area)  # one that is not would reach all others
     return [dr.select(sound, number, 0) for number in numbers]
-
-
-def _unit(rows: list[Any]) -> Any:
-    """Array3f, (0, 0, 1) in place of what has no direction."""
-    normal = ad.Array3f(rows)
-    square = dr.squared_norm(normal)
-    known = square > 1e-12
-    return dr.select(known, normal, ad.Array3f(0, 0, 1)) * dr.rsqrt(dr.select(known, square, 1))
-
-
-def _sigmoid(value: Any) -> Any:
-    return dr.rcp(1 + dr.exp(-value))

@@ -232,7 +232,7 @@ class LightModel:
         return Shading(colours, visibility[0] if visibility else None, shadows, inputs, lanes, tape)
 
     def sunlight(self, gaussians: Gaussians, sun: np.ndarray, adaptive: bool = False) -> Sunlight:
-        """For pictures under one Sun. Arguments as those of `shadows`."""
+        """Visibility, and light that bounces, under one Sun, for any number of pictures. Arguments: see `shadows`."""
         shadows = self.shadows(gaussians, sun, adaptive)
         if shadows is None and not self.config.bounce:
             return Sunlight(None, [])
@@ -329,7 +329,7 @@ def _trace_shade(
     views = field_views(config.field, field_inputs, lanes)
     items = field_items(config.field, inputs.features, views, lanes)
     output, field_tape = mlp.forward(config.field.shape, of_field, items, inputs.sun.field)
-    colours = [_sigmoid(lanes.row(output, i)) for i in range(3)]
+    colours = [mlp.sigmoid(lanes.row(output, i)) for i in range(3)]
     occlusion, refine_tape = _occluded(config, of_refine, inputs, lanes)
     faces = facing(config.field, field_inputs, views, lanes) if occlusion else []
     shown = _dimmed(colours, [1 - value for value in occlusion], faces)
@@ -365,7 +365,7 @@ def _trace_lit(
     else:
         rows = lanes.block(inputs.features, 0, field.features) + views
         outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field)
-    colours = [_sigmoid(value) for value in outputs]
+    colours = [mlp.sigmoid(value) for value in outputs]
     shown = _dimmed(colours, [lanes.padded(value) for value in visibility], facing(field, field_inputs, views, lanes))
     if bounced:
         seen = _on_seen_side(config, field_inputs, [lanes.padded(light) for light in bounced], lanes)
@@ -480,6 +480,11 @@ def _scatterers(config: LightConfig, inputs: _Inputs) -> Scatterers:
     return Scatterers(*rows, inputs.means, inputs.turns[1], inputs.logits, towards_sun(inputs.sun.light))
 
 
+def _albedo(config: LightConfig, inputs: _Inputs, lanes: Lanes) -> list[Any]:
+    """Three Floats [M] in (0, 1)."""
+    return [mlp.sigmoid(row) for row in lanes.block(inputs.features, config.albedos, 3)]
+
+
 def _on_seen_side(config: LightConfig, inputs: FieldInputs, bounced: list[Any], lanes: Lanes) -> list[Any]:
     """Three Floats [M] of the six of `irradiance`."""
     over = turned_over(config.field, inputs, lanes)
@@ -488,8 +493,7 @@ def _on_seen_side(config: LightConfig, inputs: FieldInputs, bounced: list[Any], 
 
 def _brightened(config: LightConfig, inputs: _Inputs, shown: list[Any], bounced: list[Any], lanes: Lanes) -> list[Any]:
     """Dimmed colours [M] with the light that bounces, what else is in `shown` as it was."""
-    albedo = _scatterers(config, inputs).albedo(lanes)
-    rows = zip(shown[:3], albedo, bounced, strict=True)
+    rows = zip(shown[:3], _albedo(config, inputs, lanes), bounced, strict=True)
     return [brightened(colour, rho * light, config.linear) for colour, rho, light in rows] + shown[3:]
 
 
@@ -498,9 +502,8 @@ def _before_bounce(
 ) -> tuple[list[Any], list[Any]]:
     """Gradients [M] of the dimmed colours and of the albedos' logits. What bounces counts as given, as it is small."""
     by_dimmed, by_albedo = [], []
-    for gradient, colour, rho, light in zip(
-        gradients, dimmed, _scatterers(config, inputs).albedo(lanes), bounced, strict=True
-    ):
+    rows = zip(gradients, dimmed, _albedo(config, inputs, lanes), bounced, strict=True)
+    for gradient, colour, rho, light in rows:
         of_colour, of_light = brightened_slopes(colour, rho * light, config.linear)
         by_dimmed.append(gradient * of_colour)
         by_albedo.append(gradient * of_light * light * rho * (1 - rho))
@@ -511,10 +514,6 @@ def _split(config: LightConfig, weights: list[Any]) -> tuple[list[Any], list[Any
     """Weights of the field, of the refinement."""
     count = 1 + 2 * config.field.layers
     return weights[:count], weights[count:]
-
-
-def _sigmoid(value: Any) -> Any:
-    return dr.rcp(1 + dr.exp(-value))
 
 
 _shade = recorded(_trace_shade, RECORDINGS)

@@ -42,6 +42,11 @@ class MlpShape:
         return sum(rows * columns + rows for rows, columns in self.sizes) + self.sizes[0][0] * self.shared
 
 
+def sigmoid(value: Any) -> Any:
+    """1 / (1 + e^-x)."""
+    return dr.rcp(1 + dr.exp(-value))
+
+
 def initial_weights(shape: MlpShape, rng: np.random.Generator, last: float = 1.0) -> list[np.ndarray]:
     """Uniform within 1 / sqrt(inputs) of a layer (LeCun et al. 1998, as PyTorch has it), float32, flat: the part of the
     first layer that reads what is shared, then matrix and bias of each layer. last: factor of the last layer's."""

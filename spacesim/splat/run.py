@@ -30,7 +30,8 @@ from spacesim.splat.train.config import TrainConfig
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A rendered view, float32. rgb: [H, W, 3] sRGB values over black; alpha: [H, W];
+    """A rendered view, float32. rgb: [H, W, 3] sRGB values over black, beyond 1 where what bounces
+    makes them brighter than white; alpha: [H, W];
     depth: [H, W] expected depth in metres, 0 where alpha is 0; visibility: [H, W], or None from a method without;
     normal: [H, W, 3] unit vectors in world axes, 0 where there is no surface, or None where not asked for."""
 

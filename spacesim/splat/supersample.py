@@ -12,7 +12,8 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.data.records import Camera
+from spacesim.data.errors import InputError
+from spacesim.data.records import MOST_PIXELS, Camera
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.render import RenderOutput
 from spacesim.splat.surface import unit
@@ -20,14 +21,19 @@ from spacesim.splat.tiles import RECORDINGS
 from spacesim.splat.tone import decoded, encoded_unclipped
 
 LEAST_ALPHA = 1e-3  #: a fainter pixel counts as this opaque when its colour is taken out of the blend
-MOST = 4  #: times as wide; chosen: a pixel of 16
+MOST_PLACES = 4  #: on a side of a pixel, chosen
 
 
 def finer(camera: Camera, times: int) -> Camera:
-    """The camera with `times` as many pixels on each side."""
+    """The camera with `times` as many pixels on each side. Raises InputError where these are too many."""
     if times == 1:
         return camera
     width, height = times * camera.width, times * camera.height
+    if width * height > MOST_PIXELS:
+        raise InputError(
+            f"--supersample {times}: expected pictures of at most {MOST_PIXELS // times**2} pixels, found "
+            f"{camera.width}x{camera.height}"
+        )
     numbers = [times * number for number in (camera.fx, camera.fy, camera.cx, camera.cy)]
     return Camera(camera.world_from_camera, width, height, *numbers)
 

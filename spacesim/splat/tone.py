@@ -1,6 +1,7 @@
 """Linear light to sRGB values and back in Dr.Jit, differentiable: for colours that are blended in linear light.
 
-A model's linear colours are in [0, 1]: shares of what its tone curve makes white (`spacesim.data.tone.WHITES`).
+A model's linear colours are shares of what its tone curve makes white (`spacesim.data.tone.WHITES`): at most 1 but
+where light bounces. What is brighter than white is clipped.
 """
 
 from typing import Any

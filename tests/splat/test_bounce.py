@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
-from spacesim.data.images import linear_from_srgb
-from spacesim.data.records import Camera, Sun
+from spacesim.data.records import Camera
 from spacesim.splat.appearance import FieldConfig
 from spacesim.splat.bounce import OVERLAP
 from spacesim.splat.cameras import Pinhole
@@ -207,10 +206,25 @@ def test_training_learns_albedos_and_repeats_to_the_bit(small_lit_dataset, tmp_p
     start = Trainer(small_lit_dataset, config).gaussians.to_numpy()["features"][:, config.light.albedos :]
     assert np.ptp(start) == 0
     assert np.ptp(albedos) > 0.05
-    frame = small_lit_dataset.test[0]
-    lit, dark = (runs[0].predict(frame.camera, Sun(sign * frame.sun.direction)) for sign in (1, -1))
+    frame, arrays = small_lit_dataset.test[0], runs[0].model.to_numpy()
+    arrays["features"][:, config.light.albedos :] = -30  # black
+    black = replace(runs[0], model=Gaussians.from_numpy(arrays)).predict(frame.camera, frame.sun)
+    lit = runs[0].predict(frame.camera, frame.sun)
     assert np.isfinite(lit.rgb).all()
-    assert linear_from_srgb(lit.rgb).sum() != pytest.approx(linear_from_srgb(dark.rgb).sum())
+    assert (lit.rgb >= black.rgb - 1e-6).all()
+    assert (lit.rgb - black.rgb).max() > 1e-3
+
+
+def test_one_that_is_not_a_number_lights_nobody():
+    """A receiver over a wall, some of which is broken: as bright as before, less these."""
+    splats = wall_and_receiver([0, 0, 0.5], [0, 0, -1])
+    light, up = model(replace(GLOW, bounce=splats.count)), np.array([0.0, 0, 1])
+    before = numbers(light.sunlight(splats, up).bounced[0])[-1]
+    for name, value in (("logit_opacities", np.nan), ("log_scales", np.nan), ("log_scales", np.inf), ("means", np.inf)):
+        arrays = splats.to_numpy()
+        arrays[name][800] = value
+        found = numbers(light.sunlight(Gaussians.from_numpy(arrays), up).bounced[0])[-1]
+        assert found == pytest.approx(before, rel=0.01), name
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -218,7 +232,10 @@ def test_presets_bounce_where_shadows_are_known(name):
     for method in ("relight", "park"):
         assert preset(name, method).light.bounce == 0
     for method in ("shadow-map", "shadow-splat"):
-        assert (preset(name, method).light.bounce > 0) == (name != "thesis")
+        light = preset(name, method).light
+        assert (light.bounce > 0) == (name != "thesis")
+        assert light.refine.sun.size == (25 if name == "thesis" else 1)
+        assert light.refine.positions == ("light" if name == "thesis" else "world")
 
 
 def test_impossible_bounces_are_named():

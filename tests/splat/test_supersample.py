@@ -10,17 +10,19 @@ from splats import random_splats
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
-from spacesim.data.images import srgb_from_linear
+from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.data.records import Camera
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose.scene import Composition, Placed
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.render import OUTPUTS, render
 from spacesim.splat.supersample import finer, pixel_means, supersampled
+from spacesim.splat.tone import developed
 from spacesim.splat.train.config import TrainConfig, preset
+from spacesim.splat.train.stages import LossConfig, Target, picture_loss
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
-from spacesim.splat.train.warm_start import WarmStartConfig
+from spacesim.splat.train.warm_start import WarmStart, WarmStartConfig
 
 WIDTH, HEIGHT = 5, 3
 EYE = Camera(look_at([0, -4, 0.5], [0, 0, 0]), 9, 7, 12.0, 13.0, 4.2, 3.6)
@@ -151,9 +153,12 @@ def test_the_finer_camera_sees_the_same():
         assert (seen.width, seen.height) == (times * EYE.width, times * EYE.height)
 
 
-@pytest.mark.parametrize("method", ["vanilla", "shadow-splat"])
+@pytest.mark.parametrize("method", ["vanilla", "shadow-splat", "linear"])
 def test_a_run_and_a_scene_of_it_draw_the_same(small_lit_dataset, tmp_path, method):
-    config = replace(preset("demo", method), iterations=4, init_count=60, supersample=2)
+    linear = method == "linear"
+    config = replace(preset("demo", "relight" if linear else method), iterations=4, init_count=60, supersample=2)
+    if linear:
+        config = replace(config, light=replace(config.light, linear=True, tone="srgb"))
     run = train(small_lit_dataset, tmp_path / "run", config)
     assert run.supersample == 2
     frame = small_lit_dataset.test[0]
@@ -161,6 +166,8 @@ def test_a_run_and_a_scene_of_it_draw_the_same(small_lit_dataset, tmp_path, meth
     single = replace(run, config={**run.config, "supersample": 1})
     wide = single.predict(finer(frame.camera, 2), frame.sun)
     expected = mean_light(numbers(wide.rgb), numbers(wide.alpha), 2)
+    if linear:  # what is blended is light over black
+        expected = srgb_from_linear(boxes(linear_from_srgb(numbers(wide.rgb)), 2))
     np.testing.assert_allclose(alone.rgb, expected, atol=5e-6)
     scene = Composition([Placed(run)])
     assert scene.supersample == 2
@@ -184,6 +191,68 @@ def test_supersampled_training_repeats_to_the_bit_and_resumes(small_lit_dataset,
         resumed.step()
     for name, values in runs[0].model.to_numpy().items():
         np.testing.assert_array_equal(resumed.gaussians.to_numpy()[name], values, err_msg=name)
+
+
+@pytest.mark.parametrize("tone", [None, "srgb", "filmic"])
+def test_training_compares_the_mean_light(tone):
+    """An empty picture half lit: its loss by the mean of light, or of what is light already."""
+    half = np.tile([1.0, 0.0], 2 * WIDTH * HEIGHT)
+    groups = {"colour": [ad.Float(half) for _ in range(3)]}
+    light = {None: srgb_from_linear(np.array(0.5)), "srgb": srgb_from_linear(np.array(0.5))}
+    light["filmic"] = developed(np.array(0.5), "filmic")
+    for level, same in ((float(light[tone]), True), (0.5, tone == "filmic" and abs(float(light[tone]) - 0.5) < 0.01)):
+        byte = round(255 * level)
+        rgba = ad.UInt32(np.full(WIDTH * HEIGHT, byte * 0x10101 + (255 << 24), np.uint32))
+        target = Target(rgba, ad.Float([0, 0, 0]), ad.Bool(True), {})
+        config = LossConfig(0.0, 0.0, 0.0, 0.0, 1.0, tone, 2)
+        loss, _, _ = picture_loss(groups, ad.Float(1 - np.ones_like(half)), target, (WIDTH, HEIGHT), config)
+        assert (numbers(loss)[0] < 0.004) == same
+
+
+def test_refinement_watches_the_same_gradients_and_sizes(small_dataset, monkeypatch):
+    """As shares of the picture, however finely it is drawn."""
+    found = []
+    for times in (1, 2):
+        config = replace(preset("demo"), init_count=200, supersample=times, antialiased=True)
+        trainer = Trainer(small_dataset, config)
+        seen = []
+        monkeypatch.setattr(trainer.strategy, "watches", lambda _step: True)
+        monkeypatch.setattr(trainer.strategy, "observe", lambda *given, seen=seen: seen.append(given))
+        trainer.step()
+        gradient, radius, visible = (np.array(values) for values in seen[0])
+        found.append([gradient[visible].mean(), radius[visible].mean()])
+    np.testing.assert_allclose(found[1], found[0], rtol=0.15)
+
+
+def test_the_warm_start_reads_its_masks_in_the_pixels_of_the_view(small_dataset, monkeypatch):
+    config = replace(preset("demo"), init_count=60, supersample=2)
+    config = replace(config, warm_start=WarmStartConfig(steps=6, decay=6, conservative=3))
+    trainer, sizes, pull = Trainer(small_dataset, config), [], WarmStart.pull
+
+    def watched(self, rows, camera, *rest):
+        sizes.append((camera.width, camera.height))
+        return pull(self, rows, camera, *rest)
+
+    monkeypatch.setattr(WarmStart, "pull", watched)
+    trainer.step()
+    camera = small_dataset.train[0].camera
+    assert sizes == [(camera.width, camera.height)]
+
+
+def test_fine_light_is_drawn_finely():
+    for method in ("relight", "shadow-map", "shadow-splat", "park"):
+        config = preset("fine", method)
+        assert (config.supersample, config.refinement.prune_opacity) == (2, 0.005)
+        assert config.refinement.split_screen_size < preset("fast", method).refinement.split_screen_size
+        assert preset("fast", method).supersample == preset("thesis", method).supersample == 1
+    assert preset("fine").supersample == 1
+    assert preset("fine", "shadow-map").light.shadow.mapping.filter == "variance"
+
+
+def test_pictures_too_large_to_draw_are_named():
+    vast = Camera(EYE.world_from_camera, 9000, 9000, 9000, 9000, 4500, 4500)
+    with pytest.raises(InputError, match=r"--supersample 2: expected pictures of at most 67108864 pixels, found 9000x"):
+        finer(vast, 2)
 
 
 def test_it_is_a_number_of_places():

@@ -10,7 +10,7 @@ from spacesim.splat.light import LightConfig
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.shadow.mapping import MappingConfig
 from spacesim.splat.shadow.refine import RefineConfig
-from spacesim.splat.supersample import MOST
+from spacesim.splat.supersample import MOST_PLACES
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.strategies.mcmc import McmcConfig
 from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig
@@ -22,9 +22,7 @@ STRATEGIES = ("default", "mesh-aware", "support-aware", "mcmc")
 INITS = ("mesh", "points", "random")
 PRESETS = ("demo", "fast", "fine", "thesis")
 ISOTROPY = 1e-2  #: weight of the isotropy term of `park`, chosen
-MARGIN = (
-    1e-3  #: to the exterior, of `fast` and `demo`: at few pixels 1e-4 prunes half of the surface (docs/strategies.md)
-)
+MARGIN = 1e-3  #: to the exterior, but of `thesis`: at few pixels 1e-4 prunes half of the surface (docs/strategies.md)
 LIT_SCREEN_SIZES = {"demo": 0.06, "fast": 0.03, "fine": 0.015}
 """Above which methods of light split, a share of the picture: a Gaussian has one visibility."""
 EMITTERS = {"demo": 256, "fast": 256, "fine": 1024}  #: of one bounce of light, of methods with shadows
@@ -117,8 +115,8 @@ class TrainConfig:
             raise InputError(f"--init-count: expected at least 1, found {self.init_count}")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"--sh-degree: expected 0 to 3, found {self.sh_degree}")
-        if not 1 <= self.supersample <= MOST:
-            raise InputError(f"--supersample: expected 1 to {MOST}, found {self.supersample}")
+        if not 1 <= self.supersample <= MOST_PLACES:
+            raise InputError(f"--supersample: expected 1 to {MOST_PLACES}, found {self.supersample}")
         if self.seed < 0:
             raise InputError(f"--seed: expected 0 or more, found {self.seed}")
         if (self.light is None) != (self.method == "vanilla"):
@@ -225,7 +223,7 @@ def _schedule(name: str) -> TrainConfig:
 
 
 def _light(name: str, method: str) -> LightConfig:
-    """Networks and shadows of a preset: `thesis` as in tables 4.1 to 4.3; `fast` and `demo` smaller, and with what we
+    """Networks and shadows of a preset: `thesis` as in tables 4.1 to 4.3; the others smaller, and with what we
     found better (docs/relighting.md, docs/ablations.md)."""
     sizes = {"thesis": (128, 256, 1024), "fast": (32, 64, 512), "fine": (32, 64, 1024), "demo": (16, 64, 256)}
     features, width, image = sizes[name]
