@@ -1,5 +1,7 @@
 """Pictures in every mode, how fast they are wanted, and what nonsense does to them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,17 @@ def test_colours_are_where_the_models_are(stage, stand, view):
     assert green > 150 > 60 > red
     assert not frame.picture[:5].any()  # the background is black
     assert frame.note == ""
+
+
+def test_a_pixel_is_one_place_whatever_runs_were_trained_with(stage, stand, view):
+    models = [
+        replace(model, run=replace(model.run, config={**model.run.config, "supersample": 2}))
+        for model in stage.composition.models
+    ]
+    finer = Stage(Composition(models))
+    assert finer.composition.supersample == 2
+    pictures = [draw(of, stand, view, Look(side=128)).picture for of in (stage, finer)]
+    np.testing.assert_array_equal(*pictures)
 
 
 def test_a_moved_model_is_somewhere_else(stage, stand, view):
