@@ -57,7 +57,7 @@ def pixel_means(
 
     found = {name: [mean(plane) for plane in group] for name, group in planes.items() if linear or name != "colour"}
     passed = gathered(transmittance)
-    if planes.get("colour") and not linear:
+    if "colour" in planes and not linear:
         alphas = [1 - value for value in passed]
         found["colour"] = [_mean_light(gathered(plane), alphas) for plane in planes["colour"]]
     return found, _mean(passed)

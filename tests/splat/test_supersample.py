@@ -174,6 +174,11 @@ def test_a_run_and_a_scene_of_it_draw_the_same(small_lit_dataset, tmp_path, meth
     composed = scene.predict(frame.camera, frame.sun, normals=True)
     for name in ("rgb", "alpha", "depth", "visibility", "normal"):
         np.testing.assert_array_equal(getattr(alone, name), getattr(composed, name), err_msg=name)
+    for name in ("id", "visibility", "median_depth"):
+        drawn = scene.draw(frame.camera, frame.sun, [name])
+        if name != "visibility" or name in drawn.planes:
+            assert np.isfinite(drawn.image(name)).all()
+            assert drawn.image(name).shape == (frame.camera.height, frame.camera.width)
     with_both = Composition([Placed(run), Placed(single)])
     assert with_both.contents[0] != with_both.contents[1], "a picture depends on it"
 
