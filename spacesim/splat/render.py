@@ -150,7 +150,7 @@ def _trace_clean(features: list[Any]) -> list[Any]:
 def _trace_finish(transmittance: Any, depth: list[Any], normal: list[Any]) -> tuple[Any, Any, Any]:
     """(alpha, expected depth, unit normals) of blended planes, None for those that were not blended."""
     alpha = 1 - transmittance
-    expected = _expected(depth[0], alpha) if depth else None
+    expected = over_alpha(depth[0], alpha) if depth else None
     return alpha, expected, unit(ad.Array3f(normal)) if normal else None
 
 
@@ -200,7 +200,7 @@ def _nothing(camera: Projection, outputs: Sequence[str], channels: int | None) -
     )
 
 
-def _expected(weighted: Any, alpha: Any) -> Any:
+def over_alpha(weighted: Any, alpha: Any) -> Any:
     """Blended values divided by the alpha; 0 where that is 0."""
     covered = alpha > 0
     return dr.select(covered, weighted / dr.select(covered, alpha, 1), 0)

@@ -15,7 +15,7 @@ from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError
 from spacesim.data.records import MOST_PIXELS, Camera
 from spacesim.splat.cameras import Pinhole
-from spacesim.splat.render import RenderOutput
+from spacesim.splat.render import RenderOutput, over_alpha
 from spacesim.splat.surface import unit
 from spacesim.splat.tiles import RECORDINGS
 from spacesim.splat.tone import decoded, encoded_unclipped
@@ -109,7 +109,7 @@ def _trace_reduced(
     more = {**covered, "alpha": [alpha], "known": known}
     found, _ = pixel_means({**groups, **more}, 1 - alpha, size, times, linear)
     (alpha,) = found.pop("alpha")
-    found["depth"] = [dr.select(alpha > 0, plane / dr.select(alpha > 0, alpha, 1), 0) for plane in found["depth"]]
+    found["depth"] = [over_alpha(plane, alpha) for plane in found["depth"]]
     found["normal"] = list(unit(ad.Array3f(found["normal"]))) if groups["normal"] else []
     share = found.pop("known")
     pairs = zip(found["median_depth"], share, strict=True)

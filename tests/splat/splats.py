@@ -3,6 +3,16 @@
 import numpy as np
 
 
+def light_of(values: np.ndarray) -> np.ndarray:
+    """Linear values of sRGB ones, beyond 1 too (IEC 61966-2-1), float64."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_of(light: np.ndarray) -> np.ndarray:
+    """The inverse of `light_of`."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+
+
 def random_splats(count: int, seed: int = 0, degree: int = 3) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     return {

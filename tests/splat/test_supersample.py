@@ -5,7 +5,7 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
-from splats import random_splats
+from splats import light_of, random_splats, srgb_of
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError
@@ -42,10 +42,8 @@ def mean_light(colour: np.ndarray, alpha: np.ndarray, times: int) -> np.ndarray:
     """Premultiplied sRGB values [h, w, 3], beyond 1 too: the light of straight colours, averaged with the alphas."""
     straight = np.divide(colour, alpha[..., None], out=np.zeros_like(colour), where=alpha[..., None] > 0)
     whole = boxes(alpha, times)[..., None]
-    decoded = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4)
-    light = boxes(alpha[..., None] * decoded, times)
-    light = np.divide(light, whole, out=np.zeros_like(light), where=whole > 0)
-    return whole * np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    light = boxes(alpha[..., None] * light_of(straight), times)
+    return whole * srgb_of(np.divide(light, whole, out=np.zeros_like(light), where=whole > 0))
 
 
 def planes(times: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
