@@ -24,11 +24,11 @@ from spacesim.data.store import read_dataset
 from spacesim.eval.evaluate import evaluate
 from spacesim.eval.report import write_report
 from spacesim.progress import reporting, tell_training
-from spacesim.splat.light import LightConfig
+from spacesim.splat.shading import LightConfig
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.shadow.mapping import SUN_RADIUS_DEG, MappingConfig
 from spacesim.splat.shadow.refine import RefineConfig
-from spacesim.splat.train.config import TrainConfig, preset, with_field, with_options
+from spacesim.splat.train.config import FINE_OPACITY, TrainConfig, preset, with_field, with_options
 from spacesim.splat.train.train import train
 
 SCENE = {"suns": 16, "views": 40, "test_suns": 8, "test_views": 5, "resolution": 256, "spp": 64, "test_spp": 1024}
@@ -140,7 +140,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
 def finer(config: TrainConfig) -> TrainConfig:
     """More and smaller Gaussians: split at half of the size, and kept while they are faint."""
     size = 0.5 * config.refinement.split_screen_size
-    return replace(config, refinement=replace(config.refinement, split_screen_size=size, prune_opacity=0.005))
+    return replace(config, refinement=replace(config.refinement, split_screen_size=size, prune_opacity=FINE_OPACITY))
 
 
 def with_bounce(config: TrainConfig, emitters: int) -> TrainConfig:

@@ -19,9 +19,10 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.light import LARGEST_EV, LightModel
+from spacesim.splat.light import LightModel
 from spacesim.splat.project import Projection
 from spacesim.splat.render import RenderOutput, render
+from spacesim.splat.shading import LARGEST_EV
 from spacesim.splat.supersample import supersampled
 from spacesim.splat.tone import developed
 from spacesim.splat.train.checkpoint import read_tensors
@@ -30,8 +31,8 @@ from spacesim.splat.train.config import TrainConfig
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A rendered view, float32. rgb: [H, W, 3] sRGB values over black, beyond 1 where what bounces
-    makes them brighter than white; alpha: [H, W];
+    """A rendered view, float32. rgb: [H, W, 3] sRGB values over black, beyond 1 where what bounces makes them brighter
+    than white; alpha: [H, W];
     depth: [H, W] expected depth in metres, 0 where alpha is 0; visibility: [H, W], or None from a method without;
     normal: [H, W, 3] unit vectors in world axes, 0 where there is no surface, or None where not asked for."""
 

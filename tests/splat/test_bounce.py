@@ -14,7 +14,8 @@ from spacesim.splat.bounce import OVERLAP
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.encoding import Encoding
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
+from spacesim.splat.light import LightModel, TrainingFrame
+from spacesim.splat.shading import LightConfig
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.train.config import PRESETS, preset
 from spacesim.splat.train.train import train

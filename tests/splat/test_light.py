@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
-from splats import random_splats
+from splats import light_of, random_splats, srgb_of
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError, WorkError
@@ -23,10 +23,11 @@ from spacesim.splat.bake import baked
 from spacesim.splat.cameras import Pinhole
 from spacesim.splat.encoding import Encoding
 from spacesim.splat.gaussians import Gaussians, entries
-from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
+from spacesim.splat.light import LightModel, TrainingFrame
 from spacesim.splat.mlp import MlpShape
 from spacesim.splat.render import view_colours
 from spacesim.splat.run import Run, draw_lit, load_run
+from spacesim.splat.shading import LightConfig
 from spacesim.splat.shadow.cast import ShadowConfig, cast_shadows
 from spacesim.splat.shadow.refine import RefineConfig
 from spacesim.splat.shadow.sunlight import light_rows
@@ -167,8 +168,7 @@ def bounced(light: LightModel, arrays: dict, visibility: np.ndarray) -> np.ndarr
 def brightened(light: LightModel, colour: np.ndarray, more: np.ndarray) -> np.ndarray:
     if light.config.linear:
         return colour + more
-    value = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4) + more
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.maximum(value, 1e-9) ** (1 / 2.4) - 0.055)
+    return srgb_of(light_of(colour) + more)
 
 
 def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray], given=None) -> tuple:

@@ -16,9 +16,10 @@ from spacesim.data.images import read_png
 from spacesim.data.records import Camera, Sun
 from spacesim.splat import sweep as module
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
+from spacesim.splat.light import LightModel, TrainingFrame
 from spacesim.splat.picture import LIT, SHADOWED, shadow_colours, write_picture
 from spacesim.splat.run import Prediction, Run
+from spacesim.splat.shading import LightConfig
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.sweep import SUN, resized, sky_mark, suns_around, sweep
 from spacesim.splat.video import Video, encoder, yuv420_from_rgb

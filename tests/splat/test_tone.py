@@ -14,7 +14,7 @@ from spacesim.data.images import linear_from_srgb
 from spacesim.data.tone import STANDARD_EXPOSURE, TONES, WHITES, development, displayed
 from spacesim.scenes.sun import EXPOSURE
 from spacesim.splat.appearance import FieldConfig
-from spacesim.splat.light import LightConfig
+from spacesim.splat.shading import LightConfig
 from spacesim.splat.tone import developed, light_of, picture_of
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.stages import LossConfig, Target, picture_loss

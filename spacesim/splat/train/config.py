@@ -6,7 +6,7 @@ from typing import Any, get_args, get_type_hints
 from spacesim.data.errors import InputError
 from spacesim.splat.appearance import FieldConfig
 from spacesim.splat.encoding import Encoding
-from spacesim.splat.light import LightConfig
+from spacesim.splat.shading import LightConfig
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.shadow.mapping import MappingConfig
 from spacesim.splat.shadow.refine import RefineConfig

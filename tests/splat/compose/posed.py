@@ -13,8 +13,9 @@ from spacesim.data.records import Camera
 from spacesim.splat.appearance import FieldConfig
 from spacesim.splat.encoding import Encoding
 from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.light import LightConfig, LightModel, TrainingFrame
+from spacesim.splat.light import LightModel, TrainingFrame
 from spacesim.splat.run import Run
+from spacesim.splat.shading import LightConfig
 from spacesim.splat.shadow.cast import ShadowConfig
 from spacesim.splat.shadow.mapping import MappingConfig
 from spacesim.splat.shadow.refine import RefineConfig
