@@ -12,6 +12,7 @@ from spacesim.data.geometry import quaternion_from_rotation
 from spacesim.data.records import Camera, Dataset
 from spacesim.viewer.controls import ClientControls, SunControls
 from spacesim.viewer.frames import drawn
+from spacesim.viewer.gate import files_wait
 from spacesim.viewer.handles import FRUSTUM, add_frusta
 from spacesim.viewer.loop import RenderLoop
 from spacesim.viewer.paint import Bytes, with_scale
@@ -101,7 +102,7 @@ class Client:
         """See `Actions`."""
         view, mode = self.session.view, self.session.look.mode
         if view is not None and not self._closed:
-            self._loop.do(lambda: self._send_picture(view, mode))
+            self._loop.do(lambda: self._send_picture(view, mode), (self, "picture"))
 
     def look_from(self, world_from_camera: np.ndarray, fov: float) -> None:
         """Move the client's camera to a pose [4, 4]; it goes round what is in the middle of the scene then."""
@@ -116,7 +117,9 @@ class Client:
             camera.fov = float(fov)
 
     def _send_picture(self, view: View, mode: str) -> None:
-        """On the render thread: with square pixels, as large as the window."""
+        """On the render thread: with square pixels, as large as the window; none while another is on its way."""
+        if files_wait(self.handle._websock_connection):
+            return
         scale = min(1.0, MOST_PICTURE / max(view.width, view.height))
         width, height = (max(1, round(scale * side)) for side in (view.width, view.height))
         _, picture, depths, _ = drawn(self._stage, self._shared.stand, view.camera(width, height), mode)

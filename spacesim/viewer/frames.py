@@ -21,11 +21,12 @@ LEAST = 64  #: pixels of a side
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A picture for a client. picture: [H, W, 3];  planes: what it was painted from;  seconds: that it took;  share: of
-    the full resolution;  depths: ends of the colour map in metres, or None;  note: a sentence for the user, or "" """
+    """A picture for a client. picture: [H, W, 3];  planes: what it was painted from, or None;  seconds: that it took;
+    share: of the full resolution;  depths: ends of the colour map in metres, or None;  note: a sentence for the user,
+    or "" """
 
     picture: Bytes
-    planes: Planes
+    planes: Planes | None
     seconds: float
     share: float
     depths: tuple[float, float] | None

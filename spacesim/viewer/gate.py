@@ -2,19 +2,38 @@
 
 viser takes any message that it knows: one may replace parts of its own objects, ask for a tunnel to a public server, or
 fail in a handler with a traceback. Here only the few that the viewer's controls send pass, with values that can be. A
-page of another site that a user has open may connect to a server on loopback, too; browsers say where a page is from.
+page of another site that a user has open may connect to a server on loopback, too; browsers say where a page is from,
+and what is not the viewer's own is refused before there is a connection. What one client can fill is bounded.
 """
 
 import asyncio
+import contextlib
+import importlib
 import logging
 import math
-from collections.abc import Callable, Coroutine
+import socket
+import threading
+from collections.abc import Callable, Coroutine, Iterator
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl
 
+from spacesim.data.errors import InputError
+from spacesim.viewer.address import Names, host_of
 from spacesim.viewer.state import FARTHEST, view_of
 
 LONGEST_TEXT = 200  #: characters that a field takes, chosen
+LARGEST_MESSAGE = 8 * 1024  #: bytes; nine times the largest that controls send: 884, a text of LONGEST_TEXT letters
+WAITING_FRAMES = 16  #: frames of a client that wait to be read, from which on it is not listened to
+MOST_FRAGMENTS = 64  #: of one message, chosen: browsers do not cut such short ones up
+MOST_ANSWERS = 2**20  #: bytes of answers to a client's pings that it does not take, chosen
+MOST_CLIENTS = 16  #: at once, chosen
+MOST_SOCKETS = 64  #: at once, those included that have not said yet what they want; chosen
+PATIENCE = 10.0  #: seconds that a client has to say what it wants
+PATIENCE_UNREAD = 30.0  #: seconds without a byte taken of those that wait to be sent, chosen
+MOST_WARNINGS = 10  #: about pages that were refused, chosen
+
+_ELSEWHERE = {"websocket", "playbackPath"}  # with these in its address viser's page obeys another server, as ours
+_PORTS = {"http": 80, "https": 443}
 _PHASES, _BUTTONS = ("start", "update", "end"), ("left", "middle", "right")
 
 _log = logging.getLogger(__name__)
@@ -131,10 +150,117 @@ def wake_in_turn(handler: Any) -> None:
     handler.get_message_buffer().message_event = _Alarm()
 
 
-def is_foreign(headers: Any) -> bool:
-    """Whether a browser says that the page which connects was loaded from another server than this one."""
-    origin, host = headers.get("Origin"), headers.get("Host")
-    return origin is not None and urlsplit(origin).netloc.lower() != (host or "").lower()
+def refusal(headers: Any, path: str, names: Names) -> str | None:
+    """Why a request is refused, None for one that is not. headers: of websockets;  path: with its query;  names: of
+    this server"""
+    hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+    host = host_of(hosts[0]) if len(hosts) == 1 else None
+    if host is None or not names.include(host[0]):
+        return "this server has no such name: open the address that spacesim view says, or name it with --host"
+    if origins and (len(origins) > 1 or not _is_own(origins[0], *host)):
+        return "this page is not the viewer's"
+    if not _ELSEWHERE.isdisjoint(key for key, _ in parse_qsl(path.partition("?")[2], keep_blank_values=True)):
+        return "the viewer's page shows this server alone"
+    return None
+
+
+def _is_own(origin: str, name: str, port: int | None) -> bool:
+    """Whether a page was loaded from the server that it asks."""
+    scheme, separator, rest = origin.partition("://")
+    usual = _PORTS.get(scheme.lower())
+    host = host_of(rest)
+    if not separator or usual is None or host is None:
+        return False
+    return (host[0], host[1] or usual) == (name, port or usual)
+
+
+@contextlib.contextmanager
+def guarded(names: Names) -> Iterator[None]:
+    """A server of viser that is made inside refuses what `refusal` does, before anything else sees it, and is bounded.
+    It takes clients once this ends. viser hands no such parameters on to websockets, so its `serve` is another one
+    meanwhile. Raises InputError where viser has not asked for it."""
+    library: Any = importlib.import_module("websockets.asyncio.server")
+    serve, connection = library.serve, _bounded(library.ServerConnection)
+    made, ready = threading.Event(), threading.Event()
+    refused: set[str] = set()
+
+    def guarded_serve(*arguments: Any, process_request: Callable[[Any, Any], Any], **named: Any) -> Any:
+        def process(client: Any, request: Any) -> Any:
+            reason = refusal(request.headers, request.path, names)
+            if reason is not None:
+                told = ", ".join(f"{key} {request.headers.get_all(key)!a:.200}" for key in ("Host", "Origin"))
+                if told not in refused and len(refused) < MOST_WARNINGS:
+                    refused.add(told)
+                    _log.warning("viewer: a page was refused (%s): %s", told, reason)
+                return client.respond(403, f"{reason}\n")
+            response = process_request(client, request)
+            if response is None and not ready.is_set():
+                return client.respond(503, "the viewer is starting\n")
+            if response is None and len(client.server.connections) >= MOST_CLIENTS:
+                return client.respond(503, f"the viewer has {MOST_CLIENTS} clients already: close one\n")
+            return response
+
+        made.set()
+        bounds: dict[str, Any] = {"max_size": LARGEST_MESSAGE, "max_queue": WAITING_FRAMES, "open_timeout": PATIENCE}
+        bounds |= {"close_timeout": PATIENCE, "compression": None, "create_connection": connection}
+        return serve(*arguments, process_request=process, **{**named, **bounds})
+
+    library.serve = guarded_serve
+    try:
+        yield
+    finally:
+        library.serve = serve
+    if not made.is_set():
+        raise InputError("the viewer needs a viser that makes its server with websockets.asyncio.server.serve")
+    ready.set()
+
+
+def _bounded(kind: Any) -> Any:
+    """A connection of websockets (`kind`) of which nothing piles up without bound."""
+
+    class Bounded(kind):
+        _fragments = _answers = 0
+
+        def connection_made(self, transport: Any) -> None:
+            """One too many takes the place of the oldest that is no client."""
+            super().connection_made(transport)
+            milliseconds = round(1000 * PATIENCE_UNREAD)
+            with contextlib.suppress(AttributeError, OSError):  # of Linux; elsewhere one that reads nothing stays
+                transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, milliseconds)
+            there = [one for one in self.server.handlers if not one.transport.is_closing()]
+            if len(there) > MOST_SOCKETS:
+                clients = self.server.connections
+                next(one for one in there if one not in clients).transport.abort()
+
+        def process_event(self, event: Any) -> None:
+            super().process_event(event)
+            if not getattr(event, "fin", True):
+                self._fragments += 1
+            elif self._fragments and event.opcode == 0:  # the last one
+                self._fragments = 0
+
+        def data_received(self, data: bytes) -> None:
+            before = self.transport.get_write_buffer_size()
+            super().data_received(data)
+            grown = self.transport.get_write_buffer_size() - before
+            self._answers = self._answers + grown if self.paused else 0
+            if self._fragments > MOST_FRAGMENTS or self._answers > MOST_ANSWERS:
+                self.transport.abort()
+
+        async def recv(self, decode: bool | None = None) -> Any:
+            """The next message, once all has been done about the one before; other clients come in between."""
+            await asyncio.sleep(0)
+            return await super().recv(decode)
+
+    return Bounded
+
+
+def files_wait(connection: Any) -> bool:
+    """Whether parts of files wait to be sent to a client (a connection of viser's infra). Of all other messages, newer
+    ones take the place of older."""
+    buffer = connection.get_message_buffer()
+    with buffer.buffer_lock:
+        return any(type(one).__name__ == "FileTransferPart" for one in buffer.message_from_id.values())
 
 
 class Quiet(logging.Filter):

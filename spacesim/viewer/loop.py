@@ -38,7 +38,8 @@ class RenderLoop:
         self._tidy_at: float | None = None  # None where nothing was drawn since the last time
         self._wishes: OrderedDict[Hashable, tuple[Wish, bool]] = OrderedDict()
         self._resting: dict[Hashable, tuple[float, Wish]] = {}
-        self._work: list[Callable[[], Any]] = []
+        self._work: OrderedDict[Hashable, Callable[[], Any]] = OrderedDict()
+        self._worked = False  # since the last picture
         self._changed = threading.Condition()
         self._going, self._busy = True, False
         self._thread = threading.Thread(target=self._run, name="render", daemon=True)
@@ -60,10 +61,11 @@ class RenderLoop:
             self._wishes.pop(client, None)
             self._resting.pop(client, None)
 
-    def do(self, work: Callable[[], Any]) -> None:
-        """Call `work` on the render thread, before the next picture."""
+    def do(self, work: Callable[[], Any], kind: Hashable = None) -> None:
+        """Call `work` on the render thread, before the next picture but one, instead of what was to be done before of
+        the same kind, if that is not None."""
         with self._changed:
-            self._work.append(work)
+            self._work[object() if kind is None else kind] = work
             self._changed.notify()
 
     @property
@@ -102,8 +104,9 @@ class RenderLoop:
 
     def _next(self) -> Callable[[], Any] | None:
         """What to do now, None for nothing. The lock is held."""
-        if self._work:
-            return self._work.pop(0)
+        if self._work and not self._worked:
+            return self._other_work()
+        self._worked = False
         now = time.monotonic()
         task = self._untidy(now - self._every) or self._rested(now - PATIENCE)
         if task is None and self._wishes:
@@ -111,7 +114,13 @@ class RenderLoop:
             if moving:
                 self._resting[client] = (now + self._rest, wish)
             task = self._drawing(partial(wish.draw, not moving))
-        return task or self._rested(now) or self._untidy(now)
+        task = task or self._rested(now) or self._untidy(now)
+        return task or (self._other_work() if self._work else None)
+
+    def _other_work(self) -> Callable[[], Any]:
+        """The first that is no picture. The lock is held."""
+        self._worked = True
+        return self._work.popitem(last=False)[1]
 
     def _rested(self, now: float) -> Callable[[], Any] | None:
         """A picture in full resolution that was due before `now`. The lock is held."""

@@ -138,10 +138,11 @@ class PathControls:
 
 
 class FileControls:
-    """Saves the scene as TOML into a folder. Files that were there before are left alone. do: on the render thread"""
+    """Saves the scene as TOML into a folder. Files that were there before are left alone. do: on the render thread, in
+    place of what waits of the same kind"""
 
     def __init__(
-        self, gui: Any, stage: Stage, shared: Shared, paths: PathControls, out: FilePath, do: Callable[[Any], None]
+        self, gui: Any, stage: Stage, shared: Shared, paths: PathControls, out: FilePath, do: Callable[[Any, Any], None]
     ) -> None:
         self._stage, self._shared, self._paths, self._out, self._do = stage, shared, paths, out, do
         self._own: set[FilePath] = set()
@@ -149,7 +150,7 @@ class FileControls:
             self.name = gui.add_text("Scene", "scene.toml", hint=f"a file in {out.resolve()}")
             save = gui.add_button("Save scene")
             self.told = gui.add_markdown("")
-        save.on_click(paths.with_client(lambda _number, client: do(lambda: self._save(client))))
+        save.on_click(paths.with_client(lambda _number, client: do(lambda: self._save(client), (client, "save"))))
 
     def _save(self, client: Client) -> None:
         view = client.session.view

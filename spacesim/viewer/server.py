@@ -20,7 +20,7 @@ from spacesim.data.records import Camera, Dataset
 from spacesim.viewer import address
 from spacesim.viewer.client import Client, fov_to_hold
 from spacesim.viewer.controls import ModelControls, SunControls
-from spacesim.viewer.gate import Quiet, guard, is_foreign, wake_in_turn
+from spacesim.viewer.gate import Quiet, guard, guarded, wake_in_turn
 from spacesim.viewer.handles import Gizmos, SunHandle
 from spacesim.viewer.loop import RenderLoop
 from spacesim.viewer.memory import give_back
@@ -204,20 +204,16 @@ def _serve(host: str, port: int) -> Any:
         logging.getLogger(name).addFilter(Quiet())
     warnings.filterwarnings("ignore", message="Queued a ")
     warnings.filterwarnings("ignore", message=r"\[viser\]")
-    with contextlib.redirect_stdout(io.StringIO()):  # a table with addresses
-        server = viser.ViserServer(host=host, port=port, verbose=False)
-    inner = server._websock_server
-    guard(inner)
-    wake_in_turn(inner)
+    with guarded(address.names_of(host)):
+        with contextlib.redirect_stdout(io.StringIO()):  # a table with addresses
+            server = viser.ViserServer(host=host, port=port, verbose=False)
+        inner = server._websock_server
+        guard(inner)
+        wake_in_turn(inner)
 
-    async def admit(connection: Any) -> None:
-        guard(connection)
-        wake_in_turn(connection)
-        live = inner._live_connections.get(connection.client_id)
-        headers = live.request.headers if live is not None and live.request is not None else {}
-        if live is not None and is_foreign(headers):
-            _log.warning("viewer: a page of %s tried to connect and was refused", headers.get("Origin"))
-            await live.close(1008, "this page is not the viewer's")
+        async def admit(connection: Any) -> None:
+            guard(connection)
+            wake_in_turn(connection)
 
-    inner.on_client_connect(admit)
+        inner.on_client_connect(admit)
     return server

@@ -152,7 +152,7 @@ class Session:
             height, width = frame.picture.shape[:2]
             self._pace.took(share, (width, height), frame.seconds)
         if share == 1:
-            self._last = view, stand, look, frame
+            self._last = view, stand, look, replace(frame, planes=None)  # which are six times as large
         picture = self._with_truth(frame, view, stand, look) if full and look.compare != "off" else frame.picture
         with self._lock:
             if self._closed:

@@ -1,8 +1,11 @@
 """Clients without a browser: pictures for them, nonsense from them, leaving in the middle, memory."""
 
+import asyncio
+import contextlib
 import ctypes
 import gc
 import random
+import socket
 import threading
 import time
 import urllib.error
@@ -16,6 +19,7 @@ from browser import PATIENCE, wait_for
 from spacesim.data.geometry import look_at, quaternion_from_rotation
 from spacesim.data.records import Sun
 from spacesim.splat.compose.pose import LARGEST, SMALLEST, Pose
+from spacesim.viewer import gate
 from spacesim.viewer.client import Client
 from spacesim.viewer.memory import give_back
 from spacesim.viewer.state import FARTHEST, Shared, Stand
@@ -144,17 +148,109 @@ def test_nonsense_of_a_client_harms_no_other(viewer, at_start, caplog, capfd):
     assert "Traceback" not in said
 
 
-def test_pages_of_other_sites_are_refused(viewer):
+def frame(message):
+    """Of RFC 6455, of 126 bytes and more, with a mask of zeros."""
+    return b"\x82\xfe" + len(message).to_bytes(2, "big") + bytes(4) + message
+
+
+def test_messages_that_come_at_once_are_handled_one_by_one(viewer, monkeypatch):
+    """Else one client's would pile up, and others would wait until all of them are done."""
+    tasks = []
+    with connected(viewer) as one:
+        monkeypatch.setattr(gate, "admitted", lambda _: tasks.append(len(asyncio.all_tasks())))
+        one.socket.sendall(200 * frame(camera_message()))
+        wait_for(lambda: len(tasks) == 400, "all of them")  # viser asks twice
+    assert max(tasks) < 50
+
+
+def test_pages_of_other_sites_are_refused_before_they_are_clients(viewer, monkeypatch, caplog):
+    """Not even what they send with the request, before any answer, comes to a handler."""
+    seen = []
+    monkeypatch.setattr("spacesim.viewer.gate.admitted", seen.append)
+    monkeypatch.setattr(viewer._server._websock_server, "_client_connect_cb", [seen.append])
+    lines = ["GET / HTTP/1.1", f"Host: 127.0.0.1:{viewer.port}", "Origin: https://example.org", "Upgrade: websocket"]
+    lines += ["Connection: Upgrade", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA=="]
+    head = "\r\n".join([*lines, f"Sec-WebSocket-Protocol: viser-v{viser.__version__}", "", ""]).encode()
+    for _ in range(3):
+        with socket.create_connection(("127.0.0.1", viewer.port), PATIENCE) as page:
+            page.sendall(head + 30 * frame(camera_message()))
+            assert page.recv(12) == b"HTTP/1.1 403"
+    assert seen == []
+    assert caplog.text.count("https://example.org") == 1
+
+
+def test_no_page_is_given_under_the_name_of_another(viewer):
+    request = urllib.request.Request(viewer.url, headers={"Host": f"example.org:{viewer.port}"})
+    with pytest.raises(urllib.error.HTTPError, match="403") as refused:
+        urllib.request.urlopen(request, timeout=PATIENCE)
+    assert b"no such name" in refused.value.read()
+
+
+def test_a_message_that_is_too_large_ends_one_client_alone(viewer, at_start):
+    with connected(viewer) as good, connected(viewer) as bad:
+        for socket_ in (good, bad):
+            socket_.send(camera_message())
+            pictures(socket_, 1)
+        bad.send(bytes(gate.LARGEST_MESSAGE + 1))
+        with pytest.raises(websockets.exceptions.ConnectionClosedError, match="1009"):
+            pictures(bad, 100)
+        good.send(camera_message(0.4))
+        pictures(good, 1)
+
+
+def test_clients_too_many_are_told_so(viewer, monkeypatch):
+    wait_for(lambda: not viewer._server._websock_server._live_connections, "those of other tests to be gone")
+    monkeypatch.setattr(gate, "MOST_CLIENTS", 2)
+    with connected(viewer), connected(viewer):
+        with pytest.raises(websockets.exceptions.InvalidStatus, match="503") as refused:
+            connected(viewer)
+        assert b"2 clients already" in refused.value.response.body
+
+
+def test_sockets_that_say_nothing_make_room(viewer, monkeypatch):
+    monkeypatch.setattr(gate, "MOST_SOCKETS", 4)
+    with contextlib.ExitStack() as held:
+        good = held.enter_context(connected(viewer))
+        address = ("127.0.0.1", viewer.port)
+        silent = [held.enter_context(socket.create_connection(address, PATIENCE)) for _ in range(8)]
+        assert silent[0].recv(1) == b""  # not the client, though that is older
+        good.send(camera_message(0.7))
+        pictures(good, 1)
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="the system cannot tell who reads nothing")
+def test_clients_that_read_nothing_are_sent_away(viewer, at_start, monkeypatch):
+    monkeypatch.setattr(gate, "PATIENCE_UNREAD", 1.0)
+    before = set(viewer.clients)
+    deaf = socket.socket()
+    deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    deaf.connect(("127.0.0.1", viewer.port))
     url = viewer.url.replace("http", "ws")
     version = [f"viser-v{viser.__version__}"]
-    with client.connect(url, subprotocols=version, origin="https://example.org", max_size=None) as socket:
+    named = {"compression": None, "max_queue": 1, "ping_interval": None, "close_timeout": 0.5}
+    with client.connect(url, sock=deaf, subprotocols=version, **named) as one:
+        one.send(camera_message())
+        wait_for(lambda: set(viewer.clients) - before, "the client")
+        (number,) = set(viewer.clients) - before
 
-        def listen():
-            for _ in range(100):
-                socket.recv(timeout=PATIENCE)
+        def gone():
+            with contextlib.suppress(websockets.exceptions.ConnectionClosed):
+                one.send(camera_message(time.monotonic(), image_width=1024, image_height=1024))
+            return number not in viewer.clients
 
-        with pytest.raises(websockets.exceptions.ConnectionClosed):
-            listen()
+        wait_for(gone, "it to be sent away", patience=15.0)
+
+
+def test_one_file_at_a_time_waits_for_a_client(viewer):
+    connection = viewer._server._websock_server
+    assert not gate.files_wait(connection)
+    buffer = type(connection.get_message_buffer())(connection._background_event_loop, persistent_messages=False)
+    slow = SimpleNamespace(get_message_buffer=lambda: buffer)
+    buffer.push(viser._messages.FileTransferPart(None, "a", 0, b"x"))
+    assert gate.files_wait(slow)
+    with buffer.buffer_lock:
+        buffer.pop_message_locked(0)
+    assert not gate.files_wait(slow)
 
 
 @pytest.mark.parametrize("scales", [(SMALLEST, 1.0), (1.0, SMALLEST), (LARGEST, SMALLEST), (LARGEST, LARGEST)])

@@ -2,15 +2,19 @@
 
 import asyncio
 import random
+import socket
 import threading
 
 import pytest
 from browser import PATIENCE, wait_for
 
-from spacesim.viewer.address import ATTEMPTS, free_port, is_loopback, url
-from spacesim.viewer.gate import admitted, guard, is_foreign, wake_in_turn
+from spacesim.data.errors import InputError
+from spacesim.viewer.address import ATTEMPTS, free_port, is_loopback, names_of, url
+from spacesim.viewer.gate import LARGEST_MESSAGE, LONGEST_TEXT, admitted, guard, guarded, refusal, wake_in_turn
 
 pytest.importorskip("viser", reason="viser is not installed")
+import msgspec
+import websockets
 from viser import _messages as messages
 
 CAMERA = {
@@ -109,27 +113,134 @@ def test_a_handler_that_fails_is_no_end():
     assert seen == [GOOD[0]]
 
 
+def asked(*headers, path="/", host="127.0.0.1"):
+    """Why a request with these headers is refused by a server that listens at `host`, "" for not at all."""
+    return refusal(websockets.Headers(headers), path, names_of(host)) or ""
+
+
 @pytest.mark.parametrize(
-    ("headers", "foreign"),
+    ("host", "origin"),
     [
-        ({"Host": "localhost:8080", "Origin": "http://localhost:8080"}, False),
-        ({"Host": "localhost:8080", "Origin": "https://LOCALHOST:8080"}, False),
-        ({"Host": "localhost:8080"}, False),
-        ({"Host": "127.0.0.1:8080", "Origin": "https://example.org"}, True),
-        ({"Host": "127.0.0.1:8080", "Origin": "null"}, True),
-        ({"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:9000"}, True),
-        ({"Origin": "http://127.0.0.1:9000"}, True),
+        ("localhost:8080", "http://localhost:8080"),
+        ("localhost:8080", "https://LOCALHOST:8080"),
+        ("LocalHost.:8080", "http://localhost:8080"),
+        ("localhost", "http://localhost:80"),
+        ("localhost", "https://localhost"),
+        ("127.3.2.1:1", None),
+        ("[::1]:8080", "http://[0:0::1]:8080"),
+        ("[::ffff:127.0.0.1]", None),
     ],
 )
-def test_pages_of_other_sites_are_told_apart(headers, foreign):
-    assert is_foreign(headers) is foreign
+def test_own_pages_are_let_in(host, origin):
+    origins = [("Origin", origin)] if origin else []
+    assert asked(("Host", host), *origins) == ""
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        *(
+            "null",
+            "",
+            "*",
+            "http://",
+            "://localhost:8080",
+            "localhost:8080",
+            "http://localhost",
+            "http://localhost:9000",
+        ),
+        *("http://127.0.0.1:8080", "https://example.org", "ftp://localhost:8080", "http://localhost:8080/"),
+        *("http://a@localhost:8080", "http://localhost:8080.example.org", "http://localhost:8080 http://example.org"),
+    ],
+)
+def test_pages_of_other_sites_are_refused(origin):
+    assert "not the viewer's" in asked(("Host", "localhost:8080"), ("Origin", origin))
+
+
+def test_two_origins_are_none():
+    twice = [("Origin", "http://localhost")] * 2
+    assert "not the viewer's" in asked(("Host", "localhost"), *twice)
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        *(
+            "",
+            ".",
+            "example.org",
+            "example.org:8080",
+            "localhost.example.org",
+            "127.0.0.1.example.org",
+            "0.0.0.0",
+            "::1",
+        ),
+        *(
+            "[::1",
+            "[::1]x",
+            "[::2]",
+            "10.0.0.1",
+            "127.1",
+            "2130706433",
+            "localhost:",
+            "localhost:99999",
+            "localhost:8 0",
+        ),
+        *("a@localhost", "localhost/", "localhost, example.org", "loc\xe4lhost", "localhost..", "localhost:\xb2"),
+    ],
+)
+def test_names_of_others_are_refused(host):
+    for origins in ([], [("Origin", f"http://{host}")]):
+        assert "no such name" in asked(("Host", host), *origins)
+
+
+def test_one_name_is_asked_for():
+    assert "no such name" in asked()
+    assert "no such name" in asked(("Host", "localhost"), ("Host", "localhost"))
+
+
+def test_what_it_is_called_depends_on_where_it_listens(monkeypatch):
+    monkeypatch.setattr(socket, "gethostname", lambda: "Station")
+    monkeypatch.setattr(socket, "getfqdn", lambda: "station.lab.")
+    everywhere = names_of("0.0.0.0")
+    for name in ("localhost", "station", "station.lab", "10.1.2.3", "::1", "fe80::1", "127.0.0.1"):
+        assert everywhere.include(name)
+    assert not everywhere.include("example.org")
+    assert names_of("::") == everywhere
+
+    places = {"box": ["10.0.0.7", "fd00::7"], "10.0.0.7": ["10.0.0.7"], "mine": ["127.0.1.1"], "::1": ["::1"]}
+    monkeypatch.setattr(socket, "getaddrinfo", lambda host, *_, **__: [(0,) * 4 + ((one, 0),) for one in places[host]])
+    box = names_of("box")
+    assert all(map(box.include, ("box", "10.0.0.7", "fd00::7")))
+    assert not any(map(box.include, ("localhost", "127.0.0.1", "10.0.0.8", "station")))
+    assert not names_of("10.0.0.7").include("box")
+    assert all(map(names_of("mine").include, ("mine", "localhost", "127.0.0.1", "::1")))
+    assert all(map(names_of("::1").include, ("localhost", "127.0.0.1", "::1")))
+
+
+@pytest.mark.parametrize("query", ["websocket=ws://example.org", "a&playbackPath", "%77ebsocket=", "a=1&websocket=x"])
+def test_no_page_that_obeys_another_server_is_given(query):
+    assert "this server alone" in asked(("Host", "localhost"), path=f"/?{query}")
+    assert asked(("Host", "localhost"), path="/?darkMode&a=websocket") == ""
+
+
+def test_messages_may_be_some_times_as_large_as_those_of_controls():
+    longest = messages.GuiUpdateMessage("0" * 36, {"value": "\U0001d11e" * LONGEST_TEXT})
+    assert admitted(longest)
+    largest = max(len(msgspec.msgpack.encode(one.as_serializable_dict())) for one in (*GOOD, longest))
+    assert 8 * largest < LARGEST_MESSAGE < 16 * largest
+
+
+def test_a_server_that_is_made_in_another_way_is_none():
+    import websockets.asyncio.server as library
+
+    before = library.serve
+    with pytest.raises(InputError, match="viser"), guarded(names_of("127.0.0.1")):
+        assert library.serve is not before
+    assert library.serve is before
 
 
 def test_ports_and_hosts():
-    import socket
-
-    from spacesim.data.errors import InputError
-
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -114,6 +114,22 @@ def test_a_picture_that_fails_ends_no_others(caplog):
     assert not loop._thread.is_alive()
 
 
+def test_other_work_piles_up_of_no_kind_and_lets_pictures_through(clock):
+    loop, drawn, done = RenderLoop(rest=1.0), Drawn(), []
+    for k in range(100):
+        loop.do(lambda k=k: done.append(k), "save")
+    loop.do(lambda: done.append("file"))
+    loop.do(lambda: done.append("another"))
+    loop.wish("a", drawn.wish("a"), moving=False)
+    loop.wish("b", drawn.wish("b"), moving=False)
+    order = []
+    while not loop.idle and (task := loop._next()) is not None:
+        task()
+        order.append((len(done), len(drawn.made)))
+    assert done == [99, "file", "another"]
+    assert order == [(1, 0), (1, 1), (2, 1), (2, 2), (3, 2)]
+
+
 def test_it_tidies_up_in_pauses_once_after_pictures(clock):
     drawn, tidied = Drawn(), []
     loop = RenderLoop(0.2, lambda: tidied.append(len(drawn.made)), 20.0)

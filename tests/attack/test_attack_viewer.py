@@ -1,0 +1,56 @@
+"""The attack on the viewer finds nothing, and would find what it looks for."""
+
+import attack_viewer
+import pytest
+from attack_viewer import attack, floods, foreign_pages, rebinding, slow_sockets
+
+pytest.importorskip("viser", reason="viser is not installed")
+
+GATE = "import spacesim.viewer.gate as gate; "
+
+
+def test_nothing_gets_through(tmp_path):
+    found = attack(0, 0.1, tmp_path)
+    assert found.finds == []
+    assert found.tried["own page"] == 1
+    assert found.tried["client too many"] == 20
+    assert len(found.tried) == 19
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_it_finds_that_pages_of_others_are_let_in(tmp_path):
+    told = "; ".join(
+        attack(1, 0.1, tmp_path, (foreign_pages, rebinding), f"{GATE}gate.refusal = lambda *_: None").finds
+    )
+    for words in (
+        "another site got a connection",
+        "another site changed",
+        "gave a connection",
+        "gave the page",
+        "obeys",
+    ):
+        assert words in told
+
+
+def test_it_finds_that_memory_has_no_bounds(tmp_path, monkeypatch):
+    monkeypatch.setattr(attack_viewer, "ANSWER", 1.0)
+    monkeypatch.setattr(attack_viewer, "MOST_MEMORY", 50.0)
+    bounds = "gate.LARGEST_MESSAGE = 2**26; gate.MOST_FRAGMENTS = gate.MOST_ANSWERS = gate.MOST_CLIENTS = 10**9"
+    told = "; ".join(attack(2, 0.1, tmp_path, (floods, slow_sockets), GATE + bounds).finds)
+    for words in ("messages of 49 MB", "empty pieces", "all let in", "more than 50"):
+        assert words in told
+
+
+@pytest.mark.parametrize(
+    ("weakened", "words"),
+    [
+        ("import spacesim.viewer.loop as loop; loop.RenderLoop.wish = lambda *_: None", "no picture"),
+        (f"{GATE}gate.refusal = lambda *_: 'no'", "own page got no connection"),
+        (f"{GATE}gate.admitted = lambda _: False", "proves nothing"),
+        (f"import os; {GATE}gate.admitted = lambda _: os._exit(3)", "the viewer ended, code 3"),
+    ],
+)
+def test_it_finds_that_nobody_gets_in_or_sees_anything(tmp_path, monkeypatch, weakened, words):
+    monkeypatch.setattr(attack_viewer, "PATIENCE", 3.0)
+    monkeypatch.setattr(attack_viewer, "ANSWER", 1.0)
+    assert words in "; ".join(attack(3, 0.1, tmp_path, (foreign_pages,), weakened).finds)
