@@ -17,14 +17,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import common
 import drjit as dr
-import gsplat
 import numpy as np
-import torch
-from peer_gsplat import rasterize, similarity_of
 
 from spacesim import backend
 from spacesim.backend import ad
+from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera
@@ -35,6 +34,15 @@ from spacesim.splat.render import render
 from spacesim.splat.train.config import TrainConfig, preset, with_options
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.trainer import Progress, Trainer
+
+try:
+    import gsplat
+    import torch
+    from peer_gsplat import Tensors, rasterize, similarity_of
+except ImportError as error:
+    MISSING: ImportError | None = error
+else:
+    MISSING = None
 
 GSPLAT_DEFAULTS = DefaultStrategyConfig(
     prune_opacity=0.005,
@@ -58,6 +66,10 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=7_000)
     parser.add_argument("--json", action="store_true", help="as always: the result is JSON")
     options = parser.parse_args()
+    if MISSING is not None:
+        raise InputError(f"gsplat: expected gsplat 1.5 and torch with CUDA, found none ({MISSING})")
+    if options.what == "training" and options.data is None:
+        raise InputError("--data: expected a dataset to train on, found none")
     backend.select("cuda")
     if options.what == "picture":
         result = [compare_pictures(count, size) for count, size in ((1_000, 256), (31_622, 1024))]
@@ -161,7 +173,7 @@ def psnr(pictures: list[np.ndarray], truth: list[np.ndarray]) -> float:
     return float(np.mean(-10 * np.log10(errors)))
 
 
-def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainConfig) -> dict[str, torch.Tensor]:
+def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainConfig) -> "Tensors":
     """gsplat's rasterizer, strategy and torch's Adam, on the views, backgrounds and rates of `schedule`."""
     arrays = {**start, "sh0": start["sh"][:, :1], "shN": start["sh"][:, 1:]}
     del arrays["sh"]
@@ -227,4 +239,4 @@ def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainC
 
 
 if __name__ == "__main__":
-    main()
+    common.told(main)

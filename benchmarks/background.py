@@ -1,6 +1,6 @@
 """What training against alpha is worth: the same data, once over random backgrounds, once over black.
 
-    python benchmarks/background.py DATA [--preset demo] [--iterations N] [--json]
+    python benchmarks/background.py DATA [--preset demo] [--iterations N] [--backend auto] [--json]
 
 Over the test views: mean alpha of the pixels that the object covers and of those that it does not, the share of
 covered pixels that are less than half opaque (holes), and the PSNR of whole frames over black and over white.
@@ -11,8 +11,10 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import common
 import numpy as np
 
+from spacesim import backend
 from spacesim.data.images import load_image
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_dataset
@@ -26,10 +28,12 @@ from spacesim.splat.train.trainer import Trainer
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path)
+    parser.add_argument("--backend", choices=backend.NAMES, default="auto")
     parser.add_argument("--preset", default="demo")
     parser.add_argument("--iterations", type=int)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    backend.select(options.backend)
     dataset = read_dataset(options.data)
     config = with_options(preset(options.preset), iterations=options.iterations)
     columns = ("alpha inside", "alpha outside", "holes", "psnr over black", "psnr over white")
@@ -66,4 +70,4 @@ def judge(gaussians: Gaussians, dataset: Dataset) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main()
+    common.told(main)

@@ -15,18 +15,23 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import common
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
+from spacesim.data.errors import InputError
 from spacesim.data.geometry import OPENCV_FROM_MITSUBA
 from spacesim.data.records import Camera
 from spacesim.scenes import read_scene
-from spacesim.scenes.frames import FrameMaker, cores
-from spacesim.scenes.generate import _Sweep
+from spacesim.scenes.build import build
+from spacesim.scenes.frames import FrameMaker, Job, Shot, cores, writing_threads
+from spacesim.scenes.generate import plan_views
+from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import load
 from spacesim.scenes.view import Units
 from spacesim.scenes.workers import make_in_processes
@@ -38,11 +43,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--backend", choices=backend.NAMES, default="auto")
     parser.add_argument("--scene", default="boxsat")
-    parser.add_argument("--resolution", type=int, help="default: 256 on LLVM, 512 on CUDA")
-    parser.add_argument("--spp", type=int, default=64)
-    parser.add_argument("--views", type=int, default=40, help="frames of each measurement")
-    parser.add_argument("--workers", default="1", help="numbers of processes, as 1,2,4")
-    parser.add_argument("--frames", type=int, help="measure memory over so many tiny frames instead")
+    parser.add_argument("--resolution", type=common.positive, help="default: 256 on LLVM, 512 on CUDA")
+    parser.add_argument("--spp", type=common.positive, default=64)
+    parser.add_argument("--views", type=common.positive, default=40, help="frames of each measurement (40)")
+    parser.add_argument("--workers", type=counts, default=[1], help="numbers of processes, as 1,2,4 (1)")
+    parser.add_argument("--frames", type=common.positive, help="measure memory over so many tiny frames instead")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     name = backend.select(options.backend)
@@ -50,41 +55,50 @@ def main() -> None:
         report: dict[str, Any] = {"backend": name, "memory": memory(options.scene, options.frames)}
     else:
         size = options.resolution or {"llvm": 256, "cuda": 512}[name]
-        counts = [int(count) for count in options.workers.split(",")]
         report = {"backend": name, "cores": cores(), "scene": options.scene, "pixels": size, "spp": options.spp}
-        report |= speed(options.scene, size, options.spp, options.views, counts)
+        report |= speed(options.scene, size, options.spp, options.views, options.workers)
     print(json.dumps(report, indent=1) if options.json else describe(report))
 
 
-def speed(scene: str, size: int, spp: int, views: int, counts: list[int]) -> dict[str, Any]:
+def counts(text: str) -> list[int]:
+    """Whole numbers of at least 1, as "1,2,4", for argparse."""
+    return [common.positive(count) for count in text.split(",")]
+
+
+def planned(scene: str, **changes: Any) -> tuple[Renderer, Job, list[Shot]]:
+    """The renderer of a scene, what a process that makes its frames has to know, and its training frames."""
+    config = read_scene(scene, **changes, test_views=0)
+    built, quality = build(config), config.quality
+    renderer = Renderer(built, quality.spp, quality.max_depth, config.camera.distortion)
+    views, _ = plan_views(built, config)
+    shots = [Shot(i, name, view.camera, view.sun, quality.spp) for i, (name, view) in enumerate(views)]
+    return renderer, Job(built, config.camera, quality, config.seed, Path(), writing_threads(1)), shots
+
+
+def speed(scene: str, size: int, spp: int, views: int, workers: list[int]) -> dict[str, Any]:
     """Milliseconds a frame of each way of rendering, and the ratios that are judged."""
-    sweep = _Sweep(read_scene(scene, views=views + WARM, test_views=0, resolution=(size, size), spp=spp))
-    shots, renderer = sweep.shots[: views + WARM], sweep.renderer
-    loaded = load(sweep.scene)
+    renderer, job, shots = planned(scene, views=views + WARM, resolution=(size, size), spp=spp)
+    shots, loaded = shots[: views + WARM], load(job.scene)
     mi = backend.mitsuba()
-    integrator = mi.load_dict({"type": "path", "max_depth": sweep.job.quality.max_depth, "hide_emitters": True})
-    sensors = [sensor(shot.camera, loaded.units) for shot in shots]
+    integrator = mi.load_dict({"type": "path", "max_depth": job.quality.max_depth, "hide_emitters": True})
     times: dict[str, list[float]] = {"mi.render": [], "radiance": [], "radiance and labels": [], "labels": []}
-    for shot, view in zip(shots, sensors, strict=True):
-        for held in (loaded, renderer._loaded):
-            held.point(shot.sun)
-        seed = (0, shot.index)
+    for shot in shots:
+        view, what = sensor(shot.camera, loaded.units), (shot.camera, shot.sun)
+        loaded.point(shot.sun)
 
         def raw(view: Any = view, seed: int = shot.index) -> None:
-            dr.eval(mi.render(loaded.sunlit, sensor=view, integrator=integrator, spp=spp, seed=seed))
+            for source in filter(None, (loaded.sunlit, loaded.earthlit)):
+                dr.eval(mi.render(source, sensor=view, integrator=integrator, spp=spp, seed=seed))
 
+        seed = job.seed, shot.index
         times["mi.render"].append(milliseconds(raw))
-
-        def radiance(camera: Camera = shot.camera, seed: tuple[int, ...] = seed) -> None:
-            renderer._means(renderer._launched(renderer._loaded.sunlit, camera, seed), camera)
-
-        times["radiance"].append(milliseconds(radiance))
-        times["radiance and labels"].append(milliseconds(lambda: renderer.render(shot.camera, shot.sun, seed)))  # noqa: B023
-        times["labels"].append(milliseconds(lambda: renderer._labeller.labels(shot.camera, shot.sun)))  # noqa: B023
+        times["radiance"].append(milliseconds(partial(renderer.radiance, *what, seed)))
+        times["radiance and labels"].append(milliseconds(partial(renderer.render, *what, seed)))
+        times["labels"].append(milliseconds(partial(renderer.labels, *what)))
     mean = {key: float(np.mean(values[WARM:])) for key, values in times.items()}
-    for count in counts:
+    for count in workers:
         with tempfile.TemporaryDirectory() as folder:
-            job = replace(sweep.job, root=Path(folder))
+            job = replace(job, root=Path(folder))
             names = FrameMaker(job, renderer).make(shots) if count == 1 else make_in_processes(job, shots, count)
             key = "written" if count == 1 else f"written, {count} processes"
             mean[key] = milliseconds_a_frame(names, WARM if count == 1 else 4 * count)
@@ -120,28 +134,22 @@ def milliseconds_a_frame(names: Iterator[str], skipped: int) -> float:
     """Of frames as they come, without the first ones."""
     moments = [time.perf_counter() for _ in names]
     if len(moments) <= skipped + 1:
-        raise SystemExit(f"--views: expected more than {skipped} with so many processes")
+        raise InputError(f"--views: expected at least {skipped + 2 - WARM} with so many processes")
     return 1e3 * (moments[-1] - moments[skipped]) / (len(moments) - 1 - skipped)
 
 
 def memory(scene: str, frames: int) -> list[dict[str, float]]:
     """Resident memory of this process, MB, on its way through `frames` frames of 16 x 16 pixels."""
-    sweep = _Sweep(read_scene(scene, views=frames, test_views=0, resolution=(16, 16), spp=1))
+    renderer, job, shots = planned(scene, views=frames, resolution=(16, 16), spp=1)
     marks = sorted({100, *(frames * i // 10 for i in range(1, 11))})
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        maker = FrameMaker(replace(sweep.job, root=Path(folder)), sweep.renderer)
-        for done, _ in enumerate(maker.make(sweep.shots), start=1):
+        maker = FrameMaker(replace(job, root=Path(folder)), renderer)
+        for done, _ in enumerate(maker.make(shots), start=1):
             if done in marks:
-                rows.append({"frames": done, "MB": resident(), "seconds": time.perf_counter() - start})
+                rows.append({"frames": done, "MB": common.resident() / 1e6, "seconds": time.perf_counter() - start})
     return rows
-
-
-def resident() -> float:
-    """MB of memory that this process holds (Linux)."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1e3
 
 
 def describe(report: dict[str, Any]) -> str:
@@ -161,4 +169,4 @@ def describe(report: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    common.told(main)

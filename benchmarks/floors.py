@@ -98,11 +98,11 @@ def work(pipeline: Pipeline, count: int, pixels: int) -> dict[str, tuple[float, 
     }
 
 
-def profiles(sizes: list[tuple[int, int]]) -> tuple[dict[str, Any], dict[str, list[common.Row]]]:
-    """(report, tables): one table for each size."""
+def profiles(sizes: list[tuple[int, int]], repeats: int) -> tuple[dict[str, Any], dict[str, list[common.Row]]]:
+    """(report, tables): one table for each size. repeats: of each work, REPEATS at most."""
     report, tables = [], {}
     for count, pixels in sizes:
-        device, rows = profile(count, pixels)
+        device, rows = profile(count, pixels, min(repeats, REPEATS))
         report.append({"gaussians": count, "pixels": pixels, "device": device, "rows": rows})
         told = f"{device.bandwidth / 1e9:.0f} GB/s, {device.operations / 1e9:.0f} G multiply-adds/s"
         told += f", {device.specials / 1e9:.0f} G exponentials/s"
@@ -110,7 +110,7 @@ def profiles(sizes: list[tuple[int, int]]) -> tuple[dict[str, Any], dict[str, li
     return {"profiles": report}, tables
 
 
-def profile(count: int, pixels: int) -> tuple[Device, list[common.Row]]:
+def profile(count: int, pixels: int, repeats: int) -> tuple[Device, list[common.Row]]:
     """Rates of the device; a row for each stage, one for the rest of the trainer's step, and the whole."""
     arrays, yardsticks = common.sphere_arrays(count), Yardsticks()
     with tempfile.TemporaryDirectory() as folder:
@@ -119,8 +119,8 @@ def profile(count: int, pixels: int) -> tuple[Device, list[common.Row]]:
         for _ in range(20):
             trainer.step()
         works = yardsticks.works() | {"step": trainer.step} | {stage: getattr(pipeline, stage) for stage in STAGES}
-        measured = common.kernels_in_turn(works, REPEATS)
-        clock = common.interleaved({"step": trainer.step}, REPEATS)["step"]
+        measured = common.kernels_in_turn(works, repeats)
+        clock = common.interleaved({"step": trainer.step}, repeats)["step"]
     device, whole, needs = yardsticks.device(measured), measured["step"], work(pipeline, count, pixels)
     stages = [_row(stage, measured[stage], whole, *device.floor(*needs[stage])) for stage in STAGES]
     launches, total = (sum(row[key] for row in stages) for key in ("launches", "ms"))

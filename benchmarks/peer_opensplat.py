@@ -27,12 +27,15 @@ def seconds_a_step(pairs: list[tuple[float, float]]) -> list[float]:
 
 def _seconds(binary: Path, dataset: Dataset, steps: int) -> float:
     with tempfile.TemporaryDirectory() as folder:
-        command = [str(binary), str(dataset.root), "-o", str(Path(folder) / "splat.ply"), "-n", str(steps)]
+        command = [str(binary.resolve()), str(dataset.root), "-o", str(Path(folder) / "splat.ply"), "-n", str(steps)]
         command += ["-d", "1", "--num-downscales", "0", "--sh-degree", "3", "--sh-degree-interval", "1"]
         command += ["--refine-every", OFF, "--warmup-length", OFF]
         start = time.perf_counter()
         environment = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}
-        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        except OSError as error:
+            raise SystemExit(f"--opensplat: {binary} cannot be run ({error})") from None
         seconds = time.perf_counter() - start
     if done.returncode != 0:
         raise SystemExit(f"--opensplat: {binary} ended with code {done.returncode}: {done.stderr.strip()[-300:]}")

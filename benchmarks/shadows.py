@@ -21,7 +21,7 @@ import common
 
 from spacesim import backend
 from spacesim.data.store import read_dataset
-from spacesim.eval.evaluate import evaluate
+from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report import write_report
 from spacesim.progress import reporting, tell_training
 from spacesim.splat.shading import LightConfig
@@ -60,6 +60,7 @@ def main() -> None:
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--iterations", type=int, metavar="N")
     parser.add_argument("--rows", default=",".join(ROWS), help="of thesis,ours, or names of single rows")
+    parser.add_argument("--no-geometry", action="store_true", help="do not judge shapes")
     parser.add_argument("--markdown", action="store_true")
     parser.add_argument("--json", nargs="?", const=Path("-"), type=Path, metavar="FILE")
     options = parser.parse_args()
@@ -70,10 +71,12 @@ def main() -> None:
     if unknown:
         sys.exit(f"--rows: expected some of {', '.join((*ROWS, *table))}, found {unknown[0]!r}")
     data = options.data or make_data(options.out / "data")
+    judge = EvaluateConfig(geometry=None) if options.no_geometry else EvaluateConfig()
     results: dict[str, Any] = {}
     for name, (kind, config) in table.items():
         if kind in wanted or name in wanted:
-            results[name] = measure(name, with_options(config, iterations=options.iterations), data, options.out)
+            config = with_options(config, iterations=options.iterations)
+            results[name] = measure(name, config, judge, data, options.out)
     write_report([options.out / name / "eval" for name in results], options.out / "report.html")
     tables = {
         f"{label.capitalize()} Suns": [row(name, metrics, part) for name, metrics in results.items()]
@@ -204,13 +207,13 @@ def make_data(out: Path) -> Path:
     return out
 
 
-def measure(name: str, config: TrainConfig, data: Path, out: Path) -> dict[str, Any]:
+def measure(name: str, config: TrainConfig, judge: EvaluateConfig, data: Path, out: Path) -> dict[str, Any]:
     """metrics.json of a configuration, trained and judged."""
     dataset, folder = read_dataset(data), out / name
     with reporting(f"train {name}", "iterations") as report:
         run = train(dataset, folder / "run", config, resume=True, on_progress=tell_training(report))
     with reporting(f"evaluate {name}", "frames") as report:
-        metrics: dict[str, Any] = evaluate(run, dataset, folder / "eval", progress=report)
+        metrics: dict[str, Any] = evaluate(run, dataset, folder / "eval", judge, report)
     write_report([folder / "eval"], folder / "eval/report.html")
     return metrics
 

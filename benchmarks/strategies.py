@@ -237,7 +237,7 @@ def figure(dataset: Dataset, options: argparse.Namespace) -> dict[str, Any]:
     """{name: {"gaussians": N, "inside": [(step, share)]}} of figure 5.5; without culling and densification, too."""
     surface = SignedDistance.of(dataset.root / known_mesh(dataset, "--rows figure"))
     base = preset(options.preset, options.method, "support-aware")
-    still = DefaultStrategyConfig(refine_start=NEVER, refine_stop=NEVER + 1)
+    still = DefaultStrategyConfig(refine_start=NEVER - 1, refine_stop=NEVER)
     base = replace(base, iterations=max(SCHEDULE, options.figure_steps), refinement=still)
     base = replace(base, init="random", init_box=BOX, init_count=options.start_gaussians)
     table = WarmStartConfig()

@@ -2,7 +2,7 @@
 
     python benchmarks/training.py [--sizes 31622x1024] [--peers gsplat] [--opensplat PATH] [--markdown] [--json FILE]
     python benchmarks/training.py --growth [--plot step.svg]
-    python benchmarks/training.py --profile [--sizes ...]
+    python benchmarks/training.py --profile [--sizes 31622x1024]
     python benchmarks/training.py --memory
     python benchmarks/training.py --steps 10000
 
@@ -66,7 +66,7 @@ def main() -> None:
         rows = [counters.memory(count, pixels) for count, pixels in sizes]
         return common.emit({"memory": rows}, {"Memory of training at SH 3": rows}, options)
     if options.profile:
-        report, tables = floors.profiles(sizes)
+        report, tables = floors.profiles(sizes, options.repeats)
         return common.emit(report, tables, options)
     peer = load_peer(options.peers, name)
     results = [measure(count, pixels, options.repeats, peer) for count, pixels in sizes]

@@ -28,7 +28,7 @@ import numpy as np
 import visitor
 
 from spacesim import backend
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Sun
 from spacesim.progress import reporting
 from spacesim.splat.compose import Composition, Placed, Pose
@@ -52,6 +52,7 @@ def main() -> None:
     parser.add_argument("path", type=Path, nargs="?", metavar="RUN|SCENE.toml")
     parser.add_argument("--gaussians", type=int, default=30_000, help="of the sphere (30000)")
     parser.add_argument("--side", type=int, default=512, help="pixels of the picture (512)")
+    parser.add_argument("--moving", type=float, default=6, metavar="SECONDS", help="that each rate is taken over (6)")
     parser.add_argument("--seconds", type=float, default=600, help="of looking around (600)")
     parser.add_argument("--clients", type=int, default=2, help="that look around at once (2)")
     options = parser.parse_args()
@@ -59,6 +60,7 @@ def main() -> None:
         ("gaussians", 2, 10**8),
         ("side", 16, SIDES[-1]),
         ("clients", 1, 100),
+        ("moving", 0.1, 1e6),
         ("seconds", 0, 1e6),
     ):
         if not least <= getattr(options, name) <= most:
@@ -69,7 +71,7 @@ def main() -> None:
     viewer = Viewer(show, port=0)
     viewer.start()
     try:
-        rates = [rate(viewer, mode, options.side) for mode in ("colour", "depth", "ellipsoids")]
+        rates = [rate(viewer, mode, options.side, options.moving) for mode in ("colour", "depth", "ellipsoids")]
         soak = look_around(viewer, options.seconds, options.clients, options.side) if options.seconds > 0 else {}
     finally:
         viewer.stop()
@@ -135,7 +137,7 @@ def draws(show: Show, side: int, repeats: int) -> list[common.Row]:
     ]
 
 
-def rate(viewer: Viewer, mode: str, side: int, lasts: float = 6.0) -> common.Row:
+def rate(viewer: Viewer, mode: str, side: int, lasts: float) -> common.Row:
     """Frames a second of a client that moves all the time; the first half does not count."""
     client, camera = visitor.Visitor(viewer.url, (side, side)), places(viewer.show)
     client.begin()
@@ -167,6 +169,8 @@ def look_around(viewer: Viewer, lasts: float, clients: int, side: int) -> common
             report(min(int(now), int(lasts)), int(lasts), f"{sizes[-1]:.0f} MiB")
             time.sleep(min(EVERY, lasts / 20))
         told, _ = visitors.communicate(timeout=PATIENCE)
+    if visitors.returncode != 0:
+        raise WorkError(f"visitor.py ended with code {visitors.returncode}")
     half = kept[len(kept) // 2 :]
     slope = 60 * float(np.polyfit([now for now, _, _ in half], [size for _, size, _ in half], 1)[0])
     return {

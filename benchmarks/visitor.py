@@ -12,9 +12,10 @@ import itertools
 import json
 import logging
 import socket
-import threading
+import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
 
@@ -22,7 +23,7 @@ import msgspec
 import numpy as np
 import viser
 import zstandard
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from spacesim.data.geometry import look_at, quaternion_from_rotation
@@ -155,13 +156,15 @@ def act(visitor: Visitor, rng: np.random.Generator, side: int) -> None:
 
     def scale() -> None:
         fields = [label for label in controls if label.startswith("Scale of ")]
-        label = fields[int(rng.integers(len(fields)))]
-        visitor.use(label, float(controls[label]["value"]) * float(rng.uniform(0.7, 1.4)))
+        if fields:  # one model alone has none
+            label = fields[int(rng.integers(len(fields)))]
+            visitor.use(label, float(controls[label]["value"]) * float(rng.uniform(0.7, 1.4)))
 
     def shift() -> None:
         names = sorted(visitor.handles)
         reach = 0.1 * float(np.linalg.norm(visitor.first["position"] - visitor.first["look_at"]))
-        visitor.drag(names[int(rng.integers(len(names)))], reach * rng.normal(size=3))
+        if names:
+            visitor.drag(names[int(rng.integers(len(names)))], reach * rng.normal(size=3))
 
     def window() -> None:
         visitor.window = windows(side)[int(rng.integers(3))]
@@ -220,17 +223,15 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=2)
     parser.add_argument("--side", type=int, default=512, help="pixels of the windows' longer side (512)")
     options = parser.parse_args()
-    until, counts = time.monotonic() + options.seconds, [0] * options.clients
-
-    def go(number: int) -> None:
-        counts[number] = visit(options.url, number, options.side, until)
-
-    threads = [threading.Thread(target=go, args=(number,)) for number in range(options.clients)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    print(json.dumps({"pictures": counts}))
+    try:
+        Visitor(options.url, windows(options.side)[0]).leave()
+    except (OSError, WebSocketException) as error:
+        print(f"{options.url}: expected the address of a viewer, found none ({error})", file=sys.stderr)
+        sys.exit(2)
+    until = time.monotonic() + options.seconds
+    with ThreadPoolExecutor(options.clients) as pool:
+        visits = [pool.submit(visit, options.url, number, options.side, until) for number in range(options.clients)]
+    print(json.dumps({"pictures": [one.result() for one in visits]}))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,12 @@
 """The benchmarks: what they compute of their measurements, and that they run and tell what they say they do."""
 
+import importlib.util
 import json
+import re
+import shlex
 import subprocess
 import sys
+import time
 from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
@@ -10,9 +14,28 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from spacesim import backend
+from spacesim.data.errors import InputError
+from spacesim.data.images import load_image
+from spacesim.data.store import read_dataset
 from spacesim.splat.train.config import PRESETS, preset
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
+RUNS: dict[str, list[list[str]]] = {}  #: of each script, the arguments that tests run it with
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def smallest(*commands: str) -> pytest.MarkDecorator:
+    """Marks the test of scripts' commands at their smallest size: the test gets each as `command`, split."""
+    split = [shlex.split(command) for command in commands]
+    for script, *words in split:
+        RUNS.setdefault(script, []).append(words)
+    return pytest.mark.parametrize("command", split, ids=lambda words: words[0])
+
+
+def test_every_script_runs_in_a_test():
+    scripts = {path.name for path in FOLDER.glob("*.py") if 'if __name__ == "__main__":' in path.read_text()}
+    assert set(RUNS) == scripts
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -22,9 +45,20 @@ def _importable():
     sys.path.remove(str(FOLDER))
 
 
-def call(script: str, *arguments: str) -> str:
-    command = [sys.executable, str(FOLDER / script), "--backend", "llvm", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True)
+@pytest.fixture
+def place(tmp_path, monkeypatch) -> Path:
+    """The working directory of a script."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def ended(command: list[str]) -> subprocess.CompletedProcess[str]:
+    script, *words = command
+    return subprocess.run([sys.executable, str(FOLDER / script), *words], capture_output=True, text=True)
+
+
+def call(command: list[str]) -> str:
+    done = ended(command)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -135,15 +169,20 @@ def test_what_was_measured_is_told_before_a_file_that_cannot_be_written(tmp_path
         assert f"{where}: cannot be written" in told.err
 
 
+def stand_in(path: Path, start: float, step: float) -> Path:
+    """A program that takes OpenSplat's arguments and sleeps, seconds."""
+    script = f"import sys, time\nn = int(sys.argv[sys.argv.index('-n') + 1])\ntime.sleep({start} + {step} * n)\n"
+    path.write_text(f"#!{sys.executable} -IS\n{script}")
+    path.chmod(0o755)
+    return path
+
+
 def test_opensplat_is_timed_without_its_start(tmp_path):
     """A program that needs half a second to start and 5 ms a step."""
     import peer_opensplat
     import synthetic
 
-    binary = tmp_path / "opensplat"
-    script = "import sys, time\nn = int(sys.argv[sys.argv.index('-n') + 1])\ntime.sleep(0.5 + 0.005 * n)\n"
-    binary.write_text(f"#!{sys.executable} -IS\n{script}")
-    binary.chmod(0o755)
+    binary = stand_in(tmp_path / "opensplat", start=0.5, step=0.005)
     dataset = synthetic.write_dataset(tmp_path / "data", 50, 16, views=2)
     pairs = [peer_opensplat.run_pair(binary, dataset)]
     assert peer_opensplat.seconds_a_step(pairs) == pytest.approx([5e-3], rel=0.4)
@@ -152,8 +191,9 @@ def test_opensplat_is_timed_without_its_start(tmp_path):
         peer_opensplat.run_pair(binary, dataset)
 
 
-def test_rasterizer_tells_every_stage():
-    report = json.loads(call("rasterizer.py", "--sizes", "300x32", "--repeats", "2", "--json"))
+@smallest("rasterizer.py --backend llvm --sizes 300x32 --repeats 2 --json")
+def test_rasterizer_tells_every_stage(command):
+    report = json.loads(call(command))
     (row,) = report["rows"]
     stages = {"project", "bin", "forward", "backward", "frame"}
     assert set(row["clock"]) == stages < set(row["kernels"])
@@ -163,15 +203,88 @@ def test_rasterizer_tells_every_stage():
     assert row["pairs"] > 300  # every splat touches a tile, nearly every one of this sphere's front
 
 
-def test_training_tells_a_step_and_what_was_not_measured():
-    output = call("training.py", "--sizes", "300x32", "--repeats", "2", "--markdown")
+@smallest(
+    "rasterizer.py --backend llvm --sizes 300x32,600x32 --repeats 1 --growth --plot growth.svg --peers gsplat"
+    " --markdown --json found.json"
+)
+def test_rasterizer_tells_growth_and_goes_on_without_its_peer(command, place):
+    done = ended(command)
+    assert done.returncode == 0
+    assert done.stderr == "gsplat: not measured here (gsplat runs on CUDA alone)\n"
+    assert "| Gaussians | pixels |" in done.stdout
+    report = json.loads((place / "found.json").read_text())
+    assert report["growth"]["slope"] == pytest.approx(slope_of(report["rows"], lambda row: row["least kernels"]))
+    assert len(list(ElementTree.parse(place / "growth.svg").iter(f"{SVG}circle"))) == 2
+
+
+def slope_of(rows, time_of):
+    (first, last), pairs = [time_of(row) for row in rows], [row["pairs"] for row in rows]
+    return np.log(last / first) / np.log(pairs[1] / pairs[0])
+
+
+@smallest("training.py --backend llvm --sizes 300x32 --repeats 2 --markdown")
+def test_training_tells_a_step_and_what_was_not_measured(command):
+    output = call(command)
     assert "| spacesim |" in output
     assert "not measured here: needs the binary" in output
 
 
-def test_memory_counts_the_parameters_and_their_moments():
+@smallest("training.py --backend llvm --sizes 300x32,600x32 --repeats 1 --growth --plot step.svg --json found.json")
+def test_training_tells_growth(command, place):
+    call(command)
+    report = json.loads((place / "found.json").read_text())
+    expected = slope_of(report["rows"], lambda row: row["clock"]["spacesim"]["least"])
+    assert report["growth"]["slope"] == pytest.approx(expected)
+    assert len(list(ElementTree.parse(place / "step.svg").iter(f"{SVG}circle"))) == 2
+
+
+@smallest(
+    "training.py --backend llvm --sizes 300x32 --repeats 1 --peers gsplat --opensplat ./opensplat --markdown"
+    " --json found.json"
+)
+def test_training_is_told_beside_opensplat(command, place):
+    """A program that needs 0.1 s to start and 2 ms a step."""
+    stand_in(place / "opensplat", start=0.1, step=0.002)
+    done = ended(command)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "gsplat: not measured here (gsplat runs on CUDA alone)\n"
+    (row,) = json.loads((place / "found.json").read_text())["opensplat"]
+    assert row["OpenSplat"]["median"] == pytest.approx(2, rel=0.5)
+    assert row["ours / theirs"] == pytest.approx(row["spacesim"]["median"] / row["OpenSplat"]["median"])
+
+
+@smallest("training.py --backend llvm --sizes 300x32 --repeats 2 --profile --markdown --json found.json")
+def test_profile_tells_stages_and_floors(command, place):
+    call(command)
+    (profile,) = json.loads((place / "found.json").read_text())["profiles"]
+    *parts, step, clock = profile["rows"]
+    assert [row["stage"] for row in parts] == ["project", "bin", "forward", "loss", "backward", "update", "rest"]
+    assert sum(row["ms"] for row in parts) == pytest.approx(step["ms"])
+    assert min(row["ms"] for row in (*parts[:-1], step, clock)) > 0
+    bandwidth = profile["device"]["bandwidth"]
+    assert 1e8 < bandwidth < 1e13
+    # of 300 Gaussians 59 parameters with two moments, read and written, seven gradients and two statistics
+    assert parts[5]["floor by bytes, ms"] == pytest.approx(1e3 * 300 * 4 * (6 * 59 + 9) / bandwidth)
+    assert all(row["floor by operations, ms"] > 0 for row in parts if row["stage"] in ("forward", "loss", "backward"))
+
+
+@smallest("training.py --backend llvm --steps 200 --json")
+def test_counters_over_steps(command):
+    rows = json.loads(call(command))["steps"]
+    assert [row["step"] for row in rows] == list(range(20, 201, 20))
+    recordings = [row["recordings so far"] for row in rows]
+    assert recordings[0] > 0
+    assert recordings == sorted(recordings)
+    for row in rows:
+        assert row["kernels a step"] >= 1
+        assert 2_000 * 59 * 3 * 4 / 1e6 < row["arrays' peak, MB"] < row["process, MB"]  # parameters and two moments
+
+
+@smallest("training.py --backend llvm --sizes 512x32,16385x32 --memory --markdown --json found.json")
+def test_memory_counts_the_parameters_and_their_moments(command, place):
     """16,385 rows are just above a power of two, to which Dr.Jit rounds: the most that so many ever take."""
-    report = json.loads(call("training.py", "--sizes", "512x32,16385x32", "--memory", "--json"))
+    call(command)
+    report = json.loads((place / "found.json").read_text())
     few, many = (row["bytes a Gaussian"] for row in report["memory"])
     parameters = 59 * 4
     # values and two moments are there before and after an update; gradients and statistics beside them
@@ -194,32 +307,39 @@ def test_rows_of_shadows_are_what_they_are_called(size):
         assert rows["splat, surface"] == preset(size, "shadow-splat")
 
 
-def test_shadows_compares_methods_and_goes_on_where_it_stopped(small_lit, tmp_path):
-    arguments = "--data", str(small_lit), "--out", str(tmp_path / "runs"), "--preset", "demo", "--iterations", "8"
-    first = json.loads(call("shadows.py", *arguments, "--rows", "none", "--json"))
-    both = json.loads(call("shadows.py", *arguments, "--rows", "none,map", "--json"))
+@smallest("shadows.py --backend llvm --data DATA --out RUNS --preset demo --iterations 8 --no-geometry --rows none,map")
+def test_shadows_compares_methods_and_goes_on_where_it_stopped(command, small_lit, place):
+    (place / "DATA").symlink_to(small_lit)
+    first = json.loads(call([*command[:-1], "none", "--json"]))
+    both = json.loads(call([*command, "--json"]))
     assert first["rows"]["Unseen Suns"] == both["rows"]["Unseen Suns"][:1]
     assert [row["method"] for row in both["rows"]["Unseen Suns"]] == ["none", "map"]
     assert both["rows"]["Unseen Suns"][0]["mask error"] == "", "no shadows are predicted"
     assert 0 <= float(both["rows"]["Unseen Suns"][1]["mask error"]) <= 1
-    assert (tmp_path / "runs/report.html").exists()
+    assert (place / "RUNS/report.html").exists()
 
 
-def test_light_tells_frames_and_steps():
-    sizes = "--sizes", "300x32", "--step-sizes", "300x32", "--preset", "demo", "--repeats", "2"
-    report = json.loads(call("light.py", *sizes, "--methods", "relight,shadow-map", "--json"))
+@smallest(
+    "light.py --backend llvm --sizes 300x32 --step-sizes 300x32 --preset demo --repeats 2 --methods relight,shadow-map"
+    " --markdown --json found.json"
+)
+def test_light_tells_frames_and_steps(command, place):
+    call(command)
+    report = json.loads((place / "found.json").read_text())
     assert [row["method"] for row in report["frames"]] == ["relight", "shadow-map"]
     assert all(row["frames/s"] > 0 for row in report["frames"])
     assert report["frames"][1]["shadows"] > 0 == report["frames"][0]["shadows"]
     assert len(report["steps"]) == 2
 
 
-def test_strategies_tells_tables_and_the_figure_and_goes_on_where_it_stopped(small_lit, tmp_path):
-    arguments = ["--data", str(small_lit), "--out", str(tmp_path / "runs"), "--preset", "demo", "--method", "vanilla"]
-    arguments += ["--iterations", "6", "--figure-steps", "4", "--start-gaussians", "50", "--json"]
-    first = json.loads(call("strategies.py", *arguments, "--rows", "default"))
-    plot = tmp_path / "figure.svg"
-    both = json.loads(call("strategies.py", *arguments, "--rows", "default,mesh-aware,figure", "--plot", str(plot)))
+@smallest(
+    "strategies.py --backend llvm --data DATA --out RUNS --preset demo --method vanilla --iterations 6 --figure-steps 4"
+    " --start-gaussians 50 --plot figure.svg --rows default,mesh-aware,figure"
+)
+def test_strategies_tells_tables_and_the_figure_and_goes_on_where_it_stopped(command, small_lit, place):
+    (place / "DATA").symlink_to(small_lit)
+    first = json.loads(call([*command[:-1], "default", "--json"]))
+    both = json.loads(call([*command, "--json"]))
     for title, rows in first["rows"].items():
         assert rows == both["rows"][title][: len(rows)] or title.startswith("Inside")
     pictures = both["rows"]["Pictures (table 5.4)"]
@@ -230,6 +350,173 @@ def test_strategies_tells_tables_and_the_figure_and_goes_on_where_it_stopped(sma
     for curve in both["curves"].values():
         assert [step for step, _ in curve["inside"]] == [0, 1, 2, 3, 4]
         assert all(0 <= share <= 1 for _, share in curve["inside"])
-    root = ElementTree.fromstring(plot.read_text())
-    lines = [path for path in root.iter("{http://www.w3.org/2000/svg}path") if "line" in path.get("class", "")]
+    root = ElementTree.parse(place / "figure.svg")
+    lines = [path for path in root.iter(f"{SVG}path") if "line" in path.get("class", "")]
     assert len(lines) == len(both["curves"]) == 3
+
+
+@pytest.fixture(scope="module")
+def small_pair(tmp_path_factory) -> Path:
+    """Path-traced pictures of two boxsats, the first before the Sun of the second."""
+    from spacesim.scenes import generate, read_scene
+
+    root = tmp_path_factory.mktemp("pair") / "data"
+    size = {"views": 1, "test_suns": 0, "test_views": 2, "resolution": 32, "spp": 16}
+    generate(read_scene("boxsat-pair", sun=[(45.0, 35.0)], **size), root)
+    return root
+
+
+COMPOSITION = "composition.py --backend llvm --out RUNS --rows none,none-shaded --run none=RUN --preset demo --markdown"
+
+
+@smallest(
+    f"{COMPOSITION} --views 2 --resolution 32 --no-geometry --json found.json",
+    f"{COMPOSITION} --pair PAIR --no-geometry --json found.json",
+)
+def test_composition_tells_both_tables(command, tiny_run, small_pair, place):
+    (place / "RUN").symlink_to(tiny_run)
+    (place / "PAIR").symlink_to(small_pair)
+    output = call(command)
+    found = json.loads((place / "found.json").read_text())
+    for which in ("first", "second"):
+        rows = found["rows"][f"The {which} boxsat, Sun (45, 35)"]
+        assert [row["row"] for row in rows] == ["none", "none-shaded"]
+    second = found["rows"]["The second boxsat, Sun (45, 35)"]
+    assert float(second[1]["PSNR"]) > float(second[0]["PSNR"])
+    assert "map" in output
+    assert (place / "RUNS/pairs/report.html").exists()
+    assert "PAIR" in command or len(read_dataset(place / "RUNS/pair").test) == 2
+
+
+@smallest("dataset.py --backend llvm --resolution 16 --spp 1 --views 7 --workers 1,2 --json")
+def test_dataset_tells_ways_and_ratios(command):
+    start = time.monotonic()
+    report = json.loads(call(command))
+    lasted = 1e3 * (time.monotonic() - start)
+    ways, found = ["mi.render", "radiance", "radiance and labels", "labels", "written"], report["milliseconds"]
+    assert list(found) == [*ways, "written, 2 processes"]
+    assert all(value > 0 for value in found.values())
+    assert 7 * sum(found[way] for way in ways) < lasted
+    assert report["frames_per_second"] == pytest.approx({way: 1e3 / value for way, value in found.items()})
+    fastest = min(found["written"], found["written, 2 processes"])
+    assert report["written_to_raw"] == pytest.approx(found["mi.render"] / fastest)
+    assert report["labels_to_radiance"] == pytest.approx(found["radiance and labels"] / found["radiance"] - 1)
+
+
+@smallest("dataset.py --backend llvm --frames 20 --json")
+def test_dataset_tells_memory_on_the_way(command):
+    rows = json.loads(call(command))["memory"]
+    assert [row["frames"] for row in rows] == list(range(2, 21, 2))
+    assert all(one["seconds"] < other["seconds"] for one, other in pairwise(rows))
+    largest = 1024 * int(re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[1]) / 1e6
+    assert all(20 < row["MB"] < 20 * largest for row in rows)
+
+
+def test_dataset_measures_the_same_pictures():
+    """Mitsuba's own rendering and ours show the same, so that their times can be compared."""
+    import dataset
+
+    from spacesim.scenes.scene import load
+
+    renderer, job, shots = dataset.planned("boxsat", views=1, resolution=(24, 24), spp=256)
+    mi, loaded, shot = backend.mitsuba(), load(job.scene), shots[0]
+    loaded.point(shot.sun)
+    integrator = mi.load_dict({"type": "path", "max_depth": job.quality.max_depth, "hide_emitters": True})
+    view = dataset.sensor(shot.camera, loaded.units)
+    theirs = np.array(mi.render(loaded.sunlit, sensor=view, integrator=integrator, spp=256))[..., :3]
+    ours, _ = renderer.radiance(shot.camera, shot.sun, (0, 0))
+    assert ours.mean() == pytest.approx(theirs.mean(), rel=0.03)
+    assert np.corrcoef(ours.ravel(), theirs.ravel())[0, 1] > 0.98
+
+
+def test_frames_count_from_when_the_kernels_are_there():
+    import dataset
+
+    def names():
+        for seconds in (0.2, 0.2, 0.02, 0.02, 0.02):
+            time.sleep(seconds)
+            yield "name"
+
+    assert dataset.milliseconds_a_frame(names(), skipped=1) == pytest.approx(20, rel=0.6)
+    with pytest.raises(InputError, match="--views: expected at least 2 with"):
+        dataset.milliseconds_a_frame(iter("abcd"), skipped=3)
+
+
+@smallest("background.py DATA --backend llvm --preset demo --iterations 8 --json")
+def test_background_tells_both(command, small_lit, place):
+    (place / "DATA").symlink_to(small_lit)
+    rows = json.loads(call(command))
+    assert set(rows) == {"random", "black"}
+    assert rows["random"] != rows["black"]
+    for row in rows.values():
+        assert 0 <= row["alpha outside"] < row["alpha inside"] <= 1
+        assert 0 <= row["holes"] <= 1
+        assert 5 < row["psnr over black"] < 60
+
+
+def test_background_of_a_model_that_shows_nothing(small_lit):
+    import background
+    import common
+
+    from spacesim.splat.gaussians import Gaussians
+
+    data = read_dataset(small_lit)
+    unseen = Gaussians.from_numpy({**common.sphere_arrays(10), "logit_opacities": np.full(10, -20.0)})
+    inside, outside, holes, *psnr = background.judge(unseen, data)
+    assert (inside, outside, holes) == (0, 0, 1)
+    pictures = [load_image(data, frame).over(np.zeros(3)) for frame in data.test]
+    light = [load_image(data, frame).over(np.ones(3)) for frame in data.test]
+    errors = [[np.mean(p**2) for p in pictures], [np.mean((1 - p) ** 2) for p in light]]
+    assert psnr == pytest.approx([np.mean(-10 * np.log10(error)) for error in errors], rel=1e-5)
+
+
+@smallest("against_gsplat.py picture", "against_gsplat.py training --data DATA --iterations 2")
+def test_against_gsplat_says_what_it_needs(command):
+    if importlib.util.find_spec("gsplat") is not None:
+        pytest.skip("gsplat is installed: tests/splat/test_gsplat.py compares")
+    done = ended(command)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch(r"gsplat: expected gsplat 1.5 and torch with CUDA, found none \(.*\)\n", done.stderr)
+
+
+@smallest(
+    "viewer.py --backend llvm --gaussians 200 --side 64 --repeats 1 --moving 0.5 --seconds 1 --clients 1 --json",
+    "viewer.py RUN --backend llvm --side 64 --repeats 1 --moving 0.2 --seconds 0 --json",
+)
+def test_viewer_tells_pictures_rates_and_memory(command, tiny_run, place):
+    pytest.importorskip("viser", reason="viser is not installed")
+    (place / "RUN").symlink_to(tiny_run)
+    report = json.loads(call(command))
+    assert report["gaussians"] == (300 if "RUN" in command else 200)
+    pictures = {row["picture"]: float(row["ms"].split()[0]) for row in report["draw"]}
+    assert {"colour, another camera", "depth, another camera", "colour, another Sun"} < set(pictures)
+    assert min(pictures.values()) > 0
+    assert [row["mode"] for row in report["rates"]] == ["colour", "depth", "ellipsoids"]
+    for row in report["rates"]:
+        assert float(row["frames/s"]) > 0
+        assert 0 < float(row["of full resolution"]) <= 1
+    if "RUN" in command:
+        assert report["soak"] == {}
+    else:
+        kept = [float(size) for size in report["soak"]["MiB kept after each tenth"].split(", ")]
+        assert report["soak"]["frames"] > 0
+        assert 20 < max(kept) < report["soak"]["MiB at most"] + 20
+
+
+@smallest("visitor.py URL --seconds 1.5 --clients 2 --side 64")
+def test_visitors_get_pictures(command, tiny_run):
+    pytest.importorskip("viser", reason="viser is not installed")
+    from spacesim.viewer.opened import opened
+    from spacesim.viewer.server import Viewer
+
+    viewer = Viewer(opened(tiny_run), port=0)
+    viewer.start()
+    try:
+        counts = json.loads(call([word.replace("URL", viewer.url) for word in command]))["pictures"]
+    finally:
+        viewer.stop()
+    assert len(counts) == 2
+    assert min(counts) > 0
+    gone = ended([word.replace("URL", viewer.url) for word in command])
+    assert (gone.returncode, gone.stdout) == (2, "")
+    assert re.fullmatch(rf"{viewer.url}: expected the address of a viewer, found none \(.*\)\n", gone.stderr)

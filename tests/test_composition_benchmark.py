@@ -1,9 +1,6 @@
-"""benchmarks/composition.py: its rows, its verdicts, and a whole run of it on almost nothing; what it and viewer.py
-refuse."""
+"""benchmarks/composition.py: its rows and verdicts; what it and viewer.py refuse."""
 
 import importlib
-import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -52,31 +49,6 @@ def test_verdicts():
     assert (told["second, dB"], told["at least 10"]) == ("+10.50", "yes")
     assert (told["error rate, share left"], told["at most 0.1"]) == ("0.050", "yes")
     assert (told["first, dB"], told["not worse"]) == ("-0.50", "no")
-
-
-def test_it_runs_and_says_both_tables(tiny_run, tmp_path):
-    command = [sys.executable, str(FOLDER / "composition.py"), "--backend", "llvm", "--out", str(tmp_path / "runs")]
-    command += [
-        "--rows",
-        "none,none-shaded",
-        "--run",
-        f"none={tiny_run}",
-        "--views",
-        "2",
-        "--resolution",
-        "32",
-        "--no-geometry",
-    ]
-    done = subprocess.run([*command, "--json", str(tmp_path / "found.json")], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    found = json.loads((tmp_path / "found.json").read_text())
-    for which in ("first", "second"):
-        rows = found["rows"][f"The {which} boxsat, Sun (45, 35)"]
-        assert [row["row"] for row in rows] == ["none", "none-shaded"]
-    second = found["rows"]["The second boxsat, Sun (45, 35)"]
-    assert float(second[1]["PSNR"]) > float(second[0]["PSNR"])
-    assert "map" in done.stdout
-    assert (tmp_path / "runs/pairs/report.html").exists()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,475 @@
+"""Every command that the documents show is understood by the program that it calls, and runs where this machine can."""
+
+import argparse
+import ast
+import importlib.util
+import json
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr
+from dataclasses import dataclass, replace
+from functools import cache
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trimesh
+from test_benchmarks import RUNS
+from tiny import Outcome, call, outcome
+
+from spacesim.options import parser
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
+SCRIPTS = sorted([*ROOT.glob("benchmarks/*.py"), *ROOT.glob("examples/*.py")])
+PROGRAM = re.compile(r"(?:\.venv/bin/)?(spacesim) |(?:python )?((?:benchmarks|examples|docs|tests)/[\w/]+\.py)(?: |$)")
+HAS_VISER = importlib.util.find_spec("viser") is not None
+
+VALUES = {  # what stands in a command for a value
+    **{"N": "2", "X": "2", "W": "0.1", "O": "0.05", "M": "0.2", "EV": "0.5", "PX": "24", "K": "1", "DEG": "20"},
+    **{"NAME": "boxsat", "SCENE": "boxsat", "FILE": "boxsat", "AZ,EL": "40,25", "NAME=RUN": "none=RUN"},
+    **{"GAUSSIANSxPIXELS,...": "300x32", "GAUSSIANSxPIXELS": "300x32", "PATH": "opensplat"},
+}
+FILES = {"DATA", "RUN", "RUNS", "EVAL", "DIR", "PAIR", "BOXSAT", "URL"}
+OUTPUTS = ("--out", "--ply", "--mesh", "--speedplus", "--bop")
+
+SMALL = {  # options that a command gets, so that it is as small as can be
+    "generate": {"--views": "2", "--test-views": "1", "--resolution": "24", "--spp": "1"},
+    "train": {"--preset": "demo", "--iterations": "8", "--init-count": "100"},
+    "sweep": {"--frames": "2", "--size": "24"},
+    "compose": {"--size": "24"},
+    "view": {"--port": "0"},
+}
+SMALLER = {  # and other values of those that it has
+    **{"--suns": "2", "--known-test-views": "1", "--test-spp": "2", "--workers": "2"},
+    **{"--bounce": "8", "--max-gaussians": "150", "--frame": "0"},
+}
+NOT_RUN = {  # commands with these words: why they do not run here
+    "--ray auto": "needs a Ray cluster; tests/scenes/test_workers.py starts one",
+    "tests/scenes/truth.py": "a minute; tests/scenes/test_truth.py bounds its figures",
+    "tests/scenes/kills.py": "minutes; tests/scenes/test_workers.py kills and interrupts smaller runs",
+    "tests/splat/accuracy.py": "20 seconds; the tests beside it bound its figures",
+    "tests/splat/shadow/acne.py": "a minute; the tests beside it bound its figures",
+    "tests/splat/shadow/against_truth.py": "asks for a run that has been trained to the end",
+}
+LEFT_OUT = {  # options, with their value, that commands run without: why
+    "--lpips-weights": "the weights are the user's own",
+}
+
+
+@dataclass(frozen=True)
+class Command:
+    """document: where it stands; text: as it stands there; program: "spacesim" or a script; words: its arguments;
+    target: the file that its output goes to; whole: not just named in a sentence, without what it needs."""
+
+    document: str
+    text: str
+    program: str
+    words: tuple[str, ...]
+    target: str | None
+    whole: bool
+
+    def __str__(self) -> str:
+        return f"{self.document}: {self.program} {' '.join(self.words)}"
+
+
+def prose(path: Path) -> str:
+    """A document without its fenced blocks, a script's docstring."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        return ast.get_docstring(ast.parse(text)) or ""
+    return re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def blocks(path: Path, language: str) -> list[str]:
+    """The fenced ones."""
+    text = path.read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+def shown(path: Path) -> Iterator[tuple[str, bool]]:
+    """(text, whether it stands on a line of its own) of all that could be a command, from the top down."""
+    for match in re.finditer(r"^(?: {4}|(?=python ))(\S.*)$|`([^`]+)`", prose(path), re.MULTILINE):
+        if match[2] is not None:
+            yield " ".join(match[2].split()), False
+        else:
+            yield re.split(r"\s+#|\s{2,}", match[1])[0], True
+
+
+def variants(text: str) -> list[str]:
+    """Of a usage: with all that is in brackets, with each of the alternatives "a|b|c", and, last, as plain as it is."""
+    plain = re.sub(r"\s*\[[^][]*\]", "", text)
+    found = []
+    for one in (plain, re.sub(r"[][]", "", text)):
+        words = [word.split("|") for word in one.split(" ")]
+        first = [word[0] for word in words]
+        found.append(" ".join(first))
+        for place, (base, *others) in enumerate(words):
+            for other in others:
+                whole = base[: base.index(".")] + other if other.startswith(".") else other
+                found.append(" ".join([*first[:place], whole, *first[place + 1 :]]))
+    return list(dict.fromkeys(found))[::-1]
+
+
+def value(word: str) -> str:
+    """`word`, or what takes its place if it stands for a value."""
+    word = VALUES.get(word, word)
+    assert word in FILES or not re.fullmatch("[A-Z]+", word), f"{word}: neither a file nor a value that is known here"
+    return word
+
+
+def commands(path: Path) -> Iterator[Command]:
+    for text, alone in shown(path):
+        match = PROGRAM.match(text)
+        if match is None or text == match[2]:  # a file that a sentence names
+            continue
+        for one in variants(text):
+            rest, _, target = one[match.end() :].partition(" > ")
+            words = tuple(value(word) for word in shlex.split(rest) if word != "...")
+            whole = alone or is_whole(words) or match[1] is None
+            yield Command(path.name, text, match[1] or match[2], words, target or None, whole)
+
+
+def is_whole(words: tuple[str, ...]) -> bool:
+    """Whether spacesim has all that it needs to do something."""
+    with redirect_stderr(StringIO()):
+        try:
+            parser(defaultdict(lambda: print)).parse_args(words)
+        except SystemExit:
+            return False
+    return words[0] != "generate" or "--out" in words
+
+
+EVERY = [command for path in (*DOCUMENTS, *SCRIPTS) for command in commands(path)]
+
+
+class Parsed(BaseException):
+    """A script has read its arguments."""
+
+
+@cache
+def module_of(script: str) -> Any:
+    """A script's module, without running it."""
+    path = ROOT / script
+    spec = importlib.util.spec_from_file_location(f"documented_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look themselves up
+    sys.path.insert(0, str(path.parent))
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(path.parent))
+    return module
+
+
+def takes_arguments(script: str) -> bool:
+    return re.search(r"import argparse|common\.arguments\(", (ROOT / script).read_text(encoding="utf-8")) is not None
+
+
+def can_be_read(script: str) -> bool:
+    return HAS_VISER or script not in ("benchmarks/viewer.py", "benchmarks/visitor.py")
+
+
+def read_by_script(script: str, words: list[str], monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
+    """What a script reads of its arguments. Raises SystemExit where they are wrong."""
+    if not can_be_read(script):
+        pytest.skip("viser is not installed")
+    if not takes_arguments(script):
+        assert words == [], f"{script} takes no arguments"
+        return argparse.Namespace()
+    main, read = module_of(script).main, argparse.ArgumentParser.parse_args
+
+    def parse(self: argparse.ArgumentParser) -> None:
+        raise Parsed(read(self))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(argparse.ArgumentParser, "parse_args", parse)
+        patch.setattr(sys, "argv", [script, *words])
+        with pytest.raises(Parsed) as ended:
+            main()
+    found: argparse.Namespace = ended.value.args[0]
+    return found
+
+
+def completed(words: list[str], read: Callable[[list[str]], Any], capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """A command that a sentence names, with the arguments that it cannot do without."""
+    for _ in range(3):
+        try:
+            read(words)
+            return words
+        except SystemExit:
+            said = capsys.readouterr().err
+        missing = re.search(r"arguments are required: ([^;\n]*)|one of the arguments (\S+)", said)
+        assert missing is not None, said
+        for name in (missing[1] or missing[2]).split(", "):
+            words = [*words, name, "file"] if name.startswith("--") else [*words, name.split("|")[0]]
+    raise AssertionError(words)
+
+
+@pytest.mark.parametrize("command", EVERY, ids=str)
+def test_a_command_is_understood(command, monkeypatch, capsys):
+    def read(words: list[str]) -> argparse.Namespace:
+        if command.program == "spacesim":
+            return parser(defaultdict(lambda: print)).parse_args(words)
+        return read_by_script(command.program, words, monkeypatch)
+
+    words = list(command.words)
+    try:
+        read(words if command.whole else completed(words, read, capsys))
+    except SystemExit:
+        pytest.fail(capsys.readouterr().err)
+
+
+def test_commands_are_found():
+    """In each of the ways that they are written in."""
+    told = {(command.document, command.text) for command in EVERY}
+    assert ("README.md", "spacesim sweep run --out sweep") in told  # a block, with a comment
+    assert ("README.md", ".venv/bin/spacesim doctor") in told  # a sentence
+    assert ("scale.md", "spacesim verify data") in told  # a block, with words behind it
+    assert any(document == "composition.md" and "boxsat-pair" in text for document, text in told)  # over two lines
+    assert ("performance.md", "python benchmarks/training.py --memory --markdown") in told
+    assert ("dataset.py", "python benchmarks/dataset.py --frames 10000") in told  # a docstring
+    assert ("01_simulate.py", "python examples/01_simulate.py") in told
+    assert [command.words for command in EVERY if command.target == "my.toml"] == [("generate", "boxsat", "--print")]
+
+
+def test_usages_are_expanded():
+    assert variants("a b [--c D] [--e f|g]") == ["a b --c D --e g", "a b --c D --e f", "a b"]
+    assert variants("a FILE.ply|.obj") == ["a FILE.obj", "a FILE.ply"]
+
+
+def test_options_that_sentences_name_exist(monkeypatch, capsys):
+    names = re.findall(r"^    ([a-z]+) ", call("--help").output, re.MULTILINE)
+    helps = [call(name, "--help").output for name in names]
+    for script in sorted({command.program for command in EVERY} - {"spacesim"}):
+        if takes_arguments(script) and can_be_read(script):
+            with pytest.raises(SystemExit):
+                read_by_script(script, ["--help"], monkeypatch)
+            helps.append(capsys.readouterr().out)
+    known = set(re.findall(r"--[a-z][\w-]*", "".join(helps)))
+    assert len(names) >= 12
+    for path in DOCUMENTS:
+        named = set(re.findall(r"`(--[a-z][\w-]*)", prose(path)))
+        assert named - known == set(), path.name
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_other_programs_find_what_they_are_told(path):
+    makefile, project = ((ROOT / name).read_text(encoding="utf-8") for name in ("Makefile", "pyproject.toml"))
+    for text, _ in shown(path):
+        if match := re.fullmatch(r"make (\w+)", text):
+            assert re.search(rf"^{match[1]}:", makefile, re.MULTILINE), text
+        for name in re.findall(r"pip install .*\[(\w+)\]", text):
+            assert re.search(rf"^{name} = \[", project, re.MULTILINE), text
+        if match := re.match(r"\.venv/bin/pytest (\S+)", text):
+            assert (ROOT / match[1]).exists(), text
+
+
+MEASURED = [c for c in EVERY if c.program.startswith("benchmarks/") and c.document.endswith(".md")]
+
+
+@pytest.mark.parametrize("command", MEASURED, ids=str)
+def test_a_documented_benchmark_runs_in_the_tests(command, monkeypatch):
+    """test_benchmarks.py runs the script with these switches and choices, and somewhere with each other option."""
+    runs = RUNS[Path(command.program).name]
+
+    def switches(words: list[str]) -> dict[str, Any]:
+        read = vars(read_by_script(command.program, words, monkeypatch))
+        return {name: found for name, found in read.items() if found is True or (name in ("what", "peers") and found)}
+
+    wanted = switches(list(command.words))
+    assert any(wanted.items() <= switches(run).items() for run in runs)
+    options = {word for word in command.words if word.startswith("--")}
+    assert options <= {word for run in runs for word in run} | {"--backend"}
+
+
+def smaller(words: tuple[str, ...]) -> list[str]:
+    """A command of spacesim at its smallest size."""
+    wanted = dict(SMALL.get(words[0], {}))
+    if words[0] == "train" and {"shadow-map", "shadow-splat", "park"} & set(words):
+        wanted["--light-size"] = "16"
+    if "--mesh" in words:
+        wanted |= {"--voxel": "0.2", "--views": "3"}
+    found = list(words)
+    if words[0] == "eval" and "--no-geometry" not in words:  # seconds each; the fixture tiny_eval is judged with it
+        found.append("--no-geometry")
+    for option, least in wanted.items():
+        if option not in found:
+            found += [option, least]
+    for option, least in (wanted | SMALLER).items():
+        if option in found and found[found.index(option) + 1] != "0":
+            found[found.index(option) + 1] = least
+    for option in LEFT_OUT:
+        if option in found:
+            del found[found.index(option) : found.index(option) + 2]
+    return found
+
+
+class Desk:
+    """The working directory of a document's commands. What they read, and no command before has made, is `given`.
+
+    made: where results lie; the desk holds links to them, as the same command on the same inputs runs only once.
+    """
+
+    def __init__(self, folder: Path, given: dict[str, Path], made: Path, done: dict[Any, tuple[Outcome, Path]]) -> None:
+        self.folder, self.given, self.made, self.done = folder, given, made, done
+
+    def run(self, command: Command) -> Outcome:
+        """The outcome of a command at its smallest size."""
+        words = smaller(command.words)
+        outputs = {k: word for k, word in enumerate(words) if words[k - 1] in OUTPUTS}
+        for k, word in enumerate(words[1:], start=1):
+            if k not in outputs:
+                self.put(word)
+                words[k] = str((self.folder / word).resolve()) if (self.folder / word).exists() else word
+        key = tuple(Path(word).suffix if k in outputs else word for k, word in enumerate(words))
+        place = self.done[key][1] if key in self.done else self.made / str(len(self.done))
+        if key not in self.done:
+            place.mkdir()
+            there = [str(place / f"{k}{key[k]}") if k in outputs else word for k, word in enumerate(words)]
+            self.done[key] = (viewed(there) if words[0] == "view" else call(*there)), place
+        ended, place = self.done[key]
+        for k, name in outputs.items():
+            if (place / f"{k}{key[k]}").exists():
+                (self.folder / name).unlink(missing_ok=True)
+                (self.folder / name).symlink_to(place / f"{k}{key[k]}")
+            elif "--estimate" not in words:
+                return replace(ended, code=ended.code or 1, errors=[*ended.errors, f"{words[k - 1]}: nothing is there"])
+        if command.target is not None:
+            (self.folder / command.target).unlink(missing_ok=True)
+            (self.folder / command.target).write_text(ended.output, encoding="utf-8")
+        return ended
+
+    def put(self, name: str) -> None:
+        """Lay out an input."""
+        path = self.folder / name
+        if name in self.given and not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.symlink_to(self.given[name])
+
+
+def viewed(words: list[str]) -> Outcome:
+    """The viewer's, with Ctrl-C once it has told its address."""
+    if not HAS_VISER:
+        return Outcome(0, "", [])
+    command = [sys.executable, "-u", "-m", "spacesim", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        said = next((line for line in process.stdout if "(Ctrl-C ends it)" in line), "")
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    return outcome(process.returncode if said else 1, said, errors)
+
+
+@pytest.fixture(scope="module")
+def given(tiny_data, tmp_path_factory) -> dict[str, Path]:
+    """What commands and blocks read: a dataset, one of two boxsats, a run of linear light with shadows, the scene file
+    of docs/composition.md, others."""
+    folder = tmp_path_factory.mktemp("given")
+    words = "--method", "shadow-map", "--linear", "--preset", "demo", "--iterations", 8, "--init-count", 200
+    trained = call("train", tiny_data, "--out", folder / "runs/boxsat", *words, "--light-size", 16)
+    assert trained.code == 0, trained.errors
+    small = "--views", 1, "--test-suns", 0, "--test-views", 1, "--resolution", 24, "--spp", 1
+    assert call("generate", "boxsat-pair", "--out", folder / "pair", "--sun", "45,35", *small).code == 0
+    scene, keyframes = blocks(ROOT / "docs/composition.md", "toml")[:2]
+    (folder / "scene.toml").write_text(f"frames = 2\n{scene}\n{keyframes}", encoding="utf-8")
+    (folder / "my.toml").write_text('[[objects]]\nspacecraft = "boxsat"\n', encoding="utf-8")
+    trimesh.creation.box((1, 2, 3)).export(folder / "hubble.glb")
+    meta = json.loads((tiny_data / "transforms.json").read_text(encoding="utf-8"))
+    camera = {key: meta[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
+    camera["transform_matrix"] = meta["frames"][0]["transform_matrix"]
+    (folder / "camera.json").write_text(json.dumps(camera), encoding="utf-8")
+    run, files = folder / "runs/boxsat", ("my.toml", "hubble.glb", "camera.json", "scene.toml")
+    return {
+        **{"data": tiny_data, "DATA": tiny_data, "PAIR": folder / "pair", "SCENE.toml": folder / "scene.toml"},
+        **{name: run for name in ("run", "RUN", "out/demo/run", "runs/boxsat")},
+        **{name: folder / name for name in files},
+    }
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """Where results lie."""
+    folder: Path = tmp_path_factory.mktemp("made")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done() -> dict[Any, tuple[Outcome, Path]]:
+    """What has run already, by its words and inputs."""
+    return {}
+
+
+def is_left_out(command: Command) -> bool:
+    return any(words in str(command) for words in NOT_RUN)
+
+
+WHOLE = [command for command in EVERY if command.whole and command.document.endswith(".md")]
+RUNNABLE = [command for command in WHOLE if command.program == "spacesim" and not is_left_out(command)]
+
+
+@pytest.mark.parametrize("document", dict.fromkeys(command.document for command in RUNNABLE))
+def test_commands_run_from_the_top_down(document, given, made, done, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    desk = Desk(tmp_path, given, made, done)
+    desk.put("runs/boxsat")
+    for command in RUNNABLE:
+        if command.document == document:
+            ended = desk.run(command)
+            assert ended.code == 0, (command.text, ended.errors)
+
+
+def test_what_does_not_run_is_told_why():
+    assert [str(one) for one in WHOLE if one not in (*RUNNABLE, *MEASURED) and not is_left_out(one)] == []
+    texts = [str(command) for command in WHOLE]
+    assert [words for words in (*NOT_RUN, *LEFT_OUT) if not any(words in text for text in texts)] == []
+
+
+SMALL_BLOCKS = {  # in the Python of a document: what takes the place of what
+    "README.md": {"views=60": "views=2, test_views=1, resolution=24, spp=1", 'preset("demo")': "SMALL"},
+    "relighting.md": {"1024": "24", "suns_around(120": "suns_around(2"},
+    "rasterizer.md": {"640, 480": "32, 24", "512, 512": "24, 24"},
+    "shadows.md": {"gaussians, light, 512": "gaussians, light, 32"},
+}
+PRINTED = {  # by the blocks of a document, among other things
+    "README.md": "(24, 24, 3) ",
+    "dataset.md": "[]\n",
+    "meshes.md": "12 faces",
+    "spacecraft.md": "primary_mirror",
+}
+
+
+@pytest.mark.parametrize("path", [path for path in DOCUMENTS if blocks(path, "python")], ids=lambda path: path.name)
+def test_python_runs(path, given, tmp_path, monkeypatch, capsys):
+    """The blocks of a document one after the other, with what they take for given."""
+    import drjit as dr
+
+    from spacesim.backend import ad
+    from spacesim.data.geometry import look_at
+    from spacesim.data.records import Camera
+    from spacesim.splat.gaussians import Gaussians
+    from spacesim.splat.train.config import preset
+
+    monkeypatch.chdir(tmp_path)
+    desk = Desk(tmp_path, given, tmp_path, {})
+    for name in ("runs/boxsat", "hubble.glb", *(("data", "run") if path.name != "README.md" else ())):
+        desk.put(name)
+    arrays = module_of("benchmarks/common.py").sphere_arrays(50)
+    known: dict[str, Any] = {"dr": dr, "ad": ad, "step": dr.zeros(ad.Float, 6)}
+    known |= {"gaussians": Gaussians.from_numpy(arrays), "SMALL": replace(preset("demo"), iterations=4)}
+    known["camera"] = Camera.from_fov(look_at([4, 1, 1], [0, 0, 0]), 24, 24, 35)
+    changes = SMALL_BLOCKS.get(path.name, {})
+    text = "\n".join(blocks(path, "python"))
+    assert [old for old in changes if old not in text] == []
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    exec(compile(text, path.name, "exec"), known)
+    assert PRINTED.get(path.name, "") in capsys.readouterr().out
