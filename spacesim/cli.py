@@ -5,9 +5,11 @@ from spacesim import ending  # first: from here on Ctrl-C is told in a sentence
 # isort: split
 
 import argparse
+import errno
 import json
 import logging
 import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -23,6 +25,11 @@ if TYPE_CHECKING:
     from spacesim.splat.run import Run
 
 KNOWS_ONE_LIGHT = "a vanilla run knows the light that it was trained under only; --sun changes nothing"
+_OF_PATHS = (
+    *(errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR),
+    *(errno.ELOOP, errno.EEXIST, errno.EILSEQ),
+)
+"""Errors that speak of the path that the user named, not of the work."""
 WANTS_FILTER = "the run is --antialiased: viewers without Mip-Splatting's 2D filter draw thin splats wider"
 
 
@@ -43,9 +50,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if ending.is_interrupt(error):
             ending.tell(ending.stopped())
             return ending.exit_code()
+        logging.getLogger("spacesim").debug("traceback", exc_info=error)
+        if isinstance(error, OSError) and error.filename is not None and error.errno in _OF_PATHS:
+            ending.tell(f"{error.filename}: cannot be read or written ({error.strerror})")
+            return 2
         if not isinstance(error, RuntimeError | OSError):
             raise
-        logging.getLogger("spacesim").debug("traceback", exc_info=error)
         reason = " ".join(str(error).split())
         ending.tell(f"the computation failed ({reason}); --debug shows where")
         return 1
@@ -53,8 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: Sequence[str]) -> None:
+    ending.speak_any_name()
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
-    logging.getLogger("trimesh").setLevel(logging.WARNING)
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its tracebacks: what matters of them is told
+    warnings.simplefilter("ignore")  # of libraries, about numbers that are told in sentences where they matter
     options = parser(_COMMANDS).parse_args(arguments)
     options.command = ("spacesim", *arguments)
     ending.resumed_by("--resume" if hasattr(options, "resume") else "")
@@ -274,7 +286,8 @@ def _compose(options: argparse.Namespace) -> None:
 
 
 def _verify(options: argparse.Namespace) -> None:
-    from spacesim.data.verify import verify
+    from spacesim.data.manifest import NAME
+    from spacesim.data.verify import has_digests, verify
 
     dataset, problems = verify(options.data)
     for problem in problems:
@@ -284,6 +297,8 @@ def _verify(options: argparse.Namespace) -> None:
             f"{options.data}: {len(problems)} faulty files; delete them, generate --resume makes them again"
         )
     ending.say(f"{options.data}: {len(dataset.frames)} frames, every file is there and whole")
+    if not has_digests(dataset):
+        print(f"no {NAME} lies beside them: a changed byte may go unseen", file=sys.stderr)
 
 
 def _export(options: argparse.Namespace) -> None:

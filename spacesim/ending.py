@@ -5,6 +5,7 @@ while modules are being imported the process ends at once (Python's exception wo
 other error, or leave them half made), else KeyboardInterrupt is raised as ever.
 """
 
+import io
 import os
 import signal
 import sys
@@ -87,6 +88,13 @@ def exit_code() -> int:
 def stopped() -> str:
     """The sentence of such a command."""
     return f"{STOPPED}; what was finished is kept, {_goes_on} goes on from there" if _goes_on else STOPPED
+
+
+def speak_any_name() -> None:
+    """From now on output takes any name of a file: what its encoding lacks, or what is no text, is told by numbers."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def say(text: object, end: str = "\n") -> None:

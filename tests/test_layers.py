@@ -12,7 +12,8 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 # What a file may not import at all, by the folder or module in which it stands.
 TOP = ("cli", "options", "demo", "doctor")  #: over all folders
 FORBIDDEN = {
-    "backend": ("spacesim.", "numpy"),
+    "memory": ("spacesim.", "numpy"),
+    "backend": (*(f"spacesim.{top}" for top in ("data", "scenes", "splat", "nerf", "eval", "viewer", *TOP)), "numpy"),
     "doctor": ("spacesim.scenes", "spacesim.splat", "spacesim.viewer", "spacesim.cli"),
     "data": (
         "mitsuba",

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from safetensors.numpy import save
 from tiny import GENERATE, PROGRESS, outcome
 
 from spacesim.data.errors import InputError, WorkError
@@ -68,9 +69,9 @@ def kill(program: str, moment: int, after: bool, *arguments: object) -> None:
 # --- kill -9 ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("moment", "after"), [(1, False), (5, False), (30, True), (52, False)])
+@pytest.mark.parametrize(("moment", "after"), [(1, False), (5, False), (30, True), (53, False), (55, False)])
 def test_generate_completes_what_a_kill_has_left(spacesim, tiny_data, tmp_path, moment, after):
-    """Before scene.json; amid the first frame; amid a later one; before transforms.json."""
+    """Before scene.json; amid the first frame; amid a later one; before an overview; before transforms.json."""
     out = tmp_path / "data"
     arguments = ("generate", "boxsat", "--out", out, *GENERATE)
     kill(GENERATING, moment, after, *arguments)
@@ -349,7 +350,8 @@ def test_verify_looks_at_overviews(spacesim, broken, name):
     assert found.code == 1
     assert len(found.errors) == 2
     assert str(broken / name) in found.errors[0]
-    (broken / name).unlink()  # other tools' datasets have none
+    for one in (name, "SHA256SUMS"):  # other tools' datasets have none
+        (broken / one).unlink()
     assert spacesim("verify", broken).code == 0
 
 
@@ -629,3 +631,145 @@ def test_an_azimuth_below_zero(spacesim, tmp_path):
     done = spacesim("generate", "boxsat", "--out", tmp_path / "data", *small, "--sun", "-40,10")
     assert done.code == 0, done.errors
     assert np.allclose(read_dataset(tmp_path / "data").train[0].sun.angles, (320, 10))
+
+
+# --- records that are read from disk ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def run(tiny_run, tmp_path) -> Path:
+    """A copy of the run, to be broken."""
+    return Path(shutil.copytree(tiny_run, tmp_path / "run"))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("config.json", lambda v: v.update(data=[]), "data: expected a table, found []"),
+        ("config.json", lambda v: v["data"].pop("path"), "data: path: expected text in quotes, found none"),
+        ("config.json", lambda v: v.update(light={"field": {"layers": 10**7}}), "light.field.layers: expected 1 to 32"),
+        ("config.json", lambda v: v.update(light=3), "light: expected a table, found 3"),
+        ("config.json", lambda v: v.update(supersample="2"), "supersample: expected a whole number, found '2'"),
+        ("config.json", lambda v: v.update(unheard_of=1), "unheard_of: expected one of method, "),
+        ("config.json", lambda v: v.update(init="random", init_box=1e308), "init_box: expected a number above 0, at"),
+        ("training.json", lambda v: v.update(history=[]), "history: expected at least one entry, found none"),
+        ("training.json", lambda v: v.update(history={}), "history: expected tables in double brackets, found a table"),
+        ("training.json", lambda v: v.update(backend=7), "backend: expected text in quotes, found 7"),
+    ],
+)
+def test_records_of_a_run_are_checked(spacesim, run, tmp_path, name, change, said):
+    edit(run / name, change)
+    refused = spacesim("render", run, "--out", tmp_path / "a.png")
+    assert refused.is_refusal(f"{run / name}: {said}"), refused
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda v: v["image"]["psnr"].update(mean="high"), "image.psnr.mean: expected a finite number, found 'high'"),
+        (lambda v: v["frames"][0].update(name="../x"), "frames[0].name: expected a frame's name without folders"),
+        (lambda v: v["dataset"].update(resolution=[1]), "dataset.resolution: expected a list of 2 whole numbers"),
+        (lambda v: v.update(training=None), "training: expected a table, found none"),
+        (lambda v: v["model"].update(gaussians=1e300), "model.gaussians: expected a whole number"),
+    ],
+)
+def test_metrics_are_checked(spacesim, tiny_eval, tmp_path, change, said):
+    folder = Path(shutil.copytree(tiny_eval, tmp_path / "eval"))
+    edit(folder / "metrics.json", change)
+    refused = spacesim("report", folder, "--out", tmp_path / "a.html")
+    assert refused.is_refusal(f"{folder / 'metrics.json'}: {said}"), refused
+
+
+@pytest.mark.parametrize("header", ["[]", "3", "null", '{"format": ["x"]}', "{"])
+def test_a_header_of_a_model_that_is_no_object(spacesim, run, tmp_path, header):
+    tensors, _ = read_tensors(run / "model.safetensors")
+    (run / "model.safetensors").write_bytes(save(tensors, {"spacesim": header}))
+    assert spacesim("render", run, "--out", tmp_path / "a.png").is_refusal(run / "model.safetensors")
+
+
+@pytest.mark.parametrize("content", ["[]", '{"4": "x"}', '{"refinement": 1e400}', "{", '{"40": null}'])
+def test_damaged_times_cost_only_themselves(tiny_data, uninterrupted, tmp_path, caplog, content):
+    kill(TRAINING, 7, False, tiny_data, tmp_path / "run")
+    (tmp_path / "run/checkpoints/seconds.json").write_text(content)
+    run = train(read_dataset(tiny_data), tmp_path / "run", CONFIG, resume=True)
+    assert "the time that training took before is not known" in caplog.text
+    assert (run.path / "model.safetensors").read_bytes() == (uninterrupted / "model.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["config.json", "training.json", "model.safetensors"])
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_special_files_of_a_run_are_refused(spacesim, run, tmp_path, name, kind):
+    (run / name).unlink()
+    os.mkfifo(run / name) if kind == "pipe" else (run / name).symlink_to("/dev/zero")
+    refused = spacesim("render", run, "--out", tmp_path / "a.png")
+    assert refused.is_refusal(run / name, "a pipe" if kind == "pipe" else "a device"), refused
+
+
+@pytest.mark.parametrize("key", ["gt_path", "file_path", "mask_path", "ply_file_path", "mesh_path"])
+def test_special_files_of_a_dataset_are_refused(spacesim, broken, key):
+    os.mkfifo(broken / "pipe.png")
+
+    def name(meta: dict) -> None:
+        (meta if key in meta else meta["frames"][0])[key] = "pipe.png"
+
+    edit(broken / "transforms.json", name)
+    refused = spacesim("verify", broken)
+    assert refused.code in (1, 2)
+    assert "pipe" in "".join(refused.errors)
+
+
+@pytest.mark.parametrize("direction", [[1e308, 0, 0], [0, 1e-300, 0], [1e200, 1e200, 1e200]])
+def test_a_sun_beyond_all_bounds_is_refused(spacesim, broken, direction):
+    edit(broken / "transforms.json", lambda m: m["frames"][0].update(sun_direction=direction))
+    assert spacesim("verify", broken).is_refusal("expected 3 finite numbers, a unit vector, as sun_direction")
+
+
+# --- names, sizes and what output can say ----------------------------------------------------------------------------
+
+
+def program(*arguments: object, **environment: str) -> subprocess.CompletedProcess[bytes]:
+    """The command in a process of its own."""
+    command = [sys.executable, "-m", "spacesim", *map(os.fsencode, map(str, arguments))]
+    return subprocess.run(command, capture_output=True, env={**os.environ, **environment}, timeout=100)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_names_that_output_cannot_say(tiny_data, tiny_eval, tmp_path, encoding):
+    """A run whose name is no text, told to a terminal that knows ASCII alone."""
+    for name in ("l\u00fcn\u00e4", os.fsdecode(b"l\xff")):
+        out = tmp_path / name
+        done = program("train", tiny_data, "--out", out, *FEW, PYTHONIOENCODING=encoding)
+        assert done.returncode == 0, done.stderr
+        assert b"Gaussians after 8 iterations" in done.stdout
+        judged = program("eval", out, "--data", tiny_data, "--out", tmp_path / "e", PYTHONIOENCODING=encoding)
+        assert judged.returncode == 0, judged.stderr
+        assert (tmp_path / "e/report.html").stat().st_size > 10_000
+
+
+def test_folders_that_cannot_be(spacesim, tiny_run, tiny_data, tmp_path):
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / ("x" * 300), tmp_path / "file", tmp_path / "file" / "x"):
+        for arguments in (
+            ("generate", "boxsat", "--out", out, *GENERATE),
+            ("train", tiny_data, "--out", out, *FEW),
+            ("eval", tiny_run, "--data", tiny_data, "--out", out, "--no-geometry"),
+            ("export", tiny_data, "--speedplus", out),
+        ):
+            refused = spacesim(*arguments)
+            assert refused.code == 2, refused
+            assert "computation" not in refused.errors[-1]
+            assert str(out)[:40] in refused.errors[-1]
+
+
+def test_pictures_larger_than_any_is_drawn_are_refused(spacesim, tiny_data, tmp_path):
+    done = spacesim("train", tiny_data, "--out", tmp_path / "run", *FEW, "--method", "relight")
+    assert done.code == 0, done.errors
+    scene = tmp_path / "scene.toml"
+    camera = "[camera]\nposition = [9, 0, 0]\nlook_at = [0, 0, 0]\nfov_deg = 30\nresolution = [16, 16]\n"
+    scene.write_text(f"{camera}[[models]]\nrun = 'run'\n[sun]\nazimuth_deg = 1\nelevation_deg = 2\n")
+    for size in ("16400x16", "8193x8192", "0x5", "99999999999"):
+        for command in (("sweep", tmp_path / "run", "--frames", 2), ("compose", scene)):
+            refused = spacesim(*command, "--out", tmp_path / "out", "--size", size)
+            assert refused.is_refusal("--size: expected"), refused
+    done = spacesim("sweep", tmp_path / "run", "--out", tmp_path / "s", "--size", "16384x16", "--frames", 2)
+    assert done.code == 0, done.errors

@@ -9,6 +9,15 @@ class WorkError(RuntimeError):
     """The input was fine but the work could not be done, e.g. memory or disk is short (exit code 1)."""
 
 
+def check_ranges(record: object, **ranges: tuple[float, float]) -> None:
+    """Raise InputError "field: expected ... to ..., found ..." unless each of these fields of `record` is within its
+    range, ends included."""
+    for name, (least, most) in ranges.items():
+        value = getattr(record, name)
+        if not least <= value <= most:
+            raise InputError(f"{name}: expected {least:g} to {most:g}, found {value!r}")
+
+
 def expect(condition: bool, name: str, expected: str, found: object) -> None:
     """Raise InputError "name: expected ..., found ..." unless `condition` holds."""
     if not condition:

@@ -1,5 +1,8 @@
 """Meshes as vertices and faces, and the signed distance to one, also where it is not watertight."""
 
+import io
+import re
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -7,25 +10,83 @@ import numpy as np
 import trimesh
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import write_bytes
+from spacesim.data.files import read_bytes, write_bytes
 from spacesim.data.geometry import Array
+from spacesim.memory import check_memory
 
+READ = (".ply", ".obj", ".glb", ".stl", ".off")
 WRITTEN = (".ply", ".obj", ".glb", ".stl")
+FARTHEST = 1e9  #: metres; corners beyond it are taken for damage, chosen (the Moon is at 3.8e8)
+PARSED = 30  #: bytes of memory that a byte of a mesh file takes while it is read, at most; OBJ took 22
 
 
 def read_mesh(path: Path) -> tuple[Array, np.ndarray]:
     """(vertices [V, 3] metres, faces [F, 3] int64) of a mesh file. Raises InputError where it holds none."""
-    if not Path(path).exists():
-        raise InputError(f"{path}: expected a mesh, found no such file")
-    try:
-        mesh: Any = trimesh.load(path, force="mesh", process=False)
-        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    except Exception as error:
-        raise InputError(f"{path}: expected a mesh, found a file that cannot be read as one ({error})") from None
-    faces = _drawable(vertices, faces)
+    mesh = load_trimesh(path)
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(getattr(mesh, "faces", ()), np.int64)
+    faces = drawable(vertices, faces)
     if len(faces) == 0:
-        raise InputError(f"{path}: expected a mesh, found no face with finite corners in it")
+        raise InputError(f"{path}: expected a mesh, found no face with an area and corners within {FARTHEST:g} m in it")
     return vertices, faces
+
+
+def load_trimesh(path: Path, kind: str | None = None) -> Any:
+    """What trimesh makes of one of the READ formats by itself: a mesh, or points; files beside it, such as textures,
+    are not opened. kind: one of READ, by default the ending of the name. Raises InputError where it cannot be read,
+    MemoryError where it does not fit into memory."""
+    path = Path(path)
+    content, kind = read_bytes(path, "a mesh"), kind or path.suffix.lower()
+    if kind not in READ:
+        raise InputError(f"{path}: expected a mesh in {', '.join(READ)}, found {kind or 'no ending'!r}")
+    check_memory(PARSED * len(content), f"{path}: reading it")
+    try:
+        check_promise(kind[1:], content)
+        force = None if kind == ".ply" else "mesh"
+        options = {"skip_materials": True} if kind in (".ply", ".obj") else {}
+        found: Any = trimesh.load(io.BytesIO(content), kind[1:], force=force, process=False, **options)
+        if not isinstance(found, trimesh.Trimesh | trimesh.PointCloud):
+            raise InputError(f"found {type(found).__name__}")
+        count = len(np.asarray(found.vertices, np.float64).reshape(-1, 3))
+        declared = re.search(rb"element\s+vertex\s+(\d+)", content) if kind == ".ply" else None
+        if declared is not None and count != int(declared.group(1)):
+            raise InputError(f"found {count:,} vertices, its header promises {int(declared.group(1)):,}")
+    except MemoryError:
+        raise
+    except Exception as error:  # trimesh documents none of what it raises
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: expected a mesh, found a file that cannot be read as one ({reason})") from None
+    return found
+
+
+def check_places(points: np.ndarray, path: Path) -> None:
+    """Raise InputError in the name of the file where there is no point [N, 3], or one that is not finite or beyond
+    FARTHEST."""
+    with np.errstate(invalid="ignore"):
+        if not len(points) or not (np.abs(points) <= FARTHEST).all():
+            found = "another one" if len(points) else "none"
+            raise InputError(f"{path}: expected points within {FARTHEST:g} m, found {found}")
+
+
+def check_promise(kind: str, data: bytes) -> None:
+    """Raises InputError where the header of a "ply" or "stl" file promises more than the file holds, before anyone
+    makes room for it. Other kinds pass."""
+    if kind == "stl" and len(data) >= 84 and not (data[:5] == b"solid" and b"facet" in data[:1024]):
+        count = struct.unpack_from("<I", data, 80)[0]
+        if 84 + 50 * count != len(data):
+            raise InputError(
+                f"expected {84 + 50 * count:,} bytes for the {count:,} faces that its header promises, "
+                f"found {len(data):,}"
+            )
+    if kind == "ply":
+        head, end, body = data.partition(b"end_header")
+        if not data.startswith(b"ply") or not end:
+            raise InputError('expected a ply file, from "ply" to "end_header", found something else')
+        for element, count in re.findall(rb"element\s+(\S+)\s+(\d+)", head):
+            if int(count) > len(body):
+                raise InputError(
+                    f"expected {int(count):,} elements {element.decode('ascii', 'replace')}, as its header promises, "
+                    f"found {len(body):,} bytes"
+                )
 
 
 def mesh_suffix(path: Path) -> str:
@@ -61,9 +122,9 @@ class SignedDistance:
         import igl  # a third of a second, that readers of meshes need not wait
 
         self.vertices = np.ascontiguousarray(vertices, np.float64)
-        self.faces = np.ascontiguousarray(_drawable(self.vertices, np.asarray(faces, np.int64).reshape(-1, 3)))
+        self.faces = np.ascontiguousarray(drawable(self.vertices, np.asarray(faces, np.int64).reshape(-1, 3)))
         if len(self.faces) == 0:
-            raise InputError("signed distance: expected a mesh, found no face with finite corners")
+            raise InputError("signed distance: expected a mesh, found no face with an area and finite corners")
         self.faces = _consistent(self.vertices, self.faces)
         used = self.vertices[self.faces.ravel()]
         self.lowest, self.highest = used.min(axis=0), used.max(axis=0)
@@ -134,9 +195,15 @@ def _middle(corners: Array) -> Array:
     return places[order[half, range(3)], range(3)]
 
 
-def _drawable(vertices: Array, faces: np.ndarray) -> np.ndarray:
-    """The faces whose corners are there and finite."""
+def drawable(vertices: Array, faces: np.ndarray) -> np.ndarray:
+    """The faces [F, 3] whose corners, of vertices [V, 3], are there, within FARTHEST and not on a line."""
     if len(vertices) == 0 or faces.ndim != 2 or len(faces) == 0:
         return np.zeros((0, 3), np.int64)
     faces = faces[((faces >= 0) & (faces < len(vertices))).all(axis=1)]
-    return faces[np.isfinite(vertices[faces]).all(axis=(1, 2))]
+    with np.errstate(invalid="ignore"):
+        near = np.all(np.abs(vertices) <= FARTHEST, axis=1)
+    faces = faces[near[faces].all(axis=1)]
+    corners = vertices[faces]
+    longest2 = ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=2).max(axis=1, initial=0.0)
+    size2 = (corners**2).sum(axis=2).max(axis=1, initial=0.0)
+    return faces[np.flatnonzero((longest2 > 1e-24 * size2) & (_doubled_area(corners) > 1e-12 * longest2))]

@@ -16,7 +16,17 @@ from spacesim.data.geometry import (
     normalize,
 )
 
-MOST_PIXELS = 2**28  #: of a picture: 16,384 x 16,384
+MOST_PIXELS = 2**26  #: of a picture: 8,192 x 8,192
+MOST_SIDE = 2**14  #: pixels of a picture's longer side: what H.264 encodes
+LONGEST_FOCUS = 1e9  #: pixels, chosen
+SUN_LENGTHS = 1e-6, 1e6  #: of a vector that names the Sun's direction, chosen: beyond that it is damage
+
+
+def check_size(width: int, height: int, name: str) -> None:
+    """Raise InputError in the name of the key or option where a picture has more pixels than any is drawn with."""
+    if width * height > MOST_PIXELS or max(width, height) > MOST_SIDE:
+        limit = f"at most {MOST_PIXELS:,} pixels, {MOST_SIDE:,} a side"
+        raise InputError(f"{name}: expected {limit}, found {width} x {height}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +54,13 @@ class Camera:
             raise InputError("world_from_camera: expected a rotation in its upper left [3, 3], found none")
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: expected a size of at least 1x1 pixels, found {self.width}x{self.height}")
-        if self.width * self.height > MOST_PIXELS:
-            raise InputError(f"camera: expected at most {MOST_PIXELS} pixels, found {self.width}x{self.height}")
-        if not (self.fx > 0 and self.fy > 0 and np.all(np.isfinite([self.fx, self.fy, self.cx, self.cy]))):
-            raise InputError(f"camera: expected positive finite focal lengths, found {self.fx} and {self.fy}")
+        check_size(self.width, self.height, "camera")
+        lengths, centre = np.array([self.fx, self.fy]), np.array([self.cx, self.cy])
+        if not ((lengths >= 1 / LONGEST_FOCUS) & (lengths <= LONGEST_FOCUS)).all():
+            limit = f"above 0, at most {LONGEST_FOCUS:g} pixels"
+            raise InputError(f"camera: expected focal lengths {limit}, found {self.fx} and {self.fy}")
+        if not (np.abs(centre) <= LONGEST_FOCUS).all():
+            raise InputError(f"camera: expected a principal point in pixels, found {self.cx}, {self.cy}")
         object.__setattr__(self, "world_from_camera", pose)
 
     @property
@@ -83,8 +96,8 @@ class Sun:
 
     def __post_init__(self) -> None:
         direction = np.asarray(self.direction, dtype=np.float64)
-        if direction.shape != (3,) or not np.all(np.isfinite(direction)) or not np.any(direction):
-            raise InputError(f"sun direction: expected 3 finite numbers, not all 0, found {self.direction}")
+        if direction.shape != (3,) or not SUN_LENGTHS[0] <= np.abs(direction).max() <= SUN_LENGTHS[1]:
+            raise InputError(f"sun direction: expected 3 finite numbers, a unit vector, found {self.direction}")
         object.__setattr__(self, "direction", normalize(direction))
 
     @staticmethod

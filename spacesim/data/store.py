@@ -2,14 +2,13 @@
 
 Reading any such folder is `spacesim.data.transforms`; this module re-exports `read_dataset`.
 
-    transforms.json  images/  gt/  shadow/  silhouette/  id/  depth/  points.ply  mesh.ply  scene.json
+    transforms.json  images/  gt/  shadow/  silhouette/  id/  depth/  points.ply  mesh.ply  scene.json  SHA256SUMS
 """
 
-import io
+import hashlib
 import json
 import logging
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,13 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.files import flush_disks, read_json, remove_leftovers, write_bytes, write_json
+from spacesim.data.files import flush_disks, json_bytes, read_json, remove_leftovers, write_bytes, write_json
 from spacesim.data.images import Undistortion, load_image, read_exr, read_png, write_exr, write_png
 from spacesim.data.integrity import is_whole
+from spacesim.data.manifest import differences, write_manifest
+from spacesim.data.mesh import check_places, load_trimesh
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
-from spacesim.data.transforms import read_dataset
+from spacesim.data.transforms import dataset_of, read_dataset
 
 __all__ = [
     "SHADOW_ATTACHED",
@@ -102,9 +103,12 @@ class FrameWriter:
 
     def has(self, name: str) -> bool:
         """All files of frame `name` are whole on disk, e.g. from an interrupted run (see `spacesim.data.integrity`)."""
-        paths = [self.root / folder / f"{name}{suffix}" for folder, suffix in _FILES.items()]
-        paths += [self.root / "raw" / f"{name}{suffix}.png" for suffix in self.raw]
-        return all(is_whole(path) for path in reversed(paths))
+        return all(is_whole(self.root / path) for path in reversed(self._files_of(name)))
+
+    def _files_of(self, name: str) -> list[str]:
+        """Paths of a frame's files below the folder."""
+        paths = [f"{folder}/{name}{suffix}" for folder, suffix in _FILES.items()]
+        return paths + [f"raw/{name}{suffix}.png" for suffix in self.raw]
 
     def write_frame(self, name: str, truth: Truth, image: np.ndarray, raw: np.ndarray | None = None) -> None:
         """Write the files of frame `name`, e.g. "train_00012".
@@ -159,6 +163,8 @@ class DatasetWriter(FrameWriter):
         else:
             write_json(self.root / "scene.json", scene)
         remove_leftovers(self.root)
+        if resume:
+            self._remove_damaged()
 
     def finish(
         self,
@@ -168,12 +174,14 @@ class DatasetWriter(FrameWriter):
         colors: np.ndarray,
         mesh: trimesh.Trimesh,
         distortion: Sequence[float] = (),
+        overview: Callable[[Dataset], None] | None = None,
     ) -> Dataset:
-        """Write points.ply, mesh.ply and, once the disks hold everything, transforms.json; returns the dataset as it
-        reads back.
+        """Write points.ply, mesh.ply, SHA256SUMS and, once the disks hold everything, transforms.json; returns the
+        dataset as it reads back.
 
         train, test: (frame name, camera, sun) of each frame; points: [N, 3] metres; colors: [N, 3] uint8;
-        distortion: Brown-Conrady k1, k2, p1, p2, k3 of all frames, () none.
+        distortion: Brown-Conrady k1, k2, p1, p2, k3 of all frames, () none; overview: writes pictures of the whole into
+        the folder.
         """
         missing = [name for name, _, _ in (*train, *test) if not self.has(name)]
         if missing:
@@ -181,9 +189,25 @@ class DatasetWriter(FrameWriter):
         remove_leftovers(self.root)  # of processes that were killed
         write_points(self.root / "points.ply", points, colors)
         write_bytes(self.root / "mesh.ply", mesh.export(file_type="ply", vertex_normal=False))
+        path, meta = self.root / "transforms.json", _describe_frames(train, test, distortion)
+        content = json_bytes(meta)
+        if overview is not None:
+            overview(dataset_of(path, meta))
+        parts = ["scene.json", "points.ply", "mesh.ply", *sorted(picture.name for picture in self.root.glob("*.png"))]
+        parts += [file for name, _, _ in (*train, *test) for file in self._files_of(name)]
+        write_manifest(self.root, parts, {path.name: hashlib.sha256(content).hexdigest()})
         flush_disks()
-        write_json(self.root / "transforms.json", _describe_frames(train, test, distortion))
+        write_bytes(path, content)
         return read_dataset(self.root)
+
+    def _remove_damaged(self) -> None:
+        """Take away the frames' files that are not what SHA256SUMS of the finished dataset says, to be made again."""
+        frames = (*_FILES, "raw")
+        damaged = [path for path in differences(self.root) if path.split("/")[0] in frames]
+        for path in damaged:
+            (self.root / path).unlink(missing_ok=True)
+        if damaged:
+            _log.warning("%s: %d files are damaged, %s the first; made again", self.root, len(damaged), damaged[0])
 
     def _check_resumable(self, scene: Mapping[str, Any], resume: bool) -> None:
         if not resume:
@@ -212,19 +236,12 @@ def write_points(path: Path, points: ArrayLike, colors: ArrayLike) -> None:
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """(points [N, 3] float64, colors [N, 3] uint8) of an ascii or binary PLY file; grey 128 without colours.
 
-    Raises InputError where the file is missing, cut off, no PLY, or holds positions that are not finite.
+    Raises InputError where the file is missing, cut off, no PLY, or holds positions that are not finite or
+    beyond 1e9 m.
     """
-    try:
-        content = Path(path).read_bytes()
-        cloud = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
-        points = np.asarray(cloud.vertices, np.float64)
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a PLY file, found none") from None
-    except Exception as error:  # trimesh documents none of what it raises
-        raise InputError(f"{path}: expected a PLY file, found a broken or cut off one ({error})") from None
-    declared = re.search(rb"element vertex (\d+)", content)
-    if declared is None or not 0 < len(points) == int(declared.group(1)) or not np.isfinite(points).all():
-        raise InputError(f"{path}: expected as many finite points as its header says, at least one")
+    cloud = load_trimesh(path, ".ply")
+    points = np.asarray(cloud.vertices, np.float64)
+    check_places(points, path)
     colors = np.asarray(cloud.visual.vertex_colors) if cloud.visual.kind == "vertex" else np.empty(0)
     if colors.ndim != 2:  # a cloud without colours claims to have none a vertex
         return points, np.full((len(points), 3), 128, np.uint8)

@@ -4,10 +4,12 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import read_json
 from spacesim.data.toml import Document, Keys, dotted
 
 T = TypeVar("T")
@@ -17,11 +19,13 @@ _NOUNS = {int: "a whole number", float: "a finite number", bool: "true or false"
 @dataclass(frozen=True)
 class Rules:
     """What annotations alone do not say. kinds: classes that the key `kind` chooses among, the first is the default;
-    hidden: fields that are no keys; spread: fields of which one number stands for all."""
+    hidden: fields that are no keys; spread: fields of which one number stands for all; open: classes whose unknown keys
+    are passed over, where files of other programs or versions may have more."""
 
     kinds: Mapping[type, Mapping[str, type]] = field(default_factory=dict)
     hidden: Sequence[tuple[type, str]] = ()
     spread: Sequence[str] = ()
+    open: Sequence[type] = ()
 
 
 def structure(cls: type[T], document: Document, rules: Rules, defaults: Mapping[str, Any] | None = None) -> T:
@@ -30,6 +34,17 @@ def structure(cls: type[T], document: Document, rules: Rules, defaults: Mapping[
     Raises InputError with file, line and key for a key that is not known, a value of a wrong type or an impossible one.
     """
     return _Reader(document, rules, cls).table(cls, document.values, (), defaults or {})
+
+
+def read_record(path: Path, cls: type[T], rules: Rules | None = None) -> tuple[T, dict[str, Any]]:
+    """(the `cls` that a JSON file says, its values as they stand there). null is allowed where an annotation has None.
+
+    Raises InputError where the file cannot be read, is no JSON object, or as `structure` does.
+    """
+    values = read_json(path)
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: expected a JSON object, found {_short(values)}")
+    return structure(cls, Document(str(path), values, {}), rules or Rules()), values
 
 
 def keys_of(cls: type, rules: Rules) -> dict[str, Any]:
@@ -73,6 +88,8 @@ class _Reader:
                 self._refuse((*at, "kind"), f"one of {', '.join(kinds)}", kind, near(kind, kinds))
             cls = kinds[kind]
         known = keys_of(cls, self._rules)
+        is_open = any(issubclass(cls, one) for one in self._rules.open)
+        values = {key: value for key, value in values.items() if key in known or not is_open}
         for key in values:
             if key not in known:
                 self._unknown(key, at, [*(["kind"] if kinds else []), *known], kinds)
@@ -86,7 +103,11 @@ class _Reader:
     def value(self, hint: Any, value: Any, at: Keys) -> Any:
         """`value` as its annotation `hint` wants it."""
         origin, inner = get_origin(hint), get_args(hint)
+        if hint is Any:
+            return value
         if origin in (Union, UnionType):
+            if value is None and NoneType in inner:
+                return None
             (hint,) = (one for one in inner if one is not NoneType)
             return self.value(hint, value, at)
         if origin is tuple:
@@ -122,7 +143,8 @@ class _Reader:
         try:
             return cls(**given)
         except InputError as error:
-            name, _, rest = str(error).partition(": ")
+            words, _, rest = str(error).partition(": ")
+            name = words.removeprefix("--").replace("-", "_")  # of a field, or of the option that sets it
             where = (*at, name) if any(name == f.name for f in fields(cls)) else at
             raise InputError(f"{self._document.label(where)}: {rest}") from None
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import read_bytes
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -56,17 +57,9 @@ def dotted(keys: Keys) -> str:
 def read_document(path: Path) -> Document:
     """Read a TOML file. Raises InputError, with the line where there is one, where it cannot be read or is no TOML."""
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(f"{path}: expected a scene file of at most 1 MiB, found {path.stat().st_size} bytes")
-        text = path.read_bytes().decode("utf-8-sig")
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"{path}: expected a scene file, found none that can be read ({error.strerror})") from None
+        text = read_bytes(path, "a scene file", LARGEST_FILE).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: expected text in UTF-8, found byte {error.object[error.start]:#04x}") from None
-    except ValueError as error:  # a name that no file can have
-        raise InputError(f"{str(path)!r}: expected a scene file, found none that can be read ({error})") from None
     return parse(text, str(path))
 
 

@@ -41,16 +41,25 @@ def read_dataset(path: Path) -> Dataset:
     root = path if path.is_dir() else path.parent
     own = root / "transforms.json" if path.is_dir() else path
     if own.is_file() and own.name != "transforms_train.json":
-        meta = _read_object(own)
-        train, test = _split(own, meta, _read_frames(own, meta))
-    elif (root / "transforms_train.json").is_file():
+        return dataset_of(own, _read_object(own))
+    if (root / "transforms_train.json").is_file():
         meta, train, test = _read_blender(root)
     else:
         raise InputError(_say_what_is_missing(path, root))
+    return _dataset(own, meta, train, test)
+
+
+def dataset_of(path: Path, meta: Json) -> Dataset:
+    """The dataset whose transforms.json, at `path`, says or will say `meta`. Raises InputError as `read_dataset`."""
+    return _dataset(path, meta, *_split(path, meta, _read_frames(path, meta)))
+
+
+def _dataset(path: Path, meta: Json, train: tuple[Frame, ...], test: tuple[Frame, ...]) -> Dataset:
     if not train:
-        raise InputError(f"{own}: expected frames to train on, found none")
-    scene = _read_object(root / "scene.json") if (root / "scene.json").is_file() else {}
-    return Dataset(root, train, test, _path(own, meta, "ply_file_path"), _path(own, meta, "mesh_path"), scene)
+        raise InputError(f"{path}: expected frames to train on, found none")
+    root = path.parent
+    scene = _read_object(root / "scene.json") if (root / "scene.json").exists() else {}
+    return Dataset(root, train, test, _path(path, meta, "ply_file_path"), _path(path, meta, "mesh_path"), scene)
 
 
 def read_camera(path: Path) -> Camera:
@@ -180,7 +189,7 @@ def _read_sun(values: Json) -> Sun | None:
         try:
             return Sun(np.asarray(values["sun_direction"], np.float64))
         except (TypeError, ValueError, OverflowError):
-            raise InputError("expected 3 finite numbers, not all 0, as sun_direction, found other values") from None
+            raise InputError("expected 3 finite numbers, a unit vector, as sun_direction, found other values") from None
     if "sun_azimuth_deg" in values and "sun_elevation_deg" in values:
         return Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
     return None

@@ -1,10 +1,11 @@
-"""Every file of a dataset, decoded: what `spacesim verify` looks at."""
+"""Every file of a dataset, held against its digest and decoded: what `spacesim verify` looks at."""
 
 from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
+from spacesim.data.manifest import NAME, differences
 from spacesim.data.records import Dataset
 from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, read_dataset, verify_dataset
 
@@ -18,7 +19,18 @@ def verify(path: Path) -> tuple[Dataset, list[str]]:
         dataset = read_dataset(path)
     except InputError as error:
         raise InputError(f"{error}{_way_out(Path(path), error)}") from None
-    return dataset, verify_dataset(path) + _faulty_pictures(dataset)
+    try:
+        changed = differences(dataset.root)
+    except InputError as error:
+        return dataset, [str(error)]
+    told = tuple(f"{dataset.root / name}:" for name in changed)
+    faulty = [words for words in verify_dataset(path) + _faulty_pictures(dataset) if not words.startswith(told)]
+    return dataset, [*changed.values(), *faulty]
+
+
+def has_digests(dataset: Dataset) -> bool:
+    """Whether SHA256SUMS lies beside the data: without it, a changed byte of a file without checksums goes unseen."""
+    return (dataset.root / NAME).exists()
 
 
 def _way_out(root: Path, error: InputError) -> str:

@@ -6,7 +6,6 @@ differs from one call to the next.
 """
 
 import math
-import re
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,6 +19,7 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.data.files import write_json
 from spacesim.data.geometry import Array
+from spacesim.data.identity import frame_names
 from spacesim.data.records import Dataset, Frame
 from spacesim.eval import grazing, lpips, shadow
 from spacesim.eval.geometry import GeometryConfig, JudgedShape, judge_geometry
@@ -29,13 +29,13 @@ from spacesim.eval.notes import MODELS_OF_A_SCENE, explain, explain_light, expla
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
 from spacesim.eval.objects import judge_object_shapes, judge_objects, object_names, other_order
 from spacesim.eval.relight import write_sweep
+from spacesim.eval.schema import SCHEMA
 from spacesim.eval.shape import write_shapes
 from spacesim.eval.suns import count_suns, known_suns, rounded_angles, trained_on
 
 if TYPE_CHECKING:
     from spacesim.splat.run import Run
 
-SCHEMA = 1
 _PACKAGES = ("spacesim", "mitsuba", "drjit", "numpy", "scipy", "flip-evaluator", "torch")
 
 Progress = Callable[[int, int, str], None]
@@ -218,20 +218,6 @@ def _prepare(out: Path) -> None:
         (out / "metrics.json").unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{out}: expected a folder to write to, found none ({error.strerror})") from None
-
-
-def frame_names(frames: Sequence[Frame]) -> list[str]:
-    """A unique folder name for each frame, from its file's: letters, digits, dots, dashes and underscores."""
-    names: list[str] = []
-    for frame in frames:
-        stem = str(Path(frame.file_path).with_suffix("")).removeprefix("./").removeprefix("images/")
-        stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).lstrip("._") or "frame"
-        name, count = stem, 1
-        while name in names:
-            count += 1
-            name = f"{stem}_{count}"
-        names.append(name)
-    return names
 
 
 def summary(records: Iterable[Mapping[str, float | None] | None]) -> dict[str, Any] | None:

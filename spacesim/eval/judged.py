@@ -6,24 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_json
-from spacesim.eval.evaluate import SCHEMA
-from spacesim.eval.labels import ALWAYS
+from spacesim.data.structure import read_record
 from spacesim.eval.page import escape, swatch
-
-_NEEDED = (
-    "run",
-    "data",
-    "split",
-    "model",
-    "notes",
-    "dataset",
-    "config",
-    "training",
-    "versions",
-    "frames",
-    *ALWAYS,
-)
+from spacesim.eval.schema import RULES, Metrics
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,19 +65,7 @@ def legend(runs: Sequence[Judged]) -> str:
 
 
 def _read_metrics(folder: Path) -> dict[str, Any]:
-    path = folder / "metrics.json"
-    metrics = read_json(path)
-    if not isinstance(metrics, dict) or metrics.get("schema") != SCHEMA:
-        raise InputError(f"{path}: expected metrics of schema {SCHEMA}, found something else")
-    missing = [key for key in _NEEDED if key not in metrics]
-    if missing:
-        raise InputError(f"{path}: expected the key {missing[0]}, found none")
-    if not metrics["frames"]:
-        raise InputError(f"{path}: expected frames, found none")
-    for frame in metrics["frames"]:
-        if Path(frame["name"]).name != frame["name"]:
-            raise InputError(f"{path}: expected a frame's name without folders, found {frame['name']!r}")
-    return metrics
+    return read_record(folder / "metrics.json", Metrics, RULES)[1]
 
 
 def _unique_names(found: Sequence[dict[str, Any]], folders: Sequence[Path]) -> list[str]:

@@ -107,6 +107,3 @@ GROUPS = {
     "shadow_other_cast": ("over lit pixels and shadow that another object casts", SHADOW_KIND),
 }
 """metrics.json's groups: where each is taken and what is in it."""
-
-ALWAYS = ("image", "image_full", "shadow", "shadow_full", "shadow_mask")
-"""Groups that every evaluation of this schema has, the oldest, too."""

@@ -10,9 +10,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from string import Template
 
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from spacesim.data.errors import InputError
+from spacesim.data.images import read_png
 from spacesim.eval.style import STYLE
 
 SERIES = 6
@@ -59,10 +60,8 @@ def picture(path: Path, alt: str, caption: str, limit: int) -> str:
     caption: HTML. Raises InputError where there is no such picture.
     """
     try:
-        with Image.open(path) as image:
-            image.load()
-            shown = image.convert("RGB")
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
+        shown = Image.fromarray(read_png(path)).convert("RGB")
+    except InputError:
         raise InputError(f"{path}: expected a picture that spacesim eval wrote, found none") from None
     shown.thumbnail((limit, limit), Image.Resampling.BOX)
     buffer = io.BytesIO()

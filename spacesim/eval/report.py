@@ -35,7 +35,7 @@ def write_report(evals: Sequence[Path], out: Path) -> None:
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         named = ", ".join(str(Path(folder) / "metrics.json") for folder in evals)
         raise InputError(f"{named}: expected metrics of this version, found a damaged file ({error!r})") from error
-    write_bytes(Path(out), content.encode())
+    write_bytes(Path(out), content.encode("utf-8", "backslashreplace"))
 
 
 def _content(runs: Sequence[Judged]) -> str:

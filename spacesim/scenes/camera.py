@@ -8,7 +8,7 @@ import numpy as np
 from spacesim.data.errors import InputError, expect
 from spacesim.data.geometry import Array
 from spacesim.data.images import distorted, undistorted
-from spacesim.data.records import MOST_PIXELS, Camera
+from spacesim.data.records import Camera, check_size
 from spacesim.scenes.sensor import TONES, SensorConfig
 from spacesim.scenes.spectra import WHITE_BALANCES
 from spacesim.scenes.sun import EXPOSURE
@@ -41,8 +41,7 @@ class CameraConfig:
     def __post_init__(self) -> None:
         width, height = self.resolution
         expect(min(width, height) >= 8, "resolution", "at least 8 pixels", min(width, height))
-        if width * height > MOST_PIXELS:
-            raise InputError(f"resolution: expected at most {MOST_PIXELS:,} pixels, found {width} x {height}")
+        check_size(width, height, "resolution")
         fits = SMALLEST_FOV <= self.fov_deg <= 120
         expect(fits, "fov_deg", f"an angle from {SMALLEST_FOV:g} to 120 degrees", self.fov_deg)
         expect(len(self.distortion) in (0, 5), "distortion", "k1, k2, p1, p2, k3", list(self.distortion))

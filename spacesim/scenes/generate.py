@@ -70,9 +70,8 @@ def generate(
                     progress(done, total, name)
         points, colors = surface_points(sweep.renderer, config.quality.points, config.seed)
         listed = _listed(sweep.train), _listed(sweep.test)
-        dataset = writer.finish(*listed, points, colors, sweep.scene.mesh, config.camera.distortion)
-        write_overview(dataset.root, dataset)
-    return dataset
+        lens = config.camera.distortion
+        return writer.finish(*listed, points, colors, sweep.scene.mesh, lens, lambda d: write_overview(d.root, d))
 
 
 def _open(root: Path, described: dict[str, Any], resume: bool, sweep: "_Sweep") -> DatasetWriter:

@@ -13,9 +13,14 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import read_bytes
+from spacesim.memory import check_memory
 from spacesim.scenes.gltfsurface import UV_SET, Surfaces
 from spacesim.scenes.meshpart import RawPart
 from spacesim.scenes.meshtexture import LARGEST_FILE, Folder, Notes, embedded
+
+LARGEST_IMPLIED = 1 << 24  #: bytes of an accessor without a buffer view, all zeros but for what is sparse; chosen
+A_CORNER = 200  #: bytes of memory that a vertex, or a corner of a face, takes while it is read; 140 were seen
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -30,11 +35,14 @@ def read_gltf(path: Path, notes: Notes) -> list[RawPart]:
     file.check(notes)
     surfaces = Surfaces(document, file.view, file.folder, notes)
     parts = []
+    corners = 0
     for node, name, transform in _placed_nodes(document):
         mesh = document["meshes"][_index(node["mesh"])]
         for primitive in mesh["primitives"]:
             part = _part(file, surfaces, primitive, transform, notes)
             if part is not None:
+                corners += len(part.vertices) + part.faces.size  # nodes may place one mesh any number of times
+                check_memory(A_CORNER * corners, f"{path}: its mesh")
                 own = name or str(mesh.get("name", ""))
                 several = len(mesh["primitives"]) > 1 and part.surface is not None
                 parts.append(part.named(f"{own}_{part.surface.name}" if several and part.surface else own))
@@ -43,7 +51,7 @@ def read_gltf(path: Path, notes: Notes) -> list[RawPart]:
 
 def _document(path: Path) -> tuple[dict[str, Any], bytes | None]:
     """(JSON document, binary chunk or None) of a glb (4.4) or gltf file."""
-    data = path.read_bytes()
+    data = read_bytes(path)
     body = None
     text = data
     if path.suffix.lower() == ".glb":
@@ -137,8 +145,9 @@ class _File:
         if width not in widths:
             raise InputError(f"accessor {index}: expected {widths} components, found {str(entry['type'])[:20]}")
         count = _index(entry["count"])
-        if count * width * dtype.itemsize > LARGEST_FILE:
-            raise InputError(f"accessor {index}: expected at most {LARGEST_FILE:,} bytes, found {count:,} elements")
+        most = LARGEST_FILE if "bufferView" in entry else LARGEST_IMPLIED
+        if count * width * dtype.itemsize > most:
+            raise InputError(f"accessor {index}: expected at most {most:,} bytes, found {count:,} elements")
         if "bufferView" in entry:
             stride = _index(self.document["bufferViews"][entry["bufferView"]].get("byteStride", 0))
             data = self.view(entry["bufferView"])

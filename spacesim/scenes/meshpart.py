@@ -7,9 +7,9 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from spacesim.data.mesh import FARTHEST
 from spacesim.scenes.meshtexture import Notes, Surface
 
-FARTHEST = 1e9  #: metres; vertices beyond it are taken for damage, chosen (the Moon is at 3.8e8)
 ABSENT = "faces that name vertices which are not there are dropped"
 FLAT = math.radians(0.5)  #: normals of vertices this near to their faces' are theirs, chosen
 MOST_ANGLES = 20_000_000  #: solid angles worth computing to tell cavities from inverted surfaces, chosen

@@ -3,7 +3,6 @@
 import io
 import math
 import re
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,9 @@ import numpy as np
 import trimesh
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import read_bytes
 from spacesim.data.images import linear_from_srgb
+from spacesim.data.mesh import check_promise
 from spacesim.scenes.materials import Color
 from spacesim.scenes.meshpart import ABSENT, RawPart
 from spacesim.scenes.meshtexture import NORMALS, Folder, Notes, Surface, check_picture, decoded, unit
@@ -22,8 +23,8 @@ _UNUSED = ("ke", "map_ke", "map_ks", "map_ka", "map_bump", "bump", "map_d", "dis
 def read_table(path: Path, notes: Notes) -> list[RawPart]:
     """The triangles of an obj, stl, ply or off file. Raises InputError, or whatever trimesh raises on damaged data."""
     kind = path.suffix.lower().lstrip(".")
-    data = path.read_bytes()
-    _check_promise(kind, data)
+    data = read_bytes(path)
+    check_promise(kind, data)
     smooth = (kind == "obj" and b"\nvn " in data) or (kind == "ply" and b" nx" in data[: data.find(b"end_header")])
     if not data.isascii():
         data = _as_utf8(kind, data)
@@ -88,27 +89,6 @@ class _Files(trimesh.resolvers.Resolver):
     def namespaced(self, namespace: str) -> "_Files":
         """Folders below are reached by their relative names."""
         return self
-
-
-def _check_promise(kind: str, data: bytes) -> None:
-    """Raises InputError where a header promises more than the file holds, before anyone makes room for it."""
-    if kind == "stl" and len(data) >= 84 and not (data[:5] == b"solid" and b"facet" in data[:1024]):
-        count = struct.unpack_from("<I", data, 80)[0]
-        if 84 + 50 * count != len(data):
-            raise InputError(
-                f"expected {84 + 50 * count:,} bytes for the {count:,} faces that its header promises, "
-                f"found {len(data):,}"
-            )
-    if kind == "ply":
-        head, end, body = data.partition(b"end_header")
-        if not data.startswith(b"ply") or not end:
-            raise InputError('expected a ply file, from "ply" to "end_header", found something else')
-        for element, count in re.findall(rb"element\s+(\S+)\s+(\d+)", head):
-            if int(count) > len(body):
-                raise InputError(
-                    f"expected {int(count):,} elements {element.decode('ascii', 'replace')}, as its header promises, "
-                    f"found {len(body):,} bytes"
-                )
 
 
 def _as_utf8(kind: str, data: bytes) -> bytes:

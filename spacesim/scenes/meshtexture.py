@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import read_bytes
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.scenes.materials import SMOOTHEST, WHITEST, Color, Material, lambertian, material, principled
 
@@ -83,19 +84,12 @@ class Folder:
                 if relative.is_absolute() or not target.is_relative_to(self.root):
                     raise InputError(f"{uri[:80]!r} lies outside of the mesh's folder")
                 if target.is_file():
-                    return _bytes_of(target)
+                    return read_bytes(target, "a file", LARGEST_FILE)
             except (OSError, ValueError, RuntimeError) as error:  # a name with NUL, a loop of links, no permission
                 if isinstance(error, InputError):
                     raise
                 raise InputError(f"{uri[:80]!r} cannot be read ({type(error).__name__})") from None
         raise InputError(f"{uri[:80]!r} is not there")
-
-
-def _bytes_of(path: Path) -> bytes:
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise InputError(f"{path.name!r} has {size:,} bytes, expected at most {LARGEST_FILE:,}")
-    return path.read_bytes()
 
 
 def embedded(uri: str) -> bytes:

@@ -35,6 +35,16 @@ sequences"): unsigned overflow keeps the fraction."""
 _DIRECTIONS = fibonacci_sphere(64)
 
 
+A_PIXEL, A_SAMPLE = 420, 16
+"""Bytes that a pixel, and a sample in flight, take at most on the backend: 410 a pixel were seen, labels included."""
+
+
+def _check_memory(camera: Camera, spp: int) -> None:
+    pixels = camera.width * camera.height
+    needed = A_PIXEL * pixels + A_SAMPLE * min(spp * pixels, MAX_WAVEFRONT)
+    backend.check_free_memory(needed, f"path tracing {camera.width} x {camera.height} pixels")
+
+
 class Renderer:
     """A scene loaded once, from which frames are rendered under any Sun.
 
@@ -56,6 +66,7 @@ class Renderer:
     def render(self, camera: Camera, sun: Sun, seed: Sequence[int], spp: int | None = None) -> Truth:
         """What `camera` sees under `sun` by `spp` samples a pixel; `seed` makes the noise."""
         spp = spp or self.spp
+        _check_memory(camera, spp)
         self._loaded.point(sun)
         sunlight = self._launched(self._loaded.sunlit, camera, seed, spp)
         earthlit = self._loaded.earthlit
@@ -69,6 +80,7 @@ class Renderer:
 
     def radiance(self, camera: Camera, sun: Sun, seed: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """(radiance [H, W, 3] from all sources, alpha [H, W]) of what `render` returns, without the labels."""
+        _check_memory(camera, self.spp)
         self._loaded.point(sun)
         radiance, alpha = _means(self._launched(self._loaded.sunlit, camera, seed, self.spp), camera, self.spp)
         if self._loaded.earthlit is not None:

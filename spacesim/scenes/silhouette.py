@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 
 from spacesim import backend
+from spacesim.data.errors import InputError
 from spacesim.data.exporters import Silhouette, Target
 from spacesim.data.exporters.bop import box_of
 from spacesim.data.geometry import Array
+from spacesim.data.mesh import drawable
 from spacesim.data.records import Camera
 
 
@@ -25,12 +27,16 @@ def outline(targets: Sequence[Target]) -> Callable[[Camera], list[Silhouette]]:
 
 
 def _load(target: Target) -> Any:
+    placed = target.vertices @ target.world_from_object[:3, :3].T + target.world_from_object[:3, 3]
+    world = placed.astype(np.float32)
+    faces = drawable(world.astype(np.float64), target.faces)
+    if len(faces) == 0:
+        raise InputError(f"object {target.id}: expected a mesh with an area, found none that single precision can tell")
     mi = backend.mitsuba()
-    mesh = mi.Mesh("target", len(target.vertices), len(target.faces))
+    mesh = mi.Mesh("target", len(world), len(faces))
     parameters = mi.traverse(mesh)
-    world = target.vertices @ target.world_from_object[:3, :3].T + target.world_from_object[:3, 3]
-    parameters["vertex_positions"] = mi.Float(np.asarray(world, np.float32).ravel())
-    parameters["faces"] = mi.UInt32(np.asarray(target.faces, np.uint32).ravel())
+    parameters["vertex_positions"] = mi.Float(world.ravel())
+    parameters["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
     parameters.update()
     return mi.load_dict({"type": "scene", "mesh": mesh})
 

@@ -58,6 +58,8 @@ def make_in_processes(job: Job, shots: Sequence[Shot], count: int) -> Iterator[s
 
     Raises what a process raises, and WorkError where processes die over the same frames again and again.
     """
+    if not shots:
+        return
     size = max(1, min(MOST_FRAMES, len(shots) // (4 * count)))
     tasks = deque(_Task(list(shots[i : i + size])) for i in range(0, len(shots), size))
     count = min(count, len(tasks))

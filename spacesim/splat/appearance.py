@@ -6,10 +6,11 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
+from spacesim.data.errors import check_ranges
 from spacesim.splat.cameras import Projection
 from spacesim.splat.encoding import Encoding
 from spacesim.splat.lanes import Lanes
-from spacesim.splat.mlp import MlpShape
+from spacesim.splat.mlp import MOST_FEATURES, MOST_LAYERS, MOST_WIDTH, MlpShape
 from spacesim.splat.surface import shortest_axis
 
 LOBES = (8, 32, 128, 512)  #: exponents of n . h, from satin to mirror, chosen: each is the one before to the fourth
@@ -32,6 +33,9 @@ class FieldConfig:
     sun: Encoding = field(default_factory=Encoding)
     view: Encoding = field(default_factory=Encoding)
     surface: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(self, features=(0, MOST_FEATURES), width=(1, MOST_WIDTH), layers=(1, MOST_LAYERS))
 
     @property
     def stored(self) -> int:

@@ -178,7 +178,10 @@ class LightModel:
     @staticmethod
     def from_tensors(config: LightConfig, tensors: Mapping[str, np.ndarray]) -> "LightModel":
         """The inverse of `tensors`. Raises KeyError where one is missing, ValueError where its length does not fit."""
-        *centre, scale, distance, radius = tensors["light.frame"].tolist()
+        numbers = np.asarray(tensors["light.frame"], np.float64)
+        if numbers.shape != (6,) or not np.isfinite(numbers).all() or numbers[3:].min() <= 0:
+            raise ValueError("light.frame: expected a centre and three lengths above 0, found others")
+        *centre, scale, distance, radius = numbers.tolist()
         model = LightModel.initial(config, TrainingFrame(np.array(centre), scale, distance, radius), 0)
         for i, like in enumerate(model.weights):
             weight = tensors[f"light.weight.{i:02d}"]

@@ -13,6 +13,9 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.splat.lanes import aligned
 
+MOST_FEATURES, MOST_WIDTH, MOST_LAYERS = 1024, 4096, 32
+"""Of a network: numbers a Gaussian, units of a layer, layers; chosen, far above any that pays."""
+
 
 @dataclass(frozen=True)
 class MlpShape:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import write_bytes
+from spacesim.data.files import read_bytes, write_bytes
 from spacesim.splat.gaussians import Gaussians
 
 
@@ -43,10 +43,7 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
 
 def read_ply(path: Path) -> Gaussians:
     """The inverse of `write_ply`. Raises InputError where the file has another layout."""
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    content = read_bytes(path, "a PLY of Gaussians")
     header, mark, body = content.partition(b"end_header\n")
     lines = header.decode("ascii", errors="replace").split("\n")
     names = [line.split()[-1] for line in lines if line.startswith("property float ")]

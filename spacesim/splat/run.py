@@ -6,8 +6,8 @@ RUN/model.safetensors  the trained Gaussians: there once training is done
 RUN/training.json      history, time, backend, versions
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,9 @@ from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
+from spacesim.data.structure import Rules, read_record, structure
+from spacesim.data.toml import Document
+from spacesim.memory import check_memory
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.light import LightModel
 from spacesim.splat.project import Projection
@@ -25,8 +28,11 @@ from spacesim.splat.render import RenderOutput, render
 from spacesim.splat.shading import LARGEST_EV
 from spacesim.splat.supersample import supersampled
 from spacesim.splat.tone import developed
-from spacesim.splat.train.checkpoint import read_tensors
+from spacesim.splat.train.checkpoint import HistoryEntry, read_tensors
 from spacesim.splat.train.config import TrainConfig
+
+A_PIXEL = {"cuda": 80, "llvm": 225}
+"""Bytes of main memory that a predicted pixel takes at most, until it is written: 160 and then 65 were seen on LLVM."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +47,34 @@ class Prediction:
     depth: np.ndarray
     visibility: np.ndarray | None
     normal: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """What a run says of its data. path: of the folder;  digest: see `training_digest`, of runs that tell it"""
+
+    path: str
+    digest: str | None = None
+    train_frames: int | None = None
+    test_frames: int | None = None
+
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """What training.json says: how a run came to be. seconds: of training, and the part of it that refinement took"""
+
+    history: tuple[HistoryEntry, ...]
+    seconds: float
+    gaussians: int
+    backend: str
+    refinement_seconds: float = 0.0
+    device: str | None = None
+    command: str | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.history:
+            raise InputError("history: expected at least one entry, found none")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +126,7 @@ class Run:
         colours are linear; by default that of its training pictures. Raises InputError where another method is not told
         the Sun, and for an exposure of a model whose colours are sRGB values."""
         more = stops(self.curve, exposure, str(self.path))
+        check_picture(camera)
         names = ("alpha", "depth", *(("normal",) if normals else ()))
         if self.light is None:
             plain = partial(render, self.model, outputs=(*names, "colour"), antialiased=self.antialiased)
@@ -110,6 +145,12 @@ class Run:
         if self.curve:
             rgb = developed(rgb, self.curve[0], more)
         return _prediction(output, rgb, visibility, normals)
+
+
+def check_picture(camera: Camera) -> None:
+    """Raise MemoryError, before it is drawn, where a camera's picture does not fit into memory."""
+    needed = A_PIXEL[backend.select()] * camera.width * camera.height
+    check_memory(needed, f"a picture of {camera.width} x {camera.height} pixels")
 
 
 def stops(curve: tuple[str, float] | None, exposure: float | None, found: str) -> float:
@@ -152,13 +193,10 @@ def load_run(path: Path) -> Run:
         raise InputError(f"{path}: expected a run of `spacesim train`, found no config.json in it")
     if not model_path.exists():
         raise InputError(f"{path}: training has not ended; complete it with `spacesim train ... --resume`")
-    config, training = _read_keys(path / "config.json", "data"), _read_keys(path / "training.json", "history")
+    known, data = read_config(path / "config.json")
+    _, training = read_record(path / "training.json", TrainingRecord)
+    config, light_config = {**known.to_json(), "data": data}, known.light
     tensors, _ = read_tensors(model_path)
-    try:
-        light_config = TrainConfig.from_json(config).light
-    except InputError as error:
-        expected = f"{path / 'config.json'}: expected a configuration of this version"
-        raise InputError(f"{expected}, found another ({error})") from None
     try:
         model = Gaussians.from_numpy(tensors)
         light = LightModel.from_tensors(light_config, tensors) if light_config else None
@@ -172,8 +210,10 @@ def load_run(path: Path) -> Run:
     return Run(path, config, training, model, model_path.stat().st_size, light)
 
 
-def _read_keys(path: Path, key: str) -> dict[str, Any]:
+def read_config(path: Path) -> tuple[TrainConfig, dict[str, Any]]:
+    """(how a run is trained, what on: as `TrainingData`) by its config.json. Raises InputError where it is broken."""
     values = read_json(path)
-    if not isinstance(values, dict) or key not in values:
-        raise InputError(f"{path}: expected an object with the key {key}, found none")
-    return values
+    if not isinstance(values, dict) or "data" not in values:
+        raise InputError(f"{path}: expected an object with the key data, found none")
+    data = structure(TrainingData, Document(f"{path}: data", values["data"], {}), Rules())
+    return TrainConfig.from_json(values, str(path)), asdict(data)

@@ -17,7 +17,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, write_bytes
 from spacesim.data.geometry import direction_from_angles
 from spacesim.data.images import write_png
-from spacesim.data.records import Camera, Sun
+from spacesim.data.records import Camera, Sun, check_size
 from spacesim.data.sheet import DARK_PAGE, DETAIL, LEAST, TEXT, Tile, contact_sheet, fitted, font
 from spacesim.data.tone import as_bytes
 from spacesim.splat.picture import shadow_colours
@@ -77,6 +77,7 @@ def resized(camera: Camera, size: int | tuple[int, int]) -> Camera:
     width, height = sides
     if not isinstance(size, tuple):
         width, height = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
+    check_size(width, height, "--size")
     cx = 0.5 * width + scale * (camera.cx - 0.5 * camera.width)
     cy = 0.5 * height + scale * (camera.cy - 0.5 * camera.height)
     return Camera(camera.world_from_camera, width, height, scale * camera.fx, scale * camera.fy, cx, cy)

@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError
 from spacesim.data.exporters import Target, targets_of, write_bop, write_speedplus
+from spacesim.data.exporters.objects import opaque
 from spacesim.data.exporters.speedplus import _label
 from spacesim.data.files import read_json, write_json
-from spacesim.data.images import read_exr
+from spacesim.data.images import read_exr, read_png
 from spacesim.data.records import Camera, Frame
 from spacesim.data.store import load_truth, read_dataset
 from spacesim.scenes import generate, read_scene
@@ -98,7 +99,7 @@ def test_speedplus_pose_by_hand():
     world_from_camera[:3, 3] = [-10, 0, 0]
     camera = Camera(world_from_camera, 64, 64, 100.0, 100.0, 32.0, 32.0)
     target = Target(1, "any", np.eye(4), np.zeros((1, 3)), np.zeros((0, 3), int))
-    label = _label(Frame("images/a.png", camera), target)
+    label = _label("a.png", Frame("images/a.png", camera), target)
     quaternion = np.array(label["q_vbs2tango_true"])
     np.testing.assert_allclose(quaternion * np.sign(quaternion[0]), [0.5, 0.5, -0.5, 0.5], atol=1e-12)
     np.testing.assert_allclose(label["r_Vo2To_vbs_true"], [0, 0, 10], atol=1e-12)
@@ -301,3 +302,28 @@ def test_verify_names_what_is_broken(spacesim, data, tmp_path):
     assert all(str(victim) in "\n".join(done.errors[:2]) for victim in victims)
     assert "2 faulty files" in done.errors[2]
     assert spacesim("verify", tmp_path / "none").is_refusal(tmp_path / "none")
+
+
+def test_pictures_of_one_name_in_two_folders_stay_two(data, tmp_path):
+    """As Blender's scenes have them: train/r_0 and test/r_0. Labels still name the pictures that they are of."""
+    root = Path(shutil.copytree(data, tmp_path / "data"))
+    meta = json.loads((root / "transforms.json").read_text())
+    for name in ("train_filenames", "test_filenames"):
+        split = name.split("_")[0]
+        (root / split).mkdir()
+        for number, old in enumerate(meta[name]):
+            new = f"{split}/r_{number}.png"
+            (root / old).rename(root / new)
+            meta[name][number] = new
+            next(frame for frame in meta["frames"] if frame["file_path"] == old)["file_path"] = new
+    (root / "transforms.json").write_text(json.dumps(meta))
+    dataset = read_dataset(root)
+    write_speedplus(dataset, tmp_path / "plus")
+    written = sorted(path.name for path in (tmp_path / "plus/synthetic/images").iterdir())
+    assert len(written) == len(dataset.frames)
+    for split, frames in (("train", dataset.train), ("validation", dataset.test)):
+        labels = json.loads((tmp_path / f"plus/synthetic/{split}.json").read_text())
+        for label, frame in zip(labels, frames, strict=True):
+            expected = opaque(dataset, frame)
+            assert np.array_equal(read_png(tmp_path / "plus/synthetic/images" / label["filename"]), expected)
+    assert written[0] == "test_r_0.png"

@@ -1,9 +1,13 @@
 """PNG and EXR in and out, colour, and what a frame shows."""
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
+from spacesim import memory
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import (
     linear_from_srgb,
@@ -261,3 +265,56 @@ def test_distorted_frames_are_undistorted_on_loading(tmp_path):
     expected = undistort(plain, camera, (-0.1, 0.0, 0.0, 0.0, 0.0))
     np.testing.assert_array_equal(distorted.rgb, expected.rgb)
     assert np.abs(distorted.rgb - plain.rgb).max() > 0.1
+
+
+def png_of(width: int, height: int) -> bytes:
+    """A picture of zeros, [H, W] grey, in few bytes."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    packer = zlib.compressobj(9)
+    row = bytes(width + 1)
+    body = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+
+
+@pytest.mark.filterwarnings("ignore")  # Pillow's
+def test_small_files_of_large_pictures_are_refused_before_they_are_decoded(tmp_path, monkeypatch):
+    (tmp_path / "a.png").write_bytes(png_of(13300, 13300))
+    with pytest.raises(InputError, match="at most 67,108,864 pixels, 16,384 a side, found 13300 x 13300"):
+        read_png(tmp_path / "a.png")
+    (tmp_path / "b.png").write_bytes(png_of(3000, 2000))
+    assert read_png(tmp_path / "b.png").shape == (2000, 3000)
+    monkeypatch.setattr(memory, "main_memory", lambda: 300_000_000)
+    with pytest.raises(MemoryError, match=r"b\.png: a picture of 3000 x 2000 pixels needs about 0\.384 GB"):
+        read_png(tmp_path / "b.png")
+
+
+def test_every_bit_of_a_png_counts(tmp_path):
+    path = tmp_path / "a.png"
+    write_png(path, np.random.default_rng(0).integers(0, 255, (5, 4, 3), np.uint8))
+    honest = path.read_bytes()
+    for bit in range(8 * len(honest)):
+        damaged = bytearray(honest)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match=r"a\.png: expected"):
+            read_png(path)
+
+
+@pytest.mark.filterwarnings("ignore")  # Pillow's
+@pytest.mark.parametrize("suffix", ["avif", "webp", "tif", "jpg"])
+def test_damaged_pictures_of_other_formats(tmp_path, suffix):
+    path = tmp_path / f"a.{suffix}"
+    PillowImage.fromarray(np.random.default_rng(0).integers(0, 255, (16, 16, 3), np.uint8)).save(path)
+    honest, refused = path.read_bytes(), 0
+    assert read_png(path).shape == (16, 16, 3)
+    for place in range(0, len(honest), max(1, len(honest) // 60)):
+        path.write_bytes(honest[:place] + b"\xff" * 9 + honest[place + 9 :])
+        try:
+            read_png(path)
+        except InputError:
+            refused += 1
+    assert refused > 5

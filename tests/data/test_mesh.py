@@ -160,3 +160,42 @@ def test_a_mesh_of_unknown_kind_is_not_written(tmp_path):
         with pytest.raises(InputError, match=r"expected a file name that ends in .ply"):
             write_mesh(tmp_path / name, np.zeros((3, 3)), np.array([[0, 1, 2]]))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["one place", "one line", "far away", "not finite"])
+def test_faces_without_an_area_are_no_mesh(tmp_path, kind):
+    """However many: a tracer's tree over twenty thousand faces in one place took 13 GB."""
+    vertices = np.random.default_rng(0).normal(size=(300, 3))
+    if kind == "one place":
+        vertices[:] = 1.25
+    elif kind == "one line":
+        vertices = vertices[:, :1] * np.array([1.0, 2.0, -4.0])
+    else:
+        vertices = vertices * (1e30 if kind == "far away" else np.nan)
+    faces = np.arange(300).reshape(-1, 3)
+    write_mesh(tmp_path / "a.ply", vertices, faces)
+    with pytest.raises(InputError, match=r"a\.ply: expected a mesh, found no face with an area and corners within"):
+        read_mesh(tmp_path / "a.ply")
+    write_mesh(tmp_path / "b.ply", np.concatenate([vertices, np.eye(3)]), np.concatenate([faces, [[300, 301, 302]]]))
+    assert len(read_mesh(tmp_path / "b.ply")[1]) == 1
+
+
+def test_textures_that_a_ply_names_are_not_looked_for(tmp_path, caplog):
+    write_mesh(tmp_path / "a.ply", np.eye(3), np.array([[0, 1, 2]]))
+    content = (tmp_path / "a.ply").read_bytes()
+    named = content.replace(b"element vertex", b"comment TextureFile nope.png\nelement vertex", 1)
+    (tmp_path / "a.ply").write_bytes(named)
+    assert len(read_mesh(tmp_path / "a.ply")[1]) == 1
+    assert caplog.text == ""
+
+
+def test_headers_that_promise_more_than_there_is(tmp_path):
+    write_mesh(tmp_path / "a.ply", np.eye(3), np.array([[0, 1, 2]]))
+    content = (tmp_path / "a.ply").read_bytes()
+    for number in (b"2", b"4", b"4000000000"):
+        (tmp_path / "a.ply").write_bytes(content.replace(b"element vertex 3", b"element vertex " + number))
+        with pytest.raises(InputError, match=r"a\.ply: expected a mesh"):
+            read_mesh(tmp_path / "a.ply")
+    (tmp_path / "a.xyz").write_bytes(content)
+    with pytest.raises(InputError, match=r"expected a mesh in \.ply, \.obj, \.glb, \.stl, \.off, found '\.xyz'"):
+        read_mesh(tmp_path / "a.xyz")

@@ -100,7 +100,7 @@ def root(tmp_path):
 
 def test_layout(root):
     expected = {f"{folder}/{name}.{suffix}" for folder, suffix in FOLDERS.items() for name in TRAIN + TEST}
-    assert set(contents(root)) == expected | {"transforms.json", "scene.json", "points.ply", "mesh.ply"}
+    assert set(contents(root)) == expected | {"transforms.json", "scene.json", "points.ply", "mesh.ply", "SHA256SUMS"}
     assert json.loads((root / "scene.json").read_text()) == SCENE
     assert verify_dataset(root) == []
 

@@ -170,7 +170,7 @@ NAN_POSE = [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (set_pose([[1, 2], [3]]), "images/a.png: expected a transform_matrix"),
         (set_pose("identity"), "images/a.png: expected a transform_matrix"),
         (set_pose(np.diag([2, 2, 2, 1]).tolist()), "images/a.png: world_from_camera: expected a rotation"),
-        (lambda m: m.update(fl_x=-1), "images/a.png: camera: expected positive"),
+        (lambda m: m.update(fl_x=-1), "images/a.png: camera: expected focal lengths above 0"),
         (lambda m: m.update(fl_x="wide"), "expected a finite number as fl_x, found 'wide'"),
         (lambda m: m.update(cx=float("inf")), "expected a finite number as cx, found inf"),
         (lambda m: (m.pop("fl_x"), m.pop("fl_y")), "expected fl_x or camera_angle_x"),

@@ -382,7 +382,7 @@ def test_what_is_no_evaluation(folder, tmp_path):
         write_report([tmp_path / "nothing"], out)
     with pytest.raises(InputError, match="schema 1"):
         write_report([another(folder, "newer", lambda metrics: metrics.update(schema=2))], out)
-    with pytest.raises(InputError, match="expected the key model"):
+    with pytest.raises(InputError, match="model: expected a table, found none"):
         write_report([another(folder, "lacking", lambda metrics: metrics.pop("model"))], out)
     shutil.rmtree(folder / "frames")
     with pytest.raises(InputError, match="expected a picture"):

@@ -38,6 +38,7 @@ def test_dataset_is_whole(made):
     assert verify_dataset(made) == []
     files = set(contents(made))
     top = {"transforms.json", "scene.json", "mesh.ply", "points.ply", "contact_sheet.png", "camera_density.png"}
+    top |= {"SHA256SUMS"}
     assert top | {"gt/train_00003.exr", "id/test_00001.png"} <= files
     assert len(files) == len(top) + 6 * 6
 

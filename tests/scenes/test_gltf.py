@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from spacesim import backend
+from spacesim import backend, memory
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb
 from spacesim.scenes.materials import principled
@@ -482,3 +482,32 @@ def test_normals_of_flat_faces_are_not_kept(tmp_path):
     square["attributes"]["NORMAL"] = document.add(np.tile([0, 0, 1], (4, 1)).astype("<f4"))
     craft, _ = read_mesh(document.mesh(square).write(tmp_path / "plate.gltf"), up="z")
     assert craft.parts[0].normals is None
+
+
+def test_an_accessor_without_data_is_no_larger_than_can_be_meant(tmp_path):
+    document = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"componentType": 5126, "count": 60_000_000, "type": "VEC3"}],
+    }
+    path = tmp_path / "zeros.gltf"
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match="accessor 0: expected at most 16,777,216 bytes, found 60,000,000 elements"):
+        read_mesh(path)
+
+
+def test_a_mesh_that_is_placed_too_often_is_refused_before_it_is_made(tmp_path, monkeypatch):
+    document = Document().mesh({"attributes": {"POSITION": 0}})
+    document.add(np.tile(SQUARE, (30_000, 1))[:90_000])
+    document.json["nodes"] = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(1000)]
+    document.json["scenes"] = [{"nodes": list(range(1000))}]
+    document.json["buffers"] = [
+        {"byteLength": len(document.data), "uri": "data:;base64," + base64.b64encode(document.data).decode()}
+    ]
+    path = tmp_path / "many.gltf"
+    path.write_text(json.dumps(document.json))
+    monkeypatch.setattr(memory, "main_memory", lambda: 400_000_000)
+    with pytest.raises(InputError, match="expected a mesh that fits into memory"):
+        read_mesh(path)

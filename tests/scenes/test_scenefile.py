@@ -266,14 +266,14 @@ def test_options():
         ("teapot", r"^scene: expected one of boxsat, .* or a mesh file, found 'teapot'$"),
         ("", r"^scene: expected one of boxsat"),
         ("folder", r"found the folder .*folder.$"),
-        ("none.toml", r"none.toml: expected a scene file, found none that can be read \(No such file or directory\)$"),
-        ("folder.toml", r"folder.toml: expected a scene file, .* \(Is a directory\)$"),
+        ("none.toml", r"none.toml: expected a scene file, found none$"),
+        ("folder.toml", r"folder.toml: expected a scene file, found a folder$"),
         ("none.glb", r"found no file 'none.glb'$"),
         ("a/b", r"found no file 'a/b'$"),
         ("long" * 999, r"^scene: expected"),
-        ("long" * 999 + ".toml", r"expected a scene file, found none that can be read"),
+        ("long" * 999 + ".toml", r"expected a scene file, found one that cannot be read"),
         ("a\0b", r"^scene: expected"),
-        ("a\0b.toml", r"expected a scene file, found none that can be read"),
+        ("a\0b.toml", r"expected a scene file, found one that cannot be read"),
     ],
 )
 def test_no_such_scene(source, said, tmp_path, monkeypatch):
@@ -315,7 +315,10 @@ BOXSAT = '[[objects]]\nspacecraft = "boxsat"\n'
             ", line 5: rig.random_suns: expected 1 suns and 0 test_suns, as every frame has its own, "
             "found 2 suns and 0 test_suns",
         ),
-        (BOXSAT + "[camera]\nresolution = 20000", "expected at most 268,435,456 pixels, found 20000 x 20000"),
+        (
+            BOXSAT + "[camera]\nresolution = 20000",
+            "67,108,864 pixels, 16,384 a side, found 20000 x 20000",
+        ),
         (BOXSAT + "scale = 1e300", ", line 3: objects[0].scale: expected a factor from 1e-09 to 1e+09, found 1e+300"),
         (BOXSAT + "position = [1e30, 0, 0]", ", line 3: objects[0].position: expected metres from -1e+09 to 1e+09"),
         (BOXSAT + "units = 'mm'", ", line 3: objects[0].units: expected beside a mesh only, found 'mm'"),
@@ -406,7 +409,7 @@ def test_a_huge_file_is_not_read(tmp_path):
         file.truncate(10 << 30)
     with pytest.raises(InputError) as refused:
         read_scene(path)
-    assert str(refused.value) == f"{path}: expected a scene file of at most 1 MiB, found 10737418240 bytes"
+    assert str(refused.value) == f"{path}: expected a scene file of at most 1,048,576 bytes, found 10,737,418,240"
 
 
 @pytest.mark.parametrize("part", ["a", "'a'", '"a"'])

@@ -177,3 +177,15 @@ def test_ray_that_cannot_be_had_is_told_before_anything_is_written(tmp_path, mon
     with pytest.raises(InputError, match=r"pip install 'spacesim\[cluster\]'"):
         generate(CONFIG, tmp_path / "data", ray="auto")
     assert not list(tmp_path.iterdir())
+
+
+def test_processes_that_have_nothing_left_to_do(tmp_path):
+    """All frames are there, transforms.json is not: what a kill at the end leaves."""
+    config = read_scene("boxsat", **{**OPTIONS, "views": 4})
+    root = tmp_path / "data"
+    generate(config, root, workers=2)
+    first = contents(root)
+    generate(config, root, resume=True, workers=2)
+    (root / "transforms.json").unlink()
+    generate(config, root, resume=True, workers=2)
+    assert contents(root) == first

@@ -27,6 +27,7 @@ from spacesim.splat.train.initialise import far_remark, focus_point, initial_gau
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
+from spacesim.splat.train.warm_start import WarmStartConfig
 
 REFINEMENT = DefaultStrategyConfig(
     refine_start=10, refine_every=20, pause_after_reset=0, reset_every=4, refine_stop=150, screen_size_stop=0
@@ -407,3 +408,33 @@ def test_training_on_several_views_a_step_learns_and_resumes(small_dataset, tmp_
     for name, values in whole.gaussians.to_numpy().items():
         np.testing.assert_array_equal(resumed.gaussians.to_numpy()[name], values, err_msg=name)
     assert psnr(whole.gaussians, small_dataset) > psnr(Trainer(small_dataset, config).gaussians, small_dataset) + 1
+
+
+@pytest.mark.parametrize("what", ["all", "means", "strategy.seen", "adam.first.00", "no statistics"])
+def test_a_checkpoint_without_gaussians_is_refused(small_dataset, tmp_path, what):
+    """Arrays of no length, as a file that was made by hand may have."""
+    config = replace(CONFIG, warm_start=WarmStartConfig(steps=100, decay=40, conservative=10))
+    trainer = Trainer(small_dataset, config)
+    trainer.step()
+    trainer.save(tmp_path / "c.safetensors")
+    tensors, header = read_tensors(tmp_path / "c.safetensors")
+    kept = {key: value for key, value in header.items() if key != "format"}
+    names = [name for name in tensors if what == "all" or name == what or (what[:2] == "no" and "strategy" in name)]
+    assert names
+    tensors |= {name: tensors[name][:0] for name in names}
+    write_tensors(tmp_path / "c.safetensors", tensors, kept)
+    with pytest.raises(InputError, match=r"c\.safetensors: expected a checkpoint of training"):
+        Trainer(small_dataset, config).restore(tmp_path / "c.safetensors")
+
+
+@pytest.mark.parametrize(
+    "header",
+    [{"iteration": -1}, {"iteration": 10**30}, {"adam_steps": "3"}, {"history": {}}, {"history": [{"iteration": 1}]}],
+)
+def test_a_checkpoint_with_another_header_is_refused(small_dataset, tmp_path, header):
+    trainer = Trainer(small_dataset, CONFIG)
+    trainer.save(tmp_path / "c.safetensors")
+    tensors, told = read_tensors(tmp_path / "c.safetensors")
+    write_tensors(tmp_path / "c.safetensors", tensors, {**{k: v for k, v in told.items() if k != "format"}, **header})
+    with pytest.raises(InputError, match=r"c\.safetensors: (header: )?[a-z\[\]0-9_.: ]*expected"):
+        Trainer(small_dataset, CONFIG).restore(tmp_path / "c.safetensors")

@@ -9,13 +9,15 @@ datasets the centres of pixels have whole coordinates, so cam_K's principal poin
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
-from scipy.spatial.distance import pdist
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import cdist
 
 from spacesim.data.errors import InputError
 from spacesim.data.exporters.objects import Progress, Target, new_folder, opaque, targets_of
@@ -184,16 +186,19 @@ def _write_models(folder: Path, targets: list[Target], models: list[int]) -> Non
         )
         low, sizes = points.min(axis=0), np.ptp(points, axis=0)
         infos[str(number)] = {
-            "diameter": _diameter(mesh),
+            "diameter": _diameter(points),
             **{f"min_{axis}": float(x) for axis, x in zip("xyz", low, strict=True)},
             **{f"size_{axis}": float(x) for axis, x in zip("xyz", sizes, strict=True)},
         }
     write_json(folder / "models_info.json", infos)
 
 
-def _diameter(mesh: trimesh.Trimesh) -> float:
-    """Largest distance between two vertices, which are corners of the convex hull."""
-    return float(pdist(mesh.convex_hull.vertices).max())
+def _diameter(points: np.ndarray) -> float:
+    """Largest distance between two of points [N, 3], which are corners of their convex hull; of all of them where they
+    lie on a plane or a line."""
+    with suppress(QhullError):
+        points = points[ConvexHull(points).vertices]
+    return max(float(cdist(points[i : i + 1000], points).max()) for i in range(0, len(points), 1000))
 
 
 def _test_targets(infos: dict[str, list[dict[str, Any]]], models: list[int]) -> list[dict[str, int]]:

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -12,6 +11,7 @@ from spacesim.data.errors import InputError, expect
 from spacesim.data.files import holds_files
 from spacesim.data.geometry import Array
 from spacesim.data.images import read_exr, read_png
+from spacesim.data.mesh import check_places, load_trimesh
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.tone import TONES, as_bytes, displayed
 
@@ -42,9 +42,17 @@ def targets_of(dataset: Dataset) -> list[Target]:
         sizes = [(int(count["vertices"]), int(count["faces"])) for count in counts]
         poses = [np.array(item["world_from_object"], np.float64).reshape(4, 4) for item in objects]
         names = [(int(item["id"]), str(item["name"])) for item in objects]
-    except (KeyError, TypeError, ValueError):
+        if not all(np.isfinite(pose).all() and np.linalg.det(pose[:3, :3]) > 0 for pose in poses):
+            raise ValueError
+        if min(min(size) for size in sizes) < 1:
+            raise ValueError
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(f"{path}: expected objects, their poses and shares of mesh.ply, found none") from None
-    mesh = _read_mesh(dataset)
+    source = dataset.root / (dataset.mesh_path or "mesh.ply")
+    mesh = load_trimesh(source)
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise InputError(f"{source}: expected the mesh of the dataset, found points without faces")
+    check_places(mesh.vertices, source)
     if not objects or [sum(size) for size in zip(*sizes, strict=True)] != [len(mesh.vertices), len(mesh.faces)]:
         raise InputError(f"{path}: expected the vertices and faces of mesh.ply, found other numbers of them")
     targets = []
@@ -55,6 +63,8 @@ def targets_of(dataset: Dataset) -> list[Target]:
         rigid[:3, :3] /= scale
         world = np.asarray(mesh.vertices[first_vertex : first_vertex + vertices])
         own = np.asarray(mesh.faces[first_face : first_face + faces]) - first_vertex
+        if own.min() < 0 or own.max() >= vertices or not (np.ptp(world, axis=0) > 0).any():
+            raise InputError(f"{source}: expected a mesh with a size as object {number}, found none")
         targets.append(Target(number, name, rigid, (world - rigid[:3, 3]) @ rigid[:3, :3], own))
         first_vertex, first_face = first_vertex + vertices, first_face + faces
     return targets
@@ -105,11 +115,3 @@ def new_folder(out: Path) -> Path:
     if out.exists() and (not out.is_dir() or holds_files(out)):
         raise InputError(f"{out}: expected a new or empty folder, found a file or files in it")
     return out
-
-
-def _read_mesh(dataset: Dataset) -> Any:
-    path = dataset.root / (dataset.mesh_path or "mesh.ply")
-    try:
-        return trimesh.load(path, process=False)
-    except Exception as error:  # trimesh documents none of what it raises
-        raise InputError(f"{path}: expected the mesh of the dataset, found none that can be read ({error})") from None

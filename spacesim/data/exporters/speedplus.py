@@ -17,6 +17,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.exporters.objects import Progress, Target, chosen, new_folder, opaque, targets_of
 from spacesim.data.files import write_json
 from spacesim.data.geometry import quaternion_from_rotation
+from spacesim.data.identity import frame_names
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame
 
@@ -34,27 +35,25 @@ def write_speedplus(dataset: Dataset, out: Path, wanted: str | None = None, prog
     camera = _camera(dataset.frames)
     out = new_folder(out)
     frames = dataset.frames
-    for number, frame in enumerate(frames, start=1):
-        write_png(out / "synthetic/images" / _filename(frame), opaque(dataset, frame), durable=False)
+    names = [f"{name}.png" for name in frame_names(frames)]
+    for number, (name, frame) in enumerate(zip(names, frames, strict=True), start=1):
+        write_png(out / "synthetic/images" / name, opaque(dataset, frame), durable=False)
         if progress is not None:
             progress(number, len(frames), frame.file_path)
-    write_json(out / "synthetic/train.json", [_label(frame, target) for frame in dataset.train])
-    write_json(out / "synthetic/validation.json", [_label(frame, target) for frame in dataset.test])
+    labels = [_label(name, frame, target) for name, frame in zip(names, frames, strict=True)]
+    write_json(out / "synthetic/train.json", labels[: len(dataset.train)])
+    write_json(out / "synthetic/validation.json", labels[len(dataset.train) :])
     write_json(out / "camera.json", camera)
     return target
 
 
-def _label(frame: Frame, target: Target) -> dict[str, Any]:
+def _label(name: str, frame: Frame, target: Target) -> dict[str, Any]:
     pose = target.camera_from_object(frame.camera)
     return {
-        "filename": _filename(frame),
+        "filename": name,
         "q_vbs2tango_true": quaternion_from_rotation(pose[:3, :3]).tolist(),
         "r_Vo2To_vbs_true": pose[:3, 3].tolist(),
     }
-
-
-def _filename(frame: Frame) -> str:
-    return f"{Path(frame.file_path).stem}.png"
 
 
 def _camera(frames: Sequence[Frame]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from spacesim.splat.compose.members import Ensemble, Member, display_colours
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.render import RenderOutput, render
-from spacesim.splat.run import Prediction, Run, stops
+from spacesim.splat.run import Prediction, Run, check_picture, stops
 from spacesim.splat.shadow.cast import Between, cast_between
 from spacesim.splat.supersample import supersampled
 from spacesim.splat.tone import developed
@@ -159,6 +159,7 @@ class Composition:
     ) -> ComposedPrediction:
         """Render one view. exposure: see `stops`. Raises InputError where the Sun matters and none is told."""
         more = self.stops(exposure)
+        check_picture(camera)
         names = [name for name in OUTPUTS if name not in ("median_depth", "normal")]
         drawn = self.draw(camera, sun, [*names, *(("normal",) if normals else ())])
         visibility = drawn.image("visibility") if "visibility" in drawn.planes else None

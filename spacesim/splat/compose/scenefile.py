@@ -13,7 +13,7 @@ from spacesim.data import toml
 from spacesim.data.errors import InputError
 from spacesim.data.files import write_bytes
 from spacesim.data.geometry import OPENCV_FROM_OPENGL, Array, look_at
-from spacesim.data.records import MOST_PIXELS, Camera, Sun
+from spacesim.data.records import Camera, Sun, check_size
 from spacesim.data.structure import Rules, near, structure
 from spacesim.data.transforms import read_camera, read_dataset
 from spacesim.splat.compose.path import FPS, MOST_FRAMES, ORBIT_FRAMES, Keyframe, Orbit, PosedScene, View
@@ -169,8 +169,8 @@ class CameraEntry(ViewEntry):
             raise InputError(f"{named[1]}: expected one of {', '.join(places)}, found {named[0]} beside it")
         if self.resolution is not None and min(self.resolution) < 1:
             raise InputError(f"resolution: expected at least 1 pixel a side, found {list(self.resolution)}")
-        if self.resolution is not None and self.resolution[0] * self.resolution[1] > MOST_PIXELS:
-            raise InputError(f"resolution: expected at most {MOST_PIXELS} pixels, found {list(self.resolution)}")
+        if self.resolution is not None:
+            check_size(*self.resolution, "resolution")
         if self.file is not None or self.data is not None:
             for key in ("resolution", "principal", "fov_deg", "focal"):
                 if getattr(self, key) is not None:

@@ -5,9 +5,9 @@ from typing import Any
 
 import drjit as dr
 
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, check_ranges
 from spacesim.splat.encoding import Encoding
-from spacesim.splat.mlp import MlpShape
+from spacesim.splat.mlp import MOST_FEATURES, MOST_LAYERS, MOST_WIDTH, MlpShape
 
 POSITIONS = ("light", "world")
 SURE = 0.02  #: a raw occlusion nearer to 0 or 1 counts as this near: the network can still change it (chosen)
@@ -28,6 +28,9 @@ class RefineConfig:
     bias_info: bool = True
 
     def __post_init__(self) -> None:
+        check_ranges(
+            self, features=(0, MOST_FEATURES), width=(1, MOST_WIDTH), layers=(1, MOST_LAYERS), positional=(0, 9)
+        )
         if self.positions not in POSITIONS:
             raise InputError(f"refinement: expected positions in {' or '.join(POSITIONS)}, found {self.positions!r}")
 

@@ -1,9 +1,11 @@
 """How to train: one frozen record and its presets."""
 
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
-from typing import Any, get_args, get_type_hints
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any
 
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, check_ranges
+from spacesim.data.structure import Rules, structure
+from spacesim.data.toml import Document
 from spacesim.splat.appearance import FieldConfig
 from spacesim.splat.encoding import Encoding
 from spacesim.splat.shading import LightConfig
@@ -14,6 +16,7 @@ from spacesim.splat.supersample import MOST_PLACES
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.strategies.mcmc import McmcConfig
 from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig
+from spacesim.splat.train.strategies.strategy import MOST_STEPS
 from spacesim.splat.train.strategies.support_aware import SupportAwareConfig
 from spacesim.splat.train.warm_start import WarmStartConfig
 
@@ -29,6 +32,8 @@ EMITTERS = {"demo": 256, "fast": 256, "fine": 1024}  #: of one bounce of light, 
 MCMC_PENALTY = 1e-2  #: weights of the penalties on opacity and scale of `mcmc` (Kheradmand et al. 2024)
 PRIORS = ("truth", "mesh")
 MOST_VIEWS = 64  #: of a step, chosen: one kernel reads the gradients of all; for 64 two cores compile about 11 s
+MOST_RATE, MOST_WEIGHT = 1e3, 1e6  #: of learning rates and of weights in the loss, chosen
+LARGEST_BOX = 1e6  #: of `init_box`, chosen
 WEIGHTS = (
     *("visibility_weight", "isotropy_weight", "opacity_weight", "scale_weight", "flatten_weight"),
     *("depth_weight", "normal_weight"),
@@ -57,6 +62,10 @@ class LearningRates:
     features: float = 2e-2
     networks: float = 3e-3
     networks_final: float = 3e-4
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            check_ranges(self, **{f.name: (0, MOST_RATE)})
 
 
 @dataclass(frozen=True)
@@ -103,8 +112,8 @@ class TrainConfig:
                 )
         if self.init is not None and self.init not in INITS:
             raise InputError(f"--init: expected one of {', '.join(INITS)}, found {self.init!r}")
-        if self.init_box is not None and not 0 < self.init_box < float("inf"):
-            raise InputError(f"--init-box: expected a number above 0, found {self.init_box}")
+        if self.init_box is not None and not 0 < self.init_box <= LARGEST_BOX:
+            raise InputError(f"--init-box: expected a number above 0, at most {LARGEST_BOX:g}, found {self.init_box}")
         if self.init_box is not None and self.init != "random":
             raise InputError(f"--init-box: expected --init random, found {self.init}")
         if self.iterations < 1:
@@ -125,6 +134,8 @@ class TrainConfig:
             if not 0 <= getattr(self, name) < float("inf"):
                 option = "flatten" if name == "flatten_weight" else name.replace("_", "-")
                 raise InputError(f"--{option}: expected 0 or more, found {getattr(self, name)}")
+        check_ranges(self, iterations=(1, MOST_STEPS), sh_every=(1, MOST_STEPS), checkpoint_every=(1, MOST_STEPS))
+        check_ranges(self, ssim_weight=(0, 1), seed=(0, 2**63), **{name: (0, MOST_WEIGHT) for name in WEIGHTS})
         if self.visibility_weight > 0 and not (self.light and self.light.shadow):
             raise InputError(f"--visibility-weight: expected a method with shadows, found {self.method}")
 
@@ -140,25 +151,12 @@ class TrainConfig:
         return {name: value for name, value in asdict(self).items() if name not in others}
 
     @staticmethod
-    def from_json(values: dict[str, Any]) -> "TrainConfig":
-        """The inverse of `to_json`; other keys are passed over, and missing ones have their defaults. Raises InputError
-        where one is broken."""
-        try:
-            config: TrainConfig = _record(TrainConfig, values)
-            return config
-        except (KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"config.json: expected the keys of this version's TrainConfig ({error})") from None
-
-
-def _record(kind: Any, values: dict[str, Any]) -> Any:
-    """A frozen record from plain values, records within it too."""
-    hints = get_type_hints(kind)
-    known = {f.name: values[f.name] for f in fields(kind) if f.name in values}
-    for name, value in known.items():
-        inner = next((t for t in (hints[name], *get_args(hints[name])) if is_dataclass(t)), None)
-        if inner is not None and value is not None:
-            known[name] = _record(inner, value)
-    return kind(**known)
+    def from_json(values: dict[str, Any], name: str = "config.json") -> "TrainConfig":
+        """The inverse of `to_json`; missing keys have their defaults, and the key data, which a run's config.json has
+        besides, is passed over. name: of the file, for messages. Raises InputError for a key that is not known and for
+        a value that cannot be."""
+        own = {key: value for key, value in values.items() if key != "data"}
+        return structure(TrainConfig, Document(name, own, {}), Rules())
 
 
 def preset(name: str, method: str = "vanilla", strategy: str = "default") -> TrainConfig:

@@ -8,7 +8,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.mesh import SignedDistance, read_mesh
+from spacesim.data.mesh import SignedDistance, drawable, read_mesh
 from spacesim.data.records import Camera, Dataset
 
 
@@ -18,10 +18,14 @@ class MeshPrior:
     def __init__(self, path: Path) -> None:
         """Of a mesh file in the world's axes, metres. Raises InputError where it holds none."""
         vertices, faces = read_mesh(path)
+        single = vertices.astype(np.float32)
+        faces = drawable(single.astype(np.float64), faces)
+        if len(faces) == 0:
+            raise InputError(f"{path}: expected a mesh that single precision can tell from a point, found none")
         mi = backend.mitsuba()
         mesh = mi.Mesh("prior", len(vertices), len(faces))
         parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = vertices.astype(np.float32).ravel()
+        parameters["vertex_positions"] = single.ravel()
         parameters["faces"] = faces.astype(np.uint32).ravel()
         parameters.update()
         self._scene: Any = mi.load_dict({"type": "scene", "mesh": mesh})

@@ -21,7 +21,7 @@ from spacesim.data.identity import training_digest
 from spacesim.data.lock import locked
 from spacesim.data.records import Dataset
 from spacesim.data.tone import development
-from spacesim.splat.run import Run, load_run
+from spacesim.splat.run import Run, load_run, read_config
 from spacesim.splat.train.checkpoint import write_tensors
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.initialise import far_remark, small_remark
@@ -149,14 +149,9 @@ def _identity(dataset: Dataset) -> dict[str, Any]:
 def _check_resumable(out: Path, described: dict[str, Any], resume: bool) -> None:
     if not resume:
         raise InputError(f"{out}: holds a run already; pass --resume to complete it, or name another folder")
-    before = read_json(out / "config.json")
-    if not isinstance(before, dict):
-        raise InputError(f"{out / 'config.json'}: expected a JSON object, found {type(before).__name__}")
-    before["data"] = {**(before.get("data") or {}), "path": described["data"]["path"]}  # it may have moved
-    known = {
-        **before,
-        **TrainConfig.from_json(before).to_json(),
-    }  # what an older version did not write is as by default
+    config, data = read_config(out / "config.json")
+    data["path"] = described["data"]["path"]  # it may have moved
+    known = {**config.to_json(), "data": data}  # what an older version did not write is as by default
     difference = _first_difference(known, described)
     if difference is not None:
         key, old, new = difference
@@ -181,15 +176,33 @@ def _checkpoints(out: Path) -> list[Path]:
     return sorted((out / "checkpoints").glob("step_*.safetensors"))
 
 
+def _read_seconds(path: Path) -> dict[str, float]:
+    """{iteration of a checkpoint, or "refinement": seconds}; {}, with a warning, where the file is damaged: only the
+    report tells of them."""
+    if not path.exists():
+        return {}
+    try:
+        values = read_json(path)
+        if not isinstance(values, dict):
+            raise InputError(f"{path}: expected a JSON object, found another value")
+        for key, value in values.items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e12:
+                raise InputError(f"{path}: {key}: expected seconds, found {value!r:.60}")
+        return {key: float(value) for key, value in values.items()}
+    except InputError as error:
+        log.warning("%s; the time that training took before is not known", error)
+        return {}
+
+
 class _Seconds:
     """Wall-clock time of training and the part of it that refinement took, kept across interruptions beside the
     checkpoints."""
 
     def __init__(self, out: Path, trainer: Trainer) -> None:
         self.path, self.trainer = out / "checkpoints" / "seconds.json", trainer
-        known = read_json(self.path) if self.path.exists() else {}
-        self.before, self.start = float(known.get(str(trainer.iteration), 0.0)), time.monotonic()
-        trainer.refinement_seconds = float(known.get("refinement", 0.0)) if self.before else 0.0
+        known = _read_seconds(self.path)
+        self.before, self.start = known.get(str(trainer.iteration), 0.0), time.monotonic()
+        trainer.refinement_seconds = known.get("refinement", 0.0) if self.before else 0.0
 
     def total(self) -> float:
         return self.before + time.monotonic() - self.start

@@ -5,8 +5,8 @@ binning and blending, whose lists change length from step to step, stand between
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,8 @@ import numpy as np
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Dataset
+from spacesim.data.structure import Rules, structure
+from spacesim.data.toml import Document
 from spacesim.splat.adjoint import SplatGradients
 from spacesim.splat.bounce import ALBEDO
 from spacesim.splat.gaussians import Gaussians, uploaded
@@ -24,7 +26,7 @@ from spacesim.splat.project import Footprints, Pinhole
 from spacesim.splat.rasterize import backward, forward
 from spacesim.splat.supersample import finer
 from spacesim.splat.tiles import RECORDINGS, bin_splats
-from spacesim.splat.train.checkpoint import read_tensors, write_tensors
+from spacesim.splat.train.checkpoint import CheckpointHeader, read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.initialise import (
     farthest_camera,
@@ -267,32 +269,30 @@ class Trainer:
     def restore(self, path: Path) -> None:
         """Continue from what `save` wrote. Raises InputError where the file does not fit."""
         tensors, header = read_tensors(path)
+        told = structure(CheckpointHeader, Document(f"{path}: header", header, {}), Rules())
+        if told.iteration > self.config.iterations:
+            raise InputError(f"{path}: expected an iteration up to {self.config.iterations}, found {told.iteration}")
         try:
             gaussians = Gaussians.from_numpy(tensors)
+            if gaussians.count == 0:
+                raise ValueError("Gaussians")
             light = LightModel.from_tensors(self.config.light, tensors) if self.config.light else None
             optimizer, light_optimizer = Adam(gaussians.rows()), NetworkAdam(light.weights if light else [])
             _restore_moments(optimizer, tensors, "adam")
             _restore_moments(light_optimizer, tensors, "adam.light")
-            state = {name: uploaded(tensors[f"strategy.{name}"]) for name in self.strategy.state}
-            iteration, steps, history = int(header["iteration"]), int(header["adam_steps"]), list(header["history"])
-            if self.warm_start and self._warming(iteration):
-                warm = {name: uploaded(tensors[f"warm_start.{name}"]) for name in self.warm_start.state}
-                state_sizes = {dr.width(row) for row in (*state.values(), *warm.values())}
-            else:
-                warm, state_sizes = {}, {dr.width(row) for row in state.values()}
+            state = _restored_state(self.strategy.state, tensors, "strategy", gaussians.count)
+            warming = self.warm_start is not None and self._warming(told.iteration)
+            names = self.warm_start.state if self.warm_start and warming else {}
+            warm = _restored_state(names, tensors, "warm_start", gaussians.count)
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {error}") from None
         looks, expected = ((g.sh_degree, g.feature_count) for g in (gaussians, self.gaussians))
         if looks != expected:
             raise InputError(f"{path}: expected Gaussians with the colours of this method, found others")
-        if not state_sizes <= {gaussians.count}:
-            raise InputError(f"{path}: expected statistics of {gaussians.count} Gaussians, found others")
-        if not 0 <= iteration <= self.config.iterations:
-            raise InputError(f"{path}: expected an iteration up to {self.config.iterations}, found {iteration}")
         self.gaussians, self.light, self.strategy.state = gaussians, light, state
         self.optimizer, self.light_optimizer = optimizer, light_optimizer
-        optimizer.steps = light_optimizer.steps = steps
-        self.iteration, self.history = iteration, history
+        optimizer.steps = light_optimizer.steps = told.adam_steps
+        self.iteration, self.history = told.iteration, [asdict(entry) for entry in told.history]
         if self.warm_start and warm:
             self.warm_start.state = warm
 
@@ -376,6 +376,15 @@ def _views(dataset: Dataset, config: TrainConfig) -> TrainingViews:
     truth = config.shape_terms + (("visibility",) if config.visibility_weight > 0 else ())
     prior = MeshPrior.of(dataset) if config.shape_terms and config.prior == "mesh" else None
     return TrainingViews(dataset, config.seed, config.light is not None, truth, prior)
+
+
+def _restored_state(names: Iterable[str], tensors: Mapping[str, np.ndarray], owner: str, count: int) -> dict[str, Any]:
+    """{name: Float [count]} of a checkpoint's statistics. Raises KeyError, or ValueError for another size."""
+    found = {name: tensors[f"{owner}.{name}"] for name in names}
+    for name, values in found.items():
+        if values.shape != (count,):
+            raise ValueError(f"{owner}.{name}: expected {count} numbers, found {values.shape}")
+    return {name: uploaded(values) for name, values in found.items()}
 
 
 def _restore_moments(optimizer: Adam | NetworkAdam, tensors: Mapping[str, np.ndarray], name: str) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from spacesim.backend import ad, recorded
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.images import luminance
 from spacesim.splat.cameras import NEAR, Pinhole
 from spacesim.splat.gaussians import Gaussians, numbers, triple, uploaded
@@ -19,6 +19,7 @@ from spacesim.splat.tiles import RECORDINGS
 from spacesim.splat.train.densify import raise_opacities
 from spacesim.splat.train.initialise import spacing
 from spacesim.splat.train.optimizer import Adam
+from spacesim.splat.train.strategies.strategy import MOST_SIZE, MOST_STEPS
 from spacesim.splat.train.views import DEVICE_BYTES, TrainingViews, View
 
 
@@ -54,6 +55,10 @@ class WarmStartConfig:
             and min(self.weight, self.projection_weight, self.travel, self.spacing) >= 0
         ):
             raise InputError(f"--warm-start: expected weights of 0 or more and a rescue of 0 to 1, found {self}")
+        check_ranges(self, steps=(0, MOST_STEPS), decay=(0, MOST_STEPS), conservative=(0, MOST_STEPS))
+        check_ranges(self, weight=(0, MOST_SIZE), projection_weight=(0, MOST_SIZE), reach=(0, MOST_SIZE))
+        check_ranges(self, travel=(0, MOST_SIZE), spacing=(0, MOST_SIZE), dilation=(0, 1000), downsampling=(1, 1000))
+        check_ranges(self, luminance=(0, 1), revive=(0, 1), opacity_scale=(0, 1), rescue_every=(1, MOST_STEPS))
 
     def remark(self, iterations: int) -> str:
         """A sentence where training is over before the attraction is; "" where it is not."""

@@ -12,12 +12,12 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad, recorded
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, check_ranges
 from spacesim.splat.gaussians import Gaussians, numbers, uploaded
 from spacesim.splat.tiles import RECORDINGS
 from spacesim.splat.train.densify import Refinement, append_copies, grow, limit_opacities, prune
 from spacesim.splat.train.optimizer import Adam
-from spacesim.splat.train.strategies.strategy import Strategy
+from spacesim.splat.train.strategies.strategy import MOST_SIZE, MOST_STEPS, Strategy
 
 WINDOW = ("gradient", "seen", "radius")  #: statistics since the last refinement
 
@@ -47,6 +47,10 @@ class DefaultStrategyConfig:
             raise InputError(f"--prune-opacity: expected above 0 and below 0.5, found {self.prune_opacity}")
         if not 0 < self.split_screen_size < float("inf"):
             raise InputError(f"--split-screen-size: expected a number above 0, found {self.split_screen_size}")
+        sizes, steps = (0, MOST_SIZE), (0, MOST_STEPS)
+        check_ranges(self, prune_scale=sizes, prune_screen_size=sizes, grow_gradient=sizes, duplicate_scale=sizes)
+        check_ranges(self, refine_every=(1, MOST_STEPS), reset_every=(1, MOST_STEPS), pause_after_reset=steps)
+        check_ranges(self, refine_start=steps, refine_stop=steps, screen_size_stop=steps)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import comb
 
 from spacesim.backend import ad, recorded
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, check_ranges
 from spacesim.splat.gaussians import Gaussians, numbers, opacities, principal_axes, triple, uploaded
 from spacesim.splat.tiles import RECORDINGS
 from spacesim.splat.train.densify import Refinement, rearrange
@@ -36,6 +36,7 @@ class McmcConfig:
     def __post_init__(self) -> None:
         if not (0 < self.min_opacity < 1 and self.growth >= 0 and self.noise >= 0):
             raise InputError(f"mcmc strategy: expected opacity in (0, 1), growth and noise of 0 or more, found {self}")
+        check_ranges(self, growth=(0, 100), noise=(0, 1e12))
 
 
 def shared(opacity: np.ndarray, scales: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

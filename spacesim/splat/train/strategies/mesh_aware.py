@@ -12,10 +12,11 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
-from spacesim.data.errors import InputError, WorkError
+from spacesim.data.errors import InputError, WorkError, check_ranges
 from spacesim.data.mesh import SignedDistance
 from spacesim.splat.gaussians import Gaussians, numbers
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig, DensityControl, Survey, chosen_parents
+from spacesim.splat.train.strategies.strategy import MOST_SIZE, MOST_STEPS
 
 KNOWN = ("known", "known_x", "known_y", "known_z")
 
@@ -36,6 +37,7 @@ class MeshAwareConfig:
             raise InputError(f"mesh-aware strategy: expected margins and counts of 0 or more, found {self}")
         if not 0 < self.boundary_ease <= 1:
             raise InputError(f"mesh-aware strategy: expected boundary_ease in (0, 1], found {self.boundary_ease}")
+        check_ranges(self, exterior_margin=(0, MOST_SIZE), interior_margin=(0, MOST_SIZE), cull_every=(1, MOST_STEPS))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,9 @@ from spacesim.splat.gaussians import Gaussians
 from spacesim.splat.train.densify import Refinement
 from spacesim.splat.train.optimizer import Adam
 
+MOST_STEPS = 10**9  #: of any count of iterations that is configured, chosen
+MOST_SIZE = 1e6  #: of any threshold or length that is configured, chosen
+
 
 class Strategy(ABC):
     """state: {name: Float [N]}, all that the next refinement depends on beside the Gaussians themselves; goes into

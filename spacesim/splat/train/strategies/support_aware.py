@@ -7,9 +7,10 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, check_ranges
 from spacesim.splat.gaussians import Gaussians, numbers
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig, DensityControl, Survey, chosen_parents
+from spacesim.splat.train.strategies.strategy import MOST_SIZE, MOST_STEPS
 
 CHANNELS = ("support_count", "support_gradient", "support_radius")  #: c, g and r of 5.10
 TINY = 1e-12  #: epsilon of 5.11, chosen: gradients are about 1e-4
@@ -38,6 +39,7 @@ class SupportAwareConfig:
     def __post_init__(self) -> None:
         if not (0 <= self.decay < 1 and 0 < self.ease <= 1 and 0 <= self.radius_quantile <= 1):
             raise InputError(f"support-aware strategy: expected decay, ease and quantile between 0 and 1, found {self}")
+        check_ranges(self, radius_scale=(0, MOST_SIZE), min_cloud=(0, MOST_STEPS), warm_up=(0, MOST_STEPS))
         weights = self.count_weight, self.gradient_weight, self.radius_weight
         if min(weights) < 0 or sum(weights) <= 0:
             raise InputError(f"support-aware strategy: expected weights of 0 or more, not all 0, found {weights}")

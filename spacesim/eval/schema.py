@@ -1,0 +1,258 @@
+"""What metrics.json holds, as records: `spacesim report` checks files against them before it reads on.
+
+Keys that are not named here are passed over: files of later versions may have more.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from spacesim.data.errors import InputError, check_ranges
+from spacesim.data.structure import Rules
+
+SCHEMA = 1
+LARGEST = 1e15  #: of any number in metrics.json, chosen: a larger one is damage
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Of a metric over frames. count: frames that have it;  pooled: over the pixels of all frames at once"""
+
+    mean: float
+    std: float
+    count: int
+    pooled: float | None = None
+
+    def __post_init__(self) -> None:
+        check_ranges(self, mean=(-LARGEST, LARGEST), std=(0, LARGEST), count=(0, LARGEST))
+
+
+Group = Mapping[str, Summary | None]
+Values = Mapping[str, float | None]
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Summaries by group (`labels.GROUPS`); None: not measured."""
+
+    image: Group | None
+    image_full: Group | None
+    shadow: Group | None
+    shadow_full: Group | None
+    shadow_mask: Group | None
+    shadow_attached: Group | None = None
+    shadow_self_cast: Group | None = None
+    shadow_other_cast: Group | None = None
+
+
+@dataclass(frozen=True)
+class GrazingBin:
+    """Errors of pixels over which the Sun stands so high, degrees."""
+
+    from_deg: float
+    to_deg: float
+    pixels: int
+    luminance_mae: float | None
+    visibility_mae: float | None
+    error_rate: float | None
+    false_shadow: float | None
+    missed_shadow: float | None
+
+
+@dataclass(frozen=True)
+class SunGroups(Groups):
+    """The groups over the frames of some Suns."""
+
+    frames: int = 0
+    suns: int = 0
+    by_grazing_angle: tuple[GrazingBin, ...] | None = None
+
+
+@dataclass(frozen=True)
+class NearShares:
+    """Shares of points nearer than `distance`, metres, to the other surface."""
+
+    distance: float
+    precision: float
+    recall: float
+    f: float
+
+
+@dataclass(frozen=True)
+class Floaters:
+    """Shares of the Gaussians' opacity farther than `distance`, metres, from the true surface."""
+
+    distance: float
+    outside: float | None = None
+    inside: float | None = None
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """The shape against the truth. size: of the object, metres"""
+
+    size: float
+    chamfer: float | None
+    hausdorff99: float | None
+    iou: float | None
+    precision_recall: NearShares | None
+    normals_deg: float | None = None
+    accuracy: float | None = None
+    completeness: float | None = None
+    floaters: Floaters | None = None
+    mesh: Any = None
+
+    def __post_init__(self) -> None:
+        check_ranges(self, size=(1e-9, LARGEST))
+
+
+@dataclass(frozen=True)
+class ObjectRecord:
+    """One object of several."""
+
+    id: int
+    name: str
+    frames: int
+    image: Group | None
+    shadow: Group | None
+    shadow_mask: Group | None
+    geometry: Geometry | None = None
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """One judged frame. name: of its folder of pictures;  sun: azimuth and elevation, degrees"""
+
+    file_path: str
+    name: str
+    sun: tuple[float, float] | None
+    psnr: float | None
+    image_full: Values
+    shadow_full: Values
+    shadow_mask: Values | None
+    known_sun: bool | None = None
+    ssim: float | None = None
+    lpips: float | None = None
+    mae: float | None = None
+    rmse: float | None = None
+    flip: float | None = None
+    ber: float | None = None
+    bias: float | None = None
+    boundary_mae: float | None = None
+    sharpness_ratio: float | None = None
+
+    def __post_init__(self) -> None:
+        if Path(self.name).name != self.name:
+            raise InputError(f"name: expected a frame's name without folders, found {self.name!r}")
+        if self.psnr is not None:
+            check_ranges(self, psnr=(-LARGEST, LARGEST))
+
+
+@dataclass(frozen=True)
+class RelitView:
+    """The view under one of many Suns. truth: the frame that shows it, or None"""
+
+    sun: tuple[float, float]
+    truth: str | None
+    psnr: float | None
+    known_sun: bool | None
+
+
+@dataclass(frozen=True)
+class RelightSweep:
+    """One view under many Suns. visibility: whether it was predicted"""
+
+    view: str
+    visibility: bool
+    suns: tuple[RelitView, ...]
+
+
+@dataclass(frozen=True)
+class ModelFacts:
+    """render_ms: median of a frame"""
+
+    gaussians: int
+    bytes: int
+    render_ms: float
+    backend: str
+
+    def __post_init__(self) -> None:
+        check_ranges(self, gaussians=(0, LARGEST), bytes=(0, LARGEST), render_ms=(0, LARGEST))
+
+
+@dataclass(frozen=True)
+class DatasetFacts:
+    """resolution: width and height of the first frame, pixels"""
+
+    frames: int
+    train_frames: int
+    suns: int
+    resolution: tuple[int, int]
+    scene: str | None = None
+    config: Mapping[str, Any] | None = None
+    versions: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class TrainingStep:
+    """A point of the curves of training."""
+
+    iteration: int
+    loss: float | None = None
+    gaussians: int | None = None
+
+    def __post_init__(self) -> None:
+        check_ranges(self, iteration=(0, LARGEST))
+        for name in ("loss", "gaussians"):
+            if getattr(self, name) is not None:
+                check_ranges(self, **{name: (-LARGEST, LARGEST)})
+
+
+@dataclass(frozen=True)
+class TrainingFacts:
+    """Of training.json; all None of a composed scene, which no training has made. command: text, or its words"""
+
+    history: tuple[TrainingStep, ...] | None = None
+    seconds: float | None = None
+    backend: str | None = None
+    device: str | None = None
+    command: Any = None
+    versions: Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True)
+class Metrics(Groups):
+    """The whole file."""
+
+    schema: int = 0
+    run: str = ""
+    data: str = ""
+    split: str = ""
+    model: ModelFacts = field(kw_only=True)
+    notes: tuple[str, ...] = field(kw_only=True)
+    dataset: DatasetFacts = field(kw_only=True)
+    config: Mapping[str, Any] = field(kw_only=True)
+    training: TrainingFacts = field(kw_only=True)
+    versions: Mapping[str, str] = field(kw_only=True)
+    frames: tuple[FrameRecord, ...] = field(kw_only=True)
+    geometry: Geometry | None = None
+    objects: tuple[ObjectRecord, ...] | None = None
+    known_suns: SunGroups | None = None
+    unseen_suns: SunGroups | None = None
+    by_grazing_angle: tuple[GrazingBin, ...] | None = None
+    relight: RelightSweep | None = None
+
+    def __post_init__(self) -> None:
+        if self.schema != SCHEMA:
+            raise InputError(f"schema: expected metrics of schema {SCHEMA}, found {self.schema}")
+        if not self.frames:
+            raise InputError("frames: expected at least one, found none")
+
+
+RULES = Rules(
+    open=(
+        *(Summary, Groups, GrazingBin, NearShares, Floaters, Geometry, ObjectRecord, FrameRecord, RelitView),
+        *(RelightSweep, ModelFacts, DatasetFacts, TrainingStep, TrainingFacts),
+    )
+)
