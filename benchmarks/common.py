@@ -69,6 +69,14 @@ def positive(text: str) -> int:
     return number
 
 
+def natural(text: str) -> int:
+    """A whole number of at least 0, for argparse."""
+    number = int(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"expected at least 0, found {number}")
+    return number
+
+
 def parse_sizes(text: str) -> list[tuple[int, int]]:
     """[(Gaussians, pixels of a side)] of "31622x1024,...". Ends the program with a sentence where it is malformed."""
     try:

@@ -16,6 +16,7 @@ from types import FrameType
 from spacesim.data.errors import WorkError
 
 STOPPED = "stopped"
+LONGEST_SENTENCE = 2000  #: characters, chosen
 
 _SHOW_CURSOR = "\x1b[?25h\n"  # which a bar of progress hides (ECMA-48 private mode 25)
 _OWN = [os.path.join(os.path.dirname(os.path.abspath(__file__)), name) for name in ("__main__.py", "cli.py")]
@@ -110,7 +111,10 @@ def say(text: object, end: str = "\n") -> None:
 
 
 def tell(sentence: str) -> None:
-    """Print to standard error, where there is one."""
+    """Print to standard error, where there is one; of an endless sentence, as damaged input makes it, both ends."""
+    if len(sentence) > LONGEST_SENTENCE:
+        half = LONGEST_SENTENCE // 2
+        sentence = f"{sentence[:half]} ... {sentence[-half:]}"
     with suppress(OSError):
         print(f"spacesim: {sentence}", file=sys.stderr, flush=True)
 

@@ -520,3 +520,18 @@ def test_visitors_get_pictures(command, tiny_run):
     gone = ended([word.replace("URL", viewer.url) for word in command])
     assert (gone.returncode, gone.stdout) == (2, "")
     assert re.fullmatch(rf"{viewer.url}: expected the address of a viewer, found none \(.*\)\n", gone.stderr)
+
+
+@smallest("attack.py --inputs 30 --kills 1 --bits 6 --viewer 0.1 --seed 5 --json", "attack.py --seed 5 --trial 7")
+def test_attack_tells_what_was_tried_and_held(place, command):
+    told = call(command)
+    if "--trial" in command:
+        assert told.startswith("7 ")
+        assert told.splitlines()[-1] == "None"
+        return
+    found = json.loads(told)
+    assert (found["seed"], found["finds"]) == (5, [])
+    tried = {row[""]: row["tried"] for row in found["rows"]}
+    assert tried["the viewer"] > 10
+    assert tried == {"damaged inputs, command lines": 30, "kills and signals": 1, "flipped bits": 6, **tried}
+    assert all(row["held"] == row["tried"] for row in found["rows"])

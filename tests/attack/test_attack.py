@@ -1,0 +1,123 @@
+"""The attack at its smallest: nothing is found. And it would find what it looks for."""
+
+from pathlib import Path
+
+import attack
+import corpus
+import pytest
+from attack import Worker, attack_bits, attack_inputs, attack_kills, verdict
+
+SEED = 20261122
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    return corpus.build(tmp_path_factory.mktemp("attack") / "corpus")
+
+
+def test_damaged_inputs_and_wrong_command_lines(root, tmp_path):
+    found = attack_inputs(root, tmp_path, SEED, 2000)
+    assert found.finds == []
+    assert (found.tried, found.held) == (2000, 2000)
+
+
+def test_kills(root, tmp_path):
+    assert attack_kills(root, tmp_path, SEED, 10).finds == []
+
+
+def test_flipped_bits(root, tmp_path):
+    assert attack_bits(root, tmp_path, SEED, 150).finds == []
+
+
+# --- the attack itself -----------------------------------------------------------------------------------------------
+
+WEAK = """
+import os, time
+import numpy as np
+import spacesim.cli as cli
+WAYS = {
+    "traceback": lambda: [][1],
+    "code": lambda: 7,
+    "abort": lambda: os.abort(),
+    "sleep": lambda: time.sleep(9),
+    "memory": lambda: float(np.ones(3 << 28).sum()) and 0,
+    "runtime": lambda: (_ for _ in ()).throw(RuntimeError("of no known reason")),
+}
+honest = cli.main
+cli.main = lambda arguments: WAYS[arguments[0]]() if arguments[0] in WAYS else honest(arguments)
+"""
+
+
+@pytest.mark.parametrize(
+    ("way", "words"),
+    [
+        ("traceback", "traceback: .*IndexError"),
+        ("code", "exit code 7"),
+        ("abort", "the process died .signal 6"),
+        ("sleep", "took more than 3 s"),
+        ("memory", "traceback: .*MemoryError"),
+        ("runtime", "traceback: .*of no known reason"),
+    ],
+)
+def test_it_finds(tmp_path, monkeypatch, way, words):
+    (tmp_path / "sitecustomize.py").write_text(WEAK)
+    monkeypatch.setattr(attack, "PATIENCE", 3.0)
+    path = attack.ENVIRONMENT["PYTHONPATH"]
+    monkeypatch.setitem(attack.ENVIRONMENT, "PYTHONPATH", f"{tmp_path}:{path}")
+    worker = Worker(tmp_path, headroom=1 << 30)
+    monkeypatch.setattr(attack, "PATIENCE", 60.0)
+    assert verdict(worker.run(["doctor"], tmp_path)) is None
+    monkeypatch.setattr(attack, "PATIENCE", 3.0)
+    found = verdict(worker.run([way], tmp_path))
+    monkeypatch.setattr(attack, "PATIENCE", 60.0)
+    assert verdict(worker.run(["doctor"], tmp_path)) is None, "it is started anew"
+    worker.stop()
+    assert found is not None
+    assert pytest.importorskip("re").search(words, found), found
+
+
+@pytest.mark.parametrize(
+    ("answer", "wrong"),
+    [
+        ({"code": 0, "errors": ""}, False),
+        ({"code": 2, "errors": "spacesim: --out: expected a folder\n"}, False),
+        ({"code": 2, "errors": "train: 1/2\n"}, True),
+        ({"code": 1, "errors": "spacesim: the computation failed (x); --debug shows where\n"}, True),
+        ({"code": 0, "errors": "Traceback (most recent call last):\n"}, True),
+    ],
+)
+def test_verdicts(answer, wrong):
+    assert (verdict(answer) is not None) == wrong
+
+
+def test_it_finds_bytes_that_are_called_whole(root, tmp_path, monkeypatch):
+    (tmp_path / "sitecustomize.py").write_text(
+        "import spacesim.data.verify as v\nv.differences = lambda root: {}\nv.verify_dataset = lambda path: []\n"
+    )
+    path = attack.ENVIRONMENT["PYTHONPATH"]
+    monkeypatch.setitem(attack.ENVIRONMENT, "PYTHONPATH", f"{tmp_path}:{path}")
+    found = attack_bits(root, tmp_path, SEED, 12)
+    assert any("verify calls it whole" in find for find in found.finds)
+
+
+def test_it_finds_what_a_kill_has_spoilt(root, tmp_path, monkeypatch):
+    """A command whose output depends on how often it was started."""
+    counting = "import os, sys; out = sys.argv[1]; os.makedirs(out, exist_ok=True); open(out + '/a', 'a').write('x')"
+    slow = f"{counting}; import time; time.sleep(1.5)"
+    monkeypatch.setattr(attack, "KILLED", (attack.Killed("counting", ("-c", slow, "{out}")),))
+    found = attack_kills(root, tmp_path, SEED, 3)
+    assert len(found.finds) == 3
+    assert "1 files differ, a the first" in found.finds[0]
+
+
+def test_it_finds_writes_outside_of_the_output(root, tmp_path, monkeypatch):
+    place = tmp_path / "place"
+
+    class Writing:
+        def run(self, words, folder):
+            (folder / "data/images/new.png").write_bytes(b"")
+            return {"code": 0, "errors": ""}
+
+    monkeypatch.setattr(corpus, "command_line", lambda rng: ["doctor"])
+    finds = [attack.one_trial(root, place, Writing(), SEED, number) for number in range(5)]  # type: ignore[arg-type]
+    assert all(find is not None and "a write outside of the output: ('data/images/new.png'" in find for find in finds)
