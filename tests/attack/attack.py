@@ -216,8 +216,12 @@ def _named(folder: Path, place: Path, words: list[str], what: str) -> Trial:
     return Trial(folder, named, f"{what} | {' '.join(word.replace(str(place), '.') for word in named)}")
 
 
+def _is_quick(words: Sequence[str]) -> bool:
+    return "half" not in words and ("eval" not in words or "--no-geometry" in words)
+
+
 WARM_UP = (
-    *(words for kind in corpus.KINDS for words in dict.fromkeys(kind.commands) if "half" not in words),
+    *(words for kind in corpus.KINDS for words in dict.fromkeys(kind.commands) if _is_quick(words)),
     ("sweep", "run", "--camera", "camera.json", "--frames", "2", "--size", "1024", "--out", "{out}"),
 )
 

@@ -157,9 +157,9 @@ KINDS = (
     ),
     Kind(
         "PLY", ("data/points.ply", "data/mesh.ply"), (m.of_ply, m.of_bytes, m.of_floats, m.other_file),
-        _words("verify data", f"{_TRAIN} --init points", f"{_TRAIN} --init mesh", "export data --bop {out}",
-               f"{_TRAIN} --prior mesh --depth-weight 0.1", f"{_TRAIN} --strategy mesh-aware",
-               "eval run --data data --out {out}"),
+        4 * _words("verify data", f"{_TRAIN} --init points", f"{_TRAIN} --init mesh", "export data --bop {out}",
+                   f"{_TRAIN} --prior mesh --depth-weight 0.1", f"{_TRAIN} --strategy mesh-aware")
+        + _words("eval run --data data --out {out}"),  # judges the shape, which takes seconds
     ),
     Kind(
         "meshes", ("boat.obj", "boat.glb", "boat.gltf", "boat.stl", "words.stl", "boat.off", "boat.ply", "boat.mtl"),
