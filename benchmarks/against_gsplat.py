@@ -28,9 +28,9 @@ from spacesim.data.geometry import look_at
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera
 from spacesim.data.store import read_dataset
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.project import Pinhole
-from spacesim.splat.render import render
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Pinhole
+from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import TrainConfig, preset, with_options
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.trainer import Progress, Trainer

@@ -18,9 +18,9 @@ from spacesim import backend
 from spacesim.data.images import load_image
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_dataset
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.project import Pinhole
-from spacesim.splat.render import render
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Pinhole
+from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import preset, with_options
 from spacesim.splat.train.trainer import Trainer
 

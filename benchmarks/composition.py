@@ -25,7 +25,7 @@ from spacesim import backend
 from spacesim.data.store import read_dataset
 from spacesim.eval.composition import ComposedRun
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
-from spacesim.eval.report import write_report
+from spacesim.eval.report.write import write_report
 from spacesim.progress import reporting, tell_training
 from spacesim.splat.compose import ComposeConfig, Composition, Placed, Pose, PosedScene, load_scene, save_scene
 from spacesim.splat.run import Run, load_run

@@ -29,12 +29,12 @@ from spacesim.data.geometry import OPENCV_FROM_MITSUBA
 from spacesim.data.records import Camera
 from spacesim.scenes import read_scene
 from spacesim.scenes.build import build
-from spacesim.scenes.frames import FrameMaker, Job, Shot, cores, writing_threads
-from spacesim.scenes.generate import plan_views
+from spacesim.scenes.generation.frames import FrameMaker, Job, Shot, cores, writing_threads
+from spacesim.scenes.generation.generate import plan_views
+from spacesim.scenes.generation.workers import make_in_processes
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import load
 from spacesim.scenes.view import Units
-from spacesim.scenes.workers import make_in_processes
 
 WARM = 3  #: frames before the clock starts
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from spacesim.eval.charts import compact
-from spacesim.eval.page import escape
+from spacesim.eval.report.charts import compact
+from spacesim.eval.report.html import escape
 
 SIZES = {
     "cuda": "10000x1024,31622x1024,100000x1024,316228x1024,1000000x1024,"

@@ -22,9 +22,9 @@ import synthetic
 from spacesim import backend
 from spacesim.data.geometry import fibonacci_sphere
 from spacesim.data.records import Sun
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.light import LightModel, TrainingFrame
-from spacesim.splat.project import Pinhole
+from spacesim.splat.light.model import LightModel, TrainingFrame
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.run import draw_lit
 from spacesim.splat.train.config import METHODS, preset
 

@@ -7,12 +7,12 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.data.records import Camera
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.project import Pinhole
-from spacesim.splat.rasterize import backward, forward
-from spacesim.splat.render import render
-from spacesim.splat.tiles import bin_splats
-from spacesim.splat.train.losses import photometric_loss
+from spacesim.splat.raster.bin import bin_splats
+from spacesim.splat.raster.blend import backward, forward
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Pinhole
+from spacesim.splat.raster.render import render
+from spacesim.splat.train.loss import photometric_loss
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.stages import project_views
 from spacesim.splat.train.update import Update, ViewGradients

@@ -22,12 +22,12 @@ import common
 from spacesim import backend
 from spacesim.data.store import read_dataset
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
-from spacesim.eval.report import write_report
+from spacesim.eval.report.write import write_report
 from spacesim.progress import reporting, tell_training
-from spacesim.splat.shading import LightConfig
-from spacesim.splat.shadow.cast import ShadowConfig
-from spacesim.splat.shadow.mapping import SUN_RADIUS_DEG, MappingConfig
-from spacesim.splat.shadow.refine import RefineConfig
+from spacesim.splat.light.shading import LightConfig
+from spacesim.splat.light.shadow.cast import ShadowConfig
+from spacesim.splat.light.shadow.mapping import SUN_RADIUS_DEG, MappingConfig
+from spacesim.splat.light.shadow.refine import RefineConfig
 from spacesim.splat.train.config import FINE_OPACITY, TrainConfig, preset, with_field, with_options
 from spacesim.splat.train.train import train
 

@@ -34,9 +34,9 @@ from spacesim.data.files import read_json, write_bytes, write_json
 from spacesim.data.mesh import SignedDistance
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_dataset
-from spacesim.eval.charts import line_chart
 from spacesim.eval.evaluate import evaluate
-from spacesim.eval.report import write_report
+from spacesim.eval.report.charts import line_chart
+from spacesim.eval.report.write import write_report
 from spacesim.progress import reporting, tell_training
 from spacesim.splat.train.config import METHODS, TrainConfig, preset, with_options
 from spacesim.splat.train.config import warm_start as warm_start_of

@@ -11,9 +11,9 @@ from spacesim.data.geometry import fibonacci_sphere
 from spacesim.data.images import write_png
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_dataset, write_points
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.project import Pinhole
-from spacesim.splat.render import render
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Pinhole
+from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import LearningRates, TrainConfig
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.trainer import Trainer

@@ -32,8 +32,8 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Sun
 from spacesim.progress import reporting
 from spacesim.splat.compose import Composition, Placed, Pose
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.light import LightModel, TrainingFrame
+from spacesim.splat.light.model import LightModel, TrainingFrame
+from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 from spacesim.splat.train.config import preset
 from spacesim.viewer.frames import draw

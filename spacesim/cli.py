@@ -104,7 +104,7 @@ _SCENE_OPTIONS = (
 def _generate(options: argparse.Namespace) -> None:
     from spacesim.progress import reporting
     from spacesim.scenes import generate, read_scene
-    from spacesim.scenes.generate import estimate
+    from spacesim.scenes.generation.generate import estimate
     from spacesim.scenes.scenefile import scene_text
 
     changes = {name: getattr(options, name) for name in _SCENE_OPTIONS}
@@ -164,7 +164,7 @@ def _train(options: argparse.Namespace) -> None:
 def _eval(options: argparse.Namespace) -> None:
     from spacesim.data.store import read_dataset
     from spacesim.eval.evaluate import EvaluateConfig, evaluate
-    from spacesim.eval.report import write_report
+    from spacesim.eval.report.write import write_report
     from spacesim.progress import reporting
 
     config = EvaluateConfig(options.split, options.lpips_weights)
@@ -194,7 +194,7 @@ def _judged(path: Path) -> "Run":
 
 
 def _report(options: argparse.Namespace) -> None:
-    from spacesim.eval.report import write_report
+    from spacesim.eval.report.write import write_report
 
     write_report(options.evals, options.out)
     ending.say(f"report: {options.out.resolve()}")
@@ -202,7 +202,7 @@ def _report(options: argparse.Namespace) -> None:
 
 def _render(options: argparse.Namespace) -> None:
     from spacesim.data.records import Sun
-    from spacesim.splat.picture import write_picture
+    from spacesim.splat.export.pictures import write_picture
     from spacesim.splat.run import load_run
 
     run = load_run(options.path)
@@ -220,8 +220,8 @@ def _render(options: argparse.Namespace) -> None:
 
 def _sweep(options: argparse.Namespace) -> None:
     from spacesim.progress import reporting
+    from spacesim.splat.export.sweep import FRAMES, resized, suns_around, sweep
     from spacesim.splat.run import load_run
-    from spacesim.splat.sweep import FRAMES, resized, suns_around, sweep
 
     suns = suns_around(FRAMES if options.frames is None else options.frames, options.elevation, options.azimuth)
     run = load_run(options.path)
@@ -267,7 +267,7 @@ def _compose(options: argparse.Namespace) -> None:
     from spacesim.splat.compose.output import compose
     from spacesim.splat.compose.plain import gathered
     from spacesim.splat.compose.scenefile import load_scene
-    from spacesim.splat.ply import write_ply
+    from spacesim.splat.export.ply import write_ply
 
     scene = load_scene(options.scene)
     with reporting("compose", "frames") as report:
@@ -321,8 +321,8 @@ def _export(options: argparse.Namespace) -> None:
 
 def _export_ply(options: argparse.Namespace) -> None:
     from spacesim.data.records import Sun
-    from spacesim.splat.bake import baked
-    from spacesim.splat.ply import write_ply
+    from spacesim.splat.export.bake import baked
+    from spacesim.splat.export.ply import write_ply
     from spacesim.splat.run import load_run
 
     backend.select(options.backend)
@@ -344,7 +344,7 @@ def _export_mesh(options: argparse.Namespace) -> None:
     from spacesim.data.mesh import mesh_suffix, write_mesh
     from spacesim.data.store import read_dataset
     from spacesim.progress import reporting
-    from spacesim.splat.meshing import MeshConfig, cameras_around, mesh_of
+    from spacesim.splat.export.mesh import MeshConfig, cameras_around, mesh_of
     from spacesim.splat.run import load_run
 
     mesh_suffix(options.mesh)

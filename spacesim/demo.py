@@ -13,10 +13,10 @@ from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, read_json, write_json
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
-from spacesim.eval.report import write_report
+from spacesim.eval.report.write import write_report
 from spacesim.progress import Reporter, tell_training
 from spacesim.scenes import generate, read_scene
-from spacesim.scenes.generate import versions
+from spacesim.scenes.generation.generate import versions
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.train import train
 

@@ -82,7 +82,7 @@ def _check_lpips() -> Finding:
     if _version("torch") is None:
         return _finding(False, "torch is not installed; type: pip install torch")
     importlib.import_module("torch")
-    weights, sentence = importlib.import_module("spacesim.eval.lpips").find_weights()
+    weights, sentence = importlib.import_module("spacesim.eval.metrics.lpips").find_weights()
     return _finding(weights is not None, sentence)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from spacesim import backend, doctor
+from spacesim.backend import llvm, memory, recording
 
 FAKE = "void LLVMGetVersion(unsigned *a, unsigned *b, unsigned *c) {{ *a = {}; *b = 1; *c = 7; }}\n"
 
@@ -33,9 +34,10 @@ def find_in(folder: Path) -> str:
     return run(f"""
 import os
 from spacesim import backend
+from spacesim.backend import llvm
 os.environ.pop("DRJIT_LIBLLVM_PATH", None)  # named by the package when it was imported
-backend._candidates.cache_clear()
-backend._LIBRARY_PLACES = {places!r}
+llvm._candidates.cache_clear()
+llvm._LIBRARY_PLACES = {places!r}
 print(*backend.find_llvm())
 """)
 
@@ -83,7 +85,7 @@ def test_old_and_broken_libraries_are_passed_over(fakes, tmp_path):
 
 
 def test_nothing_to_find(tmp_path):
-    assert find_in(tmp_path) == (f"None libLLVM 19 or newer is needed, found none; type: {backend.INSTALL_LLVM}")
+    assert find_in(tmp_path) == (f"None libLLVM 19 or newer is needed, found none; type: {llvm.INSTALL_LLVM}")
 
 
 def test_named_library(fakes):
@@ -98,10 +100,10 @@ def test_named_library(fakes):
 
 def old_library() -> str | None:
     """A real libLLVM older than 19, if this machine has one."""
-    for pattern in backend._LIBRARY_PLACES:
+    for pattern in llvm._LIBRARY_PLACES:
         for path in Path("/").glob(pattern.lstrip("/")):
             match = re.search(r"libLLVM(?:-|\.so\.)(\d+)", path.name)
-            if match and 14 <= int(match.group(1)) < backend.MINIMUM_LLVM:
+            if match and 14 <= int(match.group(1)) < llvm.MINIMUM_LLVM:
                 return str(path)
     return None
 
@@ -118,7 +120,7 @@ print(*sorted({{line.split()[-1] for line in open("/proc/self/maps") if "libLLVM
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="no /proc tells which library is loaded")
 @pytest.mark.parametrize(
     "imports",
-    ["import spacesim", "import spacesim.splat.render", "import spacesim.scenes.render"],
+    ["import spacesim", "import spacesim.splat.raster.render", "import spacesim.scenes.render"],
 )
 def test_importing_the_package_first_is_enough(imports):
     """A fresh interpreter in which nobody has named a library loads a new one alone, whatever older ones are there."""
@@ -127,16 +129,17 @@ def test_importing_the_package_first_is_enough(imports):
     minima, libraries = run(LOADED.format(imports=imports)).splitlines()
     assert minima == "[1, 3]"
     (library,) = libraries.split()
-    assert backend._library_version(Path(library)) >= backend.MINIMUM_LLVM
+    assert llvm._library_version(Path(library)) >= llvm.MINIMUM_LLVM
 
 
 def test_the_newest_is_named_unless_the_user_has_named_one(fakes):
     program = f"""
 import os
 from spacesim import backend
+from spacesim.backend import llvm
 os.environ.pop("DRJIT_LIBLLVM_PATH", None)
-backend._candidates.cache_clear()
-backend._LIBRARY_PLACES = ("{fakes}/libLLVM*.so*",)
+llvm._candidates.cache_clear()
+llvm._LIBRARY_PLACES = ("{fakes}/libLLVM*.so*",)
 backend.name_llvm()
 print(os.environ["DRJIT_LIBLLVM_PATH"])
 os.environ["DRJIT_LIBLLVM_PATH"] = "mine"
@@ -151,9 +154,10 @@ def test_only_old_libraries_are_not_named(fakes, tmp_path):
     program = f"""
 import os
 from spacesim import backend
+from spacesim.backend import llvm
 os.environ.pop("DRJIT_LIBLLVM_PATH", None)
-backend._candidates.cache_clear()
-backend._LIBRARY_PLACES = ("{tmp_path}/libLLVM*.so*",)
+llvm._candidates.cache_clear()
+llvm._LIBRARY_PLACES = ("{tmp_path}/libLLVM*.so*",)
 backend.name_llvm()
 print(os.environ.get("DRJIT_LIBLLVM_PATH"))
 try:
@@ -228,7 +232,7 @@ def test_constants_are_all_that_is_no_array():
     x = backend.ad.Float(1.0, 2.0)
 
     def told(value):
-        return backend._split(value, [])  # a key of dictionaries, to which 1, 1.0 and True are one
+        return recording._split(value, [])  # a key of dictionaries, to which 1, 1.0 and True are one
 
     plain = [(1, x), (1.0, x), (True, x), ("1", x), (None, x), (x, None), ({"a": 1}, x), ({"a": x}, x), ((x,), x)]
     plain += [(0.0, x), (-0.0, x), (_Pair(1), x), (_Pair(1.0), x), (_Pair((1, 2)), x), (_Pair(_Pair(1)), x)]
@@ -244,9 +248,9 @@ def test_constants_are_all_that_is_no_array():
 
 def test_the_first_arrays_of_a_type_are_told_as_the_next_are(monkeypatch):
     """Else the second call of a program would record anew."""
-    monkeypatch.setattr(backend, "_leaves", set())
+    monkeypatch.setattr(recording, "_leaves", set())
     x = backend.ad.Float(1.0, 2.0)
-    first, second = (backend._split(([x, x], {"a": [x]}, (x,), [[x], []]), []) for _ in range(2))
+    first, second = (recording._split(([x, x], {"a": [x]}, (x,), [[x], []]), []) for _ in range(2))
     assert first == second
 
 
@@ -328,7 +332,7 @@ def test_freed_arrays_are_given_back_before_memory_counts_as_short(monkeypatch):
 
     given_back: list[bool] = []
     asked = "device_memory" if backend.select() == "cuda" else "main_memory"
-    monkeypatch.setattr(backend, asked, lambda: 500 if given_back else 100)
+    monkeypatch.setattr(memory, asked, lambda: 500 if given_back else 100)
     monkeypatch.setattr(dr, "flush_malloc_cache", lambda: given_back.append(True))
     assert (backend.free_memory(), backend.free_memory(100), given_back) == (100, 100, [])
     assert (backend.free_memory(101), given_back) == (500, [True])

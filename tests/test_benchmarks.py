@@ -458,7 +458,7 @@ def test_background_of_a_model_that_shows_nothing(small_lit):
     import background
     import common
 
-    from spacesim.splat.gaussians import Gaussians
+    from spacesim.splat.raster.gaussians import Gaussians
 
     data = read_dataset(small_lit)
     unseen = Gaussians.from_numpy({**common.sphere_arrays(10), "logit_opacities": np.full(10, -20.0)})
@@ -473,7 +473,7 @@ def test_background_of_a_model_that_shows_nothing(small_lit):
 @smallest("against_gsplat.py picture", "against_gsplat.py training --data DATA --iterations 2")
 def test_against_gsplat_says_what_it_needs(command):
     if importlib.util.find_spec("gsplat") is not None:
-        pytest.skip("gsplat is installed: tests/splat/test_gsplat.py compares")
+        pytest.skip("gsplat is installed: tests/splat/raster/test_gsplat.py compares")
     done = ended(command)
     assert (done.returncode, done.stdout) == (2, "")
     assert re.fullmatch(r"gsplat: expected gsplat 1.5 and torch with CUDA, found none \(.*\)\n", done.stderr)

@@ -14,7 +14,7 @@ from tiny import GENERATE, TRAIN
 
 from spacesim.data.images import read_exr, read_png
 from spacesim.data.store import read_dataset, verify_dataset
-from spacesim.splat.ply import read_ply
+from spacesim.splat.export.ply import read_ply
 from spacesim.splat.run import load_run
 
 COMMANDS = ("doctor", "demo", "generate", "train", "eval", "report", "render", "sweep", "export")

@@ -51,12 +51,12 @@ SMALLER = {  # and other values of those that it has
     **{"--bounce": "8", "--max-gaussians": "150", "--frame": "0"},
 }
 NOT_RUN = {  # commands with these words: why they do not run here
-    "--ray auto": "needs a Ray cluster; tests/scenes/test_workers.py starts one",
+    "--ray auto": "needs a Ray cluster; tests/scenes/generation/test_workers.py starts one",
     "tests/scenes/truth.py": "a minute; tests/scenes/test_truth.py bounds its figures",
-    "tests/scenes/kills.py": "minutes; tests/scenes/test_workers.py kills and interrupts smaller runs",
+    "tests/scenes/generation/kills.py": "minutes; test_workers.py beside it kills and interrupts smaller runs",
     "tests/splat/accuracy.py": "20 seconds; the tests beside it bound its figures",
-    "tests/splat/shadow/acne.py": "a minute; the tests beside it bound its figures",
-    "tests/splat/shadow/against_truth.py": "asks for a run that has been trained to the end",
+    "tests/splat/light/shadow/acne.py": "a minute; the tests beside it bound its figures",
+    "tests/splat/light/shadow/against_truth.py": "asks for a run that has been trained to the end",
 }
 LEFT_OUT = {  # options, with their value, that commands run without: why
     "--lpips-weights": "the weights are the user's own",
@@ -455,7 +455,7 @@ def test_python_runs(path, given, tmp_path, monkeypatch, capsys):
     from spacesim.backend import ad
     from spacesim.data.geometry import look_at
     from spacesim.data.records import Camera
-    from spacesim.splat.gaussians import Gaussians
+    from spacesim.splat.raster.gaussians import Gaussians
     from spacesim.splat.train.config import preset
 
     monkeypatch.chdir(tmp_path)

@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError, WorkError
-from spacesim.memory import check_memory
 
 LARGEST_JSON = 1 << 30  #: bytes, chosen: transforms.json of a million frames
 

@@ -20,10 +20,10 @@ from PIL import Image as PillowImage
 from PIL import UnidentifiedImageError
 from scipy.ndimage import map_coordinates
 
+from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
 from spacesim.data.files import open_regular, read_bytes, write_bytes
 from spacesim.data.records import Camera, Dataset, Frame, Image, check_size
-from spacesim.memory import check_memory
 
 Float = NDArray[np.floating]
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_bytes, write_bytes
 from spacesim.data.geometry import Array
-from spacesim.memory import check_memory
 
 READ = (".ply", ".obj", ".glb", ".stl", ".off")
 WRITTEN = (".ply", ".obj", ".glb", ".stl")

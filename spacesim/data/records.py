@@ -1,11 +1,12 @@
 """What a dataset is made of: frozen records with units in their fields' docs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import (
@@ -13,6 +14,7 @@ from spacesim.data.geometry import (
     Array,
     angles_from_direction,
     direction_from_angles,
+    look_at,
     normalize,
 )
 
@@ -87,6 +89,19 @@ class Camera:
         focal = 0.5 * width / np.tan(0.5 * np.radians(fov_x_deg))
         return Camera(world_from_camera, width, height, focal, focal, 0.5 * width, 0.5 * height)
 
+    @staticmethod
+    def look_at(
+        position: ArrayLike,
+        target: ArrayLike,
+        width: int,
+        height: int,
+        fov_x_deg: float,
+        up: ArrayLike = (0.0, 0.0, 1.0),
+    ) -> "Camera":
+        """A camera at `position` [3] that looks at `target` [3], metres, its picture upright towards `up`; see
+        `from_fov`."""
+        return Camera.from_fov(look_at(position, target, up), width, height, fov_x_deg)
+
 
 @dataclass(frozen=True, eq=False)
 class Sun:
@@ -104,6 +119,19 @@ class Sun:
     def from_angles(azimuth_deg: float, elevation_deg: float) -> "Sun":
         """Azimuth from +x towards +y, elevation from the xy plane, degrees (thesis 4.1)."""
         return Sun(direction_from_angles(azimuth_deg, elevation_deg))
+
+    @staticmethod
+    def of(value: "Sun | Sequence[float] | None") -> "Sun | None":
+        """A Sun as it is, or by (azimuth, elevation) in degrees, or by its direction [3]; None stays None. Raises
+        InputError for other numbers."""
+        if value is None or isinstance(value, Sun):
+            return value
+        numbers = np.asarray(value, dtype=np.float64)
+        if numbers.shape == (2,) and np.isfinite(numbers).all() and abs(numbers[1]) <= 90:
+            return Sun.from_angles(float(numbers[0]), float(numbers[1]))
+        if numbers.shape != (3,):
+            raise InputError(f"sun: expected (azimuth, elevation up to 90) in degrees or a direction, found {value}")
+        return Sun(numbers)
 
     @property
     def angles(self) -> tuple[float, float]:

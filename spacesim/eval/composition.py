@@ -11,7 +11,7 @@ from spacesim.data.records import Camera, Sun
 
 if TYPE_CHECKING:
     from spacesim.splat.compose import ComposedPrediction, Composition
-    from spacesim.splat.gaussians import Gaussians
+    from spacesim.splat.raster.gaussians import Gaussians
 
 
 @dataclass(frozen=True, eq=False)

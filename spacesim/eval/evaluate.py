@@ -21,10 +21,10 @@ from spacesim.data.files import write_json
 from spacesim.data.geometry import Array
 from spacesim.data.identity import frame_names
 from spacesim.data.records import Dataset, Frame
-from spacesim.eval import grazing, lpips, shadow
-from spacesim.eval.geometry import GeometryConfig, JudgedShape, judge_geometry
 from spacesim.eval.judge import judge_picture, judge_visibility, light_of, tally_grazing, view_of, write_pictures
 from spacesim.eval.labels import GROUPS
+from spacesim.eval.metrics import grazing, lpips, shadow
+from spacesim.eval.metrics.geometry import GeometryConfig, JudgedShape, judge_geometry
 from spacesim.eval.notes import MODELS_OF_A_SCENE, explain, explain_light, explain_objects
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
 from spacesim.eval.objects import judge_object_shapes, judge_objects, object_names, other_order
@@ -43,7 +43,7 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """split: "test", "train" or "all";  lpips_weights: see `spacesim.eval.lpips.find_weights`;  geometry: how the
+    """split: "test", "train" or "all";  lpips_weights: see `lpips.find_weights`;  geometry: how the
     shape is judged, None: not at all"""
 
     split: str = "test"

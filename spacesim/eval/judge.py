@@ -11,8 +11,9 @@ from spacesim.data.geometry import Array
 from spacesim.data.images import load_image, luminance, read_png, write_png
 from spacesim.data.records import Dataset, Frame, Truth
 from spacesim.data.store import SHADOW_NONE, SHADOW_SELF_CAST, load_truth
-from spacesim.eval import grazing, image, lpips, pictures, shadow
-from spacesim.eval.image import Mask
+from spacesim.eval import pictures
+from spacesim.eval.metrics import grazing, image, lpips, shadow
+from spacesim.eval.metrics.image import Mask
 
 if TYPE_CHECKING:
     from spacesim.splat.run import Prediction

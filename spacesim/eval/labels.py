@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from spacesim.eval.lpips import MINIMUM_SIZE
-from spacesim.eval.shadow import BAND, THRESHOLD
+from spacesim.eval.metrics.lpips import MINIMUM_SIZE
+from spacesim.eval.metrics.shadow import BAND, THRESHOLD
 
 HIGHER, LOWER = "↑", "↓"
 

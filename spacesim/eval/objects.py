@@ -11,11 +11,11 @@ from spacesim.data.errors import InputError
 from spacesim.data.exporters.objects import targets_of
 from spacesim.data.images import read_png
 from spacesim.data.records import Dataset, Frame
-from spacesim.eval import lpips
 from spacesim.eval.composition import ComposedRun
-from spacesim.eval.geometry import GeometryConfig, judge_shape
 from spacesim.eval.judge import Light, View, judge_picture, judge_visibility
-from spacesim.splat.meshing import cameras_around
+from spacesim.eval.metrics import lpips
+from spacesim.eval.metrics.geometry import GeometryConfig, judge_shape
+from spacesim.splat.export.mesh import cameras_around
 
 GROUPS = ("image", "shadow", "shadow_mask", "shadow_self_cast", "shadow_other_cast")
 """Of `labels.GROUPS`, those that have a meaning over one object's pixels."""

@@ -7,9 +7,9 @@ import numpy as np
 from spacesim.data.images import srgb_from_linear
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT
 from spacesim.data.tone import as_bytes
-from spacesim.eval.image import Mask
-from spacesim.eval.shadow import KINDS
-from spacesim.splat.picture import LIT, SHADOWED
+from spacesim.eval.metrics.image import Mask
+from spacesim.eval.metrics.shadow import KINDS
+from spacesim.splat.export.pictures import LIT, SHADOWED
 
 ERROR_SCALE = 0.25
 """Mean absolute error of the channels at the bright end of the colour map; more is drawn as that."""

@@ -12,8 +12,9 @@ import numpy as np
 
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame
-from spacesim.eval import image, pictures
+from spacesim.eval import pictures
 from spacesim.eval.judge import view_of
+from spacesim.eval.metrics import image
 from spacesim.eval.suns import known_suns, rounded_angles
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from spacesim.data.geometry import Array, look_at, normalize
 from spacesim.data.images import write_png
 from spacesim.data.mesh import SignedDistance, write_mesh
 from spacesim.data.records import Camera
-from spacesim.eval.exterior import Sight
-from spacesim.eval.geometry import JudgedShape, Mesh
+from spacesim.eval.metrics.exterior import Sight
+from spacesim.eval.metrics.geometry import JudgedShape, Mesh
 
 WIDTH, HEIGHT = 400, 300  #: of the pictures, pixels
 FILL = 0.94  #: of their width or height that the object takes

@@ -2,7 +2,7 @@
 
 from spacesim.scenes.build import build
 from spacesim.scenes.config import SceneConfig, with_options
-from spacesim.scenes.generate import generate
+from spacesim.scenes.generation.generate import generate
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene, SceneObject
 from spacesim.scenes.scenefile import BUILT_IN_SCENES, read_scene

@@ -11,12 +11,12 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, rotation_from_quaternion
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, SceneConfig
-from spacesim.scenes.materials import Material, customised, material
-from spacesim.scenes.meshfile import both_sided, read_mesh
-from spacesim.scenes.meshpart import is_closed
+from spacesim.scenes.materials.spectra import sun_rgb
+from spacesim.scenes.materials.table import Material, customised, material
+from spacesim.scenes.meshes.parts import is_closed
+from spacesim.scenes.meshes.read import both_sided, read_mesh
 from spacesim.scenes.scene import Scene, SceneObject
 from spacesim.scenes.spacecraft import Spacecraft, spacecraft
-from spacesim.scenes.spectra import sun_rgb
 
 SIZES = (1e-6, 1e10)
 """Metres that the longest side of an object's box may have, chosen."""

@@ -9,8 +9,9 @@ from spacesim.data.errors import InputError, expect
 from spacesim.data.geometry import Array
 from spacesim.data.images import distorted, undistorted
 from spacesim.data.records import Camera, check_size
-from spacesim.scenes.sensor import TONES, SensorConfig
-from spacesim.scenes.spectra import WHITE_BALANCES
+from spacesim.data.tone import TONES
+from spacesim.scenes.materials.spectra import WHITE_BALANCES
+from spacesim.scenes.sensor import SensorConfig
 from spacesim.scenes.sun import EXPOSURE
 
 SMALLEST_FOV = 1e-3

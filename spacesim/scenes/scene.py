@@ -16,7 +16,7 @@ from spacesim.data.geometry import Array, normalize
 from spacesim.data.records import Sun
 from spacesim.scenes.earth import EarthConfig
 from spacesim.scenes.emitters import earthshine, solar_disc
-from spacesim.scenes.materials import Material
+from spacesim.scenes.materials.table import Material
 from spacesim.scenes.spacecraft import Part, Spacecraft
 from spacesim.scenes.sun import SunConfig
 from spacesim.scenes.view import Units

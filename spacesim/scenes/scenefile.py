@@ -11,7 +11,7 @@ from spacesim.data import toml
 from spacesim.data.errors import InputError
 from spacesim.data.structure import Rules, keys_of, near, structure
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
-from spacesim.scenes.materials import changed, material_names
+from spacesim.scenes.materials.table import changed, material_names
 from spacesim.scenes.rig import RIGS, RigConfig
 from spacesim.scenes.spacecraft import SPACECRAFT, spacecraft
 from spacesim.scenes.sun import SunConfig

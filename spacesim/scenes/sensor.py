@@ -1,28 +1,19 @@
-"""What becomes of the light: a sensor's electrons, noise and digital numbers, and the 8-bit image.
+"""A sensor: electrons, noise and digital numbers.
 
-The sensor follows the linear camera model of EMVA standard 1288 (release 4.0 Linear, 2021, chapter 2): electrons are
+It follows the linear camera model of EMVA standard 1288 (release 4.0 Linear, 2021, chapter 2): electrons are
 counted with Poisson statistics, dark ones among them; the amplifier adds normal noise; the system gain turns electrons
 into digital numbers (DN), which are rounded. Left out are nonuniformity of pixels, blooming, a colour filter array.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from spacesim.data.errors import expect
-from spacesim.data.tone import TONES, as_bytes, displayed, filmic
 
-if TYPE_CHECKING:
-    from spacesim.scenes.camera import CameraConfig
-
-__all__ = ["TONES", "Recording", "SensorConfig", "filmic", "record"]
-
-_NOISE = 2  # stream of random numbers
 _MOST_ELECTRONS = 1e12  # far above any full well; Poisson numbers end at 2^63
 
 
@@ -84,32 +75,3 @@ class SensorConfig:
             electrons = electrons + random.normal(0.0, self.read_noise_e, electrons.shape)
         numbers = np.rint(self.black_level_dn + self.gain * electrons)
         return np.clip(numbers, 0, self.highest).astype(np.uint16)
-
-
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """What a camera records. image: [H, W, 4], [H, W, 3] or [H, W] uint8; raw: digital numbers, [H, W] or [3, H, W]
-    uint16, None without a sensor."""
-
-    image: np.ndarray
-    raw: np.ndarray | None = None
-
-
-def record(radiance: np.ndarray, alpha: np.ndarray, camera: "CameraConfig", seed: Sequence[int]) -> Recording:
-    """What `camera` makes of linear radiance [H, W, 3], W m^-2 sr^-1, that is weighted by alpha [H, W].
-
-    Without a sensor: [H, W, 4] uint8 with straight alpha. With one: opaque over black, from digital numbers, and its
-    noise made by `seed`. The same seed gives the same noise with the same version of numpy, which promises no more for
-    distributions (NEP 19), and as far as two machines' logarithms agree in their last bit.
-    """
-    if camera.sensor is None:
-        straight = radiance / np.where(alpha > 0, alpha, 1)[..., None]
-        colours = displayed(camera.exposure * straight, camera.tone)
-        return Recording(as_bytes(np.concatenate([colours, np.clip(alpha, 0, 1)[..., None]], axis=-1)))
-    sensor = camera.sensor
-    light = camera.exposure * radiance.astype(np.float64)
-    random = np.random.Generator(np.random.PCG64(np.random.SeedSequence([*seed, _NOISE])))
-    raw = sensor.expose(light.mean(axis=-1) if sensor.monochrome else light, random)
-    signal = (raw.astype(np.float64) - sensor.black_level_dn) / (sensor.highest - sensor.black_level_dn)
-    image = as_bytes(displayed(signal, camera.tone))
-    return Recording(image, raw if sensor.monochrome else np.ascontiguousarray(np.moveaxis(raw, -1, 0)))

@@ -7,29 +7,80 @@ RUN/training.json      history, time, backend, versions
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import partial
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import Rules, read_record, structure
 from spacesim.data.toml import Document
-from spacesim.memory import check_memory
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.light import LightModel
-from spacesim.splat.project import Projection
-from spacesim.splat.render import RenderOutput, render
-from spacesim.splat.shading import LARGEST_EV
-from spacesim.splat.supersample import supersampled
-from spacesim.splat.tone import developed
+from spacesim.splat.light.model import LightModel
+from spacesim.splat.light.shading import LARGEST_EV
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Projection
+from spacesim.splat.raster.render import RenderOutput, render
+from spacesim.splat.raster.supersample import supersampled
+from spacesim.splat.raster.tone import developed
 from spacesim.splat.train.checkpoint import HistoryEntry, read_tensors
 from spacesim.splat.train.config import TrainConfig
+
+
+class Rendering:
+    """A view of a run, drawn when an array of it is asked for first. See `Run.render`."""
+
+    def __init__(self, run: "Run", camera: Camera, sun: Sun | None, exposure: float | None = None) -> None:
+        self.run, self.camera, self.sun, self.exposure = run, camera, sun, exposure
+
+    @cached_property
+    def _drawn(self) -> "Prediction":
+        return self.run.predict(self.camera, self.sun, exposure=self.exposure)
+
+    @property
+    def rgb(self) -> np.ndarray:
+        """[H, W, 3] float32, sRGB values over black, beyond 1 where what bounces makes them brighter than white."""
+        return self._drawn.rgb
+
+    @property
+    def alpha(self) -> np.ndarray:
+        """[H, W] float32 in [0, 1]."""
+        return self._drawn.alpha
+
+    @property
+    def depth(self) -> np.ndarray:
+        """[H, W] float32: expected depth along the optical axis, metres; 0 where alpha is 0."""
+        return self._drawn.depth
+
+    @property
+    def visibility(self) -> np.ndarray | None:
+        """[H, W] float32: the share of the Sun that the surface sees, 0 to 1; None of a method without shadows."""
+        return self._drawn.visibility
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """[H, W, 3] float32: unit vectors in world axes; 0 where there is no surface."""
+        drawn = self.run.predict(self.camera, self.sun, normals=True, exposure=self.exposure)
+        assert drawn.normal is not None
+        return drawn.normal
+
+    def save(self, path: str | Path, kind: str = "rgb") -> Path:
+        """Write a PNG to look at or an EXR to compute with; returns its path.
+
+        kind: "rgb", "alpha", "depth", "normal" or "shadow". Raises InputError for another suffix, and for shadows of a
+        method without.
+        """
+        from spacesim.splat.export.pictures import write_picture
+
+        drawn = replace(self._drawn, normal=self.normal) if kind == "normal" else self._drawn
+        write_picture(drawn, kind, Path(path))
+        return Path(path)
+
 
 A_PIXEL = {"cuda": 80, "llvm": 225}
 """Bytes of main memory that a predicted pixel takes at most, until it is written: 160 and then 65 were seen on LLVM."""
@@ -118,6 +169,21 @@ class Run:
     def curve(self) -> tuple[str, float] | None:
         """Tone curve and exposure (EV) of colours that are blended in linear light; None where they are sRGB values."""
         return self.light.config.curve if self.light else None
+
+    def render(
+        self, camera: Camera, sun: Sun | Sequence[float] | None = None, exposure: float | None = None
+    ) -> "Rendering":
+        """What `camera` sees under a Sun: rgb, alpha, depth, normal and visibility as numpy arrays, drawn when they are
+        asked for.
+
+        sun: (azimuth, elevation) in degrees, a direction [3] towards it, or a Sun; a run of the method `vanilla` knows
+        the light of its pictures alone;  exposure: EV, of a run whose colours are linear
+        Raises InputError where a run needs the Sun and none is told.
+        """
+        found = Sun.of(sun)
+        if found is None and self.relightable:
+            raise InputError(f"sun: expected its direction for a run of {self.config['method']}, found none")
+        return Rendering(self, camera, found, exposure)
 
     def predict(
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None

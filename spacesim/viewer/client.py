@@ -19,7 +19,7 @@ from spacesim.viewer.paint import Bytes, with_scale
 from spacesim.viewer.session import Session, Statistics
 from spacesim.viewer.stage import Stage
 from spacesim.viewer.state import Shared, View, view_of
-from spacesim.viewer.truthsource import TruthService
+from spacesim.viewer.truth.source import TruthService
 
 QUALITY, QUALITY_AT_REST = 75, 95  #: of JPEG, chosen
 MOST_PICTURE = 4096  #: pixels a side of a picture that is saved

@@ -12,12 +12,12 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.splat.cameras import Projection
-from spacesim.splat.gaussians import Gaussians, opacities
-from spacesim.splat.project import ALPHA_MIN, Footprints, Splats, project
-from spacesim.splat.rasterize import ALPHA_MAX
-from spacesim.splat.render import Blend, blend
-from spacesim.splat.surface import normals
+from spacesim.splat.raster.blend import ALPHA_MAX
+from spacesim.splat.raster.cameras import Projection
+from spacesim.splat.raster.gaussians import Gaussians, opacities
+from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats, project
+from spacesim.splat.raster.render import Blend, blend
+from spacesim.splat.raster.surface import normals
 
 SIGMAS = 1.5  #: standard deviations at which an ellipsoid ends, chosen: neighbours of a surface just touch
 FAINTEST = 0.1  #: opacity of Gaussians that are drawn at least, chosen: fainter ones are mist

@@ -13,7 +13,7 @@ from spacesim.viewer.path import path_of
 from spacesim.viewer.server import Show, import_viser
 from spacesim.viewer.stage import Stage
 from spacesim.viewer.state import Stand
-from spacesim.viewer.truthsource import data_of
+from spacesim.viewer.truth.source import data_of
 
 SUN = (45.0, 30.0)  #: azimuth and elevation at first, degrees, where no data say; chosen
 

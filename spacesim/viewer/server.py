@@ -28,7 +28,7 @@ from spacesim.viewer.path import Path as CameraPath
 from spacesim.viewer.pathcontrols import FileControls, PathControls
 from spacesim.viewer.stage import Stage
 from spacesim.viewer.state import Shared, Stand
-from spacesim.viewer.truthsource import TruthService
+from spacesim.viewer.truth.source import TruthService
 
 INSTALL = "pip install 'spacesim[viewer]'"
 FOV = np.radians(40.0)  #: vertical, where no data say, chosen

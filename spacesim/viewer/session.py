@@ -10,8 +10,8 @@ from spacesim.viewer.loop import RenderLoop, Wish
 from spacesim.viewer.paint import Bytes, compared, painted
 from spacesim.viewer.stage import Stage
 from spacesim.viewer.state import Look, Shared, Stand, View
-from spacesim.viewer.tracer import Answer
-from spacesim.viewer.truth import Truth, fitted
+from spacesim.viewer.truth.tracer import Answer
+from spacesim.viewer.truth.truth import Truth, fitted
 
 TELL_EVERY = 0.25  #: seconds between two statistics while the view moves
 STEADY = 0.8  #: share of the last estimate of frames a second in the next, chosen

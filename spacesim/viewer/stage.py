@@ -12,8 +12,8 @@ import numpy as np
 
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
-from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose import Composition
+from spacesim.splat.raster.cameras import Pinhole
 from spacesim.viewer.ellipsoids import draw_ellipsoids
 from spacesim.viewer.paint import NEEDED, Planes
 from spacesim.viewer.state import Stand

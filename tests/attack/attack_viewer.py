@@ -35,7 +35,7 @@ import numpy as np
 import spacesim
 from spacesim.data.records import Sun
 from spacesim.splat.compose import Composition, Placed, Pose
-from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 exec(sys.argv[2])
 from spacesim.viewer.server import Show, Viewer

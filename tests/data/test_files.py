@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from spacesim import memory
+from spacesim.backend import memory
 from spacesim.data.errors import InputError, WorkError, check_ranges
 from spacesim.data.files import read_bytes, read_json, remove_leftovers, write_bytes
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
-from spacesim import memory
+from spacesim.backend import memory
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import (
     linear_from_srgb,

@@ -10,9 +10,10 @@ import pytest
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image, luminance, read_png, write_png
 from spacesim.data.records import Camera, Frame
-from spacesim.eval import image, lpips, pictures, shadow
+from spacesim.eval import pictures
 from spacesim.eval.evaluate import EvaluateConfig, evaluate, frame_names, summary
 from spacesim.eval.labels import GROUPS
+from spacesim.eval.metrics import image, lpips, shadow
 
 
 @pytest.fixture(autouse=True)

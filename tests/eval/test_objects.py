@@ -8,15 +8,15 @@ import pytest
 
 from spacesim.data.images import load_image, luminance, read_exr, write_exr
 from spacesim.data.store import read_dataset
-from spacesim.eval import image, shadow
 from spacesim.eval.composition import ComposedRun
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
-from spacesim.eval.geometry import GeometryConfig
+from spacesim.eval.metrics import image, shadow
+from spacesim.eval.metrics.geometry import GeometryConfig
 from spacesim.eval.notes import explain_objects
 from spacesim.eval.objects import GROUPS, object_names, other_order
-from spacesim.eval.report import write_report
+from spacesim.eval.report.write import write_report
 from spacesim.splat.compose.scenefile import load_scene
-from spacesim.splat.meshing import MeshConfig
+from spacesim.splat.export.mesh import MeshConfig
 
 CUT = 24  #: column at which the second object begins
 

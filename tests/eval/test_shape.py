@@ -13,18 +13,18 @@ from spacesim.data.images import read_png
 from spacesim.data.mesh import SignedDistance, read_mesh, write_mesh
 from spacesim.data.store import read_dataset
 from spacesim.eval.composition import ComposedRun
-from spacesim.eval.exterior import Sight
-from spacesim.eval.geometry import COMPARED, GeometryConfig, judge_geometry, judge_shape
+from spacesim.eval.metrics.exterior import Sight
+from spacesim.eval.metrics.geometry import COMPARED, GeometryConfig, judge_geometry, judge_shape
 from spacesim.eval.objects import judge_object_shapes, object_names
-from spacesim.eval.report import write_report
+from spacesim.eval.report.surfaces import value_of
+from spacesim.eval.report.write import write_report
 from spacesim.eval.shape import BACKGROUND, COLOURS, cameras_of, coloured, write_shapes
-from spacesim.eval.surfaces import value_of
 from spacesim.splat.compose import Composition, Placed, Pose
 from spacesim.splat.compose.pose import rotation_about
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.meshing import MeshConfig, cameras_around
+from spacesim.splat.export.mesh import MeshConfig, cameras_around
+from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import load_run
-from spacesim.splat.train.initialise import initial_gaussians
+from spacesim.splat.train.start import initial_gaussians
 
 SMALL = GeometryConfig(samples=3000, voxels=40, mesh=MeshConfig(voxels=48, views=6))
 

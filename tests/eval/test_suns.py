@@ -14,7 +14,8 @@ from spacesim.data.identity import training_digest
 from spacesim.data.images import read_png, write_png
 from spacesim.data.records import Camera, Frame, Sun
 from spacesim.data.store import read_dataset
-from spacesim.eval import grazing, relight
+from spacesim.eval import relight
+from spacesim.eval.metrics import grazing
 from spacesim.eval.suns import count_suns, known_suns, trained_on
 
 FAR = Camera.from_fov(look_at([10.0, 0, 0], [0, 0, 0]), 16, 12, 30)

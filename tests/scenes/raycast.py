@@ -16,7 +16,7 @@ import numpy as np
 
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes import Renderer, Scene, build, read_scene
-from spacesim.scenes.generate import plan_views
+from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.sun import SunConfig
 
 NEAR_EDGE = 0.02

@@ -10,8 +10,8 @@ from spacesim.data.geometry import direction_from_angles, look_at
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import SHADOW_SELF_CAST
 from spacesim.scenes import Part, Renderer, Scene, SceneObject, Spacecraft, build, read_scene, render
-from spacesim.scenes.generate import plan_views
-from spacesim.scenes.materials import Material, material
+from spacesim.scenes.generation.generate import plan_views
+from spacesim.scenes.materials.table import Material, material
 from spacesim.scenes.spacecraft import spacecraft
 from spacesim.scenes.sun import EXPOSURE, SOLAR_IRRADIANCE, SunConfig
 

@@ -7,7 +7,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere
 from spacesim.scenes import build, read_scene
 from spacesim.scenes.camera import CameraConfig
-from spacesim.scenes.generate import plan_views
+from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.orbit import mean_motion
 from spacesim.scenes.rig import (
     RIGS,

@@ -11,7 +11,7 @@ from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera, Sun
 from spacesim.scenes import Renderer, build
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, SceneConfig
-from spacesim.scenes.materials import lambertian
+from spacesim.scenes.materials.table import lambertian
 from spacesim.scenes.scene import Scene, SceneObject
 from spacesim.scenes.spacecraft import Part, Spacecraft, boxsat
 

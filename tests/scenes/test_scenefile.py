@@ -18,7 +18,7 @@ from spacesim.scenes.build import build
 from spacesim.scenes.camera import CameraConfig
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, QualityConfig, SceneConfig
 from spacesim.scenes.earth import EarthConfig
-from spacesim.scenes.generate import plan_views
+from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.rig import RIGS, RigConfig
 from spacesim.scenes.scenefile import BUILT_IN_SCENES, RULES, SCENES, read_scene, scene_text
 from spacesim.scenes.sensor import SensorConfig

@@ -5,8 +5,10 @@ import pytest
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import srgb_from_linear
+from spacesim.data.tone import filmic
 from spacesim.scenes.camera import CameraConfig
-from spacesim.scenes.sensor import SensorConfig, filmic, record
+from spacesim.scenes.record import record
+from spacesim.scenes.sensor import SensorConfig
 
 NOISELESS = {"shot_noise": False, "read_noise_e": 0.0}
 

@@ -22,7 +22,7 @@ from spacesim.data.geometry import direction_from_angles, look_at
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes import Part, Renderer, Scene, SceneObject, Spacecraft
 from spacesim.scenes.earth import EARTH_RADIUS_KM, EarthConfig
-from spacesim.scenes.materials import lambertian
+from spacesim.scenes.materials.table import lambertian
 from spacesim.scenes.scenefile import BUILT_IN_SCENES
 from spacesim.scenes.sun import SOLAR_IRRADIANCE, SunConfig
 

@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from spacesim.data.records import Camera, Sun, Truth
-from spacesim.scenes import Renderer, Scene, build, read_scene, spectra
+from spacesim.scenes import Renderer, Scene, build, read_scene
 from spacesim.scenes.earth import EarthConfig
-from spacesim.scenes.generate import plan_views
-from spacesim.scenes.materials import Material, customised, lambertian
+from spacesim.scenes.generation.generate import plan_views
+from spacesim.scenes.materials import spectra
+from spacesim.scenes.materials.table import Material, customised, lambertian
 from spacesim.scenes.sun import SunConfig
 
 EARTH = EarthConfig(azimuth_deg=200.0, elevation_deg=-40.0, altitude_km=500.0)

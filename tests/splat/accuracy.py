@@ -23,9 +23,9 @@ from test_cameras import (
 )
 
 from spacesim.backend import ad
-from spacesim.splat.gaussians import NAMES, Gaussians
-from spacesim.splat.reference import render_reference
-from spacesim.splat.render import OUTPUTS, render
+from spacesim.splat.raster.gaussians import NAMES, Gaussians
+from spacesim.splat.raster.reference import render_reference
+from spacesim.splat.raster.render import OUTPUTS, render
 
 INTRINSICS = {"perspective": ("fx", "fy", "cx", "cy"), "orthographic": ("scale_x", "scale_y", "cx", "cy")}
 

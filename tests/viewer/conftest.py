@@ -9,7 +9,7 @@ import spacesim  # noqa: F401  names libLLVM before drjit is imported
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Sun
 from spacesim.splat.compose import Composition, Placed, Pose
-from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 from spacesim.viewer.opened import opened
 from spacesim.viewer.server import Viewer

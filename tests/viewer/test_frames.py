@@ -10,7 +10,7 @@ from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.eval.pictures import error_colours
 from spacesim.splat.compose import Composition, Pose
-from spacesim.splat.picture import LIT, SHADOWED
+from spacesim.splat.export.pictures import LIT, SHADOWED
 from spacesim.viewer.frames import BUDGET, LEAST, SHARES, STEP, WARM, Pace, draw, sides
 from spacesim.viewer.paint import FARTHEST_SHADE, NEEDED, PALETTE, Planes, compared, depth_range, painted, with_scale
 from spacesim.viewer.stage import Stage

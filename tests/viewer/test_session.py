@@ -11,8 +11,8 @@ from spacesim.viewer.loop import RenderLoop
 from spacesim.viewer.paint import Planes
 from spacesim.viewer.session import Session
 from spacesim.viewer.state import Shared, Stand, View
-from spacesim.viewer.tracer import Answer
-from spacesim.viewer.truth import Truth
+from spacesim.viewer.truth.tracer import Answer
+from spacesim.viewer.truth.truth import Truth
 
 
 class Screen:

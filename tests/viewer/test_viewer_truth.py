@@ -15,10 +15,10 @@ from spacesim.data.store import read_dataset
 from spacesim.splat.compose import Pose
 from spacesim.viewer.paint import painted
 from spacesim.viewer.state import Look, Stand, View
-from spacesim.viewer.tracer import PASS, Request, Tracer
-from spacesim.viewer.truth import fitted, frame_at, stored_truth
-from spacesim.viewer.truthscene import composed_scene, recorded_scene
-from spacesim.viewer.truthsource import TruthService
+from spacesim.viewer.truth.scene import composed_scene, recorded_scene
+from spacesim.viewer.truth.source import TruthService
+from spacesim.viewer.truth.tracer import PASS, Request, Tracer
+from spacesim.viewer.truth.truth import fitted, frame_at, stored_truth
 
 TURN = Pose(np.array([0.8, 0.0, 0.0, 0.6]), np.array([1.0, -2.0, 0.5]), 1.5)
 
@@ -112,7 +112,7 @@ def test_a_posed_scene_shows_what_a_posed_camera_sees(tiny_data, scene):
 def test_scenes_of_models_become_one(scene):
     from spacesim.scenes.config import MaterialConfig
 
-    name = next(iter(__import__("spacesim.scenes.materials", fromlist=["material_names"]).material_names()))
+    name = next(iter(__import__("spacesim.scenes.materials.table", fromlist=["material_names"]).material_names()))
     painted_scene = replace(
         scene,
         materials={"own": MaterialConfig(name)},

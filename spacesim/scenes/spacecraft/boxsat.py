@@ -8,7 +8,7 @@ import trimesh
 
 from spacesim.data.geometry import normalize
 from spacesim.scenes import shapes as s
-from spacesim.scenes.materials import SOLAR_CELL, material
+from spacesim.scenes.materials.table import SOLAR_CELL, material
 from spacesim.scenes.spacecraft.part import Part, Spacecraft
 
 BUS = np.array([1.4, 1.2, 1.5])

@@ -11,7 +11,7 @@ import numpy as np
 
 from spacesim.data.geometry import normalize
 from spacesim.scenes import shapes as s
-from spacesim.scenes.materials import SOLAR_CELL, material
+from spacesim.scenes.materials.table import SOLAR_CELL, material
 from spacesim.scenes.spacecraft.part import Part, Spacecraft
 
 SIZE = np.array([0.366, 0.2263, 0.1])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import trimesh
 
 from spacesim.data.geometry import Array
-from spacesim.scenes.materials import Material
+from spacesim.scenes.materials.table import Material
 
 
 @dataclass(frozen=True, eq=False)

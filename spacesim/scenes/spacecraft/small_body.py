@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 
 from spacesim.data.geometry import Array, normalize
-from spacesim.scenes.materials import material
+from spacesim.scenes.materials.table import material
 from spacesim.scenes.spacecraft.part import Part, Spacecraft
 
 DIAMETER = 500.0  #: of the sphere of equal volume, metres

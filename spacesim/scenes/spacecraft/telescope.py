@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 
 from spacesim.scenes import shapes as s
-from spacesim.scenes.materials import SOLAR_CELL, Material, lambertian, material
+from spacesim.scenes.materials.table import SOLAR_CELL, Material, lambertian, material
 from spacesim.scenes.spacecraft.part import Part, Spacecraft
 
 LENGTH, DIAMETER = 13.2, 4.2  #: of the tube; of the aft shroud, metres

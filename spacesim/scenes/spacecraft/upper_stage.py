@@ -15,7 +15,7 @@ import trimesh
 
 from spacesim.data.geometry import Array
 from spacesim.scenes import shapes as s
-from spacesim.scenes.materials import Material, lambertian, material
+from spacesim.scenes.materials.table import Material, lambertian, material
 from spacesim.scenes.spacecraft.part import Part, Spacecraft
 
 LENGTH, DIAMETER = 11.0, 4.0  #: over nozzle and adapter; of the hydrogen tank, metres

@@ -15,16 +15,16 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.data.geometry import Array
-from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.gaussians import Gaussians, uploaded
-from spacesim.splat.light import Sunlight
-from spacesim.splat.project import ALPHA_MIN
-from spacesim.splat.render import view_colours
+from spacesim.splat.light.model import Sunlight
+from spacesim.splat.light.shadow.cast import ShadowConfig
+from spacesim.splat.raster.bin import RECORDINGS
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.gaussians import Gaussians, uploaded
+from spacesim.splat.raster.project import ALPHA_MIN
+from spacesim.splat.raster.render import view_colours
+from spacesim.splat.raster.tone import picture_of
 from spacesim.splat.run import Run
-from spacesim.splat.shadow.cast import ShadowConfig
-from spacesim.splat.tiles import RECORDINGS
-from spacesim.splat.tone import picture_of
 
 PLAIN_SHADOWS = ShadowConfig(refine=None)
 """Of a run that was trained without any: a depth test (chosen)."""

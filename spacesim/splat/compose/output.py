@@ -30,9 +30,9 @@ from spacesim.data.store import intrinsics_of
 from spacesim.data.tone import as_bytes
 from spacesim.splat.compose.path import PosedScene, Shot
 from spacesim.splat.compose.scene import ComposedPrediction
-from spacesim.splat.picture import write_picture
-from spacesim.splat.sweep import COLUMNS, MOST_TILES, SIDE, resized, sky_mark
-from spacesim.splat.video import INSTALL, Video, encoder
+from spacesim.splat.export.pictures import write_picture
+from spacesim.splat.export.sweep import COLUMNS, MOST_TILES, SIDE, resized, sky_mark
+from spacesim.splat.export.video import INSTALL, Video, encoder
 
 SHOTS = "shots"
 PICTURES = {"rgb": ".png", "depth": ".exr", "id": ".png", "visibility": ".png"}

@@ -4,10 +4,10 @@ import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.records import Sun
-from spacesim.splat.bake import baked
 from spacesim.splat.compose.harmonics import rotated_harmonics
 from spacesim.splat.compose.scene import Composition
-from spacesim.splat.gaussians import SH_C0, Gaussians
+from spacesim.splat.export.bake import baked
+from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 
 
 def gathered(composition: Composition, sun: Sun | None) -> Gaussians:

@@ -21,15 +21,15 @@ from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
-from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose.members import Ensemble, Member, display_colours
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.render import RenderOutput, render
+from spacesim.splat.light.shadow.cast import Between, cast_between
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.render import RenderOutput, render
+from spacesim.splat.raster.supersample import supersampled
+from spacesim.splat.raster.tone import developed
 from spacesim.splat.run import Prediction, Run, check_picture, stops
-from spacesim.splat.shadow.cast import Between, cast_between
-from spacesim.splat.supersample import supersampled
-from spacesim.splat.tone import developed
 
 OUTPUTS = ("rgb", "alpha", "depth", "median_depth", "normal", "visibility", "id")
 SHADOWS = ("others", "ratio", "none")

@@ -11,9 +11,9 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.files import open_regular, write_bytes
-from spacesim.memory import check_memory
 
 FORMAT = "spacesim-gaussians-1"
 

@@ -6,13 +6,13 @@ from typing import Any
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.structure import Rules, structure
 from spacesim.data.toml import Document
-from spacesim.splat.appearance import FieldConfig
-from spacesim.splat.encoding import Encoding
-from spacesim.splat.shading import LightConfig
-from spacesim.splat.shadow.cast import ShadowConfig
-from spacesim.splat.shadow.mapping import MappingConfig
-from spacesim.splat.shadow.refine import RefineConfig
-from spacesim.splat.supersample import MOST_PLACES
+from spacesim.splat.light.encoding import Encoding
+from spacesim.splat.light.field import FieldConfig
+from spacesim.splat.light.shading import LightConfig
+from spacesim.splat.light.shadow.cast import ShadowConfig
+from spacesim.splat.light.shadow.mapping import MappingConfig
+from spacesim.splat.light.shadow.refine import RefineConfig
+from spacesim.splat.raster.supersample import MOST_PLACES
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.strategies.mcmc import McmcConfig
 from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig

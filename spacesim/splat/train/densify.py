@@ -9,7 +9,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import rotation_from_quaternion
-from spacesim.splat.gaussians import ROWS, Gaussians, entries, numbers, triple
+from spacesim.splat.raster.gaussians import ROWS, Gaussians, entries, numbers, triple
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.packing import release
 

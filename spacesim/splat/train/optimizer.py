@@ -7,7 +7,7 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
-from spacesim.splat.gaussians import ROWS, entries, uploaded
+from spacesim.splat.raster.gaussians import ROWS, entries, uploaded
 from spacesim.splat.train.packing import Pack, load, packed, packs, release, store, unpacked, zeros
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15

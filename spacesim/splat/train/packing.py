@@ -14,8 +14,8 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad, select
-from spacesim.splat.gaussians import uploaded
-from spacesim.splat.records import packet
+from spacesim.splat.raster.gaussians import uploaded
+from spacesim.splat.raster.records import packet
 
 SMALL = 2**14  #: Gaussians, chosen: so few take little anyway, and each way to deal their rows is compiled on its own
 SHARES = (15, 14, 12, 8, 4, 3, 2, 1)  #: pairs of an array, chosen: few, and most near powers of two

@@ -7,14 +7,14 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.splat.cameras import Pinhole
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.project import Footprints, Splats, project
-from spacesim.splat.render import view_colours
-from spacesim.splat.supersample import pixel_means
-from spacesim.splat.surface import normals
-from spacesim.splat.tone import light_of, picture_of
-from spacesim.splat.train.losses import depth_loss, normal_loss, photometric_loss, visibility_loss
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Footprints, Splats, project
+from spacesim.splat.raster.render import view_colours
+from spacesim.splat.raster.supersample import pixel_means
+from spacesim.splat.raster.surface import normals
+from spacesim.splat.raster.tone import light_of, picture_of
+from spacesim.splat.train.loss import depth_loss, normal_loss, photometric_loss, visibility_loss
 from spacesim.splat.train.optimizer import adam_step
 from spacesim.splat.train.warm_start import foreground_loss
 

@@ -24,7 +24,7 @@ from spacesim.data.tone import development
 from spacesim.splat.run import Run, load_run, read_config
 from spacesim.splat.train.checkpoint import write_tensors
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.initialise import far_remark, small_remark
+from spacesim.splat.train.start import far_remark, small_remark
 from spacesim.splat.train.trainer import Progress, Trainer
 
 KEEP_CHECKPOINTS = 2

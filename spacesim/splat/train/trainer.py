@@ -18,17 +18,20 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
 from spacesim.data.toml import Document
-from spacesim.splat.adjoint import SplatGradients
-from spacesim.splat.bounce import ALBEDO
-from spacesim.splat.gaussians import Gaussians, uploaded
-from spacesim.splat.light import LightModel, TrainingFrame
-from spacesim.splat.project import Footprints, Pinhole
-from spacesim.splat.rasterize import backward, forward
-from spacesim.splat.supersample import finer
-from spacesim.splat.tiles import RECORDINGS, bin_splats
+from spacesim.splat.light.bounce import ALBEDO
+from spacesim.splat.light.model import LightModel, TrainingFrame
+from spacesim.splat.raster.adjoint import SplatGradients
+from spacesim.splat.raster.bin import RECORDINGS, bin_splats
+from spacesim.splat.raster.blend import backward, forward
+from spacesim.splat.raster.gaussians import Gaussians, uploaded
+from spacesim.splat.raster.project import Footprints, Pinhole
+from spacesim.splat.raster.supersample import finer
 from spacesim.splat.train.checkpoint import CheckpointHeader, read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.initialise import (
+from spacesim.splat.train.optimizer import Adam, NetworkAdam
+from spacesim.splat.train.prior import MeshPrior
+from spacesim.splat.train.stages import LossConfig, Target, on_screen, picture_loss, project_views, update_light
+from spacesim.splat.train.start import (
     farthest_camera,
     focus_point,
     initial_gaussians,
@@ -36,9 +39,6 @@ from spacesim.splat.train.initialise import (
     scene_scale,
     surface_normals,
 )
-from spacesim.splat.train.optimizer import Adam, NetworkAdam
-from spacesim.splat.train.prior import MeshPrior
-from spacesim.splat.train.stages import LossConfig, Target, on_screen, picture_loss, project_views, update_light
 from spacesim.splat.train.strategies.choose import strategy_of
 from spacesim.splat.train.update import Update, ViewGradients
 from spacesim.splat.train.views import TrainingViews, View

@@ -12,12 +12,12 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.splat.cameras import Pinhole
-from spacesim.splat.gaussians import SH_C0, Gaussians
-from spacesim.splat.project import Splats, project
-from spacesim.splat.render import harmonics, shown
-from spacesim.splat.tiles import RECORDINGS
-from spacesim.splat.train.losses import penalty
+from spacesim.splat.raster.bin import RECORDINGS
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.gaussians import SH_C0, Gaussians
+from spacesim.splat.raster.project import Splats, project
+from spacesim.splat.raster.render import harmonics, shown
+from spacesim.splat.train.loss import penalty
 from spacesim.splat.train.optimizer import OWN, Adam, adam_step
 from spacesim.splat.train.packing import Pack, load, store
 from spacesim.splat.train.stages import mean, shape_values

@@ -13,7 +13,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
-from spacesim.splat.gaussians import uploaded
+from spacesim.splat.raster.gaussians import uploaded
 
 log = logging.getLogger(__name__)
 

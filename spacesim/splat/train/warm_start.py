@@ -13,12 +13,12 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.images import luminance
-from spacesim.splat.cameras import NEAR, Pinhole
-from spacesim.splat.gaussians import Gaussians, numbers, triple, uploaded
-from spacesim.splat.tiles import RECORDINGS
+from spacesim.splat.raster.bin import RECORDINGS
+from spacesim.splat.raster.cameras import NEAR, Pinhole
+from spacesim.splat.raster.gaussians import Gaussians, numbers, triple, uploaded
 from spacesim.splat.train.densify import raise_opacities
-from spacesim.splat.train.initialise import spacing
 from spacesim.splat.train.optimizer import Adam
+from spacesim.splat.train.start import spacing
 from spacesim.splat.train.strategies.strategy import MOST_SIZE, MOST_STEPS
 from spacesim.splat.train.views import DEVICE_BYTES, TrainingViews, View
 

@@ -10,15 +10,15 @@ from splats import random_splats
 from spacesim.backend import ad
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
-from spacesim.splat.appearance import FieldConfig
-from spacesim.splat.encoding import Encoding
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.light import LightModel, TrainingFrame
+from spacesim.splat.light.encoding import Encoding
+from spacesim.splat.light.field import FieldConfig
+from spacesim.splat.light.model import LightModel, TrainingFrame
+from spacesim.splat.light.shading import LightConfig
+from spacesim.splat.light.shadow.cast import ShadowConfig
+from spacesim.splat.light.shadow.mapping import MappingConfig
+from spacesim.splat.light.shadow.refine import RefineConfig
+from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
-from spacesim.splat.shading import LightConfig
-from spacesim.splat.shadow.cast import ShadowConfig
-from spacesim.splat.shadow.mapping import MappingConfig
-from spacesim.splat.shadow.refine import RefineConfig
 
 FIELD = FieldConfig(features=5, width=12, layers=3, sun=Encoding("harmonics", 2), view=Encoding("harmonics", 2))
 REFINE = RefineConfig(features=3, width=8, sun=Encoding("harmonics", 1))

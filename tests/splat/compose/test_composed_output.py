@@ -16,7 +16,7 @@ from spacesim.data.records import Sun
 from spacesim.splat.compose import Composition, Keyframe, Placed, Pose, PosedScene
 from spacesim.splat.compose import output as module
 from spacesim.splat.compose.output import compose
-from spacesim.splat.video import encoder
+from spacesim.splat.export.video import encoder
 
 with_video = pytest.mark.skipif(encoder() is None, reason="PyAV, the extra video, is not installed")
 SUN = Sun.from_angles(40, 35)

@@ -12,12 +12,12 @@ from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.data.records import Camera, Sun
-from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose import ComposeConfig, Composition, Placed, Pose
 from spacesim.splat.compose.pose import rotation_about
-from spacesim.splat.encoding import Encoding
-from spacesim.splat.gaussians import Gaussians
-from spacesim.splat.light import LightModel
+from spacesim.splat.light.encoding import Encoding
+from spacesim.splat.light.model import LightModel
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.gaussians import Gaussians
 
 SUN = Sun.from_angles(40, 35)
 EYE = seen_from([3.0, -2.0, 1.5])

@@ -9,11 +9,11 @@ from scipy.special import sph_harm_y
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere
 from spacesim.data.records import Sun
-from spacesim.splat.cameras import Pinhole
 from spacesim.splat.compose import Composition, Placed, Pose
 from spacesim.splat.compose.harmonics import band_rotations, rotated_harmonics
 from spacesim.splat.compose.plain import gathered
-from spacesim.splat.render import render
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.render import render
 
 SUN = Sun.from_angles(40, 35)
 

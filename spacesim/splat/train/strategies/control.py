@@ -13,8 +13,8 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError, check_ranges
-from spacesim.splat.gaussians import Gaussians, numbers, uploaded
-from spacesim.splat.tiles import RECORDINGS
+from spacesim.splat.raster.bin import RECORDINGS
+from spacesim.splat.raster.gaussians import Gaussians, numbers, uploaded
 from spacesim.splat.train.densify import Refinement, append_copies, grow, limit_opacities, prune
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.strategies.strategy import MOST_SIZE, MOST_STEPS, Strategy

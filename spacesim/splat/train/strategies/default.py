@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig, DensityControl, Survey
 
 __all__ = ["DefaultStrategy", "DefaultStrategyConfig"]

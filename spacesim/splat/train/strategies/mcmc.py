@@ -13,8 +13,8 @@ from scipy.special import comb
 
 from spacesim.backend import ad, recorded
 from spacesim.data.errors import InputError, check_ranges
-from spacesim.splat.gaussians import Gaussians, numbers, opacities, principal_axes, triple, uploaded
-from spacesim.splat.tiles import RECORDINGS
+from spacesim.splat.raster.bin import RECORDINGS
+from spacesim.splat.raster.gaussians import Gaussians, numbers, opacities, principal_axes, triple, uploaded
 from spacesim.splat.train.densify import Refinement, rearrange
 from spacesim.splat.train.optimizer import Adam
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig

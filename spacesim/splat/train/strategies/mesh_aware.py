@@ -14,7 +14,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.data.errors import InputError, WorkError, check_ranges
 from spacesim.data.mesh import SignedDistance
-from spacesim.splat.gaussians import Gaussians, numbers
+from spacesim.splat.raster.gaussians import Gaussians, numbers
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig, DensityControl, Survey, chosen_parents
 from spacesim.splat.train.strategies.strategy import MOST_SIZE, MOST_STEPS
 

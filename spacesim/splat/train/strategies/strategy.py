@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from spacesim.splat.gaussians import Gaussians
+from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.densify import Refinement
 from spacesim.splat.train.optimizer import Adam
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from spacesim.backend import ad
 from spacesim.data.errors import InputError, check_ranges
-from spacesim.splat.gaussians import Gaussians, numbers
+from spacesim.splat.raster.gaussians import Gaussians, numbers
 from spacesim.splat.train.strategies.control import DefaultStrategyConfig, DensityControl, Survey, chosen_parents
 from spacesim.splat.train.strategies.strategy import MOST_SIZE, MOST_STEPS
 

@@ -1,0 +1,162 @@
+"""Functions that are traced once and replayed afterwards, by `dr.freeze`."""
+
+import gc
+import itertools
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import fields, is_dataclass
+from functools import cache
+from typing import Any
+from weakref import WeakSet
+
+_PLAIN = frozenset((int, float, bool, str, type(None)))
+_EQUAL_TO_INTEGERS = frozenset((float, bool))  # 1, 1.0 and True are one key of a dictionary, 0.0 and -0.0 too
+MOST_KEYS = 2**14  # that are remembered of what is not an array, chosen
+_recorded: WeakSet[Any] = WeakSet()
+_constants: dict[int, tuple[Any, Any]] = {}  # frozen dataclasses without arrays, by `id`: what `_split` told of them
+_leaves: set[type] = set()  # types of arguments that Dr.Jit is left to look into
+
+
+def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
+    """`function` by `dr.freeze`: traced at its first call with arguments of a kind, replayed at the others.
+
+    At most `limit` recordings are kept. Arguments may be arrays, numbers and texts, and tuples, lists, dicts and
+    dataclasses of them. Dr.Jit 1.5 takes long to walk through these, knows an argument that occurs twice in a call by
+    identity, and takes f(1, 2, 1) for f(1, 2, 2): it gets a flat list of the arrays and one text for all the rest. No
+    array may stand in two places. What Dr.Jit's LLVM backend makes of a numpy array is numpy's own memory, whose
+    kernels and recordings differ by whether it happens to begin at a multiple of 64 bytes: make arguments of lists, or
+    copy them (`gaussians.uploaded`). Python's garbage collector waits during a call: arrays that it frees in the
+    middle of a recording end the process.
+    """
+    import drjit as dr
+
+    now, names = _Arguments(), _Names()
+    frozen = dr.freeze(
+        lambda _, arrays: function(*_joined(now.arguments, iter(arrays))),
+        limit=limit,
+        warn_after=2**31 - 1,  # who looks around for hours makes more recordings than are kept, and need not hear of it
+    )
+    _recorded.add(frozen)
+
+    def call(*arguments: Any) -> Any:
+        arrays: list[Any] = []
+        name = names[_split(arguments, arrays)]
+        now.arguments = arguments
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            return frozen(name, arrays)
+        finally:
+            now.arguments = ()
+            if collecting:
+                gc.enable()
+
+    return call
+
+
+class _Arguments:
+    """Of the call that may be traced now; to Dr.Jit an object that never changes."""
+
+    arguments: tuple[Any, ...] = ()
+
+
+class _Names(dict[Any, str]):
+    """A text for each value of `_split`, short and never given twice; the values that came are forgotten when they are
+    very many."""
+
+    def __init__(self) -> None:
+        self._numbers = itertools.count()
+
+    def __missing__(self, told: Any) -> str:
+        if len(self) >= MOST_KEYS:
+            self.clear()
+        name = self[told] = str(next(self._numbers))
+        return name
+
+
+_names_of_constants = _Names()
+
+
+def _split(value: Any, arrays: list[Any]) -> Any:
+    """All of `value` that is no array, as a key of dictionaries; its arrays are added to a list."""
+    kind = type(value)
+    if kind in _EQUAL_TO_INTEGERS:
+        return kind, repr(value)
+    if kind in _PLAIN:
+        return value
+    if kind is list and _leaves.issuperset(map(type, value)):
+        arrays.extend(value)
+        return kind, len(value)
+    if kind is list or kind is tuple:
+        told = _split_each(value, arrays)
+        new = kind is list and all(part is ... for part in told)  # of a type that is in `_leaves` from now on
+        return kind, len(told) if new else told
+    if kind is dict:
+        return kind, tuple(value), _split_each(value.values(), arrays)
+    known = _constants.get(id(value))
+    if known is not None:
+        return known[1]
+    names = _names(kind)  # type: ignore[arg-type]
+    if names is not None:
+        before = len(arrays)
+        told = _split_each([getattr(value, name) for name in names], arrays)
+        if len(arrays) > before or not _is_constant(value):
+            return kind, told
+        if len(_constants) >= MOST_KEYS:
+            _constants.clear()
+        _constants[id(value)] = value, (kind, _names_of_constants[told])
+        return _constants[id(value)][1]
+    _leaves.add(kind)
+    arrays.append(value)
+    return ...
+
+
+def _is_constant(value: Any) -> bool:
+    """A dataclass whose fields stay as they are: frozen, and without lists and dicts."""
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return bool(type(value).__dataclass_params__.frozen)
+
+
+def _split_each(values: Iterable[Any], arrays: list[Any]) -> tuple[Any, ...]:
+    told = []
+    for value in values:
+        kind = type(value)
+        if kind in _leaves:  # as most are
+            arrays.append(value)
+            told.append(...)
+        elif kind is int:
+            told.append(value)
+        else:
+            told.append(_split(value, arrays))
+    return tuple(told)
+
+
+def _joined(value: Any, arrays: Iterator[Any]) -> Any:
+    """`value` with `arrays` in place of its own, in the order of `_split`."""
+    kind = type(value)
+    if kind in _PLAIN:
+        return value
+    if kind is list or kind is tuple:
+        return kind(_joined(one, arrays) for one in value)
+    if kind is dict:
+        return {key: _joined(one, arrays) for key, one in value.items()}
+    names = _names(kind)  # type: ignore[arg-type]
+    if names is None:
+        return next(arrays)
+    copy = object.__new__(kind)
+    for name in names:
+        object.__setattr__(copy, name, _joined(getattr(value, name), arrays))
+    return copy
+
+
+@cache
+def _names(kind: Any) -> tuple[str, ...] | None:
+    """Of a dataclass's fields; None for any other type."""
+    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else None
+
+
+def recordings() -> int:
+    """How many recordings the functions of `recorded` that are alive have made: once warm, it stands still."""
+    return sum(frozen.n_recordings for frozen in _recorded)

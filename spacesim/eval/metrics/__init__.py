@@ -1,0 +1,1 @@
+"""The metrics: of pictures, of shadows, of shape."""

@@ -1,0 +1,142 @@
+"""The report's pictures: best, median and worst frames as truth, prediction, error and shadow masks."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from spacesim.eval.pictures import (
+    ERROR_SCALE,
+    LIT,
+    SHADOWED,
+    WRONGLY_LIT,
+    WRONGLY_SHADOWED,
+    error_colours,
+)
+from spacesim.eval.report.html import escape, picture
+from spacesim.eval.report.read import Judged
+
+Panels = Mapping[str, str]
+"""Captions of a frame's pictures by their names."""
+
+_PANELS: Panels = {
+    "truth": "Truth",
+    "prediction": "Prediction",
+    "error": "Error",
+    "shadow_truth": "Dark pixels, truth",
+    "shadow_prediction": "Dark pixels, prediction",
+}
+MISTAKES = {
+    "lit": LIT,
+    "shadowed": SHADOWED,
+    "wrongly shadowed": WRONGLY_SHADOWED,
+    "wrongly lit": WRONGLY_LIT,
+}
+
+
+def gallery(runs: Sequence[Judged]) -> str:
+    """HTML of the frames chosen by PSNR over the silhouette."""
+
+    def psnr(frame: Mapping[str, Any]) -> float | None:
+        value: float | None = frame["psnr"]
+        return value
+
+    def words(frame: Mapping[str, Any]) -> str:
+        return "" if frame["psnr"] is None else f"PSNR {frame['psnr']:.2f} dB"
+
+    stops = ", ".join(css(colour) for colour in error_colours(np.linspace(0, 1, 17)))
+    bar = f'<span class="bar" style="background: linear-gradient(90deg, {stops})"></span>'
+    keys = (
+        f'<p class="key"><span>Error, mean of the channels: 0 {bar} {ERROR_SCALE} and more</span></p>'
+        f'<p class="key">{swatches(MISTAKES)}</p>'
+    )
+    return keys + strips(runs, _PANELS, "prediction", psnr, words)
+
+
+def strips(
+    runs: Sequence[Judged],
+    panels: Panels,
+    judged_panel: str,
+    score: Callable[[Mapping[str, Any]], float | None],
+    words: Callable[[Mapping[str, Any]], str],
+) -> str:
+    """HTML of the best, the median and the worst frame: the same ones for all runs where these share frames, else each
+    run's own.
+
+    score: of a frame, the higher the better, None where it has none; words: what is said of it, beside the
+    run's name or below the panel `judged_panel`
+    """
+    limit = 480 if len(runs) <= 2 else 320  # pixels a side; keeps the page small
+    parts = []
+    for group in _comparable(runs):
+        shared = set.intersection(*(set(run.frames) for run in group))
+        rank: dict[str, float] = {}
+        for name in (name for name in group[0].frames if name in shared):
+            scores = [value for run in group if (value := score(run.frames[name])) is not None]
+            if len(scores) == len(group):
+                rank[name] = sum(scores) / len(scores)
+        for title, name in _chosen(rank or dict.fromkeys(sorted(shared), 0.0)):
+            frame = group[0].frames[name]
+            parts.append(f"<h3>{title} <small>{escape(frame['file_path'])}{sun_of(frame)}</small></h3>")
+            for run in group:
+                said = words(run.frames[name])
+                if len(runs) > 1:
+                    parts.append(f"<h4>{run.label} <small>{said}</small></h4>")
+                captions = dict(panels)
+                if len(runs) == 1 and said:
+                    captions[judged_panel] += f", {said}"
+                parts.append(_strip(run, name, panels, captions, limit))
+    return "".join(parts)
+
+
+def sun_of(frame: Mapping[str, Any]) -> str:
+    """Where a frame's Sun is, and whether training has never seen it; "" where that is not known."""
+    if frame["sun"] is None:
+        return ""
+    azimuth, elevation = frame["sun"]
+    return f" · Sun {azimuth:.1f}°, {elevation:.1f}°{', unseen' * (frame.get('known_sun') is False)}"
+
+
+def swatches(colours: Mapping[str, Sequence[int]]) -> str:
+    """HTML of what each colour means."""
+    return "".join(
+        f'<span><b style="background: {css(colour)}"></b>{escape(label)}</span>' for label, colour in colours.items()
+    )
+
+
+def css(colour: Sequence[int] | np.ndarray) -> str:
+    """A colour of three bytes as style sheets write it."""
+    return "rgb({}, {}, {})".format(*map(int, colour))
+
+
+def _comparable(runs: Sequence[Judged]) -> list[list[Judged]]:
+    """All runs as one group if they share frames of the same data, else each on its own."""
+    shared = set.intersection(*(set(run.frames) for run in runs))
+    if shared and len({run.metrics["data"] for run in runs}) == 1:
+        return [list(runs)]
+    return [[run] for run in runs]
+
+
+def _chosen(rank: Mapping[str, float]) -> list[tuple[str, str]]:
+    """(what it is, frame) of the best, the median and the worst frame; fewer where there are fewer frames."""
+    ordered = sorted(rank, key=lambda name: (-rank[name], name))
+    picks = {"Best": ordered[0], "Worst": ordered[-1], "Median": ordered[len(ordered) // 2]}
+    unique = {name: title for title, name in picks.items()}
+    titles = {title: name for name, title in unique.items()}
+    return [(title, titles[title]) for title in ("Best", "Median", "Worst") if title in titles]
+
+
+def _strip(run: Judged, name: str, panels: Panels, captions: Panels, limit: int) -> str:
+    """HTML of one run's pictures of a frame."""
+    frame = run.frames[name]
+    small = "small " if max(run.metrics["dataset"]["resolution"]) < 200 else ""
+    figures = [
+        picture(
+            run.folder / "frames" / name / f"{panel}.png",
+            f"{label} of {frame['file_path']}, {run.name}",
+            escape(captions[panel]),
+            limit,
+        )
+        for panel, label in panels.items()
+    ]
+    return f'<div class="{small}strip">{"".join(figures)}</div>'

@@ -1,0 +1,80 @@
+"""EVAL folders as the report reads them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spacesim.data.errors import InputError
+from spacesim.data.structure import read_record
+from spacesim.eval.report.html import escape, swatch
+from spacesim.eval.schema import RULES, Metrics
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """index: place in the report;  name: the run's, unique there;  metrics: what metrics.json holds"""
+
+    folder: Path
+    index: int
+    name: str
+    metrics: dict[str, Any]
+
+    @property
+    def label(self) -> str:
+        """HTML: the run's coloured dot and its name."""
+        return swatch(self.index) + escape(self.name)
+
+    @property
+    def frames(self) -> dict[str, dict[str, Any]]:
+        """The judged frames by the names of their folders."""
+        return {frame["name"]: frame for frame in self.metrics["frames"]}
+
+    @property
+    def scene(self) -> str:
+        """What the pictures show: the scene's name or else the data folder's."""
+        return str(self.metrics["dataset"].get("scene") or Path(self.metrics["data"]).name)
+
+    def mean(self, group: str, metric: str) -> float | None:
+        """Mean of a metric over the frames; None where it is null."""
+        value = self.summary(group, metric)
+        return None if value is None else value["mean"]
+
+    def summary(self, group: str, metric: str, suns: str = "") -> dict[str, Any] | None:
+        """Mean, spread and count of a metric; None where it is null. suns: "" all frames, or "known_suns" or
+        "unseen_suns": those frames alone."""
+        where = self.metrics.get(suns) if suns else self.metrics
+        return ((where or {}).get(group) or {}).get(metric)
+
+
+def read_evals(folders: Sequence[Path]) -> list[Judged]:
+    """The evaluations in `folders`. Raises InputError where there is none or a folder holds no such."""
+    if not folders:
+        raise InputError("report: expected at least one EVAL folder, found none")
+    found = [_read_metrics(Path(folder)) for folder in folders]
+    names = _unique_names(found, [Path(folder) for folder in folders])
+    together = zip(folders, names, found, strict=True)
+    return [Judged(Path(folder), index, name, metrics) for index, (folder, name, metrics) in enumerate(together)]
+
+
+def legend(runs: Sequence[Judged]) -> str:
+    """HTML that names the colours of several runs; "" for one."""
+    if len(runs) == 1:
+        return ""
+    return f'<p class="key">{"".join(f"<span>{run.label}</span>" for run in runs)}</p>'
+
+
+def _read_metrics(folder: Path) -> dict[str, Any]:
+    return read_record(folder / "metrics.json", Metrics, RULES)[1]
+
+
+def _unique_names(found: Sequence[dict[str, Any]], folders: Sequence[Path]) -> list[str]:
+    """The runs' last path components if these differ, else the runs' paths, else those of the folders."""
+    for names in (
+        [Path(metrics["run"]).name for metrics in found],
+        [str(metrics["run"]) for metrics in found],
+        [str(folder) for folder in folders],
+    ):
+        if len(set(names)) == len(names) and all(names):
+            return names
+    return [f"{folder} ({number})" for number, folder in enumerate(folders, start=1)]

@@ -1,0 +1,1 @@
+"""A scene to a dataset on disk: frames in one process, in several, on a cluster."""

@@ -1,0 +1,117 @@
+"""Frames from the path tracer to the disk: rendering goes on while threads encode and write."""
+
+import math
+import os
+import platform
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import spacesim
+from spacesim.data.records import Camera, Sun, Truth
+from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, FrameWriter
+from spacesim.scenes.camera import CameraConfig
+from spacesim.scenes.config import QualityConfig
+from spacesim.scenes.record import record
+from spacesim.scenes.render import Renderer
+from spacesim.scenes.scene import Scene
+
+MOST_THREADS = 16
+IN_FLIGHT = 1 << 30
+"""Bytes that frames which wait for a thread may hold, chosen: 57 frames of 512 x 512."""
+BYTES_A_PIXEL = 72
+"""Of a frame's truth: 18 numbers, float32."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One frame to render. index: among all frames of the dataset, it makes the noise; name: e.g. "train_00012";
+    spp: samples a pixel."""
+
+    index: int
+    name: str
+    camera: Camera
+    sun: Sun
+    spp: int
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What every process that takes part has to know. root: the dataset's folder; threads: that encode, a process."""
+
+    scene: Scene
+    camera: CameraConfig
+    quality: QualityConfig
+    seed: int
+    root: Path
+    threads: int
+
+    @property
+    def writer(self) -> FrameWriter:
+        """Writes into the folder."""
+        return FrameWriter(self.root, raw_suffixes(self.camera))
+
+
+def raw_suffixes(camera: CameraConfig) -> tuple[str, ...]:
+    """Of the files in raw/ that `record` makes a frame."""
+    if camera.sensor is None:
+        return ()
+    return RAW_MONOCHROME if camera.sensor.monochrome else RAW_COLOR
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the pictures depend on."""
+    packages = {name: version(name) for name in ("mitsuba", "drjit", "numpy", "trimesh")}
+    return {"spacesim": spacesim.__version__, "python": platform.python_version(), **packages}
+
+
+def cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def writing_threads(processes: int) -> int:
+    """Threads that encode in each of so many processes on this machine."""
+    return min(MOST_THREADS, max(1, math.ceil(cores() / processes)))
+
+
+class FrameMaker:
+    """Renders and writes the frames of a job; loads its scene once. renderer: that of the scene, where there is one."""
+
+    def __init__(self, job: Job, renderer: Renderer | None = None) -> None:
+        quality = job.quality
+        self.root = job.root
+        self._job = job
+        self._writer = job.writer
+        self._renderer = renderer or Renderer(job.scene, quality.spp, quality.max_depth, job.camera.distortion)
+        pixels = math.prod(job.camera.resolution)
+        self._most = max(1, min(job.threads + 1, IN_FLIGHT // (BYTES_A_PIXEL * pixels)))
+
+    def make(self, shots: Sequence[Shot]) -> Iterator[str]:
+        """Make the frames that are not whole on disk yet; yields the name of each once it is there, in order.
+
+        The first error, of rendering or writing, ends it: what is being written then is finished first.
+        """
+        waiting: deque[Future[str]] = deque()
+        with ThreadPoolExecutor(self._job.threads, "write") as pool:
+            try:
+                for shot in shots:
+                    if self._writer.has(shot.name):
+                        yield shot.name
+                        continue
+                    while waiting and (waiting[0].done() or len(waiting) >= self._most):
+                        yield waiting.popleft().result()
+                    truth = self._renderer.render(shot.camera, shot.sun, (self._job.seed, shot.index), shot.spp)
+                    waiting.append(pool.submit(self._write, shot, truth))
+                while waiting:
+                    yield waiting.popleft().result()
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+    def _write(self, shot: Shot, truth: Truth) -> str:
+        recording = record(truth.radiance, truth.alpha, self._job.camera, (self._job.seed, shot.index))
+        self._writer.write_frame(shot.name, truth, recording.image, recording.raw)
+        return shot.name

@@ -1,0 +1,1 @@
+"""What surfaces are made of: the table, spectra, pictures."""

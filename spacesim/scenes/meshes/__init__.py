@@ -1,0 +1,1 @@
+"""Any mesh file as parts with materials."""

@@ -1,0 +1,1 @@
+"""A trained model as files: PLY, meshes, pictures, videos."""

@@ -1,0 +1,77 @@
+"""Networks of `mlp` for pictures: forward alone, a whole network in one kernel, by Dr.Jit's cooperative vectors.
+
+On CUDA these are OptiX's: products of half precision on tensor cores, and nothing between two layers goes to memory. On
+LLVM they compute the same more slowly. Not everywhere where CUDA is there is OptiX, so `usable` tries it.
+"""
+
+import logging
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from drjit import nn
+
+from spacesim.backend import ad, recorded, select
+from spacesim.splat.light import mlp
+from spacesim.splat.light.columns import Lanes
+from spacesim.splat.light.mlp import MlpShape
+
+AGREES = 2e-3  #: difference to single precision up to which `usable` accepts a network's sigmoid
+
+log = logging.getLogger(__name__)
+
+
+def pack(shape: MlpShape, weights: list[Any]) -> list[Any]:
+    """Matrix and bias of each layer as `forward` reads them, half precision in the device's order, from weights as
+    `mlp.initial_weights` orders them. What is shared stands before the other inputs."""
+    parts = []
+    for i, (rows, columns) in enumerate(shape.sizes):
+        matrix, bias = (np.array(weight) for weight in weights[1 + 2 * i : 3 + 2 * i])
+        matrix = matrix.reshape(rows, columns)
+        if i == 0:
+            matrix = np.concatenate([np.array(weights[0]).reshape(rows, shape.shared), matrix], axis=1)
+        parts += [ad.TensorXf16(matrix.astype(np.float16)), ad.Float16(bias.astype(np.float16))]
+    views: Any = nn.pack(parts, layout="inference")
+    return list(views)
+
+
+def forward(shape: MlpShape, packed: list[Any], rows: list[Any], shared: Any) -> list[Any]:
+    """Outputs, Floats [M], of inputs `rows`, Floats [M] or of width 1.  packed: see `pack`;  shared: Float [shared]"""
+    told = [dr.gather(ad.Float, shared, ad.UInt32(i)) for i in range(shape.shared)]
+    value: Any = nn.CoopVec([ad.Float16(row) for row in [*told, *rows]])
+    for i in range(shape.layers):
+        value = nn.matvec(packed[2 * i], value, packed[2 * i + 1])
+        if i < shape.layers - 1:
+            value = dr.maximum(value, 0)
+    return [ad.Float(output) for output in value]
+
+
+@cache
+def usable() -> bool:
+    """Whether cooperative vectors work here and give what `mlp.forward` gives: tried once in a process, with a small
+    network, in a recording."""
+    try:
+        difference = _tried()
+    except Exception as error:  # whatever OptiX, driver or Dr.Jit say: pictures can be drawn without
+        reason = str(error.__cause__ or error).strip().splitlines()
+        log.warning("networks: no cooperative vectors on %s (%s)", select(), reason[-1] if reason else type(error))
+        return False
+    if not difference < AGREES:
+        log.warning("networks: cooperative vectors on %s are wrong by %.2g, not used", select(), difference)
+    return difference < AGREES
+
+
+def _tried() -> float:
+    """Largest difference between sigmoids of a network's outputs."""
+    shape, rng, count = MlpShape(19, 5, 3, 32, 3), np.random.default_rng(0), 300
+    weights = [ad.Float(weight) for weight in mlp.initial_weights(shape, rng)]
+    shared, rows = ad.Float(rng.normal(size=5)), ad.Float(rng.normal(size=19 * count))
+    lanes = Lanes.of(count)
+    run = recorded(lambda packed, rows, shared, lanes: forward(shape, packed, lanes.block(rows, 0, 19), shared), 2)
+    packed = pack(shape, weights)
+    outputs = [run(packed, rows, shared, lanes) for _ in range(2)][1]
+    exact, _ = mlp.forward(shape, weights, lanes.matrix(lanes.block(rows, 0, 19), shape.rows), shared)
+    pairs = zip(outputs, (lanes.row(exact, i) for i in range(shape.outputs)), strict=True)
+    sigmoids = [[1 / (1 + np.exp(-np.array(row))) for row in pair] for pair in pairs]
+    return max(float(np.abs(ours - other).max()) for ours, other in sigmoids)

@@ -1,0 +1,133 @@
+"""The light camera: an orthographic camera that looks along the sunlight and holds all Gaussians (thesis 4.3.1, 4.3.5).
+
+A Sun enters the kernels as an array of nine numbers, so another Sun compiles nothing; the camera is fitted where the
+Gaussians are, so that no step waits for the host.
+"""
+
+from functools import lru_cache
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import ArrayLike
+
+from spacesim.backend import ad
+from spacesim.data.geometry import Array
+from spacesim.data.records import Sun
+from spacesim.splat.raster.cameras import LARGEST, Orthographic
+from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
+from spacesim.splat.raster.project import ALPHA_MIN
+
+SUPPORT = 3.0  #: standard deviations of a single Gaussian that its light camera holds (thesis 4.31)
+REACH = 4.0  #: standard deviations of the whole, on either side of its mean, that a light camera holds at most; chosen
+MARGIN = 1.0  #: pixels left free along each border; chosen
+UPRIGHT = 1e-10  #: radians off the vertical that are rounding of angles; chosen
+SUNS = 4096  #: whose axes and encodings are kept, chosen
+NARROWEST = 1e-3  #: least extent of the image, as a share of its larger one; chosen
+
+
+def light_axes(direction: ArrayLike) -> Array:
+    """R_l of thesis 4.12: [3, 3] float64, columns are the light camera's x, y and z axes in the world (OpenCV axes).
+
+    direction: [3], from the scene towards the Sun, of any length. z = -s. The frame is the one of (x, -y, -z), a Sun
+    overhead, turned to s by the shortest way: continuous for all Suns but the one straight below, at -z, where x stays
+    the world's. Raises InputError where the direction is none.
+    """
+    x, y, z = Sun(np.asarray(direction, dtype=np.float64)).direction
+    across = x * x + y * y
+    if across < UPRIGHT**2:
+        return np.diag([1.0, -1.0, -1.0]) if z > 0 else np.diag([1.0, 1.0, 1.0])
+    inverse = 1 / (1 + z) if z >= 0 else (1 - z) / across  # equal on the unit sphere; the latter does not cancel
+    right = [1 - x * x * inverse, -x * y * inverse, -x]
+    down = [x * y * inverse, y * y * inverse - 1, y]
+    return np.stack([np.array(right), np.array(down), np.array([-x, -y, -z])], axis=1)
+
+
+def light_rows(direction: ArrayLike) -> Any:
+    """`light_axes` for the kernels: Float [9], the light camera's x, y and z axes one after another. Kept for the next
+    picture under this Sun."""
+    return _rows(*np.asarray(direction, dtype=np.float64).tolist())
+
+
+@lru_cache(maxsize=SUNS)
+def _rows(*direction: float) -> Any:
+    return ad.Float(light_axes(direction).T.ravel().tolist())
+
+
+def towards_sun(light: Any) -> Any:
+    """s: Array3f of width 1, from the scene towards the Sun, of `light_rows`."""
+    return -_axis(light, 2)
+
+
+def fit_camera(gaussians: Gaussians, light: Any, size: int) -> Orthographic:
+    """The light camera of size x size pixels that holds the Gaussians' 3 sigma supports (thesis 4.29 to 4.35).
+
+    light: Float [9] of `light_rows`. Pixels need not be square (4.35). The image's bounds are those of the supports,
+    but at most `REACH` standard deviations of the whole (the spread of the means and of the Gaussians themselves) to
+    either side of the mean, so that a stray Gaussian does not cost the others their resolution; depth counts from
+    the plane through that mean. Only Gaussians that can be drawn count; of none, the image is a metre wide about the
+    world's origin. Nothing waits for the device, and the function may be part of a recording. Detached.
+    """
+    if gaussians.count == 0:
+        return _camera(light, ad.Array3f(0), [(ad.Float(-0.5), ad.Float(0.5))] * 2, size)
+    means, log_scales, quaternions, logits = (
+        dr.detach(value)
+        for value in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
+    )
+    drawn = drawable(means, log_scales, quaternions, logits)
+    means, log_scales = dr.select(drawn, means, ad.Array3f(0)), dr.select(drawn, log_scales, ad.Array3f(0))
+    counted = dr.select(drawn, ad.Float(1), 0)
+    dr.eval(means, counted)  # here and below: one kernel for what several reductions read
+    share = dr.rcp(dr.maximum(dr.sum(counted), 1))
+    middle = ad.Array3f([dr.sum(means[i]) * share for i in range(3)])
+    offset, columns, scales = means - middle, principal_axes(quaternions), dr.exp(log_scales)
+    extents = []
+    for i in range(2):
+        axis = _axis(light, i)
+        across = dr.dot(axis, offset)
+        spread2 = dr.squared_norm(ad.Array3f([dr.dot(axis, columns[k]) * scales[k] for k in range(3)]))  # 4.30
+        support = SUPPORT * dr.sqrt(spread2)  # 4.31
+        low, high = dr.select(drawn, across - support, LARGEST), dr.select(drawn, across + support, -LARGEST)
+        extents.append((low, high, counted * dr.fma(across, across, spread2)))
+    dr.eval(extents)
+    bounds = []
+    for low, high, square in extents:
+        limit = REACH * dr.sqrt(dr.sum(square) * share)
+        lowest, highest = dr.maximum(dr.min(low), -limit), dr.minimum(dr.max(high), limit)  # 4.32
+        some = lowest < highest
+        bounds.append((dr.select(some, lowest, -0.5), dr.select(some, highest, 0.5)))
+    return _camera(light, middle, bounds, size)
+
+
+def _axis(light: Any, i: int) -> Any:
+    """Array3f of width 1: axis i of `light_rows`."""
+    return ad.Array3f([dr.gather(ad.Float, light, ad.UInt32(3 * i + j)) for j in range(3)])
+
+
+def drawable(means: Any, log_scales: Any, quaternions: Any, logits: Any) -> Any:
+    """Bool [N]: the Gaussians that `project` would draw if the image were large enough."""
+    length2 = dr.squared_norm(quaternions)
+    drawn = (length2 > 1e-24) & (length2 < 1e24) & (dr.abs(logits) < LARGEST)
+    for i in range(3):
+        drawn &= (dr.abs(means[i]) < LARGEST) & (log_scales[i] > -60) & (log_scales[i] < 20)
+    return drawn & (opacities(dr.select(drawn, logits, 0)) >= ALPHA_MIN)
+
+
+def _camera(light: Any, middle: Any, bounds: list[tuple[Any, Any]], size: int) -> Orthographic:
+    """Camera whose depths count from `middle` (Array3f, world) and whose image spans `bounds` (low, high in x and y,
+    metres from there) and the margin (thesis 4.33 to 4.35)."""
+    if size < 4:
+        raise ValueError(f"size: expected at least 4 pixels, found {size}")
+    extents = [high - low for low, high in bounds]
+    least = dr.maximum(NARROWEST * dr.maximum(*extents), 1e-6)
+    scales = [(size - 2 * MARGIN) * dr.rcp(dr.maximum(extent, least)) for extent in extents]
+    principal = [0.5 * size - scale * 0.5 * (low + high) for scale, (low, high) in zip(scales, bounds, strict=True)]
+    numbers: list[Any] = []
+    for i in range(3):
+        axis = _axis(light, i)
+        numbers += [*axis, -dr.dot(axis, middle)]
+    numbers += [*scales, *principal, ad.Float(0), ad.Float(0)]
+    place, values = dr.arange(ad.UInt32, len(numbers)), ad.Float(0)
+    for i, number in enumerate(numbers):  # eighteen lanes pick their own: one kernel, where dr.concat is eighteen
+        values = dr.select(place == i, number, values)
+    return Orthographic(values, size, size)

@@ -1,0 +1,372 @@
+"""Adjoints of blending, by hand: from gradients of the pixels to gradients of the splats.
+
+Sums over the pixels of a tile, of each (tile, splat) pair, go into a slot of the pair's own; a second pass adds up each
+splat's slots in order. No two tiles write to one address, so the gradients are the same to the bit in every run.
+
+- `by_tiles`: one lane holds a block of a tile's pixels, as in blending, and replays the tile's list from the last
+  splat blended to the first, recovering each transmittance by division. Lanes meet in a sum for each pair.
+- `by_buckets`: one lane holds a bucket of a tile's list, some pairs, and walks over the tile's pixels, from the state
+  that blending kept before the bucket. Lanes share nothing; what they read twice, and the states kept, cost memory.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from spacesim.backend import ad, select
+from spacesim.splat.raster.bin import TileLists, TileShape
+from spacesim.splat.raster.project import Splats
+from spacesim.splat.raster.records import (
+    ALPHA_MAX,
+    LOG2_E,
+    POWER_MIN,
+    Blended,
+    bucket_numbers,
+    exp2,
+    exponents,
+    lane_offsets,
+    lane_pixels,
+    load,
+    packet,
+    packet_sizes,
+    packets,
+    pixel_in_tile,
+    store,
+)
+
+COPIES_BYTES = 2**30  #: that threads' copies of gradient slots may take on a CPU, chosen
+PACKET = 4  #: lanes that run together on any CPU: Dr.Jit's packets have 4, 8 or 16, and start at a multiple
+ONE_PIXEL = TileShape(1, 1, 1)
+
+
+@dataclass
+class SplatGradients:
+    """Gradients of a scalar with respect to the splats, [N] each (depths have none), and what refinement asks for."""
+
+    splats: Splats
+    features: list[Any]
+    absolute_x: Any  #: sum over pixels of |d / d x|, per pixel of screen (Ye et al. 2024, AbsGS)
+    absolute_y: Any
+
+
+def by_tiles(
+    splats: Splats,
+    blended: Blended,
+    lists: TileLists,
+    image_size: tuple[int, int],
+    feature_gradients: list[Any],
+    transmittance_gradient: Any,
+    absolute: bool,
+) -> SplatGradients:
+    """See `blend.backward`. A lane for a block of a tile's pixels."""
+    channels, shape = len(feature_gradients), lists.shape
+    lane, offsets = lane_pixels(lists), lane_offsets(shape)
+    width, height = image_size
+    transmittance, last, behind, gradients = [], [], [], []
+    for p, (i, j) in enumerate(offsets):
+        inside = (lane.column + i < width) & (lane.row + j < height)
+        pixel, place = (lane.row + j) * width + lane.column + i, lane.place * shape.pixels + p
+        gradients.append([dr.gather(ad.Float, plane, pixel, inside) for plane in feature_gradients])
+        end = dr.gather(ad.Float, blended.tile_transmittance, place)
+        transmittance.append(end)
+        behind.append(end * dr.gather(ad.Float, transmittance_gradient, pixel, inside))
+        last.append(dr.select(inside, dr.gather(ad.UInt32, blended.last, place), 0))
+
+    sizes = packet_sizes(_numbers(channels, absolute))
+    mode = reduce_mode(4 * sum(sizes) * lists.capacity, shape)
+    slots = [dr.zeros(ad.Float, size * lists.capacity) for size in sizes]
+    records, start = blended.records, dr.gather(ad.UInt32, lists.start, lane.tile)
+
+    def remaining(k: Any, _transmittance: Any, _behind: Any) -> Any:
+        return k > start
+
+    def replay(k: Any, transmittance: list[Any], behind: list[Any]) -> Any:
+        k = k - 1
+        record = load(records, k, lists.capacity)
+        dx, dy = lane.x - record[0], lane.y - record[1]
+        a, b, c = record[2], record[3], record[4]
+        powers = exponents(record, lane.x, lane.y, shape)
+        transmittance, behind = list(transmittance), list(behind)
+        moments = Moments(dx, dy)
+        absolute_x, absolute_y = ad.Float(0), ad.Float(0)
+        by_feature = [ad.Float(0) for _ in range(channels)]
+        for p, (i, j) in enumerate(offsets):
+            unclamped = exp2(powers[p])
+            alpha = dr.minimum(unclamped, ALPHA_MAX)
+            blends = (powers[p] >= POWER_MIN) & (k < last[p])
+            # with T behind the pair: T before it is T / (1 - alpha), and its weight alpha T / (1 - alpha)
+            ratio = dr.select(blends, alpha * dr.rcp(1 - alpha), 0)
+            weight = ratio * transmittance[p]
+            along = _dot(gradients[p], record[6:])
+            for n, gradient in enumerate(gradients[p]):
+                by_feature[n] = dr.fma(weight, gradient, by_feature[n])
+            by_log_alpha = ratio * dr.fma(along, transmittance[p], -behind[p])
+            behind[p] = dr.fma(weight, along, behind[p])
+            transmittance[p] += weight
+            g = dr.select(unclamped < ALPHA_MAX, by_log_alpha, 0)
+            g_dy = moments.add(i, j, g)
+            # records hold -a/2, -b, -c/2 in units of log2 e; the factor is put back with the sums below
+            if absolute:
+                absolute_x += dr.abs(dr.fma(b, g_dy, 2 * a * (dx + i) * g))
+                absolute_y += dr.abs(dr.fma(2 * c, g_dy, b * (dx + i) * g))
+        sums = moments.sums()
+        sums += [absolute_x, absolute_y, *by_feature] if absolute else by_feature
+        add_to_slots(slots, sums, lists.sum_index(k), mode)
+        return k, transmittance, behind
+
+    first = dr.gather(ad.UInt32, blended.tile_last, lane.tile)
+    dr.while_loop((first, transmittance, behind), remaining, replay, mode="symbolic", label="replay")
+    dr.eval(slots)
+    return gather_slots(slots, splats, lists, channels, absolute)
+
+
+class Moments:
+    """Sums over a lane's pixels, column by column, of g, g dx, g dy, g dx^2, g dx dy and g dy^2, with (dx, dy) from the
+    splat's centre to the pixel. dx, dy: of the lane's first pixel"""
+
+    def __init__(self, dx: Any, dy: Any) -> None:
+        self.dx, self.dy = dx, dy
+        self.columns: dict[int, list[Any]] = {}
+
+    def add(self, column: int, row: int, g: Any) -> Any:
+        """A pixel's g. Returns g dy."""
+        dy = self.dy + row
+        g_dy = g * dy
+        s0, s1, s2 = self.columns.get(column, [ad.Float(0)] * 3)
+        self.columns[column] = [s0 + g, s1 + g_dy, dr.fma(g_dy, dy, s2)]
+        return g_dy
+
+    def sums(self) -> list[Any]:
+        """The six."""
+        total = [ad.Float(0) for _ in range(6)]
+        for column, (s0, s1, s2) in self.columns.items():
+            dx = self.dx + column
+            s0_dx = s0 * dx
+            for n, value in enumerate((s0, s0_dx, s1, s0_dx * dx, s1 * dx, s2)):
+                total[n] += value
+        return total
+
+
+def add_to_slots(slots: list[Any], sums: list[Any], slot: Any, mode: Any) -> None:
+    """Add a lane's sums to its pair's slot in each array. All lanes do: to ask each whether it has anything to add
+    costs more, on a CPU and on CUDA."""
+    for target, values in zip(slots, packets(sums), strict=True):
+        dr.scatter_reduce(dr.ReduceOp.Add, target, packet(values), slot, mode=mode)
+
+
+def _dot(one: list[Any], other: list[Any]) -> Any:
+    """Scalar product over as many entries as `one` has."""
+    total = one[0] * other[0] if one else ad.Float(0)
+    for x, y in zip(one[1:], other[1:], strict=False):
+        total = dr.fma(x, y, total)
+    return total
+
+
+def _numbers(channels: int, absolute: bool) -> int:
+    """Sums of a pair."""
+    return 6 + 2 * absolute + channels
+
+
+def _fours(channels: int, absolute: bool) -> int:
+    """How many packets of four hold them."""
+    return -(-_numbers(channels, absolute) // 4)
+
+
+@dataclass
+class _Buckets:
+    """Of each bucket [B]: its tile, the tile's left and top edges in pixels, and its pairs from `first` to below `end`
+    of the tile, none where no lane of blending came to it."""
+
+    tile: Any
+    live: Any
+    left: Any
+    top: Any
+    first: Any
+    end: Any
+
+
+def by_buckets(
+    splats: Splats,
+    blended: Blended,
+    lists: TileLists,
+    image_size: tuple[int, int],
+    feature_gradients: list[Any],
+    transmittance_gradient: Any,
+    absolute: bool,
+) -> SplatGradients:
+    """See `blend.backward`. A lane for a bucket: what lies behind a pair is all that the pixel shows, less what
+    has been blended up to the pair."""
+    channels, shape = len(feature_gradients), lists.shape
+    pixels, bucket = shape.width * shape.height, blended.bucket
+    looks = _pixel_packets(blended, lists, image_size, feature_gradients, transmittance_gradient)
+    tiles, bucket_count = lists.tiles_x * lists.tiles_y, bucket_numbers(lists, bucket)
+    number = dr.arange(ad.UInt32, bucket_count)
+    buckets = _buckets(blended, lists, number)
+    records = [_record(blended, buckets, i, lists.capacity) for i in range(bucket)]
+    until = dr.select(buckets.live, ad.UInt32(pixels), ad.UInt32(0))
+
+    def more(q: Any, _sums: Any) -> Any:
+        return q < until
+
+    def visit(q: Any, sums: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
+        column, row = pixel_in_tile(q, shape)
+        px, py = buckets.left + ad.Float(column) + 0.5, buckets.top + ad.Float(row) + 0.5
+        total, *gradients = load(looks, buckets.tile * pixels + q, tiles * pixels)
+        transmittance, *shown = load(blended.checkpoints, number * pixels + q, bucket_count * pixels)
+        last = dr.gather(ad.UInt32, blended.last, buckets.tile * pixels + q)
+        gradients, behind = gradients[:channels], total
+        for gradient, feature in zip(gradients, shown, strict=False):
+            behind = dr.fma(-gradient, feature, behind)
+        sums = [list(of_pair) for of_pair in sums]
+        for i, record in enumerate(records):
+            blends = buckets.first + i < last
+            state = transmittance, behind
+            transmittance, behind = _add_pixel(sums[i], record, (px, py), gradients, state, blends, absolute)
+        return q + 1, sums
+
+    zeros = [[ad.Float(0) for _ in range(_numbers(channels, absolute))] for _ in range(bucket)]
+    _, sums = dr.while_loop((ad.UInt32(0), zeros), more, visit, mode="symbolic", label="buckets")
+    fours = _fours(channels, absolute)
+    slots = dr.zeros(ad.Float, 4 * fours * lists.capacity)  # a pair's numbers side by side
+    for i in range(bucket):
+        listed = buckets.first + i < buckets.end
+        slot = lists.sum_index(buckets.first + i, listed)
+        values = sums[i] + [ad.Float(0)] * (4 * fours - len(sums[i]))
+        for j in range(fours):
+            value = ad.Array4f(values[4 * j : 4 * j + 4])
+            dr.scatter(slots, value, slot * fours + j, listed, dr.ReduceMode.NoConflicts)
+    dr.eval(slots)
+    return gather_slots([slots], splats, lists, channels, absolute)
+
+
+def _add_pixel(
+    sums: list[Any],
+    record: list[Any],
+    centre: tuple[Any, Any],
+    gradients: list[Any],
+    state: tuple[Any, Any],
+    blends: Any,
+    absolute: bool,
+) -> tuple[Any, Any]:
+    """Add what a pixel contributes to a pair's sums, and take the pair from the pixel's state: (transmittance, gradient
+    of what is behind). A state that blending did not keep has no part, since `blends` is false."""
+    (px, py), (transmittance, behind), channels = centre, state, len(gradients)
+    dx, dy = px - record[0], py - record[1]
+    power = exponents(record, px, py, ONE_PIXEL)[0]
+    unclamped = exp2(power)
+    alpha = dr.minimum(unclamped, ALPHA_MAX)
+    blends &= power >= POWER_MIN
+    weight = dr.select(blends, alpha * transmittance, 0)
+    along = ad.Float(0)
+    for gradient, feature in zip(gradients, record[6 : 6 + channels], strict=True):
+        along = dr.fma(gradient, feature, along)
+    behind = dr.fma(-weight, along, behind)
+    by_alpha = transmittance * along - behind * dr.rcp(1 - alpha)
+    g = dr.select(blends & (unclamped < ALPHA_MAX), by_alpha * alpha, 0)  # dL / d ln alpha
+    g_dx, g_dy = g * dx, g * dy
+    sums[0], sums[1], sums[2] = sums[0] + g, sums[1] + g_dx, sums[2] + g_dy
+    sums[3], sums[4], sums[5] = dr.fma(g_dx, dx, sums[3]), dr.fma(g_dx, dy, sums[4]), dr.fma(g_dy, dy, sums[5])
+    if absolute:
+        sums[6] += dr.abs(dr.fma(2 * record[2], g_dx, record[3] * g_dy))
+        sums[7] += dr.abs(dr.fma(2 * record[4], g_dy, record[3] * g_dx))
+    for c, gradient in enumerate(gradients, 8 if absolute else 6):
+        sums[c] = dr.fma(weight, gradient, sums[c])
+    return transmittance - weight, behind
+
+
+def _buckets(blended: Blended, lists: TileLists, number: Any) -> _Buckets:
+    tile, shape = dr.gather(ad.UInt32, blended.bucket_tile, number), lists.shape
+    live = tile < lists.tiles_x * lists.tiles_y
+    tile = dr.select(live, tile, 0)
+    start = dr.gather(ad.UInt32, lists.start, tile)
+    first = start + (number - (start // blended.bucket + tile)) * blended.bucket
+    end = dr.select(live, dr.gather(ad.UInt32, lists.end, tile), 0)
+    left, top = (tile % lists.tiles_x) * shape.width, (tile // lists.tiles_x) * shape.height
+    return _Buckets(tile, live, ad.Float(left), ad.Float(top), first, end)
+
+
+def _record(blended: Blended, buckets: _Buckets, i: int, capacity: int) -> list[Any]:
+    """Of pair i of each bucket; zeros where there is none, which no pixel has blended."""
+    listed = buckets.first + i < buckets.end
+    return load(blended.records, buckets.first + i, capacity, listed)
+
+
+def _pixel_packets(
+    blended: Blended,
+    lists: TileLists,
+    image_size: tuple[int, int],
+    feature_gradients: list[Any],
+    transmittance_gradient: Any,
+) -> list[Any]:
+    """Of each pixel, tile by tile, by fours: the scalar product of all that it shows, transmittance too, with their
+    gradients; and its features' gradients."""
+    (width, height), shape = image_size, lists.shape
+    pixels = shape.width * shape.height
+    index = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * pixels)
+    tile, (column, row) = index // pixels, pixel_in_tile(index % pixels, shape)
+    column, row = column + (tile % lists.tiles_x) * shape.width, row + (tile // lists.tiles_x) * shape.height
+    inside = (column < width) & (row < height)
+    pixel = row * width + column
+    gradients = [dr.gather(ad.Float, plane, pixel, inside) for plane in feature_gradients]
+    passed = dr.gather(ad.Float, blended.tile_transmittance, index)
+    total = passed * dr.gather(ad.Float, transmittance_gradient, pixel, inside)
+    for gradient, plane in zip(gradients, blended.features, strict=True):
+        total = dr.fma(gradient, dr.gather(ad.Float, plane, pixel, inside), total)
+    values = [total, *gradients]
+    values += [ad.Float(0)] * (-len(values) % 4)
+    looks = [store(values[i : i + 4], index, dr.width(index)) for i in range(0, len(values), 4)]
+    dr.eval(looks)
+    return looks
+
+
+def reduce_mode(bytes_: int, shape: TileShape) -> Any:
+    """How a tile's lanes add to the slots, `bytes_` large. One tile alone adds to a slot: the sums depend on none of
+    this.
+
+    On CUDA a warp sums first. On LLVM a tile whose lanes are all in one packet is one thread's, which adds lane by lane
+    in place, as Dr.Jit does to a thread's copy where every thread has one: for larger tiles, unless that is too much.
+    """
+    if select() == "cuda":
+        return dr.ReduceMode.Local
+    if PACKET % shape.lanes == 0:
+        return dr.ReduceMode.NoConflicts
+    return dr.ReduceMode.Expand if dr.thread_count() * bytes_ < COPIES_BYTES else dr.ReduceMode.Local
+
+
+def gather_slots(
+    slots: list[Any], splats: Splats, lists: TileLists, channels: int, absolute: bool = True
+) -> SplatGradients:
+    """Add up each splat's slots, in order, and turn the sums into gradients of the splat's own numbers.
+
+    slots: arrays [F P], F of a pair's sums side by side in each
+    """
+    splat = dr.arange(ad.UInt32, dr.width(splats.x))
+    position = dr.gather(ad.UInt32, lists.first_slot, splat)
+    end = position + dr.gather(ad.UInt32, lists.slot_count, splat)
+
+    def remaining(position: Any, _sums: Any) -> Any:
+        return position < end
+
+    def add(position: Any, sums: list[Any]) -> Any:
+        values = load(slots, lists.sum_of_slot(position), lists.capacity)
+        return position + 1, [total + value for total, value in zip(sums, values, strict=True)]
+
+    numbers = sum(dr.width(array) for array in slots) // lists.capacity
+    state = position, [ad.Float(0) for _ in range(numbers)]
+    _, sums = dr.while_loop(state, remaining, add, mode="symbolic", label="gather slots")
+    s0, sx, sy, sxx, sxy, syy, *rest = sums
+    by_splat = Splats(
+        x=dr.fma(splats.a, sx, splats.b * sy),
+        y=dr.fma(splats.b, sx, splats.c * sy),
+        a=-0.5 * sxx,
+        b=-sxy,
+        c=-0.5 * syy,
+        opacity=s0 * dr.rcp(dr.maximum(splats.opacity, 1e-30)),
+        depth=None,
+    )
+    absolute_x, absolute_y = [value / LOG2_E for value in rest[:2]] if absolute else (None, None)
+    by_feature = rest[2 : 2 + channels] if absolute else rest[:channels]
+    result = SplatGradients(by_splat, by_feature, absolute_x, absolute_y)
+    dr.eval(result)
+    return result

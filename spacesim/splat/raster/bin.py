@@ -1,0 +1,372 @@
+"""Stage 2: which splats each screen tile blends, front to back.
+
+Each tile lists the splats whose ellipse reaches it, in depth order, ties in index order: the result does not depend on
+scheduling. Pairs of tile and splat come from the box around a splat's ellipse; those whose tile the ellipse misses are
+in no list. How the lists are put in order depends on the backend, the order does not:
+
+- CUDA counts the pairs into their tiles and orders each list by itself (`sort.py`): a radix sort's many launches
+  cost more than its work (docs/performance.md), and Dr.Jit 1.5 cannot replay them.
+- LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile; both sorts are stable.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from spacesim.backend import ad, free_memory, recorded, select
+from spacesim.data.errors import WorkError
+from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats
+from spacesim.splat.raster.sort import ordered_lists, owners
+
+RECORDINGS = 256  #: of a function that are kept: one for each size of picture, of the lists, and of the model
+
+DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
+LONGEST = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long
+PACKET = 16  #: lanes that run together on a CPU with AVX-512; elsewhere fewer
+HANDS = 64  #: at most, chosen: no fewer than the parts into which Dr.Jit divides a launch, two a thread, as a rule
+STEPS, FEW = 8, 2  #: sizes of arrays from one power of two to the next, as a rule, and of the lists of pictures
+LONG = 2**22  #: pairs from which on lists of pictures have no more room than others, chosen: a gigabyte
+LARGEST_PAIRS = {"cuda": 0.9 * 2**30, "llvm": 0.9 * 2**29}  #: records hold four or eight numbers a pair, arrays 2^32
+PICTURE_BYTES = 200, 85  #: a pair (lists, sorting, blending), a pixel (colour, transmittance and what blending keeps of
+#: them): measured on LLVM, 90 to 210 a pair, as the rounding of arrays has it
+TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a training step, with gradients and the loss;
+#: 140 to 280 a pair measured on LLVM; on CUDA, which keeps pixels' states for the adjoint, up to 430
+
+
+@dataclass(frozen=True)
+class TileShape:
+    """A tile of width x height pixels is blended by `lanes` lanes; each holds `columns` columns of `rows` pixels."""
+
+    width: int
+    height: int
+    lanes: int
+    columns: int = 1
+
+    @property
+    def pixels(self) -> int:
+        """Pixels a lane."""
+        return self.width * self.height // self.lanes
+
+    @property
+    def rows(self) -> int:
+        """Pixels of a column."""
+        return self.pixels // self.columns
+
+
+def tile_shape() -> TileShape:
+    """The fastest shape measured for the backend (docs/performance.md). One tile is one warp on CUDA, a part of a
+    packet on LLVM, whose packets have 4 lanes or a multiple: a tile's gradients meet in an order that is fixed."""
+    return TileShape(8, 8, 32) if select() == "cuda" else TileShape(8, 8, 4, columns=2)
+
+
+@dataclass
+class TileLists:
+    """(tile, splat) pairs. `splat`, `slot` [P] are in blending order; `start`, `end` [T] delimit each tile.
+
+    Slots number the pairs splat by splat: those of splat i are `first_slot[i]` .. + `slot_count[i]`, [M]. Arrays have
+    room for more pairs and splats than there are, so that few sizes occur: P is `capacity`, M at least N.
+    order: the tiles in the order in which they are given to lanes [T], or None for that of their indices.
+    place: where each slot's pair stands in `splat` [P], or None: sums of pairs are then kept by slots (`sum_index`).
+    """
+
+    splat: Any
+    slot: Any
+    start: Any
+    end: Any
+    first_slot: Any
+    slot_count: Any
+    capacity: int
+    tiles_x: int
+    tiles_y: int
+    shape: TileShape
+    order: Any = None
+    place: Any = None
+
+    def sum_index(self, k: Any, active: Any = True) -> Any:
+        """Where the sums of pair k of `splat` are kept while they are added up.
+
+        Threads of a CPU add to the pairs of their tiles, which must not share cache lines: there it is the pair's
+        place."""
+        return dr.gather(ad.UInt32, self.slot, k, active) if self.place is None else k
+
+    def sum_of_slot(self, slot: Any) -> Any:
+        """The same of a slot."""
+        return slot if self.place is None else dr.gather(ad.UInt32, self.place, slot)
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs the tiles list. Waits for the device."""
+        return int(dr.sum(self.end - self.start)[0])
+
+
+@dataclass
+class _Boxes:
+    """Of splats [M]: boxes in tiles, how many tiles, the splats in the order in which pairs are numbered (None: that of
+    their indices), and the pairs up to and including each in that order, UInt64."""
+
+    left: Any
+    top: Any
+    columns: Any
+    count: Any
+    order: Any
+    upto: Any
+
+
+def bin_splats(
+    splats: Splats,
+    footprints: Footprints,
+    width: int,
+    height: int,
+    few_sizes: bool = False,
+    training: bool = False,
+) -> TileLists:
+    """Sort splats [N] into the tiles of a width x height image. Raises WorkError for more pairs than can be
+    sorted or held in memory. few_sizes: of lists, for pictures from all over, each of which has another number of
+    pairs; lists are up to half as long again. training: a training step has to find place in memory, not a picture.
+
+    Between its two parts, both recorded, the host waits for the number of pairs, which says how large arrays must be.
+    """
+    boxes_of, lists_of = (_boxes, _count) if select() == "cuda" else (_rank, _expand)
+    shape, count = tile_shape(), dr.width(splats.x)
+    tiles = -(-width // shape.width), -(-height // shape.height)
+    splats, footprints = dr.detach(splats), dr.detach(footprints)
+    pairs = 0
+    if count > 0:
+        capacity = room(count)
+        boxes: _Boxes = boxes_of(splats, footprints, dr.opaque(ad.UInt32, count), capacity, tiles, shape)
+        pairs = int(boxes.upto[capacity - 1])
+    _check_room(pairs, width * height, *(TRAINING_BYTES[select()] if training else PICTURE_BYTES))
+    if pairs == 0:
+        none, of_splats = dr.zeros(ad.UInt32, tiles[0] * tiles[1]), dr.zeros(ad.UInt32, max(count, 1))
+        return TileLists(none, none, none, none, of_splats, of_splats, 0, *tiles, shape)
+    steps = FEW if few_sizes and pairs < LONG else STEPS
+    lists: TileLists = lists_of(splats, footprints, boxes, room(pairs, steps), capacity, tiles, shape)
+    return lists
+
+
+def _check_room(pairs: int, pixels: int, bytes_a_pair: int, bytes_a_pixel: int) -> None:
+    needed = pairs * bytes_a_pair + pixels * bytes_a_pixel
+    most = LARGEST_PAIRS[select()]
+    if pairs > most:
+        raise WorkError(f"rasterizer: {pairs:.3g} pairs of tile and splat, at most {most:.3g} can be sorted")
+    free = free_memory(needed) if needed > 2**28 else None
+    if free is not None and needed > free:
+        raise WorkError(
+            f"rasterizer: {pairs:.3g} pairs of tile and splat on {pixels:.3g} pixels need about {needed / 1e9:.3g} GB "
+            f"of memory, {free / 1e9:.3g} GB are free"
+        )
+
+
+def room(count: int, steps: int = STEPS) -> int:
+    """`count` rounded up by about an eighth at most: few sizes are few recordings and, on LLVM, where the size of what
+    is scattered into is part of a kernel's text, few kernels to compile. steps: sizes from one power of two to the
+    next, itself one
+
+    Never `count` itself: a recording in which the two are one takes the size of the room from the number of splats."""
+    step = max(1024, (1 << max(0, count.bit_length() - 1)) // steps)
+    return (count // step + 1) * step
+
+
+def _trace_boxes(
+    splats: Splats, footprints: Footprints, count: Any, capacity: int, tiles: tuple[int, int], shape: TileShape
+) -> _Boxes:
+    """Boxes of `count` splats; pairs are numbered in the order of the splats' indices."""
+    left, top, columns, pairs, _ = _boxes_in_tiles(splats, footprints, count, capacity, tiles, shape)
+    wide = ad.UInt64(pairs)
+    dr.eval(left, top, columns, pairs, wide)
+    return _Boxes(left, top, columns, pairs, None, _running_sum(wide))
+
+
+def _trace_rank(
+    splats: Splats, footprints: Footprints, count: Any, capacity: int, tiles: tuple[int, int], shape: TileShape
+) -> _Boxes:
+    """Boxes of `count` splats; pairs are numbered in depth order."""
+    left, top, columns, pairs, live = _boxes_in_tiles(splats, footprints, count, capacity, tiles, shape)
+    # Splats that cannot be seen have no pairs, so their place does not matter.
+    lane = dr.arange(ad.UInt32, capacity)
+    key = dr.select(live, dr.gather(ad.UInt32, footprints.order, lane, live), ad.UInt32(0xFFFFFFFF))
+    dr.eval(left, top, columns, pairs, key)
+    order = _stable_order(key, 32)
+    return _Boxes(left, top, columns, pairs, order, _running_sum(ad.UInt64(dr.gather(ad.UInt32, pairs, order))))
+
+
+def _boxes_in_tiles(
+    splats: Splats, footprints: Footprints, count: Any, capacity: int, tiles: tuple[int, int], shape: TileShape
+) -> tuple[Any, Any, Any, Any, Any]:
+    """(left, top, columns, pairs, whether it can be seen) of each splat's box, [M] = [capacity]."""
+    lane = dr.arange(ad.UInt32, capacity)
+    live = lane < count
+    live &= dr.gather(ad.Bool, footprints.visible, lane, live)
+    x, y, half_width, half_height = (
+        dr.gather(ad.Float, v, lane, live) for v in (splats.x, splats.y, footprints.half_width, footprints.half_height)
+    )
+    x0, x1 = _tile_range(x, half_width, shape.width, tiles[0])
+    y0, y1 = _tile_range(y, half_height, shape.height, tiles[1])
+    return x0, y0, dr.maximum(x1 - x0, 1), dr.select(live, (x1 - x0) * (y1 - y0), ad.UInt32(0)), live
+
+
+def _running_sum(values: Any) -> Any:
+    return dr.prefix_reduce(dr.ReduceOp.Add, values, exclusive=False)
+
+
+def _trace_count(
+    splats: Splats,
+    footprints: Footprints,
+    boxes: _Boxes,
+    capacity: int,
+    splat_capacity: int,
+    tiles: tuple[int, int],
+    shape: TileShape,
+) -> TileLists:
+    """Lists that are ordered one by one."""
+    slot = dr.arange(ad.UInt32, capacity)
+    total = ad.UInt32(dr.gather(ad.UInt64, boxes.upto, ad.UInt32(splat_capacity - 1)))
+    splat = owners(boxes.upto, dr.minimum(slot, total - 1), splat_capacity)  # beyond the last pair: that one's splat
+    before = ad.UInt32(dr.gather(ad.UInt64, boxes.upto, splat)) - dr.gather(ad.UInt32, boxes.count, splat)
+    tile = _tile_of(splats, boxes, splat, slot - before, slot < total, tiles, shape)
+    key = dr.gather(ad.UInt32, footprints.order, splat)
+    first_slot = ad.UInt32(boxes.upto) - boxes.count
+    dr.eval(first_slot)
+    splat, slot, start, end = ordered_lists(tile, key, splat, tiles[0] * tiles[1], capacity)
+    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, *tiles, shape)
+
+
+def _trace_expand(
+    splats: Splats,
+    _footprints: Footprints,
+    boxes: _Boxes,
+    capacity: int,
+    splat_capacity: int,
+    tiles: tuple[int, int],
+    shape: TileShape,
+) -> TileLists:
+    """Lists from two stable sorts."""
+    # Mark each splat's first pair with its rank, then a running maximum fills in the rest.
+    splat_rank = dr.arange(ad.UInt32, splat_capacity)
+    pairs_of = dr.gather(ad.UInt32, boxes.count, boxes.order)
+    first = ad.UInt32(boxes.upto) - pairs_of
+    dr.eval(first)
+    rank = dr.zeros(ad.UInt32, capacity)
+    dr.scatter(rank, splat_rank, first, active=pairs_of > 0)
+    rank = dr.prefix_reduce(dr.ReduceOp.Max, rank, exclusive=False)
+    first_slot = dr.zeros(ad.UInt32, splat_capacity)
+    dr.scatter(first_slot, first, boxes.order)
+
+    slot = dr.arange(ad.UInt32, capacity)
+    total = ad.UInt32(dr.gather(ad.UInt64, boxes.upto, ad.UInt32(splat_capacity - 1)))
+    splat = dr.gather(ad.UInt32, boxes.order, rank)
+    within = slot - dr.gather(ad.UInt32, first, rank)
+    tile = _tile_of(splats, boxes, splat, within, slot < total, tiles, shape)
+    count = tiles[0] * tiles[1]
+    slot = _stable_order(tile, count.bit_length())
+    tile = dr.gather(ad.UInt32, tile, slot)
+    splat = dr.gather(ad.UInt32, splat, slot)
+    dr.eval(tile, splat)
+    start, end = _runs(tile, count, capacity)
+    order = _longest_first(end - start, shape)
+    place = dr.empty(ad.UInt32, capacity)
+    dr.scatter(place, dr.arange(ad.UInt32, capacity), slot)
+    dr.eval(splat, slot, start, end, first_slot, order, place)
+    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, *tiles, shape, order, place)
+
+
+def _longest_first(length: Any, shape: TileShape) -> Any:
+    """Tiles by the lengths [T] of their lists, longest first, then dealt to `HANDS` hands.
+
+    Tiles that share a packet are walked together until the longest list ends: neighbours are of about one length.
+    Threads take runs of packets: each hand has long lists and short ones.
+    """
+    count = dr.width(length)
+    sorted_ = _stable_order(LONGEST - dr.minimum(length, LONGEST), LONGEST.bit_length())
+    group = max(PACKET // shape.lanes, 1)
+    groups = count // group
+    hands = min(HANDS, groups // 4)
+    if hands < 2:
+        return sorted_
+    index = dr.arange(ad.UInt32, count)
+    dealt, within = index // group, index % group
+    few, more = divmod(groups, hands)  # the first `more` hands have one group more
+    in_first = dealt < more * (few + 1)
+    rest = dealt - more * (few + 1)
+    hand = dr.select(in_first, dealt // (few + 1), more + rest // few)
+    turn = dr.select(in_first, dealt % (few + 1), rest % few)
+    hand = dr.select((turn % 2 == 1) & (turn < few), hands - 1 - hand, hand)  # there and back, as long as all get one
+    whole = index < groups * group  # the last few tiles, with the shortest lists, stay where they are
+    return dr.gather(ad.UInt32, sorted_, dr.select(whole, (turn * hands + hand) * group + within, index))
+
+
+def _tile_of(
+    splats: Splats, boxes: _Boxes, splat: Any, within: Any, exists: Any, tiles: tuple[int, int], shape: TileShape
+) -> Any:
+    """Tile [P] of the pair `within` the box of a splat; the number of tiles where there is no such pair, or the ellipse
+    misses the tile."""
+    columns = dr.maximum(dr.gather(ad.UInt32, boxes.columns, splat), 1)
+    column = dr.gather(ad.UInt32, boxes.left, splat) + within % columns
+    row = dr.gather(ad.UInt32, boxes.top, splat) + within // columns
+    listed = exists & _touches(splats, splat, column, row, shape)
+    return dr.select(listed, row * tiles[0] + column, tiles[0] * tiles[1])
+
+
+def _touches(splats: Splats, splat: Any, column: Any, row: Any, shape: TileShape) -> Any:
+    """Does the ellipse {alpha >= ALPHA_MIN} of a splat reach a pixel centre's rectangle of a tile? [P] each.
+
+    Outside its centre a convex quadratic is least, over a rectangle, on an edge that faces the centre.
+    """
+    x, y, a, b, c, opacity = (
+        dr.gather(ad.Float, v, splat) for v in (splats.x, splats.y, splats.a, splats.b, splats.c, splats.opacity)
+    )
+    left, top = ad.Float(column * shape.width) + 0.5 - x, ad.Float(row * shape.height) + 0.5 - y
+    right, bottom = left + (shape.width - 1), top + (shape.height - 1)
+    near_x, near_y = dr.clip(0, left, right), dr.clip(0, top, bottom)
+    on_column = dr.clip(-b * near_x * dr.rcp(c), top, bottom)  # least along the facing vertical edge
+    on_row = dr.clip(-b * near_y * dr.rcp(a), left, right)
+
+    def form(dx: Any, dy: Any) -> Any:
+        return a * dx * dx + 2 * b * dx * dy + c * dy * dy
+
+    least = dr.minimum(form(near_x, on_column), form(on_row, near_y))
+    return least <= 2 * dr.log(dr.maximum(opacity / ALPHA_MIN, 1)) * (1 + 1e-4) + 1e-4
+
+
+def _stable_order(keys: Any, bits: int) -> Any:
+    """Indices that sort `keys` [N] of so many bits: a radix sort that knows how few digits there are, where dr.argsort
+    goes through all 32 bits."""
+    passes = -(-bits // DIGIT_BITS)
+    digit_bits = -(-bits // passes)
+    order = None
+    for i in range(passes):
+        digit, last = (keys >> (i * digit_bits)) & ((1 << digit_bits) - 1), i == passes - 1
+        dr.eval(digit, order, None if last else keys)
+        moved = ad.UInt32(dr.detail.block_mkperm(dr.detach(digit), dr.width(keys), 1 << digit_bits))
+        order = moved if order is None else dr.gather(ad.UInt32, order, moved)
+        if not last:
+            keys = dr.gather(ad.UInt32, keys, moved)
+        del digit, moved  # what is over goes: memory is short here
+    return order
+
+
+def _tile_range(center: Any, half: Any, size: int, tiles: int) -> tuple[Any, Any]:
+    """Half-open range of tile indices that [center - half, center + half] touches, UInt32 [N] each."""
+    low = dr.clip(dr.floor((center - half) / size), 0, tiles)
+    high = dr.clip(dr.floor((center + half) / size) + 1, low, tiles)
+    return ad.UInt32(low), ad.UInt32(high)
+
+
+def _runs(tile: Any, tiles: int, capacity: int) -> tuple[Any, Any]:
+    """First and one-past-last position of each tile's run in the sorted array `tile` [capacity]; 0, 0 where it has
+    none. Entries of `tiles` and above are in no tile."""
+    position = dr.arange(ad.UInt32, capacity)
+    previous = dr.gather(ad.UInt32, tile, dr.select(position > 0, position - 1, 0))
+    following = dr.gather(ad.UInt32, tile, dr.minimum(position + 1, capacity - 1))
+    start, end = dr.zeros(ad.UInt32, tiles), dr.zeros(ad.UInt32, tiles)
+    listed = tile < tiles
+    dr.scatter(start, position, tile, active=listed & ((position == 0) | (previous != tile)))
+    dr.scatter(end, position + 1, tile, active=listed & ((position == capacity - 1) | (following != tile)))
+    return start, end
+
+
+_boxes = recorded(_trace_boxes, RECORDINGS)
+_count = recorded(_trace_count, RECORDINGS)
+_rank = recorded(_trace_rank, RECORDINGS)
+_expand = recorded(_trace_expand, RECORDINGS)

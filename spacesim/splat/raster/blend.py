@@ -1,0 +1,203 @@
+"""Stage 3: blend each tile's splats front to back (thesis 2.14 to 2.16), and the adjoint of that.
+
+One lane holds a block of a tile's pixels and walks the tile's list. `forward` and `backward` are the two passes;
+`rasterize` is the differentiable operation made of them. The adjoint is by hand (`adjoint.py`): by buckets of pairs on
+CUDA, by tiles on LLVM. Buckets read what `forward` has kept of each pixel before each bucket. On an H100 to keep it
+costs a twentieth of what the adjoint gains; on a CPU it costs more than that (docs/performance.md).
+"""
+
+from functools import reduce
+from typing import Any
+
+import drjit as dr
+
+from spacesim.backend import ad, recorded, select
+from spacesim.splat.raster.adjoint import SplatGradients, by_buckets, by_tiles
+from spacesim.splat.raster.bin import RECORDINGS, TileLists, room
+from spacesim.splat.raster.project import Splats
+from spacesim.splat.raster.records import (
+    ALPHA_MAX,
+    POWER_MIN,
+    TRANSMITTANCE_MIN,
+    Blended,
+    bucket_numbers,
+    exp2,
+    exponents,
+    lane_pixels,
+    list_records,
+    load,
+    store,
+    tiled_index,
+)
+
+BUCKET = 8  #: pairs of a bucket, a power of two; 4 keep twice as much for 1 % of a step, 16 took longer on an H100
+BUCKET_TURN = 2  #: pairs a turn of the blending loop where buckets are kept: fewer turns have to ask for a new bucket
+CHECKPOINT_BYTES = 2**32  #: chosen: longer lists than these hold have their adjoint by tiles, on CUDA too
+
+
+def forward(
+    splats: Splats, features: list[Any], lists: TileLists, width: int, height: int, adjoint: bool = False
+) -> Blended:
+    """Blend `features` (C arrays [N]) over the pixels of a width x height image. Detached inputs.
+
+    adjoint: keep what the backend's fastest `backward` reads; it costs memory, and can do without.
+    """
+    run = _forward if width * height > 1 else trace_forward  # a recording gives a plane of one pixel another size
+    bucket = _bucket(lists, len(features)) if adjoint else 0
+    blended: Blended = run(splats, features, lists, width, height, room(dr.width(splats.x)), bucket)
+    return blended
+
+
+def _bucket(lists: TileLists, channels: int) -> int:
+    """Pairs of a bucket; 0 for the adjoint by tiles."""
+    pixels = lists.shape.width * lists.shape.height
+    needed = 16 * -(-(1 + channels) // 4) * pixels * bucket_numbers(lists, BUCKET)
+    return BUCKET if select() == "cuda" and lists.capacity > 0 and needed <= CHECKPOINT_BYTES else 0
+
+
+def trace_forward(
+    splats: Splats, features: list[Any], lists: TileLists, width: int, height: int, capacity: int, bucket: int
+) -> Blended:
+    """`forward` as a part of recordings. capacity: room for the N splats;  bucket: pairs of a bucket of the adjoint, 0
+    for none"""
+    shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
+    channels, pixels = len(features), lists.shape.pixels
+    turn = min(BUCKET_TURN, bucket) if bucket else 1
+    records = list_records(splats, features, lists, capacity)
+    lane = lane_pixels(lists)
+    start = dr.gather(ad.UInt32, lists.start, lane.tile)
+    kept = _Checkpoints(lists, bucket, channels, lane.place, start) if bucket else None
+
+    def alive(k: Any, end: Any, transmittance: list[Any], _sums: Any, _last: Any) -> Any:
+        return (k < end) & (reduce(dr.maximum, transmittance) > TRANSMITTANCE_MIN)
+
+    def blend(k: Any, end: Any, transmittance: list[Any], sums: list[list[Any]], last: list[Any]) -> Any:
+        if kept:
+            kept.keep(k, transmittance, sums)
+        transmittance, last, sums = list(transmittance), list(last), [list(pixel) for pixel in sums]
+        for u in range(turn):
+            listed = k + u < end if u else ad.Bool(True)
+            record = load(records, k + u, lists.capacity, listed)
+            powers = exponents(record, lane.x, lane.y, shape)
+            for p in range(pixels):
+                alpha = dr.minimum(exp2(powers[p]), ALPHA_MAX)
+                blends = listed & (powers[p] >= POWER_MIN) & (transmittance[p] > TRANSMITTANCE_MIN)
+                weight = dr.select(blends, alpha * transmittance[p], 0)
+                for c in range(channels):
+                    sums[p][c] = dr.fma(weight, record[6 + c], sums[p][c])
+                transmittance[p] -= weight
+                last[p] = dr.select(blends, k + (u + 1), last[p])
+        return k + turn, end, transmittance, sums, last
+
+    state = (
+        start,
+        dr.gather(ad.UInt32, lists.end, lane.tile),
+        [ad.Float(1) for _ in range(pixels)],
+        [[ad.Float(0) for _ in range(channels)] for _ in range(pixels)],
+        [ad.UInt32(0) for _ in range(pixels)],
+    )
+    if lists.capacity > 0:
+        state = dr.while_loop(state, alive, blend, mode="symbolic", label="blend")
+    _, _, transmittance, sums, last = state
+
+    lanes = tiles * shape.lanes
+    tiled = [store([sums[p][c] for p in range(pixels)], lane.place, lanes) for c in range(channels)]
+    tiled_transmittance, tiled_last = store(transmittance, lane.place, lanes), store(last, lane.place, lanes)
+    checkpoints, bucket_tile = (kept.states, kept.tile) if kept else ([], None)
+    dr.eval(tiled, tiled_transmittance, tiled_last, checkpoints, bucket_tile)
+    pixel = tiled_index(lists, width, height)
+    return Blended(
+        features=[dr.gather(ad.Float, plane, pixel) for plane in tiled],
+        transmittance=dr.gather(ad.Float, tiled_transmittance, pixel),
+        tile_transmittance=tiled_transmittance,
+        last=tiled_last,
+        tile_last=dr.block_reduce(dr.ReduceOp.Max, tiled_last, shape.lanes * pixels),
+        records=records,
+        bucket=bucket,
+        checkpoints=checkpoints,
+        bucket_tile=bucket_tile,
+    )
+
+
+class _Checkpoints:
+    """What the blending loop keeps of pixels before each bucket, see `Blended`. lane (its place), start: [T * lanes]"""
+
+    def __init__(self, lists: TileLists, bucket: int, channels: int, lane: Any, start: Any) -> None:
+        numbers, fours = bucket_numbers(lists, bucket), -(-(1 + channels) // 4)
+        pixels = lists.shape.width * lists.shape.height
+        self.shape, self.bucket, self.start = lists.shape, bucket, start
+        self.tile_number, self.within = lane // lists.shape.lanes, lane % lists.shape.lanes
+        self.first = start // bucket + self.tile_number
+        self.states = [dr.empty(ad.Float, 4 * numbers * pixels) for _ in range(fours)]
+        self.tile = dr.full(ad.UInt32, lists.tiles_x * lists.tiles_y, numbers)
+
+    def keep(self, k: Any, transmittance: list[Any], sums: list[list[Any]]) -> None:
+        """Before pair k, where a bucket starts there; of the pixels whose lane still walks."""
+        starts = ((k - self.start) & (self.bucket - 1)) == 0
+        number, own = self.first + (k - self.start) // self.bucket, self.shape.pixels
+        dr.scatter(self.tile, self.tile_number, number, active=starts)  # whichever lane still walks
+        for p in range(own):
+            values = [transmittance[p], *sums[p]]
+            values += [ad.Float(0)] * (-len(values) % 4)
+            place = (number * self.shape.lanes + self.within) * own + p
+            for i, target in enumerate(self.states):
+                dr.scatter(target, ad.Array4f(values[4 * i : 4 * i + 4]), place, starts, dr.ReduceMode.NoConflicts)
+
+
+def backward(
+    splats: Splats,
+    blended: Blended,
+    lists: TileLists,
+    image_size: tuple[int, int],
+    feature_gradients: list[Any],
+    transmittance_gradient: Any,
+    absolute: bool = True,
+) -> SplatGradients:
+    """Adjoint of `forward`: from gradients of its planes [height * width] to gradients of the splats [N].
+
+    image_size: (width, height). absolute: sum |d / d x| and |d / d y|, too. With w_i = alpha_i T_i and
+    d_i = <dL/dC, f_i>: dL/d alpha_i = T_i d_i - (sum_{j > i} w_j d_j + T_end dL/dT_end) / (1 - alpha_i).
+    """
+    count, channels = dr.width(splats.x), len(feature_gradients)
+    if lists.capacity == 0:
+        zeros = [dr.opaque(ad.Float, 0, count) for _ in range(9 + channels)]  # no literals: they fold gradients away
+        return SplatGradients(Splats(*zeros[:7]), zeros[9:], zeros[7], zeros[8])
+    run = _backward_by_buckets if blended.bucket else _backward_by_tiles
+    gradients: SplatGradients = run(
+        splats, blended, lists, image_size, feature_gradients, transmittance_gradient, absolute
+    )
+    return gradients
+
+
+class _Rasterize(dr.CustomOp):
+    """`forward` and `backward` as one node of Dr.Jit's graph. Differentiable in reverse mode."""
+
+    def eval(self, splats: Splats, features: list[Any], lists: TileLists, width: int, height: int) -> list[Any]:
+        self.splats, self.lists, self.size = splats, lists, (width, height)
+        self.blended = forward(splats, features, lists, width, height, adjoint=True)
+        return [*self.blended.features, self.blended.transmittance]
+
+    def backward(self) -> None:
+        gradients: Any = self.grad_out()
+        *by_feature, by_transmittance = gradients
+        result = backward(self.splats, self.blended, self.lists, self.size, by_feature, by_transmittance, False)
+        result.splats.depth = dr.opaque(ad.Float, 0, dr.width(self.splats.x))
+        self.set_grad_in("splats", result.splats)
+        self.set_grad_in("features", result.features)
+
+    def name(self) -> str:
+        return "rasterize"
+
+
+def rasterize(splats: Splats, features: list[Any], lists: TileLists, width: int, height: int) -> tuple[list[Any], Any]:
+    """Differentiable blending. Returns (C feature planes, transmittance plane), [height * width] each."""
+    if not dr.grad_enabled(splats, features):
+        blended = forward(splats, features, lists, width, height)
+        return blended.features, blended.transmittance
+    outputs: list[Any] = dr.custom(_Rasterize, splats, features, lists, width, height)
+    return outputs[:-1], outputs[-1]
+
+
+_forward = recorded(trace_forward, RECORDINGS)
+_backward_by_tiles = recorded(by_tiles, RECORDINGS)
+_backward_by_buckets = recorded(by_buckets, RECORDINGS)

@@ -1,0 +1,157 @@
+"""Geometry from Gaussians: normals as features to blend, the median depth of a pixel, the surface there."""
+
+from functools import reduce
+from typing import Any
+
+import drjit as dr
+
+from spacesim.backend import ad, recorded
+from spacesim.splat.raster.bin import RECORDINGS, TileLists, room
+from spacesim.splat.raster.cameras import Projection
+from spacesim.splat.raster.gaussians import Gaussians, principal_axes
+from spacesim.splat.raster.project import Splats
+from spacesim.splat.raster.records import (
+    ALPHA_MAX,
+    POWER_MIN,
+    exp2,
+    exponents,
+    lane_pixels,
+    list_records,
+    load,
+    packets,
+    store,
+    tiled_index,
+)
+
+NONE = 2**32 - 1  #: in place of a splat's number
+REACH = 2.0  #: standard deviations to which a Gaussian's surface reaches (docs/geometry.md)
+
+
+def normals(gaussians: Gaussians, camera: Projection, axes: str = "world") -> Any:
+    """Array3f [3, N]: the shortest principal axis of each Gaussian, turned towards the camera; unit length.
+
+    axes: "world", or "camera" (OpenCV's). Differentiable by the quaternions; which axis, and which way it
+    points, is taken as given. Among equal scales the first axis counts.
+    """
+    if axes not in ("world", "camera"):
+        raise ValueError(f'axes: expected "world" or "camera", found {axes!r}')
+    normal = shortest_axis(gaussians.quaternions, gaussians.log_scales)
+    away = dr.detach(dr.dot(normal, camera.rays_to(gaussians.means))) > 0
+    normal = dr.select(away, -normal, normal)
+    return normal if axes == "world" else ad.Array3f([dr.dot(camera.row(i), normal) for i in range(3)])
+
+
+def shortest_axis(quaternions: Any, log_scales: Any) -> Any:
+    """Array3f [3, N], unit, of either sign; differentiable by the quaternions. Among equal scales the first counts."""
+    columns, scales = principal_axes(quaternions), dr.detach(log_scales)
+    first = (scales[0] <= scales[1]) & (scales[0] <= scales[2])
+    return dr.select(first, columns[0], dr.select(scales[1] <= scales[2], columns[1], columns[2]))
+
+
+def unit(vector: Any) -> Any:
+    """Array3f [3, P] of unit length; 0 with no gradient where `vector` is shorter than 1e-6."""
+    square = dr.squared_norm(vector)
+    known = dr.detach(square) > 1e-12
+    return dr.select(known, vector * dr.rsqrt(dr.select(known, square, 1)), 0)
+
+
+def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> Any:
+    """UInt32 [height * width]: the splat behind which less than half of the light passes; `NONE` where there is none.
+
+    Walks each tile's list once more, until that is known of all pixels of a lane. Not differentiable.
+    """
+    if lists.capacity == 0:
+        return dr.opaque(ad.UInt32, NONE, width * height)
+    walk = _walk if width * height > 1 else trace_walk  # a recording gives a plane of one pixel another size
+    return walk(dr.detach(splats), lists, width, height, room(dr.width(splats.x)))
+
+
+def trace_walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: int) -> Any:
+    """`median_splat` as a part of recordings. capacity: room for the N splats"""
+    records, lane, pixels = list_records(splats, [], lists, capacity), lane_pixels(lists), lists.shape.pixels
+
+    def undecided(k: Any, end: Any, transmittance: list[Any], _place: Any) -> Any:
+        return (k < end) & (reduce(dr.maximum, transmittance) >= 0.5)
+
+    def pass_splat(k: Any, end: Any, transmittance: list[Any], place: list[Any]) -> Any:
+        transmittance, place = list(transmittance), list(place)
+        powers = exponents(load(records, k, lists.capacity), lane.x, lane.y, lists.shape)
+        for p in range(pixels):
+            passing = transmittance[p] >= 0.5
+            alpha = dr.select(powers[p] >= POWER_MIN, dr.minimum(exp2(powers[p]), ALPHA_MAX), 0)
+            transmittance[p] -= alpha * transmittance[p]
+            place[p] = dr.select(passing & (transmittance[p] < 0.5), k, place[p])
+        return k + 1, end, transmittance, place
+
+    start, end = (dr.gather(ad.UInt32, bound, lane.tile) for bound in (lists.start, lists.end))
+    state = start, end, [ad.Float(1) for _ in range(pixels)], [ad.UInt32(NONE) for _ in range(pixels)]
+    *_, place = dr.while_loop(state, undecided, pass_splat, mode="symbolic", label="median")
+    tiled = store(list(place), lane.place, lists.tiles_x * lists.tiles_y * lists.shape.lanes)
+    dr.eval(tiled)
+    place = dr.gather(ad.UInt32, tiled, tiled_index(lists, width, height))
+    return dr.select(place != NONE, dr.gather(ad.UInt32, lists.splat, place, place != NONE), NONE)
+
+
+def picked(values: Any, index: Any) -> Any:
+    """values[index], Float [P] of values [N] and index UInt32 [P]; 0 where the index is N or more. Differentiable, and
+    its gradients are the same to the bit in every run: added up as integers, in which order does not matter."""
+    return dr.custom(_Pick, values, index)
+
+
+def surface_depth(gaussians: Gaussians, splats: Splats, index: Any, camera: Projection, capacity: int) -> Any:
+    """Float [height * width], metres: depth of the splat `index` of each pixel (UInt32 [P], as of `median_splat`) where
+    the ray meets it, not at its centre; 0 where the index is `NONE`.
+
+    A ray d is deepest in a Gaussian at z = d'P m / d'P d, P its inverse covariance and m its centre in camera axes.
+    That is taken as linear in the pixel about the centre, as in RaDe-GS (Zhang et al. 2024), and ends `REACH` standard
+    deviations of the longest axis before and behind it. Not differentiable. capacity: room for the N splats (`room`)
+    """
+    splats = dr.detach(splats)
+    means, scales = dr.detach(gaussians.means), dr.detach(gaussians.log_scales)
+    least = dr.minimum(scales[0], dr.minimum(scales[1], scales[2]))
+    most = dr.maximum(scales[0], dr.maximum(scales[1], scales[2]))
+    ray = ad.Array3f([dr.dot(camera.row(i), camera.rays_to(means)) for i in range(3)])
+    ray *= dr.rcp(dr.select(dr.abs(ray.z) > 1e-6, ray.z, 1))
+    across, along, square = ad.Float(0), ad.Float(0), ad.Float(0)
+    for axis, scale in zip(principal_axes(dr.detach(gaussians.quaternions)), scales, strict=True):
+        turned = ad.Array3f([dr.dot(camera.row(i), axis) for i in range(3)])
+        share = dr.dot(turned, ray)
+        part = dr.exp(2 * (least - scale)) * share
+        across, along, square = across + part * turned.x, along + part * turned.y, square + part * share
+    screen = camera.screen(camera.transform(means))
+    slopes = [across / (square * screen.scale_x), along / (square * screen.scale_y)]
+    numbers = [splats.x, splats.y, *slopes, splats.depth, REACH * dr.exp(most)]
+    lane = dr.arange(ad.UInt32, dr.width(splats.depth))
+    packed = [store(values, lane, capacity) for values in packets(numbers)]
+    dr.eval(packed)
+
+    known = index != NONE
+    x, y, slope_x, slope_y, depth, reach, *_ = load(packed, index, capacity, known)
+    pixel = dr.arange(ad.UInt32, camera.width * camera.height)
+    offset = slope_x * (x - 0.5 - ad.Float(pixel % camera.width))
+    offset += slope_y * (y - 0.5 - ad.Float(pixel // camera.width))
+    offset = dr.clip(offset, -reach, reach)
+    return dr.select(known, depth + dr.select(dr.isfinite(offset), offset, 0), 0)
+
+
+class _Pick(dr.CustomOp):
+    def eval(self, values: Any, index: Any) -> Any:
+        self.index, self.count = index, dr.width(values)
+        return dr.gather(ad.Float, values, index, index < self.count)
+
+    def backward(self) -> None:
+        # Fixed point of 2^-62 of the largest sum that can come out: exact to 2^-62 P of the largest gradient.
+        gradient = ad.Float64(self.grad_out())
+        gradient = dr.select(dr.isfinite(gradient), gradient, 0)
+        unit_of_sum = dr.maximum(dr.max(dr.abs(gradient)), 1e-300) * (dr.width(self.index) / 2.0**61)
+        parts = dr.reinterpret_array(ad.UInt64, ad.Int64(dr.round(gradient / unit_of_sum)))  # CUDA adds unsigned ones
+        total = dr.zeros(ad.UInt64, self.count)
+        dr.scatter_reduce(dr.ReduceOp.Add, total, parts, self.index, self.index < self.count)
+        total = ad.Float64(dr.reinterpret_array(ad.Int64, total))
+        self.set_grad_in("values", ad.Float(total * unit_of_sum))
+
+    def name(self) -> str:
+        return "pick"
+
+
+_walk = recorded(trace_walk, RECORDINGS)

@@ -1,0 +1,183 @@
+"""Where Gaussians start: on a mesh, at points, or at random."""
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from spacesim.data.errors import InputError
+from spacesim.data.mesh import read_mesh
+from spacesim.data.records import Dataset
+from spacesim.data.store import read_points
+from spacesim.splat.raster.cameras import NEAR
+from spacesim.splat.raster.gaussians import SH_C0, Gaussians, uploaded
+
+OPACITY = 0.1  #: of every Gaussian at the start (Kerbl et al. 2023)
+NEIGHBOURS = 12  #: points that a normal is estimated from, chosen
+COARSE = 0.05  #: pixels, chosen: steps of 0.1 cost 0.4 dB of 26.6, those of 1 pixel 1.9 dB (boxsat, 96 pixels)
+FEATURES = 0.3  #: standard deviation of the features at the start, chosen
+
+
+def initial_gaussians(
+    dataset: Dataset,
+    init: str | None,
+    count: int,
+    sh_degree: int,
+    seed: int,
+    features: int = 0,
+    box: float | None = None,
+) -> Gaussians:
+    """At most `count` Gaussians: isotropic, as wide as the mean distance to their three nearest neighbours.
+
+    With `features` > 0 they have that many, normally distributed, and no harmonics.
+    init: "mesh" samples the ground-truth mesh evenly, "points" takes the dataset's points, "random" fills the cube
+    around the scene; None takes points, else the mesh, else random
+    box: side of that cube in sizes of the object; None: within the cameras
+    Raises InputError where `init` is not to be had.
+    """
+    rng = np.random.default_rng([seed, 0])
+    if init is None:
+        init = "points" if dataset.ply_file_path else "mesh" if dataset.mesh_path else "random"
+    if init == "points":
+        means, colours = _from_points(dataset, count, rng)
+    elif init == "mesh":
+        means, colours = _from_mesh(dataset, count, rng)
+    else:
+        means, colours = _at_random(dataset, count, rng, box)
+    gaussians = gaussians_at(means, colours, -1 if features else sh_degree)
+    if features:
+        values = FEATURES * rng.standard_normal((features, gaussians.count))
+        gaussians.features = uploaded(values.ravel())
+    return gaussians
+
+
+def surface_normals(means: np.ndarray) -> np.ndarray:
+    """[N, 3] unit normals of the surface on which points [N, 3] lie, of either sign: the direction in which the
+    `NEIGHBOURS` nearest points spread least (Hoppe et al. 1992)."""
+    count = min(NEIGHBOURS, len(means))
+    near = means[cKDTree(means).query(means, k=count)[1].reshape(len(means), count)]
+    centred = near - near.mean(axis=1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][:, :, 0]
+
+
+def spacing(means: np.ndarray) -> np.ndarray:
+    """[N] metres: the mean distance of each of points [N, 3] to its three nearest neighbours, 1e-6 at least; 0.01 of a
+    single one (Kerbl et al. 2023)."""
+    count = len(means)
+    neighbours = min(4, count)
+    if neighbours < 2:
+        return np.full(count, 0.01)
+    distances = cKDTree(means).query(means, k=neighbours)[0][:, 1:]
+    return np.maximum(distances.mean(axis=1), 1e-6)
+
+
+def gaussians_at(means: np.ndarray, colours: np.ndarray, sh_degree: int) -> Gaussians:
+    """Gaussians at means [N, 3] metres with sRGB colours [N, 3] in [0, 1]; sh_degree -1: without harmonics."""
+    count = len(means)
+    sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
+    sh[:, :1] = ((colours - 0.5) / SH_C0)[:, None]
+    return Gaussians.from_numpy(
+        {
+            "means": means,
+            "log_scales": np.repeat(np.log(spacing(means))[:, None], 3, axis=1),
+            "quaternions": np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+            "logit_opacities": np.full(count, np.log(OPACITY / (1 - OPACITY))),
+            "sh": sh,
+        }
+    )
+
+
+def scene_scale(dataset: Dataset) -> float:
+    """Metres: largest coordinate of the training cameras about their mean, Nerfstudio's unit of length."""
+    centers = np.array([frame.camera.position for frame in dataset.train])
+    return float(max(np.abs(centers - centers.mean(axis=0)).max(), 1e-6)) if len(centers) > 1 else 1.0
+
+
+def small_remark(dataset: Dataset) -> str:
+    """A sentence where the cameras stand so near to each other and to what they look at that little of it can be drawn,
+    as with poses in kilometres; "" where they do not."""
+    distance = nearest_camera(dataset, focus_point(dataset))
+    if max(distance, scene_scale(dataset)) >= 2 * NEAR:
+        return ""
+    return (
+        f"{dataset.root}: expected poses in metres, found training cameras {distance:.2g} m from what they look at: "
+        f"what is nearer to a camera than {NEAR} m is not drawn"
+    )
+
+
+def far_remark(dataset: Dataset) -> str:
+    """A sentence where what the cameras look at is so far from the origin that single precision shows in pictures, as
+    with the coordinates of an orbit; "" where it is not."""
+    focus = focus_point(dataset)
+    step = float(np.spacing(np.float32(np.abs(focus).max())))
+    camera = min((f.camera for f in dataset.train), key=lambda c: float(np.linalg.norm(c.position - focus)))
+    distance, away = float(np.linalg.norm(camera.position - focus)), float(np.linalg.norm(focus))
+    pixel = max(distance, 1e-6) / max(camera.fx, camera.fy)
+    if step < COARSE * pixel or away < distance:
+        return ""
+    return (
+        f"{dataset.root}: expected poses about an origin near the object, found it {away:.2g} m away, "
+        f"where single precision has steps of {step:.2g} m, {step / pixel:.2g} pixels: move the poses"
+    )
+
+
+def _from_points(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    if dataset.ply_file_path is None:
+        raise InputError(f"{dataset.root}: --init points expects ply_file_path in transforms.json, found none")
+    points, colours = read_points(dataset.root / dataset.ply_file_path)
+    if len(points) > count:
+        chosen = np.sort(rng.choice(len(points), count, replace=False))
+        points, colours = points[chosen], colours[chosen]
+    return points.astype(np.float64), colours / 255.0
+
+
+def _from_mesh(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    if dataset.mesh_path is None or not (dataset.root / dataset.mesh_path).exists():
+        raise InputError(f"{dataset.root}: --init mesh expects a mesh.ply, found none")
+    mesh = trimesh.Trimesh(*read_mesh(dataset.root / dataset.mesh_path), process=False)
+    points, _ = trimesh.sample.sample_surface(mesh, count, seed=rng)
+    return np.asarray(points), np.full((count, 3), 0.5)
+
+
+def _at_random(
+    dataset: Dataset, count: int, rng: np.random.Generator, box: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform in a cube about the point that the cameras look at: as wide as the nearest camera is far, or `box` times
+    as wide as the object."""
+    center = focus_point(dataset)
+    half = 0.5 * nearest_camera(dataset, center)
+    if box is not None:
+        half = 0.5 * box * object_size(dataset)
+    return center + rng.uniform(-half, half, (count, 3)), rng.uniform(0, 1, (count, 3))
+
+
+def object_size(dataset: Dataset) -> float:
+    """Metres: the longest side of the box around the dataset's mesh, or its points. InputError without either."""
+    if dataset.mesh_path is not None and (dataset.root / dataset.mesh_path).exists():
+        vertices, faces = read_mesh(dataset.root / dataset.mesh_path)
+        points = vertices[faces.ravel()]
+    elif dataset.ply_file_path is not None:
+        points = read_points(dataset.root / dataset.ply_file_path)[0]
+    else:
+        raise InputError(f"{dataset.root}: --init-box expects a mesh or points that tell the object's size, found none")
+    return float(np.ptp(points, axis=0).max())
+
+
+def farthest_camera(dataset: Dataset, center: np.ndarray) -> float:
+    """Metres from `center` [3] to the farthest training camera (dist_max of thesis 4.5)."""
+    return float(max(np.linalg.norm(frame.camera.position - center) for frame in dataset.train))
+
+
+def nearest_camera(dataset: Dataset, center: np.ndarray) -> float:
+    """Metres from `center` [3] to the nearest training camera."""
+    return float(min(np.linalg.norm(frame.camera.position - center) for frame in dataset.train))
+
+
+def focus_point(dataset: Dataset) -> np.ndarray:
+    """[3] the point nearest to all optical axes, in the least-squares sense."""
+    A, b = 1e-9 * np.eye(3), np.zeros(3)
+    for frame in dataset.train:
+        axis = frame.camera.world_from_camera[:3, 2]
+        across = np.eye(3) - np.outer(axis, axis)
+        A += across
+        b += across @ frame.camera.position
+    return np.linalg.solve(A, b)

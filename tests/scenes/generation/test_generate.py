@@ -1,0 +1,219 @@
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spacesim.data.errors import InputError, WorkError
+from spacesim.data.store import FrameWriter, read_points, verify_dataset
+from spacesim.scenes import build, generate, read_scene
+from spacesim.scenes.generation.generate import estimate
+from spacesim.scenes.sensor import SensorConfig
+
+SMALL = {"views": 4, "test_views": 2, "resolution": (24, 24), "spp": 4, "points": 300}
+
+
+def boxsat(**changes):
+    return read_scene("boxsat", **{**SMALL, **changes})
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("made") / "data"
+    generate(boxsat(), root)
+    return root
+
+
+def test_dataset_is_whole(made):
+    assert verify_dataset(made) == []
+    files = set(contents(made))
+    top = {"transforms.json", "scene.json", "mesh.ply", "points.ply", "contact_sheet.png", "camera_density.png"}
+    top |= {"SHA256SUMS"}
+    assert top | {"gt/train_00003.exr", "id/test_00001.png"} <= files
+    assert len(files) == len(top) + 6 * 6
+
+
+def test_test_views_have_four_times_the_samples_unless_told_otherwise(made, tmp_path):
+    cleaner = tmp_path / "cleaner"
+    generate(boxsat(spp=16, test_spp=16), cleaner)
+    for name in ("gt/test_00000.exr", "gt/test_00001.exr"):
+        assert (made / name).read_bytes() == (cleaner / name).read_bytes()
+    assert (made / "gt/train_00000.exr").read_bytes() != (cleaner / "gt/train_00000.exr").read_bytes()
+    scene = json.loads((made / "scene.json").read_text())
+    assert (scene["spp"], scene["test_spp"]) == (4, 16)
+
+
+def test_scene_json_holds_what_renders_it_again(made):
+    scene = json.loads((made / "scene.json").read_text())
+    assert scene["scene"] == "boxsat"
+    assert scene["config"] == json.loads(json.dumps(boxsat().to_json()))
+    known = {"schema", "objects", "parts", "materials", "mesh", "sun_irradiance", "exposure", "backend", "versions"}
+    assert known <= set(scene)
+    assert {part["material"] for part in scene["parts"]} == set(scene["materials"])
+    assert [part["id"] for part in scene["parts"]] == list(range(1, len(scene["parts"]) + 1))
+
+
+def test_points_lie_on_the_surface_and_have_its_colours(made):
+    points, colors = read_points(made / "points.ply")
+    mesh = build(boxsat()).mesh
+    assert points.shape == (300, 3)
+    _, distance, _ = mesh.nearest.on_surface(points[:60])
+    assert distance.max() < 1e-5
+    assert len(np.unique(colors, axis=0)) >= 4
+
+
+def test_same_seed_gives_the_same_bytes_and_another_does_not(made, tmp_path):
+    generate(boxsat(), tmp_path / "again")
+    generate(boxsat(seed=1), tmp_path / "other")
+    again, other, first = contents(tmp_path / "again"), contents(tmp_path / "other"), contents(made)
+    assert again == first
+    assert set(other) == set(first)
+    assert [name for name in first if first[name] == other[name]] == ["mesh.ply"]
+
+
+def test_resume_gives_the_same_bytes(made, tmp_path):
+    root = tmp_path / "data"
+    shutil.copytree(made, root)
+    for name in ("transforms.json", "gt/train_00002.exr", "images/test_00001.png", "points.ply"):
+        (root / name).unlink()
+    (root / "id/.train_00000.png.1234.part").write_bytes(b"left by a killed process")
+    calls: list[tuple[int, int, str]] = []
+    generate(boxsat(), root, resume=True, progress=lambda *call: calls.append(call))
+    assert contents(root) == contents(made)
+    assert calls[0][:2] == (4, 6)  # whole already
+    assert calls[1:] == [(5, 6, "train_00002"), (6, 6, "test_00001")]
+
+
+@pytest.mark.parametrize("victim", ["gt/train_00001.exr", "depth/train_00001.png"])
+@pytest.mark.parametrize("damage", ["cut", "empty", "zeros", "longer"])
+def test_a_damaged_file_is_not_whole(made, tmp_path, victim, damage):
+    root = tmp_path / "data"
+    shutil.copytree(made, root)
+    assert FrameWriter(root).has("train_00001")
+    whole = (root / victim).read_bytes()
+    # a power cut can leave the size without the bytes: zeros in the last block
+    bad = {"cut": whole[:-1], "empty": b"", "zeros": bytes(len(whole)), "longer": whole + b"\0"}
+    (root / victim).write_bytes(bad[damage])
+    assert not FrameWriter(root).has("train_00001")
+    generate(boxsat(), root, resume=True)
+    assert (root / victim).read_bytes() == whole
+
+
+def test_the_headers_of_a_large_exr_are_found_beyond_the_first_block(tmp_path):
+    """Tall pictures have chunk tables longer than the block that is read first."""
+    from spacesim.data.images import write_exr
+    from spacesim.data.integrity import is_whole
+
+    path = tmp_path / "tall.exr"
+    write_exr(path, dict.fromkeys(("depth", "alpha"), np.zeros((16 * 10_000, 1), np.float32)))
+    assert is_whole(path)
+    path.write_bytes(path.read_bytes()[:-1])
+    assert not is_whole(path)
+
+
+def test_killed_run_is_completed(tmp_path):
+    """Killed twice, at other frames each time."""
+    config = boxsat(views=40, test_views=0)
+    root = tmp_path / "killed"
+    code = (
+        "from pathlib import Path; import sys; from spacesim.scenes import generate, read_scene;"
+        f"generate(read_scene('boxsat', **{ {**SMALL, 'views': 40, 'test_views': 0}!r}), Path(sys.argv[1]), True)"
+    )
+    for frames in (3, 15):
+        process = subprocess.Popen([sys.executable, "-c", code, str(root)], stderr=subprocess.PIPE)
+        while len(list(root.glob("gt/*.exr"))) < frames:
+            assert process.poll() is None, "it should have been killed before its end"
+            time.sleep(0.002)
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+    assert not (root / "transforms.json").exists()
+    assert verify_dataset(root) != []
+    generate(config, root, resume=True)
+    generate(config, tmp_path / "whole")
+    assert contents(root) == contents(tmp_path / "whole")
+
+
+def test_the_first_error_of_a_writing_thread_ends_the_run(tmp_path, monkeypatch):
+    done: list[str] = []
+
+    def full(_, name, *rest):
+        if name == "train_00002":
+            raise WorkError("the disk is full")
+        done.append(name)
+
+    monkeypatch.setattr(FrameWriter, "write_frame", full)
+    with pytest.raises(WorkError, match="the disk is full"):
+        generate(boxsat(views=80), tmp_path / "data")
+    assert 2 <= len(done) < 40
+    assert not (tmp_path / "data/transforms.json").exists()
+
+
+def test_a_sensors_raw_pictures_are_part_of_a_frame(tmp_path):
+    for monochrome, suffixes in ((True, [""]), (False, ["_b", "_g", "_r"])):
+        root = tmp_path / f"mono{monochrome}"
+        config = boxsat(views=1, test_views=0, sensor=SensorConfig(monochrome=monochrome))
+        generate(config, root)
+        raw = sorted((root / "raw").iterdir())
+        assert [path.name for path in raw] == [f"train_00000{suffix}.png" for suffix in suffixes]
+        whole = contents(root)
+        raw[0].unlink()
+        generate(config, root, resume=True)
+        assert contents(root) == whole
+
+
+def test_estimate_leaves_nothing_behind_and_is_near_what_is_needed(made, tmp_path):
+    found = estimate(boxsat(), tmp_path / "data")
+    assert not list(tmp_path.iterdir())
+    taken = sum(-(-path.stat().st_size // 4096) * 4096 for path in made.glob("*/*"))
+    assert found.frames == 6
+    assert found.needed == pytest.approx(taken, rel=0.1)
+    assert found.seconds > 0
+    assert estimate(boxsat(), made).frames == 0
+
+
+def test_a_long_run_begins_with_an_estimate_and_ends_where_the_disk_is_too_small(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(sys.modules["spacesim.scenes.generation.generate"], "LONG", 5)
+    with caplog.at_level("INFO"):
+        generate(boxsat(), tmp_path / "data")
+    assert "6 frames left: about" in caplog.text
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: usage._replace(free=10_000))
+    with pytest.raises(WorkError, match=r"expected \d+ kB of free disk for 6 frames, found 10 kB"):
+        generate(boxsat(), tmp_path / "other")
+    assert not (tmp_path / "other/transforms.json").exists()
+
+
+def test_bad_scene_folder_and_camera_are_refused(made, tmp_path):
+    with pytest.raises(InputError, match="distance: expected cameras outside of boxsat"):
+        generate(boxsat(distance=0.3), tmp_path / "b")
+    with pytest.raises(InputError, match="workers: expected at least 1, found 0"):
+        generate(boxsat(), tmp_path / "b", workers=0)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match="--resume"):
+        generate(boxsat(), made)
+    with pytest.raises(InputError, match="'spp' differs"):
+        generate(boxsat(spp=5), made, resume=True)
+
+
+def test_estimate_and_workers_on_the_command_line(spacesim, tmp_path):
+    small = ("--views", 6, "--test-views", 0, "--resolution", 16, "--spp", 1)
+    done = spacesim("generate", "boxsat", *small, "--out", tmp_path / "a", "--estimate")
+    assert (done.code, done.errors) == (0, [])
+    assert done.output.startswith("6 frames left: about ")
+    assert not list(tmp_path.iterdir())
+    assert spacesim("generate", "boxsat", *small, "--out", tmp_path / "a", "--workers", 2).code == 0
+    assert spacesim("generate", "boxsat", *small, "--out", tmp_path / "b").code == 0
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    assert spacesim("generate", "boxsat", "--out", tmp_path / "c", "--workers", 0).is_refusal("workers")
+    refused = spacesim("generate", "boxsat", "--out", tmp_path / "c", "--workers", 2, "--ray", "local")
+    assert refused.is_refusal("--workers", "--ray")

@@ -1,0 +1,192 @@
+"""Several processes, and Ray where it is installed, write the same bytes as one, whatever happens to them."""
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from spacesim.data.errors import InputError, WorkError
+from spacesim.scenes import generate, read_scene
+from spacesim.scenes.generation import workers
+from spacesim.scenes.generation.frames import FrameMaker, Job, Shot, writing_threads
+from spacesim.scenes.generation.generate import _Sweep
+from spacesim.scenes.generation.workers import make_in_processes
+
+OPTIONS = {"views": 60, "test_views": 0, "resolution": (24, 24), "spp": 4, "points": 100}
+CONFIG = read_scene("boxsat", **OPTIONS)
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> dict[str, bytes]:
+    """What one undisturbed process writes."""
+    root = tmp_path_factory.mktemp("one") / "data"
+    generate(CONFIG, root)
+    return contents(root)
+
+
+@pytest.fixture
+def job(tmp_path) -> tuple[Job, list[Shot]]:
+    sweep = _Sweep(read_scene("boxsat", **{**OPTIONS, "views": 6}))
+    return replace(sweep.job, root=tmp_path), sweep.shots
+
+
+def workers_of(parent: int) -> list[int]:
+    """Process ids of the workers that a process has started."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+            if int(fields[1]) == parent and b"spacesim.scenes.generation.workers" in (folder / "cmdline").read_bytes():
+                found.append(int(folder.name))
+        except OSError:
+            continue
+    return found
+
+
+def alive(process: int) -> bool:
+    try:
+        return (Path("/proc") / str(process) / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+
+
+@needs_proc
+def test_killed_workers_are_replaced_and_the_bytes_are_those_of_one_process(whole, tmp_path):
+    """After every tenth frame one of two workers is killed, four in all."""
+    root, killed = tmp_path / "data", []
+
+    def kill(done: int, *_: object) -> None:
+        if done % 10 == 0 and len(killed) < 4:
+            victim = min(workers_of(os.getpid()))
+            os.kill(victim, signal.SIGKILL)
+            killed.append(victim)
+
+    generate(CONFIG, root, workers=2, progress=kill)
+    assert len(set(killed)) == 4
+    assert contents(root) == whole
+    assert workers_of(os.getpid()) == []
+
+
+@needs_proc
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_their_parent_and_resume_completes(whole, tmp_path, end):
+    """kill -9 leaves no orphans; Ctrl-C leaves no half-written file either."""
+    root = tmp_path / "data"
+    code = (
+        "import sys; from pathlib import Path; from spacesim.scenes import generate, read_scene;"
+        f"generate(read_scene('boxsat', **{OPTIONS!r}), Path(sys.argv[1]), True, workers=2)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, str(root)], stderr=subprocess.PIPE)
+    while len(list(root.glob("gt/*.exr"))) < 8:
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.002)
+    workers = workers_of(process.pid)
+    process.send_signal(end)
+    process.communicate(timeout=20)
+    assert len(workers) == 2
+    deadline = time.monotonic() + 3
+    while any(alive(worker) for worker in workers):
+        assert time.monotonic() < deadline, "workers outlive their parent"
+        time.sleep(0.01)
+    assert not (root / "transforms.json").exists(), "it should have been stopped before its end"
+    if end == signal.SIGINT:
+        assert not list(root.rglob("*.part"))
+    generate(CONFIG, root, resume=True)
+    assert contents(root) == whole
+
+
+def test_frames_that_kill_every_process_end_in_a_sentence(job, monkeypatch):
+    work, shots = job
+    monkeypatch.setattr("spacesim.scenes.generation.workers.sys.executable", "/bin/false")
+    with pytest.raises(WorkError, match=r"train_00000 to train_00000: 3 processes ended .* code 1.* --workers"):
+        list(make_in_processes(work, shots, 1))
+
+
+def test_an_error_in_a_worker_is_told_as_it_is(job, tmp_path):
+    work, shots = job
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(InputError, match=r"file/data/.*cannot be written"):
+        list(make_in_processes(replace(work, root=tmp_path / "file/data"), shots, 2))
+
+
+def test_frames_that_are_whole_are_not_rendered_again(job, monkeypatch):
+    work, shots = job
+    maker = FrameMaker(work)
+    assert list(maker.make(shots)) == [shot.name for shot in shots]
+    monkeypatch.setattr(maker, "_renderer", None)
+    assert list(maker.make(shots)) == [shot.name for shot in shots]
+
+
+class _Obliging:
+    """A connection to a worker that makes all that it is given at once."""
+
+    def __init__(self) -> None:
+        self.answers: list[str | None] = [None]
+
+    def send(self, shots: list[Shot]) -> None:
+        self.answers += [*(shot.name for shot in shots), None]
+
+    def recv(self) -> str | None:
+        return self.answers.pop(0)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_several_processes_may_ask_at_once_when_few_tasks_are_left(job, monkeypatch, count):
+    def start(_job: Job, task: Any, *_: int) -> workers._Worker:
+        return workers._Worker(None, _Obliging(), task, [task.shots])
+
+    def all_that_spoke(connections: list[_Obliging]) -> list[_Obliging]:
+        spoke = [connection for connection in connections if connection.answers]
+        assert spoke, "nobody is asked and nobody answers: it would wait for ever"
+        return spoke
+
+    monkeypatch.setattr(workers, "_start", start)
+    monkeypatch.setattr(workers, "_stop", lambda _workers: None)
+    monkeypatch.setattr(workers, "wait", all_that_spoke)
+    work, shots = job
+    assert sorted(make_in_processes(work, shots, count)) == sorted(shot.name for shot in shots)
+
+
+def test_threads_are_shared_among_processes(monkeypatch):
+    monkeypatch.setattr("spacesim.scenes.generation.frames.cores", lambda: 16)
+    assert [writing_threads(count) for count in (1, 4, 16, 40)] == [16, 4, 1, 1]
+
+
+def test_ray_writes_the_same_bytes(whole, tmp_path):
+    if importlib.util.find_spec("ray") is None:
+        pytest.skip("the extra 'cluster' is not installed")
+    generate(CONFIG, tmp_path / "data", ray="local")
+    assert contents(tmp_path / "data") == whole
+
+
+def test_ray_that_cannot_be_had_is_told_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r"pip install 'spacesim\[cluster\]'"):
+        generate(CONFIG, tmp_path / "data", ray="auto")
+    assert not list(tmp_path.iterdir())
+
+
+def test_processes_that_have_nothing_left_to_do(tmp_path):
+    """All frames are there, transforms.json is not: what a kill at the end leaves."""
+    config = read_scene("boxsat", **{**OPTIONS, "views": 4})
+    root = tmp_path / "data"
+    generate(config, root, workers=2)
+    first = contents(root)
+    generate(config, root, resume=True, workers=2)
+    (root / "transforms.json").unlink()
+    generate(config, root, resume=True, workers=2)
+    assert contents(root) == first

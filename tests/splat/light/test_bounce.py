@@ -1,0 +1,247 @@
+"""One bounce of light, against what is known of two surfaces. The formula has its float64 twin in test_light.py."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import look_at
+from spacesim.data.records import Camera
+from spacesim.splat.light.bounce import OVERLAP
+from spacesim.splat.light.encoding import Encoding
+from spacesim.splat.light.field import FieldConfig
+from spacesim.splat.light.model import LightModel, TrainingFrame
+from spacesim.splat.light.shading import LightConfig
+from spacesim.splat.light.shadow.cast import ShadowConfig
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.train.config import PRESETS, preset
+from spacesim.splat.train.train import train
+from spacesim.splat.train.trainer import Trainer
+
+NONE = Encoding("harmonics", 0)
+FIELD = FieldConfig(features=2, width=4, layers=2, sun=NONE, view=NONE, surface=True)
+GLOW = LightConfig(FIELD, bounce=4000)
+SIDE = 40  #: Gaussians on a side of a square wall
+
+
+def numbers(plane) -> np.ndarray:
+    return np.array(plane, dtype=np.float64)
+
+
+def discs(places: np.ndarray, normals: np.ndarray, spacing: float, albedo: float) -> dict[str, np.ndarray]:
+    """Thin opaque Gaussians about `places` [N, 3], across `normals` [N, 3], whose area 2 pi s^2 times `OVERLAP` and
+    opacity is that of a square of `spacing`."""
+    opacity = 1 / (1 + np.exp(-6))
+    scale = spacing / np.sqrt(2 * np.pi * OVERLAP * opacity)
+    logit = np.log(albedo / (1 - albedo))
+    turns = [Rotation.align_vectors([normal], [[0, 0, 1]])[0].as_quat(scalar_first=True) for normal in normals]
+    count = len(places)
+    return {
+        "means": places,
+        "log_scales": np.log(np.tile([scale, scale, 1e-4], (count, 1))),
+        "quaternions": np.array(turns),
+        "logit_opacities": np.full(count, 6.0),
+        "sh": np.zeros((count, 0, 3)),
+        "features": np.column_stack([np.zeros((count, 2)), normals, np.full((count, 3), logit)]),
+    }
+
+
+def joined(*parts: dict[str, np.ndarray]) -> Gaussians:
+    return Gaussians.from_numpy({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+
+
+def square(spacing: float) -> np.ndarray:
+    """[SIDE^2, 2] places on a square about 0."""
+    line = (np.arange(SIDE) - 0.5 * (SIDE - 1)) * spacing
+    return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+
+
+def model(config: LightConfig = GLOW) -> LightModel:
+    return LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, 5.0, 3.0), 0)
+
+
+def wall_and_receiver(place, normal, albedo: float = 0.5) -> Gaussians:
+    """A square wall, 2 m wide, in the plane z = 0 that faces up, and one small Gaussian."""
+    spacing = 2.0 / SIDE
+    wall = np.column_stack([square(spacing), np.zeros(SIDE * SIDE)])
+    up = np.tile([0.0, 0, 1], (len(wall), 1))
+    receiver = discs(np.array([place], float), np.array([normal], float), 1e-4, albedo)
+    return joined(discs(wall, up, spacing, albedo), receiver)
+
+
+def form_factor(height: float, half: float) -> float:
+    """Of a piece that faces the middle of a square at `height`: four corners, each of half by half (Howell, B-3)."""
+    x = half / height
+    root = np.sqrt(1 + x * x)
+    return 4 * (x / root * np.arctan(x / root)) / np.pi
+
+
+@pytest.mark.parametrize("height", [0.3, 1.0, 3.0])
+def test_a_wall_lights_what_faces_it_as_its_form_factor_says(height):
+    splats = wall_and_receiver([0, 0, height], [0, 0, -1])
+    config = replace(GLOW, bounce=splats.count)
+    light = model(config).sunlight(splats, np.array([0.0, 0, 1]))
+    assert light.visibility is None
+    found = np.array([numbers(row)[-1] for row in light.bounced])
+    expected = 0.5 * form_factor(height, 1.0)  # albedo, the Sun straight above
+    np.testing.assert_allclose(found[:3], expected, rtol=0.02)
+    np.testing.assert_allclose(found[3:], 0, atol=1e-6)  # its other side sees black sky
+
+
+def test_light_goes_with_the_cosine_of_the_sun_and_a_sample_is_as_bright_as_all():
+    splats = wall_and_receiver([0.2, 0.1, 0.8], [0, 0, -1])
+    high, low = np.array([0.0, 0, 1]), np.array([np.sin(1.2), 0, np.cos(1.2)])
+    whole = [numbers(model(GLOW).sunlight(splats, sun).bounced[0])[-1] for sun in (high, low)]
+    assert whole[1] == pytest.approx(whole[0] * np.cos(1.2), rel=1e-4)
+    part = numbers(model(replace(GLOW, bounce=150)).sunlight(splats, high).bounced[0])[-1]
+    assert part == pytest.approx(whole[0], rel=0.1)
+    behind = numbers(model(GLOW).sunlight(splats, -high).bounced[0])[-1]
+    assert behind == pytest.approx(0, abs=1e-6), "lit from below it shines down, away from the receiver"
+
+
+def test_what_lies_in_shadow_scatters_nothing():
+    """A roof over the wall: what stands beside it sees the wall's light go out."""
+    shadow = ShadowConfig("splatting", 128, refine=None)
+    spacing = 2.0 / SIDE
+    roof = np.column_stack([square(1.5 * spacing), np.full(SIDE * SIDE, 2.0)])
+    black = discs(roof, np.tile([0.0, 0, 1], (len(roof), 1)), 1.5 * spacing, 0.001)
+    places = np.array([[0.0, 0, 0.8]])
+    wall = np.column_stack([square(spacing), np.zeros(SIDE * SIDE)])
+    parts = [discs(wall, np.tile([0.0, 0, 1], (len(wall), 1)), spacing, 0.5)]
+    receiver = discs(places, np.array([[0.0, 0, -1]]), 1e-4, 0.5)
+    lit = model(replace(GLOW, shadow=shadow))
+    up = np.array([0.0, 0, 1])
+    free, covered = (
+        numbers(lit.sunlight(joined(*parts, *more, receiver), up).bounced[0])[-1] for more in ([], [black])
+    )
+    assert free > 0.1
+    assert covered < 0.05 * free
+
+
+def test_turning_all_together_changes_nothing():
+    splats = wall_and_receiver([0.3, -0.2, 0.6], [0.3, 0.1, -0.9])
+    turn = Rotation.from_rotvec([0.4, -1.1, 0.7])
+    arrays = splats.to_numpy()
+    arrays["means"] = turn.apply(arrays["means"])
+    quaternions = turn * Rotation.from_quat(arrays["quaternions"], scalar_first=True)
+    arrays["quaternions"] = quaternions.as_quat(scalar_first=True)
+    arrays["features"][:, 2:5] = turn.apply(arrays["features"][:, 2:5])
+    sun = np.array([0.48, -0.36, 0.8])
+    one, other = model().sunlight(splats, sun), model().sunlight(Gaussians.from_numpy(arrays), turn.apply(sun))
+    np.testing.assert_allclose(
+        [numbers(row) for row in one.bounced], [numbers(row) for row in other.bounced], atol=2e-5
+    )
+
+
+def test_a_picture_is_brighter_by_what_arrives_at_the_side_that_is_seen():
+    """Linear colours: what one bounce adds is albedo times the light at that side."""
+    splats = wall_and_receiver([0, 0, 0.7], [0, 0, 1])
+    plain, glowing = (model(LightConfig(FIELD, linear=True, bounce=bounce)) for bounce in (0, 500))
+    glowing.weights = plain.weights
+    up, count = np.array([0.0, 0, 1]), splats.count
+    bounced = glowing.sunlight(splats, up).bounced
+    for height, side in ((3.0, 0), (0.4, 1)):
+        camera = Pinhole.of(Camera(look_at([0.01, 0, height], [0, 0, 0.7]), 8, 8, 8, 8, 4, 4))
+        bare = replace_features(splats, count)
+        before, after = plain.lit(bare, camera, up)[0], glowing.lit(splats, camera, up)[0]
+        for c in range(3):
+            more = numbers(after[c])[-1] - numbers(before[c])[-1]
+            assert more == pytest.approx(0.5 * numbers(bounced[3 * side + c])[-1], abs=1e-5)
+    assert numbers(bounced[3])[-1] > 0.05 > numbers(bounced[0])[-1]
+
+
+def replace_features(splats: Gaussians, count: int) -> Gaussians:
+    """Without albedos."""
+    arrays = splats.to_numpy()
+    return Gaussians.from_numpy({**arrays, "features": arrays["features"][:, :5]})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "two in one place",
+        "no normal",
+        "no size",
+        "vast",
+        "not a number",
+        "one Gaussian",
+        "sun along the wall",
+        "sun below",
+    ],
+)
+def test_odd_models_stay_finite(change):
+    arrays = wall_and_receiver([0, 0, 0.5], [0, 0, -1]).to_numpy()
+    sun = np.array([0.0, 0, 1])
+    if change == "two in one place":
+        arrays["means"][:] = 0
+    elif change == "no normal":
+        arrays["features"][:, 2:5] = 0
+    elif change == "no size":
+        arrays["log_scales"][:] = -60
+    elif change == "vast":
+        arrays["log_scales"][:, 0] = 60
+    elif change == "not a number":
+        arrays["means"][7], arrays["features"][9], arrays["logit_opacities"][11] = np.nan, np.nan, np.nan
+    elif change == "one Gaussian":
+        arrays = {name: values[:1] for name, values in arrays.items()}
+    else:
+        sun = np.array([1.0, 0, 0] if change == "sun along the wall" else [0.0, 0, -1])
+    light = model().sunlight(Gaussians.from_numpy(arrays), sun)
+    for row in light.bounced:
+        assert len(numbers(row)) == len(arrays["means"])
+        odd = np.isin(np.arange(len(numbers(row))), [7, 9]) & (change == "not a number")  # what they receive themselves
+        assert np.isfinite(numbers(row)[~odd]).all()
+        assert (numbers(row)[~odd] >= 0).all()
+
+
+def test_training_learns_albedos_and_repeats_to_the_bit(small_lit_dataset, tmp_path):
+    config = replace(preset("demo", "shadow-splat"), iterations=30, init_count=300)
+    assert config.light.bounce > 0
+    runs = [train(small_lit_dataset, tmp_path / name, config) for name in ("one", "two")]
+    assert len({(run.path / "model.safetensors").read_bytes() for run in runs}) == 1
+    albedos = runs[0].model.to_numpy()["features"][:, config.light.albedos :]
+    assert albedos.shape[1] == 3
+    start = Trainer(small_lit_dataset, config).gaussians.to_numpy()["features"][:, config.light.albedos :]
+    assert np.ptp(start) == 0
+    assert np.ptp(albedos) > 0.05
+    frame, arrays = small_lit_dataset.test[0], runs[0].model.to_numpy()
+    arrays["features"][:, config.light.albedos :] = -30  # black
+    black = replace(runs[0], model=Gaussians.from_numpy(arrays)).predict(frame.camera, frame.sun)
+    lit = runs[0].predict(frame.camera, frame.sun)
+    assert np.isfinite(lit.rgb).all()
+    assert (lit.rgb >= black.rgb - 1e-6).all()
+    assert (lit.rgb - black.rgb).max() > 1e-3
+
+
+def test_one_that_is_not_a_number_lights_nobody():
+    """A receiver over a wall, some of which is broken: as bright as before, less these."""
+    splats = wall_and_receiver([0, 0, 0.5], [0, 0, -1])
+    light, up = model(replace(GLOW, bounce=splats.count)), np.array([0.0, 0, 1])
+    before = numbers(light.sunlight(splats, up).bounced[0])[-1]
+    for name, value in (("logit_opacities", np.nan), ("log_scales", np.nan), ("log_scales", np.inf), ("means", np.inf)):
+        arrays = splats.to_numpy()
+        arrays[name][800] = value
+        found = numbers(light.sunlight(Gaussians.from_numpy(arrays), up).bounced[0])[-1]
+        assert found == pytest.approx(before, rel=0.01), name
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_bounce_where_shadows_are_known(name):
+    for method in ("relight", "park"):
+        assert preset(name, method).light.bounce == 0
+    for method in ("shadow-map", "shadow-splat"):
+        light = preset(name, method).light
+        assert (light.bounce > 0) == (name != "thesis")
+        assert light.refine.sun.size == (25 if name == "thesis" else 1)
+        assert light.refine.positions == ("light" if name == "thesis" else "world")
+
+
+def test_impossible_bounces_are_named():
+    with pytest.raises(InputError, match="--bounce: expected --field surface"):
+        LightConfig(FieldConfig(), bounce=10)
+    for bounce in (-1, 2**14 + 1):
+        with pytest.raises(InputError, match=f"--bounce: expected 0 to 16384, found {bounce}"):
+            LightConfig(FIELD, bounce=bounce)

@@ -1,0 +1,597 @@
+"""Networks and their adjoints against a float64 twin; what light does to training, checkpoints and predictions."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import drjit as dr
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.special import sph_harm_y
+from splats import light_of, random_splats, srgb_of
+
+from spacesim.backend import ad
+from spacesim.data.errors import InputError, WorkError
+from spacesim.data.geometry import fibonacci_sphere, look_at
+from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
+from spacesim.data.records import Camera, Dataset, Sun
+from spacesim.splat.export.bake import baked
+from spacesim.splat.light import model as light_module
+from spacesim.splat.light.encoding import Encoding
+from spacesim.splat.light.field import FieldConfig
+from spacesim.splat.light.mlp import MlpShape
+from spacesim.splat.light.model import LightModel, TrainingFrame
+from spacesim.splat.light.shading import LightConfig
+from spacesim.splat.light.shadow.cast import ShadowConfig, cast_shadows
+from spacesim.splat.light.shadow.light_camera import light_rows
+from spacesim.splat.light.shadow.refine import RefineConfig
+from spacesim.splat.raster import tone
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.gaussians import Gaussians, entries
+from spacesim.splat.raster.render import view_colours
+from spacesim.splat.run import Run, draw_lit, load_run
+from spacesim.splat.train.checkpoint import read_tensors, write_tensors
+from spacesim.splat.train.config import METHODS, PRESETS, LearningRates, TrainConfig, preset
+from spacesim.splat.train.densify import grow, prune
+from spacesim.splat.train.loss import anisotropy
+from spacesim.splat.train.optimizer import Adam
+from spacesim.splat.train.strategies.default import DefaultStrategyConfig
+from spacesim.splat.train.train import train
+from spacesim.splat.train.trainer import Trainer
+
+SUN = np.array([0.48, -0.36, 0.8])
+FIELD = FieldConfig(features=5, width=12, layers=3, sun=Encoding("harmonics", 2), view=Encoding("positional", 1))
+REFINE = RefineConfig(features=3, width=8, sun=Encoding("harmonics", 1))
+CONFIGS = {
+    "relight": LightConfig(FIELD),
+    "map": LightConfig(FIELD, ShadowConfig("mapping", 32, refine=REFINE)),
+    "splat": LightConfig(FIELD, ShadowConfig("splatting", 32, refine=None)),
+    "linear": LightConfig(FIELD, linear=True),
+    "gradients": LightConfig(FIELD, ShadowConfig("splatting", 32, refine=REFINE, gradients=True)),
+    "surface": LightConfig(replace(FIELD, surface=True), ShadowConfig("mapping", 32, grazing="lift", refine=REFINE)),
+    "bounce": LightConfig(replace(FIELD, surface=True), ShadowConfig("splatting", 32, refine=REFINE), bounce=7),
+    "bounce, linear": LightConfig(replace(FIELD, surface=True), bounce=5, linear=True),
+    "park": LightConfig(
+        FIELD,
+        ShadowConfig(
+            "splatting", 32, bias=0.0, refine=replace(REFINE, positions="world", positional=2, bias_info=False)
+        ),
+    ),
+}
+
+
+def numbers(plane) -> np.ndarray:
+    return np.array(plane, dtype=np.float64)
+
+
+def gaussians(count: int, features: int, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    return Gaussians.from_numpy(
+        {
+            "means": rng.normal(size=(count, 3)),
+            "log_scales": rng.uniform(-3, -1, (count, 3)),
+            "quaternions": rng.normal(size=(count, 4)),
+            "logit_opacities": rng.normal(size=count),
+            "sh": np.zeros((count, 0, 3)),
+            "features": rng.normal(size=(count, features)),
+        }
+    )
+
+
+def eye() -> Pinhole:
+    return Pinhole.of(Camera(look_at([0, -6, 1], [0, 0, 0]), 32, 32, 40, 40, 16, 16))
+
+
+def model(name: str, seed: int = 0) -> LightModel:
+    """With a refinement that does something: its last layer starts at 0."""
+    light = LightModel.initial(CONFIGS[name], TrainingFrame(np.array([0.1, 0.2, -0.3]), 2.0, 7.0, 3.0), seed)
+    rng = np.random.default_rng(seed)
+    light.weights = [ad.Float(numbers(w) + 0.3 * rng.normal(size=dr.width(w))) for w in light.weights]
+    return light
+
+
+# ---- a float64 twin, from the equations ----
+
+
+def encoded(encoding: Encoding, vectors: np.ndarray) -> np.ndarray:
+    """[N, size] by scipy and by numpy."""
+    if encoding.kind == "positional":
+        waves = [f(2**k * np.pi * vectors) for k in range(encoding.degree) for f in (np.sin, np.cos)]
+        # sine and cosine of each coordinate stand side by side
+        pairs = [np.stack(waves[2 * k : 2 * k + 2], axis=-1).reshape(len(vectors), 6) for k in range(encoding.degree)]
+        return np.concatenate([vectors, *pairs], axis=1)
+    polar, azimuth = np.arccos(np.clip(vectors[:, 2], -1, 1)), np.arctan2(vectors[:, 1], vectors[:, 0])
+    terms = []
+    for degree in range(encoding.degree + 1):
+        for order in range(-degree, degree + 1):
+            value = sph_harm_y(degree, abs(order), polar, azimuth) * (1 if order == 0 else np.sqrt(2))
+            terms.append(value.imag if order < 0 else value.real)
+    return np.stack(terms, axis=1)
+
+
+def network(shape: MlpShape, weights: list[np.ndarray], items: np.ndarray, shared: np.ndarray) -> np.ndarray:
+    """[N, outputs]."""
+    value = items
+    for i, (rows, columns) in enumerate(shape.sizes):
+        bias = weights[2 + 2 * i] + (weights[0].reshape(rows, -1) @ shared if i == 0 else 0)
+        value = value @ weights[1 + 2 * i].reshape(rows, columns).T + bias
+        if i < shape.layers - 1:
+            value = np.maximum(value, 0)
+    return value
+
+
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-x))
+
+
+def cosines(normal: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """[N, 8]: of the side that is seen with the Sun (and where that is positive), the viewer, and halfway between."""
+    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    normal *= -np.sign((normal * direction).sum(axis=1, keepdims=True))
+    half = SUN - direction
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    lambert = normal @ SUN
+    halfway = np.maximum((normal * half).sum(axis=1), 0)
+    lobes = [halfway**n for n in (8, 32, 128, 512)]
+    return np.stack([lambert, np.maximum(lambert, 0), -(normal * direction).sum(axis=1), halfway, *lobes], axis=1)
+
+
+def shortest_axes(arrays: dict) -> np.ndarray:
+    turns = Rotation.from_quat(arrays["quaternions"], scalar_first=True).as_matrix()
+    return turns[np.arange(len(turns)), :, arrays["log_scales"].argmin(axis=1)]
+
+
+def bounced(light: LightModel, arrays: dict, visibility: np.ndarray) -> np.ndarray:
+    """[N, 3] light of the emitters at the side that is seen: discs of Wallace et al. (1989), one pair after another."""
+    config, count = light.config, len(arrays["means"])
+    features, first = arrays["features"].astype(np.float64), config.field.features
+    normals = features[:, first : first + 3] / np.linalg.norm(features[:, first : first + 3], axis=1, keepdims=True)
+    albedo, found = sigmoid(features[:, config.albedos :]), np.zeros((count, 3))
+    for i in range(count):
+        towards = np.array([0, -6, 1.0]) - arrays["means"][i]
+        seen = normals[i] * np.sign(normals[i] @ towards)
+        for number in range(config.bounce):
+            k = int((number + 0.5) * count / config.bounce)
+            away = arrays["means"][k] - arrays["means"][i]
+            square = away @ away
+            if square == 0:
+                continue
+            lit = normals[k] * np.sign(normals[k] @ SUN)
+            long = np.sort(np.exp(arrays["log_scales"][k]))[1:].prod()
+            area = 0.3 * count / config.bounce * 2 * np.pi * long * sigmoid(arrays["logit_opacities"][k])
+            cosines = max(seen @ away, 0) * max(-lit @ away, 0) / square
+            found[i] += albedo[k] * visibility[k] * (lit @ SUN) * area * cosines / (np.pi * square + area)
+    return found
+
+
+def brightened(light: LightModel, colour: np.ndarray, more: np.ndarray) -> np.ndarray:
+    if light.config.linear:
+        return colour + more
+    return srgb_of(light_of(colour) + more)
+
+
+def twin(light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray], given=None) -> tuple:
+    """(colours [N, 3], visibility [N] as it is shown, light that bounces) of 4.2, 4.11 to 4.14 and 4.17; raw: occlusion
+    and bias info as given; given: light that bounces, instead of that of these numbers."""
+    config, field = light.config, light.config.field
+    direction = arrays["means"] - np.array([0, -6, 1.0])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    features, split = arrays["features"].astype(np.float64), 1 + 2 * field.layers
+    items = np.concatenate([features[:, : field.features], encoded(field.view, direction)], axis=1)
+    if field.surface:
+        normal = features[:, field.features : field.stored]
+        items = np.concatenate([items, cosines(normal, direction)], axis=1)
+    faces = 1
+    if field.surface:
+        learned, of_shape = (cosines(n, direction)[:, 0] for n in (normal, shortest_axes(arrays)))
+        faces = np.interp(np.maximum(learned, of_shape), [-0.2, 0], [0, 1])
+    colour = sigmoid(network(field.shape, weights[:split], items, encoded(field.sun, SUN[None])[0]))
+    if not raw:
+        visible = np.ones(len(colour))
+        colour, given = with_bounce(light, arrays, colour, visible, given)
+        return colour, visible, given
+    occlusion, alignment, thickness, bias = raw
+    if config.refine:
+        refine = config.refine
+        position = (arrays["means"] - light.frame.centre) / light.frame.scale
+        if refine.positions == "light":
+            axes = numbers(light.sun_terms(SUN).light).reshape(3, 3)
+            np.testing.assert_allclose(axes[2], -SUN, atol=1e-6)
+            position = position @ axes.T
+        told = [occlusion[:, None], features[:, field.stored : config.albedos]]
+        told.append(encoded(Encoding("positional", refine.positional), position))
+        if refine.bias_info:
+            scale = light.frame.scale
+            told += [column[:, None] for column in (1 - occlusion, alignment, thickness / scale, bias / scale)]
+        items = np.concatenate(told, axis=1)
+        correction = network(refine.shape, weights[split:], items, encoded(refine.sun, SUN[None])[0])[:, 0]
+        sure = np.clip(occlusion, 0.02, 0.98)
+        occlusion = sigmoid(np.log(sure / (1 - sure)) + correction)
+    colour, given = with_bounce(light, arrays, colour * (1 - occlusion)[:, None], 1 - occlusion, given)
+    return colour, (1 - occlusion) * faces, given
+
+
+def with_bounce(light: LightModel, arrays: dict, colour: np.ndarray, visible: np.ndarray, given) -> tuple:
+    """(colours, light that bounces): as they are for a model without."""
+    if not light.config.bounce:
+        return colour, None
+    given = bounced(light, arrays, visible) if given is None else given
+    albedo = sigmoid(arrays["features"].astype(np.float64)[:, light.config.albedos :])
+    return brightened(light, colour, albedo * given), given
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_shading_and_its_adjoint_match_the_equations_in_float64(name):
+    light, count = model(name), 37
+    splats = gaussians(count, light.config.features)
+    arrays = {key: value.astype(np.float64) for key, value in splats.to_numpy().items()}
+    weights = [numbers(weight) for weight in light.weights]
+    shadows = light.shadows(splats, SUN)
+    raw = [numbers(row) for row in (shadows.occlusion, *shadows.info)] if shadows else []
+    shading = light.shade(splats, eye(), SUN)
+    colour, visibility, given_light = twin(light, arrays, weights, raw)
+    assert given_light is None or np.abs(given_light).max() > 0.01
+    np.testing.assert_allclose(np.stack([numbers(c) for c in shading.colours], axis=1), colour, atol=3e-5)
+    assert (shading.visibility is None) == (light.config.shadow is None)
+    if shading.visibility is not None:
+        np.testing.assert_allclose(numbers(shading.visibility), visibility, atol=3e-5)
+
+    rng = np.random.default_rng(5)
+    by_colour, by_visibility = rng.normal(size=(count, 3)), rng.normal(size=count) * bool(raw)
+    given = ad.Float(by_visibility) if raw else None
+    if raw:
+        shading.shadows = SimpleNamespace(adjoint=lambda by_occlusion: [by_occlusion])
+    back = light.adjoint(shading, [ad.Float(column) for column in by_colour.T], given)
+
+    def loss(arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray] = raw) -> float:
+        colour, visibility, _ = twin(light, arrays, weights, raw, given_light)
+        return float((by_colour * colour).sum() + by_visibility @ visibility)
+
+    for _ in range(6):  # along random directions, all numbers at once
+        step = rng.normal(size=arrays["features"].shape)
+        slope = difference(lambda h, s=step: loss({**arrays, "features": arrays["features"] + h * s}, weights))
+        assert numbers(back.features).reshape(-1, count).T.ravel() @ step.ravel() == pytest.approx(
+            slope, rel=2e-3, abs=2e-3
+        )
+    for i, weight in enumerate(weights):
+        step = rng.normal(size=weight.shape)
+        slope = difference(
+            lambda h, i=i, s=step: loss(arrays, [w + h * s * (j == i) if j == i else w for j, w in enumerate(weights)])
+        )
+        assert numbers(back.weights[i]) @ step == pytest.approx(slope, rel=2e-3, abs=2e-3), i
+    assert len(back.geometry) == bool(light.config.shadow and light.config.shadow.gradients)
+    if back.geometry:
+        step = rng.normal(size=count) * (np.abs(raw[0] - 0.5) < 0.479)  # off the corners at `SURE`
+        slope = difference(lambda h: loss(arrays, weights, [raw[0] + h * step, *raw[1:]]))
+        assert numbers(back.geometry[0]) @ step == pytest.approx(slope, rel=2e-3, abs=2e-3)
+
+
+def difference(function) -> float:
+    h = 1e-6
+    return (function(h) - function(-h)) / (2 * h)
+
+
+@pytest.mark.parametrize("kind", [("harmonics", 0), ("harmonics", 4), ("positional", 0), ("positional", 4)])
+def test_encodings_are_those_of_scipy_and_numpy(kind):
+    encoding = Encoding(*kind)
+    rng = np.random.default_rng(1)
+    vectors = rng.normal(size=(50, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    ours = encoding(ad.Array3f(vectors.T.astype(np.float32)))
+    assert len(ours) == encoding.size
+    rows = np.stack([numbers(row) + np.zeros(50) for row in ours], axis=1)
+    expected = encoded(encoding, vectors)
+    signs = np.sign((rows * expected).sum(axis=0))  # conventions differ in the sign of a harmonic
+    np.testing.assert_allclose(rows, expected * (signs if encoding.kind == "harmonics" else 1), atol=2e-5)
+    np.testing.assert_array_equal(numbers(encoding.of_one(vectors[3]))[:1], rows[3, :1].astype(np.float32))
+
+
+@pytest.mark.parametrize("by_vectors", [False, True])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_pictures_have_the_colours_that_are_trained(monkeypatch, name, by_vectors):
+    monkeypatch.setattr(light_module, "COOPERATIVE", ("cuda", "llvm") if by_vectors else ())
+    light, tolerance = model(name), 2e-3 if by_vectors else 1e-5
+    splats = gaussians(700, light.config.features)
+    other_eye = Pinhole.of(Camera(look_at([5, 2, 1], [0, 0, 0]), 32, 32, 40, 40, 16, 16))
+
+    def same(camera, sun: np.ndarray) -> None:
+        (colours, visibility), trained = light.lit(splats, camera, sun), light.shade(splats, camera, sun)
+        for one, other in zip(colours, trained.colours, strict=True):
+            np.testing.assert_allclose(numbers(one), numbers(other), atol=tolerance)
+        assert (visibility is None) == (trained.visibility is None)
+        if visibility is not None:
+            np.testing.assert_allclose(numbers(visibility), numbers(trained.visibility), atol=1e-6)
+
+    same(eye(), SUN)
+    kept = light._kept
+    same(other_eye, -SUN)
+    assert light._kept is kept, "computed again for another Sun"
+    splats.features += 0.5  # in place
+    same(eye(), SUN)
+    assert light._kept is kept if by_vectors else light._kept is not kept
+    light.weights[1] = light.weights[1] * 2
+    same(eye(), SUN)
+    splats = gaussians(40, light.config.features, seed=3)
+    same(eye(), SUN)
+
+
+def test_an_untrained_refinement_passes_raw_shadows_on():
+    light = LightModel.initial(CONFIGS["map"], TrainingFrame(np.zeros(3), 1.0, 5.0, 3.0), 0)
+    splats = gaussians(200, light.config.features)
+    raw = numbers(light.shadows(splats, SUN).occlusion)
+    refined = 1 - numbers(light.shade(splats, eye(), SUN).visibility)
+    np.testing.assert_allclose(refined, np.clip(raw, 0.02, 0.98), atol=1e-5)
+
+
+# ---- features as parameters of Gaussians ----
+
+
+def test_features_follow_their_gaussian_through_refinement():
+    splats = gaussians(6, 4)
+    splats.features = ad.Float(np.arange(24, dtype=np.float32))
+    optimizer = Adam(splats.rows())
+    first, second = optimizer.moments()
+    first[-1] = np.arange(24, dtype=np.float32) + 100
+    optimizer.put(first, second)
+    before = splats.to_numpy()["features"]
+    duplicate, split = np.eye(6, dtype=bool)[1], np.eye(6, dtype=bool)[4]
+    index = grow(splats, optimizer, duplicate, split, np.random.default_rng(0))
+    np.testing.assert_array_equal(splats.to_numpy()["features"], before[index])
+    moments = optimizer.moments()[0][-1].reshape(4, -1).T
+    np.testing.assert_array_equal(moments[:5], before[index[:5]] + 100)
+    assert not moments[5:].any(), "what is new starts without moments"
+    kept = prune(splats, optimizer, np.arange(splats.count) % 2 == 0)
+    np.testing.assert_array_equal(splats.to_numpy()["features"], before[index[kept]])
+    assert splats.feature_count == 4
+    assert len(optimizer.moments()[1][-1]) == 4 * splats.count
+
+
+def test_entries_of_packed_rows():
+    row = np.arange(12, dtype=np.float32)
+    chosen = entries(ad.Float(row), ad.UInt32([2, 2, 0]), 4)
+    np.testing.assert_array_equal(np.array(chosen).reshape(3, 3), row.reshape(3, 4)[:, [2, 2, 0]])
+
+
+@pytest.mark.parametrize("features", [np.zeros((5, 2)), np.zeros((6, 0)), np.zeros(6)])
+def test_features_of_another_shape_are_refused(features):
+    arrays = gaussians(6, 2).to_numpy()
+    with pytest.raises(ValueError, match="features"):
+        Gaussians.from_numpy({**arrays, "features": features})
+
+
+# ---- training ----
+
+REFINEMENT = DefaultStrategyConfig(
+    refine_start=10,
+    refine_every=20,
+    pause_after_reset=0,
+    reset_every=4,
+    refine_stop=80,
+    screen_size_stop=0,
+    prune_opacity=0.01,
+)
+
+
+def training(name: str, **changes) -> TrainConfig:
+    method = name if name in METHODS else "shadow-map" if CONFIGS[name].shadow else "relight"
+    given = {"method": method, "light": CONFIGS[name], "iterations": 60, "checkpoint_every": 25, "init_count": 40}
+    return TrainConfig(**{**given, "refinement": REFINEMENT, **changes})
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_training_with_light_repeats_to_the_bit_and_resumes(small_lit_dataset, tmp_path, name):
+    config = training(name, visibility_weight=0.1 if CONFIGS[name].shadow else 0.0)
+    run = train(small_lit_dataset, tmp_path / "one", config)
+    again = train(small_lit_dataset, tmp_path / "two", config)
+    model_of = [(folder.path / "model.safetensors").read_bytes() for folder in (run, again)]
+    assert model_of[0] == model_of[1]
+    assert run.training["history"] == again.training["history"]
+
+    resumed = Trainer(small_lit_dataset, config)
+    resumed.restore(tmp_path / "one/checkpoints/step_00000050.safetensors")
+    for _ in range(10):
+        resumed.step()
+    tensors, _ = read_tensors(run.path / "model.safetensors")
+    for key, value in resumed.model_tensors().items():
+        np.testing.assert_array_equal(value, tensors[key], err_msg=key)
+
+
+def psnr(run: Run, dataset: Dataset) -> float:
+    """Of the training pictures over black, dB."""
+    errors = []
+    for frame in dataset.train:
+        truth = load_image(dataset, frame).over(np.zeros(3))
+        errors.append(np.mean((np.clip(run.predict(frame.camera, frame.sun).rgb, 0, 1) - truth) ** 2))
+    return float(-10 * np.log10(np.mean(errors)))
+
+
+def test_light_learns_and_the_sun_changes_the_picture(small_lit_dataset, tmp_path):
+    rates = LearningRates(features=2e-2, networks=5e-3)
+    start, run = (
+        train(small_lit_dataset, tmp_path / str(n), training("map", rates=rates, iterations=n, init_count=400))
+        for n in (1, 400)
+    )
+    assert psnr(run, small_lit_dataset) > psnr(start, small_lit_dataset) + 3
+    loaded, frame = load_run(run.path), small_lit_dataset.test[0]
+    assert loaded.relightable
+    one, other = (loaded.predict(frame.camera, Sun.from_angles(*angles)) for angles in ((0, 40), (180, -40)))
+    assert np.abs(one.rgb - other.rgb).max() > 0.05
+    assert one.visibility.shape == one.alpha.shape
+    assert ((one.visibility >= 0) & (one.visibility <= 1 + 1e-5)).all()
+    with pytest.raises(InputError, match="Sun's direction"):
+        loaded.predict(frame.camera)
+    for direction in (*np.eye(3), *-np.eye(3), frame.camera.world_from_camera[:3, 2]):
+        shown = loaded.predict(frame.camera, Sun(direction))
+        assert np.isfinite(shown.rgb).all()
+        assert np.isfinite(shown.visibility).all()
+
+
+def test_the_transfer_function_is_that_of_our_images():
+    values = np.linspace(-0.1, 1.2, 400).astype(np.float32)
+    np.testing.assert_allclose(numbers(tone.encoded(ad.Float(values))), srgb_from_linear(values), atol=2e-6)
+    inside = np.clip(values, 0, 1)
+    np.testing.assert_allclose(numbers(tone.decoded(ad.Float(inside))), linear_from_srgb(inside), atol=2e-6)
+
+
+def test_linear_colours_are_blended_before_they_are_encoded(small_lit_dataset, tmp_path):
+    run = train(small_lit_dataset, tmp_path / "run", training("linear", iterations=5))
+    frame = small_lit_dataset.test[0]
+    drawn = draw_lit(run.model, run.light, Pinhole.of(frame.camera), frame.sun.direction).image("features")
+    np.testing.assert_array_equal(run.predict(frame.camera, frame.sun).rgb, srgb_from_linear(drawn))
+
+
+@pytest.mark.parametrize("name", ["map", "linear"])
+def test_baked_harmonics_show_what_the_model_shows_under_that_sun(name):
+    light, splats = model(name), gaussians(120, CONFIGS[name].features)
+    plain = baked(splats, light, SUN)
+    assert plain.sh_degree == 3
+    assert plain.features is None
+    errors, spread = [], []
+    for place in fibonacci_sphere(20):
+        camera = Pinhole.of(Camera(look_at(40 * place, [0, 0, 0]), 32, 32, 40, 40, 16, 16))
+        exact = np.stack([numbers(c) for c in light.lit(splats, camera, SUN)[0]])
+        exact = srgb_from_linear(exact) if CONFIGS[name].linear else exact
+        errors.append(numbers(view_colours(plain, camera)) - exact)
+        spread.append(exact)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.5 * np.std(spread, axis=0).mean(), "the view matters, and is kept"
+
+
+def test_round_gaussians_feel_no_pull_towards_roundness():
+    """Their scales differ by the last bit of an exponential; its sign must not decide a gradient."""
+    log_scales = ad.Array3f(np.repeat(np.random.default_rng(0).uniform(-9, 2, (1, 500)), 3, axis=0).astype(np.float32))
+    log_scales[1] *= 1 + 1e-7
+    dr.enable_grad(log_scales)
+    dr.backward(anisotropy(log_scales))
+    assert not numbers(dr.grad(log_scales)).any()
+    flat = np.log([[0.1], [0.2], [0.6]]).astype(np.float32)
+    assert numbers(anisotropy(ad.Array3f(flat)))[0] == pytest.approx((0.2 + 0.1 + 0.3) / 3, rel=1e-5)
+
+
+SPLATTED = LightConfig(FIELD, ShadowConfig("splatting", 32, refine=REFINE))
+
+
+@pytest.mark.parametrize(
+    ("tensor", "changes"),
+    [
+        ("light.weight.05", {"visibility_weight": 1.0}),
+        ("features", {"light": replace(SPLATTED, linear=True)}),
+        ("means", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, gradients=True))}),
+        ("features", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, grazing="lift"))}),
+        ("features", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, bias=0.0))}),
+    ],
+    ids=["supervised", "linear", "gradients", "grazing", "bias"],
+)
+def test_every_option_changes_what_is_learned(small_lit_dataset, tensor, changes):
+    learned = []
+    for given in ({"light": SPLATTED}, {"light": SPLATTED, **changes}):
+        trainer = Trainer(small_lit_dataset, training("splat", **given))
+        for _ in range(4):
+            trainer.step()
+        learned.append(trainer.model_tensors()[tensor])
+    assert not np.array_equal(*learned)
+
+
+def test_shadow_gradients_are_those_of_the_occlusion():
+    """By central differences of the whole of what casts shadows, light camera and bias held."""
+    arrays = random_splats(30, seed=4)
+    config, light = ShadowConfig("splatting", 32, bias=0.0, gradients=True, refine=None), light_rows([0.2, -0.3, 0.9])
+    shadows = cast_shadows(Gaussians.from_numpy(arrays), light, config, 3.0)
+    by_rows = shadows.adjoint(ad.Float(np.ones(30, np.float32)))
+    opacity = np.array(by_rows[10])
+    assert np.abs(opacity).max() > 1e-3
+    for index in np.argsort(-np.abs(opacity))[:5]:
+        sums = []
+        for step in (0.05, -0.05):
+            moved = {name: values.copy() for name, values in arrays.items()}
+            moved["logit_opacities"][index] += step
+            found = cast_shadows(Gaussians.from_numpy(moved), light, config, 3.0).occlusion
+            sums.append(float(np.array(found, np.float64).sum()))
+        assert opacity[index] == pytest.approx((sums[0] - sums[1]) / 0.1, rel=0.1)
+
+
+@pytest.mark.parametrize("kind", ["empty", "no features", "few features"])
+def test_models_that_do_not_fit_their_networks_are_refused(small_lit_dataset, tmp_path, kind):
+    run = train(small_lit_dataset, tmp_path / "run", training("map", iterations=2))
+    tensors, header = read_tensors(run.path / "model.safetensors")
+    if kind == "empty":
+        tensors |= {name: tensors[name][:0] for name in run.model.to_numpy()}
+    elif kind == "no features":
+        del tensors["features"]
+    else:
+        tensors["features"] = tensors["features"][:, :4]
+    write_tensors(run.path / "model.safetensors", tensors, {k: v for k, v in header.items() if k != "format"})
+    with pytest.raises(InputError, match=r"model\.safetensors"):
+        load_run(run.path)
+    config = json.loads((run.path / "config.json").read_text())
+    config["light"]["shadow"]["grazing"] = "somehow"  # of another version
+    (run.path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(InputError, match=r"config\.json: light\.shadow\.grazing: expected one of .*somehow"):
+        load_run(run.path)
+
+
+def test_a_run_that_never_began_can_be_started_otherwise(small_lit_dataset, tmp_path, monkeypatch):
+    def broken(_self):
+        raise WorkError("the memory is short")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "step", broken)
+        with pytest.raises(WorkError):
+            train(small_lit_dataset, tmp_path / "run", training("map"))
+    run = train(small_lit_dataset, tmp_path / "run", training("map", iterations=2))
+    assert run.config["iterations"] == 2
+
+
+def test_resume_takes_what_an_older_version_did_not_write_for_the_default(small_lit_dataset, tmp_path):
+    config = training("map", iterations=2)
+    run = train(small_lit_dataset, tmp_path / "run", config)
+    written = json.loads((run.path / "config.json").read_text())
+    for name in ("views_per_step", "isotropy_weight"):
+        del written[name]
+    (run.path / "config.json").write_text(json.dumps(written))
+    assert train(small_lit_dataset, tmp_path / "run", config, resume=True).gaussians == run.gaussians
+    wider = replace(config, light=replace(config.light, field=replace(FIELD, width=20)))
+    with pytest.raises(InputError, match=r"light\.field\.width 12, --resume asks for 20"):
+        train(small_lit_dataset, tmp_path / "run", wider, resume=True)
+
+
+def test_vanilla_ignores_suns_and_light_needs_them(small_lit_dataset):
+    dark = replace(small_lit_dataset, train=tuple(replace(frame, sun=None) for frame in small_lit_dataset.train))
+    Trainer(dark, replace(training("relight"), method="vanilla", light=None))
+    with pytest.raises(InputError, match=r"expected sun_direction in every training frame.*train_"):
+        Trainer(dark, training("relight"))
+
+
+def test_supervised_visibility_needs_truth(small_lit_dataset):
+    blind = replace(small_lit_dataset, train=tuple(replace(f, gt_path=None) for f in small_lit_dataset.train))
+    with pytest.raises(InputError, match=r"path-traced visibility.*train_"):
+        Trainer(blind, training("map", visibility_weight=0.1))
+    with pytest.raises(InputError, match="visibility-weight"):
+        training("relight", visibility_weight=0.1)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_survive_json_and_have_the_thesis_numbers(name, method):
+    config = preset(name, method)
+    written = json.loads(json.dumps(config.to_json()))
+    assert TrainConfig.from_json(written).to_json() == config.to_json()  # other strategies are left out
+    if name != "thesis" or method == "vanilla":
+        return
+    field, shadow = config.light.field, config.light.shadow
+    assert (field.features, field.sun.kind) == ((72, "positional") if method == "park" else (128, "harmonics"))
+    assert (field.width, field.layers) == (256, 3)
+    if method == "relight":
+        assert shadow is None
+    else:
+        assert (shadow.bias, shadow.refine.width) == ((0, 32) if method == "park" else (10, 64))
+        assert shadow.refine.features == 6
+        assert shadow.softness == 1e-6
+    if method != "park":
+        assert field.shape == MlpShape(128 + 25, 25, 3, 256, 3)
+
+
+@pytest.mark.parametrize("change", [{"method": "mystery"}, {"size": 2}, {"bias": -1.0}, {"softness": 0.0}])
+def test_impossible_shadows_are_named(change):
+    with pytest.raises(InputError, match="expected"):
+        ShadowConfig(**change)

@@ -1,0 +1,203 @@
+"""Networks on columns in chunks against numpy in float64: sizes around the borders of chunks, and to the bit twice."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from spacesim.backend import ad, recorded
+from spacesim.splat.light import cooperative, mlp
+from spacesim.splat.light.columns import CHUNK, Lanes, aligned
+from spacesim.splat.light.mlp import MlpShape
+
+SHAPES = {
+    "filled up": MlpShape(5, 3, 2, 12, 3),
+    "as it is": MlpShape(8, 2, 1, 16, 2),
+    "one layer": MlpShape(7, 1, 3, 4, 1),
+}
+COUNTS = [1, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK - 1, 2 * CHUNK, 2 * CHUNK + 1, 5 * CHUNK + 77]
+
+
+def numbers(values) -> np.ndarray:
+    return np.array(values, dtype=np.float64)
+
+
+def columns(tensor, count: int) -> np.ndarray:
+    """[C, N] of [B, C, m]."""
+    array = numbers(tensor)
+    return array.transpose(1, 0, 2).reshape(array.shape[1], -1)[:, :count]
+
+
+def twin(shape, weights, items, shared, by_output):
+    """(outputs [outputs, N], gradients of the weights, of the items [inputs, N]) in float64."""
+    matrices = [weight.reshape(size) for weight, size in zip(weights[1::2], shape.sizes, strict=True)]
+    biases = [bias[:, None] for bias in weights[2::2]]
+    biases[0] = biases[0] + weights[0].reshape(-1, shape.shared) @ shared[:, None]
+    values = [items]
+    for i, (matrix, bias) in enumerate(zip(matrices, biases, strict=True)):
+        value = matrix @ values[-1] + bias
+        values.append(value if i == shape.layers - 1 else np.maximum(value, 0))
+    gradients, by_value = [np.zeros(0)] * len(weights), by_output
+    for i in reversed(range(shape.layers)):
+        gradients[1 + 2 * i] = (by_value @ values[i].T).ravel()
+        gradients[2 + 2 * i] = by_value.sum(axis=1)
+        if i == 0:
+            gradients[0] = np.outer(by_value.sum(axis=1), shared).ravel()
+        by_value = matrices[i].T @ by_value
+        if i > 0:
+            by_value = by_value * (values[i] > 0)
+    return values[-1], gradients, by_value
+
+
+class Case:
+    """A network of random weights, items of N Gaussians and gradients of what it says of them."""
+
+    def __init__(self, shape: MlpShape, count: int) -> None:
+        rng = np.random.default_rng(count)
+        self.shape, self.count = shape, count
+        self.weights = mlp.initial_weights(shape, rng)
+        self.shared = rng.normal(size=shape.shared).astype(np.float32)
+        self.items = rng.normal(size=(shape.inputs, count)).astype(np.float32)
+        self.by_output = rng.normal(size=(shape.outputs, count)).astype(np.float32)
+
+    def device(self) -> list:
+        """Weights, items, shared, gradients: as the networks read them."""
+        floats = [[ad.Float(v) for v in values] for values in (self.weights, self.items, self.by_output)]
+        return [floats[0], floats[1], ad.Float(self.shared), floats[2], Lanes.of(self.count)]
+
+    def exact(self):
+        doubles = [np.float64(weight) for weight in self.weights]
+        return twin(self.shape, doubles, *map(np.float64, (self.items, self.shared, self.by_output)))
+
+
+def passes(shape, weights, rows, shared, by_rows, lanes):
+    items = lanes.matrix([lanes.padded(row) for row in rows], shape.rows)
+    output, tape = mlp.forward(shape, weights, items, shared)
+    by_output = lanes.matrix([lanes.padded(row) for row in by_rows])
+    gradients, by_items = mlp.backward(shape, weights, tape, shared, by_output)
+    return output, gradients, by_items
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("name", SHAPES)
+def test_networks_and_their_adjoint_match_float64(name, count):
+    case = Case(SHAPES[name], count)
+    output, gradients, by_items = passes(case.shape, *case.device())
+    exact, exact_gradients, exact_by_items = case.exact()
+    assert output.shape[1:] == (case.shape.outputs, CHUNK)
+    np.testing.assert_allclose(columns(output, count), exact, atol=2e-6)
+    np.testing.assert_allclose(columns(by_items, count)[: case.shape.inputs], exact_by_items, atol=5e-6)
+    assert len(gradients) == len(case.weights)
+    for one, other, weight in zip(gradients, exact_gradients, case.weights, strict=True):
+        assert dr.width(one) == len(weight)
+        np.testing.assert_allclose(numbers(one), other, rtol=1e-4, atol=1e-6 * (100 + count))
+
+
+def test_recorded_passes_repeat_to_the_bit_and_serve_other_sizes():
+    shape = SHAPES["filled up"]
+    record = recorded(passes, 16)
+    for count in (700, 900, CHUNK + 1, 5000, 700):  # the first three have room for as many
+        case = Case(shape, count)
+        output, gradients, _ = record(shape, *case.device())
+        again, same, _ = record(shape, *case.device())
+        assert numbers(output).tobytes() == numbers(again).tobytes()
+        for one, other in zip(gradients, same, strict=True):
+            assert numbers(one).tobytes() == numbers(other).tobytes()
+        exact, exact_gradients, _ = case.exact()
+        np.testing.assert_allclose(columns(output, count), exact, atol=2e-6)
+        np.testing.assert_allclose(numbers(gradients[1]), exact_gradients[1], rtol=1e-4, atol=1e-2)
+
+
+def test_recordings_are_as_wide_as_the_columns_whatever_they_read():
+    record = recorded(lambda packed, lanes: lanes.matrix(lanes.block(packed, 4, 2)), 16)
+    for count in (512, 1000, 300):  # 512: the packed rows are a multiple of the columns, and more than the matrix
+        packed = np.random.default_rng(count).normal(size=(38, count)).astype(np.float32)
+        found = record(ad.Float(packed.ravel()), Lanes.of(count))
+        np.testing.assert_array_equal(columns(found, count), packed[4:6])
+        np.testing.assert_array_equal(columns(found, 1024)[:, count:], np.repeat(packed[4:6, -1:], 1024 - count, 1))
+
+
+@pytest.mark.parametrize("first", [1, 4, 7])
+def test_a_network_that_knows_first_inputs_says_the_same(first):
+    case = Case(MlpShape(9, 3, 2, 12, 3), CHUNK + 1)
+    weights, rows, shared, _, lanes = case.device()
+    rows = [lanes.padded(row) for row in rows]
+    known = mlp.known(case.shape, weights, lanes.matrix(rows[:first], aligned(first)), first)
+    output, _ = mlp.forward(case.shape, weights, lanes.matrix(rows[first:], aligned(9 - first)), shared, known)
+    np.testing.assert_allclose(columns(output, case.count), case.exact()[0], atol=2e-6)
+
+
+def test_columns_beyond_the_gaussians_change_nothing():
+    shape, count = SHAPES["as it is"], 1500
+    case = Case(shape, count)
+    weights, rows, shared, by_rows, lanes = case.device()
+    _, gradients, _ = passes(shape, weights, rows, shared, by_rows, lanes)
+    wide = [ad.Float(np.append(row, np.full(9, 7e3))) for row in case.items]  # beyond N: never read
+    _, same, _ = passes(shape, weights, wide, shared, by_rows, lanes)
+    for one, other in zip(gradients, same, strict=True):
+        np.testing.assert_array_equal(numbers(one), numbers(other))
+
+
+@pytest.mark.parametrize("still", [False, True])
+@pytest.mark.parametrize("count", [1, CHUNK - 1, CHUNK, 31622, 100_000])
+def test_columns_are_more_than_the_gaussians_and_whole_chunks(count, still):
+    lanes = Lanes.of(count, still)
+    assert numbers(lanes.count) == count
+    assert count < lanes.capacity <= (count + CHUNK if still else 9 / 8 * count + 1024)
+    assert lanes.capacity % CHUNK == 0
+
+
+def test_weights_have_the_size_that_the_shape_says():
+    for shape in SHAPES.values():
+        weights = mlp.initial_weights(shape, np.random.default_rng(0))
+        assert sum(map(len, weights)) == shape.parameters
+        assert shape.inputs <= shape.rows < shape.inputs + 4
+        assert shape.rows % 4 == 0
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_rows_come_back_from_matrices(count):
+    rng, lanes = np.random.default_rng(1), Lanes.of(count)
+    packed = rng.normal(size=(6, count)).astype(np.float32)
+    like = ad.Float(np.zeros(count))
+    one = lanes.matrix([*lanes.block(ad.Float(packed.ravel()), 1, 3), ad.Float(2)], aligned(5))
+    assert one.shape == (lanes.capacity // CHUNK, 8, CHUNK)
+    np.testing.assert_array_equal(columns(one, count)[:3], packed[1:4])
+    np.testing.assert_array_equal(columns(one, count)[3:], np.repeat([[2.0], [0], [0], [0], [0]], count, axis=1))
+    rows = [lanes.row(one, i) for i in (2, 0)]
+    dr.eval(rows)
+    for row, i in zip(lanes.narrowed(rows, like), (3, 1), strict=True):
+        np.testing.assert_array_equal(numbers(row), packed[i])
+    other = lanes.matrix([lanes.spread(ad.Float(packed[5]))])
+    back = lanes.packed([(one, 1, 2), (other, 0, 1)], ad.Float(np.zeros(3 * count)))
+    np.testing.assert_array_equal(numbers(back).reshape(3, count), packed[[2, 3, 5]])
+
+
+def test_cooperative_vectors_give_the_same_colours():
+    assert cooperative.usable()
+    shape, count = MlpShape(57, 25, 3, 64, 3), 700
+    record = recorded(cooperative.forward, 4)
+    for seed in range(2):  # the second with other weights, by the recording of the first
+        case = Case(shape, count + seed)
+        weights, rows, shared, _, lanes = case.device()
+        found = record(shape, cooperative.pack(shape, weights), [lanes.spread(row) for row in rows], shared)
+        exact, *_ = case.exact()
+        for row, other in zip(found, exact, strict=True):
+            np.testing.assert_allclose(
+                1 / (1 + np.exp(-numbers(row)[: case.count])), 1 / (1 + np.exp(-other)), atol=2e-3
+            )
+
+
+def test_cooperative_vectors_that_fail_or_lie_are_not_used(monkeypatch, caplog):
+    def fails() -> float:
+        raise RuntimeError("no OptiX here")
+
+    for tried, told in (
+        (fails, "no OptiX here"),
+        (lambda: 0.1, "wrong by 0.1"),
+        (lambda: float("nan"), "wrong by nan"),
+    ):
+        monkeypatch.setattr(cooperative, "_tried", tried)
+        cooperative.usable.cache_clear()
+        assert not cooperative.usable()
+        assert told in caplog.records[-1].getMessage()
+    cooperative.usable.cache_clear()

@@ -1,0 +1,188 @@
+"""Lists of tiles: both ways of ordering them against numpy, and against each other."""
+
+import dataclasses
+
+import drjit as dr
+import numpy as np
+import pytest
+from splats import random_splats
+
+from spacesim.backend import ad, recordings, select
+from spacesim.data.geometry import look_at
+from spacesim.data.records import Camera
+from spacesim.splat.raster import bin as tiles
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
+from spacesim.splat.raster.sort import ordered_lists, owners
+
+WAYS = ("cuda", "llvm")
+
+
+@pytest.fixture(params=WAYS)
+def way(request, monkeypatch):
+    """Each backend's way of ordering lists, and its tiles, on the backend that runs."""
+    use(request.param, monkeypatch)
+
+
+def use(name, monkeypatch):
+    if name == "llvm" and select() == "cuda":
+        pytest.skip("Dr.Jit cannot replay its sort on CUDA")
+    monkeypatch.setattr(tiles, "select", lambda: name)
+
+
+def projected(count: int, width: int, height: int, seed: int = 0) -> tuple[Splats, Footprints]:
+    view = Camera.from_fov(look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0]), width, height, 40)
+    splats, footprints = project(Gaussians.from_numpy(random_splats(count, seed, degree=0)), Pinhole.of(view))
+    dr.eval(splats, footprints)
+    return splats, footprints
+
+
+def listed(lists: tiles.TileLists) -> list[list[int]]:
+    splat, start, end = np.array(lists.splat), np.array(lists.start), np.array(lists.end)
+    return [splat[s:e].tolist() for s, e in zip(start, end, strict=True)]
+
+
+def expected(splats: Splats, footprints: Footprints, width: int, height: int, shape: tiles.TileShape):
+    """Of each tile, who reaches one of its pixels for certain, and who may do so by its box; in order."""
+    x, y, a, b, c, opacity = (np.array(getattr(splats, n), np.float64) for n in ("x", "y", "a", "b", "c", "opacity"))
+    box = np.array(footprints.half_width, np.float64), np.array(footprints.half_height, np.float64)
+    order = np.lexsort((np.arange(len(x)), np.array(footprints.order)))
+    order = order[np.array(footprints.visible)[order]]
+    certain, possible = [], []
+    for top in range(0, height, shape.height):
+        for left in range(0, width, shape.width):
+            px, py = np.meshgrid(left + np.arange(shape.width) + 0.5, top + np.arange(shape.height) + 0.5)
+            dx, dy = px.ravel() - x[order, None], py.ravel() - y[order, None]
+            power = -0.5 * (a[order, None] * dx**2 + 2 * b[order, None] * dx * dy + c[order, None] * dy**2)
+            reaches = (opacity[order, None] * np.exp(power) > 1.01 / 255).any(axis=1)
+            near = (x[order] + box[0][order] >= left) & (x[order] - box[0][order] <= left + shape.width)
+            near &= (y[order] + box[1][order] >= top) & (y[order] - box[1][order] <= top + shape.height)
+            certain.append(order[reaches].tolist())
+            possible.append(order[near].tolist())
+    return certain, possible
+
+
+@pytest.mark.parametrize(("count", "size"), [(1, (16, 8)), (40, (50, 30)), (700, (90, 61)), (3000, (16, 8))])
+def test_tiles_list_who_reaches_them_in_order(way, count, size):
+    splats, footprints = projected(count, *size)
+    lists = tiles.bin_splats(splats, footprints, *size)
+    certain, possible = expected(splats, footprints, *size, lists.shape)
+    ours = listed(lists)
+    assert sum(map(len, certain)) > 0
+    for own, inner, outer in zip(ours, certain, possible, strict=True):
+        assert set(inner) <= set(own)
+        assert own == [splat for splat in outer if splat in set(own)]
+    assert lists.pairs == sum(map(len, ours))
+
+
+def test_slots_are_the_splats_own(way):
+    """Each listed pair has a slot of its own among its splat's."""
+    splats, footprints = projected(900, 70, 50)
+    lists = tiles.bin_splats(splats, footprints, 70, 50)
+    start, end = np.array(lists.start), np.array(lists.end)
+    entries = np.concatenate([np.arange(s, e) for s, e in zip(start, end, strict=True)])
+    splat, slot = np.array(lists.splat)[entries], np.array(lists.slot)[entries]
+    first, count = np.array(lists.first_slot)[splat], np.array(lists.slot_count)[splat]
+    assert (slot >= first).all()
+    assert (slot < first + count).all()
+    assert len(np.unique(slot)) == len(slot)
+    assert slot.max() < lists.capacity
+    kept = np.array(lists.sum_index(ad.UInt32(entries.astype(np.uint32))))
+    np.testing.assert_array_equal(np.array(lists.sum_of_slot(ad.UInt32(slot))), kept)
+    assert len(np.unique(kept)) == len(kept)
+
+
+@pytest.mark.parametrize(("count", "size"), [(2000, (64, 64)), (500, (33, 90)), (9000, (8, 8))])
+def test_both_ways_list_the_same(count, size, monkeypatch):
+    splats, footprints = projected(count, *size)
+    monkeypatch.setattr(tiles, "tile_shape", lambda: tiles.TileShape(16, 8, 16))
+    found = []
+    for name in WAYS:
+        use(name, monkeypatch)
+        found.append(listed(tiles.bin_splats(splats, footprints, *size)))
+    assert found[0] == found[1]
+    assert sum(map(len, found[0])) > count / 2
+
+
+def test_equal_depths_are_in_index_order(way):
+    """What shadow splatting relies on: of two events at one depth the first comes first."""
+    splats, footprints = projected(600, 48, 48)
+    footprints.order = ad.UInt32(np.random.default_rng(0).integers(3, 6, 600).astype(np.uint32))
+    order = np.array(footprints.order)
+    lists = listed(tiles.bin_splats(splats, footprints, 48, 48))
+    assert max(map(len, lists)) > 30
+    for own in lists:
+        assert own == sorted(own, key=lambda splat: (order[splat], splat))
+
+
+def test_recordings_serve_other_numbers_of_splats_and_pairs(way):
+    """Larger, smaller, and as many as an array has room for, all twice; the second time nothing is recorded."""
+    counts = [1000, 1023, 1024, 40, 1, 961, 2048, 2047]
+    found = {}
+    for count in counts:
+        splats, footprints = projected(count, 64, 40, seed=count)
+        lists = tiles.bin_splats(splats, footprints, 64, 40)
+        certain, possible = expected(splats, footprints, 64, 40, lists.shape)
+        found[count] = listed(lists)
+        for own, inner, outer in zip(found[count], certain, possible, strict=True):
+            assert set(inner) <= set(own)
+            assert own == [splat for splat in outer if splat in set(own)]
+    before = recordings()
+    for count in counts:
+        assert listed(tiles.bin_splats(*projected(count, 64, 40, seed=count), 64, 40)) == found[count]
+    assert recordings() == before
+
+
+def test_nobody_seen_is_no_list(way):
+    splats, footprints = projected(50, 32, 32)
+    hidden = dataclasses.replace(footprints, visible=dr.zeros(ad.Bool, 50))
+    lists = tiles.bin_splats(splats, hidden, 32, 32)
+    assert lists.pairs == 0
+    assert lists.capacity == 0
+
+
+@pytest.mark.parametrize("runs", [(4, 16), (4, 4096), (64, 4096), (8, 8)])
+@pytest.mark.parametrize(
+    "lengths", [[1], [0, 5, 0], [300, 0, 17, 1, 64], [16, 4, 15, 17, 3], [2000, 3, 1500], [0, 0, 1]]
+)
+def test_lists_of_any_length_are_ordered(lengths, runs):
+    """Against numpy's sort; lists longer than a run, as long, and shorter; many equal keys."""
+    rng = np.random.default_rng(sum(lengths))
+    members = np.repeat(np.arange(len(lengths)), lengths)
+    members = np.concatenate([members, np.full(37, len(lengths))])  # in no list
+    rng.shuffle(members)
+    size = len(members)
+    keys, numbers = rng.integers(0, 9, size), rng.permutation(size)
+    arrays = (ad.UInt32(values.astype(np.uint32)) for values in (members, keys, numbers))
+    number, source, start, end = (np.array(v) for v in ordered_lists(*arrays, len(lengths), size, runs))
+    np.testing.assert_array_equal(end - start, lengths)
+    for i, (s, e) in enumerate(zip(start, end, strict=True)):
+        mine = np.flatnonzero(members == i)
+        wanted = mine[np.lexsort((numbers[mine], keys[mine]))]
+        np.testing.assert_array_equal(source[s:e], wanted)
+        np.testing.assert_array_equal(number[s:e], numbers[wanted])
+
+
+def test_owners_of_slots():
+    counts = np.array([0, 3, 0, 0, 5, 1, 0])
+    upto = ad.UInt64(np.cumsum(counts).astype(np.uint64))
+    found = np.array(owners(upto, dr.arange(ad.UInt32, 11), len(counts)))
+    np.testing.assert_array_equal(found, [*np.repeat(np.arange(7), counts), 7, 7])
+
+
+@pytest.mark.parametrize(
+    "lengths", [[3], [0, 5, 2], [7] * 70, list(range(300)), list(range(1024)), [5000, 3000, 2047, 1, 0] * 40]
+)
+def test_tiles_are_dealt_longest_first(lengths):
+    """Each tile once; those that share a packet have lists of about one length; runs of tiles have long and short."""
+    lengths = np.random.default_rng(0).permutation(lengths)
+    shape = tiles.TileShape(8, 8, 4, 2)
+    order = np.array(tiles._longest_first(ad.UInt32(lengths.astype(np.uint32)), shape))
+    assert sorted(order.tolist()) == list(range(len(lengths)))
+    dealt = np.minimum(lengths, tiles.LONGEST)[order]
+    ranks = np.sort(np.minimum(lengths, tiles.LONGEST))[::-1]
+    packets = dealt[: len(dealt) // 4 * 4].reshape(-1, 4)
+    assert sorted(map(tuple, packets)) == sorted(map(tuple, ranks[: len(dealt) // 4 * 4].reshape(-1, 4)))
+    if len(lengths) >= 300:
+        quarters = [part.sum() for part in np.array_split(dealt, 4)]
+        assert max(quarters) < (1.3 if len(lengths) == 300 else 1.1) * min(quarters)

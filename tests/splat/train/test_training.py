@@ -1,0 +1,440 @@
+"""Training as a whole: it learns, it repeats to the bit, it survives interruption."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from splats import random_splats
+
+from spacesim.backend import recordings
+from spacesim.cli import main
+from spacesim.data.errors import InputError, WorkError
+from spacesim.data.images import load_image
+from spacesim.data.lock import locked
+from spacesim.splat.export.ply import read_ply, write_ply
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Pinhole
+from spacesim.splat.raster.render import render
+from spacesim.splat.run import load_run
+from spacesim.splat.train import views
+from spacesim.splat.train.checkpoint import read_tensors, write_tensors
+from spacesim.splat.train.config import TrainConfig, preset, with_options
+from spacesim.splat.train.start import far_remark, focus_point, initial_gaussians, scene_scale, small_remark
+from spacesim.splat.train.strategies.default import DefaultStrategyConfig
+from spacesim.splat.train.train import train
+from spacesim.splat.train.trainer import Trainer
+from spacesim.splat.train.warm_start import WarmStartConfig
+
+REFINEMENT = DefaultStrategyConfig(
+    refine_start=10, refine_every=20, pause_after_reset=0, reset_every=4, refine_stop=150, screen_size_stop=0
+)
+CONFIG = TrainConfig(iterations=160, checkpoint_every=50, sh_every=40, sh_degree=1, refinement=REFINEMENT)
+
+
+def psnr(model: Gaussians, dataset) -> float:
+    errors = []
+    for frame in dataset.test:
+        colour = np.array(render(model, Pinhole.of(frame.camera)).colour).T
+        truth = load_image(dataset, frame).over(np.zeros(3)).reshape(-1, 3)
+        errors.append(np.mean((np.clip(colour, 0, 1) - truth) ** 2))
+    return float(np.mean(-10 * np.log10(errors)))
+
+
+@pytest.fixture(scope="module")
+def finished(small_dataset, tmp_path_factory):
+    return train(small_dataset, tmp_path_factory.mktemp("runs") / "run", CONFIG)
+
+
+def test_training_learns_views_that_it_has_not_seen(small_dataset, finished):
+    start = initial_gaussians(small_dataset, None, 60, 1, 0)
+    assert psnr(finished.model, small_dataset) > psnr(start, small_dataset) + 6
+
+
+def test_same_seed_same_model_to_the_bit(small_dataset, finished, tmp_path):
+    again = train(small_dataset, tmp_path / "again", CONFIG)
+    name = "model.safetensors"
+    assert (again.path / name).read_bytes() == (finished.path / name).read_bytes()
+    assert again.training["history"] == finished.training["history"]
+    other = train(small_dataset, tmp_path / "other", replace(CONFIG, seed=1, iterations=20))
+    assert not np.array_equal(other.model.to_numpy()["means"][:10], finished.model.to_numpy()["means"][:10])
+
+
+def test_no_training_ends_with_a_refinement_that_nothing_follows(small_dataset):
+    """Step 80 resets opacities to at most 0.1, but not as the last one."""
+    for steps in (80, 81):
+        trainer = Trainer(small_dataset, replace(CONFIG, iterations=steps))
+        trainer.gaussians.logit_opacities += 3
+        trainer.iteration = 79  # finished
+        trainer.step()
+        assert (np.array(trainer.gaussians.logit_opacities).max() > 0) == (steps == 80)
+
+
+def test_a_run_trained_with_the_filter_is_drawn_with_it(small_dataset, tmp_path, capsys):
+    run = train(small_dataset, tmp_path / "run", replace(CONFIG, iterations=60, antialiased=True))
+    plain = train(small_dataset, tmp_path / "plain", replace(CONFIG, iterations=60))
+    assert not np.array_equal(run.model.to_numpy()["means"][:20], plain.model.to_numpy()["means"][:20])
+    camera = small_dataset.test[0].camera
+    drawn = render(load_run(run.path).model, Pinhole.of(camera), outputs=("colour",), antialiased=True)
+    np.testing.assert_array_equal(load_run(run.path).predict(camera).rgb, drawn.image("colour"))
+    unfiltered = render(run.model, Pinhole.of(camera), outputs=("colour",)).image("colour")
+    assert not np.array_equal(drawn.image("colour"), unfiltered)
+    for exported, told in ((run, True), (plain, False)):  # other viewers draw as they do
+        assert main(["export", str(exported.path), "--ply", str(tmp_path / "model.ply")]) == 0
+        assert ("--antialiased" in capsys.readouterr().err) == told
+
+
+@pytest.mark.parametrize("stop", [50, 100])
+def test_a_restored_trainer_goes_on_as_if_never_stopped(small_dataset, tmp_path, stop):
+    straight = Trainer(small_dataset, CONFIG)
+    for _ in range(stop):
+        straight.step()
+    straight.save(tmp_path / "checkpoint.safetensors")
+    resumed = Trainer(small_dataset, CONFIG)
+    resumed.restore(tmp_path / "checkpoint.safetensors")
+    for _ in range(30):
+        straight.step()
+        resumed.step()
+    one, other = straight.gaussians.to_numpy(), resumed.gaussians.to_numpy()
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, other[name])
+
+
+def test_checkpoints_that_do_not_fit_are_refused(small_dataset, tmp_path):
+    trainer = Trainer(small_dataset, CONFIG)
+    trainer.save(tmp_path / "good.safetensors")
+    tensors, header = read_tensors(tmp_path / "good.safetensors")
+    broken = [
+        ({**tensors, "adam.first.00": tensors["adam.first.00"][1:]}, header),
+        ({name: value for name, value in tensors.items() if name != "adam.second.10"}, header),
+        ({**tensors, "strategy.seen": tensors["strategy.seen"][1:]}, header),
+        ({name: value for name, value in tensors.items() if name != "means"}, header),
+        ({**tensors, "sh": tensors["sh"][:, :1]}, header),
+        (tensors, {**header, "iteration": 10**6}),
+        (tensors, {**header, "iteration": "many"}),
+        (tensors, {**header, "history": None}),
+    ]
+    for number, (content, told) in enumerate(broken):
+        path = tmp_path / f"broken_{number}.safetensors"
+        write_tensors(path, content, {key: value for key, value in told.items() if key != "format"})
+        with pytest.raises(InputError, match=path.name):
+            trainer.restore(path)
+    trainer.restore(tmp_path / "good.safetensors")
+
+
+def test_killed_training_is_completed_by_resume(small_dataset, finished, tmp_path):
+    """The process dies without warning right after a checkpoint; --resume gives the same model to the bit."""
+    script = f"""
+import os, signal
+from pathlib import Path
+from spacesim.data.store import read_dataset
+from spacesim.splat.train.checkpoint import read_tensors, write_tensors
+from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.train import train
+config = TrainConfig.from_json({CONFIG.to_json()!r})
+def die(progress):
+    if progress.iteration == 100 and progress.gaussians:
+        os.kill(os.getpid(), signal.SIGKILL)
+train(read_dataset(Path({str(small_dataset.root)!r})), Path({str(tmp_path / "run")!r}), config, on_progress=die)
+"""
+    died = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert died.returncode == -9, died.stderr
+    with pytest.raises(InputError, match="resume"):
+        load_run(tmp_path / "run")
+    with pytest.raises(InputError, match="holds a run already"):
+        train(small_dataset, tmp_path / "run", CONFIG)
+    with pytest.raises(InputError, match="seed"):
+        train(small_dataset, tmp_path / "run", replace(CONFIG, seed=5), resume=True)
+    resumed = train(small_dataset, tmp_path / "run", CONFIG, resume=True)
+    name = "model.safetensors"
+    assert (resumed.path / name).read_bytes() == (finished.path / name).read_bytes()
+
+
+def test_one_training_at_a_time_in_a_folder(small_dataset, tmp_path):
+    """Two would mix the configuration of one with the checkpoints of the other."""
+    run, config = tmp_path / "run", replace(CONFIG, iterations=2)
+    with locked(run), pytest.raises(InputError, match="run: expected no other run at work in the folder"):
+        train(small_dataset, run, config)
+    assert not list(run.iterdir())
+    leftover = run / ".config.json.0123.part"  # of a process that was killed while it wrote
+    leftover.write_bytes(b"half a file")
+    assert train(small_dataset, run, config).gaussians > 0
+    assert not leftover.exists()
+
+
+def test_a_run_is_not_resumed_through_another_lens(small_dataset, finished):
+    lens = (0.1, 0.0, 0.0, 0.0, 0.0)
+    other = replace(small_dataset, train=tuple(replace(f, distortion=lens) for f in small_dataset.train))
+    with pytest.raises(InputError, match=r"was started with data\.digest"):
+        train(other, finished.path, CONFIG, resume=True)
+
+
+def test_a_finished_run_is_left_alone_by_resume(small_dataset, finished):
+    before = (finished.path / "model.safetensors").stat().st_mtime_ns
+    train(small_dataset, finished.path, CONFIG, resume=True)
+    assert (finished.path / "model.safetensors").stat().st_mtime_ns == before
+
+
+def test_the_run_says_how_it_was_made(finished):
+    config = json.loads((finished.path / "config.json").read_text())
+    assert TrainConfig.from_json(config) == CONFIG
+    assert finished.training["history"][-1]["iteration"] == CONFIG.iterations
+    assert finished.training["gaussians"] == finished.gaussians
+    assert len(list((finished.path / "checkpoints").glob("step_*.safetensors"))) == 2
+
+
+def test_refinement_that_leaves_nothing_is_said(small_dataset):
+    trainer = Trainer(small_dataset, replace(CONFIG, refinement=replace(REFINEMENT, prune_opacity=0.499)))
+    with pytest.raises(WorkError, match="prune every Gaussian"):
+        trainer.run(lambda progress: None, lambda: None)
+
+
+def test_random_background_keeps_a_black_hull_solid(black_dataset):
+    """Over black a black hull costs nothing to lose, and all of it goes; against alpha its silhouette stays."""
+    over_black = Trainer(black_dataset, replace(CONFIG, random_background=False))
+    with pytest.raises(WorkError, match="prune every Gaussian"):
+        over_black.run(lambda progress: None, lambda: None)
+    against_alpha = Trainer(black_dataset, CONFIG)
+    against_alpha.run(lambda progress: None, lambda: None)
+    frame = black_dataset.test[0]
+    alpha = np.array(render(against_alpha.gaussians, Pinhole.of(frame.camera)).alpha)
+    truth = load_image(black_dataset, frame).alpha.ravel()
+    assert alpha[truth > 0.99].mean() > 0.9
+    assert alpha[truth < 0.01].mean() < 0.05
+
+
+@pytest.mark.parametrize("init", ["points", "random"])
+def test_initial_gaussians(small_dataset, init):
+    one, two = (initial_gaussians(small_dataset, init, 40, 2, 3).to_numpy() for _ in range(2))
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, two[name])
+    assert one["means"].shape == (40, 3)
+    assert one["sh"].shape == (40, 9, 3)
+    np.testing.assert_allclose(1 / (1 + np.exp(-one["logit_opacities"])), 0.1, rtol=1e-5)
+    assert np.abs(one["means"]).max() < 2
+
+
+def test_initialising_from_what_is_not_there(small_dataset):
+    with pytest.raises(InputError, match="mesh"):
+        initial_gaussians(small_dataset, "mesh", 40, 0, 0)
+    with pytest.raises(InputError, match="ply_file_path"):
+        initial_gaussians(replace(small_dataset, ply_file_path=None), "points", 40, 0, 0)
+
+
+def test_scene_scale_and_focus(small_dataset):
+    np.testing.assert_allclose(focus_point(small_dataset), 0, atol=1e-6)
+    centers = np.array([frame.camera.position for frame in small_dataset.train])
+    assert scene_scale(small_dataset) == pytest.approx(np.abs(centers - centers.mean(0)).max())
+
+
+def placed(dataset, factor=1.0, shift=0.0):
+    """The dataset with other positions of its training cameras."""
+    cameras = [replace(f.camera, world_from_camera=f.camera.world_from_camera.copy()) for f in dataset.train]
+    for camera in cameras:
+        camera.world_from_camera[:3, 3] = factor * camera.world_from_camera[:3, 3] + shift
+    return replace(dataset, train=tuple(replace(f, camera=c) for f, c in zip(dataset.train, cameras, strict=True)))
+
+
+def test_poses_in_kilometres_are_told(small_dataset):
+    assert small_remark(small_dataset) == small_remark(placed(small_dataset, 1e-2)) == ""
+    assert small_remark(placed(small_dataset, 1e4)) == ""
+    assert "expected poses in metres, found training cameras 0.003 m from" in small_remark(placed(small_dataset, 1e-3))
+
+
+def test_poses_far_from_the_origin_are_told(small_dataset):
+    assert far_remark(small_dataset) == far_remark(placed(small_dataset, shift=1e3)) == ""
+    assert far_remark(placed(small_dataset, 1e4, 1e6)) == ""
+    assert "found it 1.2e+07 m away, where single precision has steps of 0.5 m" in far_remark(
+        placed(small_dataset, shift=7e6)
+    )
+
+
+def test_ply_round_trip(finished, tmp_path):
+    write_ply(finished.model, tmp_path / "model.ply")
+    ours, back = finished.model.to_numpy(), read_ply(tmp_path / "model.ply").to_numpy()
+    for name in ("means", "log_scales", "logit_opacities", "sh"):
+        np.testing.assert_array_equal(ours[name], back[name])
+    header = (tmp_path / "model.ply").read_bytes().split(b"end_header\n")[0].decode()
+    names = [line.split()[-1] for line in header.splitlines() if line.startswith("property")]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert names[-8:] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    # INRIA's files hold the rest channel by channel: f_rest_0 .. 2 are the red ones of degree 1
+    table = np.frombuffer((tmp_path / "model.ply").read_bytes().split(b"end_header\n")[1], "<f4")
+    row = table.reshape(-1, len(names))[0]
+    np.testing.assert_array_equal(row[9:12], ours["sh"][0, 1:4, 0])
+
+
+def test_broken_files_are_named(finished, tmp_path):
+    whole = (finished.path / "model.safetensors").read_bytes()
+    for name in ("config.json", "training.json"):
+        (tmp_path / name).write_text((finished.path / name).read_text())
+    for content in (whole[: len(whole) // 2], b"", b"nonsense"):
+        (tmp_path / "model.safetensors").write_bytes(content)
+        with pytest.raises(InputError, match="safetensors"):
+            load_run(tmp_path)
+    (tmp_path / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+    with pytest.raises(InputError, match=r"broken\.ply"):
+        read_ply(tmp_path / "broken.ply")
+
+
+def test_ply_of_no_gaussians(tmp_path):
+    empty = Gaussians.from_numpy({name: values[:0] for name, values in random_splats(3).items()})
+    write_ply(empty, tmp_path / "empty.ply")
+    assert read_ply(tmp_path / "empty.ply").count == 0
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        *(("iterations", 0), ("method", "magic"), ("init", "dreams"), ("seed", -1), ("sh_degree", 4)),
+        *(("views_per_step", 0), ("views_per_step", 65)),
+    ],
+)
+def test_configurations_that_cannot_be(option, value):
+    with pytest.raises(InputError, match=option.replace("_", "-")):
+        with_options(preset("demo"), **{option: value})
+
+
+def test_presets_and_table_5_1():
+    table = preset("thesis").refinement
+    values = (table.prune_opacity, table.prune_scale, table.reset_every, table.prune_screen_size)
+    assert values == (0.05, 0.05, 30, 0.05)
+    more = (table.split_screen_size, table.refine_every, table.pause_after_reset, table.max_gaussians)
+    assert more == (0.01, 100, 1000, 250_000)
+    assert (preset("thesis").iterations, table.refine_stop) == (200_000, 150_000)
+    with pytest.raises(InputError, match="preset"):
+        preset("miracle")
+
+
+def test_opaque_pictures_are_trained_over_black(opaque_dataset):
+    """Pictures without alpha: the black sky is black for want of light, not for want of splats."""
+    trainer = Trainer(opaque_dataset, CONFIG)
+    assert not trainer.background(3, trainer.views[0]).any()
+    trainer.run(lambda progress: None, lambda: None)
+    assert psnr(trainer.gaussians, opaque_dataset) > 20
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs processor affinity")
+def test_the_number_of_threads_does_not_show(small_dataset, tmp_path):
+    """Round-off gradients of round splats are denormal when squared, and a lone thread does not flush those."""
+    config = replace(CONFIG, init="random", init_count=20_000, iterations=12)
+    script = f"""
+import os
+os.sched_setaffinity(0, {{min(os.sched_getaffinity(0))}})
+from pathlib import Path
+from spacesim.data.store import read_dataset
+from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.train import train
+config = TrainConfig.from_json({config.to_json()!r})
+train(read_dataset(Path({str(small_dataset.root)!r})), Path({str(tmp_path / "alone")!r}), config)
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)
+    together = train(small_dataset, tmp_path / "together", config)
+    name = "model.safetensors"
+    assert (tmp_path / "alone" / name).read_bytes() == (together.path / name).read_bytes()
+
+
+def test_several_views_a_step_follow_their_mean_gradient(small_dataset):
+    """Adam's first moment after a first step is a tenth of the gradient."""
+    config = replace(CONFIG, sh_every=10)
+
+    def moments(views_per_step: int, iteration: int) -> np.ndarray:
+        trainer = Trainer(small_dataset, replace(config, views_per_step=views_per_step))
+        trainer.iteration = iteration
+        trainer.step()
+        return np.stack(trainer.optimizer.moments()[0])
+
+    first, second, both = moments(1, 0), moments(1, 1), moments(2, 0)
+    assert np.abs(first - second).max() > 0.1 * np.abs(first).max()
+    np.testing.assert_allclose(both, (first + second) / 2, rtol=1e-4, atol=1e-6 * np.abs(first).max())
+
+
+def test_views_of_which_nothing_counts_are_told_once(small_dataset, caplog):
+    """Their loss is 0, whatever is drawn: as if all were well."""
+    first = replace(small_dataset.train[0], distortion=(1e30, 0.0, 0.0, 0.0, 0.0))
+    trainer = Trainer(replace(small_dataset, train=(first,)), CONFIG)
+    for _ in range(2):
+        assert float(trainer.step()[0]) < 1e-7
+        trainer.views._cached.cache_clear()
+    assert [r.message for r in caplog.records] == [
+        f"{first.file_path}: no pixel of it counts, by its mask or by its lens distortion"
+    ]
+
+
+def test_where_memory_is_short_pictures_are_read_again(small_dataset, monkeypatch):
+    kept = Trainer(small_dataset, CONFIG)
+    monkeypatch.setattr(views, "main_memory", lambda: 4 * 10**9)
+    monkeypatch.setattr(views, "free_memory", lambda: 4 * 10**9)
+    assert views.kept_bytes() == (10**9, 5 * 10**8)
+    monkeypatch.setattr(views, "main_memory", lambda: 0)
+    monkeypatch.setattr(views, "free_memory", lambda: 0)
+    read_again = Trainer(small_dataset, CONFIG)
+    for _ in range(3):
+        assert float(read_again.step()[0]) == float(kept.step()[0])
+    assert read_again.views._cached.cache_info().currsize == read_again.views._uploaded.cache_info().currsize == 1
+    assert kept.views._cached.cache_info().currsize == 3
+
+
+def test_where_numpy_has_a_picture_in_memory_records_nothing_anew(small_dataset):
+    trainer = Trainer(small_dataset, CONFIG)
+    load, offset = trainer.views._load, [0]
+
+    def at_offset(index: int) -> views.View:
+        view = load(index)
+        memory = np.empty(view.rgba.size + 32, np.uint32)
+        first = -memory.ctypes.data // 4 % 16 + offset[0]
+        memory[first : first + view.rgba.size] = view.rgba
+        return replace(view, rgba=memory[first : first + view.rgba.size])
+
+    trainer.views._cached = at_offset
+    for _ in range(4):
+        trainer.step()
+    known, offset[0] = recordings(), 1
+    for _ in range(4):
+        trainer.step()
+    assert recordings() == known
+
+
+def test_training_on_several_views_a_step_learns_and_resumes(small_dataset, tmp_path):
+    config = replace(CONFIG, views_per_step=3, iterations=40, checkpoint_every=20)
+    whole = Trainer(small_dataset, config)
+    whole.run(lambda progress: None, lambda: whole.save(tmp_path / "half"))
+    resumed = Trainer(small_dataset, config)
+    resumed.restore(tmp_path / "half")
+    resumed.run(lambda progress: None, lambda: None)
+    for name, values in whole.gaussians.to_numpy().items():
+        np.testing.assert_array_equal(resumed.gaussians.to_numpy()[name], values, err_msg=name)
+    assert psnr(whole.gaussians, small_dataset) > psnr(Trainer(small_dataset, config).gaussians, small_dataset) + 1
+
+
+@pytest.mark.parametrize("what", ["all", "means", "strategy.seen", "adam.first.00", "no statistics"])
+def test_a_checkpoint_without_gaussians_is_refused(small_dataset, tmp_path, what):
+    """Arrays of no length, as a file that was made by hand may have."""
+    config = replace(CONFIG, warm_start=WarmStartConfig(steps=100, decay=40, conservative=10))
+    trainer = Trainer(small_dataset, config)
+    trainer.step()
+    trainer.save(tmp_path / "c.safetensors")
+    tensors, header = read_tensors(tmp_path / "c.safetensors")
+    kept = {key: value for key, value in header.items() if key != "format"}
+    names = [name for name in tensors if what == "all" or name == what or (what[:2] == "no" and "strategy" in name)]
+    assert names
+    tensors |= {name: tensors[name][:0] for name in names}
+    write_tensors(tmp_path / "c.safetensors", tensors, kept)
+    with pytest.raises(InputError, match=r"c\.safetensors: expected a checkpoint of training"):
+        Trainer(small_dataset, config).restore(tmp_path / "c.safetensors")
+
+
+@pytest.mark.parametrize(
+    "header",
+    [{"iteration": -1}, {"iteration": 10**30}, {"adam_steps": "3"}, {"history": {}}, {"history": [{"iteration": 1}]}],
+)
+def test_a_checkpoint_with_another_header_is_refused(small_dataset, tmp_path, header):
+    trainer = Trainer(small_dataset, CONFIG)
+    trainer.save(tmp_path / "c.safetensors")
+    tensors, told = read_tensors(tmp_path / "c.safetensors")
+    write_tensors(tmp_path / "c.safetensors", tensors, {**{k: v for k, v in told.items() if k != "format"}, **header})
+    with pytest.raises(InputError, match=r"c\.safetensors: (header: )?[a-z\[\]0-9_.: ]*expected"):
+        Trainer(small_dataset, CONFIG).restore(tmp_path / "c.safetensors")
