@@ -3,28 +3,17 @@
 python examples/03_evaluate.py        a few seconds; writes out/examples/eval
 """
 
-from pathlib import Path
-from typing import Any
-
-from spacesim.data.store import read_dataset
-from spacesim.eval.evaluate import EvaluateConfig, evaluate
-from spacesim.eval.report import write_report
-from spacesim.splat.run import load_run
-
-DATA, RUN, OUT = Path("out/examples/data"), Path("out/examples/run"), Path("out/examples/eval")
+import spacesim as ss
 
 
-def main(data: Path = DATA, run: Path = RUN, out: Path = OUT) -> dict[str, Any]:
-    metrics = evaluate(load_run(run), read_dataset(data), out, EvaluateConfig(split="test"))
-    for group in "image", "shadow":
-        for name, value in metrics[group].items():
-            known = f"{value['mean']:.4f} ± {value['std']:.4f}" if value else "null"
-            print(f"{group:>6} {name:<16} {known}")
-    for note in metrics["notes"]:
-        print(f"note: {note}")
-    write_report([out], out / "report.html")
-    print(f"report: {out / 'report.html'}")
-    return metrics
+def main(data="out/examples/data", run="out/examples/run", out="out/examples/eval"):
+    scores = ss.evaluate(run, data, out)
+    for group in "image", "shadow", "shadow_mask":
+        for name, value in (scores[group] or {}).items():
+            print(f"{group:>11} {name:<20}", f"{value['mean']:.4f} ± {value['std']:.4f}" if value else "null")
+    print(*scores["notes"], sep="\n")
+    print(f"report: {out}/report.html")
+    return scores
 
 
 if __name__ == "__main__":

@@ -1,38 +1,46 @@
 """5. Compose: the run of 02_reconstruct.py twice in one scene; one of the two flies past while the Sun moves.
 
-python examples/05_compose.py        a few seconds; writes out/examples/composed and out/examples/scene.toml
+python examples/05_compose.py        a few seconds; writes out/examples/scene.toml and out/examples/composed
 """
 
 from pathlib import Path
 
-from spacesim.data.geometry import look_at
-from spacesim.data.records import Camera, Sun
-from spacesim.splat.compose import Composition, Keyframe, Placed, Pose, PosedScene, save_scene
-from spacesim.splat.compose.output import compose
-from spacesim.splat.compose.pose import rotation_about
-from spacesim.splat.run import load_run
+import spacesim as ss
 
-RUN, SCENE, OUT = Path("out/examples/run"), Path("out/examples/scene.toml"), Path("out/examples/composed")
+SCENE = """
+frames = {frames}
+[sun]
+azimuth_deg = -60
+elevation_deg = 40
+[camera]
+position = [5, -7, 4]
+look_at = [0, 0, 0.5]
+fov_deg = 40
+resolution = [{size}, {size}]
+[[models]]
+run = "{run}"
+name = "target"
+[[models]]
+run = "{run}"
+name = "chaser"
+position = [2.0, -1.5, 1.5]
+[[keyframes]]
+time = 0.0
+sun = {{ azimuth_deg = -60, elevation_deg = 40 }}
+models.chaser = {{ position = [2.0, -1.5, 1.5] }}
+[[keyframes]]
+time = {seconds}
+sun = {{ azimuth_deg = 0, elevation_deg = 40 }}
+models.chaser = {{ position = [-1.0, -2.0, 1.0], scale = 0.8 }}
+"""
 
 
-def main(run: Path = RUN, scene_file: Path = SCENE, out: Path = OUT, frames: int = 48, size: int = 256) -> PosedScene:
-    model = load_run(run)
-    start, end = Pose(translation=[2.0, -1.5, 1.5]), Pose(rotation_about([0, 0, 1], 60), [-1.0, -2.0, 1.0], 0.8)
-    camera = Camera.from_fov(look_at([5, -7, 4], [0, 0, 0.5]), size, size, 40)
-    scene = PosedScene(
-        Composition([Placed(model, name="target"), Placed(model, start, "chaser")]),
-        Sun.from_angles(-60, 40),
-        camera,
-        keyframes=[
-            Keyframe(0.0, Sun.from_angles(-60, 40), poses={"chaser": start}),
-            Keyframe((frames - 1) / 24, Sun.from_angles(0, 40), poses={"chaser": end}),
-        ],
-        frames=frames,
-    )
-    save_scene(scene_file, scene)  # for `spacesim compose` and `spacesim view`
-    done = compose(scene, out, report=lambda k, of: print(f"{k}/{of}") if k == of else None)
-    print(f"scene: {scene_file}; pictures: {out}; {done.video or done.note or done.sheet}")
-    return scene
+def main(run="out/examples/run", scene="out/examples/scene.toml", out="out/examples/composed", frames=48, size=256):
+    text = SCENE.format(frames=frames, size=size, run=Path(run).absolute(), seconds=(frames - 1) / 24)
+    Path(scene).write_text(text)  # for `spacesim compose` and `spacesim view`, too
+    done = ss.compose(scene, out)
+    print(f"scene: {scene}; pictures: {out}; {done.video or done.note or done.sheet}")
+    return ss.load_scene(scene)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,86 @@
-"""Differentiable simulation and reconstruction of spacecraft under the Sun."""
+"""Differentiable simulation and reconstruction of spacecraft under the Sun.
 
-from spacesim.backend import name_llvm
+    import spacesim as ss
+
+    data = ss.generate("boxsat", "data", suns=4, views=60, resolution=128)
+    run = ss.train(data, "run", preset="demo", method="shadow-map")
+    view = run.render(data.test[0].camera, sun=(40, 25))
+    scores = ss.evaluate(run, data, "eval")
+
+Everything is imported when it is first used: `import spacesim` itself takes no time.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from spacesim.backend.llvm import name_llvm
+from spacesim.data.errors import InputError, WorkError
+
+if TYPE_CHECKING:
+    from spacesim.api import (
+        BackendError,
+        Camera,
+        Dataset,
+        Gaussians,
+        Rendering,
+        Run,
+        SceneConfig,
+        Sun,
+        TrainConfig,
+        compose,
+        evaluate,
+        generate,
+        load_image,
+        load_run,
+        load_scene,
+        load_truth,
+        preset,
+        read_dataset,
+        read_scene,
+        render,
+        train,
+        write_report,
+    )
 
 __version__ = "0.1.0"
 
+__all__ = [
+    "BackendError",
+    "Camera",
+    "Dataset",
+    "Gaussians",
+    "InputError",
+    "Rendering",
+    "Run",
+    "SceneConfig",
+    "Sun",
+    "TrainConfig",
+    "WorkError",
+    "compose",
+    "evaluate",
+    "generate",
+    "load_image",
+    "load_run",
+    "load_scene",
+    "load_truth",
+    "preset",
+    "read_dataset",
+    "read_scene",
+    "render",
+    "train",
+    "write_report",
+]
+
 name_llvm()
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'spacesim' has no attribute {name!r}")
+    from spacesim import api
+
+    globals()[name] = getattr(api, name)
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

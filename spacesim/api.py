@@ -1,0 +1,188 @@
+"""What `import spacesim as ss` gives: plain values in, records and numpy arrays out.
+
+Each function says in one call what the command of its name does; what is behind it stands in the rooms of
+docs/architecture.md.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from spacesim.backend import BackendError
+from spacesim.data.errors import InputError
+from spacesim.data.images import load_image
+from spacesim.data.records import Camera, Dataset, Sun
+from spacesim.data.store import load_truth
+from spacesim.data.transforms import read_dataset
+from spacesim.scenes import SceneConfig, read_scene
+from spacesim.scenes import generate as _generate
+from spacesim.splat.compose import PosedScene
+from spacesim.splat.compose.output import Composed
+from spacesim.splat.compose.output import compose as _compose
+from spacesim.splat.compose.scenefile import load_scene
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.render import RenderOutput
+from spacesim.splat.raster.render import render as _render
+from spacesim.splat.run import Rendering, Run, load_run
+from spacesim.splat.train.config import TrainConfig, preset
+
+Progress = Callable[[int, int, str], None]
+"""Called with (done, of all, what is at work)."""
+
+__all__ = [
+    "BackendError",
+    "Camera",
+    "Dataset",
+    "Gaussians",
+    "Rendering",
+    "Run",
+    "SceneConfig",
+    "Sun",
+    "TrainConfig",
+    "compose",
+    "evaluate",
+    "generate",
+    "load_image",
+    "load_run",
+    "load_scene",
+    "load_truth",
+    "preset",
+    "read_dataset",
+    "read_scene",
+    "render",
+    "train",
+    "write_report",
+]
+
+
+def generate(
+    scene: str | Path | SceneConfig,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    workers: int = 1,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Dataset:
+    """Path-trace a dataset with its truth into the folder `out` (docs/dataset.md).
+
+    scene: name of a built-in scene ("boxsat"), a scene file (.toml), a mesh file, or what `read_scene` returns
+    resume: complete what an interrupted call has left; a finished dataset is returned as it is
+    workers: processes of this machine
+    options: of the scene, as the command line has them: suns, views, test_suns, test_views, sun=[(azimuth, elevation),
+        ...] in degrees, distance in metres, resolution=256 or (width, height) in pixels, fov_deg, exposure, spp, seed
+
+    Raises InputError for a scene, an option or a folder that cannot be, WorkError where disk or processes fail.
+    """
+    if not isinstance(scene, SceneConfig):
+        scene = read_scene(scene, **options)
+    elif options:
+        raise InputError(f"{next(iter(options))}: expected no options beside a scene that has been read, found one")
+    return _generate(scene, Path(out), resume, progress, workers)
+
+
+def train(
+    data: str | Path | Dataset,
+    out: str | Path,
+    config: TrainConfig | None = None,
+    *,
+    preset: str = "fast",
+    method: str = "vanilla",
+    strategy: str = "default",
+    resume: bool = False,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Run:
+    """Train Gaussians on a dataset and write the run to the folder `out`.
+
+    data: a folder of a Nerfstudio dataset, ours or another's, or what `read_dataset` returns
+    config: the whole configuration; or else, by name, a preset ("demo", "fast", "fine", "thesis"), a method ("vanilla",
+        "relight", "shadow-map", "shadow-splat", "park") and a strategy ("default", "mesh-aware", "support-aware",
+        "mcmc"), and as `options` fields of TrainConfig: iterations=7000, seed=0, init_count=20000, ...
+    resume: go on from the newest checkpoint, with the same result to the bit; a finished run is returned as it is
+
+    Raises InputError for data, a configuration or a folder that cannot be, WorkError where the loss is not finite or
+    the disk is full.
+    """
+    from spacesim.splat.train import config as configuration
+    from spacesim.splat.train.train import train as run_training
+
+    if config is None:
+        config = configuration.preset(preset, method, strategy)
+    unknown = [name for name in options if name not in TrainConfig.__dataclass_fields__]
+    if unknown:
+        raise InputError(f"{unknown[0]}: expected a field of TrainConfig, found none of that name")
+    dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
+
+    def tell(state: Any) -> None:
+        if progress is not None:
+            progress(state.iteration, state.iterations, f"loss {state.loss:.4f}, {state.gaussians} Gaussians")
+
+    return run_training(dataset, Path(out), replace(config, **options), resume, tell)
+
+
+def evaluate(
+    run: str | Path | Run,
+    data: str | Path | Dataset,
+    out: str | Path,
+    *,
+    split: str = "test",
+    lpips_weights: str | Path | None = None,
+    geometry: bool = True,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Judge a run against a dataset; write metrics.json, report.html and the frames' pictures into the folder `out`.
+
+    run: a folder, or what `train` or `load_run` returns;  split: "test", "train" or "all"
+    lpips_weights: a file or folder of AlexNet and linear weights, without which LPIPS is null
+    geometry: judge the shape, too
+
+    Returns what metrics.json holds (docs/metrics.md): scores["image"]["psnr"]["mean"] in dB, and so on; None for what
+    cannot be computed. Raises InputError where there is nothing to judge.
+    """
+    from spacesim.eval.evaluate import EvaluateConfig
+    from spacesim.eval.evaluate import evaluate as judge
+
+    weights = None if lpips_weights is None else Path(lpips_weights)
+    config = EvaluateConfig(split, weights)
+    judged = run if isinstance(run, Run) else load_run(Path(run))
+    dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
+    config = config if geometry else replace(config, geometry=None)
+    metrics = judge(judged, dataset, Path(out), config, progress)
+    write_report(out, Path(out) / "report.html")
+    return metrics
+
+
+def write_report(evals: str | Path | list[str | Path], out: str | Path) -> Path:
+    """Write one HTML page about one evaluation, or several side by side; returns its path.
+
+    evals: folders that `evaluate` has written. Raises InputError where one holds no evaluation.
+    """
+    from spacesim.eval.report.write import write_report as write
+
+    folders = evals if isinstance(evals, list) else [evals]
+    write([Path(folder) for folder in folders], Path(out))
+    return Path(out)
+
+
+def compose(scene: str | Path | PosedScene, out: str | Path, *, size: int | tuple[int, int] | None = None) -> Composed:
+    """Render a scene of several runs, with shadows on each other, into the folder `out`: pictures, depth, object
+    numbers, visibility, a contact sheet and, of several frames, a video.
+
+    scene: a scene file (docs/composition.md), or what `load_scene` returns;  size: pixels of the longer side, or
+    (width, height), in place of the camera's. Raises InputError for a scene or a folder that cannot be.
+    """
+    posed = scene if isinstance(scene, PosedScene) else load_scene(Path(scene))
+    return _compose(posed, Path(out), size)
+
+
+def render(gaussians: Gaussians, camera: Camera, **options: Any) -> RenderOutput:
+    """Gaussians seen by a camera, as Dr.Jit arrays: differentiable by every parameter that has gradients enabled.
+
+    options: sh_degree, outputs=("colour", "alpha", "depth", "median_depth", "normal"), features, antialiased; see
+    docs/rasterizer.md. `RenderOutput.to_numpy()` gives (colour [H, W, 3], alpha [H, W], depth [H, W] in metres).
+    Raises ValueError for another output.
+    """
+    return _render(gaussians, Pinhole.of(camera), **options)
