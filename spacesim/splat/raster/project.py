@@ -62,14 +62,33 @@ def project(gaussians: Gaussians, camera: Projection, antialiased: Any = False) 
     means = dr.select(sane, means, ad.Array3f(0))
     log_scales = dr.select(sane, log_scales, ad.Array3f(0))
     opacity = opacities(dr.select(sane, logits, 0))
+    spread = _spread(antialiased)
+    return project_ellipsoids(means, dr.exp(log_scales), quaternions, opacity, sane, camera, spread, antialiased)
 
+
+def project_ellipsoids(
+    means: Any,
+    scales: Any,
+    quaternions: Any,
+    opacity: Any,
+    sane: Any,
+    camera: Projection,
+    spread: Any,
+    compensated: Any,
+) -> tuple[Splats, Footprints]:
+    """`project` of Gaussians with these means, standard deviations (Array3f [3, N], metres), rotations and opacities.
+
+    sane: Bool [N]: numbers that can be drawn; the others must be finite all the same
+    spread: pixels^2 added to the screen-space covariance, a number or Float [N]
+    compensated: whether what that adds to a splat's area is taken from its opacity; True, False or Bool [N]
+    """
     center = camera.transform(means)
     sane &= dr.detach(camera.in_reach(center))
     center = dr.select(sane, center, ad.Array3f(0, 0, 1))
     screen = camera.screen(center)
 
     # rows m_x, m_y of J R S (2.12, 2.13)
-    axes, scales = principal_axes(quaternions), dr.exp(log_scales)
+    axes = principal_axes(quaternions)
     rows_x: list[Any] = []
     rows_y: list[Any] = []
     for i in range(3):
@@ -85,13 +104,12 @@ def project(gaussians: Gaussians, camera: Projection, antialiased: Any = False) 
     # The determinant as a sum of squares (Lagrange's identity) cannot cancel to zero or below.
     xx, yy, xy = dr.squared_norm(m_x), dr.squared_norm(m_y), dr.dot(m_x, m_y)
     own_determinant = dr.squared_norm(dr.cross(m_x, m_y))
-    spread = _spread(antialiased)
     determinant = own_determinant + spread * (xx + yy + spread)
     xx, yy = xx + spread, yy + spread
     inverse_determinant = dr.rcp(determinant)
-    if antialiased is not False:
+    if compensated is not False:
         kept = _compensation(own_determinant * inverse_determinant)
-        opacity *= kept if antialiased is True else dr.select(antialiased, kept, 1)
+        opacity *= kept if compensated is True else dr.select(compensated, kept, 1)
     splats = Splats(
         x=screen.x,
         y=screen.y,

@@ -1,0 +1,172 @@
+"""The rasterizer through `spacesim.torch.rasterization` beside our own path and, where it is installed, gsplat.
+
+python benchmarks/torch_door.py [--sizes 31622x512,...] [--peers gsplat] [--repeats 15] [--json]
+
+A picture with its gradients, by all parameters of the Gaussians, for one camera: harmonics of degree 3, colour and
+alpha. "own" is `render` with Dr.Jit's gradients. With --peers gsplat the largest differences from its pictures and
+gradients are told, too; that needs CUDA.
+"""
+
+import json
+import time
+from functools import partial
+from typing import Any
+
+import common
+import drjit as dr
+import numpy as np
+
+from spacesim import backend
+from spacesim.data.errors import InputError
+from spacesim.data.records import Camera
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Pinhole
+from spacesim.splat.raster.render import render
+
+NAMES = ("means", "quats", "scales", "opacities", "colors")
+MODES = ({}, {"rasterize_mode": "antialiased"}, {"camera_model": "ortho"}, {"render_mode": "RGB+ED"})
+
+
+def main() -> None:
+    """Measure each size and print a table."""
+    parser = common.arguments(__doc__, "31622x512,101958x512")
+    parser.add_argument("--peers", default="", help="gsplat")
+    options = parser.parse_args()
+    name = backend.select(options.backend)
+    try:
+        import torch
+    except ImportError:
+        raise InputError("torch: expected it, found none; type: pip install torch") from None
+    peer = _peer(options.peers, name)
+    from spacesim.torch import rasterization
+
+    device = "cuda" if name == "cuda" else "cpu"
+    if device == "cpu":
+        torch.set_num_threads(1)
+    rows, found = [], []
+    for count, side in common.parse_sizes(options.sizes):
+        leaves, camera = _scene(torch, count, side, device)
+        ours = _timed(partial(_own, leaves, camera), options.repeats, torch, device)
+        door = _timed(partial(_through, torch, rasterization, leaves, camera), options.repeats, torch, device)
+        row: common.Row = {"Gaussians": count, "pixels": side, "own, ms": ours.median, "torch, ms": door.median}
+        row["torch / own"] = door.median / ours.median
+        if peer is not None:
+            theirs = _timed(partial(_through, torch, peer, leaves, camera), options.repeats, torch, device)
+            row |= {"gsplat, ms": theirs.median, "torch / gsplat": door.median / theirs.median}
+            for mode in MODES:
+                different = _differences(torch, rasterization, peer, leaves, camera, mode)
+                found.append({"Gaussians": count, **mode, **different})
+        rows.append(row)
+    if options.json:
+        print(json.dumps({"rows": rows, "differences": found}, indent=1))
+        return
+    print(common.table(rows, options.markdown))
+    for one in found:
+        print(one)
+
+
+def _peer(names: str, name: str) -> Any:
+    if not names:
+        return None
+    if names != "gsplat" or name != "cuda":
+        raise InputError(f"--peers: expected gsplat on CUDA, found {names} on {name}")
+    try:
+        import gsplat
+    except ImportError as error:
+        raise InputError(f"gsplat: expected it for --peers, found none ({error})") from None
+    return gsplat.rasterization
+
+
+def _scene(torch: Any, count: int, side: int, device: str) -> tuple[dict[str, Any], Camera]:
+    """Splats on a sphere, as leaves, and a camera."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(count, 3))
+    spacing = np.sqrt(4 * np.pi / count)
+    arrays = {
+        "means": directions / np.linalg.norm(directions, axis=1, keepdims=True),
+        "quats": rng.normal(size=(count, 4)),
+        "scales": spacing * rng.uniform(0.3, 1.0, (count, 3)),
+        "opacities": rng.uniform(0.1, 0.95, count),
+        "colors": 0.3 * rng.normal(size=(count, 16, 3)),
+    }
+    camera = Camera.look_at([4, 1, 1], [0, 0, 0], side, side, 35)
+    leaves = {k: torch.tensor(v, dtype=torch.float32, device=device, requires_grad=True) for k, v in arrays.items()}
+    intrinsics = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    for name, value in (("viewmats", camera.camera_from_world), ("Ks", intrinsics)):
+        leaves[name] = torch.tensor(np.array(value), dtype=torch.float32, device=device)[None]
+    return leaves, camera
+
+
+def _own(leaves: dict[str, Any], camera: Camera) -> None:
+    """A picture by `render`, and gradients, without torch in between."""
+    if not hasattr(_own, "arrays") or _own.arrays.count != len(leaves["means"]):  # type: ignore[attr-defined]
+        plain = {name: leaves[name].detach().cpu().numpy() for name in NAMES}
+        opacity = plain["opacities"]
+        _own.arrays = Gaussians.from_numpy(  # type: ignore[attr-defined]
+            {
+                "means": plain["means"],
+                "log_scales": np.log(plain["scales"]),
+                "quaternions": plain["quats"],
+                "logit_opacities": np.log(opacity / (1 - opacity)),
+                "sh": plain["colors"],
+            }
+        )
+    model: Gaussians = _own.arrays  # type: ignore[attr-defined]
+    for parameter in model.parameters().values():
+        dr.disable_grad(parameter)
+        dr.enable_grad(parameter)
+    output = render(model, Pinhole.of(camera), outputs=("colour", "alpha"))
+    total = sum((dr.sum(dr.square(plane)) for plane in output.colour), dr.sum(output.alpha))
+    dr.backward(total)
+    gradients = [dr.grad(parameter) for parameter in model.parameters().values()]
+    dr.eval(gradients)
+    dr.sync_thread()
+
+
+def _through(torch: Any, rasterization: Any, leaves: dict[str, Any], camera: Camera) -> None:
+    """A picture by a function of gsplat's signature, and gradients."""
+    picture, alpha, _ = rasterization(
+        **leaves, width=camera.width, height=camera.height, sh_degree=3, packed=False, render_mode="RGB"
+    )
+    torch.autograd.grad(picture.square().sum() + alpha.sum(), [leaves[name] for name in NAMES])
+
+
+def _timed(work: Any, repeats: int, torch: Any, device: str) -> common.Timing:
+    seconds = []
+    for number in range(common.WARM_UP + repeats):
+        start = time.perf_counter()
+        work()
+        if device == "cuda":
+            torch.cuda.synchronize()
+        if number >= common.WARM_UP:
+            seconds.append(time.perf_counter() - start)
+    return common.Timing.of(seconds)
+
+
+def _differences(
+    torch: Any, one: Any, other: Any, leaves: dict[str, Any], camera: Camera, mode: dict
+) -> dict[str, float]:
+    """Largest absolute differences of pictures and alphas, relative norms of differences of gradients."""
+    found = []
+    weights = None
+    for function in (one, other):
+        own = {name: leaf.detach().clone().requires_grad_(name != "Ks") for name, leaf in leaves.items()}
+        if mode.get("camera_model") == "ortho":
+            own["Ks"][:, :2, :2] /= 4
+        size = {"width": camera.width, "height": camera.height, "sh_degree": 3, "packed": False}
+        picture, alpha, _ = function(**own, **size, **mode)
+        both = torch.cat([picture, alpha], dim=-1)
+        if weights is None:
+            weights = torch.randn(both.shape, device=both.device, generator=torch.Generator(both.device).manual_seed(1))
+        (weights[..., :3] * both[..., :3] + weights[..., -1:] * both[..., -1:]).sum().backward()
+        found.append((picture.detach(), alpha.detach(), {name: own[name].grad for name in (*NAMES, "viewmats")}))
+    (a, alpha_a, by_a), (b, alpha_b, by_b) = found
+    solid = (alpha_b > 0.01).expand_as(b)
+    told = {"picture": float((a - b)[solid].abs().max()), "alpha": float((alpha_a - alpha_b).abs().max())}
+    for name, gradient in by_b.items():
+        told[f"gradient {name}"] = float((by_a[name] - gradient).norm() / gradient.norm())
+    return told
+
+
+if __name__ == "__main__":
+    common.told(main)
