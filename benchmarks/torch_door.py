@@ -146,7 +146,8 @@ def _timed(work: Any, repeats: int, torch: Any, device: str) -> common.Timing:
 def _differences(
     torch: Any, one: Any, other: Any, leaves: dict[str, Any], camera: Camera, mode: dict
 ) -> dict[str, float]:
-    """Largest absolute differences of pictures and alphas, relative norms of differences of gradients."""
+    """Largest absolute differences of pictures and alphas, shares of pixels that differ by more than some (a splat
+    whose alpha is all but 1/255 may count with one alone), relative norms of differences of gradients."""
     found = []
     weights = None
     for function in (one, other):
@@ -161,8 +162,9 @@ def _differences(
         (weights[..., :3] * both[..., :3] + weights[..., -1:] * both[..., -1:]).sum().backward()
         found.append((picture.detach(), alpha.detach(), {name: own[name].grad for name in (*NAMES, "viewmats")}))
     (a, alpha_a, by_a), (b, alpha_b, by_b) = found
-    solid = (alpha_b > 0.01).expand_as(b)
-    told = {"picture": float((a - b)[solid].abs().max()), "alpha": float((alpha_a - alpha_b).abs().max())}
+    off = torch.where(alpha_b > 0.01, a - b, 0 * a).abs().amax(dim=-1).flatten()
+    told = {"picture": float(off.max()), "alpha": float((alpha_a - alpha_b).abs().max())}
+    told |= {f"pixels off by {bound:g}": float((off > bound).float().mean()) for bound in (1e-4, 1e-3)}
     for name, gradient in by_b.items():
         told[f"gradient {name}"] = float((by_a[name] - gradient).norm() / gradient.norm())
     return told

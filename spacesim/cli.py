@@ -66,8 +66,9 @@ def _run(arguments: Sequence[str]) -> None:
     ending.speak_any_name()
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its tracebacks: what matters of them is told
-    warnings.simplefilter("ignore")  # of libraries, about numbers that are told in sentences where they matter
     options = parser(_COMMANDS).parse_args(arguments)
+    if not options.debug:
+        warnings.simplefilter("ignore")  # of libraries, about numbers that are told in sentences where they matter
     options.command = ("spacesim", *arguments)
     ending.resumed_by("--resume" if hasattr(options, "resume") else "")
     if options.debug:

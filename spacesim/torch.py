@@ -22,8 +22,8 @@ except ImportError:
 
 import drjit as dr
 
-from spacesim.backend import ad
-from spacesim.splat.raster.bin import bin_splats
+from spacesim.backend import ad, recorded
+from spacesim.splat.raster.bin import RECORDINGS, bin_splats
 from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.cameras import LARGEST, Orthographic, Pinhole, Projection
 from spacesim.splat.raster.gaussians import Gaussians
@@ -34,6 +34,8 @@ Results = tuple[Tensor, Tensor, dict[str, Any]]
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 BORDER = 0.15  #: of the image beyond its border: splats are linearized no farther, as gsplat has it
+MATRIX = 5  #: number of the leaf that is a view's matrix; its intrinsics follow
+INTRINSICS = 0, 4, 2, 5  #: places of fx, fy, cx, cy in a matrix [9]
 LEAST_ALPHA = 1e-10  #: by which "ED" divides at least, as gsplat
 
 
@@ -124,10 +126,12 @@ def rasterization(
         camera_model == "ortho",
     )
     views = []
+    places = torch.linalg.inv(viewmats)[:, :3, 3]
     for index in range(cameras):
         own = colors[index] if colors.dim() == (4 if sh_degree is not None else 3) else colors
         harmonic = own if sh_degree is not None else None
-        view = _Projected.apply(means, quats, scales, opacities, harmonic, viewmats[index], Ks[index], kind, sh_degree)
+        camera = (tensor[index].clone() for tensor in (viewmats, Ks, places))  # each where memory begins
+        view = _Projected.apply(means, quats, scales, opacities, harmonic, *camera, kind, sh_degree)
         views.append((*view, _features(render_mode, view[4] if harmonic is not None else own, view[2])))
     means2d = _stacked([view[0] for view in views])  # one tensor for all cameras, which can retain its gradient
     blended = []
@@ -168,27 +172,32 @@ class _Kind:
 
 @dataclass
 class _Perspective(Pinhole):
-    """Between a near and a far plane, metres."""
+    """Between a near and a far plane, metres. place: three Floats; harmonics are asked for in directions from there."""
 
     near: float = 0.0
     far: float = 0.0
-
-    def in_reach(self, center: Any) -> Any:
-        return (center.z > self.near) & (center.z < self.far) & (dr.max(dr.abs(center)) < LARGEST)
-
-
-@dataclass
-class _Parallel(Orthographic):
-    """Between a near and a far plane, metres; harmonics are asked for in the direction from the camera's place."""
-
-    near: float = 0.0
-    far: float = 0.0
+    place: Any = None
 
     def in_reach(self, center: Any) -> Any:
         return (center.z > self.near) & (center.z < self.far) & (dr.max(dr.abs(center)) < LARGEST)
 
     def rays_to(self, points: Any) -> Any:
-        return points + (self.row(0) * self[3] + self.row(1) * self[7] + self.row(2) * self[11])
+        return points - ad.Array3f(self.place)
+
+
+@dataclass
+class _Parallel(Orthographic):
+    """As `_Perspective`; gsplat asks for harmonics of an orthographic camera in directions from its place, too."""
+
+    near: float = 0.0
+    far: float = 0.0
+    place: Any = None
+
+    def in_reach(self, center: Any) -> Any:
+        return (center.z > self.near) & (center.z < self.far) & (dr.max(dr.abs(center)) < LARGEST)
+
+    def rays_to(self, points: Any) -> Any:
+        return points - ad.Array3f(self.place)
 
 
 @dataclass
@@ -205,43 +214,35 @@ class _Projected(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Any:
-        """means, quats, scales, opacities, harmonics or None, viewmat, K;  `_Kind`, degree of harmonics."""
-        *tensors, kind, sh_degree = arguments
+        """means, quats, scales, opacities, harmonics or None, viewmat, K, camera's place;  `_Kind`, degree."""
+        *tensors, kind, degree = arguments
         ctx.set_materialize_grads(False)
-        leaves = [None if tensor is None else _floats(tensor) for tensor in tensors]
-        for leaf, needed in zip(leaves, ctx.needs_input_grad, strict=False):
-            if leaf is not None and needed:
-                dr.enable_grad(leaf)
-        splats, footprints, colours = _project(leaves, kind, sh_degree)
-        ctx.leaves, ctx.tensors = (
-            leaves,
-            [None if tensor is None else (tensor.shape, tensor.dtype) for tensor in tensors],
-        )
-        ctx.groups = [[splats.x, splats.y], [splats.a, splats.b, splats.c], [splats.depth], [splats.opacity], colours]
-        drawn = _Drawn(dr.detach(splats), footprints)
-        dr.eval(ctx.groups, drawn)
         device, count = tensors[0].device, len(tensors[0])
-        means2d, conics, depths, opacities, colour = (_joined(group, count, device) for group in ctx.groups)
-        return means2d, conics, depths[:, 0], opacities[:, 0], colour, drawn
+        leaves = [None if tensor is None else _floats(tensor) for tensor in tensors]
+        run = _project if count > 1 else _trace_project  # a recording takes a column of one for a number
+        splats, footprints, colours = run(leaves, kind, degree)
+        ctx.leaves, ctx.told, ctx.tensors = leaves, (kind, degree), tensors
+        groups = [splats.x, splats.y], [splats.a, splats.b, splats.c], [splats.depth], [splats.opacity], colours
+        means2d, conics, depths, opacities, colour = (_joined(group, count, device) for group in groups)
+        return means2d, conics, depths[:, 0], opacities[:, 0], colour, _Drawn(splats, footprints)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> Any:
         """Gradients of the tensors."""
-        moved = []
-        for group, gradient in zip(ctx.groups, gradients, strict=False):
-            if gradient is None or not group:
-                continue
-            for array, column in zip(group, _columns(gradient.reshape(len(gradient), len(group))), strict=True):
-                if dr.grad_enabled(array):
-                    dr.set_grad(array, column)
-                    moved.append(array)
-        dr.enqueue(dr.ADMode.Backward, *moved)
-        dr.traverse(dr.ADMode.Backward)
+        count, device = len(ctx.tensors[0]), ctx.tensors[0].device
+        sizes = 2, 3, 1, 1, 3
+        columns = [
+            [] if gradient is None or not gradient.numel() else _columns(gradient.reshape(count, size))
+            for gradient, size in zip(gradients[:5], sizes, strict=True)
+        ]
+        dr.eval(columns)
+        run = _project_back if count > 1 else _trace_project_back
+        kind, degree = ctx.told
+        found = run(ctx.leaves, kind, degree, columns)
         results: list[Tensor | None] = []
-        for leaf, tensor, needed in zip(ctx.leaves, ctx.tensors, ctx.needs_input_grad, strict=False):
-            known = leaf is not None and needed
-            device = next(gradient.device for gradient in gradients if isinstance(gradient, Tensor))
-            results.append(_tensor(dr.grad(leaf), device).reshape(tensor[0]).to(tensor[1]) if known else None)
+        for number, (tensor, group, needed) in enumerate(zip(ctx.tensors, found, ctx.needs_input_grad, strict=False)):
+            known = tensor is not None and needed
+            results.append(_gradient(number, group, tensor, device) if known else None)
         return (*results, None, None)
 
 
@@ -291,55 +292,131 @@ class _Blended(torch.autograd.Function):
         return (*splats, _joined(by_features, count, device), None, None, None, None)
 
 
-def _project(leaves: Sequence[Any], kind: _Kind, sh_degree: int | None) -> tuple[Splats, Footprints, list[Any]]:
-    """(splats, footprints, colours or nothing) of what the leaves say, flat arrays."""
-    means, quats, scales, opacities, harmonic, viewmat, matrix = leaves
-    count = dr.width(opacities)
-    camera = _camera(viewmat, matrix, kind)
-    rows = [[_column(flat, i, size) for i in range(size)] for flat, size in ((means, 3), (quats, 4), (scales, 3))]
-    opacity = opacities
+@dataclass
+class _Parts:
+    """What a camera's splats depend on, as columns [N] and numbers of width 1. harmonic: none, or three times K;
+    pose: 12, row by row;  matrix: fx, fy, cx, cy;  place: of the camera"""
+
+    means: list[Any]
+    quats: list[Any]
+    scales: list[Any]
+    opacity: list[Any]
+    harmonic: list[Any]
+    pose: list[Any]
+    matrix: list[Any]
+    place: list[Any]
+
+    def groups(self) -> list[list[Any]]:
+        """In the order of the leaves."""
+        gaussian = [self.means, self.quats, self.scales, self.opacity, self.harmonic]
+        return [*gaussian, self.pose, self.matrix, self.place]
+
+
+def _parts(leaves: list[Any], degree: int | None) -> _Parts:
+    """Of flat arrays: means, quats, scales, opacities, harmonics or None, viewmat [16], K [9], place [3]."""
+    means, quats, scales, opacity, harmonic, viewmat, matrix, place = leaves
+    count = dr.width(opacity)
+    sh: list[Any] = []
+    if harmonic is not None and degree is not None:
+        terms = dr.width(harmonic) // count
+        sh = [_column(harmonic, i, terms, count) for i in range(3 * (degree + 1) ** 2)]
+    columns = [
+        [_column(flat, i, size, count) for i in range(size)] for flat, size in ((means, 3), (quats, 4), (scales, 3))
+    ]
+    numbers = [
+        [dr.gather(ad.Float, flat, ad.UInt32(i)) for i in places]
+        for flat, places in ((viewmat, range(12)), (matrix, INTRINSICS), (place, range(3)))
+    ]
+    pose, intrinsics, stands = numbers
+    return _Parts(columns[0], columns[1], columns[2], [ad.Float(opacity)], sh, pose, intrinsics, stands)
+
+
+def _trace_project(leaves: list[Any], kind: _Kind, degree: int | None) -> tuple[Splats, Footprints, list[Any]]:
+    """(splats, footprints, colours or nothing)."""
+    return _splats_of(_parts(leaves, degree), kind, degree)
+
+
+def _splats_of(parts: _Parts, kind: _Kind, degree: int | None) -> tuple[Splats, Footprints, list[Any]]:
+    (opacity,) = parts.opacity
+    camera = _camera(parts, kind)
     sane = dr.isfinite(opacity) & (opacity > 0)
-    for row in (*rows[0], *rows[1], *rows[2]):
+    for row in (*parts.means, *parts.quats, *parts.scales):
         sane &= dr.isfinite(row) & (dr.abs(row) < LARGEST)
     sane = dr.detach(sane)
-    place, turn, size = ([dr.select(sane, row, 0) for row in group] for group in rows)
-    spread = kind.spread
+    centre, turn, size = ([dr.select(sane, row, 0) for row in group] for group in parts.groups()[:3])
     splats, footprints = project_ellipsoids(
-        ad.Array3f(place),
+        ad.Array3f(centre),
         ad.Array3f(size),
         ad.Array4f(turn),
         dr.select(sane, opacity, 0),
         sane,
         camera,
-        spread,
+        kind.spread,
         kind.antialiased,
     )
     if kind.radius_clip > 0:
         small = dr.maximum(footprints.half_width, footprints.half_height) <= kind.radius_clip
         footprints.visible &= ~small
-    if harmonic is None or sh_degree is None:
+    if degree is None or not parts.harmonic:
         return splats, footprints, []
-    terms = dr.width(harmonic) // (3 * count)
-    sh = [_column(harmonic, i, 3 * terms) for i in range(3 * (sh_degree + 1) ** 2)]
-    model = Gaussians(ad.Array3f(place), None, None, opacity, ad.ArrayXf(sh))
-    sums = harmonics(model, camera, sh_degree)
+    model = Gaussians(ad.Array3f(centre), None, None, opacity, ad.ArrayXf(parts.harmonic))
+    sums = harmonics(model, camera, degree)
     return splats, footprints, [dr.select(shown(total), total, 0) for total in sums]
 
 
-def _camera(viewmat: Any, matrix: Any, kind: _Kind) -> Projection:
-    """The camera of a matrix [16] and intrinsics [9], differentiable by both."""
-    pose = [dr.gather(ad.Float, viewmat, ad.UInt32(i)) for i in range(12)]
-    fx, fy, cx, cy = (dr.gather(ad.Float, matrix, ad.UInt32(i)) for i in (0, 4, 2, 5))
+def _trace_project_back(
+    leaves: list[Any], kind: _Kind, degree: int | None, gradients: list[list[Any]]
+) -> list[list[Any]]:
+    """Gradients of the parts, from those of means2d, conics, depths, opacities and colours by column; none: 0."""
+    parts = _parts(leaves, degree)
+    for group in parts.groups():
+        for value in group:
+            dr.enable_grad(value)
+    splats, _, colours = _splats_of(parts, kind, degree)
+    groups = [splats.x, splats.y], [splats.a, splats.b, splats.c], [splats.depth], [splats.opacity], colours
+    total = ad.Float(0)
+    for group, columns in zip(groups, gradients, strict=True):
+        for value, gradient in zip(group, columns, strict=False):
+            total += value * gradient
+    dr.backward(total)
+    return [[dr.grad(value) for value in group] for group in parts.groups()]
+
+
+_project = recorded(_trace_project, RECORDINGS)
+_project_back = recorded(_trace_project_back, RECORDINGS)
+
+
+def _camera(parts: _Parts, kind: _Kind) -> Projection:
+    """The camera, differentiable by its pose, its intrinsics and its place."""
+    fx, fy, cx, cy = parts.matrix
     zero = ad.Float(0)
+    numbers = [*parts.pose, fx, fy, cx, cy, zero, zero]
     if kind.ortho:
-        return _Parallel(dr.concat([*pose, fx, fy, cx, cy, zero, zero]), kind.width, kind.height, kind.near, kind.far)
+        return _Parallel(dr.concat(numbers), kind.width, kind.height, kind.near, kind.far, parts.place)
     (f, g), (x, y) = dr.detach([fx, fy]), dr.detach([cx, cy])
     sides = [
         *((edge * kind.width - x) / f for edge in (-BORDER, 1 + BORDER)),
         *((edge * kind.height - y) / g for edge in (-BORDER, 1 + BORDER)),
     ]
-    values = dr.concat([*pose, fx, fy, cx, cy, zero, zero, *sides])
-    return _Perspective(values, kind.width, kind.height, kind.near, kind.far)
+    return _Perspective(dr.concat([*numbers, *sides]), kind.width, kind.height, kind.near, kind.far, parts.place)
+
+
+def _gradient(number: int, group: list[Any], tensor: Tensor, device: Any) -> Tensor:
+    """Of leaf `number` in the shape of its tensor: from columns, or from the numbers of a matrix that count."""
+    if number < MATRIX:  # of the Gaussians
+        count = len(tensor)
+        found = _joined(group, count, device)
+        missing = tensor.numel() // count - len(group)  # harmonics of higher degrees
+        if missing:
+            found = torch.cat([found, torch.zeros((count, missing), device=device)], dim=-1)
+    else:
+        values = _tensor(dr.concat(group), device)
+        found = torch.zeros(tensor.numel(), device=device)
+        if number == MATRIX + 1:
+            found[torch.tensor(INTRINSICS, device=device)] = values
+        else:
+            found[: len(values)] = values
+    return found.reshape(tensor.shape).to(tensor.dtype)
 
 
 def _features(render_mode: str, colors: Tensor, depths: Tensor) -> Tensor:
@@ -440,17 +517,17 @@ def _floats(tensor: Tensor) -> Any:
     return ad.Float(tensor.detach().to(torch.float32).contiguous().reshape(-1))
 
 
-def _column(flat: Any, index: int, size: int) -> Any:
-    """Column `index` of a flat array [N * size], in memory of Dr.Jit's own: what torch has may lie otherwise, and each
-    way to lie is recorded anew."""
-    rows = dr.arange(ad.UInt32, dr.width(flat) // size)
+def _column(flat: Any, index: int, size: int, count: int) -> Any:
+    """Column `index` of a flat array [count * size], in memory of Dr.Jit's own: what torch has may lie otherwise, and
+    each way to lie is recorded anew."""
+    rows = dr.arange(ad.UInt32, count)
     return dr.gather(ad.Float, flat, rows * size + index, mode=dr.ReduceMode.Permute)
 
 
 def _columns(tensor: Tensor) -> list[Any]:
     """The columns of a tensor [N, size], Floats."""
     flat, size = _floats(tensor), tensor.shape[-1]
-    return [_column(flat, i, size) for i in range(size)]
+    return [_column(flat, i, size, len(tensor)) for i in range(size)]
 
 
 def _tensor(array: Any, device: Any) -> Tensor:

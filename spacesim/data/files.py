@@ -12,7 +12,9 @@ from typing import Any, BinaryIO
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError, WorkError
 
-LARGEST_JSON = 1 << 30  #: bytes, chosen: transforms.json of a million frames
+LARGEST_JSON = 1 << 25  #: bytes of a record, chosen
+LARGEST_LIST = 1 << 30  #: bytes of a record with an entry for each frame, of a million of them, chosen
+PARSED = 30  #: bytes of memory that a byte of JSON takes while it is read, at most; 26 were seen
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -52,7 +54,7 @@ def read_bytes(path: Path, expected: str = "a file", most: int | None = None) ->
             raise InputError(f"{path}: expected {expected} of at most {most:,} bytes, found {size:,}")
         check_memory(size, f"{path}: reading it")
         try:
-            return file.read(size) if size else file.read(most or LARGEST_JSON)  # files of the system claim to be empty
+            return file.read(size) if size else file.read(most or LARGEST_LIST)  # files of the system claim to be empty
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
 
@@ -166,11 +168,14 @@ def json_bytes(value: Any) -> bytes:
     return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file; InputError says what is wrong with it."""
+def read_json(path: Path, most: int = LARGEST_JSON) -> Any:
+    """Read a JSON file of at most `most` bytes; InputError says what is wrong with it. Raises MemoryError where its
+    values do not fit into memory."""
     path = Path(path)
+    content = read_bytes(path, "a JSON file", most)
+    check_memory(PARSED * len(content), f"{path}: reading it")
     try:
-        return json.loads(read_bytes(path, "a JSON file", LARGEST_JSON).decode("utf-8"))
+        return json.loads(content.decode("utf-8"))
     except InputError:
         raise
     except (ValueError, RecursionError) as error:  # malformed, no UTF-8, endless numbers or brackets

@@ -19,8 +19,12 @@ OPENCV_FROM_MITSUBA: Array = np.diag([-1.0, -1.0, 1.0, 1.0])
 def normalize(vectors: ArrayLike) -> Array:
     """Unit vectors of `vectors` [..., 3]; a zero vector raises ValueError."""
     vectors = np.asarray(vectors, dtype=np.float64)
-    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    if not np.all(lengths > 0):
+    with np.errstate(over="ignore", under="ignore"):
+        lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    if not np.all((lengths > 0) & np.isfinite(lengths)):  # squares can be beyond all bounds where the numbers are not
+        vectors = vectors / np.maximum(np.abs(vectors).max(axis=-1, keepdims=True), np.finfo(np.float64).tiny)
+        lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    if not np.all((lengths > 0) & np.isfinite(lengths)):
         raise ValueError("vectors: expected non-zero vectors, found one of length 0 or NaN")
     return vectors / lengths
 

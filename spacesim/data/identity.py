@@ -34,7 +34,7 @@ def frame_names(frames: Sequence[Frame]) -> list[str]:
     taken: set[str] = set()
     for frame in frames:
         stem = str(Path(frame.file_path).with_suffix("")).removeprefix("./").removeprefix("images/")
-        stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).lstrip("._")[-LONGEST_NAME:] or "frame"
+        stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem)[-LONGEST_NAME:].lstrip("._") or "frame"
         name, count = stem, 1
         while name.lower() in taken:  # some file systems do not tell cases apart
             count += 1

@@ -146,15 +146,22 @@ def write_exr(path: Path, layers: Mapping[str, np.ndarray], durable: bool = True
     write_bytes(path, stream.getvalue(), durable)
 
 
-def read_exr(path: Path) -> dict[str, np.ndarray]:
+def read_exr(path: Path, size: tuple[int, int] | None = None) -> dict[str, np.ndarray]:
     """Layers {name: [H, W] or [H, W, 3] float32} of an EXR file; a lone unnamed part is "".
 
-    Raises InputError where the file is missing, cut off, damaged or no EXR.
+    size: (width, height) that it must have, pixels. Raises InputError where the file is missing, cut off, damaged, no
+    EXR or of another size, before it is decoded.
     """
     content = read_bytes(path, "an EXR file")
     expected = _count_exr_parts(content)  # OpenEXR itself only warns, and leaves out what it cannot read
     if expected is None:
         raise InputError(f"{path}: expected an EXR file, found one that is cut off or damaged")
+    width, height = _exr_size(content)
+    if size is not None and (width, height) != size:
+        expected_size = f"{size[0]}x{size[1]} pixels as the camera says"
+        raise InputError(f"{path}: expected {expected_size}, found {width}x{height}")
+    check_size(width, height, str(path))
+    check_memory(DECODING * expected * width * height, f"{path}: a file of {width} x {height} pixels")
     try:
         parts = OpenEXR.File(io.BytesIO(content), separate_channels=True).parts
         layers = {part.name(): _layer_of(part) for part in parts}
@@ -331,8 +338,29 @@ def _count_exr_parts(content: bytes) -> int | None:
         return None
 
 
+def _exr_size(content: bytes) -> tuple[int, int]:
+    """(width, height), pixels, of the largest part of an EXR file; (0, 0) where no header tells."""
+    largest, position = (0, 0), 8
+    try:
+        while content[position]:
+            attributes, position = _exr_attributes(content, position)
+            left, top, right, bottom = struct.unpack("<4i", attributes[b"dataWindow"])
+            largest = max(largest, (right - left + 1, bottom - top + 1), key=lambda size: max(size[0] * size[1], 0))
+            if not struct.unpack_from("<I", content, 4)[0] & _EXR_MULTIPART:
+                break
+    except (struct.error, IndexError, ValueError, KeyError, OverflowError):
+        pass
+    return largest
+
+
 def walk_exr_header(content: bytes, position: int) -> tuple[int, int]:
     """(number of chunks that the header at `position` tells, position after it)."""
+    attributes, position = _exr_attributes(content, position)
+    return struct.unpack("<i", attributes[b"chunkCount"])[0], position
+
+
+def _exr_attributes(content: bytes, position: int) -> tuple[dict[bytes, bytes], int]:
+    """(values of the header at `position` by name, position after it)."""
     attributes = {}
     while content[position]:
         name, kind, _ = content[position : position + 1024].split(b"\0", 2)
@@ -340,4 +368,4 @@ def walk_exr_header(content: bytes, position: int) -> tuple[int, int]:
         size = struct.unpack_from("<I", content, position)[0]
         attributes[name] = content[position + 4 : position + 4 + size]
         position += 4 + size
-    return struct.unpack("<i", attributes[b"chunkCount"])[0], position + 1
+    return attributes, position + 1

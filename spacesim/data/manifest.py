@@ -18,7 +18,7 @@ LARGEST = 1 << 30  #: bytes, chosen: of ten million files
 _BLOCK = 1 << 20  # bytes read at once
 _THREADS = min(8, os.cpu_count() or 1)
 
-_LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
+_LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
 
 def digest_of(path: Path) -> str:
@@ -43,10 +43,13 @@ def write_manifest(root: Path, paths: Iterable[str], known: Mapping[str, str]) -
 def read_manifest(root: Path) -> dict[str, str]:
     """{path below `root`: digest} of SHA256SUMS; {} where there is none. Raises InputError where it is broken."""
     path = root / NAME
-    if not path.exists():
+    if not os.path.lexists(path):
         return {}
     found = {}
-    for number, line in enumerate(read_bytes(path, most=LARGEST).decode("utf-8", "replace").splitlines(), start=1):
+    *lines, rest = read_bytes(path, most=LARGEST).decode("utf-8", "replace").split("\n")
+    if not lines or rest:
+        raise InputError(f"{path}: expected a digest and a path in each line, found a file that is empty or cut off")
+    for number, line in enumerate(lines, start=1):
         match = _LINE.fullmatch(line)
         if match is None or PurePosixPath(match[2]).is_absolute() or ".." in PurePosixPath(match[2]).parts:
             raise InputError(

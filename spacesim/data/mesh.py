@@ -14,7 +14,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import read_bytes, write_bytes
 from spacesim.data.geometry import Array
 
-READ = (".ply", ".obj", ".glb", ".stl", ".off")
+READ = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 WRITTEN = (".ply", ".obj", ".glb", ".stl")
 FARTHEST = 1e9  #: metres; corners beyond it are taken for damage, chosen (the Moon is at 3.8e8)
 PARSED = 30  #: bytes of memory that a byte of a mesh file takes while it is read, at most; OBJ took 22
@@ -43,13 +43,14 @@ def load_trimesh(path: Path, kind: str | None = None) -> Any:
         check_promise(kind[1:], content)
         force = None if kind == ".ply" else "mesh"
         options = {"skip_materials": True} if kind in (".ply", ".obj") else {}
-        found: Any = trimesh.load(io.BytesIO(content), kind[1:], force=force, process=False, **options)
+        beside = _Beside(path.parent)
+        found: Any = trimesh.load(io.BytesIO(content), kind[1:], resolver=beside, force=force, process=False, **options)
         if not isinstance(found, trimesh.Trimesh | trimesh.PointCloud):
             raise InputError(f"found {type(found).__name__}")
         count = len(np.asarray(found.vertices, np.float64).reshape(-1, 3))
-        declared = re.search(rb"element\s+vertex\s+(\d+)", content) if kind == ".ply" else None
-        if declared is not None and count != int(declared.group(1)):
-            raise InputError(f"found {count:,} vertices, its header promises {int(declared.group(1)):,}")
+        declared = next((n for name, n in _elements(content) if name == b"vertex"), count) if kind == ".ply" else count
+        if count != declared:
+            raise InputError(f"found {count:,} vertices, its header promises {declared:,}")
     except MemoryError:
         raise
     except Exception as error:  # trimesh documents none of what it raises
@@ -58,19 +59,52 @@ def load_trimesh(path: Path, kind: str | None = None) -> Any:
     return found
 
 
-def check_places(points: np.ndarray, path: Path) -> None:
+class _Beside(trimesh.resolvers.Resolver):
+    """The files that a mesh file names, in its own folder and below."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.resolve()
+
+    def get(self, key: str) -> bytes:
+        """The bytes of the file called `key`. Raises InputError where it is not there, or elsewhere."""
+        path = (self.folder / key).resolve()
+        if not path.is_relative_to(self.folder):
+            raise InputError(f"{key[:80]!r} lies outside of the mesh's folder")
+        return read_bytes(path, "a part of a mesh")
+
+    def keys(self) -> tuple[str, ...]:
+        """No listing: files are asked for by name."""
+        return ()
+
+    def write(self, name: str, data: Any) -> None:
+        """Nothing is written."""
+        raise PermissionError(name)
+
+    def namespaced(self, namespace: str) -> "_Beside":
+        """Folders below are reached by their relative names."""
+        return self
+
+
+def check_places(points: np.ndarray, path: Path, farthest: float = 1e15) -> None:
     """Raise InputError in the name of the file where there is no point [N, 3], or one that is not finite or beyond
-    FARTHEST."""
+    `farthest` metres, by default as far as squares in single precision reach."""
     with np.errstate(invalid="ignore"):
-        if not len(points) or not (np.abs(points) <= FARTHEST).all():
+        if not len(points) or not (np.abs(points) <= farthest).all():
             found = "another one" if len(points) else "none"
-            raise InputError(f"{path}: expected points within {FARTHEST:g} m, found {found}")
+            raise InputError(f"{path}: expected points within {farthest:g} m, found {found}")
+
+
+def _elements(data: bytes) -> list[tuple[bytes, int]]:
+    """(name, count) of the elements that a PLY header promises."""
+    head = data.partition(b"end_header")[0]
+    return [(name, int(count)) for name, count in re.findall(rb"(?m)^[ \t]*element[ \t]+(\S+)[ \t]+(\d+)", head)]
 
 
 def check_promise(kind: str, data: bytes) -> None:
     """Raises InputError where the header of a "ply" or "stl" file promises more than the file holds, before anyone
     makes room for it. Other kinds pass."""
-    if kind == "stl" and len(data) >= 84 and not (data[:5] == b"solid" and b"facet" in data[:1024]):
+    is_text = data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:1024].lower()
+    if kind == "stl" and len(data) >= 84 and not is_text:
         count = struct.unpack_from("<I", data, 80)[0]
         if 84 + 50 * count != len(data):
             raise InputError(
@@ -78,13 +112,13 @@ def check_promise(kind: str, data: bytes) -> None:
                 f"found {len(data):,}"
             )
     if kind == "ply":
-        head, end, body = data.partition(b"end_header")
+        _, end, body = data.partition(b"end_header")
         if not data.startswith(b"ply") or not end:
             raise InputError('expected a ply file, from "ply" to "end_header", found something else')
-        for element, count in re.findall(rb"element\s+(\S+)\s+(\d+)", head):
-            if int(count) > len(body):
+        for element, count in _elements(data):
+            if count > len(body):
                 raise InputError(
-                    f"expected {int(count):,} elements {element.decode('ascii', 'replace')}, as its header promises, "
+                    f"expected {count:,} elements {element.decode('ascii', 'replace')}, as its header promises, "
                     f"found {len(body):,} bytes"
                 )
 

@@ -9,6 +9,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,18 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.files import flush_disks, json_bytes, read_json, remove_leftovers, write_bytes, write_json
+from spacesim.data.files import (
+    LARGEST_LIST,
+    flush_disks,
+    json_bytes,
+    read_json,
+    remove_leftovers,
+    write_bytes,
+    write_json,
+)
 from spacesim.data.images import Undistortion, load_image, read_exr, read_png, write_exr, write_png
 from spacesim.data.integrity import is_whole
-from spacesim.data.manifest import differences, write_manifest
+from spacesim.data.manifest import differences, read_manifest, write_manifest
 from spacesim.data.mesh import check_places, load_trimesh
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
 from spacesim.data.transforms import dataset_of, read_dataset
@@ -72,7 +81,7 @@ def load_truth(dataset: Dataset, frame: Frame) -> Truth:
     if frame.gt_path is None:
         raise InputError(f"{dataset.root}: expected ground truth of {frame.file_path}, found no gt_path")
     path = dataset.root / frame.gt_path
-    layers = read_exr(path)
+    layers = read_exr(path, (frame.camera.width, frame.camera.height))
     names = [field.name for field in fields(Truth)]
     missing = [name for name in names if name not in layers and name not in _OPTIONAL]
     if missing:
@@ -201,9 +210,18 @@ class DatasetWriter(FrameWriter):
         return read_dataset(self.root)
 
     def _remove_damaged(self) -> None:
-        """Take away the frames' files that are not what SHA256SUMS of the finished dataset says, to be made again."""
+        """Take away the frames' files that are not what SHA256SUMS of the finished dataset says, or, before there is
+        one, that cannot be decoded: they are made again, and no damage gets a digest."""
         frames = (*_FILES, "raw")
-        damaged = [path for path in differences(self.root) if path.split("/")[0] in frames]
+        known = read_manifest(self.root)
+        if known:
+            damaged = [path for path in differences(self.root) if path.split("/")[0] in frames]
+        else:
+            paths = [path for folder in frames for path in sorted((self.root / folder).glob("*.*"))]
+            with ThreadPoolExecutor() as pool:
+                whole = list(pool.map(_can_be_decoded, paths))
+            pairs = zip(paths, whole, strict=True)
+            damaged = [str(path.relative_to(self.root)) for path, is_sound in pairs if not is_sound]
         for path in damaged:
             (self.root / path).unlink(missing_ok=True)
         if damaged:
@@ -213,11 +231,20 @@ class DatasetWriter(FrameWriter):
         if not resume:
             raise InputError(f"{self.root}: expected a new or empty folder, found a dataset; go on with --resume")
         path = self.root / "scene.json"
-        found = read_json(path)
+        found = read_json(path, LARGEST_LIST)
         found = found if isinstance(found, dict) else {}
         for key in [*scene, *found]:
             if key not in found or key not in scene or found[key] != scene[key]:
                 raise InputError(f"{path}: expected the scene asked for, {key!r} differs; choose another folder")
+
+
+def _can_be_decoded(path: Path) -> bool:
+    """A frame's PNG or EXR file."""
+    try:
+        (read_exr if path.suffix == ".exr" else read_png)(path)
+    except InputError:
+        return False
+    return True
 
 
 def write_points(path: Path, points: ArrayLike, colors: ArrayLike) -> None:

@@ -9,7 +9,7 @@ from types import NoneType, UnionType
 from typing import Any, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_json
+from spacesim.data.files import LARGEST_JSON, read_json
 from spacesim.data.toml import Document, Keys, dotted
 
 T = TypeVar("T")
@@ -36,12 +36,14 @@ def structure(cls: type[T], document: Document, rules: Rules, defaults: Mapping[
     return _Reader(document, rules, cls).table(cls, document.values, (), defaults or {})
 
 
-def read_record(path: Path, cls: type[T], rules: Rules | None = None) -> tuple[T, dict[str, Any]]:
+def read_record(
+    path: Path, cls: type[T], rules: Rules | None = None, most: int = LARGEST_JSON
+) -> tuple[T, dict[str, Any]]:
     """(the `cls` that a JSON file says, its values as they stand there). null is allowed where an annotation has None.
 
     Raises InputError where the file cannot be read, is no JSON object, or as `structure` does.
     """
-    values = read_json(path)
+    values = read_json(path, most)
     if not isinstance(values, dict):
         raise InputError(f"{path}: expected a JSON object, found {_short(values)}")
     return structure(cls, Document(str(path), values, {}), rules or Rules()), values

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_json
+from spacesim.data.files import LARGEST_LIST, read_json
 from spacesim.data.geometry import OPENCV_FROM_OPENGL
 from spacesim.data.images import image_size
 from spacesim.data.records import Camera, Dataset, Frame, Sun
@@ -99,7 +99,7 @@ def _read_blender(root: Path) -> tuple[Json, tuple[Frame, ...], tuple[Frame, ...
 
 
 def _read_object(path: Path) -> Json:
-    value = read_json(path)
+    value = read_json(path, LARGEST_LIST)
     if not isinstance(value, dict):
         raise InputError(f"{path}: expected a JSON object, found {type(value).__name__}")
     return value
@@ -189,7 +189,7 @@ def _read_sun(values: Json) -> Sun | None:
         try:
             return Sun(np.asarray(values["sun_direction"], np.float64))
         except (TypeError, ValueError, OverflowError):
-            raise InputError("expected 3 finite numbers, a unit vector, as sun_direction, found other values") from None
+            raise InputError("expected 3 finite numbers, not all 0, as sun_direction, found other values") from None
     if "sun_azimuth_deg" in values and "sun_elevation_deg" in values:
         return Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
     return None

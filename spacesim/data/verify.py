@@ -5,7 +5,7 @@ from typing import Any
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
-from spacesim.data.manifest import NAME, differences
+from spacesim.data.manifest import NAME, differences, read_manifest
 from spacesim.data.records import Dataset
 from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, read_dataset, verify_dataset
 
@@ -21,11 +21,22 @@ def verify(path: Path) -> tuple[Dataset, list[str]]:
         raise InputError(f"{error}{_way_out(Path(path), error)}") from None
     try:
         changed = differences(dataset.root)
+        listed = read_manifest(dataset.root)
     except InputError as error:
         return dataset, [str(error)]
+    absent = sorted(_named(dataset) - listed.keys()) if listed else []
+    changed |= {name: f"{dataset.root / NAME}: expected a digest of {name}, found none" for name in absent}
     told = tuple(f"{dataset.root / name}:" for name in changed)
     faulty = [words for words in verify_dataset(path) + _faulty_pictures(dataset) if not words.startswith(told)]
     return dataset, [*changed.values(), *faulty]
+
+
+def _named(dataset: Dataset) -> set[str]:
+    """Paths of the files that a dataset has: transforms.json and what it names, scene.json."""
+    keys = "file_path", "gt_path", "shadow_path", "silhouette_path", "id_path", "depth_file_path", "mask_path"
+    paths = {getattr(frame, key) for frame in dataset.frames for key in keys}
+    paths |= {dataset.ply_file_path, dataset.mesh_path, "transforms.json"}
+    return {path for path in paths if path is not None} | ({"scene.json"} if dataset.scene else set())
 
 
 def has_digests(dataset: Dataset) -> bool:

@@ -58,10 +58,12 @@ Tell = Callable[[Tally], None]
 
 
 class Worker:
-    """A process that runs commands, and is started anew when it dies or hangs."""
+    """A process that runs commands, and is started anew when it dies or hangs. warm_up: honest commands, whose memory
+    is what others are compared with;  headroom: bytes beyond that"""
 
-    def __init__(self, folder: Path, warm_up: Sequence[Sequence[str]] = (), headroom: int | None = HEADROOM) -> None:
+    def __init__(self, folder: Path, warm_up: Sequence[Sequence[str]] = (), headroom: int = HEADROOM) -> None:
         self.folder, self.warm_up, self.headroom = folder, warm_up, headroom
+        self.honest = 0  #: bytes that the warm-up took at most
         self._process: subprocess.Popen[bytes] | None = None
         self._log = folder / "worker.log"
         self._done = 0
@@ -72,7 +74,10 @@ class Worker:
             self.stop()
             self._start()
         self._done += 1
-        return self._ask({"arguments": list(arguments), "folder": str(folder)})
+        answer = self._ask({"arguments": list(arguments), "folder": str(folder)})
+        if self.honest and answer.get("peak", 0) > self.honest + self.headroom:
+            answer["beyond"] = answer["peak"] - self.honest
+        return answer
 
     def stop(self) -> None:
         """End the process."""
@@ -91,14 +96,14 @@ class Worker:
                 stderr=log,
                 env=ENVIRONMENT,
             )
+        self.honest = 0
         for number, arguments in enumerate(self.warm_up):
             out = str(self.folder / f"warm{number}")
             answer = self._ask({"arguments": [word.format(out=out) for word in arguments], "folder": str(self.folder)})
             assert answer.get("code") == 0, (arguments, answer)
             for path in self.folder.glob(f"warm{number}*"):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
-        if self.headroom is not None:
-            self._ask(self.headroom)
+            self.honest = max(self.honest, answer["peak"])
 
     def _ask(self, told: Any) -> dict[str, Any]:
         process = self._process
@@ -137,6 +142,10 @@ def verdict(answer: dict[str, Any]) -> str | None:
         return f"traceback: {' / '.join(errors.strip().splitlines()[-4:])}"
     if code not in (0, 1, 2):
         return f"exit code {code}"
+    if "beyond" in answer:
+        return f"took {answer['beyond'] / 1e9:.1f} GB more than honest input"
+    if "the memory is short" in errors:
+        return f"asked for more memory than there is: {errors.strip().splitlines()[-1]}"
     if "the computation failed" in errors:
         return f"unexplained: {errors.strip().splitlines()[-1]}"
     if code != 0 and not any(line.startswith("spacesim") for line in errors.splitlines()):

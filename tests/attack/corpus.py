@@ -113,6 +113,10 @@ KINDS = (
         "SHA256SUMS", ("data/SHA256SUMS",), (m.of_bytes, m.other_file), _words("verify data"),
     ),
     Kind(
+        "shots", ("composed/shots/0000.json",), (m.of_json, m.of_bytes, m.other_file),
+        _words("compose composed.toml --out composed"),
+    ),
+    Kind(
         "camera.json", ("camera.json",), (m.of_json, m.of_json, m.of_bytes, m.other_file),
         _words(_LOOK, "sweep run --camera camera.json --frames 2 --out {out}"),
     ),
@@ -269,6 +273,7 @@ def build(root: Path) -> Path:
     keys = ("w", "h", "fl_x", "fl_y", "cx", "cy")
     camera = {key: meta[key] for key in keys} | {"transform_matrix": meta["frames"][0]["transform_matrix"]}
     (root / "camera.json").write_text(json.dumps(camera))
+    _call("compose", root / "composed.toml", "--out", root / "composed")
     _write_other(root / "other", meta)
     return root
 

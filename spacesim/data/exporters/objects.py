@@ -11,7 +11,7 @@ from spacesim.data.errors import InputError, expect
 from spacesim.data.files import holds_files
 from spacesim.data.geometry import Array
 from spacesim.data.images import read_exr, read_png
-from spacesim.data.mesh import check_places, load_trimesh
+from spacesim.data.mesh import FARTHEST, check_places, load_trimesh
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.tone import TONES, as_bytes, displayed
 
@@ -42,9 +42,7 @@ def targets_of(dataset: Dataset) -> list[Target]:
         sizes = [(int(count["vertices"]), int(count["faces"])) for count in counts]
         poses = [np.array(item["world_from_object"], np.float64).reshape(4, 4) for item in objects]
         names = [(int(item["id"]), str(item["name"])) for item in objects]
-        if not all(np.isfinite(pose).all() and np.linalg.det(pose[:3, :3]) > 0 for pose in poses):
-            raise ValueError
-        if min(min(size) for size in sizes) < 1:
+        if not all(map(_is_similarity, poses)) or len(sizes) != len(poses) or min(map(min, sizes)) < 1:
             raise ValueError
     except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(f"{path}: expected objects, their poses and shares of mesh.ply, found none") from None
@@ -52,7 +50,7 @@ def targets_of(dataset: Dataset) -> list[Target]:
     mesh = load_trimesh(source)
     if not isinstance(mesh, trimesh.Trimesh):
         raise InputError(f"{source}: expected the mesh of the dataset, found points without faces")
-    check_places(mesh.vertices, source)
+    check_places(mesh.vertices, source, FARTHEST)
     if not objects or [sum(size) for size in zip(*sizes, strict=True)] != [len(mesh.vertices), len(mesh.faces)]:
         raise InputError(f"{path}: expected the vertices and faces of mesh.ply, found other numbers of them")
     targets = []
@@ -68,6 +66,16 @@ def targets_of(dataset: Dataset) -> list[Target]:
         targets.append(Target(number, name, rigid, (world - rigid[:3, 3]) @ rigid[:3, :3], own))
         first_vertex, first_face = first_vertex + vertices, first_face + faces
     return targets
+
+
+def _is_similarity(pose: Array) -> bool:
+    """Rotation, one scale from 1e-9 to 1e9 and a translation within FARTHEST, [4, 4]."""
+    with np.errstate(all="ignore"):
+        square = pose[:3, :3] @ pose[:3, :3].T
+        scale2 = float(np.trace(square)) / 3
+        alike = bool(np.abs(square - scale2 * np.eye(3)).max() <= 1e-4 * scale2) and 1e-18 <= scale2 <= 1e18
+        right = bool(np.linalg.det(pose[:3, :3]) > 0)
+        return alike and right and bool(np.abs(pose[:3, 3]).max() <= FARTHEST) and bool((pose[3] == (0, 0, 0, 1)).all())
 
 
 def chosen(targets: list[Target], wanted: str | None) -> Target:

@@ -5,18 +5,20 @@ unpickled (`torch.load` with `weights_only=True` accepts tensors alone).
 """
 
 import importlib.util
+import io
 import os
-import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load_file
+from safetensors.numpy import load as load_tensors
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import read_bytes
+
+LARGEST_WEIGHTS = 1 << 30  #: bytes, chosen: those of AlexNet take 244 MB
 
 BACKBONE_FILE = "alexnet-owt-7be5be79.pth"
 """AlexNet on ImageNet, as torchvision publishes it."""
@@ -131,9 +133,10 @@ def load(path: Path | None = None) -> tuple[Lpips | None, str]:
 
 
 def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
+    content = read_bytes(path, "a safetensors file", LARGEST_WEIGHTS)
     try:
-        return load_file(path)
-    except (SafetensorError, OSError, ValueError) as error:
+        return dict(load_tensors(content))
+    except Exception as error:  # of damaged headers, numbers that numpy lacks
         raise InputError(f"{path}: expected a safetensors file, found another ({error})") from None
 
 
@@ -141,8 +144,11 @@ def _read_pth(path: Path) -> dict[str, Any]:
     import torch
 
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+        file = io.BytesIO(read_bytes(path, "a file of tensors", LARGEST_WEIGHTS))
+        content = torch.load(file, map_location="cpu", weights_only=True)
+    except InputError:
+        raise
+    except Exception as error:  # torch documents none of what it raises on damaged files
         reason = str(error).strip().split("\n")[0]
         raise InputError(f"{path}: expected a file of tensors alone, found another ({reason})") from None
     tensors = content if isinstance(content, dict) else {}

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import LARGEST_LIST
 from spacesim.data.structure import read_record
 from spacesim.eval.report.html import escape, swatch
 from spacesim.eval.schema import RULES, Metrics
@@ -65,7 +66,7 @@ def legend(runs: Sequence[Judged]) -> str:
 
 
 def _read_metrics(folder: Path) -> dict[str, Any]:
-    return read_record(folder / "metrics.json", Metrics, RULES)[1]
+    return read_record(folder / "metrics.json", Metrics, RULES, LARGEST_LIST)[1]
 
 
 def _unique_names(found: Sequence[dict[str, Any]], folders: Sequence[Path]) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.errors import InputError, expect
-from spacesim.data.files import read_json, write_json
+from spacesim.data.files import LARGEST_LIST, read_json, write_json
 from spacesim.data.lock import locked
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import DatasetWriter
@@ -80,7 +80,7 @@ def _open(root: Path, described: dict[str, Any], resume: bool, sweep: "_Sweep") 
     path = root / "scene.json"
     if resume and path.exists():
         try:
-            read_json(path)
+            read_json(path, LARGEST_LIST)
         except InputError as error:
             raise InputError(
                 f"{error}; if the frames there are of the scene asked for, delete this file and resume again, "

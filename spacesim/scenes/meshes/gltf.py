@@ -20,6 +20,7 @@ from spacesim.scenes.meshes.parts import RawPart
 from spacesim.scenes.meshes.textures import LARGEST_FILE, Folder, Notes, embedded
 
 LARGEST_IMPLIED = 1 << 24  #: bytes of an accessor without a buffer view, all zeros but for what is sparse; chosen
+MOST_CORNERS = 30_000_000  #: of what the nodes place, chosen: ten million faces of shared vertices
 A_CORNER = 200  #: bytes of memory that a vertex, or a corner of a face, takes while it is read; 140 were seen
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -42,6 +43,8 @@ def read_gltf(path: Path, notes: Notes) -> list[RawPart]:
             part = _part(file, surfaces, primitive, transform, notes)
             if part is not None:
                 corners += len(part.vertices) + part.faces.size  # nodes may place one mesh any number of times
+                if corners > MOST_CORNERS:
+                    raise InputError(f"expected at most {MOST_CORNERS:,} vertices and corners, found more")
                 check_memory(A_CORNER * corners, f"{path}: its mesh")
                 own = name or str(mesh.get("name", ""))
                 several = len(mesh["primitives"]) > 1 and part.surface is not None

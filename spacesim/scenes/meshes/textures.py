@@ -15,6 +15,7 @@ from urllib.parse import unquote
 import numpy as np
 from PIL import Image
 
+from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_bytes
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
@@ -22,6 +23,8 @@ from spacesim.scenes.materials.table import SMOOTHEST, WHITEST, Color, Material,
 
 LARGEST_FILE = 2 << 30  #: bytes of a file that is read, chosen
 LARGEST_PICTURE = 1 << 26  #: pixels of a texture that is read (8192 x 8192), chosen
+MOST_TEXTURE_PIXELS = 1 << 27  #: of all textures of a file, chosen: eight of 4096 x 4096
+DECODING = 20  #: bytes that a pixel takes while it is decoded, at most
 WIDEST_PICTURE = 4096  #: pixels; wider or higher textures are reduced to it, chosen
 
 NORMALS = "normals of vertices are not used, facets are flat"
@@ -36,6 +39,7 @@ class Notes:
 
     def __init__(self) -> None:
         self._kinds: dict[tuple[str, str], dict[str, None]] = {}
+        self.pixels = 0  #: of the textures that have been decoded
 
     def drop(self, kind: str, subject: str = "") -> None:
         """Something in the file that is not used."""
@@ -112,12 +116,17 @@ def decoded(data: bytes, what: str, notes: Notes) -> np.ndarray | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             image = Image.open(io.BytesIO(data))
-            if image.width * image.height <= LARGEST_PICTURE:
+            if image.width * image.height <= LARGEST_PICTURE and notes.pixels < MOST_TEXTURE_PIXELS:
+                check_memory(DECODING * image.width * image.height, f"{what}: decoding it")
+                notes.pixels += image.width * image.height
                 return _rgb_picture(image, what, notes)
+    except MemoryError:
+        raise
     except Exception as error:  # Pillow raises what it likes on damaged data
         notes.drop(_UNDECODED, f"{what} ({type(error).__name__})")
         return None
-    notes.drop(f"textures of more than {LARGEST_PICTURE:,} pixels are not used", what)
+    limit = f"{LARGEST_PICTURE:,} pixels, or {MOST_TEXTURE_PIXELS:,} in all"
+    notes.drop(f"textures of more than {limit} are not used", what)
     return None
 
 

@@ -180,7 +180,10 @@ def _is_there(out: Path, index: int, what: dict[str, Any]) -> bool:
         return False
     if not isinstance(told, dict) or told.get("digest") != what["digest"]:
         return False
-    return all(is_whole(out / kind / f"{index:04d}{PICTURES[kind]}") for kind in told.get("pictures", PICTURES))
+    kinds = told.get("pictures")
+    if not isinstance(kinds, list) or not {"rgb", "depth", "id"} <= {kind for kind in kinds if kind in tuple(PICTURES)}:
+        return False
+    return all(kind in tuple(PICTURES) and is_whole(out / kind / f"{index:04d}{PICTURES[kind]}") for kind in kinds)
 
 
 def _write(out: Path, index: int, shot: Shot, what: dict[str, Any], exposure: float | None) -> None:

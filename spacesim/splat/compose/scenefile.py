@@ -120,11 +120,13 @@ class ViewEntry:
             raise InputError(f"focal: expected positive numbers of pixels, found {list(self.focal)}")
         if self.focal is not None and self.fov_deg is not None:
             raise InputError("focal: expected alone, found fov_deg beside it")
-        if (place := self.place) is not None:
-            try:
+        try:
+            if (place := self.place) is not None:
                 Camera(place, 1, 1, 1.0, 1.0, 0.5, 0.5)
-            except InputError as error:
-                raise InputError(f"transform_matrix: {str(error).partition(': ')[2]}") from None
+        except InputError as error:
+            raise InputError(f"transform_matrix: {str(error).partition(': ')[2]}") from None
+        except ValueError:
+            raise InputError("position: expected a place that looks at another, found numbers beyond that") from None
 
     @property
     def place(self) -> Array | None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_json
+from spacesim.data.files import LARGEST_LIST, read_json
 from spacesim.data.structure import structure
 from spacesim.data.toml import Document
 from spacesim.scenes.config import ObjectConfig, SceneConfig
@@ -24,12 +24,13 @@ def recorded_scene(data: Path) -> SceneConfig:
     path = Path(data) / "scene.json"
     if not path.is_file():
         raise InputError(f"{path}: expected the scene that the data were made from, found none; the truth is not known")
-    values = read_json(path)
+    values = read_json(path, LARGEST_LIST)
     config = values.get("config") if isinstance(values, dict) else None
     if not isinstance(config, dict):
         raise InputError(f"{path}: expected an object with the key config, found none")
     known = _without_nulls(config)
-    known.get("sun", {}).pop("color", None)  # what the white balance makes of it, again
+    if isinstance(known.get("sun"), dict):
+        known["sun"].pop("color", None)  # what the white balance makes of it, again
     scene = structure(SceneConfig, Document(str(path), known, {}), RULES)
     return replace(scene, objects=tuple(_found(one, path) for one in scene.objects))
 
