@@ -73,13 +73,12 @@ cli.main = main
 )
 def test_it_finds(tmp_path, monkeypatch, way, words):
     (tmp_path / "sitecustomize.py").write_text(WEAK)
-    monkeypatch.setattr(attack, "PATIENCE", 3.0)
     path = attack.ENVIRONMENT["PYTHONPATH"]
     monkeypatch.setitem(attack.ENVIRONMENT, "PYTHONPATH", f"{tmp_path}:{path}")
     worker = Worker(tmp_path, [["doctor"]], headroom=1 << 30)
-    monkeypatch.setattr(attack, "PATIENCE", 60.0)
     assert verdict(worker.run(["doctor"], tmp_path)) is None
-    monkeypatch.setattr(attack, "PATIENCE", 3.0)
+    if way == "sleep":
+        monkeypatch.setattr(attack, "PATIENCE", 3.0)
     found = verdict(worker.run([way], tmp_path))
     monkeypatch.setattr(attack, "PATIENCE", 60.0)
     assert verdict(worker.run(["doctor"], tmp_path)) is None, "it is started anew"

@@ -197,5 +197,7 @@ def test_headers_that_promise_more_than_there_is(tmp_path):
         with pytest.raises(InputError, match=r"a\.ply: expected a mesh"):
             read_mesh(tmp_path / "a.ply")
     (tmp_path / "a.xyz").write_bytes(content)
-    with pytest.raises(InputError, match=r"expected a mesh in \.ply, \.obj, \.glb, \.stl, \.off, found '\.xyz'"):
+    with pytest.raises(
+        InputError, match=r"expected a mesh in \.ply, \.obj, \.glb, \.gltf, \.stl, \.off, found '\.xyz'"
+    ):
         read_mesh(tmp_path / "a.xyz")

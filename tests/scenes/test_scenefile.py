@@ -317,7 +317,7 @@ BOXSAT = '[[objects]]\nspacecraft = "boxsat"\n'
         ),
         (
             BOXSAT + "[camera]\nresolution = 20000",
-            "67,108,864 pixels, 16,384 a side, found 20000 x 20000",
+            "134,217,728 pixels, 16,384 a side, found 20000 x 20000",
         ),
         (BOXSAT + "scale = 1e300", ", line 3: objects[0].scale: expected a factor from 1e-09 to 1e+09, found 1e+300"),
         (BOXSAT + "position = [1e30, 0, 0]", ", line 3: objects[0].position: expected metres from -1e+09 to 1e+09"),

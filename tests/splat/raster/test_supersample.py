@@ -254,7 +254,7 @@ def test_fine_light_is_drawn_finely():
 
 def test_pictures_too_large_to_draw_are_named():
     vast = Camera(EYE.world_from_camera, 8000, 8000, 8000, 8000, 4000, 4000)
-    with pytest.raises(InputError, match=r"--supersample 2: expected pictures of at most 16777216 pixels, found 8000x"):
+    with pytest.raises(InputError, match=r"--supersample 2: expected pictures of at most 33554432 pixels, found 8000x"):
         finer(vast, 2)
 
 
