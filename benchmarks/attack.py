@@ -83,10 +83,13 @@ def _attacked(options: argparse.Namespace, root: Path, place: Path) -> list[tupl
 
 
 def _teller(name: str, count: int) -> attack.Tell:
-    last = time.monotonic()
+    last, told = time.monotonic(), 0
 
     def tell(tally: attack.Tally) -> None:
-        nonlocal last
+        nonlocal last, told
+        for find in tally.finds[told:]:
+            print(find, file=sys.stderr, flush=True)
+        told = len(tally.finds)
         if time.monotonic() - last >= EVERY or tally.tried == count:
             last = time.monotonic()
             print(f"{name}: {tally.tried}/{count}, {len(tally.finds)} finds", file=sys.stderr, flush=True)

@@ -434,7 +434,11 @@ def test_what_does_not_run_is_told_why():
 
 
 SMALL_BLOCKS = {  # in the Python of a document: what takes the place of what
-    "README.md": {"views=60": "views=2, test_views=1, resolution=24, spp=1", 'preset("demo")': "SMALL"},
+    "README.md": {
+        "views=60, resolution=128": "views=2, test_views=1, resolution=24, spp=1",
+        'preset="demo"': 'preset="demo", iterations=4, init_count=50',
+        '"eval")': '"eval", geometry=False)',
+    },
     "relighting.md": {"1024": "24", "suns_around(120": "suns_around(2"},
     "rasterizer.md": {"640, 480": "32, 24", "512, 512": "24, 24"},
     "shadows.md": {"gaussians, light, 512": "gaussians, light, 32"},

@@ -255,3 +255,21 @@ def test_without_torch_a_sentence():
     program = "import sys; sys.modules['torch'] = None; import spacesim.torch"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert "ImportError: spacesim.torch: expected torch, found none; type: pip install torch" in done.stderr
+
+
+def test_recordings_serve_other_numbers_of_gaussians(monkeypatch):
+    """One after another, larger and smaller: what is replayed is what is traced."""
+    from spacesim import torch as door
+
+    for count in (60, 300, 17, 1024, 1, 500):
+        leaves = as_floats(scene(count, cameras=1))
+        found = []
+        for traced in (False, True):
+            with monkeypatch.context() as patch:
+                if traced:
+                    patch.setattr(door, "_project", door._trace_project)
+                    patch.setattr(door, "_project_back", door._trace_project_back)
+                picture, alpha, _ = rasterization(**leaves, width=SIDE, height=SIDE, sh_degree=3)
+                found.append([picture, *torch.autograd.grad(picture.sin().sum() + alpha.sum(), list(leaves.values()))])
+        for one, other in zip(*found, strict=True):
+            assert torch.allclose(one, other, rtol=1e-5, atol=1e-6), count
