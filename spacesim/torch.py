@@ -171,8 +171,9 @@ class _Kind:
 
 
 @dataclass
-class _Perspective(Pinhole):
-    """Between a near and a far plane, metres. place: three Floats; harmonics are asked for in directions from there."""
+class _Between(Projection):
+    """Between a near and a far plane, metres. place: three Floats; harmonics are asked for in directions from there,
+    which gsplat does of orthographic cameras, too."""
 
     near: float = 0.0
     far: float = 0.0
@@ -186,18 +187,13 @@ class _Perspective(Pinhole):
 
 
 @dataclass
-class _Parallel(Orthographic):
-    """As `_Perspective`; gsplat asks for harmonics of an orthographic camera in directions from its place, too."""
+class _Perspective(_Between, Pinhole):
+    """A pinhole camera."""
 
-    near: float = 0.0
-    far: float = 0.0
-    place: Any = None
 
-    def in_reach(self, center: Any) -> Any:
-        return (center.z > self.near) & (center.z < self.far) & (dr.max(dr.abs(center)) < LARGEST)
-
-    def rays_to(self, points: Any) -> Any:
-        return points - ad.Array3f(self.place)
+@dataclass
+class _Parallel(_Between, Orthographic):
+    """An orthographic camera."""
 
 
 @dataclass

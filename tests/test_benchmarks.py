@@ -222,6 +222,19 @@ def slope_of(rows, time_of):
     return np.log(last / first) / np.log(pairs[1] / pairs[0])
 
 
+@pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
+@smallest("torch_door.py --backend llvm --sizes 300x32 --repeats 2 --peers gsplat --json")
+def test_torch_door_tells_both_ways_and_goes_on_without_its_peer(command):
+    done = ended(command)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "gsplat: not measured here (gsplat runs on CUDA alone)\n"
+    report = json.loads(done.stdout)
+    (row,) = report["rows"]
+    assert row["torch / own"] == pytest.approx(row["torch, ms"] / row["own, ms"])
+    assert min(row["torch, ms"], row["own, ms"]) > 0
+    assert report["differences"] == []
+
+
 @smallest("training.py --backend llvm --sizes 300x32 --repeats 2 --markdown")
 def test_training_tells_a_step_and_what_was_not_measured(command):
     output = call(command)

@@ -773,3 +773,56 @@ def test_pictures_larger_than_any_is_drawn_are_refused(spacesim, tiny_data, tmp_
             assert refused.is_refusal("--size: expected"), refused
     done = spacesim("sweep", tmp_path / "run", "--out", tmp_path / "s", "--size", "16384x16", "--frames", 2)
     assert done.code == 0, done.errors
+
+
+def test_a_null_character_in_a_name_is_told(spacesim, tiny_run, broken, tmp_path):
+    scene = tmp_path / "scene.toml"
+    scene.write_text('[[models]]\nrun = "a\\u0000b"\n')
+    assert spacesim("compose", scene, "--out", tmp_path / "c").is_refusal("scene.toml, line 2", "null character")
+    edit(broken / "transforms.json", lambda meta: meta.update(ply_file_path="a\0b"))
+    assert spacesim("verify", broken).is_refusal("ply_file_path")
+
+
+@pytest.mark.parametrize("pictures", [5, None, True, [], ["nope"], "rgb", ["rgb", "depth", "id", 5]])
+def test_a_damaged_record_of_a_composed_frame_is_made_again(spacesim, tiny_run, tmp_path, pictures):
+    scene, out = tmp_path / "scene.toml", tmp_path / "out"
+    camera = "[camera]\nposition = [9, 0, 0]\nlook_at = [0, 0, 0]\nfov_deg = 30\nresolution = [16, 16]\n"
+    scene.write_text(f"{camera}[[models]]\nrun = '{tiny_run}'\n")
+    assert spacesim("compose", scene, "--out", out).code == 0
+    honest = contents(out)
+    edit(out / "shots/0000.json", lambda record: record.update(pictures=pictures))
+    (out / "rgb/0000.png").unlink()
+    done = spacesim("compose", scene, "--out", out)
+    assert done.code == 0, done.errors
+    assert contents(out) == honest
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut off", "one line less", "a dangling link"])
+def test_a_list_of_digests_that_lacks_some_is_no_proof(spacesim, broken, tmp_path, damage):
+    sums, victim = broken / "SHA256SUMS", broken / "gt/train_00001.exr"
+    lines = sums.read_text().splitlines(keepends=True)
+    content = {"empty": "", "cut off": "".join(lines)[:-3]}.get(damage)
+    if damage == "a dangling link":
+        sums.unlink()
+        sums.symlink_to("nowhere")
+    else:
+        kept = "".join(line for line in lines if victim.name not in line) if content is None else content
+        sums.write_text(kept)
+    flipped = bytearray(victim.read_bytes())
+    flipped[-40] ^= 1
+    victim.write_bytes(flipped)
+    refused = spacesim("verify", broken)
+    assert refused.code == 1, refused
+    assert any("SHA256SUMS" in line for line in refused.errors)
+
+
+def test_frames_that_were_damaged_before_the_end_are_made_again(spacesim, broken, tiny_data):
+    """An interrupted run, without SHA256SUMS yet: no damage may get a digest."""
+    for name in ("SHA256SUMS", "transforms.json"):
+        (broken / name).unlink()
+    picture = broken / "id/train_00001.png"
+    flipped = bytearray(picture.read_bytes())
+    flipped[flipped.index(b"IDAT") + 6] ^= 2
+    picture.write_bytes(flipped)
+    assert spacesim("generate", "boxsat", "--out", broken, *GENERATE, "--resume").code == 0
+    assert contents(broken) == contents(tiny_data)

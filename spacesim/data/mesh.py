@@ -43,7 +43,7 @@ def load_trimesh(path: Path, kind: str | None = None) -> Any:
         check_promise(kind[1:], content)
         force = None if kind == ".ply" else "mesh"
         options = {"skip_materials": True} if kind in (".ply", ".obj") else {}
-        beside = _Beside(path.parent)
+        beside = Beside(path.parent)
         found: Any = trimesh.load(io.BytesIO(content), kind[1:], resolver=beside, force=force, process=False, **options)
         if not isinstance(found, trimesh.Trimesh | trimesh.PointCloud):
             raise InputError(f"found {type(found).__name__}")
@@ -59,7 +59,7 @@ def load_trimesh(path: Path, kind: str | None = None) -> Any:
     return found
 
 
-class _Beside(trimesh.resolvers.Resolver):
+class Beside(trimesh.resolvers.Resolver):
     """The files that a mesh file names, in its own folder and below."""
 
     def __init__(self, folder: Path) -> None:
@@ -80,7 +80,7 @@ class _Beside(trimesh.resolvers.Resolver):
         """Nothing is written."""
         raise PermissionError(name)
 
-    def namespaced(self, namespace: str) -> "_Beside":
+    def namespaced(self, namespace: str) -> "Beside":
         """Folders below are reached by their relative names."""
         return self
 

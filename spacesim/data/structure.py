@@ -138,6 +138,8 @@ class _Reader:
         number = float(value) if hint is float and type(value) is int and abs(value) < 1e300 else value
         if type(number) is not hint or (hint is float and not math.isfinite(number)):
             self._refuse(at, _noun(hint), value)
+        if isinstance(value, str) and "\0" in value:  # no file has such a name
+            self._refuse(at, "text without a null character", value)
         return number
 
     def _made(self, cls: Any, given: Mapping[str, Any], at: Keys) -> Any:

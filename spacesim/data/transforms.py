@@ -254,6 +254,6 @@ def _path(source: Path, values: Json, key: str) -> str | None:
     value = values.get(key)
     if value is None:
         return None
-    if not isinstance(value, str) or not value:
+    if not isinstance(value, str) or not value or "\0" in value:
         raise InputError(f"{source}: expected a file path as {key}, found {value!r}")
     return str(PurePosixPath(value))

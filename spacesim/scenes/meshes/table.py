@@ -12,7 +12,7 @@ import trimesh
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_bytes
 from spacesim.data.images import linear_from_srgb
-from spacesim.data.mesh import check_promise
+from spacesim.data.mesh import Beside, check_promise
 from spacesim.scenes.materials.table import Color
 from spacesim.scenes.meshes.parts import ABSENT, RawPart
 from spacesim.scenes.meshes.textures import NORMALS, Folder, Notes, Surface, check_picture, decoded, unit
@@ -59,17 +59,18 @@ def _loaded(data: bytes, kind: str, resolver: "_Files") -> trimesh.Scene:
     return trimesh.load(io.BytesIO(data), kind, resolver=resolver, force="scene", process=False, **options)
 
 
-class _Files(trimesh.resolvers.Resolver):
+class _Files(Beside):
     """What trimesh may open while it reads a file: what `Folder` allows; the rest is noted."""
 
     def __init__(self, path: Path, notes: Notes) -> None:
-        self.folder, self.notes, self.file_name = Folder(path), notes, path.name
+        super().__init__(path.parent)
+        self.allowed, self.notes, self.file_name = Folder(path), notes, path.name
         self.pictures: dict[int, np.ndarray | None] = {}
 
     def get(self, key: str) -> bytes:
         """The bytes of the file called `key`; FileNotFoundError (and a note) where it cannot be had."""
         try:
-            data = self.folder.read(str(key))
+            data = self.allowed.read(str(key))
         except InputError as error:
             self.notes.drop("files that cannot be had are not used", str(error))
             raise FileNotFoundError(str(error)) from None
@@ -77,18 +78,6 @@ class _Files(trimesh.resolvers.Resolver):
             return _as_utf8("mtl", data)
         check_picture(data, str(key)[:80], self.notes)
         return data
-
-    def keys(self) -> tuple[str, ...]:
-        """No listing: files are asked for by name."""
-        return ()
-
-    def write(self, name: str, data: Any) -> None:
-        """Nothing is written."""
-        raise PermissionError(name)
-
-    def namespaced(self, namespace: str) -> "_Files":
-        """Folders below are reached by their relative names."""
-        return self
 
 
 def _as_utf8(kind: str, data: bytes) -> bytes:
