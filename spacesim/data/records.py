@@ -22,6 +22,7 @@ MOST_PIXELS = 2**27  #: of a picture: 16,384 x 8,192
 MOST_SIDE = 2**14  #: pixels of a picture's longer side: what H.264 encodes
 LONGEST_FOCUS = 1e9  #: pixels, chosen
 SUN_LENGTHS = 1e-15, 1e15  #: of a vector that names the Sun's direction, chosen: metres to it are 1.5e11
+SUN_WORDS = f"3 finite numbers, the largest of {SUN_LENGTHS[0]:g} to {SUN_LENGTHS[1]:g}"
 
 
 def check_size(width: int, height: int, name: str) -> None:
@@ -112,7 +113,7 @@ class Sun:
     def __post_init__(self) -> None:
         direction = np.asarray(self.direction, dtype=np.float64)
         if direction.shape != (3,) or not SUN_LENGTHS[0] <= np.abs(direction).max() <= SUN_LENGTHS[1]:
-            raise InputError(f"sun direction: expected 3 finite numbers, not all 0, found {self.direction}")
+            raise InputError(f"sun direction: expected {SUN_WORDS}, found {self.direction}")
         object.__setattr__(self, "direction", normalize(direction))
 
     @staticmethod

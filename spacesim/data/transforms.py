@@ -20,7 +20,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import LARGEST_LIST, read_json
 from spacesim.data.geometry import OPENCV_FROM_OPENGL
 from spacesim.data.images import image_size
-from spacesim.data.records import Camera, Dataset, Frame, Sun
+from spacesim.data.records import SUN_WORDS, Camera, Dataset, Frame, Sun
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 TRUTH_PATHS = ("gt_path", "shadow_path", "silhouette_path", "id_path", "depth_file_path", "mask_path")
@@ -189,7 +189,7 @@ def _read_sun(values: Json) -> Sun | None:
         try:
             return Sun(np.asarray(values["sun_direction"], np.float64))
         except (TypeError, ValueError, OverflowError):
-            raise InputError("expected 3 finite numbers, not all 0, as sun_direction, found other values") from None
+            raise InputError(f"expected {SUN_WORDS}, as sun_direction, found other values") from None
     if "sun_azimuth_deg" in values and "sun_elevation_deg" in values:
         return Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
     return None

@@ -93,7 +93,10 @@ class Target:
         self.process.stdin.flush()
         if not select.select([self.process.stdout], [], [], PATIENCE)[0]:
             raise TimeoutError("the viewer's process does not answer")
-        return json.loads(self.process.stdout.readline())
+        line = self.process.stdout.readline()
+        if not line:
+            raise ConnectionError("the viewer's process ended")
+        return json.loads(line)
 
     def memory(self) -> tuple[float, float] | None:
         """MB now and at most, None where the system does not tell."""
@@ -168,10 +171,11 @@ def honest(one: Target, part: str) -> None:
         pictures(one.port)
     except Exception as error:
         one.found(f"{part}: somebody else got no picture any more ({type(error).__name__}: {error})")
-    if one.process.poll() is not None:
-        one.found(f"{part}: the viewer ended, code {one.process.returncode}")
+    try:
+        state = one.state()
+    except ConnectionError:  # BrokenPipeError is one, too
+        one.found(f"{part}: the viewer ended, code {one.process.wait(PATIENCE)}")
         return
-    state = one.state()
     numbers = [number for pose in state["poses"] for row in pose for number in row] + state["sun"]
     if not all(map(math.isfinite, numbers)):
         one.found(f"{part}: the scene has numbers that are none")

@@ -372,7 +372,7 @@ BOXSAT = '[[objects]]\nspacecraft = "boxsat"\n'
         ("folder = '/'\n" + BOXSAT, ", line 1: folder: expected"),
         (BOXSAT.replace("boxsat", "boxsta"), ", line 2: objects[0].spacecraft: expected one of boxsat"),
         (BOXSAT.replace("boxsat", "boxsta"), "found 'boxsta'; did you mean boxsat?"),
-        ('[[objects]]\nmesh = "a\\u0000b"', ", line 2: objects[0].mesh: expected a mesh file"),
+        ('[[objects]]\nmesh = "a\\u0000b"', ", line 2: objects[0].mesh: expected text without a null character"),
         (f"[[objects]]\nmesh = '{'long' * 999}'", ", line 2: objects[0].mesh: expected a mesh file"),
         ("[[objects]]\n\nmesh = 'none.glb'", ", line 3: objects[0].mesh: expected a mesh file, found no file"),
         (BOXSAT + "[objects.materials]\nbus = 'gold'", ", line 4: objects[0].materials.bus: expected one of"),

@@ -86,8 +86,8 @@ def test_solar_reflectance_is_weighted_with_sunlight():
 def test_colour_science_leaves_no_trace_and_is_not_needed_for_presets():
     code = (
         "import sys, warnings; warnings.simplefilter('error')\n"
-        "from spacesim.scenes import materials, spectra\n"
-        "materials.material('white-paint'); spectra.sun_rgb('sun')\n"
+        "from spacesim.scenes.materials import spectra, table\n"
+        "table.material('white-paint'); spectra.sun_rgb('sun')\n"
         "assert 'colour' not in sys.modules\n"
         "spectra.sun_rgb('d65')\n"
         "assert 'colour' in sys.modules\n"
