@@ -11,6 +11,7 @@ profiler. "frame" is parameters to picture without gradients; forward and backwa
 and splat, and draws it with `--plot`.
 """
 
+import importlib
 import sys
 from pathlib import Path
 from typing import Any
@@ -56,18 +57,17 @@ def main() -> None:
         write_bytes(options.plot, growth.plot("project + bin + forward + backward, kernels", points).encode())
 
 
-def load_peer(wanted: str | None, name: str) -> Any:
-    """The module `peer_gsplat`, or None with a line that says why it is not measured."""
+def load_peer(wanted: str | None, name: str, module: str = "peer_gsplat") -> Any:
+    """The module, or None with a line that says why it is not measured."""
     if wanted is None:
         return None
     try:
         if name != "cuda":
             raise ImportError("gsplat runs on CUDA alone")
-        import peer_gsplat
+        return importlib.import_module(module)
     except ImportError as error:
         print(f"gsplat: not measured here ({error})", file=sys.stderr)
         return None
-    return peer_gsplat
 
 
 def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:

@@ -8,7 +8,6 @@ gradients are told, too; that needs CUDA.
 """
 
 import json
-import sys
 import time
 from functools import partial
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import common
 import drjit as dr
 import numpy as np
+from rasterizer import load_peer
 
 from spacesim import backend
 from spacesim.data.errors import InputError
@@ -38,7 +38,8 @@ def main() -> None:
         import torch
     except ImportError:
         raise InputError("torch: expected it, found none; type: pip install torch") from None
-    peer = _peer(options.peers, name)
+    gsplat = load_peer(options.peers, name, "gsplat")
+    peer = gsplat and gsplat.rasterization
     from spacesim.torch import rasterization
 
     device = "cuda" if name == "cuda" else "cpu"
@@ -64,20 +65,6 @@ def main() -> None:
     print(common.table(rows, options.markdown))
     for one in found:
         print(one)
-
-
-def _peer(wanted: str | None, name: str) -> Any:
-    """gsplat's function, or None with a line that says why it is not measured."""
-    if wanted is None:
-        return None
-    try:
-        if name != "cuda":
-            raise ImportError("gsplat runs on CUDA alone")
-        import gsplat
-    except ImportError as error:
-        print(f"gsplat: not measured here ({error})", file=sys.stderr)
-        return None
-    return gsplat.rasterization
 
 
 def _scene(torch: Any, count: int, side: int, device: str) -> tuple[dict[str, Any], Camera]:
