@@ -28,12 +28,13 @@ from spacesim.data.geometry import look_at
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera
 from spacesim.data.store import read_dataset
+from spacesim.eval.metrics.image import psnr as psnr_of
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import TrainConfig, preset, with_options
-from spacesim.splat.train.strategies.default import DefaultStrategyConfig
-from spacesim.splat.train.trainer import Progress, Trainer
+from spacesim.splat.train.strategies.control import RefinementConfig
+from spacesim.splat.train.trainer import Trainer, TrainingProgress
 
 try:
     import gsplat
@@ -44,7 +45,7 @@ except ImportError as error:
 else:
     MISSING = None
 
-GSPLAT_DEFAULTS = DefaultStrategyConfig(
+GSPLAT_DEFAULTS = RefinementConfig(
     prune_opacity=0.005,
     prune_scale=0.1,
     prune_screen_size=0.15,
@@ -98,7 +99,7 @@ def compare_pictures(count: int, size: int) -> dict[str, Any]:
         dr.enable_grad(parameter)
     output = render(ours, Pinhole.of(camera))
     weights = rng.normal(size=(size, size, 4)).astype(np.float32)
-    planes = [*output.colour, output.alpha]
+    planes = [*output.color, output.alpha]
     columns = [ad.Float(np.ascontiguousarray(weights[..., c].ravel())) for c in range(4)]
     dr.backward(sum((dr.sum(w * p) for w, p in zip(columns, planes, strict=True)), ad.Float(0)))
 
@@ -109,13 +110,13 @@ def compare_pictures(count: int, size: int) -> dict[str, Any]:
     (torch.cat([image[..., :3], alpha], -1) * torch.tensor(weights, device="cuda")).sum().backward()
 
     image_np, alpha_np = image.detach().cpu().numpy(), alpha.detach().cpu().numpy()[..., 0]
-    colour, our_alpha, depth = output.to_numpy()
+    color, our_alpha, depth = output.to_numpy()
     solid = alpha_np > 0.01
-    off = np.abs(colour - image_np[..., :3]).max(axis=-1)
+    off = np.abs(color - image_np[..., :3]).max(axis=-1)
     result = {
         "gaussians": count,
         "pixels": size,
-        "colour": float(off.max()),
+        "color": float(off.max()),
         "pixels off by more than 2e-3": int((off > 2e-3).sum()),
         "alpha": float(np.abs(our_alpha - alpha_np).max()),
         "depth": float(np.abs(depth - image_np[..., 3])[solid].max()),
@@ -157,20 +158,19 @@ def compare_training(data: Path, iterations: int) -> dict[str, Any]:
     return {"iterations": iterations, "test views": len(truth), "spacesim": ours, "gsplat": theirs}
 
 
-def tell(progress: Progress) -> None:
+def tell(progress: TrainingProgress) -> None:
     """A line every 500 iterations."""
     if progress.iteration % 500 == 0:
         now = time.strftime("%H:%M:%S")
         print(
-            f"{now} {progress.iteration}: loss {progress.loss:.4f}, {progress.gaussians} Gaussians",
+            f"{now} {progress.iteration}: loss {progress.loss:.4f}, {progress.gaussian_count} Gaussians",
             file=sys.stderr,
         )
 
 
 def psnr(pictures: list[np.ndarray], truth: list[np.ndarray]) -> float:
     """Mean over views of the PSNR of whole frames, dB (thesis 2.18)."""
-    errors = [np.mean((np.clip(p, 0, 1) - t) ** 2) for p, t in zip(pictures, truth, strict=True)]
-    return float(np.mean(-10 * np.log10(errors)))
+    return float(np.mean([psnr_of(np.clip(p, 0, 1), t) for p, t in zip(pictures, truth, strict=True)]))
 
 
 def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainConfig) -> "Tensors":
@@ -233,7 +233,7 @@ def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainC
             optimizer.zero_grad(set_to_none=True)
         strategy.step_post_backward(splats, optimizers, state, index, info, packed=False)
         if (index + 1) % 50 == 0:
-            tell(Progress(index + 1, config.iterations, loss.item(), len(splats["means"])))
+            tell(TrainingProgress(index + 1, config.iterations, loss.item(), len(splats["means"])))
     names = {"scales": "log_scales", "quats": "quaternions", "opacities": "logit_opacities"}
     return {names.get(name, name): value.detach() for name, value in splats.items()}
 

@@ -18,6 +18,7 @@ from spacesim import backend
 from spacesim.data.images import load_image
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_dataset
+from spacesim.eval.metrics.image import psnr
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
@@ -58,13 +59,13 @@ def judge(gaussians: Gaussians, dataset: Dataset) -> np.ndarray:
     """Means over the test views of the five figures that `main` prints."""
     rows = []
     for frame in dataset.test:
-        colour, alpha, _ = render(gaussians, Pinhole.of(frame.camera)).to_numpy()
+        color, alpha, _ = render(gaussians, Pinhole.of(frame.camera)).to_numpy()
         truth = load_image(dataset, frame)
         covered, empty = truth.alpha > 0.999, truth.alpha < 0.001
         errors = []
         for background in (0.0, 1.0):
-            picture = np.clip(colour + (1 - alpha[..., None]) * background, 0, 1)
-            errors.append(-10 * np.log10(np.mean((picture - truth.over(np.full(3, background))) ** 2)))
+            picture = np.clip(color + (1 - alpha[..., None]) * background, 0, 1)
+            errors.append(psnr(picture, truth.over(np.full(3, background))))
         rows.append([alpha[covered].mean(), alpha[empty].mean(), (alpha[covered] < 0.5).mean(), *errors])
     return np.mean(rows, axis=0)
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
@@ -21,7 +21,11 @@ from spacesim.backend import BackendError
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import write_bytes
 from spacesim.data.geometry import fibonacci_sphere, look_at
-from spacesim.data.records import Camera
+from spacesim.data.records import Camera, Dataset
+
+if TYPE_CHECKING:
+    from spacesim.eval.evaluate import EvaluateConfig
+    from spacesim.splat.train.config import TrainConfig
 
 WARM_UP = 5  #: calls that do not count
 PACKAGES = ("spacesim", "drjit", "mitsuba", "numpy", "torch", "gsplat", "fused_ssim")
@@ -95,6 +99,29 @@ def told(main: Callable[[], None]) -> None:
     except (InputError, BackendError, WorkError) as error:
         print(error, file=sys.stderr)
         sys.exit(2 if isinstance(error, InputError) else 1)
+
+
+def generated(scene: str, out: Path, **options: Any) -> Path:
+    """The folder of a scene's dataset, made as far as it is not there."""
+    from spacesim.progress import show_progress
+    from spacesim.scenes import generate, read_scene
+
+    with show_progress("generate", "frames") as report:
+        generate(read_scene(scene, **options), out, resume=True, progress=report)
+    return out
+
+
+def measured(name: str, config: "TrainConfig", judge: "EvaluateConfig", dataset: Dataset, folder: Path) -> Row:
+    """metrics.json of a configuration, trained in FOLDER/run and evaluated in FOLDER/eval, as far as that is not done;
+    "training" beside it, or {"note": why} where training fails."""
+    from spacesim.progress import show_progress
+    from spacesim.reproduce.perform import evaluated, trained
+
+    try:
+        run = trained(folder / "run", dataset, config, name, show_progress)
+    except WorkError as error:
+        return {"note": str(error)}
+    return {**evaluated(run, dataset, folder / "eval", judge, name, show_progress), "training": run.training}
 
 
 def row_names(text: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Composes two boxsats that were trained apart and judges them against the path-traced pair (tables 4.6 and 4.7).
+"""Composes two boxsats that were trained apart in several ways and evaluates them against the path-traced pair.
 
     python benchmarks/composition.py --out RUNS [--preset fast] [--iterations N] [--rows thesis,ours]
     python benchmarks/composition.py --out RUNS --data BOXSAT --pair PAIR
@@ -6,9 +6,10 @@
 Trains each method on one boxsat under many Suns, unless RUNS/NAME/run is there already (the folders are those of
 shadows.py, so its runs serve, too), stands it twice into one scene, at the origin and at (-3, -3, -3) m as in the
 thesis, and compares the scene with path-traced pictures of both under the Sun at azimuth 45, elevation 35, where the
-first hides the Sun from the second. Metrics are over the pixels of each. Without BOXSAT and PAIR it makes them first,
-in RUNS/data and RUNS/pair. An interrupted call goes on where it stopped. Every row's scene is RUNS/pairs/NAME.toml, its
-report RUNS/pairs/NAME/report.html; all rows on one page: RUNS/pairs/report.html.
+first hides the Sun from the second. Metrics are over the pixels of each; `spacesim reproduce` shows tables 4.6 and 4.7
+themselves. Without BOXSAT and PAIR it makes them first, in RUNS/data and RUNS/pair. An interrupted call goes on where
+it stopped. Every row's scene is RUNS/pairs/NAME.toml, its report RUNS/pairs/NAME/report.html; all rows on one page:
+RUNS/pairs/report.html.
 """
 
 import argparse
@@ -22,40 +23,28 @@ import common
 import shadows
 
 from spacesim import backend
+from spacesim.data.records import Dataset
 from spacesim.data.store import read_dataset
-from spacesim.eval.composition import ComposedRun
-from spacesim.eval.evaluate import EvaluateConfig, evaluate
+from spacesim.eval.evaluate import EvaluateConfig
 from spacesim.eval.report.write import write_report
-from spacesim.progress import reporting, tell_training
-from spacesim.splat.compose import ComposeConfig, Composition, Placed, Pose, PosedScene, load_scene, save_scene
+from spacesim.progress import show_progress
+from spacesim.reproduce.experiments import PLACES, SUN
+from spacesim.reproduce.perform import composed, evaluated, trained
 from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.config import TrainConfig, preset, with_options
-from spacesim.splat.train.train import train
 
-SUN = (45.0, 35.0)  #: azimuth and elevation, degrees, of tables 4.6 and 4.7
-PLACES = {"first": (0.0, 0.0, 0.0), "second": (-3.0, -3.0, -3.0)}  #: metres
 ROWS = ("thesis", "ours")
 COLUMNS = shadows.COLUMNS[:9]  #: those of both tables
-
-THESIS = {  # of the second boxsat: tables 4.6 and 4.7, means
-    "none": (0.0398, 0.0694, 26.3320, 0.8507, 0.2018, 0.1505, 0.0392, 0.0351, 1.6572),
-    "map": (0.0015, 0.0139, 40.5382, 0.9809, 0.1468, 0.0030, -0.000702, 0.0156, 0.0254),
-    "park": (0.0017, 0.0131, 41.2144, 0.9857, 0.1217, 0.0030, -0.0000949, 0.0150, 0.2027),
-    "splat": (0.0015, 0.0129, 41.3919, 0.9866, 0.1147, 0.0030, -0.000214, 0.0147, 0.2436),
-}
-GAIN_DB, ERROR_SHARE = 10.0, 0.1  #: wanted of shadows over the second: PSNR gained at least, error rate left at most
 
 
 @dataclass(frozen=True)
 class Row:
-    """name: of the row;  run: of the run, a folder of RUNS;  config: of its training;  shadows: between the models;
-    baseline: the row without shadows that it is compared with"""
+    """name: of the row;  run: of the run, a folder of RUNS;  config: of its training;  shadows: between the models"""
 
     name: str
     run: str
     config: TrainConfig
     shadows: str
-    baseline: str
 
 
 def main() -> None:
@@ -63,14 +52,16 @@ def main() -> None:
     parser.add_argument("--backend", choices=backend.NAMES, default="auto")
     parser.add_argument("--out", type=Path, required=True, metavar="RUNS")
     parser.add_argument("--data", type=Path, metavar="BOXSAT", help="what is trained on; made where it is not named")
-    parser.add_argument("--pair", type=Path, metavar="PAIR", help="what is judged against; made where it is not named")
+    parser.add_argument(
+        "--pair", type=Path, metavar="PAIR", help="what is evaluated against; made where it is not named"
+    )
     parser.add_argument("--resolution", type=int, default=256, metavar="PX", help="of what is made (256)")
     parser.add_argument("--views", type=int, default=50, metavar="N", help="of the pair (50)")
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--iterations", type=int, metavar="N")
     parser.add_argument("--rows", default=",".join(ROWS), help="of thesis,ours, or names of single rows")
     parser.add_argument("--run", action="append", default=[], metavar="NAME=RUN", help="take this run; repeatable")
-    parser.add_argument("--no-geometry", action="store_true", help="do not judge shapes")
+    parser.add_argument("--no-geometry", action="store_true", help="do not evaluate shapes")
     parser.add_argument("--markdown", action="store_true")
     parser.add_argument("--json", nargs="?", const=Path("-"), type=Path, metavar="FILE")
     options = parser.parse_args()
@@ -91,9 +82,10 @@ def main() -> None:
         if row.run in given:
             run = load_run(Path(given[row.run]))
         else:
-            data = data or make_data(options.out / "data", options.resolution)
-            run = trained(row, with_options(row.config, iterations=options.iterations), data, options.out)
-        results[row.name] = judged(row, run, pair, options.out, not options.no_geometry)
+            data = data or shadows.make_data(options.out / "data", resolution=options.resolution)
+            config = with_options(row.config, iterations=options.iterations)
+            run = trained(options.out / row.run / "run", read_dataset(data), config, row.run, show_progress)
+        results[row.name] = judged(row, run, pair, options.out / "pairs", not options.no_geometry)
     write_report([options.out / "pairs" / name for name in results], options.out / "pairs/report.html")
     tables = {
         f"The {which} boxsat, Sun ({SUN[0]:g}, {SUN[1]:g})": [
@@ -101,11 +93,6 @@ def main() -> None:
         ]
         for which in PLACES
     }
-    tables["The second boxsat in the thesis"] = [
-        {"row": name, **dict(zip((heading for heading, _, _ in COLUMNS), shown(values), strict=True))}
-        for name, values in THESIS.items()
-    ]
-    tables["Targets"] = [targets(row, results) for row in rows if row.baseline in results and row.name != row.baseline]
     common.emit({"rows": tables, "pair": str(pair.root), "data": str(data)}, tables, options)
 
 
@@ -125,55 +112,29 @@ def rows_of(kind: str, size: str) -> Iterator[Row]:
     "none-shaded" asks what that alone gives to a method without shadows."""
     if kind == "thesis":
         configs = dict(shadows.configurations("thesis", size))
-        yield Row("none", "none", configs["none"], "none", "none")
+        yield Row("none", "none", configs["none"], "none")
         for name in ("map", "splat", "park"):
-            yield Row(name, name, configs[name], "others", "none")
+            yield Row(name, name, configs[name], "others")
         for name in ("map", "splat"):
-            yield Row(f"{name}-ratio", name, configs[name], "ratio", "none")
-        yield Row("none-shaded", "none", configs["none"], "others", "none")
+            yield Row(f"{name}-ratio", name, configs[name], "ratio")
+        yield Row("none-shaded", "none", configs["none"], "others")
         return
-    yield Row("none-surface", "none, surface", preset(size, "relight"), "none", "none-surface")
+    yield Row("none-surface", "none, surface", preset(size, "relight"), "none")
     for name, method in (("map", "shadow-map"), ("splat", "shadow-splat")):
-        yield Row(f"{name}-surface", f"{name}, surface", preset(size, method), "others", "none-surface")
-
-
-def make_data(out: Path, resolution: int) -> Path:
-    """One boxsat under the Suns of shadows.py."""
-    from spacesim.scenes import generate, read_scene
-
-    size = {**shadows.SCENE, "resolution": resolution}
-    scene = read_scene("boxsat", **size, known_test_views=2, shared_test_views=True)
-    with reporting("generate", "frames") as report:
-        generate(scene, out, resume=True, progress=report)
-    return out
+        yield Row(f"{name}-surface", f"{name}, surface", preset(size, method), "others")
 
 
 def make_pair(out: Path, resolution: int, views: int) -> Path:
     """Both boxsats under one Sun."""
-    from spacesim.scenes import generate, read_scene
-
     size = {"views": 1, "test_suns": 0, "test_views": views, "resolution": resolution, "test_spp": 1024}
-    with reporting("generate the pair", "frames") as report:
-        generate(read_scene("boxsat-pair", sun=[SUN], **size), out, resume=True, progress=report)
-    return out
+    return common.generated("boxsat-pair", out, sun=[SUN], **size)
 
 
-def trained(row: Row, config: TrainConfig, data: Path, out: Path) -> Run:
-    with reporting(f"train {row.run}", "iterations") as report:
-        return train(read_dataset(data), out / row.run / "run", config, resume=True, on_progress=tell_training(report))
-
-
-def judged(row: Row, run: Run, pair: Any, out: Path, shapes: bool) -> dict[str, Any]:
+def judged(row: Row, run: Run, pair: Dataset, out: Path, shapes: bool) -> dict[str, Any]:
     """metrics.json of the scene with this run twice."""
-    config = EvaluateConfig() if shapes else EvaluateConfig(geometry=None)
-    file, folder = out / "pairs" / f"{row.name}.toml", out / "pairs" / row.name
-    models = [Placed(run, Pose(translation=place), which) for which, place in PLACES.items()]
-    save_scene(file, PosedScene(Composition(models, ComposeConfig(row.shadows))))
-    scene = ComposedRun(load_scene(file).composition, file)
-    with reporting(f"evaluate {row.name}", "frames") as report:
-        metrics: dict[str, Any] = evaluate(scene, pair, folder, config, report)  # type: ignore[arg-type]
-    write_report([folder], folder / "report.html")
-    return metrics
+    judge = EvaluateConfig() if shapes else EvaluateConfig(geometry=None)
+    scene = composed(run, out / f"{row.name}.toml", row.shadows)
+    return evaluated(scene, pair, out / row.name, judge, row.name, show_progress)
 
 
 def table_row(name: str, metrics: Mapping[str, Any], which: str) -> common.Row:
@@ -191,29 +152,6 @@ def shown(values: Any) -> list[str]:
         "" if value is None else f"{value:.{2 if metric == 'psnr' else 4}f}"
         for metric, value in zip(metrics, values, strict=True)
     ]
-
-
-def targets(row: Row, results: Mapping[str, Mapping[str, Any]]) -> common.Row:
-    """What shadows between the models gain over the row without any."""
-    ours, base = results[row.name], results[row.baseline]
-    psnr = {which: [_of(one, which, "image", "psnr") for one in (ours, base)] for which in PLACES}
-    errors = [_of(one, "second", "shadow", "ber") for one in (ours, base)]
-    gains = {which: None if None in pair else pair[0] - pair[1] for which, pair in psnr.items()}
-    share = errors[0] / errors[1] if None not in errors and errors[1] else None
-    return {
-        "row": row.name,
-        "over": row.baseline,
-        "second, dB": "" if gains["second"] is None else f"{gains['second']:+.2f}",
-        f"at least {GAIN_DB:g}": _verdict(gains["second"], lambda gain: gain >= GAIN_DB),
-        "error rate, share left": "" if share is None else f"{share:.3f}",
-        f"at most {ERROR_SHARE:g}": _verdict(share, lambda left: left <= ERROR_SHARE),
-        "first, dB": "" if gains["first"] is None else f"{gains['first']:+.2f}",
-        "not worse": _verdict(gains["first"], lambda gain: gain >= 0),
-    }
-
-
-def _verdict(value: float | None, holds: Any) -> str:
-    return "" if value is None else "yes" if holds(value) else "no"
 
 
 def _of(metrics: Mapping[str, Any], which: str, group: str, metric: str) -> float | None:

@@ -17,8 +17,8 @@ from spacesim.splat.train.config import preset
 from spacesim.splat.train.trainer import Trainer
 
 SCENE = 2_000, 64  #: Gaussians and pixels of the run over many steps
-MOST = 6_000  #: Gaussians that refinement may reach in it
-LEAST_STEPS = 200  #: of `over_steps`: ten before each mark are under the kernel history, the others are timed
+MAX_GAUSSIANS = 6_000  #: Gaussians that refinement may reach in it
+MIN_STEPS = 200  #: of `over_steps`: ten before each mark are under the kernel history, the others are timed
 UNSEEN = -20.0  #: logit of an opacity too faint to be drawn
 
 
@@ -70,7 +70,7 @@ def over_steps(steps: int, marks: int = 10) -> list[Row]:
     """Train `steps` steps with refinement going on to the end; a row at each of `marks` moments."""
     count, pixels = SCENE
     config = replace(preset("fast"), iterations=steps, init_count=count, sh_every=max(steps // 20, 1))
-    refinement = replace(config.refinement, refine_stop=steps + 1, max_gaussians=MOST, screen_size_stop=steps)
+    refinement = replace(config.refinement, refine_stop=steps + 1, max_gaussians=MAX_GAUSSIANS, screen_size_stop=steps)
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(write_dataset(Path(folder) / "data", count, pixels), replace(config, refinement=refinement))

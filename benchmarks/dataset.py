@@ -29,12 +29,12 @@ from spacesim.data.geometry import OPENCV_FROM_MITSUBA
 from spacesim.data.records import Camera
 from spacesim.scenes import read_scene
 from spacesim.scenes.build import build
-from spacesim.scenes.generation.frames import FrameMaker, Job, Shot, cores, writing_threads
+from spacesim.scenes.cameras.kernel_camera import Units
+from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, cores, writing_threads
 from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.generation.workers import make_in_processes
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import load
-from spacesim.scenes.view import Units
 
 WARM = 3  #: frames before the clock starts
 
@@ -65,18 +65,18 @@ def counts(text: str) -> list[int]:
     return [common.positive(count) for count in text.split(",")]
 
 
-def planned(scene: str, **changes: Any) -> tuple[Renderer, Job, list[Shot]]:
+def planned(scene: str, **changes: Any) -> tuple[Renderer, Job, list[FrameSpec]]:
     """The renderer of a scene, what a process that makes its frames has to know, and its training frames."""
     config = read_scene(scene, **changes, test_views=0)
     built, quality = build(config), config.quality
     renderer = Renderer(built, quality.spp, quality.max_depth, config.camera.distortion)
     views, _ = plan_views(built, config)
-    shots = [Shot(i, name, view.camera, view.sun, quality.spp) for i, (name, view) in enumerate(views)]
+    shots = [FrameSpec(i, name, view.camera, view.sun, quality.spp) for i, (name, view) in enumerate(views)]
     return renderer, Job(built, config.camera, quality, config.seed, Path(), writing_threads(1)), shots
 
 
 def speed(scene: str, size: int, spp: int, views: int, workers: list[int]) -> dict[str, Any]:
-    """Milliseconds a frame of each way of rendering, and the ratios that are judged."""
+    """Milliseconds a frame of each way of rendering, and the ratios that are evaluated."""
     renderer, job, shots = planned(scene, views=views + WARM, resolution=(size, size), spp=spp)
     shots, loaded = shots[: views + WARM], load(job.scene)
     mi = backend.mitsuba()

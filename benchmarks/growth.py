@@ -16,7 +16,7 @@ SIZES = {
 WIDTH, HEIGHT = 640, 400
 LEFT, RIGHT, TOP, BOTTOM = 62, 18, 44, 52
 SLOPE_ONE, OTHER = "#5a6472", "#1b2027"
-COLOURS = {"gaussians": "#2a66ad", "pixels": "#b9560f"}
+COLORS = {"gaussians": "#2a66ad", "pixels": "#b9560f"}
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,9 @@ def plot(title: str, points: list[Point]) -> str:
     for name, chosen in series.items():
         where = [place(p.pairs, p.milliseconds) for p in chosen]
         path = "L".join(f"{x:.1f} {y:.1f}" for x, y in where)
-        marks.append(f'<path d="M{path}" fill="none" stroke="{COLOURS[name]}" stroke-width="2"/>')
-        marks += [dot(x, y, COLOURS[name]) for x, y in where]
-        legend.append((COLOURS[name], f"{describe(name, chosen)}: slope {slope(chosen):.2f}"))
+        marks.append(f'<path d="M{path}" fill="none" stroke="{COLORS[name]}" stroke-width="2"/>')
+        marks += [dot(x, y, COLORS[name]) for x, y in where]
+        legend.append((COLORS[name], f"{describe(name, chosen)}: slope {slope(chosen):.2f}"))
     for point in others:
         x, y = place(point.pairs, point.milliseconds)
         words = f"{compact(point.gaussians)} on {point.pixels}²"
@@ -103,17 +103,17 @@ def plot(title: str, points: list[Point]) -> str:
             dot(x, y, OTHER),
             text(x - 7, y - 6, words, "end") if x > WIDTH / 2 else text(x + 7, y + 14, words, "start"),
         ]
-    for row, (colour, words) in enumerate(reversed(legend)):
+    for row, (color, words) in enumerate(reversed(legend)):
         at = TOP + 16 + 18 * row
-        dashes = ' stroke-dasharray="5 4"' if colour == SLOPE_ONE else ' stroke-width="2"'
-        marks.append(f'<path d="M{LEFT + 12} {at - 4}h22" stroke="{colour}"{dashes}/>')
+        dashes = ' stroke-dasharray="5 4"' if color == SLOPE_ONE else ' stroke-width="2"'
+        marks.append(f'<path d="M{LEFT + 12} {at - 4}h22" stroke="{color}"{dashes}/>')
         marks.append(text(LEFT + 42, at, words, "start"))
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}"'
     return f'{head} role="img" aria-label="{escape(title)}" font-family="sans-serif">{"".join(marks)}</svg>\n'
 
 
-def dot(x: float, y: float, colour: str) -> str:
-    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"/>'
+def dot(x: float, y: float, color: str) -> str:
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{color}"/>'
 
 
 def common_side(points: list[Point]) -> list[Point]:

@@ -55,11 +55,11 @@ class Frame:
         return np.asarray(SUNS[self.calls % len(SUNS)])
 
     def shadows(self) -> None:
-        dr.eval(self.light.shadows(self.gaussians, self.sun(), adaptive=True))
+        dr.eval(self.light.shadows(self.gaussians, self.sun()))
 
     def shade(self) -> None:
         """Shadows and field."""
-        dr.eval(self.light.lit(self.gaussians, self.camera, self.sun(), adaptive=True))
+        dr.eval(self.light.shade_picture(self.gaussians, self.camera, self.sun()))
 
     def frame(self) -> None:
         output = draw_lit(self.gaussians, self.light, self.camera, self.sun())

@@ -59,9 +59,9 @@ class Frame:
             _, _, info = rasterize(self.splats, camera, 3)
         self.radii, self.depths = info["radii"].detach(), info["depths"].detach()
         count = len(arrays["means"])
-        colours = _tensor(np.random.default_rng(0).uniform(size=(1, count, 3)))
+        colors = _tensor(np.random.default_rng(0).uniform(size=(1, count, 3)))
         opacities = info["opacities"].detach().reshape(1, count)
-        leaves = (info["means2d"], info["conics"], colours, opacities)
+        leaves = (info["means2d"], info["conics"], colors, opacities)
         self.leaves = [leaf.detach().clone().requires_grad_() for leaf in leaves]
         self.pairs = self.bin()
         self.image = self._blend()

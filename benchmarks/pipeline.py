@@ -12,10 +12,10 @@ from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
-from spacesim.splat.train.loss import photometric_loss
-from spacesim.splat.train.optimizer import Adam
+from spacesim.splat.train.loss.terms import photometric_loss
+from spacesim.splat.train.optimizer.adam import Adam
+from spacesim.splat.train.optimizer.update import Update, ViewGradients
 from spacesim.splat.train.stages import project_views
-from spacesim.splat.train.update import Update, ViewGradients
 
 SSIM_WEIGHT = 0.2
 DEGREE = 3  #: of spherical harmonics
@@ -36,7 +36,7 @@ class Pipeline:
         self.truth = list(ad.Array3f(noise))
         self.factors = ad.Float([1.0, 1.0, *[0.0] * len(self.gaussians.rows())])
         dr.eval(self.gaussians.rows(), self.optimizer.arrays, self.truth, self.factors)
-        self._project, self._loss = recorded(project_views, RECORDINGS), recorded(_loss, RECORDINGS)
+        self._project, self._loss = recorded(project_views, limit=RECORDINGS), recorded(_loss, limit=RECORDINGS)
         self._update = Update(antialiased=False, scale=1.0)
         for stage in (self.project, self.bin, self.forward, self.loss, self.backward, self.update):
             stage()
@@ -44,7 +44,7 @@ class Pipeline:
     def project(self) -> None:
         """Gaussians to ellipses on the screen and colours."""
         found = self._project(self.gaussians.rows(), self.camera, DEGREE, False, (), 1.0)
-        self.splats, self.footprints, self.colour = *found[:2], found[2]["colour"]
+        self.splats, self.footprints, self.color = *found[:2], found[2]["color"]
 
     def bin(self) -> None:
         """Ellipses to lists of tiles."""
@@ -52,26 +52,26 @@ class Pipeline:
 
     def forward(self) -> None:
         """Lists to pixels."""
-        self.blended = forward(self.splats, self.colour, self.lists, *self.size, adjoint=True)
+        self.blended = forward(self.splats, self.color, self.lists, *self.size, adjoint=True)
         dr.eval(self.blended.features, self.blended.transmittance, self.blended.tile_last)
 
     def loss(self) -> None:
         """L1 + D-SSIM and the gradients of the pixels."""
-        self.by_pixel = self._loss(self.blended.features, self.blended.transmittance, self.truth, self.size)
+        self.grad_pixels = self._loss(self.blended.features, self.blended.transmittance, self.truth, self.size)
 
     def backward(self) -> None:
         """Gradients of the pixels to gradients of the ellipses and colours."""
-        self.by_splat = backward(self.splats, self.blended, self.lists, self.size, *self.by_pixel)
+        self.grad_splats = backward(self.splats, self.blended, self.lists, self.size, *self.grad_pixels)
 
     def update(self) -> None:
         """Gradients of the ellipses to those of the parameters, and an Adam step whose rates are 0."""
-        gradients = ViewGradients(self.camera, self.by_splat.splats, {"colour": self.by_splat.features})
+        gradients = ViewGradients(self.camera, self.grad_splats.splats, {"color": self.grad_splats.features})
         self._update(self.gaussians, self.optimizer, DEGREE, [gradients], self.factors, {})
 
     def frame(self) -> None:
         """Parameters to picture, as a user asks for it: colour and alpha, without gradients."""
-        output = render(self.gaussians, self.camera, outputs=("colour",))
-        dr.eval(output.colour, output.alpha)
+        output = render(self.gaussians, self.camera, outputs=("color",))
+        dr.eval(output.color, output.alpha)
 
     @property
     def blended_pairs(self) -> int:
@@ -90,9 +90,9 @@ def arguments_of(pipeline: Pipeline) -> dict[str, Any]:
     }
 
 
-def _loss(colour: list[Any], transmittance: Any, truth: list[Any], size: tuple[int, int]) -> tuple[list[Any], Any]:
+def _loss(color: list[Any], transmittance: Any, truth: list[Any], size: tuple[int, int]) -> tuple[list[Any], Any]:
     """Gradients of the loss over a grey background, by colour and transmittance."""
-    planes, passed = ad.Array3f(colour), ad.Float(transmittance)
+    planes, passed = ad.Array3f(color), ad.Float(transmittance)
     dr.enable_grad(planes, passed)
     dr.backward(photometric_loss(planes + 0.5 * passed, ad.Array3f(truth), *size, SSIM_WEIGHT))
     return list(dr.grad(planes)), dr.grad(passed)

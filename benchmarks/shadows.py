@@ -3,11 +3,12 @@
     python benchmarks/shadows.py --data DATA --out RUNS [--preset fast] [--iterations N] [--rows thesis,ours]
     python benchmarks/shadows.py --out RUNS
 
-Without DATA it makes one first: boxsat, 16 Suns x 40 views of 256 pixels, judged under these and under 8 never seen.
-Prints, for each method, what tables 4.4 and 4.5 of the thesis have, and the errors of the predicted shadow masks. Rows
-"thesis" are the methods as the thesis has them, with and without bias and refinement, in networks of the preset's size;
-rows "ours" add the field that knows surfaces, the bias that holds at grazing Suns, and one option each. What is trained
-already is not trained again: an interrupted call goes on where it stopped. Every run's report is in RUNS/NAME/eval.
+Without DATA it makes one first: boxsat, 16 Suns x 40 views of 256 pixels, evaluated under these and under 8 never seen.
+Prints, for each row, what tables 4.4 and 4.5 of the thesis have, and the errors of the predicted shadow masks. Rows
+"thesis" are the methods as the thesis has them, with and without bias and refinement, in networks of the preset's size
+(`spacesim reproduce` shows them in its own, beside its numbers); rows "ours" add the field that knows surfaces, the
+bias that holds at grazing Suns, and one option each. What is done already is not done again: an interrupted call goes
+on where it stopped. Every run's report is in RUNS/NAME/eval.
 """
 
 import argparse
@@ -21,15 +22,13 @@ import common
 
 from spacesim import backend
 from spacesim.data.store import read_dataset
-from spacesim.eval.evaluate import EvaluateConfig, evaluate
+from spacesim.eval.evaluate import EvaluateConfig
 from spacesim.eval.report.write import write_report
-from spacesim.progress import reporting, tell_training
-from spacesim.splat.light.shading import LightConfig
-from spacesim.splat.light.shadow.cast import ShadowConfig
+from spacesim.splat.light.config import LightConfig
+from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig
 from spacesim.splat.light.shadow.mapping import SUN_RADIUS_DEG, MappingConfig
 from spacesim.splat.light.shadow.refine import RefineConfig
-from spacesim.splat.train.config import FINE_OPACITY, TrainConfig, preset, with_field, with_options
-from spacesim.splat.train.train import train
+from spacesim.splat.train.config import TrainConfig, preset, with_options, with_settings
 
 SCENE = {"suns": 16, "views": 40, "test_suns": 8, "test_views": 5, "resolution": 256, "spp": 64, "test_spp": 1024}
 ROWS = ("thesis", "ours")
@@ -60,7 +59,7 @@ def main() -> None:
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--iterations", type=int, metavar="N")
     parser.add_argument("--rows", default=",".join(ROWS), help="of thesis,ours, or names of single rows")
-    parser.add_argument("--no-geometry", action="store_true", help="do not judge shapes")
+    parser.add_argument("--no-geometry", action="store_true", help="do not evaluate shapes")
     parser.add_argument("--markdown", action="store_true")
     parser.add_argument("--json", nargs="?", const=Path("-"), type=Path, metavar="FILE")
     options = parser.parse_args()
@@ -70,20 +69,22 @@ def main() -> None:
     unknown = [name for name in wanted if name not in (*ROWS, *table)]
     if unknown:
         sys.exit(f"--rows: expected some of {', '.join((*ROWS, *table))}, found {unknown[0]!r}")
-    data = options.data or make_data(options.out / "data")
+    dataset = read_dataset(options.data or make_data(options.out / "data"))
     judge = EvaluateConfig(geometry=None) if options.no_geometry else EvaluateConfig()
     results: dict[str, Any] = {}
     for name, (kind, config) in table.items():
         if kind in wanted or name in wanted:
             config = with_options(config, iterations=options.iterations)
-            results[name] = measure(name, config, judge, data, options.out)
-    write_report([options.out / name / "eval" for name in results], options.out / "report.html")
+            results[name] = common.measured(name, config, judge, dataset, options.out / name)
+    evaluated = [options.out / name / "eval" for name, found in results.items() if "note" not in found]
+    if evaluated:
+        write_report(evaluated, options.out / "report.html")
     tables = {
         f"{label.capitalize()} Suns": [row(name, metrics, part) for name, metrics in results.items()]
         for label, part in SUNS.items()
         if any(metrics.get(part) for metrics in results.values())
     }
-    common.emit({"rows": tables, "data": str(data)}, tables, options)
+    common.emit({"rows": tables, "data": str(dataset.root)}, tables, options)
 
 
 def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
@@ -102,15 +103,15 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "none, surface", relit
     yield "map, surface", mapped
     yield "splat, surface", splatted
-    yield "map, surface, thesis's shadows", with_shadow(mapped, bias=10.0, grazing="none", mapping=MappingConfig())
-    yield "map, surface, bilinear", with_shadow(mapped, mapping=MappingConfig())
+    yield "map, surface, thesis's shadows", with_shadow(mapped, bias=10.0, grazing="none", method=MappingConfig())
+    yield "map, surface, bilinear", with_shadow(mapped, method=MappingConfig())
     yield "map, surface, lifted alone", with_shadow(mapped, grazing="lift")
     yield "splat, surface, lifted alone", with_shadow(splatted, grazing="lift")
     yield "map, surface, no refinement", with_shadow(mapped, refine=None)
     closer = MappingConfig("percentage-closer", sun_radius_deg=SUN_RADIUS_DEG)
-    yield "map, surface, percentage-closer", with_shadow(mapped, mapping=closer)
-    other = "median" if shadow_of(mapped).mapping.filter == "variance" else "variance"
-    yield f"map, surface, {other}", with_shadow(mapped, mapping=MappingConfig(other))
+    yield "map, surface, percentage-closer", with_shadow(mapped, method=closer)
+    other = "median" if size == "fine" else "variance"
+    yield f"map, surface, {other}", with_settings(mapped, {"light.shadow.method": {"filter": other}})
     yield "none, surface, unfiltered", replace(relit, antialiased=False)
     yield "map, surface, unfiltered", replace(mapped, antialiased=False)
     yield "splat, surface, unfiltered", replace(splatted, antialiased=False)
@@ -119,8 +120,9 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, light of twice the size", with_shadow(mapped, size=2 * shadow_of(mapped).size)
     yield "map, surface, linear", replace(mapped, light=replace(mapped.light, linear=True))
     yield "map, surface, linear, filmic", replace(mapped, light=replace(mapped.light, linear=True, tone="filmic"))
-    yield "splat, surface, gradients", with_shadow(splatted, gradients=True)
-    both = with_shadow(replace(splatted, visibility_weight=0.1), gradients=True)
+    moving = SplattingConfig(gradients=True)
+    yield "splat, surface, gradients", with_shadow(splatted, method=moving)
+    both = with_shadow(replace(splatted, visibility_weight=0.1), method=moving)
     yield "splat, surface, supervised, gradients", both
     yield "splat, surface, lifted alone, supervised, gradients", with_shadow(both, grazing="lift")
     yield "none, surface, bounce", with_bounce(relit, splatted.light.bounce)
@@ -143,7 +145,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
 def finer(config: TrainConfig) -> TrainConfig:
     """More and smaller Gaussians: split at half of the size, and kept while they are faint."""
     size = 0.5 * config.refinement.split_screen_size
-    return replace(config, refinement=replace(config.refinement, split_screen_size=size, prune_opacity=FINE_OPACITY))
+    return replace(config, refinement=replace(config.refinement, split_screen_size=size, prune_opacity=0.005))
 
 
 def with_bounce(config: TrainConfig, emitters: int) -> TrainConfig:
@@ -154,13 +156,13 @@ def with_bounce(config: TrainConfig, emitters: int) -> TrainConfig:
 
 def as_thesis(config: TrainConfig) -> TrainConfig:
     """The field, the shadows and the splats as the thesis has them, in networks of the preset's size."""
-    assert config.light is not None
-    config = replace(config, light=replace(config.light, field=with_field(config.light.field, "thesis"), bounce=0))
+    config = with_settings(config, {"light.field.inputs": "directions", "light.bounce": 0})
     config = replace(config, antialiased=False, supersample=1)
-    shadow: dict[str, Any] = {"bias": 10.0, "grazing": "none", "mapping": MappingConfig()}
-    if config.light.shadow:
-        shadow["refine"] = RefineConfig(width=refine_of(config).width)
-    return with_shadow(config, **shadow) if config.light.shadow else config
+    if config.light is None or config.light.shadow is None:
+        return config
+    printed = preset("thesis", config.method)
+    refine = replace(refine_of(printed), width=refine_of(config).width)
+    return with_shadow(config, **{**vars(shadow_of(printed)), "size": config.light.shadow.size, "refine": refine})
 
 
 def as_ours(config: TrainConfig) -> TrainConfig:
@@ -169,14 +171,14 @@ def as_ours(config: TrainConfig) -> TrainConfig:
     assert config.light is not None
     if config.preset != "thesis":
         return config
-    config = replace(config, light=replace(config.light, field=with_field(config.light.field, "surface")))
+    config = with_settings(config, {"light.field.inputs": "surface"})
     config = replace(config, antialiased=preset("fast", config.method).antialiased)
-    if config.light.shadow is None:
+    if config.light is None or config.light.shadow is None:
         return config
     fast = preset("fast", config.method)
     ours, refine = shadow_of(fast), replace(refine_of(fast), width=refine_of(config).width)
     config = with_bounce(config, fast.light.bounce)
-    return with_shadow(config, bias=ours.bias, grazing=ours.grazing, mapping=ours.mapping, refine=refine)
+    return with_shadow(config, bias=ours.bias, grazing=ours.grazing, method=ours.method, refine=refine)
 
 
 def with_shadow(config: TrainConfig, **changes: Any) -> TrainConfig:
@@ -198,28 +200,15 @@ def refine_of(config: TrainConfig) -> RefineConfig:
     return refine
 
 
-def make_data(out: Path) -> Path:
-    from spacesim.scenes import generate, read_scene
-
-    scene = read_scene("boxsat", **SCENE, known_test_views=2, shared_test_views=True)
-    with reporting("generate", "frames") as report:
-        generate(scene, out, resume=True, progress=report)
-    return out
-
-
-def measure(name: str, config: TrainConfig, judge: EvaluateConfig, data: Path, out: Path) -> dict[str, Any]:
-    """metrics.json of a configuration, trained and judged."""
-    dataset, folder = read_dataset(data), out / name
-    with reporting(f"train {name}", "iterations") as report:
-        run = train(dataset, folder / "run", config, resume=True, on_progress=tell_training(report))
-    with reporting(f"evaluate {name}", "frames") as report:
-        metrics: dict[str, Any] = evaluate(run, dataset, folder / "eval", judge, report)
-    write_report([folder / "eval"], folder / "eval/report.html")
-    return metrics
+def make_data(out: Path, **changes: Any) -> Path:
+    """One boxsat under many Suns."""
+    return common.generated("boxsat", out, **{**SCENE, **changes}, known_test_views=2, shared_test_views=True)
 
 
 def row(name: str, metrics: dict[str, Any], part: str) -> common.Row:
     """Means over the frames of known or unseen Suns."""
+    if "note" in metrics:
+        return {"method": name, "Gaussians": metrics["note"]}
     found: common.Row = {"method": name, "Gaussians": metrics["model"]["gaussians"]}
     for heading, group, metric, *what in COLUMNS:
         value = ((metrics.get(part) or {}).get(group) or {}).get(metric)

@@ -15,7 +15,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import LearningRates, TrainConfig
-from spacesim.splat.train.strategies.default import DefaultStrategyConfig
+from spacesim.splat.train.strategies.control import RefinementConfig
 from spacesim.splat.train.trainer import Trainer
 
 VIEWS = 8
@@ -35,7 +35,7 @@ def write_dataset(root: Path, count: int, pixels: int, views: int = VIEWS) -> Da
     (root / "images").mkdir(parents=True)
     for index, direction in enumerate(fibonacci_sphere(views)):
         camera = camera_from(direction, pixels)
-        picture = render(model, Pinhole.of(camera), outputs=("colour",)).image("colour")
+        picture = render(model, Pinhole.of(camera), outputs=("color",)).image("color")
         name = f"images/train_{index:02d}.png"
         write_png(root / name, np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8), durable=False)
         frames.append({"file_path": name, "transform_matrix": camera.opengl.tolist()})
@@ -59,7 +59,7 @@ def still_trainer(dataset: Dataset, count: int, arrays: dict[str, np.ndarray] | 
         init_count=count,
         sh_every=1,
         rates=STILL,
-        refinement=DefaultStrategyConfig(refine_start=NEVER, refine_stop=NEVER),
+        refinement=RefinementConfig(refine_start=NEVER, refine_stop=NEVER),
         **options,
     )
     trainer = Trainer(dataset, config)

@@ -1,15 +1,17 @@
 """The rasterizer through `spacesim.torch.rasterization` beside our own path and, where it is installed, gsplat.
 
-python benchmarks/torch_door.py [--sizes 31622x512,...] [--peers gsplat] [--repeats 15] [--json]
+python benchmarks/torch_door.py [--sizes 31622x512,...] [--peers gsplat] [--repeats 15] [--store FILE.npz] [--json]
 
 A picture with its gradients, by all parameters of the Gaussians, for one camera: harmonics of degree 3, colour and
 alpha. "own" is `render` with Dr.Jit's gradients. With --peers gsplat the largest differences from its pictures and
-gradients are told, too; that needs CUDA.
+gradients are told, too; that needs CUDA. --store writes what gsplat makes of a small scene, which
+tests/test_torch.py holds ours against.
 """
 
 import json
 import time
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import common
@@ -32,6 +34,7 @@ def main() -> None:
     """Measure each size and print a table."""
     parser = common.arguments(__doc__, "31622x512,101958x512")
     parser.add_argument("--peers", choices=["gsplat"], help="measured beside ours; needs CUDA and gsplat")
+    parser.add_argument("--store", type=Path, metavar="FILE.npz", help="write the peer's pictures and gradients")
     options = parser.parse_args()
     name = backend.select(options.backend)
     try:
@@ -40,6 +43,9 @@ def main() -> None:
         raise InputError("torch: expected it, found none; type: pip install torch") from None
     gsplat = load_peer(options.peers, name, "gsplat")
     peer = gsplat and gsplat.rasterization
+    if options.store is not None and peer is not None:
+        np.savez_compressed(options.store, **_stored(torch, peer))
+        return
     from spacesim.torch import rasterization
 
     device = "cuda" if name == "cuda" else "cpu"
@@ -105,8 +111,8 @@ def _own(leaves: dict[str, Any], camera: Camera) -> None:
     for parameter in model.parameters().values():
         dr.disable_grad(parameter)
         dr.enable_grad(parameter)
-    output = render(model, Pinhole.of(camera), outputs=("colour", "alpha"))
-    total = sum((dr.sum(dr.square(plane)) for plane in output.colour), dr.sum(output.alpha))
+    output = render(model, Pinhole.of(camera), outputs=("color", "alpha"))
+    total = sum((dr.sum(dr.square(plane)) for plane in output.color), dr.sum(output.alpha))
     dr.backward(total)
     gradients = [dr.grad(parameter) for parameter in model.parameters().values()]
     dr.eval(gradients)
@@ -158,6 +164,37 @@ def _differences(
     for name, gradient in by_b.items():
         told[f"gradient {name}"] = float((by_a[name] - gradient).norm() / gradient.norm())
     return told
+
+
+def _stored(torch: Any, peer: Any) -> dict[str, np.ndarray]:
+    """Inputs, and for each of MODES pictures, alphas and gradients of a weighted sum of both, of 40 Gaussians before
+    two cameras of 32 x 24 pixels."""
+    rng = np.random.default_rng(7)
+    cameras = [Camera.look_at([3.5, 1, 1 - k], [0, 0, 0], 32, 24, 40) for k in range(2)]
+    found = {
+        "means": 0.6 * rng.normal(size=(40, 3)),
+        "quats": rng.normal(size=(40, 4)),
+        "scales": rng.uniform(0.05, 0.3, (40, 3)),
+        "opacities": rng.uniform(0.1, 0.95, 40),
+        "colors": 0.4 * rng.normal(size=(40, 16, 3)),
+        "viewmats": np.stack([camera.camera_from_world for camera in cameras]),
+        "Ks": np.stack([[[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]] for c in cameras]),
+        "backgrounds": rng.uniform(size=(2, 3)),
+        "weights": rng.normal(size=(2, 24, 32, 5)),
+    }
+    inputs = {name: array.astype(np.float32) for name, array in found.items()}
+    found = dict(inputs)
+    for number, mode in enumerate(MODES):
+        own = {name: torch.tensor(array, device="cuda") for name, array in inputs.items()}
+        weights = own.pop("weights")
+        if mode.get("camera_model") == "ortho":
+            own["Ks"][:, :2, :2] /= 4
+        leaves = {name: tensor.requires_grad_(name != "Ks") for name, tensor in own.items()}
+        picture, alpha, _ = peer(**leaves, width=32, height=24, sh_degree=3, packed=False, **mode)
+        ((weights[..., : picture.shape[-1]] * picture).sum() + (weights[..., 4:] * alpha).sum()).backward()
+        found |= {f"{number}.picture": picture.detach(), f"{number}.alpha": alpha.detach()}
+        found |= {f"{number}.by.{name}": leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    return {name: array if isinstance(array, np.ndarray) else array.cpu().numpy() for name, array in found.items()}
 
 
 if __name__ == "__main__":

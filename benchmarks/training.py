@@ -52,8 +52,8 @@ def main() -> None:
     parser.add_argument("--memory", action="store_true", help="bytes a Gaussian")
     parser.add_argument("--steps", type=int, metavar="N", help="counters over N steps with refinement")
     options = parser.parse_args()
-    if options.steps is not None and options.steps < counters.LEAST_STEPS:
-        raise SystemExit(f"--steps: expected at least {counters.LEAST_STEPS}, found {options.steps}")
+    if options.steps is not None and options.steps < counters.MIN_STEPS:
+        raise SystemExit(f"--steps: expected at least {counters.MIN_STEPS}, found {options.steps}")
     if options.opensplat and not options.opensplat.is_file():
         raise SystemExit(f"--opensplat: expected OpenSplat's binary, found no file {options.opensplat}")
     name = backend.select(options.backend)

@@ -30,18 +30,18 @@ import visitor
 from spacesim import backend
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Sun
-from spacesim.progress import reporting
-from spacesim.splat.compose import Composition, Placed, Pose
+from spacesim.progress import show_progress
+from spacesim.splat.compose import Composition, PlacedRun, Pose
 from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 from spacesim.splat.train.config import preset
-from spacesim.viewer.frames import draw
-from spacesim.viewer.memory import give_back
-from spacesim.viewer.opened import opened
-from spacesim.viewer.server import Show, Viewer
-from spacesim.viewer.stage import Stage
-from spacesim.viewer.state import MODES, SIDES, Look, Stand, View
+from spacesim.viewer.drawing.frames import draw_frame
+from spacesim.viewer.drawing.memory import give_back
+from spacesim.viewer.drawing.scene_renderer import SceneRenderer
+from spacesim.viewer.load import load_setup
+from spacesim.viewer.server import Viewer, ViewerSetup
+from spacesim.viewer.state import MODES, SIDES, DisplaySettings, SceneState, ViewerCamera
 
 EVERY = 2.0  #: seconds between two readings of the memory
 PATIENCE = 90.0  #: seconds that clients may take beyond their time
@@ -66,7 +66,7 @@ def main() -> None:
         if not least <= getattr(options, name) <= most:
             sys.exit(f"--{name}: expected {least} to {most:g}, found {getattr(options, name)}")
     backend.select(options.backend)
-    show = opened(options.path) if options.path else spheres(options.gaussians)
+    show = load_setup(options.path) if options.path else spheres(options.gaussians)
     rows = draws(show, options.side, options.repeats)
     viewer = Viewer(show, port=0)
     viewer.start()
@@ -75,12 +75,18 @@ def main() -> None:
         soak = look_around(viewer, options.seconds, options.clients, options.side) if options.seconds > 0 else {}
     finally:
         viewer.stop()
-    report = {"gaussians": show.stage.gaussians, "side": options.side, "draw": rows, "rates": rates, "soak": soak}
+    report = {
+        "gaussians": show.renderer.gaussian_count,
+        "side": options.side,
+        "draw": rows,
+        "rates": rates,
+        "soak": soak,
+    }
     tables = {"Pictures in full resolution, ms": rows, "Frames a client gets while it moves": rates}
     common.emit(report, {**tables, "Looking around": [soak] if soak else []}, options)
 
 
-def spheres(count: int) -> Show:
+def spheres(count: int) -> ViewerSetup:
     """Two relightable spheres of half the Gaussians each, one above the other."""
     config = preset("demo", "shadow-map").light
     assert config is not None
@@ -91,15 +97,15 @@ def spheres(count: int) -> Show:
         arrays["features"] = rng.normal(size=(count // 2, config.features)).astype(np.float32)
         light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, common.DISTANCE, 1.0), k)
         run = Run(Path(f"sphere{k}"), {"method": "shadow-map"}, {}, Gaussians.from_numpy(arrays), 0, light)
-        placed.append(Placed(run, Pose(translation=np.array([0.0, 0, height]), scale=0.8), f"sphere {k}"))
-    stage = Stage(Composition(placed))
+        placed.append(PlacedRun(run, Pose(translation=np.array([0.0, 0, height]), scale=0.8), f"sphere {k}"))
+    renderer = SceneRenderer(Composition(placed))
     poses = tuple(one.pose for one in placed)
-    return Show(stage, Stand(poses, Sun.from_angles(45, 60)), (None, None), None, Path())
+    return ViewerSetup(renderer, SceneState(poses, Sun.from_angles(45, 60)), (None, None), None, Path())
 
 
-def places(show: Show) -> Iterator[np.ndarray]:
+def places(show: ViewerSetup) -> Iterator[np.ndarray]:
     """Poses [4, 4] of a camera that goes round the scene for ever."""
-    centre, radius = show.stage.bounds(show.stand)
+    centre, radius = show.renderer.bounds(show.state)
     return visitor.places(centre, 3.5 * radius)
 
 
@@ -108,27 +114,29 @@ def suns() -> Iterator[Sun]:
         yield Sun.from_angles(7.0 * k % 360, 40)
 
 
-def draws(show: Show, side: int, repeats: int) -> list[common.Row]:
+def draws(show: ViewerSetup, side: int, repeats: int) -> list[common.Row]:
     """Milliseconds of a picture."""
     camera, sun = places(show), suns()
-    still = View(next(places(show)), visitor.FOV, side, side)
+    still = ViewerCamera(next(places(show)), visitor.FOV, side, side)
 
-    def turned() -> Stand:
-        pose = show.stand.poses[0]
+    def turned() -> SceneState:
+        pose = show.state.poses[0]
         angle = 0.05 * next(counter)
         rotation = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-        return show.stand.placed(0, Pose(rotation @ pose.rotation, pose.translation, pose.scale))
+        return show.state.with_pose(0, Pose(rotation @ pose.rotation, pose.translation, pose.scale))
 
     counter = itertools.count()
-    look = Look(side=side)
+    settings = DisplaySettings(side=side)
     works: dict[str, common.Work] = {
-        f"{mode}, another camera": lambda mode=mode: draw(
-            show.stage, show.stand, replace(still, world_from_camera=next(camera)), replace(look, mode=mode)
+        f"{mode}, another camera": lambda mode=mode: draw_frame(
+            show.renderer, show.state, replace(still, world_from_camera=next(camera)), replace(settings, mode=mode)
         )
         for mode in MODES
     }
-    works["colour, another Sun"] = lambda: draw(show.stage, replace(show.stand, sun=next(sun)), still, look)
-    works["colour, another pose"] = lambda: draw(show.stage, turned(), still, look)
+    works["colour, another Sun"] = lambda: draw_frame(
+        show.renderer, replace(show.state, sun=next(sun)), still, settings
+    )
+    works["colour, another pose"] = lambda: draw_frame(show.renderer, turned(), still, settings)
     found: dict[str, common.Timing] = {}
     for name, work in works.items():  # one after another: what a change leaves as it was is not computed again
         found |= common.interleaved({name: work}, repeats)
@@ -139,7 +147,7 @@ def draws(show: Show, side: int, repeats: int) -> list[common.Row]:
 
 def rate(viewer: Viewer, mode: str, side: int, lasts: float) -> common.Row:
     """Frames a second of a client that moves all the time; the first half does not count."""
-    client, camera = visitor.Visitor(viewer.url, (side, side)), places(viewer.show)
+    client, camera = visitor.Visitor(viewer.url, (side, side)), places(viewer.setup)
     client.begin()
     client.use("Mode", mode)
     client.use("Resolution", str(min((one for one in SIDES if one >= side), default=SIDES[-1])))
@@ -149,7 +157,7 @@ def rate(viewer: Viewer, mode: str, side: int, lasts: float) -> common.Row:
         client.picture()
         if now > start + lasts / 2:
             count += 1
-            shares += [one.session._pace.share for one in list(viewer.clients.values())]
+            shares += [one.session._resolution.share for one in list(viewer.clients.values())]
     client.leave()
     while viewer.clients:
         time.sleep(0.01)
@@ -161,11 +169,14 @@ def look_around(viewer: Viewer, lasts: float, clients: int, side: int) -> common
     command = [sys.executable, str(Path(__file__).with_name("visitor.py")), viewer.url]
     command += ["--seconds", str(lasts), "--clients", str(clients), "--side", str(side)]
     start, sizes, kept = time.monotonic(), [], list[tuple[float, float, int]]()
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as visitors, reporting("look around", "seconds") as report:
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE) as visitors,
+        show_progress("look around", "seconds") as report,
+    ):
         while visitors.poll() is None and (now := time.monotonic() - start) < lasts + PATIENCE:
             sizes.append(_megabytes())
             if now >= lasts * (len(kept) + 1) / 10:
-                kept.append((now, _kept(viewer), backend.recordings()))
+                kept.append((now, _cache(viewer), backend.recordings()))
             report(min(int(now), int(lasts)), int(lasts), f"{sizes[-1]:.0f} MiB")
             time.sleep(min(EVERY, lasts / 20))
         told, _ = visitors.communicate(timeout=PATIENCE)
@@ -184,7 +195,7 @@ def look_around(viewer: Viewer, lasts: float, clients: int, side: int) -> common
     }
 
 
-def _kept(viewer: Viewer) -> float:
+def _cache(viewer: Viewer) -> float:
     """MiB once what is free has gone back to the system."""
     found, done = [], threading.Event()
 
@@ -194,7 +205,7 @@ def _kept(viewer: Viewer) -> float:
         found.append(_megabytes())
         done.set()
 
-    viewer.loop.do(read)
+    viewer.loop.submit(read)
     done.wait(PATIENCE)
     return found[0]
 

@@ -13,7 +13,9 @@ def main(data="out/examples/data", out="out/examples/run", iterations=1_000, gau
     view = run.render(dataset.test[0].camera, sun=(40, 25))  # view.rgb [H, W, 3], view.depth [H, W] metres
     for name, kind in ("view.png", "rgb"), ("depth.exr", "depth"), ("shadow.png", "shadow"), ("normal.png", "normal"):
         view.save(f"{out}/{name}", kind)
-    print(f"{out}: {run.gaussians} Gaussians in {run.bytes / 1e6:.1f} MB, trained on {run.training['backend']}")
+    print(
+        f"{out}: {run.gaussian_count} Gaussians in {run.model_bytes / 1e6:.1f} MB, trained on {run.training['backend']}"
+    )
     return run
 
 

@@ -1,4 +1,4 @@
-"""3. Evaluate: judge the run of 02_reconstruct.py on held-out views, print the metrics, write the report.
+"""3. Evaluate: evaluate the run of 02_reconstruct.py on held-out views, print the metrics, write the report.
 
 python examples/03_evaluate.py        a few seconds; writes out/examples/eval
 """

@@ -26,12 +26,12 @@ def main(out="out/examples/fit.png", count=300, size=128, steps=200):
     optimizer, losses = Adam(lr=1e-2, params=start.parameters()), []
     for _ in range(steps):
         picture = ss.render(ss.Gaussians(**dict(optimizer.items())), camera)
-        loss = dr.mean(dr.square(picture.colour - target), axis=None)
+        loss = dr.mean(dr.square(picture.color - target), axis=None)
         dr.backward(loss)
         optimizer.step()
         losses.append(float(loss[0]))
     print(f"mean squared error: {losses[0]:.5f} at first, {losses[-1]:.5f} after {steps} steps")
-    both = np.hstack([truth, picture.image("colour").mean(axis=-1)])
+    both = np.hstack([truth, picture.image("color").mean(axis=-1)])
     Path(out).parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.rint(255 * np.clip(both, 0, 1)).astype(np.uint8)).save(out)
     return losses

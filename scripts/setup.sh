@@ -1,10 +1,10 @@
 #!/bin/sh
-# Makes ./.venv ready: setup.sh base (to run spacesim) or setup.sh test (to test it as well).
+# Makes ./.venv ready: setup.sh base (to run spacesim), test (to test it as well) or docs (to build its documentation).
 #
 # 1. a Python from 3.10 to 3.13 with venv ($PYTHON, else the first that fits on the path)
 # 2. the versions that requirements/lock.txt pins
 # 3. libatomic, which Dr.Jit's wheel takes for granted
-# 4. a backend for Dr.Jit: a CUDA device, else libLLVM 19 or newer (spacesim/backend.py says what it looks for)
+# 4. a backend for Dr.Jit: a CUDA device, else libLLVM 19 or newer (spacesim/backend/llvm.py says what it looks for)
 #
 # Debian and Ubuntu keep venv, libatomic and libLLVM in packages of their own; they are installed with apt-get where missing.
 set -eu
@@ -121,7 +121,13 @@ if [ "$WANTED" = test ]; then
         say "PyAV cannot be had here; the tests that need it (videos) are skipped"
     install --no-build-isolation -e '.[viewer]' 2>/dev/null ||
         say "viser cannot be had here; the tests that need it (the viewer) are skipped"
+    install --no-build-isolation -e '.[docs]' 2>/dev/null ||
+        say "mkdocs-material cannot be had here; the test that builds the documentation site is skipped"
     install torch 2>/dev/null || install --retries 1 --extra-index-url "$TORCH_CPU" torch 2>/dev/null ||
         say "torch's CPU build cannot be had here; the tests that need it (LPIPS) are skipped"
+fi
+if [ "$WANTED" = docs ]; then
+    install --no-build-isolation -e '.[docs]'
+    install torch 2>/dev/null || install --extra-index-url "$TORCH_CPU" torch # its part of the API is documented, too
 fi
 say "done"

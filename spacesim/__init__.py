@@ -6,6 +6,7 @@
     run = ss.train(data, "run", preset="demo", method="shadow-map")
     view = run.render(data.test[0].camera, sun=(40, 25))
     scores = ss.evaluate(run, data, "eval")
+    pose = ss.refine_pose(run, image, camera, sun=(40, 25))
 
 Everything is imported when it is first used: `import spacesim` itself takes no time.
 """
@@ -19,13 +20,20 @@ if TYPE_CHECKING:
     from spacesim.api import (
         BackendError,
         Camera,
+        Composed,
         Dataset,
+        Frame,
         Gaussians,
+        Image,
+        PosedScene,
+        RefinedPose,
         Rendering,
+        RenderOutput,
         Run,
         SceneConfig,
         Sun,
         TrainConfig,
+        Truth,
         compose,
         evaluate,
         generate,
@@ -36,6 +44,7 @@ if TYPE_CHECKING:
         preset,
         read_dataset,
         read_scene,
+        refine_pose,
         render,
         train,
         write_report,
@@ -46,14 +55,21 @@ __version__ = "0.1.0"
 __all__ = [
     "BackendError",
     "Camera",
+    "Composed",
     "Dataset",
+    "Frame",
     "Gaussians",
+    "Image",
     "InputError",
+    "PosedScene",
+    "RefinedPose",
+    "RenderOutput",
     "Rendering",
     "Run",
     "SceneConfig",
     "Sun",
     "TrainConfig",
+    "Truth",
     "WorkError",
     "compose",
     "evaluate",
@@ -65,6 +81,7 @@ __all__ = [
     "preset",
     "read_dataset",
     "read_scene",
+    "refine_pose",
     "render",
     "train",
     "write_report",

@@ -1,10 +1,10 @@
 """What `import spacesim as ss` gives: plain values in, records and numpy arrays out.
 
-Each function says in one call what the command of its name does; what is behind it stands in the rooms of
-docs/architecture.md.
+Each function says in one call what the command of its name does; what is behind it stands in the layers of
+docs/explanation/architecture.md.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,16 @@ from typing import Any
 from spacesim.backend import BackendError
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
-from spacesim.data.records import Camera, Dataset, Sun
+from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
 from spacesim.data.store import load_truth
 from spacesim.data.transforms import read_dataset
 from spacesim.scenes import SceneConfig, read_scene
 from spacesim.scenes import generate as _generate
-from spacesim.splat.compose import PosedScene
+from spacesim.splat.compose import PosedScene, load_predictor
 from spacesim.splat.compose.output import Composed
 from spacesim.splat.compose.output import compose as _compose
 from spacesim.splat.compose.scenefile import load_scene
+from spacesim.splat.pose import RefinedPose, refine_pose
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import RenderOutput
@@ -28,19 +29,26 @@ from spacesim.splat.raster.render import render as _render
 from spacesim.splat.run import Rendering, Run, load_run
 from spacesim.splat.train.config import TrainConfig, preset
 
-Progress = Callable[[int, int, str], None]
-"""Called with (done, of all, what is at work)."""
+ProgressCallback = Callable[[int, int, str], None]
+"""Called now and then with how much is done, of how much, and words about it."""
 
 __all__ = [
     "BackendError",
     "Camera",
+    "Composed",
     "Dataset",
+    "Frame",
     "Gaussians",
+    "Image",
+    "PosedScene",
+    "RefinedPose",
+    "RenderOutput",
     "Rendering",
     "Run",
     "SceneConfig",
     "Sun",
     "TrainConfig",
+    "Truth",
     "compose",
     "evaluate",
     "generate",
@@ -51,6 +59,7 @@ __all__ = [
     "preset",
     "read_dataset",
     "read_scene",
+    "refine_pose",
     "render",
     "train",
     "write_report",
@@ -63,18 +72,21 @@ def generate(
     *,
     resume: bool = False,
     workers: int = 1,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     **options: Any,
 ) -> Dataset:
-    """Path-trace a dataset with its truth into the folder `out` (docs/dataset.md).
+    """Path-trace a dataset with its truth into the folder `out` (docs/reference/dataset.md).
 
     scene: name of a built-in scene ("boxsat"), a scene file (.toml), a mesh file, or what `read_scene` returns
     resume: complete what an interrupted call has left; a finished dataset is returned as it is
     workers: processes of this machine
     options: of the scene, as the command line has them: suns, views, test_suns, test_views, sun=[(azimuth, elevation),
-        ...] in degrees, distance in metres, resolution=256 or (width, height) in pixels, fov_deg, exposure, spp, seed
+        ...] in degrees, distance in metres, resolution=256 or (width, height) in pixels, fov_deg, exposure (display
+        value of a radiance of 1 W m^-2 sr^-1), spp (samples a pixel), seed
+    progress: called with (frames done, frames in all, name of the frame last done)
 
-    Raises InputError for a scene, an option or a folder that cannot be, WorkError where disk or processes fail.
+    Raises InputError for a scene, an option or a folder that cannot be, WorkError where disk, memory or processes fail,
+    BackendError where no backend can run.
     """
     if not isinstance(scene, SceneConfig):
         scene = read_scene(scene, **options)
@@ -88,39 +100,50 @@ def train(
     out: str | Path,
     config: TrainConfig | None = None,
     *,
-    preset: str = "fast",
-    method: str = "vanilla",
-    strategy: str = "default",
+    preset: str | None = None,
+    method: str | None = None,
+    strategy: str | None = None,
+    settings: Mapping[str, Any] | None = None,
     resume: bool = False,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     **options: Any,
 ) -> Run:
     """Train Gaussians on a dataset and write the run to the folder `out`.
 
     data: a folder of a Nerfstudio dataset, ours or another's, or what `read_dataset` returns
-    config: the whole configuration; or else, by name, a preset ("demo", "fast", "fine", "thesis"), a method ("vanilla",
-        "relight", "shadow-map", "shadow-splat", "park") and a strategy ("default", "mesh-aware", "support-aware",
-        "mcmc"), and as `options` fields of TrainConfig: iterations=7000, seed=0, init_count=20000, ...
+    config: the whole configuration; without one, what `preset` returns for these names, refused beside a configuration
+    preset: None is "fast";  method: None is "vanilla";  strategy: None is "default"
+    options: fields of TrainConfig in place of the configuration's: iterations=7000, which shortens its whole schedule
+        where it is fewer, seed=0, init_count=20000, ...
+    settings: fields by their dotted names, as `spacesim train --set` has them: {"light.shadow.bias": 5}
     resume: go on from the newest checkpoint, with the same result to the bit; a finished run is returned as it is
+    progress: called with (iterations done, iterations in all, "loss 0.0123, 4000 Gaussians") now and then
 
     Raises InputError for data, a configuration or a folder that cannot be, WorkError where the loss is not finite or
-    the disk is full.
+    the disk is full, BackendError where no backend can run.
     """
     from spacesim.splat.train import config as configuration
     from spacesim.splat.train.train import train as run_training
 
+    names = {"preset": preset, "method": method, "strategy": strategy}
+    choices = {name: word for name, word in names.items() if word is not None}
     if config is None:
-        config = configuration.preset(preset, method, strategy)
+        config = configuration.preset(choices.pop("preset", "fast"), **choices)
+    elif choices:
+        name, word = next(iter(choices.items()))
+        raise InputError(f"{name}: expected none beside a configuration, found {word!r}")
     unknown = [name for name in options if name not in TrainConfig.__dataclass_fields__]
     if unknown:
         raise InputError(f"{unknown[0]}: expected a field of TrainConfig, found none of that name")
+    config = configuration.shortened(config, options.get("iterations", config.iterations))
+    config = configuration.with_settings(replace(config, **options), settings or {})
     dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
 
     def tell(state: Any) -> None:
         if progress is not None:
-            progress(state.iteration, state.iterations, f"loss {state.loss:.4f}, {state.gaussians} Gaussians")
+            progress(state.iteration, state.iterations, f"loss {state.loss:.4f}, {state.gaussian_count} Gaussians")
 
-    return run_training(dataset, Path(out), replace(config, **options), resume, tell)
+    return run_training(dataset, Path(out), config, resume, tell)
 
 
 def evaluate(
@@ -131,26 +154,28 @@ def evaluate(
     split: str = "test",
     lpips_weights: str | Path | None = None,
     geometry: bool = True,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
-    """Judge a run against a dataset; write metrics.json, report.html and the frames' pictures into the folder `out`.
+    """Evaluate a run against a dataset; write metrics.json, report.html and the frames' pictures into the folder `out`.
 
-    run: a folder, or what `train` or `load_run` returns;  split: "test", "train" or "all"
+    run: a folder, a scene file, or what `train` or `load_run` returns;  split: "test", "train" or "all"
     lpips_weights: a file or folder of AlexNet and linear weights, without which LPIPS is null
-    geometry: judge the shape, too
+    geometry: evaluate the shape, too
+    progress: called with (frames done, frames in all, file of the next) before each frame and at the end
 
-    Returns what metrics.json holds (docs/metrics.md): scores["image"]["psnr"]["mean"] in dB, and so on; None for what
-    cannot be computed. Raises InputError where there is nothing to judge.
+    Returns what metrics.json holds (docs/reference/metrics.md): scores["image"]["psnr"]["mean"] in dB, and so on; None
+    for what cannot be computed. Raises InputError where there is nothing to evaluate, WorkError where a
+    prediction is not finite, BackendError where no backend can run.
     """
     from spacesim.eval.evaluate import EvaluateConfig
-    from spacesim.eval.evaluate import evaluate as judge
+    from spacesim.eval.evaluate import evaluate as evaluate_run
 
     weights = None if lpips_weights is None else Path(lpips_weights)
     config = EvaluateConfig(split, weights)
-    judged = run if isinstance(run, Run) else load_run(Path(run))
+    loaded = load_predictor(Path(run)) if isinstance(run, str | Path) else run
     dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
     config = config if geometry else replace(config, geometry=None)
-    metrics = judge(judged, dataset, Path(out), config, progress)
+    metrics = evaluate_run(loaded, dataset, Path(out), config, progress)
     write_report(out, Path(out) / "report.html")
     return metrics
 
@@ -171,8 +196,10 @@ def compose(scene: str | Path | PosedScene, out: str | Path, *, size: int | tupl
     """Render a scene of several runs, with shadows on each other, into the folder `out`: pictures, depth, object
     numbers, visibility, a contact sheet and, of several frames, a video.
 
-    scene: a scene file (docs/composition.md), or what `load_scene` returns;  size: pixels of the longer side, or
-    (width, height), in place of the camera's. Raises InputError for a scene or a folder that cannot be.
+    scene: a scene file (docs/reference/composed-scenes.md), or what `load_scene` returns
+    size: pixels of the longer side, or (width, height), in place of the camera's
+
+    Raises InputError for a scene or a folder that cannot be, BackendError where no backend can run.
     """
     posed = scene if isinstance(scene, PosedScene) else load_scene(Path(scene))
     return _compose(posed, Path(out), size)
@@ -181,8 +208,12 @@ def compose(scene: str | Path | PosedScene, out: str | Path, *, size: int | tupl
 def render(gaussians: Gaussians, camera: Camera, **options: Any) -> RenderOutput:
     """Gaussians seen by a camera, as Dr.Jit arrays: differentiable by every parameter that has gradients enabled.
 
-    options: sh_degree, outputs=("colour", "alpha", "depth", "median_depth", "normal"), features, antialiased; see
-    docs/rasterizer.md. `RenderOutput.to_numpy()` gives (colour [H, W, 3], alpha [H, W], depth [H, W] in metres).
-    Raises ValueError for another output.
+    sh_degree: highest degree of spherical harmonics used; by default all that are stored
+    outputs: ("color", "alpha", "depth") by default, also "median_depth" and "normal"; alpha is always there
+    features: C arrays [N] of numbers to blend beside them
+    antialiased: with Mip-Splatting's 2D filter; see docs/how-to/gradients.md for all of these
+
+    `RenderOutput.to_numpy()` gives (colour [H, W, 3], alpha [H, W], depth [H, W] in metres). Raises ValueError for
+    another output or features of another length, BackendError where no backend can run.
     """
     return _render(gaussians, Pinhole.of(camera), **options)

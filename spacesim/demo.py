@@ -14,7 +14,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, read_json, write_json
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report.write import write_report
-from spacesim.progress import Reporter, tell_training
+from spacesim.progress import Reporter, report_training
 from spacesim.scenes import generate, read_scene
 from spacesim.scenes.generation.generate import versions
 from spacesim.splat.train.config import preset
@@ -55,7 +55,7 @@ def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Repor
     finished("generate")
     with reporting("train", "iterations") as report:
         command = ("spacesim", "demo", "--out", str(out))
-        run = train(dataset, out / "run", TRAINING, True, tell_training(report), command)
+        run = train(dataset, out / "run", TRAINING, True, report_training(report), command)
     finished("train")
     with reporting("evaluate", "frames") as report:
         metrics = evaluate(run, dataset, out / "eval", EvaluateConfig(), report)

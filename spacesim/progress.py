@@ -10,7 +10,7 @@ from rich import progress
 from rich.console import Console
 
 if TYPE_CHECKING:
-    from spacesim.splat.train.trainer import Progress
+    from spacesim.splat.train.trainer import TrainingProgress
 
 LINE_EVERY = 5.0  #: seconds between two plain lines
 
@@ -40,13 +40,13 @@ class Reporter:
             self.last_line = now
 
 
-def tell_training(report: Reporter) -> "Callable[[Progress], None]":
+def report_training(report: Reporter) -> "Callable[[TrainingProgress], None]":
     """What tells `report` of a training's progress."""
-    return lambda p: report(p.iteration, p.iterations, f"loss {p.loss:.4f}  {p.gaussians} Gaussians")
+    return lambda p: report(p.iteration, p.iterations, f"loss {p.loss:.4f}  {p.gaussian_count} Gaussians")
 
 
 @contextmanager
-def reporting(title: str, unit: str, quiet: bool = False) -> Iterator[Reporter]:
+def show_progress(title: str, unit: str, quiet: bool = False) -> Iterator[Reporter]:
     """A `Reporter` for the work of the `with` block. quiet: no bar (plain lines go on)."""
     console = Console(stderr=True)
     if quiet or not console.is_terminal:

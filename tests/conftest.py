@@ -1,5 +1,6 @@
 """One tiny dataset, one tiny run and its evaluation, for the tests of the command line."""
 
+import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,30 @@ from tiny import GENERATE, TRAIN, Outcome, call
 
 # A shell may have started us with Ctrl-C ignored, which the commands that tests start and stop would inherit.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+LONGEST = ("test_attack", "test_benchmarks", "test_robustness", "test_refine_pose", "test_workers", "test_doc_commands")
+"""Files of tests that take long, the longest first: what is left at the end is short, and processes end together."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest."""
+    order = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
+
+#: folders of tests whose subject is what threads do together
+ALL_THREADS = (Path(__file__).parent / "splat" / "raster", Path(__file__).parent / "splat" / "train")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _threads(request) -> None:
+    """Test processes side by side share the cores: threads of Dr.Jit that wait for work keep one busy."""
+    import drjit
+
+    count, processes = len(os.sched_getaffinity(0)), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    together = any(folder in request.path.parents for folder in ALL_THREADS)
+    drjit.set_thread_count(count if together else max(1, count // processes))
 
 
 @pytest.fixture(scope="session")
@@ -37,7 +62,7 @@ def tiny_run(tiny_data, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_eval(tiny_run, tiny_data, tmp_path_factory) -> Path:
-    """`tiny_run` judged on the test views of `tiny_data`."""
+    """`tiny_run` evaluated on the test views of `tiny_data`."""
     out = tmp_path_factory.mktemp("tiny") / "eval"
     done = call("eval", tiny_run, "--data", tiny_data, "--out", out)
     assert done.code == 0, done.errors

@@ -1,5 +1,8 @@
 """Finding libLLVM and saying what is missing, in processes of their own: none aborts or shows a traceback."""
 
+import ctypes
+import inspect
+import mmap
 import os
 import re
 import shutil
@@ -8,6 +11,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from spacesim import backend, doctor
@@ -103,7 +107,7 @@ def old_library() -> str | None:
     for pattern in llvm._LIBRARY_PLACES:
         for path in Path("/").glob(pattern.lstrip("/")):
             match = re.search(r"libLLVM(?:-|\.so\.)(\d+)", path.name)
-            if match and 14 <= int(match.group(1)) < llvm.MINIMUM_LLVM:
+            if match and 14 <= int(match.group(1)) < llvm.MIN_LLVM:
                 return str(path)
     return None
 
@@ -129,7 +133,7 @@ def test_importing_the_package_first_is_enough(imports):
     minima, libraries = run(LOADED.format(imports=imports)).splitlines()
     assert minima == "[1, 3]"
     (library,) = libraries.split()
-    assert llvm._library_version(Path(library)) >= llvm.MINIMUM_LLVM
+    assert llvm._library_version(Path(library)) >= llvm.MIN_LLVM
 
 
 def test_the_newest_is_named_unless_the_user_has_named_one(fakes):
@@ -221,7 +225,7 @@ def test_recordings_tell_constants_apart_that_occur_twice():
     def function(x, sizes, extra, flag):
         return x * sizes[0] + 10 * sizes[1] * x + 100 * extra * x + (1000 * x if flag else 0)
 
-    recorded = backend.recorded(function, 8)
+    recorded = backend.recorded(function, limit=8)
     for extra in (3, 4):
         for flag in (True, False):
             expected = 3 + 40 + 100 * extra + 1000 * flag
@@ -269,7 +273,7 @@ def test_recorded_functions_get_what_they_are_called_with():
         first = things["rows"]
         return {"sum": [a + x * b for a, b in first], "rest": _Pair(rest[0].one[1] - x, rest[0].other)}
 
-    recorded = backend.recorded(function, 4)
+    recorded = backend.recorded(function, limit=4)
     for k in (1, 2):
         x, y, z = (ad.Float(k, 2.0 * k, i) for i in range(3))
         v = ad.Array2f(ad.Float(1.0, k, 0), ad.Float(0.0, k, 5))
@@ -280,6 +284,57 @@ def test_recorded_functions_get_what_they_are_called_with():
     assert len(seen) == 1
     things, (pair,) = seen[0]
     assert (things["n"], type(things["rows"][0]), pair.one[::2]) == (None, tuple, (3, "a"))
+
+
+def test_a_recorded_function_is_traced_where_no_recording_serves():
+    """One element, none, gradients, and within another recording."""
+    import drjit as dr
+
+    ad, seen = backend.ad, []
+
+    @backend.recorded
+    def scaled(x, factor=2.0):
+        """`x` times a number."""
+        seen.append(dr.width(x))
+        return factor * x
+
+    assert (scaled.__doc__, list(inspect.signature(scaled).parameters)) == ("`x` times a number.", ["x", "factor"])
+    three, one = ad.Float(1.0, 2.0, 3.0), ad.Float(4.0)
+    for _ in range(2):
+        assert scaled(three).numpy() == pytest.approx([2, 4, 6])
+        assert scaled(three, factor=3.0).numpy() == pytest.approx([3, 6, 9])
+    assert seen == [3, 3]  # each factor once
+    for _ in range(2):
+        assert scaled(one).numpy() == pytest.approx([8])
+    assert seen == [3, 3, 1, 1]
+    leaf = ad.Float(three)
+    dr.enable_grad(leaf)
+    dr.backward(scaled(leaf))
+    assert dr.grad(leaf).numpy() == pytest.approx([2, 2, 2])
+    assert scaled.traced(three).numpy() == pytest.approx([2, 4, 6])
+
+    before, outer = backend.recordings(), backend.recorded(lambda x: scaled(x) + 1)
+    assert [list(outer(three + i).numpy()) for i in range(2)] == [[3, 5, 7], [5, 7, 9]]
+    assert backend.recordings() == before + 1
+
+
+def test_what_one_element_is_can_be_said():
+    import drjit as dr
+
+    ad, seen = backend.ad, []
+
+    def summed(x, width):
+        seen.append(width)
+        return dr.gather(ad.Float, x, dr.arange(ad.UInt32, width))
+
+    by_width = backend.recorded(summed, elements=lambda _, x, width: width)
+    x = ad.Float(1.0, 2.0, 3.0)
+    for width in (2, 1, 2, 1):
+        assert list(by_width(x, width).numpy()) == [1, 2][:width]
+    assert seen == [2, 1, 1]
+    always = backend.recorded(lambda x: seen.append("one") or x + 1, elements=None)
+    assert [float(always(dr.opaque(ad.Float, i))[0]) for i in range(3)] == [1, 2, 3]
+    assert seen[3:] == ["one"]
 
 
 @pytest.mark.parametrize(
@@ -353,3 +408,22 @@ def test_device_memory_falls_with_what_is_taken():
     assert before - left >= 2**30 - 2**20
     del array
     assert backend.free_memory(10**18) > left + 2**29
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is protected by Linux's calls")
+@pytest.mark.parametrize("count", [1, 5, 16, 31])
+def test_upload_reads_nothing_beyond_the_array(count):
+    """Values that end where their page ends, and the next page cannot be read: what a kernel of LLVM dies of."""
+    import drjit as dr
+
+    from spacesim.backend.upload import upload
+
+    libc, page = ctypes.CDLL(None, use_errno=True), mmap.PAGESIZE
+    pages = mmap.mmap(-1, 2 * page)
+    start = ctypes.addressof(ctypes.c_char.from_buffer(pages))
+    assert libc.mprotect(ctypes.c_void_p(start + page), ctypes.c_size_t(page), 0) == 0
+    for kind, dtype in ((backend.ad.Float, np.float32), (backend.ad.UInt32, np.uint32), (backend.ad.Bool, np.bool_)):
+        values = np.frombuffer(pages, dtype, count, page - count * np.dtype(dtype).itemsize)
+        values[:] = 1
+        assert np.array(dr.select(upload(values, kind) == kind(1), backend.ad.Float(2), 3)).tolist() == [2] * count
+        del values

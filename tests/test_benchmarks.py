@@ -9,6 +9,7 @@ import sys
 import time
 from itertools import pairwise
 from pathlib import Path
+from unittest.mock import ANY
 from xml.etree import ElementTree
 
 import numpy as np
@@ -197,7 +198,7 @@ def test_rasterizer_tells_every_stage(command):
     (row,) = report["rows"]
     stages = {"project", "bin", "forward", "backward", "frame"}
     assert set(row["clock"]) == stages < set(row["kernels"])
-    assert all(row["kernels"][stage] > 0 for stage in stages)
+    assert all(row["kernels"][renderer] > 0 for renderer in stages)
     assert row["kernels"]["sum"] == pytest.approx(sum(row["kernels"][s] for s in stages - {"frame"}))
     assert {"device", "drjit", "spacesim", "backend"} <= set(report["machine"])
     assert row["pairs"] > 300  # every splat touches a tile, nearly every one of this sphere's front
@@ -346,26 +347,19 @@ def test_light_tells_frames_and_steps(command, place):
 
 
 @smallest(
-    "strategies.py --backend llvm --data DATA --out RUNS --preset demo --method vanilla --iterations 6 --figure-steps 4"
-    " --start-gaussians 50 --plot figure.svg --rows default,mesh-aware,figure"
+    "strategies.py --backend llvm --data DATA --out RUNS --preset demo --method vanilla --iterations 6"
+    " --start-gaussians 50 --rows default,mesh-aware"
 )
-def test_strategies_tells_tables_and_the_figure_and_goes_on_where_it_stopped(command, small_lit, place):
+def test_strategies_tells_tables_and_goes_on_where_it_stopped(command, small_lit, place):
     (place / "DATA").symlink_to(small_lit)
     first = json.loads(call([*command[:-1], "default", "--json"]))
     both = json.loads(call([*command, "--json"]))
     for title, rows in first["rows"].items():
-        assert rows == both["rows"][title][: len(rows)] or title.startswith("Inside")
+        assert rows == both["rows"][title][: len(rows)]
     pictures = both["rows"]["Pictures (table 5.4)"]
     assert [row["strategy"] for row in pictures] == ["default", "mesh-aware"]
-    assert pictures[0]["thesis PSNR"] == "36.3851"
     sizes = both["rows"]["Size and speed (table 5.6)"]
     assert 0 <= float(sizes[1]["refinement [%]"]) <= 100
-    for curve in both["curves"].values():
-        assert [step for step, _ in curve["inside"]] == [0, 1, 2, 3, 4]
-        assert all(0 <= share <= 1 for _, share in curve["inside"])
-    root = ElementTree.parse(place / "figure.svg")
-    lines = [path for path in root.iter(f"{SVG}path") if "line" in path.get("class", "")]
-    assert len(lines) == len(both["curves"]) == 3
 
 
 @pytest.fixture(scope="module")
@@ -396,7 +390,7 @@ def test_composition_tells_both_tables(command, tiny_run, small_pair, place):
         assert [row["row"] for row in rows] == ["none", "none-shaded"]
     second = found["rows"]["The second boxsat, Sun (45, 35)"]
     assert float(second[1]["PSNR"]) > float(second[0]["PSNR"])
-    assert "map" in output
+    assert "none-shaded" in output
     assert (place / "RUNS/pairs/report.html").exists()
     assert "PAIR" in command or len(read_dataset(place / "RUNS/pair").test) == 2
 
@@ -453,6 +447,22 @@ def test_frames_count_from_when_the_kernels_are_there():
     assert dataset.milliseconds_a_frame(names(), skipped=1) == pytest.approx(20, rel=0.6)
     with pytest.raises(InputError, match="--views: expected at least 2 with"):
         dataset.milliseconds_a_frame(iter("abcd"), skipped=3)
+
+
+@smallest("pose.py --backend llvm --out OUT --data DATA --run RUN --views 2 --starts 1 --json")
+def test_pose_tells_errors_before_and_after(command, tiny_data, tiny_run, place):
+    (place / "DATA").symlink_to(tiny_data)
+    (place / "RUN").symlink_to(tiny_run)
+    report = json.loads(call(command))
+    assert list(report["views"]) == ["traced, alpha", "traced, black sky", "the model's own"]
+    for views in report["views"].values():
+        assert len(views) == 2
+        for view in views:
+            assert view["before"] == pytest.approx([5, 5])
+    for row in report["rows"]:
+        assert 0 <= row["within 0.5 deg, 0.5 %"] <= 1
+        assert row["median, deg"] <= row["90th, deg"]
+        assert row["s a view"] > 0
 
 
 @smallest("background.py DATA --backend llvm --preset demo --iterations 8 --json")
@@ -519,10 +529,10 @@ def test_viewer_tells_pictures_rates_and_memory(command, tiny_run, place):
 @smallest("visitor.py URL --seconds 1.5 --clients 2 --side 64")
 def test_visitors_get_pictures(command, tiny_run):
     pytest.importorskip("viser", reason="viser is not installed")
-    from spacesim.viewer.opened import opened
+    from spacesim.viewer.load import load_setup
     from spacesim.viewer.server import Viewer
 
-    viewer = Viewer(opened(tiny_run), port=0)
+    viewer = Viewer(load_setup(tiny_run), port=0)
     viewer.start()
     try:
         counts = json.loads(call([word.replace("URL", viewer.url) for word in command]))["pictures"]
@@ -535,7 +545,9 @@ def test_visitors_get_pictures(command, tiny_run):
     assert re.fullmatch(rf"{viewer.url}: expected the address of a viewer, found none \(.*\)\n", gone.stderr)
 
 
-@smallest("attack.py --inputs 30 --kills 1 --bits 6 --viewer 0.1 --seed 5 --json", "attack.py --seed 5 --trial 7")
+@smallest(
+    "attack.py --inputs 8 --kills 1 --bits 2 --viewer 0.1 --seed 5 --processes 1 --json", "attack.py --seed 5 --trial 7"
+)
 def test_attack_tells_what_was_tried_and_held(place, command):
     told = call(command)
     if "--trial" in command:
@@ -546,5 +558,5 @@ def test_attack_tells_what_was_tried_and_held(place, command):
     assert (found["seed"], found["finds"]) == (5, [])
     tried = {row[""]: row["tried"] for row in found["rows"]}
     assert tried["the viewer"] > 10
-    assert tried == {"damaged inputs, command lines": 30, "kills and signals": 1, "flipped bits": 6, **tried}
+    assert tried == {"damaged inputs, command lines": 8, "kills and signals": 1, "flipped bits": 2, "the viewer": ANY}
     assert all(row["held"] == row["tried"] for row in found["rows"])

@@ -13,17 +13,18 @@ import pytest
 from tiny import GENERATE, TRAIN
 
 from spacesim.data.images import read_exr, read_png
-from spacesim.data.store import read_dataset, verify_dataset
+from spacesim.data.store import find_unreadable_files, read_dataset
 from spacesim.splat.export.ply import read_ply
 from spacesim.splat.run import load_run
 
-COMMANDS = ("doctor", "demo", "generate", "train", "eval", "report", "render", "sweep", "export")
+THESIS = {"kind": "directions"} | {name: {"kind": "harmonics", "degree": 4} for name in ("sun", "view")}
+COMMANDS = ("doctor", "demo", "generate", "train", "eval", "report", "render", "sweep", "export", "reproduce")
 
 
 def test_help_names_every_command(spacesim):
     shown = spacesim("--help")
     assert shown.code == 0
-    assert all(re.search(rf"^ +{name} ", shown.output, re.MULTILINE) for name in COMMANDS)
+    assert all(re.search(rf"^ +{name}\b", shown.output, re.MULTILINE) for name in COMMANDS)
     assert spacesim("--version").output.startswith("spacesim ")
 
 
@@ -40,47 +41,74 @@ def test_the_module_is_a_program_too():
     assert done.stdout.startswith("spacesim ")
 
 
-def test_no_bias_is_no_bias(spacesim, tiny_data, tmp_path):
-    words = "--method", "shadow-map", "--preset", "demo", "--iterations", 2, "--init-count", 50, "--light-size", 16
-    assert spacesim("train", tiny_data, "--out", tmp_path / "run", *words, "--shadow-bias", 0).code == 0
-    assert json.loads((tmp_path / "run/config.json").read_text())["light"]["shadow"]["bias"] == 0
-
-
 @pytest.mark.parametrize(
     ("words", "keys", "value"),
     [
-        ("--method shadow-map --linear", "light linear", True),
-        ("--method shadow-map --linear --tone filmic", "light tone", "filmic"),
-        ("--method shadow-map --linear --exposure -1.5", "light exposure", -1.5),
-        ("--method shadow-map --shadow-filter median", "light shadow mapping filter", "median"),
-        ("--method shadow-map --field thesis", "light field surface", False),
-        ("--method park --field thesis", "light field view kind", "positional"),
-        ("--method shadow-map --grazing bias", "light shadow grazing", "bias"),
-        ("--method shadow-map --light-size 24", "light shadow size", 24),
-        ("--method shadow-map --shadow-filter variance", "light shadow mapping filter", "variance"),
+        ("--method shadow-map --set light.shadow.bias=0", "light shadow bias", 0),
+        ("--method shadow-map --set light.linear=true", "light linear", True),
+        ("--method shadow-map --set light.tone=filmic --set light.linear=true", "light tone", "filmic"),
+        ("--method shadow-map --set light.linear=true --set light.exposure=-1.5", "light exposure", -1.5),
+        ("--method shadow-map --set light.shadow.method.filter=bilinear", "light shadow method filter", "bilinear"),
+        ("--method shadow-map --set light.field.inputs=directions --set light.bounce=0", "light field inputs", THESIS),
+        ("--method park --set light.field.inputs=directions", "light field inputs view kind", "positional"),
+        ("--method baseline-park", "method", "baseline-park"),
+        ("--method park", "method", "baseline-park"),
+        ("--method shadow-map --set light.shadow.grazing=none", "light shadow grazing", "none"),
+        ("--method shadow-map --set light.shadow.size=24", "light shadow size", 24),
         (
-            "--method shadow-map --shadow-filter percentage-closer --sun-radius 0.2666",
-            "light shadow mapping sun_radius_deg",
+            "--method shadow-map --set light.shadow.method={filter='percentage-closer',sun_radius_deg=0.2666}",
+            "light shadow method sun_radius_deg",
             0.2666,
         ),
-        ("--method shadow-map --no-refinement", "light shadow refine", None),
-        ("--method shadow-splat --shadow-gradients", "light shadow gradients", True),
-        ("--method shadow-splat --visibility-weight 0.3", "visibility_weight", 0.3),
-        ("--method shadow-map --bounce 7", "light bounce", 7),
-        ("--method relight --bounce 7", "light bounce", 7),
-        ("--method shadow-map --bounce 0", "light bounce", 0),
-        ("--method shadow-map --supersample 2", "supersample", 2),
-        ("--method vanilla --supersample 3", "supersample", 3),
+        ("--method shadow-map --set light.shadow.refine=none", "light shadow refine", None),
+        ("--method shadow-splat --set light.shadow.method.gradients=true", "light shadow method gradients", True),
+        ("--method shadow-splat --set visibility_weight=0.3", "visibility_weight", 0.3),
+        ("--method relight --set light.bounce=7", "light bounce", 7),
+        ("--method vanilla --set supersample=3", "supersample", 3),
+        ("--set antialiased=true --set antialiased=false", "antialiased", False),
+        ("--init-count 40 --set init_count=30", "init_count", 30),
+        ("--strategy mesh-aware --set strategy.cull_every=77", "strategy cull_every", 77),
+        ("--set strategy.growth=0.5 --set strategy=mcmc", "strategy growth", 0.5),
+        ("--max-gaussians 99", "refinement max_gaussians", 99),
+        ("--warm-start --set warm_start.steps=1", "warm_start steps", 1),
+        ("--set warm_start={}", "warm_start steps", 2000),
     ],
 )
-def test_options_of_light_reach_the_run(spacesim, tiny_data, tmp_path, words, keys, value):
+def test_settings_reach_the_run(spacesim, tiny_data, tmp_path, words, keys, value):
     small = "--preset", "demo", "--iterations", 1, "--init-count", 50
-    size = ("--light-size", 16) if "shadow" in words and "--light-size" not in words else ()
+    shadowed = re.search("shadow|park", words) and "shadow.size" not in words
+    size = ("--set", "light.shadow.size=16") if shadowed else ()
     assert spacesim("train", tiny_data, "--out", tmp_path / "run", *small, *size, *words.split()).code == 0
     found = json.loads((tmp_path / "run/config.json").read_text())
     for key in keys.split():
         found = found[key]
     assert found == value
+
+
+def test_the_help_of_train_fits_on_a_screen(spacesim, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    shown = spacesim("train", "--help").output
+    assert shown.count("\n") <= 40
+    assert re.search(r"--iterations N +steps of training \(default: of the preset\)", shown)
+    assert "docs/how-to/choose.md" in shown
+    assert re.findall(r"^  (--[a-z-]+)", shown, re.MULTILINE) == [
+        *("--out", "--method", "--strategy", "--preset", "--iterations", "--seed", "--init", "--init-count"),
+        *("--max-gaussians", "--warm-start", "--resume", "--set", "--fields", "--backend", "--debug"),
+    ]
+
+
+def test_fields_are_listed_with_the_defaults_of_a_preset(spacesim):
+    def listed(*words: str) -> dict[str, list[str]]:
+        done = spacesim("train", "--fields", "--method", "shadow-map", *words)
+        assert done.code == 0
+        return {line.split()[0]: line.split()[1:] for line in done.output.splitlines()}
+
+    fast, fine = listed(), listed("--preset", "fine", "--set", "seed=8")
+    assert (fast["light.shadow.method.filter"][0], fast["supersample"][0], fast["seed"][0]) == ("median", "1", "0")
+    assert (fine["light.shadow.method.filter"][0], fine["supersample"][0], fine["seed"][0]) == ("variance", "2", "8")
+    assert "strategy.cull_every" in listed("--strategy", "mesh-aware")
+    assert "strategy.cull_every" not in fast
+    assert " ".join(fast["init_count"]) == "20000 Gaussians at the start, at most [whole number]"
 
 
 @pytest.mark.parametrize("strategy", ["mesh-aware", "support-aware"])
@@ -107,10 +135,16 @@ def test_doctor(spacesim):
 
 
 def test_generate_writes_a_whole_dataset(tiny_data):
-    assert verify_dataset(tiny_data) == []
+    assert find_unreadable_files(tiny_data) == []
     dataset = read_dataset(tiny_data)
     assert (len(dataset.train), len(dataset.test)) == (6, 2)
     assert json.loads((tiny_data / "scene.json").read_text())["config"]["quality"]["spp"] == 4
+
+
+def test_verify_draws_where_cameras_look_from(spacesim, tiny_data, tmp_path):
+    done = spacesim("verify", tiny_data, "--camera-density", tmp_path / "map.png")
+    assert done.code == 0
+    assert (tmp_path / "map.png").read_bytes() == (tiny_data / "camera_density.png").read_bytes()
 
 
 def test_suns_are_given_by_azimuth_and_elevation(spacesim, tmp_path):
@@ -173,7 +207,7 @@ def test_train_leaves_a_run(tiny_run, tiny_data):
     assert run.config["iterations"] == 50
     assert run.config["data"]["path"] == str(tiny_data.resolve())
     assert run.training["history"][-1]["iteration"] == 50
-    assert run.gaussians == 300
+    assert run.gaussian_count == 300
 
 
 def test_training_again_needs_resume_and_resuming_a_finished_run_changes_nothing(spacesim, tiny_run, tiny_data):
@@ -271,7 +305,7 @@ def test_export(spacesim, tiny_run, tmp_path):
     done = spacesim("export", tiny_run, "--ply", out)
     assert (done.code, done.output) == (0, f"{out}: 300 Gaussians\n")
     means = read_ply(out).to_numpy()["means"]
-    assert np.array_equal(means, load_run(tiny_run).model.to_numpy()["means"])
+    assert np.array_equal(means, load_run(tiny_run).gaussians.to_numpy()["means"])
 
 
 def test_paths_with_spaces_and_other_letters(spacesim, tiny_data, tmp_path):
@@ -293,6 +327,76 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--set supersample=9", ["--set supersample: expected 1 to 4, found 9"]),
+        (
+            "--set light.bounce=9",
+            ["--set light.bounce: expected light", "vanilla; try --method shadow-map"],
+        ),
+        ("--method relight --set light.shadow.bias=5", ["expected light.shadow to be", "; try --method shadow-map"]),
+        ("--set nonsense=1", ["--set nonsense: expected one of method,", "'nonsense'; see spacesim train --fields"]),
+        ("--method shadow-map --set light.field.inputs=directions", ["--set light.bounce", "surface"]),
+        ("--set seed", ["--set: expected KEY=VALUE, found 'seed'"]),
+        ("--set =3", ["--set: expected KEY=VALUE, found '=3'"]),
+        ("--set seed=three", ["--seed: expected a whole number, found 'three'"]),
+        ("--set seed.x=3", ["--set seed.x: expected seed alone, which has no fields"]),
+        ("--set method=relight", ["--set: expected --method, which sets all that goes with it"]),
+        ("--set lihgt.bounce=9", ["--set lihgt", "rates, refinement, strategy", "mean light?"]),
+        ("--method relight --set light.bounse=9", ["--set light.bounse", "mean bounce?"]),
+        ("--set cull_every=9", ["--set cull_every", "did you mean strategy.cull_every?"]),
+        ("--set antialiased=1", ["--set antialiased: expected true or false, found 1"]),
+        ("--set strategy=mcmd", ["--set strategy", "default, mesh-aware", "did you mean mcmc?"]),
+        ("--set warm_start.steps=9", ["--set warm_start.steps", "expected warm_start to be there"]),
+        (
+            "--method relight --set light.shadow.bias=3",
+            ["--set light.shadow.bias", "expected light.shadow to be there, found none", "relight"],
+        ),
+        ("--method relight --set visibility_weight=1", ["--set visibility_weight", "shadows", "relight"]),
+        ("--method shadow-splat --set light.shadow.bias=-1", ["--set light.shadow.bias: expected 0 or more, found -1"]),
+        (
+            "--method shadow-splat --set light.shadow.method.filter=median",
+            ["light.shadow.method.filter", "one of kind, gradients"],
+        ),
+        (
+            "--method shadow-map --set light.shadow.method.gradients=true",
+            ["light.shadow.method.gradients", "kind splatting knows it"],
+        ),
+        (
+            "--method shadow-map --set light.shadow.method=splatting",
+            ["--set light: expected shadow mapping", "found shadow splatting"],
+        ),
+        (
+            "--method shadow-map --set light.shadow.bias=inf",
+            ["--set light.shadow.bias: expected a finite number, found inf"],
+        ),
+        (
+            "--method shadow-map --set light.shadow.size=0",
+            ["--set light.shadow.size: expected 4 to 8192 pixels, found 0"],
+        ),
+        ("--method shadow-map --set light.shadow.size=100000", ["--set light.shadow.size", "found 100000"]),
+        (
+            "--method shadow-map --set light.shadow.method.sun_radius_deg=1",
+            ["method.sun_radius_deg", "percentage-closer"],
+        ),
+        (
+            "--method shadow-map --set light.shadow.grazing=never",
+            ["shadow.grazing: expected one of none, bias, lift, both"],
+        ),
+        ("--method relight --set light.tone=filmic", ["--set light.tone: expected linear colours"]),
+        (
+            "--method relight --set light.linear=true --set light.exposure=1e9",
+            ["--set light.exposure: expected -40 to 40 EV"],
+        ),
+    ],
+)
+def test_a_setting_that_cannot_be_is_named(spacesim, tiny_data, tmp_path, words, said):
+    refused = spacesim("train", tiny_data, "--out", tmp_path / "out", *words.split())
+    assert refused.is_refusal(*said), refused
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
     ("arguments", "names"),
     [
         ("", ["COMMAND"]),
@@ -306,14 +410,14 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("generate boxsat --out OUT --units mm", ["units", "mesh file", "boxsat"]),
         ("generate boxsat --out OUT --resolution 8x8x8", ["--resolution", "8x8x8"]),
         ("generate boxsat --out OUT --resolution 8x0", ["resolution", "found 0"]),
-        ("generate boxsat --out OUT --fov 180", ["fov_deg", "found 180"]),
+        ("generate boxsat --out OUT --fov 180", ["--fov: expected", "found 180"]),
         ("generate boxsat --out OUT --exposure nan", ["exposure", "found nan"]),
         ("generate boxsat --out OUT --distance 0", ["distance", "found 0"]),
         ("generate upper-stage --out OUT --distance 9", ["distance", "upper-stage"]),
         ("generate boxsat --out OUT --views 0", ["views", "at least 1", "found 0"]),
         ("generate boxsat --out OUT --views two", ["--views", "two"]),
         ("generate boxsat --out OUT --suns 0", ["suns", "found 0"]),
-        ("generate boxsat --out OUT --test-views -1", ["test_views"]),
+        ("generate boxsat --out OUT --test-views -1", ["--test-views: expected"]),
         ("generate boxsat --out OUT --resolution 0", ["resolution", "found 0"]),
         ("generate boxsat --out OUT --spp 0", ["spp", "found 0"]),
         ("generate boxsat --out OUT --seed -1", ["seed", "found -1"]),
@@ -330,26 +434,10 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("train DATA --out OUT --strategy none", ["--strategy", "default", "none"]),
         ("train DATA --out OUT --preset huge", ["--preset", "thesis", "huge"]),
         ("train DATA --out OUT --preset huge --method shadow-map", ["--preset", "fine, thesis", "huge"]),
-        ("train DATA --out OUT --supersample 9", ["--supersample", "1 to 4", "found 9"]),
-        ("train DATA --out OUT --bounce 9", ["--bounce", "learns light", "vanilla"]),
-        ("train DATA --out OUT --method shadow-map --field thesis --bounce 9", ["--bounce", "--field surface"]),
+        ("train DATA --out OUT --max-gaussians 0", ["--max-gaussians: expected at least 1, found 0"]),
         ("train DATA --out OUT --init sphere", ["--init", "points", "sphere"]),
         ("train DATA --out OUT --init-count 0", ["--init-count", "found 0"]),
         ("train DATA --out OUT --method magic", ["--method", "vanilla, relight, shadow-map", "magic"]),
-        ("train DATA --out OUT --field surface", ["--field", "learns light", "vanilla"]),
-        ("train DATA --out OUT --method relight --shadow-bias 3", ["--shadow-bias", "with shadows", "relight"]),
-        ("train DATA --out OUT --method relight --linear --light-size 9", ["--light-size", "with shadows", "relight"]),
-        ("train DATA --out OUT --method relight --visibility-weight 1", ["--visibility-weight", "shadows", "relight"]),
-        ("train DATA --out OUT --method shadow-splat --grazing lift --shadow-bias -1", ["bias", "-1"]),
-        ("train DATA --out OUT --method shadow-splat --shadow-filter variance", ["--shadow-filter", "shadow-map"]),
-        ("train DATA --out OUT --method shadow-map --shadow-gradients", ["--shadow-gradients", "splatting"]),
-        ("train DATA --out OUT --method shadow-map --shadow-bias inf", ["--shadow-bias", "inf"]),
-        ("train DATA --out OUT --method shadow-map --light-size 0", ["--light-size", "found 0"]),
-        ("train DATA --out OUT --method shadow-map --sun-radius 0.27", ["--sun-radius", "percentage-closer"]),
-        ("train DATA --out OUT --method shadow-map --light-size 100000", ["--light-size", "found 100000"]),
-        ("train DATA --out OUT --method relight --tone filmic", ["--tone", "--linear"]),
-        ("train DATA --out OUT --method relight --linear --exposure 1e9", ["--exposure", "40 EV"]),
-        ("train DATA --out OUT --exposure 1", ["--exposure", "learns light", "vanilla"]),
         ("train DATA --out OUT --seed -1", ["--seed", "found -1"]),
         ("train DATA --out OUT --backend vulkan", ["--backend", "vulkan"]),
         ("train DATA --out DATA", ["DATA", "empty or new folder"]),
@@ -357,7 +445,7 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("eval DATA --data DATA --out OUT", ["DATA", "config.json"]),
         ("eval RUN --data RUN --out OUT", ["RUN", "transforms.json"]),
         ("eval RUN --data ABSENT --out OUT", ["ABSENT"]),
-        ("eval RUN --data DATA --out OUT --split some", ["split", "some"]),
+        ("eval RUN --data DATA --out OUT --split some", ["--split: expected test, train or all", "some"]),
         ("eval RUN --data DATA --out OUT --lpips-weights ABSENT", ["ABSENT"]),
         ("report ABSENT --out OUT.html", ["ABSENT"]),
         ("report RUN --out OUT.html", ["RUN", "metrics.json"]),
@@ -368,12 +456,13 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("render RUN --out OUT.png --camera ABSENT", ["ABSENT"]),
         ("render RUN --out OUT.png --camera DATA/scene.json", ["scene.json", "w and h"]),
         ("render RUN --out OUT.png --kind shade", ["--kind", "shade"]),
-        ("render RUN --out OUT.png --kind shadow", ["--kind shadow", "predicts shadows"]),
+        ("render RUN --out OUT.png --kind shadow", ["--kind: expected another than shadow"]),
         ("sweep RUN --out OUT", ["RUN", "vanilla"]),
         ("render RUN --out OUT.png --sun 5", ["--sun", "5"]),
         ("render RUN --out OUT.jpg", ["OUT.jpg", ".png"]),
         ("render RUN --out OUT", [".png", ".exr"]),
         ("render DATA --out OUT.png", ["DATA", "config.json"]),
+        ("trian DATA --out OUT", ["COMMAND", "found 'trian'", "did you mean train?"]),
         ("export RUN", ["--ply"]),
         ("export DATA --ply OUT.ply", ["DATA", "config.json"]),
     ],
@@ -385,6 +474,12 @@ def test_bad_usage_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tmp_path, a
     refused = spacesim(*words)
     assert refused.is_refusal(*names), refused
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_is_called_like_an_option_is_none(spacesim, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert spacesim("train", "seed", "--out", "out").is_refusal("spacesim: seed: expected a dataset folder")
+    assert spacesim("train", "absent", "--out", "out", "--seed", -1).is_refusal("spacesim: --seed: expected 0 or more")
 
 
 UNWRITABLE = ["BELOW_A_FILE/out", *(path for path in ("/proc/out", "/dev/full") if Path(path).parent.is_dir())]

@@ -9,7 +9,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections import defaultdict
+import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr
 from dataclasses import dataclass, replace
@@ -23,20 +23,24 @@ import trimesh
 from test_benchmarks import RUNS
 from tiny import Outcome, call, outcome
 
-from spacesim.options import parser
+from spacesim.cli.program import parser
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
+TUTORIALS = sorted(ROOT.glob("docs/tutorials/*.md"))
+PAGES = [path for path in sorted(ROOT.glob("docs/**/*.md")) if path not in TUTORIALS]
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 SCRIPTS = sorted([*ROOT.glob("benchmarks/*.py"), *ROOT.glob("examples/*.py")])
-PROGRAM = re.compile(r"(?:\.venv/bin/)?(spacesim) |(?:python )?((?:benchmarks|examples|docs|tests)/[\w/]+\.py)(?: |$)")
+PROGRAM = re.compile(
+    r"(?:\.venv/bin/)?(spacesim) |(?:python )?((?:benchmarks|examples|scripts|tests)/[\w/]+\.py)(?: |$)"
+)
 HAS_VISER = importlib.util.find_spec("viser") is not None
 
 VALUES = {  # what stands in a command for a value
-    **{"N": "2", "X": "2", "W": "0.1", "O": "0.05", "M": "0.2", "EV": "0.5", "PX": "24", "K": "1", "DEG": "20"},
-    **{"NAME": "boxsat", "SCENE": "boxsat", "FILE": "boxsat", "AZ,EL": "40,25", "NAME=RUN": "none=RUN"},
+    **{"N": "2", "PX": "24", "K": "1", "NAME": "boxsat", "FILE": "boxsat", "AZ,EL": "40,25", "NAME=RUN": "none=RUN"},
+    **{"KEY=VALUE": "seed=3"},
     **{"GAUSSIANSxPIXELS,...": "300x32", "GAUSSIANSxPIXELS": "300x32", "PATH": "opensplat"},
 }
-FILES = {"DATA", "RUN", "RUNS", "EVAL", "DIR", "PAIR", "BOXSAT", "URL"}
+FILES = {"DATA", "RUN", "RUNS", "EVAL", "DIR", "OUT", "PAIR", "BOXSAT", "URL"}
 OUTPUTS = ("--out", "--ply", "--mesh", "--speedplus", "--bop")
 
 SMALL = {  # options that a command gets, so that it is as small as can be
@@ -48,19 +52,23 @@ SMALL = {  # options that a command gets, so that it is as small as can be
 }
 SMALLER = {  # and other values of those that it has
     **{"--suns": "2", "--known-test-views": "1", "--test-spp": "2", "--workers": "2"},
-    **{"--bounce": "8", "--max-gaussians": "150", "--frame": "0"},
+    **{"--max-gaussians": "150", "--frame": "0"},
 }
 NOT_RUN = {  # commands with these words: why they do not run here
     "--ray auto": "needs a Ray cluster; tests/scenes/generation/test_workers.py starts one",
+    "spacesim reproduce": "minutes with --quick, else a day; tests/test_reproduce.py does all of it at its smallest",
     "tests/scenes/truth.py": "a minute; tests/scenes/test_truth.py bounds its figures",
     "tests/scenes/generation/kills.py": "minutes; test_workers.py beside it kills and interrupts smaller runs",
     "tests/splat/accuracy.py": "20 seconds; the tests beside it bound its figures",
     "tests/splat/light/shadow/acne.py": "a minute; the tests beside it bound its figures",
     "tests/splat/light/shadow/against_truth.py": "asks for a run that has been trained to the end",
 }
-LEFT_OUT = {  # options, with their value, that commands run without: why
-    "--lpips-weights": "the weights are the user's own",
-}
+LIT = {"relight", "shadow-map", "shadow-splat", "baseline-park"}  #: methods that are told the Sun
+
+
+def name_of(path: Path) -> str:
+    """How a document is called in these tests: by its path under docs, or its own name."""
+    return str(path.relative_to(ROOT / "docs")) if path.is_relative_to(ROOT / "docs") else path.name
 
 
 @dataclass(frozen=True)
@@ -80,17 +88,25 @@ class Command:
 
 
 def prose(path: Path) -> str:
-    """A document without its fenced blocks, a script's docstring."""
+    """A document without its fenced blocks but those of commands, which are indented in their place; a script's
+    docstring."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".py":
         return ast.get_docstring(ast.parse(text)) or ""
-    return re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+
+    def instead(match: re.Match[str]) -> str:
+        return textwrap.indent(match[3], "    ") if match[1] == "bash" else ""
+
+    return FENCE.sub(instead, text)
+
+
+FENCE = re.compile(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', re.MULTILINE | re.DOTALL)
+"""A fenced block: its language, the file that it is, its text."""
 
 
 def blocks(path: Path, language: str) -> list[str]:
     """The fenced ones."""
-    text = path.read_text(encoding="utf-8")
-    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    return [match[3] for match in FENCE.finditer(path.read_text(encoding="utf-8")) if match[1] == language]
 
 
 def shown(path: Path) -> Iterator[tuple[str, bool]]:
@@ -133,20 +149,20 @@ def commands(path: Path) -> Iterator[Command]:
             rest, _, target = one[match.end() :].partition(" > ")
             words = tuple(value(word) for word in shlex.split(rest) if word != "...")
             whole = alone or is_whole(words) or match[1] is None
-            yield Command(path.name, text, match[1] or match[2], words, target or None, whole)
+            yield Command(name_of(path), text, match[1] or match[2], words, target or None, whole)
 
 
 def is_whole(words: tuple[str, ...]) -> bool:
     """Whether spacesim has all that it needs to do something."""
     with redirect_stderr(StringIO()):
         try:
-            parser(defaultdict(lambda: print)).parse_args(words)
+            parser(words).parse_args(words)
         except SystemExit:
             return False
     return words[0] != "generate" or "--out" in words
 
 
-EVERY = [command for path in (*DOCUMENTS, *SCRIPTS) for command in commands(path)]
+EVERY = [command for path in (*DOCUMENTS, *TUTORIALS, *SCRIPTS) for command in commands(path)]
 
 
 class Parsed(BaseException):
@@ -218,7 +234,7 @@ def completed(words: list[str], read: Callable[[list[str]], Any], capsys: pytest
 def test_a_command_is_understood(command, monkeypatch, capsys):
     def read(words: list[str]) -> argparse.Namespace:
         if command.program == "spacesim":
-            return parser(defaultdict(lambda: print)).parse_args(words)
+            return parser(words).parse_args(words)
         return read_by_script(command.program, words, monkeypatch)
 
     words = list(command.words)
@@ -231,11 +247,11 @@ def test_a_command_is_understood(command, monkeypatch, capsys):
 def test_commands_are_found():
     """In each of the ways that they are written in."""
     told = {(command.document, command.text) for command in EVERY}
-    assert ("README.md", "spacesim sweep run --out sweep") in told  # a block, with a comment
-    assert ("README.md", ".venv/bin/spacesim doctor") in told  # a sentence
-    assert ("scale.md", "spacesim verify data") in told  # a block, with words behind it
-    assert any(document == "composition.md" and "boxsat-pair" in text for document, text in told)  # over two lines
-    assert ("performance.md", "python benchmarks/training.py --memory --markdown") in told
+    assert ("README.md", "spacesim view run") in told  # a fenced block, with a comment
+    assert ("how-to/trouble.md", "spacesim doctor") in told  # a sentence
+    assert ("research/viewer.md", "python benchmarks/viewer.py") in told  # an indented block
+    assert ("research/memory.md", "python benchmarks/training.py --memory --markdown") in told
+    assert ("tutorials/relight.md", "spacesim render run --sun 40,25 --out relit.png") in told
     assert ("dataset.py", "python benchmarks/dataset.py --frames 10000") in told  # a docstring
     assert ("01_simulate.py", "python examples/01_simulate.py") in told
     assert [command.words for command in EVERY if command.target == "my.toml"] == [("generate", "boxsat", "--print")]
@@ -247,7 +263,7 @@ def test_usages_are_expanded():
 
 
 def test_options_that_sentences_name_exist(monkeypatch, capsys):
-    names = re.findall(r"^    ([a-z]+) ", call("--help").output, re.MULTILINE)
+    names = re.findall(r"^    ([a-z]+)\b", call("--help").output, re.MULTILINE)
     helps = [call(name, "--help").output for name in names]
     for script in sorted({command.program for command in EVERY} - {"spacesim"}):
         if takes_arguments(script) and can_be_read(script):
@@ -256,12 +272,29 @@ def test_options_that_sentences_name_exist(monkeypatch, capsys):
             helps.append(capsys.readouterr().out)
     known = set(re.findall(r"--[a-z][\w-]*", "".join(helps)))
     assert len(names) >= 12
-    for path in DOCUMENTS:
+    for path in (*DOCUMENTS, *TUTORIALS):
         named = set(re.findall(r"`(--[a-z][\w-]*)", prose(path)))
-        assert named - known == set(), path.name
+        assert named - known == set(), path
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_fields_that_sentences_name_exist():
+    """Each `--set KEY=VALUE` is taken, and each `light.shadow.bias` is a field, of some method of light."""
+    methods = "shadow-map", "shadow-splat", "relight"
+    listed = " ".join(call("train", "--fields", "--method", method).output for method in methods).split()
+    named: set[str] = set()
+    for path in (*DOCUMENTS, *TUTORIALS):
+        text = prose(path)
+        named |= set(re.findall(r"`((?:light|refinement)\.[\w.]+)`", text))
+        for span in re.findall(r"`([^`]*--set [^`]*)`|^ {4}(.*--set .*)$", text, re.MULTILINE):
+            pairs = re.findall(r"--set [\w.]+=[^\s`]+", "".join(span))
+            words = " ".join(pairs).split()
+            ended = [call("train", "--fields", "--method", method, *words) for method in methods]
+            assert 0 in [one.code for one in ended], (name_of(path), ended[0].errors)
+    assert len(named) >= 5
+    assert named - set(listed) == set()
+
+
+@pytest.mark.parametrize("path", [*DOCUMENTS, *TUTORIALS], ids=name_of)
 def test_other_programs_find_what_they_are_told(path):
     makefile, project = ((ROOT / name).read_text(encoding="utf-8") for name in ("Makefile", "pyproject.toml"))
     for text, _ in shown(path):
@@ -294,12 +327,10 @@ def test_a_documented_benchmark_runs_in_the_tests(command, monkeypatch):
 def smaller(words: tuple[str, ...]) -> list[str]:
     """A command of spacesim at its smallest size."""
     wanted = dict(SMALL.get(words[0], {}))
-    if words[0] == "train" and {"shadow-map", "shadow-splat", "park"} & set(words):
-        wanted["--light-size"] = "16"
     if "--mesh" in words:
         wanted |= {"--voxel": "0.2", "--views": "3"}
     found = list(words)
-    if words[0] == "eval" and "--no-geometry" not in words:  # seconds each; the fixture tiny_eval is judged with it
+    if words[0] == "eval" and "--no-geometry" not in words:  # seconds each; the fixture tiny_eval is evaluated with it
         found.append("--no-geometry")
     for option, least in wanted.items():
         if option not in found:
@@ -307,9 +338,8 @@ def smaller(words: tuple[str, ...]) -> list[str]:
     for option, least in (wanted | SMALLER).items():
         if option in found and found[found.index(option) + 1] != "0":
             found[found.index(option) + 1] = least
-    for option in LEFT_OUT:
-        if option in found:
-            del found[found.index(option) : found.index(option) + 2]
+    if found[0] == "train" and (LIT - {"relight"}) & set(found):  # the last one of a key counts
+        found += ["--set", "light.shadow.size=16"]
     return found
 
 
@@ -372,14 +402,15 @@ def viewed(words: list[str]) -> Outcome:
 @pytest.fixture(scope="module")
 def given(tiny_data, tmp_path_factory) -> dict[str, Path]:
     """What commands and blocks read: a dataset, one of two boxsats, a run of linear light with shadows, the scene file
-    of docs/composition.md, others."""
+    of docs/reference/composed-scenes.md, others."""
     folder = tmp_path_factory.mktemp("given")
-    words = "--method", "shadow-map", "--linear", "--preset", "demo", "--iterations", 8, "--init-count", 200
-    trained = call("train", tiny_data, "--out", folder / "runs/boxsat", *words, "--light-size", 16)
+    words = "--method", "shadow-map", "--preset", "demo", "--iterations", 8, "--init-count", 200
+    small = "--set", "light.linear=true", "--set", "light.shadow.size=16"
+    trained = call("train", tiny_data, "--out", folder / "runs/boxsat", *words, *small)
     assert trained.code == 0, trained.errors
     small = "--views", 1, "--test-suns", 0, "--test-views", 1, "--resolution", 24, "--spp", 1
     assert call("generate", "boxsat-pair", "--out", folder / "pair", "--sun", "45,35", *small).code == 0
-    scene, keyframes = blocks(ROOT / "docs/composition.md", "toml")[:2]
+    scene, keyframes = blocks(ROOT / "docs/reference/composed-scenes.md", "toml")[:2]
     (folder / "scene.toml").write_text(f"frames = 2\n{scene}\n{keyframes}", encoding="utf-8")
     (folder / "my.toml").write_text('[[objects]]\nspacecraft = "boxsat"\n', encoding="utf-8")
     trimesh.creation.box((1, 2, 3)).export(folder / "hubble.glb")
@@ -388,9 +419,12 @@ def given(tiny_data, tmp_path_factory) -> dict[str, Path]:
     camera["transform_matrix"] = meta["frames"][0]["transform_matrix"]
     (folder / "camera.json").write_text(json.dumps(camera), encoding="utf-8")
     run, files = folder / "runs/boxsat", ("my.toml", "hubble.glb", "camera.json", "scene.toml")
+    evaluated = call("eval", run, "--data", tiny_data, "--out", folder / "eval", "--no-geometry")
+    assert evaluated.code == 0, evaluated.errors
     return {
         **{"data": tiny_data, "DATA": tiny_data, "PAIR": folder / "pair", "SCENE.toml": folder / "scene.toml"},
-        **{name: run for name in ("run", "RUN", "out/demo/run", "runs/boxsat")},
+        **{name: run for name in ("run", "RUN", "other", "out/demo/run", "runs/boxsat")},
+        **{name: folder / "eval" for name in ("eval", "eval-other")},
         **{name: folder / name for name in files},
     }
 
@@ -412,7 +446,8 @@ def is_left_out(command: Command) -> bool:
     return any(words in str(command) for words in NOT_RUN)
 
 
-WHOLE = [command for command in EVERY if command.whole and command.document.endswith(".md")]
+OF_TUTORIALS = [name_of(path) for path in TUTORIALS]
+WHOLE = [c for c in EVERY if c.whole and c.document.endswith(".md") and c.document not in OF_TUTORIALS]
 RUNNABLE = [command for command in WHOLE if command.program == "spacesim" and not is_left_out(command)]
 
 
@@ -430,50 +465,79 @@ def test_commands_run_from_the_top_down(document, given, made, done, tmp_path, m
 def test_what_does_not_run_is_told_why():
     assert [str(one) for one in WHOLE if one not in (*RUNNABLE, *MEASURED) and not is_left_out(one)] == []
     texts = [str(command) for command in WHOLE]
-    assert [words for words in (*NOT_RUN, *LEFT_OUT) if not any(words in text for text in texts)] == []
+    assert [words for words in NOT_RUN if not any(words in text for text in texts)] == []
 
 
+SMALL_FACE = {  # of the six lines
+    "views=60, resolution=128": "views=2, test_views=1, resolution=24, spp=1",
+    'preset="demo"': 'preset="demo", iterations=4, init_count=50',
+    '"eval")': '"eval", geometry=False)',
+}
 SMALL_BLOCKS = {  # in the Python of a document: what takes the place of what
-    "README.md": {
-        "views=60, resolution=128": "views=2, test_views=1, resolution=24, spp=1",
-        'preset="demo"': 'preset="demo", iterations=4, init_count=50',
-        '"eval")': '"eval", geometry=False)',
-    },
-    "relighting.md": {"1024": "24", "suns_around(120": "suns_around(2"},
-    "rasterizer.md": {"640, 480": "32, 24", "512, 512": "24, 24"},
-    "shadows.md": {"gaussians, light, 512": "gaussians, light, 32"},
+    "README.md": SMALL_FACE,
+    "index.md": SMALL_FACE,
+    "how-to/gradients.md": {"640, 480": "32, 24"},
+    "tutorials/first-model.md": {"256, 256": "24, 24"},
+    "tutorials/torch.md": {"96, 400, 100": "24, 50, 3"},
+    "tutorials/compose.md": {"frames = 48": "frames = 2", "size=128": "size=24"},
 }
 PRINTED = {  # by the blocks of a document, among other things
     "README.md": "(24, 24, 3) ",
-    "dataset.md": "[]\n",
-    "meshes.md": "12 faces",
-    "spacecraft.md": "primary_mirror",
+    "reference/dataset.md": "(40, 40) (40, 40, 3) 255",
+    "reference/models-and-materials.md": "primary_mirror",
+    "tutorials/first-model.md": "nearest point ",
+    "tutorials/relight.md": "unseen_suns {'mean': ",
+    "tutorials/torch.md": "after 3 steps",
+    "tutorials/compose.md": "composed-small/sheet.png",
 }
 
 
-@pytest.mark.parametrize("path", [path for path in DOCUMENTS if blocks(path, "python")], ids=lambda path: path.name)
+def shrunk(path: Path, text: str) -> str:
+    """`text` of a document with smaller numbers."""
+    for old, new in SMALL_BLOCKS.get(name_of(path), {}).items():
+        assert old in text, f"{name_of(path)} has no {old!r} any more"
+        text = text.replace(old, new)
+    return text
+
+
+@pytest.mark.parametrize("path", [path for path in DOCUMENTS if blocks(path, "python")], ids=name_of)
 def test_python_runs(path, given, tmp_path, monkeypatch, capsys):
     """The blocks of a document one after the other, with what they take for given."""
-    import drjit as dr
-
-    from spacesim.backend import ad
-    from spacesim.data.geometry import look_at
-    from spacesim.data.records import Camera
     from spacesim.splat.raster.gaussians import Gaussians
-    from spacesim.splat.train.config import preset
 
     monkeypatch.chdir(tmp_path)
     desk = Desk(tmp_path, given, tmp_path, {})
-    for name in ("runs/boxsat", "hubble.glb", *(("data", "run") if path.name != "README.md" else ())):
+    for name in ("runs/boxsat", *(("data", "run") if path.name not in ("README.md", "index.md") else ())):
         desk.put(name)
-    arrays = module_of("benchmarks/common.py").sphere_arrays(50)
-    known: dict[str, Any] = {"dr": dr, "ad": ad, "step": dr.zeros(ad.Float, 6)}
-    known |= {"gaussians": Gaussians.from_numpy(arrays), "SMALL": replace(preset("demo"), iterations=4)}
-    known["camera"] = Camera.from_fov(look_at([4, 1, 1], [0, 0, 0]), 24, 24, 35)
-    changes = SMALL_BLOCKS.get(path.name, {})
-    text = "\n".join(blocks(path, "python"))
-    assert [old for old in changes if old not in text] == []
-    for old, new in changes.items():
-        text = text.replace(old, new)
+    known: dict[str, Any] = {"gaussians": Gaussians.from_numpy(module_of("benchmarks/common.py").sphere_arrays(50))}
+    text = shrunk(path, "\n".join(blocks(path, "python")))
     exec(compile(text, path.name, "exec"), known)
-    assert PRINTED.get(path.name, "") in capsys.readouterr().out
+    assert PRINTED.get(name_of(path), "") in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("path", TUTORIALS, ids=name_of)
+def test_a_tutorial_runs(path, tmp_path, monkeypatch, capsys):
+    """All of its blocks from the top down, in an empty folder: files are written, commands and Python run. They are as
+    they stand there but for the numbers that `smaller` and SMALL_BLOCKS put in."""
+    if path.stem == "torch":
+        pytest.importorskip("torch", reason="torch is not installed")
+    monkeypatch.chdir(tmp_path)
+    known: dict[str, Any] = {}
+    ran, said = 0, ""
+    for match in FENCE.finditer(shrunk(path, path.read_text(encoding="utf-8"))):
+        language, name, text = match.groups()
+        if name:
+            Path(name).write_text(text, encoding="utf-8")
+        elif language == "python":
+            exec(compile(text, name_of(path), "exec"), known)
+        else:
+            assert language == "bash", f"{name_of(path)}: a block of {language!r} that nothing runs"
+            for line in filter(None, text.splitlines()):
+                program, *words = shlex.split(line, comments=True)
+                assert program == "spacesim", line
+                small = smaller(tuple(words))
+                ended = viewed(small) if words[0] == "view" else call(*small)
+                assert ended.code == 0, (line, ended.errors)
+        ran, said = ran + 1, said + capsys.readouterr().out
+    assert ran >= 3
+    assert PRINTED.get(name_of(path), "") in said

@@ -1,44 +1,203 @@
-"""The documents name what is there: every module, every file that they link to."""
+"""The book: its links and blocks, what the code says of it, its size, the pages that are generated, the site."""
 
+import ast
+import importlib.util
+import inspect
 import re
+import subprocess
+import sys
+from dataclasses import fields
+from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
+import spacesim as ss
+
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.glob("**/*.md"))
+DOCUMENTS = [*sorted(ROOT.glob("*.md")), *PAGES]
 MODULES = sorted(path for path in ROOT.glob("spacesim/**/*.py") if path.name != "__init__.py")
+FOLDERS = sorted({path.parent for path in MODULES} - {ROOT / "spacesim"})
+PLACES = ("spacesim", "tests", "examples", "benchmarks", "scripts")
+SOURCES = sorted(
+    path for place in PLACES for path in ROOT.glob(f"{place}/**/*") if path.suffix in (".py", ".toml", ".sh")
+)
+MAX_WORDS, MAX_LINES = 20_000, 80  #: of the book with README; of README
+ARCHITECTURE = DOCS / "explanation" / "architecture.md"
 
 
-ROOMS = sorted({path.parent for path in MODULES} - {ROOT / "spacesim"})
+def of(path: Path) -> str:
+    return str(path.relative_to(ROOT))
 
 
-@pytest.mark.parametrize("room", ROOMS, ids=lambda path: path.name)
-def test_architecture_names_every_room(room):
-    assert f"{room.name}/" in (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+@cache
+def generator() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("generate_docs", DOCS / "generate.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@cache
+def generated() -> dict[str, str]:
+    """{path under docs: text}."""
+    pages: dict[str, str] = generator().pages()
+    return pages
+
+
+def without_blocks(text: str) -> str:
+    return re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def anchors(text: str) -> set[str]:
+    """Of the headings, as the site makes them."""
+    found = re.findall(r"^#+ (.+)$", without_blocks(text), re.MULTILINE)
+    return {re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower()) for heading in found}
+
+
+def text_of(path: Path) -> str | None:
+    """Of a page, which may be a generated one; None where there is none."""
+    if path.is_relative_to(DOCS) and str(path.relative_to(DOCS)) in generated():
+        return generated()[str(path.relative_to(DOCS))]
+    return path.read_text(encoding="utf-8") if path.is_file() else None
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=of)
+def test_architecture_names_every_folder(folder):
+    assert f"{folder.name}/" in ARCHITECTURE.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=of)
 def test_documents_name_no_module_that_is_gone(document):
-    known = {
-        path.name
-        for place in ("spacesim", "tests", "examples", "benchmarks", "docs")
-        for path in ROOT.glob(f"{place}/**/*.py")
-    }
+    known = {path.name for place in (*PLACES, "docs") for path in ROOT.glob(f"{place}/**/*.py")}
     named = re.findall(r"`[\w/]+\.py\b", document.read_text(encoding="utf-8"))
     assert {Path(name.strip("`")).name for name in named} - known == set()
-    whole = {name.strip("`") for name in named if name.startswith("`spacesim/")}
+    whole = {name.strip("`") for name in named if "/" in name and name.strip("`").split("/")[0] in PLACES}
     assert {name for name in whole if not (ROOT / name).exists()} == set()
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
-def test_links_lead_somewhere(document):
-    links = re.findall(r"\]\(([^)#\s]+)", document.read_text(encoding="utf-8"))
-    local = [link for link in links if not link.startswith("https://")]
-    assert [link for link in local if not (document.parent / link).exists()] == []
+@pytest.mark.parametrize("document", DOCUMENTS, ids=of)
+def test_links_and_anchors_lead_somewhere(document):
+    links = re.findall(r"\]\(([^)\s]+)\)", without_blocks(document.read_text(encoding="utf-8")))
+    dead = []
+    for link in links:
+        if link.startswith("https://"):
+            continue
+        name, _, anchor = link.partition("#")
+        place = (document.parent / name).resolve() if name else document
+        text = text_of(place) if place.suffix == ".md" else None
+        if (text is None and (place.suffix == ".md" or not place.exists())) or (
+            anchor and text is not None and anchor not in anchors(text)
+        ):
+            dead.append(link)
+    assert dead == []
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda path: path.name)
-def test_documents_that_the_code_names_are_there(module):
-    named = re.findall(r"\bdocs/[\w-]+\.md\b", module.read_text(encoding="utf-8"))
-    assert [name for name in named if not (ROOT / name).exists()] == []
+def test_pictures_are_shown():
+    shown = {Path(name).name for page in DOCUMENTS for name in re.findall(r"!\[[^]]*\]\(([^)]+)\)", page.read_text())}
+    assert {path.name for path in DOCS.glob("pictures/*") if path.suffix in (".png", ".svg")} == shown
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=of)
+def test_documents_that_the_code_names_are_there(source):
+    named = re.findall(r"\bdocs/[\w/.-]+\.(?:md|py|png|svg)\b", source.read_text(encoding="utf-8"))
+    assert [name for name in named if name not in KNOWN and not (ROOT / name).exists()] == []
+
+
+KNOWN = {f"docs/reference/{name}.md" for name in ("api", "options", "scene-fields", "materials", "command-line")}
+
+
+def test_names_of_generated_pages():
+    assert {f"docs/{name}" for name in generated()} == KNOWN
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=of)
+def test_python_blocks_parse(document):
+    for block in re.findall(r"^```python\n(.*?)^```$", document.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+        ast.parse(block)
+
+
+def test_the_book_is_short():
+    texts = [path.read_text(encoding="utf-8") for path in (ROOT / "README.md", *PAGES)]
+    assert sum(len(text.split()) for text in texts) <= MAX_WORDS
+    assert len(texts[0].splitlines()) <= MAX_LINES
+
+
+@pytest.mark.parametrize("page", PAGES, ids=of)
+def test_pages_tell_no_history(page):
+    text = page.read_text(encoding="utf-8").lower()
+    journal = "before that", "before this", "used to", "no longer", "| goal |"
+    assert [words for words in journal if words in text] == []
+
+
+def test_every_page_is_in_the_navigation():
+    listed = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
+    assert listed == {str(page.relative_to(DOCS)) for page in PAGES} | set(generated())
+
+
+@pytest.mark.parametrize("name", ss.__all__)
+def test_the_reference_has_every_public_name(name):
+    entry = re.search(rf"^### ss\.{name}\n(.*?)(?=^##|\Z)", generated()["reference/api.md"], re.MULTILINE | re.DOTALL)
+    assert entry is not None
+    docstring = inspect.getdoc(getattr(ss, name))
+    assert docstring
+    assert docstring in entry[1]
+
+
+def test_the_reference_has_rasterization():
+    torch_door = pytest.importorskip("spacesim.torch", reason="torch is not installed", exc_type=ImportError)
+    page = generated()["reference/api.md"]
+    for argument in inspect.signature(torch_door.rasterization).parameters:
+        assert f"    {argument}: " in page
+    assert inspect.getdoc(torch_door.rasterization) in page
+
+
+def test_the_reference_has_every_field_and_command():
+    options, commands = (generated()[f"reference/{name}.md"] for name in ("options", "command-line"))
+    assert [f.name for f in fields(ss.TrainConfig) if f.name not in options] == []
+    for name in ("generate", "train", "eval", "report", "render", "sweep", "view", "compose", "verify", "export"):
+        assert f"## spacesim {name}\n" in commands
+    assert "--iterations" in commands
+    rows = re.findall(
+        r"^\[(\S+)\]$", (ROOT / "spacesim/assets/materials.toml").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert len(rows) >= 16
+    assert [name for name in rows if f"\n| `{name}` | " not in generated()["reference/materials.md"]] == []
+
+
+def named_in_docstrings() -> set[str]:
+    """Numbers of equations. Those of scenes are sections of glTF's specification."""
+    found: set[str] = set()
+    for path in MODULES:
+        if path.is_relative_to(ROOT / "spacesim" / "scenes"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                said = ast.get_docstring(node) or ""
+                for match in re.finditer(r"\((\d)\.(\d{1,2})(?: to \1\.(\d{1,2}))?[);,]", said):
+                    numbers = range(int(match[2]), int(match[3] or match[2]) + 1)
+                    found |= {f"{match[1]}.{number}" for number in numbers}
+    return found
+
+
+def test_every_equation_that_is_named_is_explained():
+    explained = set(re.findall(r"\((\d\.\d+)\)", (DOCS / "explanation/equations.md").read_text(encoding="utf-8")))
+    pages = "".join(page.read_text(encoding="utf-8") for page in PAGES if page.parent.name != "research")
+    assert len(named_in_docstrings()) > 30
+    assert named_in_docstrings() - explained == set()
+    assert set(re.findall(r"\(([2-5]\.\d{1,2})\)", pages)) - explained == set()
+
+
+@pytest.mark.skipif(importlib.util.find_spec("material") is None, reason="mkdocs-material is not installed (make docs)")
+def test_the_site_is_built_without_warnings(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    page = (tmp_path / "site/reference/api/index.html").read_text(encoding="utf-8")
+    assert "ss.generate" in page
+    assert re.findall(r'(?:src|href)="https?://(?!squidfunk)[^"]*\.(?:js|css|woff2?)"', page) == []

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from spacesim.data.images import read_exr, read_png
-from spacesim.data.store import verify_dataset
+from spacesim.data.store import find_unreadable_files
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-MOST_LINES = 20
+MAX_LINES = 20
 
 
 def example(name: str) -> Any:
@@ -35,7 +35,7 @@ def test_examples_are_short_and_import_from_spacesim_alone(path):
     lines = {
         line for function in functions for node in ast.walk(function) for line in [getattr(node, "lineno", 0)] if line
     }
-    assert len(lines) <= MOST_LINES
+    assert len(lines) <= MAX_LINES
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_compose(run, tmp_path):
 
 
 def test_simulate(data, capsys):
-    assert verify_dataset(data) == []
+    assert find_unreadable_files(data) == []
     dataset = example("01_simulate").main(data, views=6, resolution=48, spp=4)  # all there already
     assert (len(dataset.train), len(dataset.test)) == (6, 4)
     printed = capsys.readouterr().out
@@ -88,3 +88,11 @@ def test_rasterizer_gradients(tmp_path):
     losses = example("04_rasterizer_gradients").main(tmp_path / "fit.png", count=60, size=40, steps=40)
     assert losses[-1] < 0.6 * losses[0]
     assert read_png(tmp_path / "fit.png").shape == (40, 80)
+
+
+def test_refine_pose(data, run):
+    pose, before, after = example("06_refine_pose").main(run, data, starts=1)
+    assert before == pytest.approx((5, 5))
+    assert pose.covariance.shape == (6, 6)
+    assert np.isfinite(after).all()
+    assert after != before

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ DEVICE = "cuda" if backend.select() == "cuda" else "cpu"
 
 
 def scene(count: int = 60, cameras: int = 2) -> dict:
-    """Leaves in double precision, so that finite differences and the dense twin are exact."""
+    """Leaves in double precision, so that finite differences and the dense reference are exact."""
     rng = np.random.default_rng(3)
     placed = [Camera.look_at([3.5, 1, 1 - k], [0, 0, 0], SIDE, SIDE, 40) for k in range(cameras)]
     arrays = {
@@ -99,12 +100,12 @@ def dense(leaves: dict, camera: int, degree: int | None, eps2d: float, antialias
     opacity = leaves["opacities"]
     if antialiased:
         opacity = opacity * torch.sqrt((torch.linalg.det(flat) / torch.linalg.det(spread)).clamp(min=0))
-    colour = leaves["colors"]
+    color = leaves["colors"]
     if degree is not None:
         away = leaves["means"] - torch.linalg.inv(view)[:3, 3]
         basis = harmonics(away / away.norm(dim=-1, keepdim=True))[:, : (degree + 1) ** 2]
-        colour = (torch.einsum("nk,nkc->nc", basis, colour[:, : (degree + 1) ** 2]) + 0.5).clamp(min=0)
-    features = torch.cat([colour, z[:, None]], -1)
+        color = (torch.einsum("nk,nkc->nc", basis, color[:, : (degree + 1) ** 2]) + 0.5).clamp(min=0)
+    features = torch.cat([color, z[:, None]], -1)
     order = torch.argsort(z)
     pixel = torch.arange(SIDE) + 0.5
     grid = torch.stack(torch.meshgrid(pixel, pixel, indexing="xy"), -1).double()
@@ -151,9 +152,33 @@ def test_pictures_and_gradients_are_those_of_the_formulas(degree, mode, model, e
         assert float((found - expected).norm() / expected.norm()) < 1e-3, name
 
 
+@pytest.mark.parametrize(
+    ("number", "mode"),
+    list(enumerate([{}, {"rasterize_mode": "antialiased"}, {"camera_model": "ortho"}, {"render_mode": "RGB+ED"}])),
+)
+def test_pictures_and_gradients_are_those_that_gsplat_made(number, mode):
+    """Of gsplat 1.5.3 on CUDA, stored by benchmarks/torch_door.py --peers gsplat --store."""
+    with np.load(Path(__file__).parent / "gsplat.npz", allow_pickle=False) as file:
+        stored = {name: torch.tensor(file[name]) for name in file.files}
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds")
+    leaves = {name: stored[name].clone().to(DEVICE) for name in names}
+    if mode.get("camera_model") == "ortho":
+        leaves["Ks"][:, :2, :2] /= 4
+    leaves = {name: leaf.requires_grad_(name != "Ks") for name, leaf in leaves.items()}
+    picture, alpha, _ = rasterization(**leaves, width=32, height=24, sh_degree=3, **mode)
+    assert float((picture.detach().cpu() - stored[f"{number}.picture"]).abs().max()) < 1e-4
+    assert float((alpha.detach().cpu() - stored[f"{number}.alpha"]).abs().max()) < 1e-4
+    weights = stored["weights"].to(DEVICE)
+    ((weights[..., : picture.shape[-1]] * picture).sum() + (weights[..., 4:] * alpha).sum()).backward()
+    for name, leaf in leaves.items():
+        if name != "Ks":
+            expected = stored[f"{number}.by.{name}"]
+            assert float((leaf.grad.cpu() - expected).norm() / expected.norm()) < 1e-3, name
+
+
 def test_modes_backgrounds_and_what_is_told():
     leaves = as_floats(scene())
-    size = {"width": SIDE, "height": SIDE, "sh_degree": 2}
+    size = {"width": SIDE, "height": SIDE, "sh_degree": 2, "packed": False}
     rgb, alpha, meta = rasterization(**leaves, **size)
     both, _, _ = rasterization(**leaves, **size, render_mode="RGB+D")
     expected, _, _ = rasterization(**leaves, **size, render_mode="ED")
@@ -171,6 +196,7 @@ def test_modes_backgrounds_and_what_is_told():
         "radii": (2, count, 2),
     }  # fmt: skip
     assert meta["radii"].dtype == torch.int32
+    assert (meta["tile_width"], meta["tile_height"]) == (3, 3)  # of 16 pixels
     each = [
         rasterization(**{**leaves, "viewmats": leaves["viewmats"][k : k + 1], "Ks": leaves["Ks"][k : k + 1]}, **size)
         for k in (0, 1)
@@ -180,7 +206,7 @@ def test_modes_backgrounds_and_what_is_told():
 
 def test_planes_and_radii_leave_out_what_is_beyond_them():
     leaves = as_floats(scene())
-    size = {"width": SIDE, "height": SIDE, "sh_degree": 0, "render_mode": "ED"}
+    size = {"width": SIDE, "height": SIDE, "sh_degree": 0, "render_mode": "ED", "packed": False}
     depths = rasterization(**leaves, **size)[2]["depths"]
     middle = float(depths.median())
     near, alpha, meta = rasterization(**leaves, **size, far_plane=middle)
@@ -196,13 +222,87 @@ def test_planes_and_radii_leave_out_what_is_beyond_them():
 def test_gradients_of_positions_on_the_screen():
     """What strategies of gsplat read: `means2d.retain_grad()`, and the sum of absolute gradients beside it."""
     leaves = as_floats(scene())
-    picture, _, meta = rasterization(**leaves, width=SIDE, height=SIDE, sh_degree=1, absgrad=True)
+    size = {"width": SIDE, "height": SIDE, "sh_degree": 1, "absgrad": True}
+    picture, _, meta = rasterization(**leaves, **size, packed=False)
     meta["means2d"].retain_grad()
     picture.square().sum().backward()
     gradient, absolute = meta["means2d"].grad, meta["means2d"].absgrad
     assert gradient.shape == absolute.shape == (2, len(leaves["means"]), 2)
     assert gradient.abs().sum() > 0
     assert (absolute >= gradient.abs() * (1 - 1e-4) - 1e-5).all()
+
+
+def test_packed_results_are_those_that_are_drawn():
+    """Rows of the others, camera by camera, with what makes gradients reach them."""
+    found = []
+    for packed in (True, False):
+        leaves = as_floats(scene())
+        size = {"width": SIDE, "height": SIDE, "sh_degree": 1, "far_plane": 4.0, "absgrad": True}
+        picture, _, meta = rasterization(**leaves, **size, packed=packed)
+        meta["means2d"].retain_grad()
+        (picture.square().sum() + meta["depths"][meta["radii"][..., 0] > 0].sum()).backward()
+        found.append((picture, meta, leaves))
+    (picture, packed, by_packed), (expected, dense, by_dense) = found
+    drawn = (dense["radii"] > 0).all(-1)
+    assert 0 < int(drawn.sum()) < drawn.numel()
+    cameras, gaussians = torch.where(drawn)
+    assert torch.equal(packed["camera_ids"], cameras)
+    assert torch.equal(packed["gaussian_ids"], gaussians)
+    assert torch.equal(packed["batch_ids"], 0 * cameras)
+    for name in ("means2d", "conics", "opacities", "depths", "radii"):
+        assert torch.equal(packed[name], dense[name][drawn]), name
+    assert torch.equal(packed["means2d"].grad, dense["means2d"].grad[drawn])
+    assert torch.equal(packed["means2d"].absgrad, dense["means2d"].absgrad[drawn])
+    assert torch.equal(picture, expected)
+    for name, leaf in by_dense.items():
+        assert torch.equal(by_packed[name].grad, leaf.grad), name
+
+
+@pytest.mark.parametrize("packed", [{}, {"packed": False}])
+def test_a_training_script_of_gsplats_runs_with_its_import_changed(packed):
+    """Packed, as gsplat has it by default, and not: sums of the gradients on the screen by Gaussian, and Gaussians that
+    are duplicated and removed by them, as its default strategy does it."""
+    torch.manual_seed(0)
+    count, is_packed = 80, packed.get("packed", True)
+    truth = as_floats(scene(120, cameras=3))
+    cameras = {"viewmats": truth.pop("viewmats").detach(), "Ks": truth.pop("Ks").detach()}
+    size = {"width": SIDE, "height": SIDE, "sh_degree": 1}
+    with torch.no_grad():
+        target = rasterization(**truth, **cameras, **size)[0]
+    splats = {name: leaf.detach()[:count].clone().requires_grad_() for name, leaf in truth.items()}
+    losses, numbers = [], [count]
+    state = {"gradient": torch.zeros(count, device=DEVICE), "count": torch.zeros(count, device=DEVICE)}
+    optimizer = torch.optim.Adam(splats.values(), lr=0.01)
+    for step in range(1, 31):
+        picture, _, info = rasterization(**splats, **cameras, **size, **packed, absgrad=True)
+        info["means2d"].retain_grad()
+        loss = (picture - target).square().mean()
+        loss.backward()
+        by_place = info["means2d"].absgrad.clone()
+        assert (by_place >= info["means2d"].grad.abs() * (1 - 1e-4) - 1e-7).all()
+        by_place *= torch.tensor([info["width"], info["height"]], device=DEVICE) / 2 * info["n_cameras"]
+        if is_packed:
+            ids = info["gaussian_ids"]
+        else:
+            drawn = (info["radii"] > 0).all(dim=-1)
+            ids, by_place = torch.where(drawn)[1], by_place[drawn]
+        state["gradient"].index_add_(0, ids, by_place.norm(dim=-1))
+        state["count"].index_add_(0, ids, torch.ones_like(ids, dtype=torch.float32))
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        with torch.no_grad():
+            splats["opacities"].clamp_(0.01, 0.99)
+            if step % 10 == 0:
+                mean = state["gradient"] / state["count"].clamp_min(1)
+                grows, stays = mean > mean.quantile(0.7), splats["opacities"] > 0.02
+                for name, value in splats.items():
+                    splats[name] = torch.cat([value[stays], value[grows]]).requires_grad_()
+                numbers.append(len(splats["means"]))
+                state = {name: torch.zeros(numbers[-1], device=DEVICE) for name in state}
+                optimizer = torch.optim.Adam(splats.values(), lr=0.01)
+        losses.append(float(loss))
+    assert len(set(numbers)) == 4
+    assert losses[-1] < 0.6 * losses[0]
 
 
 def test_numbers_that_cannot_be_drawn_harm_no_others():
@@ -231,7 +331,10 @@ def test_numbers_that_cannot_be_drawn_harm_no_others():
         ({"sh_degree": 4}, "sh_degree: expected 0 to 3, found 4"),
         ({"sh_degree": None}, r"colors: expected \[60, D\]"),
         ({"quats": torch.zeros(60, 3)}, r"quats: expected \[60, 4\], found \[60, 3\]"),
+        ({"quats": torch.zeros(60, 3)}, r"found \[60, 3\]$"),
         ({"means": torch.zeros(2, 60, 3)}, "batches are not supported"),
+        ({"viewmats": torch.eye(4)}, r"viewmats: expected \[C, 4, 4\], found \[4, 4\]; add \[None\]"),
+        ({"Ks": torch.eye(3)}, r"Ks: expected \[C, 3, 3\], found \[3, 3\]; add \[None\]"),
         ({"backgrounds": torch.zeros(2, 4)}, r"backgrounds: expected \[2, 3\], found \[2, 4\]"),
     ],
 )
@@ -259,16 +362,16 @@ def test_without_torch_a_sentence():
 
 def test_recordings_serve_other_numbers_of_gaussians(monkeypatch):
     """One after another, larger and smaller: what is replayed is what is traced."""
-    from spacesim import torch as door
+    from spacesim.torch import autograd
 
-    for count in (60, 300, 17, 1024, 1, 500):
+    for count in (60, 300, 17, 1024, 1, 500, 1023, 768, 2):
         leaves = as_floats(scene(count, cameras=1))
         found = []
         for traced in (False, True):
             with monkeypatch.context() as patch:
                 if traced:
-                    patch.setattr(door, "_project", door._trace_project)
-                    patch.setattr(door, "_project_back", door._trace_project_back)
+                    patch.setattr(autograd, "project", autograd.project.traced)
+                    patch.setattr(autograd, "project_back", autograd.project_back.traced)
                 picture, alpha, _ = rasterization(**leaves, width=SIDE, height=SIDE, sh_degree=3)
                 found.append([picture, *torch.autograd.grad(picture.sin().sum() + alpha.sum(), list(leaves.values()))])
         for one, other in zip(*found, strict=True):

@@ -8,7 +8,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
-MINIMUM_LLVM = 19
+MIN_LLVM = 19
 INSTALL_LLVM = "sudo apt-get install libllvm19"
 _LIBRARY_PLACES = (
     "/usr/lib/*-linux-gnu*/libLLVM*.so*",
@@ -31,23 +31,23 @@ def find_llvm() -> tuple[Path | None, str]:
         if version is None:
             return (
                 None,
-                f"DRJIT_LIBLLVM_PATH names {named}, which cannot be loaded as libLLVM {MINIMUM_LLVM} or newer",
+                f"DRJIT_LIBLLVM_PATH names {named}, which cannot be loaded as libLLVM {MIN_LLVM} or newer",
             )
-        if version < MINIMUM_LLVM:
-            return None, f"DRJIT_LIBLLVM_PATH names libLLVM {version}, expected {MINIMUM_LLVM} or newer"
+        if version < MIN_LLVM:
+            return None, f"DRJIT_LIBLLVM_PATH names libLLVM {version}, expected {MIN_LLVM} or newer"
         return Path(named), f"libLLVM {version} at {named}"
     candidates = _candidates()
     for path, version in candidates:
-        if version >= MINIMUM_LLVM and (_library_version(path) or 0) >= MINIMUM_LLVM:
+        if version >= MIN_LLVM and (_library_version(path) or 0) >= MIN_LLVM:
             return path, f"libLLVM {version} at {path}"
-    found = sorted({version for _, version in candidates})
-    other = f"only version {', '.join(map(str, found))}" if found else "none"
-    return None, f"libLLVM {MINIMUM_LLVM} or newer is needed, found {other}; type: {INSTALL_LLVM}"
+    versions = sorted({version for _, version in candidates})
+    other = f"only version {', '.join(map(str, versions))}" if versions else "none"
+    return None, f"libLLVM {MIN_LLVM} or newer is needed, found {other}; type: {INSTALL_LLVM}"
 
 
 def name_llvm() -> None:
-    """Name the newest libLLVM in DRJIT_LIBLLVM_PATH, unless the user has named one. Judges by file names alone."""
-    good = [path for path, version in _candidates() if version >= MINIMUM_LLVM]
+    """Name the newest libLLVM in DRJIT_LIBLLVM_PATH, unless the user has named one. Only file names are looked at."""
+    good = [path for path, version in _candidates() if version >= MIN_LLVM]
     if good:
         os.environ.setdefault("DRJIT_LIBLLVM_PATH", str(good[0]))
 
@@ -55,13 +55,13 @@ def name_llvm() -> None:
 @cache
 def _candidates() -> list[tuple[Path, int]]:
     """(library, version by its name) in the usual places, newest first."""
-    found: dict[Path, int] = {}
+    by_path: dict[Path, int] = {}
     for pattern in _LIBRARY_PLACES:
         for path in Path("/").glob(pattern.lstrip("/")):
             match = re.search(r"libLLVM(?:-|\.so\.|\.)?(\d+)", path.name)
             if match and path.exists() and _is_for_this_machine(path):
-                found.setdefault(path.resolve(), int(match.group(1)))
-    return sorted(found.items(), key=lambda item: (-item[1], str(item[0])))
+                by_path.setdefault(path.resolve(), int(match.group(1)))
+    return sorted(by_path.items(), key=lambda item: (-item[1], str(item[0])))
 
 
 def _is_for_this_machine(path: Path) -> bool:

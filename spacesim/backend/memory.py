@@ -54,8 +54,8 @@ def _left_by_groups(root: Path) -> Iterator[int]:
             continue
         mount = root / "sys/fs/cgroup" / controllers
         most, used, dropped = first if controllers else second
-        own = mount / path.strip("/")  # in a container that is the mount itself, whatever its path outside
-        for group in (own, *own.parents):
+        group_path = mount / path.strip("/")  # in a container that is the mount itself, whatever its path outside
+        for group in (group_path, *group_path.parents):
             if not group.is_relative_to(mount):
                 break
             try:
@@ -74,17 +74,17 @@ def _known_numbers(path: Path) -> dict[str, int]:
     return {row[0]: int(row[1]) for row in rows if len(row) > 1 and row[1].isdigit()}
 
 
-def free_memory(wanted: int = 0) -> int | None:
+def free_memory(needed: int = 0) -> int | None:
     """Bytes that arrays may still take on the chosen backend; None where the system does not say. Where fewer than
-    `wanted` are free, what Dr.Jit keeps of freed arrays, each for others of its size, goes back to the system first."""
-    asked = main_memory if select() == "llvm" else device_memory
-    free = asked()
-    if free is not None and free < wanted:
+    `needed` are free, what Dr.Jit keeps of freed arrays, each for others of its size, goes back to the system first."""
+    measure = main_memory if select() == "llvm" else device_memory
+    free = measure()
+    if free is not None and free < needed:
         dr = load_drjit()
         dr.sync_thread()
         dr.flush_malloc_cache()
         dr.sync_thread()  # only then CUDA lets go of it
-        free = asked()
+        free = measure()
     return free
 
 

@@ -1,62 +1,129 @@
-"""Functions that are traced once and replayed afterwards, by `dr.freeze`."""
+"""Functions that are traced once and replayed afterwards, by `dr.freeze`: the decorator `recorded`."""
 
 import gc
 import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
-from functools import cache
-from typing import Any
+from functools import cache, update_wrapper
+from typing import Any, Generic, ParamSpec, TypeVar, overload
 from weakref import WeakSet
+
+P = ParamSpec("P")
+R = TypeVar("R")
+RECORDINGS = 256  #: of a function that are kept: one for each size of picture, of the lists, and of the model
 
 _PLAIN = frozenset((int, float, bool, str, type(None)))
 _EQUAL_TO_INTEGERS = frozenset((float, bool))  # 1, 1.0 and True are one key of a dictionary, 0.0 and -0.0 too
-MOST_KEYS = 2**14  # that are remembered of what is not an array, chosen
+MAX_KEYS = 2**14  # that are remembered of what is not an array
 _recorded: WeakSet[Any] = WeakSet()
 _constants: dict[int, tuple[Any, Any]] = {}  # frozen dataclasses without arrays, by `id`: what `_split` told of them
 _leaves: set[type] = set()  # types of arguments that Dr.Jit is left to look into
 
 
-def recorded(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
-    """`function` by `dr.freeze`: traced at its first call with arguments of a kind, replayed at the others.
-
-    At most `limit` recordings are kept. Arguments may be arrays, numbers and texts, and tuples, lists, dicts and
-    dataclasses of them. Dr.Jit 1.5 takes long to walk through these, knows an argument that occurs twice in a call by
-    identity, and takes f(1, 2, 1) for f(1, 2, 2): it gets a flat list of the arrays and one text for all the rest. No
-    array may stand in two places. What Dr.Jit's LLVM backend makes of a numpy array is numpy's own memory, whose
-    kernels and recordings differ by whether it happens to begin at a multiple of 64 bytes: make arguments of lists, or
-    copy them (`gaussians.uploaded`). Python's garbage collector waits during a call: arrays that it frees in the
-    middle of a recording end the process.
-    """
+def elements_of_first(arrays: list[Any], *_: Any, **__: Any) -> int:
+    """How many elements the first of a call's arrays has; 1 where it has no arrays."""
     import drjit as dr
 
-    now, names = _Arguments(), _Names()
-    frozen = dr.freeze(
-        lambda _, arrays: function(*_joined(now.arguments, iter(arrays))),
-        limit=limit,
-        warn_after=2**31 - 1,  # who looks around for hours makes more recordings than are kept, and need not hear of it
-    )
-    _recorded.add(frozen)
+    return int(dr.width(arrays[0])) if arrays else 1
 
-    def call(*arguments: Any) -> Any:
+
+Elements = Callable[..., int]
+"""(arrays of a call in order, its arguments) to how many elements, Gaussians or pixels say, the call is about."""
+
+
+@overload
+def recorded(
+    function: Callable[P, R], /, limit: int = RECORDINGS, *, elements: Elements | None = elements_of_first
+) -> "Recorded[P, R]": ...
+
+
+@overload
+def recorded(
+    *, limit: int = RECORDINGS, elements: Elements | None = elements_of_first
+) -> "Callable[[Callable[P, R]], Recorded[P, R]]": ...
+
+
+def recorded(
+    function: Callable[..., Any] | None = None,
+    /,
+    limit: int = RECORDINGS,
+    *,
+    elements: Elements | None = elements_of_first,
+) -> Any:
+    """Decorator, bare or with options: the function is traced once and replayed afterwards, see `Recorded`.
+
+    limit: recordings that are kept, the latest used
+    elements: how many elements a call is about, by default those of its first array. A call about one is traced, since
+        a recording takes an array of one element for a number, and gives a plane of one pixel another size. None: never
+    """
+    if function is None:
+        return lambda function: Recorded(function, limit, elements)
+    return Recorded(function, limit, elements)
+
+
+class Recorded(Generic[P, R]):
+    """A function by `dr.freeze`: traced at its first call with arguments of a kind, replayed at the others.
+
+    Traced as they are, and not recorded, are calls about one element (see `recorded`), calls with an array that
+    has gradients, so that they can be differentiated, and calls within another recording, of which they are a part.
+
+    Arguments may be arrays, numbers and texts, and tuples, lists, dicts and dataclasses of them. Dr.Jit 1.5 takes
+    long to walk through these, knows an argument that occurs twice in a call by identity, and takes f(1, 2, 1) for
+    f(1, 2, 2): it gets a flat list of the arrays and one text for all the rest. No array may stand in two places. What
+    Dr.Jit's LLVM backend makes of a numpy array is numpy's own memory, whose kernels and recordings differ by whether
+    it happens to begin at a multiple of 64 bytes: make arguments of lists, or copy them (`gaussians.upload`).
+    Python's garbage collector waits during a call: arrays that it frees in the middle of a recording end the process.
+
+    traced: the function itself, without a recording
+    """
+
+    traced: Callable[P, R]
+
+    def __init__(self, function: Callable[P, R], limit: int, elements: Elements | None) -> None:
+        import drjit as dr
+
+        update_wrapper(self, function)
+        self.traced, self._elements, self._names = function, elements, _Names()
+        now = self._now = _Arguments()
+
+        def replay(_: str, arrays: list[Any]) -> Any:
+            rest = iter(arrays)
+            return function(*_joined(now.arguments, rest), **_joined(now.named, rest))
+
+        # who looks around for hours makes more recordings than are kept, and need not hear of it
+        self._frozen = dr.freeze(replay, limit=limit, warn_after=2**31 - 1)
+        self._has_gradients, self._flag, self._scope = dr.grad_enabled, dr.flag, dr.JitFlag.FreezingScope
+        _recorded.add(self._frozen)
+
+    def __call__(self, *arguments: P.args, **named: P.kwargs) -> R:
+        if self._flag(self._scope):
+            return self.traced(*arguments, **named)
         arrays: list[Any] = []
-        name = names[_split(arguments, arrays)]
-        now.arguments = arguments
+        kind = _split(arguments, arrays)
+        if named:
+            kind = kind, _split(named, arrays)
+        about_one = self._elements is not None and self._elements(arrays, *arguments, **named) == 1
+        if about_one or self._has_gradients(arrays):
+            return self.traced(*arguments, **named)
+        name, now = self._names[kind], self._now
+        now.arguments, now.named = arguments, named
         collecting = gc.isenabled()
         gc.disable()
         try:
-            return frozen(name, arrays)
+            result: R = self._frozen(name, arrays)
+            return result
         finally:
-            now.arguments = ()
+            now.arguments, now.named = (), {}
             if collecting:
                 gc.enable()
-
-    return call
 
 
 class _Arguments:
     """Of the call that may be traced now; to Dr.Jit an object that never changes."""
 
-    arguments: tuple[Any, ...] = ()
+    def __init__(self) -> None:
+        self.arguments: tuple[Any, ...] = ()
+        self.named: dict[str, Any] = {}
 
 
 class _Names(dict[Any, str]):
@@ -67,7 +134,7 @@ class _Names(dict[Any, str]):
         self._numbers = itertools.count()
 
     def __missing__(self, told: Any) -> str:
-        if len(self) >= MOST_KEYS:
+        if len(self) >= MAX_KEYS:
             self.clear()
         name = self[told] = str(next(self._numbers))
         return name
@@ -92,16 +159,16 @@ def _split(value: Any, arrays: list[Any]) -> Any:
         return kind, len(told) if new else told
     if kind is dict:
         return kind, tuple(value), _split_each(value.values(), arrays)
-    known = _constants.get(id(value))
-    if known is not None:
-        return known[1]
+    constant = _constants.get(id(value))
+    if constant is not None:
+        return constant[1]
     names = _names(kind)  # type: ignore[arg-type]
     if names is not None:
         before = len(arrays)
         told = _split_each([getattr(value, name) for name in names], arrays)
         if len(arrays) > before or not _is_constant(value):
             return kind, told
-        if len(_constants) >= MOST_KEYS:
+        if len(_constants) >= MAX_KEYS:
             _constants.clear()
         _constants[id(value)] = value, (kind, _names_of_constants[told])
         return _constants[id(value)][1]
@@ -139,9 +206,9 @@ def _joined(value: Any, arrays: Iterator[Any]) -> Any:
     if kind in _PLAIN:
         return value
     if kind is list or kind is tuple:
-        return kind(_joined(one, arrays) for one in value)
+        return kind(_joined(item, arrays) for item in value)
     if kind is dict:
-        return {key: _joined(one, arrays) for key, one in value.items()}
+        return {key: _joined(item, arrays) for key, item in value.items()}
     names = _names(kind)  # type: ignore[arg-type]
     if names is None:
         return next(arrays)

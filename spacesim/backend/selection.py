@@ -6,7 +6,7 @@
 
 import importlib
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from spacesim.backend.llvm import find_llvm
 
@@ -57,10 +57,10 @@ def select(name: str = "auto") -> str:
             raise ValueError(f"backend: {_selected} has been chosen in this process, {name} cannot follow")
         return _selected
     reasons = available()
-    wanted = ["cuda", "llvm"] if name == "auto" else [name]
-    usable = [backend for backend in wanted if reasons[backend] is None]
+    candidates = ["cuda", "llvm"] if name == "auto" else [name]
+    usable = [backend for backend in candidates if reasons[backend] is None]
     if not usable:
-        raise BackendError("; ".join(f"{backend}: {reasons[backend]}" for backend in wanted))
+        raise BackendError("; ".join(f"{backend}: {reasons[backend]}" for backend in candidates))
     _selected = usable[0]
     return _selected
 
@@ -92,4 +92,7 @@ class _Arrays:
         return value
 
 
-ad: Any = _Arrays()
+if TYPE_CHECKING:
+    import drjit.auto.ad as ad  # the same types, whichever backend they are of
+else:
+    ad = _Arrays()

@@ -12,8 +12,8 @@ from typing import Any, BinaryIO
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError, WorkError
 
-LARGEST_JSON = 1 << 25  #: bytes of a record, chosen
-LARGEST_LIST = 1 << 30  #: bytes of a record with an entry for each frame, of a million of them, chosen
+MAX_JSON_BYTES = 1 << 25  #: bytes of a record
+MAX_LIST_BYTES = 1 << 30  #: bytes of a record with an entry for each frame, of a million of them
 PARSED = 30  #: bytes of memory that a byte of JSON takes while it is read, at most; 26 were seen
 
 _KINDS = (
@@ -54,7 +54,8 @@ def read_bytes(path: Path, expected: str = "a file", most: int | None = None) ->
             raise InputError(f"{path}: expected {expected} of at most {most:,} bytes, found {size:,}")
         check_memory(size, f"{path}: reading it")
         try:
-            return file.read(size) if size else file.read(most or LARGEST_LIST)  # files of the system claim to be empty
+            # files of the system claim to be empty
+            return file.read(size) if size else file.read(most or MAX_LIST_BYTES)
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
 
@@ -89,7 +90,7 @@ def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise WorkError(
-                f"{path}: the disk is full; free space and run again, with --resume if the command has it"
+                f"{path}: the disk is full; free space and run again, resuming what can be resumed"
             ) from error
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
@@ -168,7 +169,7 @@ def json_bytes(value: Any) -> bytes:
     return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
 
 
-def read_json(path: Path, most: int = LARGEST_JSON) -> Any:
+def read_json(path: Path, most: int = MAX_JSON_BYTES) -> Any:
     """Read a JSON file of at most `most` bytes; InputError says what is wrong with it. Raises MemoryError where its
     values do not fit into memory."""
     path = Path(path)

@@ -1,7 +1,7 @@
 """Rotations, camera axes and directions, in float64 numpy.
 
 World axes are right-handed with z up. Camera axes, when nothing else is said, are OpenCV's: x right, y down,
-z forward along the optical axis. Quaternions are (w, x, y, z). See docs/conventions.md.
+z forward along the optical axis. Quaternions are (w, x, y, z). See docs/explanation/conventions.md.
 """
 
 import numpy as np

@@ -1,5 +1,5 @@
-"""What data are known by: training data wherever they lie, so that judging notices others in their place, and frames by
-names of which no two are the same."""
+"""What data are known by: training data wherever they lie, so that evaluating notices others in their place, and frames
+by names of which no two are the same."""
 
 import hashlib
 import re
@@ -8,17 +8,17 @@ from pathlib import Path
 
 from spacesim.data.records import Dataset, Frame
 
-LONGEST_NAME = 100  #: characters of a frame's name, chosen; file systems take 255 bytes
+MAX_NAME_LENGTH = 100  #: characters of a frame's name; file systems take 255 bytes
 
 
 def training_digest(dataset: Dataset) -> str:
     """Of the training frames: names and sizes of the files, poses, intrinsics, lenses, Suns. Raises OSError where a
     picture is missing."""
-    told = [
+    identity = [
         (f.file_path, (dataset.root / f.file_path).stat().st_size, _numbers(f), f.sun and f.sun.angles)
         for f in dataset.train
     ]
-    return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
+    return hashlib.sha256(repr(identity).encode()).hexdigest()[:16]
 
 
 def _numbers(frame: Frame) -> list[float]:
@@ -34,7 +34,7 @@ def frame_names(frames: Sequence[Frame]) -> list[str]:
     taken: set[str] = set()
     for frame in frames:
         stem = str(Path(frame.file_path).with_suffix("")).removeprefix("./").removeprefix("images/")
-        stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem)[-LONGEST_NAME:].lstrip("._") or "frame"
+        stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem)[-MAX_NAME_LENGTH:].lstrip("._") or "frame"
         name, count = stem, 1
         while name.lower() in taken:  # some file systems do not tell cases apart
             count += 1

@@ -1,4 +1,4 @@
-"""Images in and out: PNG (sRGB, labels), EXR (linear truth), and what a frame shows to training and judging.
+"""Images in and out: PNG (sRGB, labels), EXR (linear truth), and what a frame shows to training and evaluating.
 
 EXR layout: one multi-part file a frame, each part one layer, ZIP-compressed scan lines of float32. Layers of
 three channels are R, G, B (radiance, albedo) or X, Y, Z (normal); single ones A (alpha), Z (depth) or Y (all
@@ -117,8 +117,8 @@ def _check_png(content: bytes) -> None:
 def write_png(path: Path, pixels: np.ndarray, durable: bool = True) -> None:
     """Write [H, W], [H, W, 3] or [H, W, 4] uint8, or [H, W] uint16, as PNG: whole or not at all (see `write_bytes`)."""
     is_grey = pixels.ndim == 2 and pixels.dtype in (np.uint8, np.uint16)
-    is_colour = pixels.ndim == 3 and pixels.shape[2] in (3, 4) and pixels.dtype == np.uint8
-    if pixels.size == 0 or not (is_grey or is_colour):
+    is_color = pixels.ndim == 3 and pixels.shape[2] in (3, 4) and pixels.dtype == np.uint8
+    if pixels.size == 0 or not (is_grey or is_color):
         raise ValueError(
             "pixels: expected [H, W], [H, W, 3] or [H, W, 4] uint8 or [H, W] uint16, "
             f"found {list(pixels.shape)} {pixels.dtype}"
@@ -173,7 +173,8 @@ def read_exr(path: Path, size: tuple[int, int] | None = None) -> dict[str, np.nd
 
 
 def load_image(dataset: Dataset, frame: Frame) -> Image:
-    """The image of `frame` as trained on and compared with, undistorted where the frame says so.
+    """The image of `frame` as trained on and compared with, undistorted where the frame says so: rgb [H, W, 3] sRGB
+    values in [0, 1], alpha [H, W], valid [H, W].
 
     Straight alpha comes from the file, else from the silhouette, else it is 1. Pixels to be ignored are opaque
     black whatever the file holds, so that it cannot reach their neighbours through a window. Raises InputError
@@ -197,8 +198,8 @@ def load_image(dataset: Dataset, frame: Frame) -> Image:
 def undistort(image: Image, camera: Camera, distortion: tuple[float, ...]) -> Image:
     """`image` as the pinhole `camera` sees it, resampled bilinearly. What comes from outside is not valid.
 
-    distortion: see `distorted`. Colours are weighted by alpha, so that none bleeds in from where alpha is 0. Pixels
-    that are not valid are opaque black.
+    distortion: see `distort_points`. Colours are weighted by alpha, so that none bleeds in from where alpha is 0.
+    Pixels that are not valid are opaque black.
     """
     source = Undistortion(camera, distortion)
     alpha = source.linear(image.alpha)
@@ -216,13 +217,13 @@ def _without_ignored(rgb: np.ndarray, alpha: np.ndarray, valid: np.ndarray) -> t
 class Undistortion:
     """Pictures of a lens, resampled to what the pinhole `camera` sees. inside: [H, W] bool, where the lens sees it.
 
-    distortion: see `distorted`.
+    distortion: see `distort_points`.
     """
 
     def __init__(self, camera: Camera, distortion: tuple[float, ...]) -> None:
         x = (np.arange(camera.width) + 0.5 - camera.cx)[None, :] / camera.fx
         y = (np.arange(camera.height) + 0.5 - camera.cy)[:, None] / camera.fy
-        u, v = distorted(x, y, distortion)
+        u, v = distort_points(x, y, distortion)
         self._columns, self._rows = u * camera.fx + camera.cx - 0.5, v * camera.fy + camera.cy - 0.5
         self.inside = (self._columns >= -0.5) & (self._columns <= camera.width - 0.5)
         self.inside &= (self._rows >= -0.5) & (self._rows <= camera.height - 0.5)
@@ -247,7 +248,7 @@ class Undistortion:
         return np.where(inside, labels[rows, columns], np.zeros((), labels.dtype))
 
 
-def distorted(x: Any, y: Any, distortion: Sequence[Any]) -> tuple[Any, Any]:
+def distort_points(x: Any, y: Any, distortion: Sequence[Any]) -> tuple[Any, Any]:
     """Where the lens images the direction (x, y, 1), on the plane at depth 1: any arrays, of numpy or of Dr.Jit.
 
     distortion: k1, k2, p1, p2, k3 of the Brown-Conrady model (D. C. Brown, "Close-range camera calibration",
@@ -259,8 +260,8 @@ def distorted(x: Any, y: Any, distortion: Sequence[Any]) -> tuple[Any, Any]:
     return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
 
-def undistorted(u: Any, v: Any, distortion: Sequence[Any], steps: int = 8) -> tuple[Any, Any]:
-    """The direction (x, y, 1) that the lens images at (u, v): the inverse of `distorted`, by Newton's method.
+def undistort_points(u: Any, v: Any, distortion: Sequence[Any], steps: int = 8) -> tuple[Any, Any]:
+    """The direction (x, y, 1) that the lens images at (u, v): the inverse of `distort_points`, by Newton's method.
 
     From (u, v) it goes straight to the solution, also near a fold: along a radius the map is concave for barrel
     distortion, convex for pincushion.
@@ -274,7 +275,7 @@ def undistorted(u: Any, v: Any, distortion: Sequence[Any], steps: int = 8) -> tu
         a = radial + 2 * slope * x * x + 2 * p1 * y + 6 * p2 * x  # the derivative, [[a, b], [b, d]]
         b = 2 * slope * x * y + 2 * p1 * x + 2 * p2 * y
         d = radial + 2 * slope * y * y + 6 * p1 * y + 2 * p2 * x
-        at_x, at_y = distorted(x, y, distortion)
+        at_x, at_y = distort_points(x, y, distortion)
         e, f, determinant = u - at_x, v - at_y, a * d - b * b
         x, y = x + (d * e - b * f) / determinant, y + (a * f - b * e) / determinant
     return x, y

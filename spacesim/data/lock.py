@@ -14,8 +14,8 @@ except ImportError:  # Windows
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Make `folder` and keep every other `locked` out of it, of this and other processes, within the `with` block.
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Make `folder` and keep every other `lock_folder` out of it, of this and other processes, within the `with` block.
 
     Raises InputError where another one is in it. The lock is on the folder itself and leaves nothing there. Where the
     system or the file system cannot do that (Windows; NFS locks files alone) nobody is kept out; where the folder

@@ -16,7 +16,7 @@ from spacesim.data.geometry import Array
 
 READ = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 WRITTEN = (".ply", ".obj", ".glb", ".stl")
-FARTHEST = 1e9  #: metres; corners beyond it are taken for damage, chosen (the Moon is at 3.8e8)
+MAX_COORDINATE = 1e9  #: metres; corners beyond it are taken for damage (the Moon is at 3.8e8)
 PARSED = 30  #: bytes of memory that a byte of a mesh file takes while it is read, at most; OBJ took 22
 
 
@@ -24,9 +24,11 @@ def read_mesh(path: Path) -> tuple[Array, np.ndarray]:
     """(vertices [V, 3] metres, faces [F, 3] int64) of a mesh file. Raises InputError where it holds none."""
     mesh = load_trimesh(path)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(getattr(mesh, "faces", ()), np.int64)
-    faces = drawable(vertices, faces)
+    faces = drawable_faces(vertices, faces)
     if len(faces) == 0:
-        raise InputError(f"{path}: expected a mesh, found no face with an area and corners within {FARTHEST:g} m in it")
+        raise InputError(
+            f"{path}: expected a mesh, found no face with an area and corners within {MAX_COORDINATE:g} m in it"
+        )
     return vertices, faces
 
 
@@ -40,14 +42,16 @@ def load_trimesh(path: Path, kind: str | None = None) -> Any:
         raise InputError(f"{path}: expected a mesh in {', '.join(READ)}, found {kind or 'no ending'!r}")
     check_memory(PARSED * len(content), f"{path}: reading it")
     try:
-        check_promise(kind[1:], content)
+        check_header_counts(kind[1:], content)
         force = None if kind == ".ply" else "mesh"
         options = {"skip_materials": True} if kind in (".ply", ".obj") else {}
-        beside = Beside(path.parent)
-        found: Any = trimesh.load(io.BytesIO(content), kind[1:], resolver=beside, force=force, process=False, **options)
-        if not isinstance(found, trimesh.Trimesh | trimesh.PointCloud):
-            raise InputError(f"found {type(found).__name__}")
-        count = len(np.asarray(found.vertices, np.float64).reshape(-1, 3))
+        beside = MeshFolderResolver(path.parent)
+        loaded: Any = trimesh.load(
+            io.BytesIO(content), kind[1:], resolver=beside, force=force, process=False, **options
+        )
+        if not isinstance(loaded, trimesh.Trimesh | trimesh.PointCloud):
+            raise InputError(f"found {type(loaded).__name__}")
+        count = len(np.asarray(loaded.vertices, np.float64).reshape(-1, 3))
         declared = next((n for name, n in _elements(content) if name == b"vertex"), count) if kind == ".ply" else count
         if count != declared:
             raise InputError(f"found {count:,} vertices, its header promises {declared:,}")
@@ -56,10 +60,10 @@ def load_trimesh(path: Path, kind: str | None = None) -> Any:
     except Exception as error:  # trimesh documents none of what it raises
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: expected a mesh, found a file that cannot be read as one ({reason})") from None
-    return found
+    return loaded
 
 
-class Beside(trimesh.resolvers.Resolver):
+class MeshFolderResolver(trimesh.resolvers.Resolver):
     """The files that a mesh file names, in its own folder and below."""
 
     def __init__(self, folder: Path) -> None:
@@ -80,12 +84,12 @@ class Beside(trimesh.resolvers.Resolver):
         """Nothing is written."""
         raise PermissionError(name)
 
-    def namespaced(self, namespace: str) -> "Beside":
+    def namespaced(self, namespace: str) -> "MeshFolderResolver":
         """Folders below are reached by their relative names."""
         return self
 
 
-def check_places(points: np.ndarray, path: Path, farthest: float = 1e15) -> None:
+def check_points(points: np.ndarray, path: Path, farthest: float = 1e15) -> None:
     """Raise InputError in the name of the file where there is no point [N, 3], or one that is not finite or beyond
     `farthest` metres, by default as far as squares in single precision reach."""
     with np.errstate(invalid="ignore"):
@@ -100,7 +104,7 @@ def _elements(data: bytes) -> list[tuple[bytes, int]]:
     return [(name, int(count)) for name, count in re.findall(rb"(?m)^[ \t]*element[ \t]+(\S+)[ \t]+(\d+)", head)]
 
 
-def check_promise(kind: str, data: bytes) -> None:
+def check_header_counts(kind: str, data: bytes) -> None:
     """Raises InputError where the header of a "ply" or "stl" file promises more than the file holds, before anyone
     makes room for it. Other kinds pass."""
     is_text = data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:1024].lower()
@@ -156,15 +160,15 @@ class SignedDistance:
         import igl  # a third of a second, that readers of meshes need not wait
 
         self.vertices = np.ascontiguousarray(vertices, np.float64)
-        self.faces = np.ascontiguousarray(drawable(self.vertices, np.asarray(faces, np.int64).reshape(-1, 3)))
+        self.faces = np.ascontiguousarray(drawable_faces(self.vertices, np.asarray(faces, np.int64).reshape(-1, 3)))
         if len(self.faces) == 0:
             raise InputError("signed distance: expected a mesh, found no face with an area and finite corners")
-        self.faces = _consistent(self.vertices, self.faces)
+        self.faces = _orient_consistently(self.vertices, self.faces)
         used = self.vertices[self.faces.ravel()]
         self.lowest, self.highest = used.min(axis=0), used.max(axis=0)
         self._tree, self._winding = igl.AABB(), igl.FastWindingNumberBVH()
         self._tree.init(self.vertices, self.faces)
-        self._centre = _middle(self.vertices[self.faces])
+        self._centre = _area_median(self.vertices[self.faces])
         self._winding.init(self.vertices - self._centre, self.faces)  # which adds up in single precision
 
     @staticmethod
@@ -176,12 +180,12 @@ class SignedDistance:
         """[N] metres, for points [N, 3]; infinite for those that are not finite."""
         points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
         finite = np.isfinite(points).all(axis=1)
-        found = np.full(len(points), np.inf)
+        distances = np.full(len(points), np.inf)
         if not finite.any():
-            return found
-        asked = points[finite]
-        found[finite] = np.where(self.inside(asked), -1, 1) * self.unsigned(asked)
-        return found
+            return distances
+        finite_points = points[finite]
+        distances[finite] = np.where(self.inside(finite_points), -1, 1) * self.unsigned(finite_points)
+        return distances
 
     def unsigned(self, points: Array) -> Array:
         """[N] metres, for finite points [N, 3]: how far they are from the surface, on whichever side."""
@@ -191,14 +195,14 @@ class SignedDistance:
     def inside(self, points: Array) -> np.ndarray:
         """[N] bool, for points [N, 3]: whether they are inside. Cheaper than their distances."""
         points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
-        found = np.zeros(len(points), bool)
+        is_inside = np.zeros(len(points), bool)
         within = np.flatnonzero(((points >= self.lowest) & (points <= self.highest)).all(axis=1))
         if len(within):
-            found[within] = np.abs(self._winding.winding_number(points[within] - self._centre)) >= 0.5
-        return found
+            is_inside[within] = np.abs(self._winding.winding_number(points[within] - self._centre)) >= 0.5
+        return is_inside
 
 
-def _consistent(vertices: Array, faces: np.ndarray) -> np.ndarray:
+def _orient_consistently(vertices: Array, faces: np.ndarray) -> np.ndarray:
     """Faces [F, 3] of which neighbours turn the same way: across edges that are in two faces, the smaller part by area
     of what hangs together is turned. Corners in one place are one."""
     import igl
@@ -209,8 +213,8 @@ def _consistent(vertices: Array, faces: np.ndarray) -> np.ndarray:
     if not turned.any():
         return faces
     area = _doubled_area(vertices[faces])
-    more = 2 * np.bincount(piece, area * turned) > np.bincount(piece, area)
-    return np.ascontiguousarray(np.where((turned ^ more[piece])[:, None], faces[:, ::-1], faces))
+    mostly_turned = 2 * np.bincount(piece, area * turned) > np.bincount(piece, area)
+    return np.ascontiguousarray(np.where((turned ^ mostly_turned[piece])[:, None], faces[:, ::-1], faces))
 
 
 def _doubled_area(corners: Array) -> Array:
@@ -219,7 +223,7 @@ def _doubled_area(corners: Array) -> Array:
     return np.asarray(np.linalg.norm(across, axis=1))
 
 
-def _middle(corners: Array) -> Array:
+def _area_median(corners: Array) -> Array:
     """[3] with half of the area of triangles [F, 3, 3] below it along each axis, wherever some of them have strayed."""
     area = _doubled_area(corners)
     places = corners.mean(axis=1)
@@ -229,13 +233,13 @@ def _middle(corners: Array) -> Array:
     return places[order[half, range(3)], range(3)]
 
 
-def drawable(vertices: Array, faces: np.ndarray) -> np.ndarray:
-    """The faces [F, 3] whose corners, of vertices [V, 3], are there, within FARTHEST and not on a line."""
+def drawable_faces(vertices: Array, faces: np.ndarray) -> np.ndarray:
+    """The faces [F, 3] whose corners, of vertices [V, 3], are there, within MAX_COORDINATE and not on a line."""
     if len(vertices) == 0 or faces.ndim != 2 or len(faces) == 0:
         return np.zeros((0, 3), np.int64)
     faces = faces[((faces >= 0) & (faces < len(vertices))).all(axis=1)]
     with np.errstate(invalid="ignore"):
-        near = np.all(np.abs(vertices) <= FARTHEST, axis=1)
+        near = np.all(np.abs(vertices) <= MAX_COORDINATE, axis=1)
     faces = faces[near[faces].all(axis=1)]
     corners = vertices[faces]
     longest2 = ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=2).max(axis=1, initial=0.0)

@@ -18,35 +18,31 @@ from spacesim.data.geometry import (
     normalize,
 )
 
-MOST_PIXELS = 2**27  #: of a picture: 16,384 x 8,192
-MOST_SIDE = 2**14  #: pixels of a picture's longer side: what H.264 encodes
-LONGEST_FOCUS = 1e9  #: pixels, chosen
-SUN_LENGTHS = 1e-15, 1e15  #: of a vector that names the Sun's direction, chosen: metres to it are 1.5e11
+MAX_PIXELS = 2**27  #: of a picture: 16,384 x 8,192
+MAX_SIDE = 2**14  #: pixels of a picture's longer side: what H.264 encodes
+MAX_FOCAL_LENGTH = 1e9  #: pixels
+SUN_LENGTHS = 1e-15, 1e15  #: of a vector that names the Sun's direction: metres to it are 1.5e11
 SUN_WORDS = f"3 finite numbers, the largest of {SUN_LENGTHS[0]:g} to {SUN_LENGTHS[1]:g}"
 
 
 def check_size(width: int, height: int, name: str) -> None:
     """Raise InputError in the name of the key or option where a picture has more pixels than any is drawn with."""
-    if width * height > MOST_PIXELS or max(width, height) > MOST_SIDE:
-        limit = f"at most {MOST_PIXELS:,} pixels, {MOST_SIDE:,} a side"
+    if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
+        limit = f"at most {MAX_PIXELS:,} pixels, {MAX_SIDE:,} a side"
         raise InputError(f"{name}: expected {limit}, found {width} x {height}")
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera. The centre of pixel (column i, row j) is at (i + 0.5, j + 0.5).
+    """A pinhole camera. The centre of pixel (column i, row j) is at (i + 0.5, j + 0.5)."""
 
-    world_from_camera: [4, 4] float64, rigid, OpenCV axes (x right, y down, z forward), metres
-    width, height: pixels;  fx, fy: focal lengths, pixels;  cx, cy: principal point, pixels
-    """
-
-    world_from_camera: Array
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    world_from_camera: Array  #: [4, 4] float64, rigid, OpenCV axes (x right, y down, z forward), metres
+    width: int  #: pixels
+    height: int  #: pixels
+    fx: float  #: focal lengths, pixels
+    fy: float  #: focal lengths, pixels
+    cx: float  #: principal point, pixels
+    cy: float  #: principal point, pixels
 
     def __post_init__(self) -> None:
         pose = np.asarray(self.world_from_camera, dtype=np.float64)
@@ -59,10 +55,10 @@ class Camera:
             raise InputError(f"camera: expected a size of at least 1x1 pixels, found {self.width}x{self.height}")
         check_size(self.width, self.height, "camera")
         lengths, centre = np.array([self.fx, self.fy]), np.array([self.cx, self.cy])
-        if not ((lengths >= 1 / LONGEST_FOCUS) & (lengths <= LONGEST_FOCUS)).all():
-            limit = f"above 0, at most {LONGEST_FOCUS:g} pixels"
+        if not ((lengths >= 1 / MAX_FOCAL_LENGTH) & (lengths <= MAX_FOCAL_LENGTH)).all():
+            limit = f"above 0, at most {MAX_FOCAL_LENGTH:g} pixels"
             raise InputError(f"camera: expected focal lengths {limit}, found {self.fx} and {self.fy}")
-        if not (np.abs(centre) <= LONGEST_FOCUS).all():
+        if not (np.abs(centre) <= MAX_FOCAL_LENGTH).all():
             raise InputError(f"camera: expected a principal point in pixels, found {self.cx}, {self.cy}")
         object.__setattr__(self, "world_from_camera", pose)
 
@@ -106,9 +102,9 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Sun:
-    """The Sun as a direction. direction: [3] unit vector, world frame, from the scene towards the Sun."""
+    """The Sun as a direction."""
 
-    direction: Array
+    direction: Array  #: [3] unit vector, world frame, from the scene towards the Sun
 
     def __post_init__(self) -> None:
         direction = np.asarray(self.direction, dtype=np.float64)
@@ -196,12 +192,11 @@ class Dataset:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """An image as trained on and compared with. rgb: [H, W, 3] float32 sRGB values in [0, 1], straight alpha;
-    alpha: [H, W] float32; valid: [H, W] bool, False where `mask_path` says to ignore the pixel."""
+    """An image as trained on and compared with."""
 
-    rgb: np.ndarray
-    alpha: np.ndarray
-    valid: np.ndarray
+    rgb: np.ndarray  #: [H, W, 3] float32 sRGB values in [0, 1], straight alpha
+    alpha: np.ndarray  #: [H, W] float32
+    valid: np.ndarray  #: [H, W] bool, False where `mask_path` says to ignore the pixel
 
     def over(self, background: np.ndarray) -> np.ndarray:
         """[H, W, 3] this image over a background colour [3] or image [H, W, 3] (on sRGB values, as the thesis)."""

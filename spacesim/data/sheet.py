@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-Colour = tuple[int, int, int]
+Color = tuple[int, int, int]
 
 GAP = 8  #: pixels between pictures
 NAME, DETAIL = 14, 13  #: pixels of a label's lines, first and second
@@ -18,9 +18,9 @@ NAME, DETAIL = 14, 13  #: pixels of a label's lines, first and second
 class Page:
     """sRGB colours of the paper, of text and of text that matters less."""
 
-    paper: Colour
-    ink: Colour
-    faint: Colour
+    paper: Color
+    ink: Color
+    faint: Color
 
 
 WHITE_PAGE = Page((255, 255, 255), (0, 0, 0), (110, 110, 110))
@@ -29,17 +29,16 @@ DARK_PAGE = Page((20, 22, 27), (236, 236, 232), (150, 154, 162))
 
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """pixels: [H, W], [H, W, 3] or [H, W, 4] uint8, or [H, W] uint16;  name, detail: lines below it, "" for none;
-    mark: [h, w, 3] uint8, h at most `TEXT` - 4, to the right of these, or None"""
+    """A small picture and its label."""
 
-    pixels: np.ndarray
-    name: str = ""
-    detail: str = ""
-    mark: np.ndarray | None = None
+    pixels: np.ndarray  #: [H, W], [H, W, 3] or [H, W, 4] uint8, or [H, W] uint16
+    name: str = ""  #: lines below it, "" for none
+    detail: str = ""  #: lines below it, "" for none
+    mark: np.ndarray | None = None  #: [h, w, 3] uint8, h at most `LABEL_HEIGHT` - 4, to the right of these, or None
 
 
-TEXT = 40  #: pixels of a label's height
-LEAST = 110  #: pixels of a place's width: room for the names
+LABEL_HEIGHT = 40  #: pixels of a label's height
+MIN_TILE_WIDTH = 110  #: pixels of a place's width: room for the names
 
 
 @cache
@@ -48,7 +47,7 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
 
 
-def fitted(pixels: np.ndarray, wide: int, high: int) -> Image.Image:
+def fit_picture(pixels: np.ndarray, wide: int, high: int) -> Image.Image:
     """A picture over black, as large as fits into wide x high pixels. pixels: as in `Tile`."""
     if pixels.dtype == np.uint16:
         pixels = (pixels >> 8).astype(np.uint8)
@@ -74,7 +73,7 @@ def contact_sheet(
     columns: int | None = None,
     side: int = 176,
     page: Page = WHITE_PAGE,
-    least: int = LEAST,
+    least: int = MIN_TILE_WIDTH,
 ) -> np.ndarray:
     """[H, W, 3] uint8: the title, and `count` tiles row by row, over black where a picture is smaller than its place.
 
@@ -86,15 +85,15 @@ def contact_sheet(
     wide, high = (side, max(1, round(side * aspect))) if aspect <= 1 else (max(1, round(side / aspect)), side)
     wide = max(wide, least)
     rows = math.ceil(count / columns)
-    told = math.ceil(font(20).getlength(title)) + 2 * GAP
-    size = max(GAP + columns * (wide + GAP), 560, told), head + rows * (high + TEXT + GAP)
+    title_width = math.ceil(font(20).getlength(title)) + 2 * GAP
+    size = max(GAP + columns * (wide + GAP), 560, title_width), head + rows * (high + LABEL_HEIGHT + GAP)
     picture = Image.new("RGB", size, page.paper)
     draw = ImageDraw.Draw(picture)
     draw.text((GAP, head / 2), title, page.ink, font(20), anchor="lm")
     for k, tile in enumerate(tiles):
-        x, y = GAP + k % columns * (wide + GAP), head + k // columns * (high + TEXT + GAP)
+        x, y = GAP + k % columns * (wide + GAP), head + k // columns * (high + LABEL_HEIGHT + GAP)
         draw.rectangle((x, y, x + wide - 1, y + high - 1), (0, 0, 0))
-        shown = fitted(tile.pixels, wide, high)
+        shown = fit_picture(tile.pixels, wide, high)
         picture.paste(shown, (x + (wide - shown.width) // 2, y + (high - shown.height) // 2))
         draw.text((x, y + high + 4), tile.name, page.ink, font(NAME))
         draw.text((x, y + high + 21), tile.detail, page.faint, font(DETAIL))

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import (
-    LARGEST_LIST,
+    MAX_LIST_BYTES,
     flush_disks,
     json_bytes,
     read_json,
@@ -29,9 +29,9 @@ from spacesim.data.files import (
     write_json,
 )
 from spacesim.data.images import Undistortion, load_image, read_exr, read_png, write_exr, write_png
-from spacesim.data.integrity import is_whole
-from spacesim.data.manifest import differences, read_manifest, write_manifest
-from spacesim.data.mesh import check_places, load_trimesh
+from spacesim.data.integrity.manifest import check_manifest, read_manifest, write_manifest
+from spacesim.data.integrity.whole import is_whole
+from spacesim.data.mesh import check_points, load_trimesh
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
 from spacesim.data.transforms import dataset_of, read_dataset
 
@@ -42,10 +42,10 @@ __all__ = [
     "SHADOW_SELF_CAST",
     "DatasetWriter",
     "FrameWriter",
+    "find_unreadable_files",
     "load_truth",
     "read_dataset",
     "read_points",
-    "verify_dataset",
     "write_points",
 ]
 
@@ -72,8 +72,8 @@ _log = logging.getLogger(__name__)
 
 
 def load_truth(dataset: Dataset, frame: Frame) -> Truth:
-    """What the path tracer knows of `frame`, as its pinhole camera sees it. Raises InputError where that is missing or
-    broken.
+    """What the path tracer knows of `frame`, as its pinhole camera sees it: arrays [H, W] and [H, W, 3], see `Truth`.
+    Raises InputError where that is missing or broken.
 
     Where the frame's lens distorts, radiance and alpha are resampled bilinearly; labels take the nearest pixel's value,
     so that none is averaged, and are 0 beyond what the lens sees.
@@ -110,8 +110,8 @@ class FrameWriter:
         self.raw = tuple(raw)
         self._warned = False
 
-    def has(self, name: str) -> bool:
-        """All files of frame `name` are whole on disk, e.g. from an interrupted run (see `spacesim.data.integrity`)."""
+    def has_frame(self, name: str) -> bool:
+        """All files of frame `name` are whole on disk, e.g. from an interrupted run (see `data.integrity.whole`)."""
         return all(is_whole(self.root / path) for path in reversed(self._files_of(name)))
 
     def _files_of(self, name: str) -> list[str]:
@@ -192,7 +192,7 @@ class DatasetWriter(FrameWriter):
         distortion: Brown-Conrady k1, k2, p1, p2, k3 of all frames, () none; overview: writes pictures of the whole into
         the folder.
         """
-        missing = [name for name, _, _ in (*train, *test) if not self.has(name)]
+        missing = [name for name, _, _ in (*train, *test) if not self.has_frame(name)]
         if missing:
             raise WorkError(f"{self.root}: expected all frames to be written, {missing[0]} is not")
         remove_leftovers(self.root)  # of processes that were killed
@@ -213,14 +213,14 @@ class DatasetWriter(FrameWriter):
         """Take away the frames' files that are not what SHA256SUMS of the finished dataset says, or, before there is
         one, that cannot be decoded: they are made again, and no damage gets a digest."""
         frames = (*_FILES, "raw")
-        known = read_manifest(self.root)
-        if known:
-            damaged = [path for path in differences(self.root) if path.split("/")[0] in frames]
+        digests = read_manifest(self.root)
+        if digests:
+            damaged = [path for path in check_manifest(self.root) if path.split("/")[0] in frames]
         else:
             paths = [path for folder in frames for path in sorted((self.root / folder).glob("*.*"))]
             with ThreadPoolExecutor() as pool:
-                whole = list(pool.map(_can_be_decoded, paths))
-            pairs = zip(paths, whole, strict=True)
+                decodable = list(pool.map(_can_be_decoded, paths))
+            pairs = zip(paths, decodable, strict=True)
             damaged = [str(path.relative_to(self.root)) for path, is_sound in pairs if not is_sound]
         for path in damaged:
             (self.root / path).unlink(missing_ok=True)
@@ -229,12 +229,14 @@ class DatasetWriter(FrameWriter):
 
     def _check_resumable(self, scene: Mapping[str, Any], resume: bool) -> None:
         if not resume:
-            raise InputError(f"{self.root}: expected a new or empty folder, found a dataset; go on with --resume")
+            raise InputError(
+                f"resume: expected with {self.root}, which holds a dataset, or a new folder, found neither"
+            )
         path = self.root / "scene.json"
-        found = read_json(path, LARGEST_LIST)
-        found = found if isinstance(found, dict) else {}
-        for key in [*scene, *found]:
-            if key not in found or key not in scene or found[key] != scene[key]:
+        existing = read_json(path, MAX_LIST_BYTES)
+        existing = existing if isinstance(existing, dict) else {}
+        for key in [*scene, *existing]:
+            if key not in existing or key not in scene or existing[key] != scene[key]:
                 raise InputError(f"{path}: expected the scene asked for, {key!r} differs; choose another folder")
 
 
@@ -268,14 +270,14 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     cloud = load_trimesh(path, ".ply")
     points = np.asarray(cloud.vertices, np.float64)
-    check_places(points, path)
+    check_points(points, path)
     colors = np.asarray(cloud.visual.vertex_colors) if cloud.visual.kind == "vertex" else np.empty(0)
     if colors.ndim != 2:  # a cloud without colours claims to have none a vertex
         return points, np.full((len(points), 3), 128, np.uint8)
     return points, colors[:, :3].astype(np.uint8)
 
 
-def verify_dataset(path: Path) -> list[str]:
+def find_unreadable_files(path: Path) -> list[str]:
     """Sentences about what is wrong with a dataset folder, [] where every file is there and fits."""
     try:
         dataset = read_dataset(path)
@@ -304,10 +306,10 @@ def verify_dataset(path: Path) -> list[str]:
 
 
 def _read_label(path: Path, camera: Camera) -> None:
-    found = read_png(path).shape[:2]
-    if found != (camera.height, camera.width):
+    size = read_png(path).shape[:2]
+    if size != (camera.height, camera.width):
         expected = f"{camera.width}x{camera.height}"
-        raise InputError(f"{path}: expected {expected} pixels as the camera says, found {found[1]}x{found[0]}")
+        raise InputError(f"{path}: expected {expected} pixels as the camera says, found {size[1]}x{size[0]}")
 
 
 def _describe_frames(
@@ -317,13 +319,13 @@ def _describe_frames(
     intrinsics = [intrinsics_of(camera) for _, camera, _ in (*train, *test)]
     shared = all(entry == intrinsics[0] for entry in intrinsics)
     frames = []
-    for (name, camera, sun), own in zip((*train, *test), intrinsics, strict=True):
+    for (name, camera, sun), frame_intrinsics in zip((*train, *test), intrinsics, strict=True):
         azimuth, elevation = sun.angles
         frames.append(
             {
                 "file_path": f"images/{name}.png",
                 "transform_matrix": camera.opengl.tolist(),
-                **({} if shared else own),
+                **({} if shared else frame_intrinsics),
                 "sun_direction": sun.direction.tolist(),
                 "sun_azimuth_deg": azimuth,
                 "sun_elevation_deg": elevation,

@@ -4,12 +4,13 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
+from functools import lru_cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import LARGEST_JSON, read_json
+from spacesim.data.files import MAX_JSON_BYTES, read_json
 from spacesim.data.toml import Document, Keys, dotted
 
 T = TypeVar("T")
@@ -18,14 +19,15 @@ _NOUNS = {int: "a whole number", float: "a finite number", bool: "true or false"
 
 @dataclass(frozen=True)
 class Rules:
-    """What annotations alone do not say. kinds: classes that the key `kind` chooses among, the first is the default;
-    hidden: fields that are no keys; spread: fields of which one number stands for all; open: classes whose unknown keys
-    are passed over, where files of other programs or versions may have more."""
+    """What annotations alone do not say."""
 
+    #: classes that the key `kind` chooses among, the first is the default
     kinds: Mapping[type, Mapping[str, type]] = field(default_factory=dict)
-    hidden: Sequence[tuple[type, str]] = ()
-    spread: Sequence[str] = ()
+    hidden: Sequence[tuple[type, str]] = ()  #: fields that are no keys
+    spread: Sequence[str] = ()  #: fields of which one number stands for all
+    #: classes whose unknown keys are passed over, where files of other programs or versions may have more
     open: Sequence[type] = ()
+    none: str | None = None  #: the word that stands for None, where annotations have it
 
 
 def structure(cls: type[T], document: Document, rules: Rules, defaults: Mapping[str, Any] | None = None) -> T:
@@ -37,7 +39,7 @@ def structure(cls: type[T], document: Document, rules: Rules, defaults: Mapping[
 
 
 def read_record(
-    path: Path, cls: type[T], rules: Rules | None = None, most: int = LARGEST_JSON
+    path: Path, cls: type[T], rules: Rules | None = None, most: int = MAX_JSON_BYTES
 ) -> tuple[T, dict[str, Any]]:
     """(the `cls` that a JSON file says, its values as they stand there). null is allowed where an annotation has None.
 
@@ -47,6 +49,60 @@ def read_record(
     if not isinstance(values, dict):
         raise InputError(f"{path}: expected a JSON object, found {_short(values)}")
     return structure(cls, Document(str(path), values, {}), rules or Rules()), values
+
+
+def plain(record: Any) -> Any:
+    """The inverse of `structure`: a record as tables, lists and values that JSON has. The alternatives of a union say
+    which one they are under the key `kind`."""
+    if is_dataclass(record) and not isinstance(record, type):
+        kind = {"kind": tag} if (tag := kind_of(type(record))) else {}
+        return {**kind, **{f.name: plain(getattr(record, f.name)) for f in fields(record)}}
+    if isinstance(record, Mapping):
+        return {key: plain(value) for key, value in record.items()}
+    return [plain(value) for value in record] if isinstance(record, list | tuple) else record
+
+
+def kind_of(cls: Any) -> str | None:
+    """The word that chooses this class among the alternatives of a union: its class variable `kind`."""
+    tag = cls.__dict__.get("kind")
+    return tag if isinstance(tag, str) and all(f.name != "kind" for f in fields(cls)) else None
+
+
+def alternatives(hint: Any) -> dict[str, type]:
+    """{kind: class} of an annotation that is a union of records, each with a class variable `kind`; {} of another."""
+    inner = get_args(hint) if get_origin(hint) in (Union, UnionType) else ()
+    return {
+        tag: member
+        for member in inner
+        if isinstance(member, type) and is_dataclass(member) and (tag := kind_of(member))
+    }
+
+
+def choices(hint: Any) -> tuple[str, ...]:
+    """What an annotation `Literal[...]`, or one with None beside it, allows; () of another."""
+    if get_origin(hint) is Literal:
+        return get_args(hint)
+    inner = get_args(hint) if get_origin(hint) in (Union, UnionType) else ()
+    return next((get_args(member) for member in inner if get_origin(member) is Literal), ())
+
+
+def check_choices(record: Any) -> None:
+    """Raise InputError "field: expected one of ..., found ..." unless every field of `record` that is annotated with
+    `Literal[...]` holds one of these words."""
+    cls: Any = type(record)
+    for name, hint in _hints(cls).items():
+        allowed, value = choices(hint), getattr(record, name)
+        if allowed and value not in allowed and not (value is None and NoneType in get_args(hint)):
+            raise InputError(
+                f"{name}: expected one of {', '.join(allowed)}, found {value!r}{did_you_mean(value, allowed)}"
+            )
+
+
+@lru_cache
+def _hints(cls: Any) -> dict[str, Any]:
+    """Annotations of the fields of a dataclass."""
+    hints = get_type_hints(cls)
+    return {f.name: hints[f.name] for f in fields(cls)}
 
 
 def keys_of(cls: type, rules: Rules) -> dict[str, Any]:
@@ -61,14 +117,14 @@ def places_of(cls: type, rules: Rules, at: Keys = ()) -> Iterator[Keys]:
     for kind in dict.fromkeys([cls, *rules.kinds.get(cls, {}).values()]):
         for key, hint in keys_of(kind, rules).items():
             yield (*at, key)
-            inner = [one for one in get_args(hint) if get_origin(hint) in (Union, UnionType)]
-            for table in (one for one in (hint, *inner) if isinstance(one, type) and is_dataclass(one)):
+            inner = [member for member in get_args(hint) if get_origin(hint) in (Union, UnionType)]
+            for table in (member for member in (hint, *inner) if isinstance(member, type) and is_dataclass(member)):
                 yield from places_of(table, rules, (*at, key))
 
 
-def near(word: object, known: Iterable[str]) -> str:
-    """ "; did you mean ...?" where one of the `known` words is close to `word`, else nothing."""
-    close = get_close_matches(str(word), list(known), n=1)
+def did_you_mean(word: object, words: Iterable[str]) -> str:
+    """ "; did you mean ...?" where one of the `words` is close to `word`, else nothing."""
+    close = get_close_matches(str(word), list(words), n=1)
     return f"; did you mean {close[0]}?" if close else ""
 
 
@@ -80,27 +136,31 @@ class _Reader:
 
     def table(self, cls: Any, values: Any, at: Keys, defaults: Mapping[str, Any] | None = None) -> Any:
         """The dataclass `cls`, or the one that `kind` chooses, from a table."""
+        return self._read_record(cls, self._rules.kinds.get(cls, {}), values, at, defaults)
+
+    def _read_record(
+        self, cls: Any, kinds: Mapping[str, type], values: Any, at: Keys, defaults: Mapping[str, Any] | None = None
+    ) -> Any:
         if not isinstance(values, Mapping):
             self._refuse(at, "a table", values)
         values = dict(values)
-        kinds = self._rules.kinds.get(cls, {})
         if kinds:
             kind = values.pop("kind", next(iter(kinds)))
             if not isinstance(kind, str) or kind not in kinds:
-                self._refuse((*at, "kind"), f"one of {', '.join(kinds)}", kind, near(kind, kinds))
+                self._refuse((*at, "kind"), f"one of {', '.join(kinds)}", kind, did_you_mean(kind, kinds))
             cls = kinds[kind]
-        known = keys_of(cls, self._rules)
-        is_open = any(issubclass(cls, one) for one in self._rules.open)
-        values = {key: value for key, value in values.items() if key in known or not is_open}
+        hints = keys_of(cls, self._rules)
+        is_open = any(issubclass(cls, open_class) for open_class in self._rules.open)
+        values = {key: value for key, value in values.items() if key in hints or not is_open}
         for key in values:
-            if key not in known:
-                self._unknown(key, at, [*(["kind"] if kinds else []), *known], kinds)
-        given = {key: self.value(known[key], value, (*at, key)) for key, value in values.items()}
-        given = {**(defaults or {}), **given}
+            if key not in hints:
+                self._refuse_key(key, at, [*(["kind"] if kinds else []), *hints], kinds)
+        settings = {key: self.value(hints[key], value, (*at, key)) for key, value in values.items()}
+        settings = {**(defaults or {}), **settings}
         for f in fields(cls):
-            if f.default is MISSING and f.default_factory is MISSING and f.name not in given:
-                self._refuse((*at, f.name), _noun(known[f.name]), None)
-        return self._made(cls, given, at)
+            if f.default is MISSING and f.default_factory is MISSING and f.name not in settings:
+                self._refuse((*at, f.name), _noun(hints[f.name]), None)
+        return self._construct(cls, settings, at)
 
     def value(self, hint: Any, value: Any, at: Keys) -> Any:
         """`value` as its annotation `hint` wants it."""
@@ -108,21 +168,31 @@ class _Reader:
         if hint is Any:
             return value
         if origin in (Union, UnionType):
-            if value is None and NoneType in inner:
+            if NoneType in inner and (value is None or (value == self._rules.none and isinstance(value, str))):
                 return None
-            (hint,) = (one for one in inner if one is not NoneType)
+            if kinds := alternatives(hint):
+                if isinstance(value, str):
+                    if value not in kinds:
+                        self._refuse(at, f"one of {', '.join(kinds)}", value, did_you_mean(value, kinds))
+                    value = {"kind": value}
+                return self._read_record(None, kinds, value, at)
+            (hint,) = (member for member in inner if member is not NoneType)
             return self.value(hint, value, at)
         if origin is tuple:
-            return self._list(hint, value, at)
+            return self._read_list(hint, value, at)
+        if origin is Literal:
+            if not isinstance(value, str) or value not in inner:
+                self._refuse(at, _noun(hint), value, did_you_mean(value, inner))
+            return value
         if origin is not None and issubclass(origin, Mapping):
             if not isinstance(value, Mapping):
                 self._refuse(at, "a table", value)
-            return {key: self.value(inner[1], one, (*at, key)) for key, one in value.items()}
+            return {key: self.value(inner[1], item, (*at, key)) for key, item in value.items()}
         if is_dataclass(hint):
             return self.table(hint, value, at)
         return self._plain(hint, value, at)
 
-    def _list(self, hint: Any, value: Any, at: Keys) -> tuple[Any, ...]:
+    def _read_list(self, hint: Any, value: Any, at: Keys) -> tuple[Any, ...]:
         inner = get_args(hint)
         is_open, may_spread = inner[-1] is Ellipsis, at[-1] in self._rules.spread
         if may_spread and type(value) in (int, float):
@@ -130,7 +200,9 @@ class _Reader:
         if not isinstance(value, list) or (not is_open and len(value) != len(inner)):
             self._refuse(at, _noun(hint) + (" or one for all" if may_spread else ""), value)
         hints = [inner[0]] * len(value) if is_open else inner
-        return tuple(self.value(one, item, (*at, i)) for i, (one, item) in enumerate(zip(hints, value, strict=True)))
+        return tuple(
+            self.value(item_hint, item, (*at, i)) for i, (item_hint, item) in enumerate(zip(hints, value, strict=True))
+        )
 
     def _plain(self, hint: Any, value: Any, at: Keys) -> Any:
         if hint not in _NOUNS:
@@ -142,23 +214,24 @@ class _Reader:
             self._refuse(at, "text without a null character", value)
         return number
 
-    def _made(self, cls: Any, given: Mapping[str, Any], at: Keys) -> Any:
-        """`cls` with the fields `given`; its own InputError, which begins with a field's name, gets file and line."""
+    def _construct(self, cls: Any, settings: Mapping[str, Any], at: Keys) -> Any:
+        """`cls` with the fields `settings`; its own InputError, which begins with a field's name, gets file and
+        line."""
         try:
-            return cls(**given)
+            return cls(**settings)
         except InputError as error:
             words, _, rest = str(error).partition(": ")
-            name = words.removeprefix("--").replace("-", "_")  # of a field, or of the option that sets it
-            where = (*at, name) if any(name == f.name for f in fields(cls)) else at
-            raise InputError(f"{self._document.label(where)}: {rest}") from None
+            where = (*at, words) if any(words == f.name for f in fields(cls)) else at
+            label = self._document.label(where)
+            raise InputError(f"{label}: {rest}" if label else str(error)) from None
 
-    def _unknown(self, key: str, at: Keys, known: Sequence[str], kinds: Mapping[str, type]) -> NoReturn:
+    def _refuse_key(self, key: str, at: Keys, expected: Sequence[str], kinds: Mapping[str, type]) -> NoReturn:
         places = [place for place in places_of(self._root, self._rules) if place[-1] == key]
         others = [kind for kind, cls in kinds.items() if key in keys_of(cls, self._rules)]
-        hint = f"; did you mean {dotted(places[0])}?" if places else near(key, known)
+        hint = f"; did you mean {dotted(places[0])}?" if places else did_you_mean(key, expected)
         if others:
             hint = f"; kind {' and '.join(others)} know{'s' * (len(others) == 1)} it"
-        self._refuse((*at, key), f"one of {', '.join(known)}", key, hint)
+        self._refuse((*at, key), f"one of {', '.join(expected)}", key, hint)
 
     def _refuse(self, at: Keys, expected: str, found: Any, hint: str = "") -> NoReturn:
         what = "none" if found is None else _short(found)
@@ -176,7 +249,9 @@ def _noun(hint: Any) -> str:
     """What an annotation asks for, in words."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
-        return _noun(next(one for one in inner if one is not NoneType))
+        return _noun(next(member for member in inner if member is not NoneType))
+    if origin is Literal:
+        return f"one of {', '.join(inner)}"
     if origin is tuple and inner[-1] is Ellipsis:
         return "tables in double brackets" if is_dataclass(inner[0]) else f"a list, each item {_noun(inner[0])}"
     if origin is tuple:

@@ -24,17 +24,17 @@ else:
 
 Keys = tuple[str | int, ...]  #: where a value is: names of tables and keys, numbers of what is in a list
 
-LARGEST_FILE = 1 << 20  #: bytes, chosen: far more than anybody writes by hand
-_DEEPEST = 16  # parts of a key, nested tables that lines are kept of
+MAX_FILE_BYTES = 1 << 20  #: bytes: far more than anybody writes by hand
+_MAX_KEY_PARTS = 16  # parts of a key, nested tables that lines are kept of
 
 
 @dataclass(frozen=True)
 class Document:
-    """A TOML file. name: of the file, for messages; lines: of keys, tables and what is in lists, counted from 1."""
+    """A TOML file."""
 
-    name: str
+    name: str  #: of the file, for messages
     values: Mapping[str, Any]
-    lines: Mapping[Keys, int]
+    lines: Mapping[Keys, int]  #: of keys, tables and what is in lists, counted from 1
 
     def place(self, keys: Keys) -> str:
         """File and line of a value or, where it is not there, of the table that it belongs into."""
@@ -57,7 +57,7 @@ def dotted(keys: Keys) -> str:
 def read_document(path: Path) -> Document:
     """Read a TOML file. Raises InputError, with the line where there is one, where it cannot be read or is no TOML."""
     try:
-        text = read_bytes(path, "a scene file", LARGEST_FILE).decode("utf-8-sig")
+        text = read_bytes(path, "a scene file", MAX_FILE_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: expected text in UTF-8, found byte {error.object[error.start]:#04x}") from None
     return parse(text, str(path))
@@ -66,7 +66,7 @@ def read_document(path: Path) -> Document:
 def parse(text: str, name: str) -> Document:
     """The document that `text` says; `name` stands in messages. Raises InputError."""
     if _LONG_KEY.search(text):
-        raise InputError(f"{name}: expected keys of at most {_DEEPEST} parts, found one of more")
+        raise InputError(f"{name}: expected keys of at most {_MAX_KEY_PARTS} parts, found one of more")
     try:
         values = tomllib.loads(text)
         lines = dict(_lines(text.replace("\r\n", "\n")))
@@ -79,17 +79,17 @@ def parse(text: str, name: str) -> Document:
 
 def _syntax_error(message: str, text: str, name: str) -> str:
     """Of tomllib's "what is wrong (at line 3, column 5)"."""
-    found = re.fullmatch(r"(?s)(.*?) \(at (?:line (\d+), column \d+|end of document)\)", message)
-    if not found:
+    match = re.fullmatch(r"(?s)(.*?) \(at (?:line (\d+), column \d+|end of document)\)", message)
+    if not match:
         return f"{name}: expected TOML, found an error: {message}"
-    what, line = found.groups()
+    what, line = match.groups()
     line = line or str(text.rstrip().count("\n") + 1)
     return f"{name}, line {line}: expected TOML, found an error: {what[:1].lower()}{what[1:]}"
 
 
 _KEY_PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')"""
 _KEY = re.compile(rf"{_KEY_PART}(?:[ \t]*\.[ \t]*{_KEY_PART})*")
-_LONG_KEY = re.compile(rf"""(?<![\w-])(?:(?:[\w-]+|"[^"\\\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){{{_DEEPEST}}}""")
+_LONG_KEY = re.compile(rf"""(?<![\w-])(?:(?:[\w-]+|"[^"\\\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){{{_MAX_KEY_PARTS}}}""")
 """Parsers keep every beginning of a dotted key, which takes memory as the square of its length."""
 
 _BLANK = re.compile(r"(?:[ \t\n]|#[^\n]*)*")
@@ -105,7 +105,7 @@ def _lines(text: str) -> Iterator[tuple[Keys, int]]:
     starts = [0, *(match.end() for match in re.finditer("\n", text))]
     seen: set[Keys] = set()
     for keys, position in _Scanner(text).statements():
-        for end in range(1, min(len(keys), _DEEPEST) + 1):
+        for end in range(1, min(len(keys), _MAX_KEY_PARTS) + 1):
             if keys[:end] not in seen:
                 seen.add(keys[:end])
                 yield keys[:end], bisect_right(starts, position)
@@ -194,10 +194,10 @@ class _Scanner:
 def dump(values: Mapping[str, Any]) -> str:
     """`values` as TOML: numbers, strings, booleans, lists, tables and lists of tables. Raises InputError for what TOML
     cannot say."""
-    return "\n".join(_dumped(values, ())).strip("\n") + "\n"
+    return "\n".join(_dump_lines(values, ())).strip("\n") + "\n"
 
 
-def _dumped(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
+def _dump_lines(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
     later = {key: value for key, value in table.items() if isinstance(value, Mapping) or _is_tables(value)}
     for key, value in table.items():
         if key not in later:
@@ -208,7 +208,7 @@ def _dumped(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
             if _is_tables(value) or not item or any(not isinstance(inner, Mapping) for inner in item.values()):
                 yield ""
                 yield f"[[{header}]]" if _is_tables(value) else f"[{header}]"
-            yield from _dumped(item, (*path, key))
+            yield from _dump_lines(item, (*path, key))
 
 
 def _is_tables(value: Any) -> bool:

@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spacesim.data.images import srgb_from_linear
 
-TONES = ("srgb", "filmic")
+Tone = Literal["srgb", "filmic"]
+TONES: tuple[Tone, ...] = get_args(Tone)
 WHITES = {"srgb": 1.0, "filmic": (0.56 + math.sqrt(0.56**2 + 4 * 0.08 * 0.14)) / 0.16}
 """Linear display value that each curve makes white: the least v with t(v) = 1, which is 7.24 for `filmic`."""
 STANDARD_EXPOSURE = math.pi / 1361.0
@@ -17,16 +18,17 @@ STANDARD_EXPOSURE = math.pi / 1361.0
 at 1 au, whose irradiance is 1361 W m^-2 (IAU 2015 B3), shows 1."""
 
 
-def development(scene: Mapping[str, Any]) -> tuple[str, float] | None:
+def tone_and_exposure(scene: Mapping[str, Any]) -> tuple[Tone, float] | None:
     """(tone curve, exposure in EV) of a dataset's pictures, by its scene.json; None where that does not say."""
     try:
-        tone, exposure = str(scene["config"]["camera"]["tone"]), float(scene["exposure"])
-        return (tone, math.log2(exposure / STANDARD_EXPOSURE)) if tone in TONES and exposure > 0 else None
+        tone = TONES[TONES.index(scene["config"]["camera"]["tone"])]
+        exposure = float(scene["exposure"])
+        return (tone, math.log2(exposure / STANDARD_EXPOSURE)) if exposure > 0 else None
     except (KeyError, TypeError, ValueError):
         return None
 
 
-def displayed(linear: np.ndarray, tone: str) -> np.ndarray:
+def display_values(linear: np.ndarray, tone: str) -> np.ndarray:
     """sRGB values in [0, 1] of linear display values, of which 1 is white, by one of TONES."""
     return srgb_from_linear(filmic(linear) if tone == "filmic" else linear)
 

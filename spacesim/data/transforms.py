@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import LARGEST_LIST, read_json
+from spacesim.data.files import MAX_LIST_BYTES, read_json
 from spacesim.data.geometry import OPENCV_FROM_OPENGL
 from spacesim.data.images import image_size
 from spacesim.data.records import SUN_WORDS, Camera, Dataset, Frame, Sun
@@ -30,7 +30,7 @@ _SPLITS = ("train", "val", "test")
 Json = Mapping[str, Any]
 
 
-def read_dataset(path: Path) -> Dataset:
+def read_dataset(path: str | Path) -> Dataset:
     """The dataset in a folder, or of the transforms.json named.
 
     Raises InputError, naming the file, where it is no such dataset: nothing there, an unfinished `generate`,
@@ -39,14 +39,14 @@ def read_dataset(path: Path) -> Dataset:
     """
     path = Path(path)
     root = path if path.is_dir() else path.parent
-    own = root / "transforms.json" if path.is_dir() else path
-    if own.is_file() and own.name != "transforms_train.json":
-        return dataset_of(own, _read_object(own))
+    source = root / "transforms.json" if path.is_dir() else path
+    if source.is_file() and source.name != "transforms_train.json":
+        return dataset_of(source, _read_object(source))
     if (root / "transforms_train.json").is_file():
         meta, train, test = _read_blender(root)
     else:
         raise InputError(_say_what_is_missing(path, root))
-    return _dataset(own, meta, train, test)
+    return _dataset(source, meta, train, test)
 
 
 def dataset_of(path: Path, meta: Json) -> Dataset:
@@ -99,7 +99,7 @@ def _read_blender(root: Path) -> tuple[Json, tuple[Frame, ...], tuple[Frame, ...
 
 
 def _read_object(path: Path) -> Json:
-    value = read_json(path, LARGEST_LIST)
+    value = read_json(path, MAX_LIST_BYTES)
     if not isinstance(value, dict):
         raise InputError(f"{path}: expected a JSON object, found {type(value).__name__}")
     return value
@@ -111,9 +111,9 @@ def _read_frames(source: Path, meta: Json) -> tuple[Frame, ...]:
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{source}: expected a list of frames, found {'none' if not entries else 'another value'}")
     frames = sorted((_read_frame(source, meta, entry) for entry in entries), key=lambda frame: frame.file_path)
-    for one, other in pairwise(frames):
-        if one.file_path == other.file_path:
-            raise InputError(f"{source}: expected each image once, found {one.file_path} twice")
+    for first, second in pairwise(frames):
+        if first.file_path == second.file_path:
+            raise InputError(f"{source}: expected each image once, found {first.file_path} twice")
     return tuple(frames)
 
 
@@ -197,32 +197,32 @@ def _read_sun(values: Json) -> Sun | None:
 
 def _split(source: Path, meta: Json, frames: tuple[Frame, ...]) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
     """(train, test) of `frames` by the rules above."""
-    known = [frame.file_path for frame in frames]
+    paths = [frame.file_path for frame in frames]
     lists = {key: meta.get(f"{key}_filenames") for key in _SPLITS}
-    listed = {key: _listed(source, names, known) for key, names in lists.items() if names is not None}
-    folders = {key: {path for path in known if key in PurePosixPath(path).parts[:-1]} for key in _SPLITS}
+    listed = {key: _listed(source, names, paths) for key, names in lists.items() if names is not None}
+    folders = {key: {path for path in paths if key in PurePosixPath(path).parts[:-1]} for key in _SPLITS}
     if listed:
         test = listed.get("test", listed.get("val"))
-        train = listed.get("train", set(known) - (test or set()))
-        test = set(known) - train if test is None else test
+        train = listed.get("train", set(paths) - (test or set()))
+        test = set(paths) - train if test is None else test
     elif folders["train"] and (folders["test"] or folders["val"]):
         train, test = folders["train"], folders["test"] or folders["val"]
     else:
-        test = set(known[::_HOLD_OUT]) if len(known) > 1 else set()
-        train = set(known) - test
+        test = set(paths[::_HOLD_OUT]) if len(paths) > 1 else set()
+        train = set(paths) - test
     if train & test:
         both = min(train & test)
         raise InputError(f"{source}: expected frames for training and testing apart, found {both} in both")
     return tuple(f for f in frames if f.file_path in train), tuple(f for f in frames if f.file_path in test)
 
 
-def _listed(source: Path, names: Any, known: list[str]) -> set[str]:
+def _listed(source: Path, names: Any, paths: list[str]) -> set[str]:
     """The file paths of a list such as `train_filenames`, each of which must be one of a frame."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{source}: expected lists of file paths as train_filenames and the like")
     listed = {f"{PurePosixPath(name)}" for name in names}
-    listed = {name if name in known else f"{name}.png" for name in listed}
-    unknown = sorted(listed.difference(known))
+    listed = {name if name in paths else f"{name}.png" for name in listed}
+    unknown = sorted(listed.difference(paths))
     if unknown:
         raise InputError(f"{source}: expected a frame for each name in its lists, found none for {unknown[0]}")
     return listed

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from spacesim.eval.metrics.lpips import MINIMUM_SIZE
+from spacesim.eval.metrics.lpips import MIN_SIDE
 from spacesim.eval.metrics.shadow import BAND, THRESHOLD
 
 HIGHER, LOWER = "↑", "↓"
@@ -10,17 +10,15 @@ HIGHER, LOWER = "↑", "↓"
 
 @dataclass(frozen=True)
 class Metric:
-    """key: name in metrics.json;  goal: "↑", "↓" or "→ x", the value to come close to;  digits: decimals
-    meaning: a sentence;  null: why it can be missing in a frame that shows the object
-    """
+    """A metric: its names, its unit and what it means."""
 
-    key: str
+    key: str  #: name in metrics.json
     label: str
     unit: str
-    goal: str
-    digits: int
-    meaning: str
-    null: str = "no pixel is there to measure"
+    goal: str  #: "↑", "↓" or "→ x", the value to come close to
+    digits: int  #: decimals
+    meaning: str  #: a sentence
+    null: str = "no pixel is there to measure"  #: why it can be missing in a frame that shows the object
 
     def distance(self, value: float) -> float:
         """How far `value` is from the goal; the smaller, the better."""
@@ -29,11 +27,15 @@ class Metric:
         return abs(value - float(self.goal.removeprefix("→")))
 
 
+def metric_of(key: str, metrics: tuple[Metric, ...]) -> Metric:
+    """The one of `metrics` that metrics.json calls `key`. Raises KeyError where there is none."""
+    return {metric.key: metric for metric in metrics}[key]
+
+
 IMAGE = (
     Metric(
         "psnr", "PSNR", "dB", HIGHER, 2,
-        "Peak signal-to-noise ratio (2.18), peak 1.",
-        "prediction and truth are equal, so it is infinite",
+        "Peak signal-to-noise ratio (2.18), peak 1; equal pictures: 100 dB.",
     ),
     Metric(
         "ssim", "SSIM", "", HIGHER, 4,
@@ -43,7 +45,7 @@ IMAGE = (
     Metric(
         "lpips", "LPIPS", "", LOWER, 4,
         "Learned perceptual distance (2.20), AlexNet, version 0.1.",
-        f"a side of the picture is below the network's {MINIMUM_SIZE} pixels",
+        f"a side of the picture is below the network's {MIN_SIDE} pixels",
     ),
     Metric("mae", "MAE", "", LOWER, 4, "Mean absolute error of the sRGB values in [0, 1] (2.21)."),
     Metric("rmse", "RMSE", "", LOWER, 4, "Root mean squared error of the sRGB values in [0, 1] (2.22)."),

@@ -35,14 +35,16 @@ def explain(records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips:
     return notes + _explain_kinds(records)
 
 
-def explain_light(known: Sequence[bool | None], by_grazing_angle: bool, no_sweep: str, untold: str = "") -> list[str]:
+def explain_light(
+    known_suns: Sequence[bool | None], by_grazing_angle: bool, no_sweep: str, untold: str = ""
+) -> list[str]:
     """Sentences where what is said of the light is null.
 
-    known: of each frame, whether training has seen its Sun, or None; by_grazing_angle: whether there are numbers;
+    known_suns: of each frame, whether training has seen its Sun, or None; by_grazing_angle: whether there are numbers;
     no_sweep: why one view under many Suns is null, "" where it is not;  untold: why it is not known what training has
     seen, "" where it is
     """
-    notes = _explain_suns(known, untold)
+    notes = _explain_suns(known_suns, untold)
     if not by_grazing_angle:
         notes.append("by_grazing_angle is null: the data has no path-traced truth.")
     return [*notes, no_sweep] if no_sweep else notes
@@ -54,9 +56,9 @@ def explain_objects(
     models: Sequence[str] | None,
     nearest: Sequence[int] = (),
 ) -> list[str]:
-    """Sentences about objects that are judged on their own. names: of the data's objects, {} where it has one;
-    models: names of a composed scene's, None for a run;  nearest: objects that its models stand at, where these are
-    others than those that they are judged as"""
+    """Sentences about objects that are evaluated on their own. names: of the data's objects, {} where it has one;
+    models: names of a composed scene's, None for a run;  nearest: objects that its models stand nearest to,
+    where they are evaluated as others"""
     if not names:
         return ["objects is null: the data does not say of more than one object."]
     notes = []
@@ -64,9 +66,9 @@ def explain_objects(
         have = f"The scene has {len(models)} models, the data {len(names)} objects"
         notes.append(f"{have}: objects have the data's names.")
     if models is not None and nearest:
-        found, wanted = ", ".join(map(str, nearest)), ", ".join(map(str, names))
-        stand = f"{', '.join(models)} stand where objects {found} of the data are"
-        notes.append(f"{stand} and are judged as objects {wanted}: put the models in the objects' order.")
+        order, in_order = ", ".join(map(str, nearest)), ", ".join(map(str, names))
+        stand = f"{', '.join(models)} stand where objects {order} of the data are"
+        notes.append(f"{stand} and are evaluated as objects {in_order}: put the models in the objects' order.")
     counts = {name: sum(name in record["objects"] for record in records) for name in names.values()}
     return notes + [
         f"{name} is in {count} of {len(records)} frames; its numbers are over these."
@@ -75,24 +77,24 @@ def explain_objects(
     ]
 
 
-def _explain_suns(known: Sequence[bool | None], untold: str) -> list[str]:
-    told = [one for one in known if one is not None]
-    if not told:
-        reason = untold or "no judged frame or no training frame says where its Sun is"
+def _explain_suns(known_suns: Sequence[bool | None], untold: str) -> list[str]:
+    definite = [is_known for is_known in known_suns if is_known is not None]
+    if not definite:
+        reason = untold or "no evaluated frame or no training frame says where its Sun is"
         return [f"known_suns and unseen_suns are null: {reason}."]
     notes = []
-    if len(told) < len(known):
-        missing = len(known) - len(told)
-        notes.append(f"{missing} of {len(known)} frames say nothing of their Sun and are in neither split.")
-    if not any(told):
-        notes.append("known_suns is null: no judged frame is lit by a Sun of a training frame.")
-    if all(told):
-        notes.append("unseen_suns is null: every judged frame is lit by a Sun of a training frame.")
+    if len(definite) < len(known_suns):
+        missing = len(known_suns) - len(definite)
+        notes.append(f"{missing} of {len(known_suns)} frames say nothing of their Sun and are in neither split.")
+    if not any(definite):
+        notes.append("known_suns is null: no evaluated frame is lit by a Sun of a training frame.")
+    if all(definite):
+        notes.append("unseen_suns is null: every evaluated frame is lit by a Sun of a training frame.")
     return notes
 
 
 def _explain_kinds(records: Sequence[dict[str, Any]]) -> list[str]:
-    """A sentence for each kind of shadow that no frame shows, where visibility is judged at all."""
+    """A sentence for each kind of shadow that no frame shows, where visibility is evaluated at all."""
     if all(record["shadow_mask"] is None for record in records):
         return []
     kinds = {
@@ -101,7 +103,7 @@ def _explain_kinds(records: Sequence[dict[str, Any]]) -> list[str]:
         "shadow_other_cast": "lies in another object's shadow",
     }
     return [
-        f"{kind} is null: no pixel of the judged frames {what}."
+        f"{kind} is null: no pixel of the evaluated frames {what}."
         for kind, what in kinds.items()
         if all(record[kind] is None for record in records)
     ]

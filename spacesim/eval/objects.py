@@ -1,21 +1,23 @@
-"""Each object of a scene judged on its own, over its pixels of the true picture (thesis 4.3.6, tables 4.6 and 4.7), and
-by its shape."""
+"""Each object of a scene evaluated on its own, over its pixels of the true picture (thesis 4.3.6, tables 4.6 and 4.7),
+and by its shape."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.exporters.objects import targets_of
+from spacesim.data.exporters.objects import labelled_objects
 from spacesim.data.images import read_png
 from spacesim.data.records import Dataset, Frame
-from spacesim.eval.composition import ComposedRun
-from spacesim.eval.judge import Light, View, judge_picture, judge_visibility
+from spacesim.eval.frame_metrics import FrameImages, FrameLight, image_groups, visibility_groups
 from spacesim.eval.metrics import lpips
-from spacesim.eval.metrics.geometry import GeometryConfig, judge_shape
+from spacesim.eval.metrics.geometry import GeometryConfig, compare_shape
 from spacesim.splat.export.mesh import cameras_around
+
+if TYPE_CHECKING:
+    from spacesim.splat.run import Predictor
 
 GROUPS = ("image", "shadow", "shadow_mask", "shadow_self_cast", "shadow_other_cast")
 """Of `labels.GROUPS`, those that have a meaning over one object's pixels."""
@@ -24,74 +26,80 @@ GROUPS = ("image", "shadow", "shadow_mask", "shadow_self_cast", "shadow_other_ca
 def object_names(dataset: Dataset, models: Sequence[str] = ()) -> dict[int, str]:
     """{number in the id images: name} of a dataset with more than one object; {} of others. models: names of as many
     models, which are told instead of the dataset's own."""
-    told = dataset.scene.get("objects")
-    if not isinstance(told, list) or len(told) < 2:
+    objects = dataset.scene.get("objects")
+    if not isinstance(objects, list) or len(objects) < 2:
         return {}
-    if len(models) == len(told):
+    if len(models) == len(objects):
         return {number: name for number, name in enumerate(models, start=1)}
-    return {number: f"{one.get('name', 'object')} {number}" for number, one in enumerate(told, start=1)}
+    return {number: f"{entry.get('name', 'object')} {number}" for number, entry in enumerate(objects, start=1)}
 
 
-def judge_objects(
-    dataset: Dataset, frame: Frame, names: Mapping[int, str], view: View, light: Light, network: lpips.Lpips | None
+def object_groups(
+    dataset: Dataset,
+    frame: Frame,
+    names: Mapping[int, str],
+    view: FrameImages,
+    light: FrameLight,
+    network: lpips.Lpips | None,
 ) -> dict[str, dict[str, Any]]:
     """{name: {group: metrics}} of the objects that the frame shows; {} where it has no picture of their numbers."""
     ids = _ids(dataset, frame, light) if names else None
     if ids is None:
         return {}
-    found = {}
+    groups = {}
     for number, name in names.items():
         mask = (ids == number) & view.valid
         if mask.any():
             alone = replace(view, silhouette=mask, valid=mask)
-            record: dict[str, Any] = {**judge_picture(alone, network), **judge_visibility(light, alone)}
-            found[name] = {group: record[group] for group in GROUPS}
-    return found
+            record: dict[str, Any] = {**image_groups(alone, network), **visibility_groups(light, alone)}
+            groups[name] = {group: record[group] for group in GROUPS}
+    return groups
 
 
-def other_order(run: object, dataset: Dataset) -> list[int]:
+def swapped_order(run: "Predictor", dataset: Dataset) -> list[int]:
     """Numbers of the objects that a scene's models stand nearest to, in the models' order, where that is not the
-    objects' own: each model is judged as another one then. [] of a run, where all is in order, or cannot be told."""
-    if not isinstance(run, ComposedRun):
+    objects' own, so that models are evaluated as other objects. [] of a run, and where all is in order or cannot be
+    told."""
+    if not run.parts:
         return []
     try:
-        targets = targets_of(dataset)
+        targets = labelled_objects(dataset)
     except InputError:
         return []
-    if len(targets) < 2 or len(run.names) != len(targets):
+    if len(targets) < 2 or len(run.parts) != len(targets):
         return []
     bounds = [(target.vertices.min(axis=0), target.vertices.max(axis=0)) for target in targets]
     middles = [t.world_from_object[:3] @ [*(0.5 * (a + b)), 1] for t, (a, b) in zip(targets, bounds, strict=True)]
-    nearest = [int(np.linalg.norm(middles - place, axis=1).argmin()) for place in run.places]
-    own = list(range(len(targets)))
-    return [targets[k].id for k in nearest] if nearest != own and sorted(nearest) == own else []
+    nearest = [int(np.linalg.norm(middles - part.centre, axis=1).argmin()) for part in run.parts]
+    order = list(range(len(targets)))
+    return [targets[k].id for k in nearest] if nearest != order and sorted(nearest) == order else []
 
 
-def judge_object_shapes(
-    run: object, dataset: Dataset, names: Mapping[int, str], config: GeometryConfig | None
+def compare_object_shapes(
+    run: "Predictor", dataset: Dataset, names: Mapping[int, str], config: GeometryConfig | None
 ) -> dict[int, dict[str, Any] | None]:
     """{number: "geometry" as metrics.json has it} of a composed scene's models, each alone against its object's part of
     the true mesh; {} of a run, whose Gaussians belong to no object, and where models or mesh cannot be told apart.
 
     Raises InputError where the grid does not fit into memory.
     """
-    if not isinstance(run, ComposedRun) or config is None or dataset.mesh_path is None or len(run.names) != len(names):
+    if not run.parts or config is None or dataset.mesh_path is None or len(run.parts) != len(names):
         return {}
     try:
-        targets = targets_of(dataset)
+        targets = labelled_objects(dataset)
     except InputError:
         return {}
-    found = {}
-    for index, target in enumerate(targets):
+    shapes = {}
+    for part, target in zip(run.parts, targets, strict=True):
         turn, shift = target.world_from_object[:3, :3], target.world_from_object[:3, 3]
         truth = target.vertices @ turn.T + shift, target.faces
-        model = run.composition.alone(index)
-        antialiased, cameras = run.composition.models[index].run.antialiased, cameras_around(model, config.mesh.views)
-        found[target.id] = judge_shape(model, antialiased, cameras, truth, config).values
-    return found
+        model = part.gaussians
+        cameras = cameras_around(model, config.mesh.views)
+        shapes[target.id] = compare_shape(model, part.antialiased, cameras, truth, config).values
+    return shapes
 
 
-def _ids(dataset: Dataset, frame: Frame, light: Light) -> np.ndarray | None:
+def _ids(dataset: Dataset, frame: Frame, light: FrameLight) -> np.ndarray | None:
     """[H, W] numbers of objects, 0 for none."""
     if light.truth is not None:
         return light.truth.object_id

@@ -1,4 +1,4 @@
-"""Pictures of a judged frame for people to look at: the error in colours, shadow masks with mistakes."""
+"""Pictures of an evaluated frame for people to look at: the error in colours, shadow masks with mistakes."""
 
 from functools import cache
 
@@ -21,19 +21,19 @@ ATTACHED, SELF_CAST, OTHER_CAST = (124, 130, 142), SHADOWED, (122, 78, 132)
 """sRGB colours of the kinds of true shadow."""
 
 ATTACHED_LIT = (176, 202, 216)
-"""sRGB colour of a surface that faces away from the Sun and is predicted to see it: paler than mistakes, as masks are
-judged where a surface faces the Sun."""
+"""sRGB colour of a surface that faces away from the Sun and is predicted to see it: paler than mistakes, as
+masks are only evaluated where a surface faces the Sun."""
 
 
 def error_picture(prediction: np.ndarray, truth: np.ndarray, valid: Mask) -> np.ndarray:
     """[H, W, 3] uint8 colours of the mean absolute error, 0 to `ERROR_SCALE`; black where not valid."""
     error = np.abs(prediction - truth).mean(axis=-1) * valid
-    return error_colours(error / ERROR_SCALE)
+    return error_colors(error / ERROR_SCALE)
 
 
-def error_colours(values: np.ndarray) -> np.ndarray:
+def error_colors(values: np.ndarray) -> np.ndarray:
     """[..., 3] uint8 colours of values in [0, 1]: black, violet, red, yellow, white in even steps."""
-    table = _colour_table()
+    table = _color_table()
     return table[np.rint(np.clip(values, 0, 1) * (len(table) - 1)).astype(np.intp)]
 
 
@@ -61,8 +61,8 @@ def kinds_picture(classes: np.ndarray, mask: Mask) -> np.ndarray:
     """[H, W, 3] uint8: what each pixel of `mask` truly is, by its shadow class [H, W]; the rest black."""
     picture = np.zeros((*mask.shape, 3), np.uint8)
     picture[mask] = LIT
-    for (first, last), colour in zip(KINDS.values(), (ATTACHED, SELF_CAST, OTHER_CAST), strict=True):
-        picture[mask & (classes >= first) & (classes <= last)] = colour
+    for (first, last), color in zip(KINDS.values(), (ATTACHED, SELF_CAST, OTHER_CAST), strict=True):
+        picture[mask & (classes >= first) & (classes <= last)] = color
     return picture
 
 
@@ -70,12 +70,12 @@ def visibility_picture(visibility: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """[H, W, 3] uint8: predicted visibility [H, W] in [0, 1], from the colour of shadow to that of light in even steps,
     over black by `alpha` [H, W]."""
     seen = np.clip(visibility, 0, 1)[..., None]
-    colours = (np.array(SHADOWED) * (1 - seen) + np.array(LIT) * seen) / 255
-    return as_bytes(colours * np.clip(alpha, 0, 1)[..., None])
+    colors = (np.array(SHADOWED) * (1 - seen) + np.array(LIT) * seen) / 255
+    return as_bytes(colors * np.clip(alpha, 0, 1)[..., None])
 
 
 @cache
-def _colour_table() -> np.ndarray:
+def _color_table() -> np.ndarray:
     """[256, 3] uint8: a path of rising lightness through Oklab in even steps."""
     lightness = [0, 0.2, 0.4, 0.6, 0.78, 0.92, 1]
     chroma = [0, 0.1, 0.17, 0.19, 0.15, 0.12, 0]

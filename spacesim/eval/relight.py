@@ -13,38 +13,37 @@ import numpy as np
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.eval import pictures
-from spacesim.eval.judge import view_of
+from spacesim.eval.frame_metrics import frame_images
 from spacesim.eval.metrics import image
 from spacesim.eval.suns import known_suns, rounded_angles
 
 if TYPE_CHECKING:
-    from spacesim.splat.run import Prediction, Run
+    from spacesim.splat.run import Prediction, Predictor
 
-MOST_SUNS = 8
-"""Of a strip (chosen: what a page shows side by side)."""
+MAX_SUNS = 8
+"""Of a strip (what a page shows side by side)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """A view and the frames that name its Suns, by rising phase angle. truths: the frame of this view under the Sun,
-    None where the dataset has none."""
+    """A view and the frames that name its Suns, by rising phase angle."""
 
     view: Frame
     lit_as: tuple[Frame, ...]
-    truths: tuple[Frame | None, ...]
+    truths: tuple[Frame | None, ...]  #: the frame of this view under the Sun, None where the dataset has none
 
 
-def plan_sweep(judged: Sequence[Frame], every: Sequence[Frame]) -> Sweep | None:
-    """The judged view with the most Suns of its own, of several the one with the Sun most behind the camera, under up
-    to `MOST_SUNS` of the Suns of all frames: those with truth, then others, spread over the phase angles.
+def plan_sweep(frames: Sequence[Frame], every: Sequence[Frame]) -> Sweep | None:
+    """The evaluated view with the most Suns of its own, of several the one with the Sun most behind the camera, under
+    up to `MAX_SUNS` of the Suns of all frames: those with truth, then others, spread over the phase angles.
 
     None where the frames have fewer than two Suns.
     """
-    suns = {tuple(angles): frame for frame in (*judged, *every) if (angles := rounded_angles(frame)) is not None}
+    suns = {tuple(angles): frame for frame in (*frames, *every) if (angles := rounded_angles(frame)) is not None}
     if len(suns) < 2:
         return None
     groups: dict[tuple[float, ...], dict[tuple[float, ...], Frame]] = {}
-    for frame in judged:
+    for frame in frames:
         if (angles := rounded_angles(frame)) is not None:
             groups.setdefault(_place(frame.camera), {}).setdefault(tuple(angles), frame)
     if not groups:
@@ -53,18 +52,18 @@ def plan_sweep(judged: Sequence[Frame], every: Sequence[Frame]) -> Sweep | None:
     def rank(group: dict[tuple[float, ...], Frame]) -> tuple[int, float]:
         return -len(group), min(phase_deg(frame.camera, frame) for frame in group.values())
 
-    own = min(groups.values(), key=rank)
-    view = min(own.values(), key=lambda frame: phase_deg(frame.camera, frame))
+    view_suns = min(groups.values(), key=rank)
+    view = min(view_suns.values(), key=lambda frame: phase_deg(frame.camera, frame))
 
     def spread(names: list[tuple[float, ...]], count: int) -> list[tuple[float, ...]]:
         ordered = sorted(names, key=lambda name: (phase_deg(view.camera, suns[name]), name))
         places = np.linspace(0, len(ordered) - 1, min(count, len(ordered))).round().astype(int)
         return [ordered[place] for place in places]
 
-    with_truth = spread(list(own), MOST_SUNS)
-    others = spread([name for name in suns if name not in own], MOST_SUNS - len(with_truth))
-    chosen = spread(with_truth + others, MOST_SUNS)
-    return Sweep(view, tuple(suns[name] for name in chosen), tuple(own.get(name) for name in chosen))
+    with_truth = spread(list(view_suns), MAX_SUNS)
+    others = spread([name for name in suns if name not in view_suns], MAX_SUNS - len(with_truth))
+    chosen = spread(with_truth + others, MAX_SUNS)
+    return Sweep(view, tuple(suns[name] for name in chosen), tuple(view_suns.get(name) for name in chosen))
 
 
 def phase_deg(camera: Camera, lit_as: Frame) -> float:
@@ -75,30 +74,30 @@ def phase_deg(camera: Camera, lit_as: Frame) -> float:
 
 
 def write_sweep(
-    run: "Run", dataset: Dataset, judged: Sequence[Frame], trained: Sequence[Frame], out: Path
+    run: "Predictor", dataset: Dataset, frames: Sequence[Frame], trained: Sequence[Frame], out: Path
 ) -> tuple[dict[str, Any] | None, str]:
     """Write the pictures below `out`, in place of earlier ones. What metrics.json says of them, None where there are
     none, and then a sentence why. trained: the frames that the run was trained on"""
     _forget(out / "relight")
-    sweep = plan_sweep(judged, dataset.frames)
+    sweep = plan_sweep(frames, dataset.frames)
     if sweep is None:
         return None, "relight is null: the data has fewer than two Suns."
     predictions = [run.predict(sweep.view.camera, frame.sun) for frame in sweep.lit_as]
-    if all(np.array_equal(predictions[0].rgb, one.rgb) for one in predictions[1:]):
+    if all(np.array_equal(predictions[0].rgb, picture.rgb) for picture in predictions[1:]):
         return None, "relight is null: the run shows the same picture under every Sun."
-    known = known_suns(sweep.lit_as, trained)
+    known_sun = known_suns(sweep.lit_as, trained)
     steps = []
     for index, frame in enumerate(sweep.lit_as):
         truth, prediction = sweep.truths[index], predictions[index]
         step: dict[str, Any] = {
             "sun": rounded_angles(frame),
             "phase_deg": round(phase_deg(sweep.view.camera, frame), 2),
-            "known_sun": known[index],
+            "known_sun": known_sun[index],
             "truth": None if truth is None else truth.file_path,
             "psnr": None,
         }
         if truth is not None:
-            view, _ = view_of(dataset, truth, prediction)
+            view, _ = frame_images(dataset, truth, prediction)
             step["psnr"] = image.psnr(view.prediction, view.truth, view.silhouette)
             write_png(out / "relight" / f"truth_{index:02d}.png", pictures.as_bytes(view.truth))
         _write_prediction(out / "relight", index, prediction)

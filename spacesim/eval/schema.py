@@ -12,20 +12,20 @@ from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.structure import Rules
 
 SCHEMA = 1
-LARGEST = 1e15  #: of any number in metrics.json, chosen: a larger one is damage
+MAX_NUMBER = 1e15  #: of any number in metrics.json: a larger one is damage
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Of a metric over frames. count: frames that have it;  pooled: over the pixels of all frames at once"""
+    """Of a metric over frames."""
 
     mean: float
     std: float
-    count: int
-    pooled: float | None = None
+    count: int  #: frames that have it
+    pooled: float | None = None  #: over the pixels of all frames at once
 
     def __post_init__(self) -> None:
-        check_ranges(self, mean=(-LARGEST, LARGEST), std=(0, LARGEST), count=(0, LARGEST))
+        check_ranges(self, mean=(-MAX_NUMBER, MAX_NUMBER), std=(0, MAX_NUMBER), count=(0, MAX_NUMBER))
 
 
 Group = Mapping[str, Summary | None]
@@ -90,9 +90,9 @@ class Floaters:
 
 @dataclass(frozen=True)
 class Geometry:
-    """The shape against the truth. size: of the object, metres"""
+    """The shape against the truth."""
 
-    size: float
+    size: float  #: of the object, metres
     chamfer: float | None
     hausdorff99: float | None
     iou: float | None
@@ -102,9 +102,10 @@ class Geometry:
     completeness: float | None = None
     floaters: Floaters | None = None
     mesh: Any = None
+    hausdorff: float | None = None
 
     def __post_init__(self) -> None:
-        check_ranges(self, size=(1e-9, LARGEST))
+        check_ranges(self, size=(1e-9, MAX_NUMBER))
 
 
 @dataclass(frozen=True)
@@ -122,11 +123,11 @@ class ObjectRecord:
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """One judged frame. name: of its folder of pictures;  sun: azimuth and elevation, degrees"""
+    """One evaluated frame."""
 
     file_path: str
-    name: str
-    sun: tuple[float, float] | None
+    name: str  #: of its folder of pictures
+    sun: tuple[float, float] | None  #: azimuth and elevation, degrees
     psnr: float | None
     image_full: Values
     shadow_full: Values
@@ -146,49 +147,49 @@ class FrameRecord:
         if Path(self.name).name != self.name:
             raise InputError(f"name: expected a frame's name without folders, found {self.name!r}")
         if self.psnr is not None:
-            check_ranges(self, psnr=(-LARGEST, LARGEST))
+            check_ranges(self, psnr=(-MAX_NUMBER, MAX_NUMBER))
 
 
 @dataclass(frozen=True)
 class RelitView:
-    """The view under one of many Suns. truth: the frame that shows it, or None"""
+    """The view under one of many Suns."""
 
     sun: tuple[float, float]
-    truth: str | None
+    truth: str | None  #: the frame that shows it, or None
     psnr: float | None
     known_sun: bool | None
 
 
 @dataclass(frozen=True)
 class RelightSweep:
-    """One view under many Suns. visibility: whether it was predicted"""
+    """One view under many Suns."""
 
     view: str
-    visibility: bool
+    visibility: bool  #: whether it was predicted
     suns: tuple[RelitView, ...]
 
 
 @dataclass(frozen=True)
 class ModelFacts:
-    """render_ms: median of a frame"""
+    """Size and speed of a model."""
 
     gaussians: int
     bytes: int
-    render_ms: float
+    render_ms: float  #: median of a frame
     backend: str
 
     def __post_init__(self) -> None:
-        check_ranges(self, gaussians=(0, LARGEST), bytes=(0, LARGEST), render_ms=(0, LARGEST))
+        check_ranges(self, gaussians=(0, MAX_NUMBER), bytes=(0, MAX_NUMBER), render_ms=(0, MAX_NUMBER))
 
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """resolution: width and height of the first frame, pixels"""
+    """The dataset that a run was evaluated on."""
 
     frames: int
     train_frames: int
     suns: int
-    resolution: tuple[int, int]
+    resolution: tuple[int, int]  #: width and height of the first frame, pixels
     scene: str | None = None
     config: Mapping[str, Any] | None = None
     versions: Mapping[str, Any] | None = None
@@ -203,21 +204,21 @@ class TrainingStep:
     gaussians: int | None = None
 
     def __post_init__(self) -> None:
-        check_ranges(self, iteration=(0, LARGEST))
+        check_ranges(self, iteration=(0, MAX_NUMBER))
         for name in ("loss", "gaussians"):
             if getattr(self, name) is not None:
-                check_ranges(self, **{name: (-LARGEST, LARGEST)})
+                check_ranges(self, **{name: (-MAX_NUMBER, MAX_NUMBER)})
 
 
 @dataclass(frozen=True)
 class TrainingFacts:
-    """Of training.json; all None of a composed scene, which no training has made. command: text, or its words"""
+    """Of training.json; all None of a composed scene, which no training has made."""
 
     history: tuple[TrainingStep, ...] | None = None
     seconds: float | None = None
     backend: str | None = None
     device: str | None = None
-    command: Any = None
+    command: Any = None  #: text, or its words
     versions: Mapping[str, str] | None = None
 
 

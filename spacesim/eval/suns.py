@@ -1,4 +1,4 @@
-"""Which judged frames are lit by a Sun that training has seen."""
+"""Which evaluated frames are lit by a Sun that training has seen."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,30 +13,30 @@ from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import read_dataset
 
 SAME_SUN_DEG = 0.01
-"""Degrees between two directions that still count as one Sun (chosen: files keep directions far better than that, and
+"""Degrees between two directions that still count as one Sun (files keep directions far better than that, and
 the Suns of a dataset stand degrees apart)."""
 
 
-def trained_on(config: Mapping[str, Any], dataset: Dataset) -> tuple[Sequence[Frame], str]:
-    """The frames that a run was trained on, and "": those of the judged `dataset` if it is the run's own, else those of
-    the dataset that the run names. () where that one is gone or has changed, and why nothing can be said then.
+def training_frames(config: Mapping[str, Any], dataset: Dataset) -> tuple[Sequence[Frame], str]:
+    """The frames that a run was trained on, and "": those of the evaluated `dataset` if it is the run's own, else those
+    of the dataset that the run names. () where that one is gone or has changed, and why nothing can be said then.
 
     config: the run's
     """
-    told = config.get("data") or {}
-    if "digest" not in told:
+    data = config.get("data") or {}
+    if "digest" not in data:
         return dataset.train, ""
-    path = Path(told["path"])
-    found = _digest(dataset)
-    if found == told["digest"] or (found is None and path == dataset.root.resolve()):
+    path = Path(data["path"])
+    digest = _digest(dataset)
+    if digest == data["digest"] or (digest is None and path == dataset.root.resolve()):
         return dataset.train, ""
     try:
-        own = read_dataset(path)
+        training_set = read_dataset(path)
     except InputError:
         return (), f"the run was trained on other data, {path}, which is gone"
-    if _digest(own) != told["digest"]:
+    if _digest(training_set) != data["digest"]:
         return (), f"the run was trained on other data, and {path} has changed since"
-    return own.train, ""
+    return training_set.train, ""
 
 
 def known_suns(frames: Sequence[Frame], training: Sequence[Frame]) -> list[bool | None]:

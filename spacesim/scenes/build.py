@@ -12,14 +12,14 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, rotation_from_quaternion
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, SceneConfig
 from spacesim.scenes.materials.spectra import sun_rgb
-from spacesim.scenes.materials.table import Material, customised, material
+from spacesim.scenes.materials.table import Material, customise, material
 from spacesim.scenes.meshes.parts import is_closed
-from spacesim.scenes.meshes.read import both_sided, read_mesh
+from spacesim.scenes.meshes.read import make_two_sided, read_mesh
 from spacesim.scenes.scene import Scene, SceneObject
 from spacesim.scenes.spacecraft import Spacecraft, spacecraft
 
 SIZES = (1e-6, 1e10)
-"""Metres that the longest side of an object's box may have, chosen."""
+"""Metres that the longest side of an object's box may have."""
 
 FINEST = 1e-5
 """Least size of an object, over how far the scene reaches from the world's origin. Chosen: the coordinates of meshes
@@ -64,7 +64,7 @@ def _pose(item: ObjectConfig) -> Array:
 def _check_sizes(scene: Scene) -> None:
     """Raises InputError for an object that is smaller or larger than single precision can hold beside the others."""
     least, most = SIZES
-    sizes = [(one.spacecraft.name, _size(one)) for one in scene.objects]
+    sizes = [(item.spacecraft.name, _size(item)) for item in scene.objects]
     for name, size in sizes:
         if not least <= size <= most:
             raise InputError(f"object {name}: expected a size from {least:g} to {most:g} m, found {size:.3g} m")
@@ -77,9 +77,9 @@ def _check_sizes(scene: Scene) -> None:
             raise InputError(f"object {name}: expected a size of at least {FINEST:g} of the scene's, found {found}")
 
 
-def _size(one: SceneObject) -> float:
+def _size(item: SceneObject) -> float:
     """The longest side of the box around an object in world axes, metres."""
-    turned = [np.asarray(part.mesh.vertices) @ one.world_from_object[:3, :3].T for part in one.spacecraft.parts]
+    turned = [np.asarray(part.mesh.vertices) @ item.world_from_object[:3, :3].T for part in item.spacecraft.parts]
     lowest, highest = (np.stack([ends(part, axis=0) for part in turned]) for ends in (np.min, np.max))
     return float((highest.max(axis=0) - lowest.min(axis=0)).max())
 
@@ -94,7 +94,7 @@ def _with_materials(craft: Spacecraft, item: ObjectConfig, custom: Mapping[str, 
         chosen = _material(name, custom)
         for i in fitting:
             wrap = item.two_sided is True and is_closed(parts[i].mesh.faces)
-            parts[i] = replace(parts[i], material=both_sided(chosen) if wrap else chosen)
+            parts[i] = replace(parts[i], material=make_two_sided(chosen) if wrap else chosen)
     return replace(craft, parts=tuple(parts))
 
 
@@ -103,4 +103,4 @@ def _material(name: str, custom: Mapping[str, MaterialConfig]) -> Material:
     if name not in custom:
         return material(name)
     change = custom[name]
-    return customised(name, change.preset, albedo=change.albedo, roughness=change.roughness)
+    return customise(name, change.preset, albedo=change.albedo, roughness=change.roughness)

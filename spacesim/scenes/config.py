@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError, expect
-from spacesim.scenes.camera import CameraConfig
-from spacesim.scenes.earth import EarthConfig
-from spacesim.scenes.rig import FibonacciRig, RigConfig, kinds_with, rig_kind
-from spacesim.scenes.sun import SunConfig
+from spacesim.scenes.cameras.camera import CameraConfig
+from spacesim.scenes.cameras.rig import FibonacciRig, RigConfig, kinds_with, rig_kind
+from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.scenes.lights.sun import SunConfig
 
 Vector = tuple[float, float, float]
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "in": 0.0254, "ft": 0.3048}
@@ -20,46 +20,41 @@ UP_AXES = ("x", "y", "z")
 """Axes of a mesh file that may become z."""
 
 SCALES = (1e-9, 1e9)
-"""Least and greatest factor on the size of an object, chosen."""
+"""Least and greatest factor on the size of an object."""
 
-FARTHEST = 1e9
-"""Metres of a position in each coordinate, chosen (the Moon is at 3.8e8)."""
+MAX_COORDINATE = 1e9
+"""Metres of a position in each coordinate (the Moon is at 3.8e8)."""
 
 
 _UNLESS_ASKED_FOR = ("known_test_views", "shared_test_views")  # in scene.json: datasets without them stay as they were
 
-MOST_SEED = 2**63 - 1
+MAX_SEED = 2**63 - 1
 """Largest whole number that every TOML reader knows."""
 
 
 @dataclass(frozen=True)
 class ObjectConfig:
-    """An object and its pose. Raises InputError unless it names one of spacecraft and mesh.
+    """An object and its pose. Raises InputError unless it names one of spacecraft and mesh."""
 
-    spacecraft: a built-in one; mesh: a mesh file, relative to the scene file; name: "" the spacecraft's or the file's;
-    position: metres, world frame; rotation_wxyz: quaternion that turns body axes into world axes, of any length but 0;
-    scale: factor on its size; units, up, two_sided: of the mesh file and only with one, see `read_mesh`; "" and None
-    are the format's own axis (z where it has none) and sides as `read_mesh` finds them;
-    materials: a material's name for each part or pattern of parts ("panel_*"), the last that fits counts.
-    """
-
-    spacecraft: str = ""
-    mesh: str = ""
-    name: str = ""
-    position: Vector = (0.0, 0.0, 0.0)
+    spacecraft: str = ""  #: a built-in one
+    mesh: str = ""  #: a mesh file, relative to the scene file
+    name: str = ""  #: "" the spacecraft's or the file's
+    position: Vector = (0.0, 0.0, 0.0)  #: metres, world frame
+    #: quaternion that turns body axes into world axes, of any length but 0
     rotation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    scale: float = 1.0
-    units: str = "m"
-    up: str = ""
-    two_sided: bool | None = None
+    scale: float = 1.0  #: factor on its size
+    units: str = "m"  #: of the mesh file, and only with one: "m", "cm", "mm", "km", "in" or "ft"
+    up: str = ""  #: the mesh file's axis that becomes z: "x", "y" or "z"; "" the format's own, z where it has none
+    two_sided: bool | None = None  #: whether all parts show both sides; None and False: open ones alone
+    #: a material's name for each part or pattern of parts ("panel_*"), the last that fits counts
     materials: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if bool(self.spacecraft) == bool(self.mesh):
             found = "both" if self.mesh else "neither"
             raise InputError(f"objects: expected either spacecraft or mesh, found {found}")
-        near = all(abs(x) <= FARTHEST for x in self.position)  # which nan is not
-        expect(near, "position", f"metres from {-FARTHEST:g} to {FARTHEST:g}", list(self.position))
+        near = all(abs(x) <= MAX_COORDINATE for x in self.position)  # which nan is not
+        expect(near, "position", f"metres from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}", list(self.position))
         turns = all(map(math.isfinite, self.rotation_wxyz)) and any(self.rotation_wxyz)
         expect(turns, "rotation_wxyz", "four finite numbers, not all 0", list(self.rotation_wxyz))
         least, most = SCALES
@@ -74,12 +69,11 @@ class ObjectConfig:
 
 @dataclass(frozen=True)
 class MaterialConfig:
-    """A material of a scene file: a preset, changed. albedo: linear camera RGB, 0 to 1; roughness: GGX alpha; None: as
-    the preset."""
+    """A material of a scene file: a preset, changed."""
 
     preset: str
-    albedo: Vector | None = None
-    roughness: float | None = None
+    albedo: Vector | None = None  #: linear camera RGB, 0 to 1
+    roughness: float | None = None  #: GGX alpha; None: as the preset
 
     def __post_init__(self) -> None:
         albedo = self.albedo or (0.0,)
@@ -89,14 +83,13 @@ class MaterialConfig:
 
 @dataclass(frozen=True)
 class QualityConfig:
-    """spp: samples a pixel; test_spp: of test views, whose noise counts as an error of whatever is judged by them, None
-    for four times as many; max_depth: longest light path in edges, 2 is direct light alone; points: surface samples in
-    points.ply. Raises InputError for a value out of range; the upper limits are chosen."""
+    """How carefully frames are rendered. Raises InputError for a value out of range; the upper limits are chosen."""
 
-    spp: int = 64
+    spp: int = 64  #: samples a pixel
+    #: of test views, whose noise counts as an error of whatever is evaluated by them, None for four times as many
     test_spp: int | None = None
-    max_depth: int = 6
-    points: int = 20_000
+    max_depth: int = 6  #: longest light path in edges, 2 is direct light alone
+    points: int = 20_000  #: surface samples in points.ply
 
     def __post_init__(self) -> None:
         samples = (1, 1_000_000)
@@ -107,31 +100,31 @@ class QualityConfig:
             expect(value is None or value <= highest, name, f"at most {highest:,}", value)
 
     @property
-    def judged_spp(self) -> int:
+    def resolved_test_spp(self) -> int:
         """Samples a pixel of test views."""
         return self.test_spp or 4 * self.spp
 
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """All of a scene. seed: of view lattices, noise and points; folder: where relative paths of meshes begin."""
+    """All of a scene."""
 
     name: str
     objects: tuple[ObjectConfig, ...]
-    seed: int = 0
+    seed: int = 0  #: of view lattices, noise and points
     materials: Mapping[str, MaterialConfig] = field(default_factory=dict)
     sun: SunConfig = field(default_factory=SunConfig)
     earth: EarthConfig | None = None
     rig: RigConfig = field(default_factory=FibonacciRig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     quality: QualityConfig = field(default_factory=QualityConfig)
-    folder: Path | None = field(default=None, compare=False)
+    folder: Path | None = field(default=None, compare=False)  #: where relative paths of meshes begin
 
     def __post_init__(self) -> None:
         expect(bool(self.name), "name", "a name", self.name)
         if not self.objects:
             raise InputError("objects: expected at least one object, found none")
-        expect(0 <= self.seed <= MOST_SEED, "seed", f"0 to {MOST_SEED}", self.seed)
+        expect(0 <= self.seed <= MAX_SEED, "seed", f"0 to {MAX_SEED}", self.seed)
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values, without the folder: a dataset does not depend on where its scene file lay."""
@@ -150,7 +143,7 @@ def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
     changes: dict[str, dict[str, Any]] = {"": {}, "rig": {}, "camera": {}, "quality": {}}
     owners = {part: {f.name for f in fields(getattr(scene, part))} if part else {"name", "seed"} for part in changes}
     for name, value in options.items():
-        part = next((part for part, known in owners.items() if name in known), None)
+        part = next((part for part, names in owners.items() if name in names), None)
         if part is None:
             raise InputError(f"{name}: expected {_options_of(scene, name, owners)}")
         if value is not None:
@@ -168,7 +161,7 @@ def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
 def _options_of(scene: SceneConfig, name: str, owners: Mapping[str, Iterable[str]]) -> str:
     """What is expected of an option that `scene` does not know: those of its rig, where another kind knows it."""
     kinds = kinds_with(name)
-    known = owners["rig"] if kinds else set().union(*owners.values())
+    names = owners["rig"] if kinds else set().union(*owners.values())
     whose = f"{scene.name}, whose rig is of kind {rig_kind(scene.rig)}"
     others = f" ({' and '.join(kinds)} know{'s' * (len(kinds) == 1)} {name})" if kinds else ""
-    return f"one of the options {', '.join(sorted(known))} of {whose}{others}"
+    return f"one of the options {', '.join(sorted(names))} of {whose}{others}"

@@ -12,41 +12,44 @@ import drjit as dr
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend.upload import upload
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_NONE, SHADOW_SELF_CAST
-from spacesim.scenes.emitters import opaque
-from spacesim.scenes.scene import Loaded, Scene
-from spacesim.scenes.view import RADIUS, View, replayed
+from spacesim.scenes.cameras.kernel_camera import RADIUS, KernelCamera, record_on_cuda
+from spacesim.scenes.lights.emitters import kernel_input
+from spacesim.scenes.scene import MitsubaScene, Scene
 from spacesim.scenes.visibility import Disc, SolarDirections
 
 OFFSET = 2e-6 * RADIUS
 """From the surface to where shadow rays start: 26 steps of single precision at the bounding sphere."""
 
-LANES = 1 << 24
+MAX_RAYS = 1 << 24
 """Most shadow rays at once."""
 
 
 class Labeller:
     """Labels of a loaded scene. distortion: of the lens, as `Renderer` takes it."""
 
-    def __init__(self, scene: Scene, loaded: Loaded, distortion: Sequence[float]) -> None:
+    def __init__(self, scene: Scene, loaded: MitsubaScene, distortion: Sequence[float]) -> None:
         self._scene = loaded.labelled
         self._distortion = tuple(distortion)
         self._units = loaded.units
         self._parts = PartTable.of(scene, self._scene)
         self._directions = SolarDirections(scene.sun, loaded.sun.limb)
-        self._centres = replayed(self._trace_centres)
-        self._penumbrae = replayed(self._trace_penumbrae)
+        self._centres = record_on_cuda(self._trace_centres)
+        self._penumbrae = record_on_cuda(self._trace_penumbrae)
 
     def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
         """All fields of Truth but radiance and alpha."""
-        inputs = View.of(camera, self._units), opaque(sun.direction), self._directions.few(sun)
+        inputs = KernelCamera.of(camera, self._units), kernel_input(sun.direction), self._directions.few(sun)
         numbers, ids, points = self._centres(self._scene, self._parts, *inputs)
         labels = _images(numbers, ids, camera)
         self._refine(points, sun, labels)
         return labels
 
-    def _trace_centres(self, scene: Any, parts: "PartTable", view: View, sun: Any, disc: Disc) -> tuple[Any, ...]:
+    def _trace_centres(
+        self, scene: Any, parts: "PartTable", view: KernelCamera, sun: Any, disc: Disc
+    ) -> tuple[Any, ...]:
         """(labels that are numbers, one after another; labels that are bytes, packed; surface points)."""
         mi = backend.mitsuba()
         pixel = dr.arange(mi.UInt32, view.width * view.height)
@@ -67,7 +70,7 @@ class Labeller:
         points = _Points(surface.p + OFFSET * normal, normal, object_id)
         dr.eval(numbers, part_id, points)  # in one kernel
         faces_sun = cosine > 0
-        visibility, shadow = _seen(scene, parts, disc, points, faces_sun)
+        visibility, shadow = _sun_visibility(scene, parts, disc, points, faces_sun)
         shadow = dr.select(hit, dr.select(faces_sun, shadow, SHADOW_ATTACHED), SHADOW_NONE)
         flat: list[Any] = [dr.ravel(values) for values in (*numbers, visibility)]
         return dr.concat(flat), object_id | (part_id << 8) | (shadow << 16), points
@@ -79,42 +82,42 @@ class Labeller:
         disc = self._directions.many(sun) if len(mixed) else None
         settled = np.zeros(len(cosine), bool)
         while disc is not None and len(mixed):
-            todo = _grown(mixed, labels["shadow"].shape)
+            todo = _dilate(mixed, labels["shadow"].shape)
             todo = todo[(cosine[todo] > 0) & ~settled[todo]]
-            visibility[todo], shadow[todo] = self._ask(disc, points, todo)
+            visibility[todo], shadow[todo] = self._query_penumbrae(disc, points, todo)
             settled[todo] = True
             mixed = todo[(visibility[todo] > 0) & (visibility[todo] < 1)]
 
-    def _ask(self, disc: Disc, points: "_Points", lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(visibility, shadow classes), [N], of the points `lanes` [N]."""
+    def _query_penumbrae(self, disc: Disc, points: "_Points", indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(visibility, shadow classes), [N], of the points `indices` [N]."""
         uint = backend.mitsuba().UInt32
-        most = max(1, LANES // disc.count)
+        most = max(1, MAX_RAYS // disc.count)
         pieces = [np.empty((2, 0), np.float32)]
-        for first in range(0, len(lanes), most):
-            piece = lanes[first : first + most]
+        for first in range(0, len(indices), most):
+            piece = indices[first : first + most]
             capacity = min(most, max(1024, 1 << (len(piece) - 1).bit_length()))
             padded = np.zeros(capacity, np.uint32)
             padded[: len(piece)] = piece
             inputs = disc, points, uint(padded), dr.opaque(uint, len(piece))
-            found = self._penumbrae(self._scene, self._parts, *inputs, capacity)
-            pieces.append(found.numpy().reshape(2, -1)[:, : len(piece)])
+            values = self._penumbrae(self._scene, self._parts, *inputs, capacity)
+            pieces.append(values.numpy().reshape(2, -1)[:, : len(piece)])
         visibility, shadow = np.concatenate(pieces, axis=1)
         return visibility, shadow.astype(np.uint8)
 
     def _trace_penumbrae(
-        self, scene: Any, parts: "PartTable", disc: Disc, points: "_Points", lanes: Any, count: Any, capacity: int
+        self, scene: Any, parts: "PartTable", disc: Disc, points: "_Points", indices: Any, count: Any, capacity: int
     ) -> Any:
-        """Visibility, then shadow classes, of the points `lanes` [capacity]; those from `count` on are not asked."""
+        """Visibility, then shadow classes, of the points `indices` [capacity]; those from `count` on are not asked."""
         mi = backend.mitsuba()
         origin, normal = (
-            mi.Vector3f(*(dr.gather(mi.Float, x, lanes) for x in vector)) for vector in (points.origin, points.normal)
+            mi.Vector3f(*(dr.gather(mi.Float, x, indices) for x in vector)) for vector in (points.origin, points.normal)
         )
-        chosen = _Points(origin, normal, dr.gather(mi.UInt32, points.object_id, lanes))
-        visibility, shadow = _seen(scene, parts, disc, chosen, dr.arange(mi.UInt32, capacity) < count)
+        chosen = _Points(origin, normal, dr.gather(mi.UInt32, points.object_id, indices))
+        visibility, shadow = _sun_visibility(scene, parts, disc, chosen, dr.arange(mi.UInt32, capacity) < count)
         return dr.concat([visibility, mi.Float(shadow)])
 
 
-def _seen(scene: Any, parts: "PartTable", disc: Disc, points: "_Points", active: Any) -> tuple[Any, Any]:
+def _sun_visibility(scene: Any, parts: "PartTable", disc: Disc, points: "_Points", active: Any) -> tuple[Any, Any]:
     """(visibility, shadow classes), [N], of points; 0 and a cast shadow where not `active`."""
     mi = backend.mitsuba()
     free, hidden, shape = disc.seen(scene, points.origin, points.normal, active)
@@ -128,7 +131,7 @@ def _seen(scene: Any, parts: "PartTable", disc: Disc, points: "_Points", active:
     return visibility, dr.select(visibility < 0.5, cast, SHADOW_LIT)
 
 
-def _grown(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _dilate(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Indices [M] of `pixels` [N] of an image (row by row) and of the eight next to each."""
     row, column = (pixels[:, None] // shape[1], pixels[:, None] % shape[1])
     down, right = (step.ravel() - 1 for step in np.indices((3, 3)))
@@ -146,15 +149,12 @@ class _Points:
 
 @dataclass(frozen=True)
 class PartTable:
-    """Labels of parts, each indexed by the number that Dr.Jit knows a shape by; inputs of kernels.
-
-    textured: whose albedo varies over them, None where no part's does.
-    """
+    """Labels of parts, each indexed by the number that Dr.Jit knows a shape by; inputs of kernels."""
 
     objects: Any
     parts: Any
     albedos: Any
-    textured: Any
+    textured: Any  #: whose albedo varies over them, None where no part's does
 
     @classmethod
     def of(cls, scene: Scene, loaded: Any) -> "PartTable":
@@ -170,8 +170,8 @@ class PartTable:
             index, material = shapes[placed.shape_id], placed.part.material
             objects[index], parts[index] = placed.object_id, placed.part_id
             albedos[index], textured[index] = material.albedo, _has_color_image(material.bsdf)
-        varied = mi.Bool(textured) if textured.any() else None
-        return cls(mi.UInt32(objects), mi.UInt32(parts), mi.Float(albedos.ravel()), varied)
+        varied = upload(textured, mi.Bool) if textured.any() else None
+        return cls(upload(objects, mi.UInt32), upload(parts, mi.UInt32), upload(albedos), varied)
 
     def ids(self, shape: Any, active: Any) -> tuple[Any, Any]:
         """(object id, part id) of shape pointers, 0 where not `active`."""

@@ -19,9 +19,9 @@ import numpy as np
 from spacesim import backend
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.records import Camera, Sun, Truth
+from spacesim.scenes.cameras.kernel_camera import KernelCamera, record_on_cuda
 from spacesim.scenes.labels import OFFSET, Labeller
 from spacesim.scenes.scene import Scene, load
-from spacesim.scenes.view import View, replayed
 
 MAX_WAVEFRONT = 1 << 24
 """Most samples in flight at once, 16 bytes each: more are rendered in several passes."""
@@ -61,31 +61,33 @@ class Renderer:
         self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
         self._sampler = mi.load_dict({"type": "independent"})
         self._labeller = Labeller(scene, self._loaded, distortion)
-        self._sums = replayed(self._trace_paths)
+        self._sums = record_on_cuda(self._trace_paths)
 
     def render(self, camera: Camera, sun: Sun, seed: Sequence[int], spp: int | None = None) -> Truth:
         """What `camera` sees under `sun` by `spp` samples a pixel; `seed` makes the noise."""
         spp = spp or self.spp
         _check_memory(camera, spp)
         self._loaded.point(sun)
-        sunlight = self._launched(self._loaded.sunlit, camera, seed, spp)
+        sunlight = self._launch_passes(self._loaded.sunlit, camera, seed, spp)
         earthlit = self._loaded.earthlit
-        earthlight = self._launched(earthlit, camera, (*seed, _EARTH), spp) if earthlit else None
+        earthlight = self._launch_passes(earthlit, camera, (*seed, _EARTH), spp) if earthlit else None
         labels = self._labeller.labels(camera, sun)  # while the device traces paths
-        radiance, alpha = _means(sunlight, camera, spp)
+        radiance, alpha = _mean_radiance(sunlight, camera, spp)
         if earthlight is None:
             return Truth(radiance=radiance, alpha=alpha, **labels)
-        earth, _ = _means(earthlight, camera, spp)
+        earth, _ = _mean_radiance(earthlight, camera, spp)
         return Truth(radiance=radiance + earth, alpha=alpha, **labels, radiance_earth=earth)
 
     def radiance(self, camera: Camera, sun: Sun, seed: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """(radiance [H, W, 3] from all sources, alpha [H, W]) of what `render` returns, without the labels."""
         _check_memory(camera, self.spp)
         self._loaded.point(sun)
-        radiance, alpha = _means(self._launched(self._loaded.sunlit, camera, seed, self.spp), camera, self.spp)
+        radiance, alpha = _mean_radiance(
+            self._launch_passes(self._loaded.sunlit, camera, seed, self.spp), camera, self.spp
+        )
         if self._loaded.earthlit is not None:
-            earth = self._launched(self._loaded.earthlit, camera, (*seed, _EARTH), self.spp)
-            radiance = radiance + _means(earth, camera, self.spp)[0]
+            earth = self._launch_passes(self._loaded.earthlit, camera, (*seed, _EARTH), self.spp)
+            radiance = radiance + _mean_radiance(earth, camera, self.spp)[0]
         return radiance, alpha
 
     def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
@@ -93,9 +95,9 @@ class Renderer:
         self._loaded.point(sun)
         return self._labeller.labels(camera, sun)
 
-    def _launched(self, scene: Any, camera: Camera, seed: Sequence[int], spp: int) -> list[Any]:
+    def _launch_passes(self, scene: Any, camera: Camera, seed: Sequence[int], spp: int) -> list[Any]:
         """Sums over samples, as `_trace_paths` returns them, of each pass; the device may still be at work on them."""
-        uint, view = backend.mitsuba().UInt32, View.of(camera, self._loaded.units)
+        uint, view = backend.mitsuba().UInt32, KernelCamera.of(camera, self._loaded.units)
         passes = min(spp, -(-spp * view.width * view.height // MAX_WAVEFRONT))
         seeds = [dr.opaque(uint, int(state)) for state in np.random.SeedSequence(seed).generate_state(passes)]
         firsts = [spp * i // passes for i in range(passes + 1)]
@@ -104,15 +106,15 @@ class Renderer:
             for i in range(passes)
         ]
 
-    def _trace_paths(self, scene: Any, view: View, noise: "_Noise", spp: int) -> Any:
+    def _trace_paths(self, scene: Any, view: KernelCamera, noise: "_Noise", spp: int) -> Any:
         """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]."""
         mi = backend.mitsuba()
         samples = spp * view.width * view.height
         sampler = self._sampler.fork()  # a state that was there before must not be let go of in a recording
         sampler.seed(noise.sampler, samples)
-        lane = dr.arange(mi.UInt32, samples)
-        pixel = lane // spp
-        offset = _pixel_offsets(pixel, lane - pixel * spp + noise.first, noise.shift)
+        index = dr.arange(mi.UInt32, samples)
+        pixel = index // spp
+        offset = _pixel_offsets(pixel, index - pixel * spp + noise.first, noise.shift)
         ray, _ = view.rays(pixel, offset, self._distortion)
         radiance, hit, _ = self._integrator.sample(scene, sampler, ray)
         channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
@@ -126,9 +128,9 @@ class Renderer:
         From outside, a ray meets a closed surface from its front; from within, many rays meet a back first.
         """
         mi = backend.mitsuba()
-        lane = dr.arange(mi.UInt32, len(positions) * len(_DIRECTIONS))
-        direction = _gathered(_DIRECTIONS, lane % len(_DIRECTIONS))
-        origin = _gathered(self._loaded.units.points(positions), lane // len(_DIRECTIONS))
+        index = dr.arange(mi.UInt32, len(positions) * len(_DIRECTIONS))
+        direction = _gather(_DIRECTIONS, index % len(_DIRECTIONS))
+        origin = _gather(self._loaded.units.points(positions), index // len(_DIRECTIONS))
         surface = self._loaded.labelled.ray_intersect(mi.Ray3f(origin, direction))
         back = surface.is_valid() & (dr.dot(surface.n, direction) > 0)
         return back.numpy().reshape(len(positions), -1).mean(axis=1) > 0.1
@@ -139,24 +141,24 @@ class Renderer:
         Where parts touch or overlap, their surfaces are hidden for good.
         """
         mi = backend.mitsuba()
-        lane = dr.arange(mi.UInt32, len(points) * len(_DIRECTIONS))
-        normal = _gathered(normals, lane // len(_DIRECTIONS))
-        origin = _gathered(self._loaded.units.points(points) + OFFSET * normals, lane // len(_DIRECTIONS))
-        direction = _gathered(_DIRECTIONS, lane % len(_DIRECTIONS)) + 1.001 * normal  # cosine-weighted
+        index = dr.arange(mi.UInt32, len(points) * len(_DIRECTIONS))
+        normal = _gather(normals, index // len(_DIRECTIONS))
+        origin = _gather(self._loaded.units.points(points) + OFFSET * normals, index // len(_DIRECTIONS))
+        direction = _gather(_DIRECTIONS, index % len(_DIRECTIONS)) + 1.001 * normal  # cosine-weighted
         free = ~self._loaded.labelled.ray_test(mi.Ray3f(origin, dr.normalize(direction)))
         return free.numpy().reshape(len(points), -1).any(axis=1)
 
 
 @dataclass(frozen=True)
 class _Noise:
-    """Of one pass, inputs of kernels. sampler, shift: seeds; first: number of the pass's first sample."""
+    """Of one pass, inputs of kernels."""
 
-    sampler: Any
-    shift: Any
-    first: Any
+    sampler: Any  #: seeds
+    shift: Any  #: seeds
+    first: Any  #: number of the pass's first sample
 
 
-def _means(sums: Sequence[Any], camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray]:
+def _mean_radiance(sums: Sequence[Any], camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray]:
     """Radiance from one source [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
     total: np.ndarray = sum(values.numpy() for values in sums) / np.float32(spp)
     shape = camera.height, camera.width
@@ -172,7 +174,7 @@ def _pixel_offsets(pixel: Any, sample: Any, seed: Any) -> Any:
     return mi.Point2f(*(mi.Float(fraction) * 2.0**-24 for fraction in fractions))
 
 
-def _gathered(vectors: Array, index: Any) -> Any:
+def _gather(vectors: Array, index: Any) -> Any:
     """Rows `index` of `vectors` [N, 3]."""
     vector = backend.mitsuba().Vector3f
     return dr.gather(vector, vector(np.ascontiguousarray(np.asarray(vectors, np.float32).T)), index)

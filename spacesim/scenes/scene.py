@@ -11,37 +11,37 @@ import trimesh
 from scipy.spatial import QhullError
 
 from spacesim import backend
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, normalize
 from spacesim.data.records import Sun
-from spacesim.scenes.earth import EarthConfig
-from spacesim.scenes.emitters import earthshine, solar_disc
+from spacesim.scenes.cameras.kernel_camera import Units
+from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.scenes.lights.emitters import earthshine, solar_disc
+from spacesim.scenes.lights.sun import SunConfig
 from spacesim.scenes.materials.table import Material
 from spacesim.scenes.spacecraft import Part, Spacecraft
-from spacesim.scenes.sun import SunConfig
-from spacesim.scenes.view import Units
 
-MOST_OBJECTS, MOST_PARTS = 84, 255  #: 170 + object id is a shadow class below 255, part ids are bytes
+MAX_OBJECTS, MAX_PARTS = 84, 255  #: 170 + object id is a shadow class below 255, part ids are bytes
 
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """A spacecraft in the world. world_from_object: [4, 4] rigid transform, metres."""
+    """A spacecraft in the world."""
 
     spacecraft: Spacecraft
-    world_from_object: Array = field(default_factory=lambda: np.eye(4))
+    world_from_object: Array = field(default_factory=lambda: np.eye(4))  #: [4, 4] rigid transform, metres
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedPart:
-    """A part in the world. object_id and part_id count from 1 over the scene; mesh: world frame, metres; normals: as of
-    the part, world frame."""
+    """A part in the world. object_id and part_id count from 1 over the scene."""
 
     object_id: int
     part_id: int
     part: Part
-    mesh: trimesh.Trimesh
-    normals: Array | None = None
+    mesh: trimesh.Trimesh  #: world frame, metres
+    normals: Array | None = None  #: as of the part, world frame
 
     @property
     def shape_id(self) -> str:
@@ -60,16 +60,16 @@ class Scene:
 
     def __post_init__(self) -> None:
         parts = sum(len(item.spacecraft.parts) for item in self.objects)
-        if len(self.objects) > MOST_OBJECTS or parts > MOST_PARTS:
+        if len(self.objects) > MAX_OBJECTS or parts > MAX_PARTS:
             raise InputError(
-                f"scene {self.name}: expected at most {MOST_OBJECTS} objects and {MOST_PARTS} parts, which "
+                f"scene {self.name}: expected at most {MAX_OBJECTS} objects and {MAX_PARTS} parts, which "
                 f"8-bit labels can tell apart, found {len(self.objects)} and {parts}"
             )
 
     @cached_property
     def parts(self) -> tuple[PlacedPart, ...]:
         """All parts of all objects, in the order of their part ids. Materials that differ have different names."""
-        materials = _told_apart(part.material for item in self.objects for part in item.spacecraft.parts)
+        materials = _unique_materials(part.material for item in self.objects for part in item.spacecraft.parts)
         placed: list[PlacedPart] = []
         for object_id, item in enumerate(self.objects, start=1):
             for part in item.spacecraft.parts:
@@ -130,29 +130,29 @@ class Scene:
         }
 
 
-def _told_apart(materials: Iterable[Material]) -> dict[Material, Material]:
+def _unique_materials(materials: Iterable[Material]) -> dict[Material, Material]:
     """What each of `materials` becomes: those that are alike one, others of the same name numbered from 2, as two mesh
     files may both have a material "hull/paint"."""
-    found = list(dict.fromkeys(materials))
-    taken = {material.name for material in found}
+    distinct = list(dict.fromkeys(materials))
+    taken = {material.name for material in distinct}
     namesakes: dict[str, list[Material]] = {}
     result: dict[Material, Material] = {}
-    for material in found:
-        known = namesakes.setdefault(material.name, [])
-        like = next((one for one in known if _alike(one, material)), None)
+    for material in distinct:
+        others = namesakes.setdefault(material.name, [])
+        like = next((other for other in others if _is_same_material(other, material)), None)
         if like is None:
-            name, number = material.name, len(known) + 1
-            while known and name in taken:
+            name, number = material.name, len(others) + 1
+            while others and name in taken:
                 name, number = f"{material.name}_{number}", number + 1
             taken.add(name)
             like = material if name == material.name else replace(material, name=name)
-            known.append(like)
+            others.append(like)
         result[material] = like
     return result
 
 
-def _alike(one: Material, other: Material) -> bool:
-    return one.tile == other.tile and _describe_material(one) == _describe_material(other)
+def _is_same_material(first: Material, second: Material) -> bool:
+    return first.tile == second.tile and _describe_material(first) == _describe_material(second)
 
 
 def _describe_material(material: Material) -> dict[str, Any]:
@@ -162,14 +162,11 @@ def _describe_material(material: Material) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class Loaded:
-    """A scene in Mitsuba. sunlit and earthlit (None without an Earth) hold the same shapes, and one emitter each.
+class MitsubaScene:
+    """A scene in Mitsuba. sunlit and earthlit (None without an Earth) hold the same shapes, and one emitter each."""
 
-    labelled: the shapes without light, and no ray slips between two triangles of them; units: of all three.
-    """
-
-    units: Units
-    labelled: Any
+    units: Units  #: of all three
+    labelled: Any  #: the shapes without light, and no ray slips between two triangles of them
     sunlit: Any
     sun: Any
     earthlit: Any = None
@@ -182,7 +179,7 @@ class Loaded:
             self.earth.point(sun)
 
 
-def load(scene: Scene) -> Loaded:
+def load(scene: Scene) -> MitsubaScene:
     """`scene` in Mitsuba: one mesh a part, flat-shaded unless it has normals of its own."""
     mi = backend.mitsuba()
     keys = {p.shape_id: (p.part.material, not p.mesh.is_watertight) for p in scene.parts}
@@ -194,9 +191,9 @@ def load(scene: Scene) -> Loaded:
     sun = solar_disc(scene.sun, scene.earth)
     sunlit = mi.load_dict({"type": "scene", "sun": sun, **shapes})
     if scene.earth is None:
-        return Loaded(units, labelled, sunlit, sun)
+        return MitsubaScene(units, labelled, sunlit, sun)
     earth = earthshine(scene.earth, scene.sun)
-    return Loaded(units, labelled, sunlit, sun, mi.load_dict({"type": "scene", "earth": earth, **shapes}), earth)
+    return MitsubaScene(units, labelled, sunlit, sun, mi.load_dict({"type": "scene", "earth": earth, **shapes}), earth)
 
 
 def _mitsuba_mesh(placed: PlacedPart, units: Units, bsdf: Any) -> Any:
@@ -211,13 +208,13 @@ def _mitsuba_mesh(placed: PlacedPart, units: Units, bsdf: Any) -> Any:
     has = {"has_vertex_normals": normals is not None, "has_vertex_texcoords": uv is not None}
     result = mi.Mesh(placed.shape_id, len(vertices), len(faces), props=properties, **has)
     parameters = mi.traverse(result)
-    parameters["vertex_positions"] = mi.Float(np.asarray(vertices, dtype=np.float32).ravel())
-    parameters["faces"] = mi.UInt32(np.asarray(faces, dtype=np.uint32).ravel())
+    parameters["vertex_positions"] = upload(vertices)
+    parameters["faces"] = upload(faces, mi.UInt32)
     if uv is not None:
-        parameters["vertex_texcoords"] = mi.Float(np.asarray(uv, dtype=np.float32).ravel())
+        parameters["vertex_texcoords"] = upload(uv)
     parameters.update()
     if normals is not None:  # only now: with new positions Mitsuba makes normals of its own
-        parameters["vertex_normals"] = mi.Float(np.asarray(normals, dtype=np.float32).ravel())
+        parameters["vertex_normals"] = upload(normals)
         parameters.update()
     return result
 
@@ -227,9 +224,9 @@ def _texture_coordinates(placed: PlacedPart) -> tuple[Array | None, bool]:
     part, material = placed.part, placed.part.material
     if not material.images:
         return None, False
-    own = None if material.tile else getattr(part.mesh.visual, "uv", None)
-    if own is not None:
-        return np.asarray(own), False
+    mesh_uv = None if material.tile else getattr(part.mesh.visual, "uv", None)
+    if mesh_uv is not None:
+        return np.asarray(mesh_uv), False
     return (box_projection(part.mesh) if part.flat is None else part.flat) / (material.tile or 1.0), True
 
 

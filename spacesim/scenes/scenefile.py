@@ -1,4 +1,4 @@
-"""Scenes by name, from a scene file (docs/scenes.md) or around a mesh file, and scenes as text."""
+"""Scenes by name, from a scene file (docs/reference/scene-files.md) or around a mesh file, and scenes as text."""
 
 import os
 from collections.abc import Collection, Mapping
@@ -9,12 +9,12 @@ from typing import Any, NoReturn
 
 from spacesim.data import toml
 from spacesim.data.errors import InputError
-from spacesim.data.structure import Rules, keys_of, near, structure
+from spacesim.data.structure import Rules, did_you_mean, keys_of, structure
+from spacesim.scenes.cameras.rig import RIGS, RigConfig
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
-from spacesim.scenes.materials.table import changed, material_names
-from spacesim.scenes.rig import RIGS, RigConfig
+from spacesim.scenes.lights.sun import SunConfig
+from spacesim.scenes.materials.table import customise_preset, material_names
 from spacesim.scenes.spacecraft import SPACECRAFT, spacecraft
-from spacesim.scenes.sun import SunConfig
 
 SCENES = Path(__file__).parents[1] / "assets" / "scenes"
 BUILT_IN_SCENES = tuple(sorted(path.stem for path in SCENES.glob("*.toml")))
@@ -36,22 +36,22 @@ def read_scene(source: str | Path, **options: Any) -> SceneConfig:
     cannot be.
     """
     path = Path(source)
-    given = {name: value for name, value in options.items() if value is not None}
+    chosen = {name: value for name, value in options.items() if value is not None}
     if str(source) in BUILT_IN_SCENES:
         path = SCENES / f"{source}.toml"
-    reading: dict[str, Any] = {name: given.pop(name) for name in ("units", "up", "two_sided") if name in given}
+    reading: dict[str, Any] = {name: chosen.pop(name) for name in ("units", "up", "two_sided") if name in chosen}
     if path.suffix.lower() != ".toml":
-        return with_options(_mesh_scene(path, str(source), reading), **given)
+        return with_options(_mesh_scene(path, str(source), reading), **chosen)
     for name in reading:
         raise InputError(f"{name}: expected a mesh file as the scene, found {source}, whose objects say it themselves")
-    return with_options(_read_file(path), **given)
+    return with_options(_read_file(path), **chosen)
 
 
 def scene_text(scene: SceneConfig) -> str:
     """The scene as a TOML file that `read_scene` reads; meshes are relative to the working directory where they lie
     below it."""
     folder = scene.folder or Path()
-    objects = tuple(replace(one, mesh=_from_here(folder / one.mesh)) if one.mesh else one for one in scene.objects)
+    objects = tuple(replace(item, mesh=_from_here(folder / item.mesh)) if item.mesh else item for item in scene.objects)
     return toml.dump(_plain(replace(scene, objects=objects)))
 
 
@@ -59,12 +59,12 @@ def _mesh_scene(path: Path, source: str, reading: Mapping[str, Any]) -> SceneCon
     """A mesh file alone, which `reading` says how to read."""
     if os.path.isfile(path):  # which, unlike Path.is_file, takes any name
         return SceneConfig(path.stem, (ObjectConfig(mesh=path.name, **reading),), folder=path.parent)
-    wanted = f"scene: expected one of {', '.join(BUILT_IN_SCENES)}, a scene file (.toml) or a mesh file"
+    expected = f"scene: expected one of {', '.join(BUILT_IN_SCENES)}, a scene file (.toml) or a mesh file"
     if os.path.isdir(path):
-        raise InputError(f"{wanted}, found the folder {source!r}")
+        raise InputError(f"{expected}, found the folder {source!r}")
     if path.suffix or len(path.parts) > 1:
-        raise InputError(f"{wanted}, found no file {source!r}")
-    raise InputError(f"{wanted}, found {source!r}{near(source, BUILT_IN_SCENES)}")
+        raise InputError(f"{expected}, found no file {source!r}")
+    raise InputError(f"{expected}, found {source!r}{did_you_mean(source, BUILT_IN_SCENES)}")
 
 
 def _read_file(path: Path) -> SceneConfig:
@@ -81,32 +81,32 @@ def _check_names(scene: SceneConfig, document: toml.Document) -> None:
     def refuse(expected: str, found: str, *keys: str | int) -> NoReturn:
         raise InputError(f"{document.label(keys)}: expected {expected}, found {found}")
 
-    def check(name: str, known: Collection[str], *keys: str | int) -> None:
-        if name not in known:
-            refuse(f"one of {', '.join(known)}", f"{name!r}{near(name, known)}", *keys)
+    def check(name: str, names: Collection[str], *keys: str | int) -> None:
+        if name not in names:
+            refuse(f"one of {', '.join(names)}", f"{name!r}{did_you_mean(name, names)}", *keys)
 
     for name, custom in scene.materials.items():
         if name in presets:
             refuse("a name that no preset has", repr(name), "materials", name)
         check(custom.preset, presets, "materials", name, "preset")
         try:
-            changed(name, custom.preset, custom.albedo, custom.roughness)
+            customise_preset(name, custom.preset, custom.albedo, custom.roughness)
         except InputError as error:
             key, _, rest = str(error).removeprefix(f"material {name}: ").partition(": ")
             raise InputError(f"{document.label(('materials', name, key))}: {rest}") from None
-    for index, one in enumerate(scene.objects):
-        for pattern, name in one.materials.items():
+    for index, item in enumerate(scene.objects):
+        for pattern, name in item.materials.items():
             check(name, (*scene.materials, *presets), "objects", index, "materials", pattern)
-        if one.mesh:
-            if not os.path.isfile(folder / one.mesh):
-                refuse("a mesh file", f"no file {str(folder / one.mesh)!r}", "objects", index, "mesh")
+        if item.mesh:
+            if not os.path.isfile(folder / item.mesh):
+                refuse("a mesh file", f"no file {str(folder / item.mesh)!r}", "objects", index, "mesh")
             continue
-        check(one.spacecraft, SPACECRAFT, "objects", index, "spacecraft")
-        parts = [part.name for part in spacecraft(one.spacecraft).parts] if one.materials else []
-        for pattern in one.materials:
+        check(item.spacecraft, SPACECRAFT, "objects", index, "spacecraft")
+        parts = [part.name for part in spacecraft(item.spacecraft).parts] if item.materials else []
+        for pattern in item.materials:
             if not any(fnmatchcase(part, pattern) for part in parts):
-                found = f"none that fits{near(pattern, parts)}"
-                refuse(f"a part of {one.spacecraft}, or a pattern", found, "objects", index, "materials", pattern)
+                found = f"none that fits{did_you_mean(pattern, parts)}"
+                refuse(f"a part of {item.spacecraft}, or a pattern", found, "objects", index, "materials", pattern)
 
 
 def _from_here(mesh: Path) -> str:
@@ -118,10 +118,10 @@ def _plain(value: Any) -> Any:
     """Plain values of a dataclass, for TOML: what is None, "" or an empty table is left out."""
     if not is_dataclass(value):
         if isinstance(value, Mapping):
-            return {key: _plain(one) for key, one in value.items()}
-        return [_plain(one) for one in value] if isinstance(value, tuple) else value
+            return {key: _plain(item) for key, item in value.items()}
+        return [_plain(item) for item in value] if isinstance(value, tuple) else value
     values = {name: getattr(value, name) for name in keys_of(type(value), RULES)}
     kinds = next((kinds for base, kinds in RULES.kinds.items() if isinstance(value, base)), {})
     kind = [name for name, cls in kinds.items() if type(value) is cls]
-    plain = {name: _plain(one) for name, one in values.items() if one is not None and one not in ("", {})}
+    plain = {name: _plain(item) for name, item in values.items() if item is not None and item not in ("", {})}
     return {"kind": kind[0], **plain} if kind else plain

@@ -35,13 +35,13 @@ def crumpled_box(size: ArrayLike, levels: int, depth: float, seed: int) -> trime
 
 def rod(start: ArrayLike, end: ArrayLike, radius: float, segments: int = 24) -> trimesh.Trimesh:
     """A solid cylinder from `start` [3] to `end` [3]."""
-    return along(revolved([(0, 0), (radius, 0), (radius, 1), (0, 1)], segments), start, end)
+    return stretch_mesh(revolve([(0, 0), (radius, 0), (radius, 1), (0, 1)], segments), start, end)
 
 
 def tube(start: ArrayLike, end: ArrayLike, inner: float, outer: float, segments: int = SEGMENTS) -> trimesh.Trimesh:
     """A cylinder from `start` [3] to `end` [3] with a hole through it."""
     profile = [(inner, 0), (outer, 0), (outer, 1), (inner, 1)]
-    return along(revolved(profile, segments), start, end)
+    return stretch_mesh(revolve(profile, segments), start, end)
 
 
 def dish(diameter: float, focal_length: float, thickness: float, rings: int = 16) -> trimesh.Trimesh:
@@ -50,10 +50,10 @@ def dish(diameter: float, focal_length: float, thickness: float, rings: int = 16
     height = radius**2 / (4.0 * focal_length)
     inside = np.stack([radius, height], axis=-1)
     outside = inside - [0.0, thickness]
-    return revolved(np.concatenate([outside, inside[::-1]]))
+    return revolve(np.concatenate([outside, inside[::-1]]))
 
 
-def revolved(profile: ArrayLike, segments: int = SEGMENTS) -> trimesh.Trimesh:
+def revolve(profile: ArrayLike, segments: int = SEGMENTS) -> trimesh.Trimesh:
     """The solid that `profile` [P, 2] of (radius, z) sweeps about the z axis.
 
     The profile is a polygon, counter-clockwise in the (radius, z) plane, closed by itself; where its first
@@ -111,7 +111,7 @@ def pipe(points: ArrayLike, radius: float, segments: int = 12) -> trimesh.Trimes
     points = np.asarray(points, dtype=np.float64)
     heading = normalize(np.diff(points, axis=0))
     angle = np.arange(segments) * (2.0 * np.pi / segments)
-    turn = frame(points[0], heading[0])[:3, :3]
+    turn = axis_frame(points[0], heading[0])[:3, :3]
     ring = points[0] + radius * (np.outer(np.cos(angle), turn[:, 0]) + np.outer(np.sin(angle), turn[:, 1]))
     rings = [ring]
     for i, point in enumerate(points[1:]):
@@ -144,22 +144,22 @@ def handrail(start: ArrayLike, end: ArrayLike, away: ArrayLike, height: float, r
     return pipe([start, start + lift, end + lift, end], radius, 8)
 
 
-def along(mesh: trimesh.Trimesh, start: ArrayLike, end: ArrayLike) -> trimesh.Trimesh:
+def stretch_mesh(mesh: trimesh.Trimesh, start: ArrayLike, end: ArrayLike) -> trimesh.Trimesh:
     """`mesh` with z in [0, 1] stretched and turned so that its axis runs from `start` [3] to `end` [3]."""
     start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     mesh = mesh.copy()
     mesh.apply_scale([1.0, 1.0, float(np.linalg.norm(end - start))])
-    return placed(mesh, start, end - start)
+    return place_mesh(mesh, start, end - start)
 
 
-def placed(mesh: trimesh.Trimesh, origin: ArrayLike, axis: ArrayLike) -> trimesh.Trimesh:
+def place_mesh(mesh: trimesh.Trimesh, origin: ArrayLike, axis: ArrayLike) -> trimesh.Trimesh:
     """`mesh` with its z axis turned to `axis` [3] and then moved to `origin` [3]."""
     mesh = mesh.copy()
-    mesh.apply_transform(frame(origin, axis))
+    mesh.apply_transform(axis_frame(origin, axis))
     return mesh
 
 
-def frame(origin: ArrayLike, axis: ArrayLike) -> Array:
+def axis_frame(origin: ArrayLike, axis: ArrayLike) -> Array:
     """A rigid transform [4, 4] that takes the origin to `origin` [3] and +z to the direction of `axis`
     [3]."""
     z = normalize(axis)
@@ -171,21 +171,23 @@ def frame(origin: ArrayLike, axis: ArrayLike) -> Array:
     return transform
 
 
-def turned(mesh: trimesh.Trimesh, angle_deg: float, axis: ArrayLike, about: ArrayLike = (0, 0, 0)) -> trimesh.Trimesh:
+def rotate_mesh(
+    mesh: trimesh.Trimesh, angle_deg: float, axis: ArrayLike, about: ArrayLike = (0, 0, 0)
+) -> trimesh.Trimesh:
     """`mesh` turned by `angle_deg` about the line through `about` [3] along `axis` [3], right-handed."""
     mesh = mesh.copy()
     mesh.apply_transform(trimesh.transformations.rotation_matrix(np.radians(angle_deg), axis, about))
     return mesh
 
 
-def moved(mesh: trimesh.Trimesh, offset: ArrayLike) -> trimesh.Trimesh:
+def translate_mesh(mesh: trimesh.Trimesh, offset: ArrayLike) -> trimesh.Trimesh:
     """`mesh` moved by `offset` [3]."""
     mesh = mesh.copy()
     mesh.apply_translation(offset)
     return mesh
 
 
-def joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+def join_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """Several solids as one mesh."""
     return trimesh.util.concatenate(list(meshes))
 
@@ -204,6 +206,6 @@ def whole_cells(boxes: trimesh.Trimesh, cell: tuple[float, float]) -> Array:
     places = corner_of_box[boxes.faces % 8]  # [F, 3, 3]
     across = np.array([[1, 2], [0, 2], [0, 1]])[np.ptp(places, axis=1).argmin(axis=1)]  # [F, 2]
     sides = np.take_along_axis(lengths[boxes.faces[:, 0] // 8], across, axis=1)
-    whole = np.round(sides / cell) * cell
-    sides = np.where(whole > 0, whole, sides)
+    rounded = np.round(sides / cell) * cell
+    sides = np.where(rounded > 0, rounded, sides)
     return (np.take_along_axis(places, across[:, None, :], axis=2) * sides[:, None, :]).reshape(-1, 2)

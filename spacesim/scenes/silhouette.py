@@ -7,15 +7,16 @@ from typing import Any
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
-from spacesim.data.exporters import Silhouette, Target
-from spacesim.data.exporters.bop import box_of
+from spacesim.data.exporters import LabelledObject, Silhouette
+from spacesim.data.exporters.bop import bounding_box
 from spacesim.data.geometry import Array
-from spacesim.data.mesh import drawable
+from spacesim.data.mesh import drawable_faces
 from spacesim.data.records import Camera
 
 
-def outline(targets: Sequence[Target]) -> Callable[[Camera], list[Silhouette]]:
+def silhouette_finder(targets: Sequence[LabelledObject]) -> Callable[[Camera], list[Silhouette]]:
     """What finds the silhouettes of `targets` in a pinhole camera. An object that reaches beyond the image is looked
     for one image's width and height further on each side, as the BOP toolkit does."""
     alone = [(_load(target), target) for target in targets]
@@ -26,33 +27,33 @@ def outline(targets: Sequence[Target]) -> Callable[[Camera], list[Silhouette]]:
     return find
 
 
-def _load(target: Target) -> Any:
+def _load(target: LabelledObject) -> Any:
     placed = target.vertices @ target.world_from_object[:3, :3].T + target.world_from_object[:3, 3]
     world = placed.astype(np.float32)
-    faces = drawable(world.astype(np.float64), target.faces)
+    faces = drawable_faces(world.astype(np.float64), target.faces)
     if len(faces) == 0:
         raise InputError(f"object {target.id}: expected a mesh with an area, found none that single precision can tell")
     mi = backend.mitsuba()
     mesh = mi.Mesh("target", len(world), len(faces))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float(world.ravel())
-    parameters["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+    parameters["vertex_positions"] = upload(world)
+    parameters["faces"] = upload(faces, mi.UInt32)
     parameters.update()
     return mi.load_dict({"type": "scene", "mesh": mesh})
 
 
-def _silhouette(scene: Any, target: Target, camera: Camera) -> Silhouette:
+def _silhouette(scene: Any, target: LabelledObject, camera: Camera) -> Silhouette:
     width, height = camera.width, camera.height
     if _is_within(target, camera):
         mask = _hits(scene, camera)
-        return Silhouette(mask, int(mask.sum()), box_of(mask))
+        return Silhouette(mask, int(mask.sum()), bounding_box(mask))
     wide = replace(camera, width=3 * width, height=3 * height, cx=camera.cx + width, cy=camera.cy + height)
     hits = _hits(scene, wide)
     mask = hits[height : 2 * height, width : 2 * width]
-    return Silhouette(mask, int(hits.sum()), box_of(hits, (-width, -height)))
+    return Silhouette(mask, int(hits.sum()), bounding_box(hits, (-width, -height)))
 
 
-def _is_within(target: Target, camera: Camera) -> bool:
+def _is_within(target: LabelledObject, camera: Camera) -> bool:
     """All vertices are in front of the camera and in its image."""
     pose = target.camera_from_object(camera)
     points: Array = target.vertices @ pose[:3, :3].T + pose[:3, 3]

@@ -13,9 +13,9 @@ import numpy as np
 from spacesim import backend
 from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
-from spacesim.scenes.emitters import Limb
-from spacesim.scenes.shapes import frame
-from spacesim.scenes.sun import SunConfig
+from spacesim.scenes.lights.emitters import Limb
+from spacesim.scenes.lights.sun import SunConfig
+from spacesim.scenes.shapes import axis_frame
 
 RIM = 8  #: directions on the rim: a straight edge that passes between two of them hides 1.2 % of the disc at most
 FINE = 256  #: directions all over the disc: steps of 0.4 %
@@ -23,12 +23,11 @@ FINE = 256  #: directions all over the disc: steps of 0.4 %
 
 @dataclass(frozen=True)
 class Disc:
-    """Directions to points of the Sun's disc, inputs of kernels. directions: `count` unit vectors; limb: of the Earth,
-    which can hide the Sun too, or None."""
+    """Directions to points of the Sun's disc, inputs of kernels."""
 
     count: int
-    directions: Any
-    limb: Limb | None
+    directions: Any  #: `count` unit vectors
+    limb: Limb | None  #: of the Earth, which can hide the Sun too, or None
 
     def seen(self, scene: Any, origin: Any, normal: Any, active: Any) -> tuple[Any, Any, Any]:
         """From points [3, N] with their `normal` on the lit side; `active` says which of them are asked.
@@ -37,16 +36,16 @@ class Disc:
         seen there, whether a shape hides it, and the pointer of that shape.
         """
         mi = backend.mitsuba()
-        lane = dr.arange(mi.UInt32, self.count * dr.width(active))
-        point = lane // self.count
-        asked = dr.gather(mi.Bool, active, point)
+        index = dr.arange(mi.UInt32, self.count * dr.width(active))
+        point = index // self.count
+        is_active = dr.gather(mi.Bool, active, point)
         start, axis = (mi.Vector3f(*(dr.gather(mi.Float, x, point) for x in vector)) for vector in (origin, normal))
-        direction = dr.gather(mi.Vector3f, self.directions, lane - point * self.count)
-        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), direction), active=asked)
-        free = asked & ~hit.is_valid() & (dr.dot(axis, direction) > 0)
+        direction = dr.gather(mi.Vector3f, self.directions, index - point * self.count)
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), direction), active=is_active)
+        free = is_active & ~hit.is_valid() & (dr.dot(axis, direction) > 0)
         if self.limb is not None:
             free &= ~self.limb.hides(direction)
-        return free, asked & hit.is_valid(), hit.shape
+        return free, is_active & hit.is_valid(), hit.shape
 
 
 class SolarDirections:
@@ -73,6 +72,6 @@ class SolarDirections:
 
     def _disc(self, points: Array, sun: Sun) -> Disc:
         height = np.sqrt(1 - (points**2).sum(axis=1))
-        rotated = np.column_stack([points, height]) @ frame([0, 0, 0], sun.direction)[:3, :3].T
+        rotated = np.column_stack([points, height]) @ axis_frame([0, 0, 0], sun.direction)[:3, :3].T
         directions = backend.mitsuba().Vector3f(np.ascontiguousarray(rotated.T, np.float32))
         return Disc(len(points), directions, self._limb)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -21,13 +21,14 @@ from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import Rules, read_record, structure
 from spacesim.data.toml import Document
+from spacesim.splat.light.config import MAX_EXPOSURE
 from spacesim.splat.light.model import LightModel
-from spacesim.splat.light.shading import LARGEST_EV
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.output import RenderOutput
 from spacesim.splat.raster.project import Projection
-from spacesim.splat.raster.render import RenderOutput, render
-from spacesim.splat.raster.supersample import supersampled
-from spacesim.splat.raster.tone import developed
+from spacesim.splat.raster.render import render
+from spacesim.splat.raster.supersample import render_supersampled
+from spacesim.splat.raster.tone import adjust_exposure
 from spacesim.splat.train.checkpoint import HistoryEntry, read_tensors
 from spacesim.splat.train.config import TrainConfig
 
@@ -35,7 +36,7 @@ from spacesim.splat.train.config import TrainConfig
 class Rendering:
     """A view of a run, drawn when an array of it is asked for first. See `Run.render`."""
 
-    def __init__(self, run: "Run", camera: Camera, sun: Sun | None, exposure: float | None = None) -> None:
+    def __init__(self, run: "Predictor", camera: Camera, sun: Sun | None, exposure: float | None = None) -> None:
         self.run, self.camera, self.sun, self.exposure = run, camera, sun, exposure
 
     @cached_property
@@ -88,40 +89,109 @@ A_PIXEL = {"cuda": 80, "llvm": 225}
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A rendered view, float32. rgb: [H, W, 3] sRGB values over black, beyond 1 where what bounces makes them brighter
-    than white; alpha: [H, W];
-    depth: [H, W] expected depth in metres, 0 where alpha is 0; visibility: [H, W], or None from a method without;
-    normal: [H, W, 3] unit vectors in world axes, 0 where there is no surface, or None where not asked for."""
+    """A rendered view, float32."""
 
-    rgb: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray
-    visibility: np.ndarray | None
+    rgb: np.ndarray  #: [H, W, 3] sRGB values over black, beyond 1 where what bounces makes them brighter than white
+    alpha: np.ndarray  #: [H, W]
+    depth: np.ndarray  #: [H, W] expected depth in metres, 0 where alpha is 0
+    visibility: np.ndarray | None  #: [H, W], or None from a method without
+    #: [H, W, 3] unit vectors in world axes, 0 where there is no surface, or None where not asked for
     normal: np.ndarray | None = None
+
+
+class Part(Protocol):
+    """A model of a composed scene, where it stands."""
+
+    @property
+    def name(self) -> str:
+        """As the scene calls it."""
+
+    @property
+    def centre(self) -> np.ndarray:
+        """[3] metres, world: the middle of its Gaussians."""
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """Its Gaussians, in the world's axes."""
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether it is drawn with the anti-aliasing filter."""
+
+
+class Predictor(Protocol):
+    """What evaluating, sweeping and showing ask for: a trained `Run`, or several in one scene (`ComposedRun`)."""
+
+    @property
+    def path(self) -> Path:
+        """The run's folder, or the scene's file."""
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """How it was trained, or composed; "method" names the method or all of them."""
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """How training went, see `TrainingRecord`; {} of a scene."""
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """All Gaussians, in the world's axes."""
+
+    @property
+    def gaussian_count(self) -> int:
+        """Number of Gaussians."""
+
+    @property
+    def model_bytes(self) -> int:
+        """Size of the files of all models, each counted once."""
+
+    @property
+    def backend(self) -> str:
+        """The backend that renders now."""
+
+    @property
+    def antialiased(self) -> Any:
+        """Whether Gaussians are drawn with the anti-aliasing filter: one bool for all, or Bool [N]."""
+
+    @property
+    def relightable(self) -> bool:
+        """Whether the Sun's direction changes what is predicted."""
+
+    @property
+    def parts(self) -> Sequence[Part]:
+        """The models of a scene, which stand for the dataset's objects in their order; none of a single run."""
+
+    def predict(
+        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
+    ) -> Prediction:
+        """Render one view. normals: predict these, too;  exposure: EV, of colours that are linear; by default that of
+        the training pictures. Raises InputError where the Sun matters and none is told, and for an exposure of colours
+        that are sRGB values."""
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What a run says of its data. path: of the folder;  digest: see `training_digest`, of runs that tell it"""
+    """What a run says of its data."""
 
-    path: str
-    digest: str | None = None
+    path: str  #: of the folder
+    digest: str | None = None  #: see `training_digest`, of runs that tell it
     train_frames: int | None = None
     test_frames: int | None = None
 
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """What training.json says: how a run came to be. seconds: of training, and the part of it that refinement took"""
+    """What training.json says: how a run came to be."""
 
-    history: tuple[HistoryEntry, ...]
-    seconds: float
-    gaussians: int
-    backend: str
-    refinement_seconds: float = 0.0
-    device: str | None = None
-    command: str | None = None
-    versions: Mapping[str, str] = field(default_factory=dict)
+    history: tuple[HistoryEntry, ...]  #: of some iterations, in order
+    seconds: float  #: of training
+    gaussians: int  #: at the end
+    backend: str  #: that trained
+    refinement_seconds: float = 0.0  #: the part of `seconds` that refinement took
+    device: str | None = None  #: that trained
+    command: str | None = None  #: the command line, or None of another caller
+    versions: Mapping[str, str] = field(default_factory=dict)  #: of libraries
 
     def __post_init__(self) -> None:
         if not self.history:
@@ -130,20 +200,23 @@ class TrainingRecord:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A trained model with its history. bytes: size of the model's file. It predicts on one thread at a time, and no
-    other may use Dr.Jit meanwhile: they would wait for each other for ever, or recordings fail (Dr.Jit 1.5)."""
+    """A trained model with its history.
 
-    path: Path
-    config: dict[str, Any]
-    training: dict[str, Any]
-    model: Gaussians
-    bytes: int
-    light: LightModel | None = None
+    It predicts on one thread at a time, and no other may use Dr.Jit meanwhile: they would wait for each other for ever,
+    or recordings fail (Dr.Jit 1.5).
+    """
+
+    path: Path  #: the folder
+    config: dict[str, Any]  #: what config.json says
+    training: dict[str, Any]  #: what training.json says, see docs/reference/runs.md
+    gaussians: Gaussians
+    model_bytes: int  #: size of the model's file
+    light: LightModel | None = None  #: None of a method without light
 
     @property
-    def gaussians(self) -> int:
+    def gaussian_count(self) -> int:
         """Number of Gaussians."""
-        return self.model.count
+        return self.gaussians.count
 
     @property
     def backend(self) -> str:
@@ -163,7 +236,12 @@ class Run:
     @property
     def relightable(self) -> bool:
         """Whether the Sun's direction changes what is predicted."""
-        return self.light is not None
+        return self.light is not None and self.light.config.field.knows_sun
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """None: it was trained as one."""
+        return ()
 
     @property
     def curve(self) -> tuple[str, float] | None:
@@ -176,40 +254,42 @@ class Run:
         """What `camera` sees under a Sun: rgb, alpha, depth, normal and visibility as numpy arrays, drawn when they are
         asked for.
 
-        sun: (azimuth, elevation) in degrees, a direction [3] towards it, or a Sun; a run of the method `vanilla` knows
-        the light of its pictures alone;  exposure: EV, of a run whose colours are linear
+        sun: (azimuth, elevation) in degrees, a direction [3] towards it, or a Sun; a run that is not `relightable`
+        knows the light of its pictures alone;  exposure: EV, of a run whose colours are linear
         Raises InputError where a run needs the Sun and none is told.
         """
-        found = Sun.of(sun)
-        if found is None and self.relightable:
+        direction = Sun.of(sun)
+        if direction is None and self.relightable:
             raise InputError(f"sun: expected its direction for a run of {self.config['method']}, found none")
-        return Rendering(self, camera, found, exposure)
+        return Rendering(self, camera, direction, exposure)
 
     def predict(
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> Prediction:
-        """Render one view. The method `vanilla` knows one light: `sun` changes nothing. exposure: EV, of a model whose
-        colours are linear; by default that of its training pictures. Raises InputError where another method is not told
-        the Sun, and for an exposure of a model whose colours are sRGB values."""
-        more = stops(self.curve, exposure, str(self.path))
+        """Render one view. A run that is not `relightable` knows one light: `sun` changes nothing. Where training
+        pictures have embeddings, every view is drawn with their mean. exposure: EV, of a model whose colours are
+        linear; by default that of its training pictures. Raises InputError where a relightable run is not told the Sun,
+        and for an exposure of a model whose colours are sRGB values."""
+        stops_more = stops(self.curve, exposure, str(self.path))
         check_picture(camera)
         names = ("alpha", "depth", *(("normal",) if normals else ()))
         if self.light is None:
-            plain = partial(render, self.model, outputs=(*names, "colour"), antialiased=self.antialiased)
-            output = supersampled(plain, camera, self.supersample)
-            return _prediction(output, output.image("colour"), None, normals)
-        if sun is None:
+            plain = partial(render, self.gaussians, outputs=(*names, "color"), antialiased=self.antialiased)
+            output = render_supersampled(plain, camera, self.supersample)
+            return _prediction(output, output.image("color"), None, normals)
+        if sun is None and self.relightable:
             raise InputError(
                 f"{self.path}: expected the Sun's direction for a run of {self.config['method']}, found none"
             )
-        lit = partial(draw_lit, self.model, self.light, sun=sun.direction, outputs=names, antialiased=self.antialiased)
-        output = supersampled(lit, camera, self.supersample, colours=3, linear=self.curve is not None)
+        towards = None if sun is None else sun.direction
+        lit = partial(draw_lit, self.gaussians, self.light, sun=towards, outputs=names, antialiased=self.antialiased)
+        output = render_supersampled(lit, camera, self.supersample, colors=3, linear=self.curve is not None)
         drawn, alpha = output.image("features"), output.image("alpha")
         visible = np.zeros_like(alpha)
         visibility = np.divide(drawn[..., 3], alpha, out=visible, where=alpha > 0) if drawn.shape[2] > 3 else None
         rgb = drawn[..., :3]
         if self.curve:
-            rgb = developed(rgb, self.curve[0], more)
+            rgb = adjust_exposure(rgb, self.curve[0], stops_more)
         return _prediction(output, rgb, visibility, normals)
 
 
@@ -219,31 +299,32 @@ def check_picture(camera: Camera) -> None:
     check_memory(needed, f"a picture of {camera.width} x {camera.height} pixels")
 
 
-def stops(curve: tuple[str, float] | None, exposure: float | None, found: str) -> float:
+def stops(curve: tuple[str, float] | None, exposure: float | None, source: str) -> float:
     """By how many EV a picture is exposed more than those of training: none where no `exposure` is asked for. curve: as
-    `Run.curve`;  found: whose it is. Raises InputError for colours that are sRGB values, and for no such exposure."""
+    `Run.curve`;  source: whose it is. Raises InputError for colours that are sRGB values, and for no such exposure."""
     if exposure is None:
         return 0.0
     if curve is None:
-        raise InputError(f"--exposure: expected a run trained with --linear, found {found}")
-    if not abs(exposure) <= LARGEST_EV:
-        raise InputError(f"--exposure: expected -{LARGEST_EV} to {LARGEST_EV} EV, found {exposure}")
+        raise InputError(f"exposure: expected a run trained in linear light (light.linear), found {source}")
+    if not abs(exposure) <= MAX_EXPOSURE:
+        raise InputError(f"exposure: expected -{MAX_EXPOSURE} to {MAX_EXPOSURE} EV, found {exposure}")
     return exposure - curve[1]
 
 
 def draw_lit(
-    model: Gaussians,
+    gaussians: Gaussians,
     light: LightModel,
     camera: Projection,
-    sun: np.ndarray,
+    sun: np.ndarray | None,
     outputs: Sequence[str] = (),
     antialiased: bool = False,
 ) -> RenderOutput:
     """A relit and shadowed frame on the device. features: colour (3 planes), then, of a model with shadows, visibility,
-    all premultiplied. sun: [3], unit, towards the Sun;  outputs, antialiased: see `render`"""
-    colours, visibility = light.lit(model, camera, sun, adaptive=True)
-    lit = [] if visibility is None else [visibility]
-    return render(model, camera, outputs=outputs, features=[*colours, *lit], antialiased=antialiased)
+    all premultiplied. sun: [3], unit, towards the Sun, None of a model that is not told;  outputs, antialiased: see
+    `render`"""
+    colors, visibility = light.shade_picture(gaussians, camera, sun)
+    visibilities = [] if visibility is None else [visibility]
+    return render(gaussians, camera, outputs=outputs, features=[*colors, *visibilities], antialiased=antialiased)
 
 
 def _prediction(output: RenderOutput, rgb: np.ndarray, visibility: np.ndarray | None, normals: bool) -> Prediction:
@@ -251,7 +332,7 @@ def _prediction(output: RenderOutput, rgb: np.ndarray, visibility: np.ndarray | 
     return Prediction(np.ascontiguousarray(rgb), alpha, depth, visibility, output.image("normal") if normals else None)
 
 
-def load_run(path: Path) -> Run:
+def load_run(path: str | Path) -> Run:
     """Load a finished run. Raises InputError where the folder is no run or its training has not ended."""
     path = Path(path)
     model_path = path / "model.safetensors"
@@ -259,21 +340,21 @@ def load_run(path: Path) -> Run:
         raise InputError(f"{path}: expected a run of `spacesim train`, found no config.json in it")
     if not model_path.exists():
         raise InputError(f"{path}: training has not ended; complete it with `spacesim train ... --resume`")
-    known, data = read_config(path / "config.json")
+    train_config, data = read_config(path / "config.json")
     _, training = read_record(path / "training.json", TrainingRecord)
-    config, light_config = {**known.to_json(), "data": data}, known.light
+    config, light_config = {**train_config.to_json(), "data": data}, train_config.light
     tensors, _ = read_tensors(model_path)
     try:
-        model = Gaussians.from_numpy(tensors)
+        gaussians = Gaussians.from_numpy(tensors)
         light = LightModel.from_tensors(light_config, tensors) if light_config else None
-        if light_config and (model.count == 0 or model.feature_count != light_config.features):
-            found = f"{model.count} with {model.feature_count if model.count else 0}"
+        if light_config and (gaussians.count == 0 or gaussians.feature_count != light_config.features):
+            found = f"{gaussians.count} with {gaussians.feature_count if gaussians.count else 0}"
             raise ValueError(f"features: expected Gaussians with {light_config.features} each, found {found}")
     except (KeyError, ValueError) as error:
         raise InputError(f"{model_path}: expected the tensors of a model, found none or others ({error})") from None
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise InputError(f"{model_path}: expected finite numbers, found others; train the run again")
-    return Run(path, config, training, model, model_path.stat().st_size, light)
+    return Run(path, config, training, gaussians, model_path.stat().st_size, light)
 
 
 def read_config(path: Path) -> tuple[TrainConfig, dict[str, Any]]:

@@ -10,19 +10,19 @@ from PIL import Image
 
 from spacesim.data.geometry import quaternion_from_rotation
 from spacesim.data.records import Camera, Dataset
-from spacesim.viewer.controls import ClientControls, SunControls
-from spacesim.viewer.frames import drawn
-from spacesim.viewer.gate import files_wait
-from spacesim.viewer.handles import FRUSTUM, add_frusta
-from spacesim.viewer.loop import RenderLoop
-from spacesim.viewer.paint import Bytes, with_scale
+from spacesim.viewer.drawing.frames import draw_mode
+from spacesim.viewer.drawing.loop import RenderLoop
+from spacesim.viewer.drawing.paint import Bytes, add_color_bar
+from spacesim.viewer.drawing.scene_renderer import SceneRenderer
+from spacesim.viewer.network.message_filter import has_pending_files
+from spacesim.viewer.panels.controls import ClientControls, SunControls
+from spacesim.viewer.panels.handles import FRUSTUM, add_frusta
 from spacesim.viewer.session import Session, Statistics
-from spacesim.viewer.stage import Stage
-from spacesim.viewer.state import Shared, View, view_of
+from spacesim.viewer.state import SharedScene, ViewerCamera, parse_viewer_camera
 from spacesim.viewer.truth.source import TruthService
 
-QUALITY, QUALITY_AT_REST = 75, 95  #: of JPEG, chosen
-MOST_PICTURE = 4096  #: pixels a side of a picture that is saved
+QUALITY, QUALITY_AT_REST = 75, 95  #: of JPEG
+MAX_PICTURE_SIDE = 4096  #: pixels a side of a picture that is saved
 
 
 class Client:
@@ -31,27 +31,27 @@ class Client:
     def __init__(
         self,
         handle: Any,
-        stage: Stage,
-        shared: Shared,
+        renderer: SceneRenderer,
+        shared: SharedScene,
         loop: RenderLoop,
         truth: TruthService,
         dataset: Dataset | None,
         sun: SunControls | None,
         facts: list[str],
     ) -> None:
-        self.handle, self._stage, self._shared, self._loop, self._dataset = handle, stage, shared, loop, dataset
+        self.handle, self._renderer, self._shared, self._loop, self._dataset = handle, renderer, shared, loop, dataset
         self._sun = sun
         self._frusta: list[Any] = []
         self._lock = threading.Lock()
         self._closed = False
-        self.session = Session(stage, shared, loop, self, truth)
+        self.session = Session(renderer, shared, loop, self, truth)
         frames = len(dataset.frames) if dataset else 0
         self.controls = ClientControls(handle.gui, self.session, self, facts, frames)
 
     def begin(self) -> None:
         """Draw for it from now on."""
         self.handle.camera.on_update(self._moved)
-        self._look(self.handle.camera)
+        self._on_camera(self.handle.camera)
 
     def close(self) -> None:
         """It has gone."""
@@ -68,47 +68,47 @@ class Client:
             self.handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
             self.handle.flush()
 
-    def tell(self, statistics: Statistics) -> None:
+    def show_statistics(self, statistics: Statistics) -> None:
         """See `Screen`."""
         if not self._closed:
-            self.controls.tell(statistics)
+            self.controls.show_statistics(statistics)
 
     # ---- Actions ----
 
-    def jump(self, frame: int) -> None:
+    def jump_to_frame(self, frame: int) -> None:
         """See `Actions`."""
         if self._dataset is None or not 0 <= frame < len(self._dataset.frames):
             return
-        found = self._dataset.frames[frame]
-        sun = found.sun
+        record = self._dataset.frames[frame]
+        sun = record.sun
         if sun is not None and self._sun is not None:
             self._sun.drag(sun)
         elif sun is not None:  # no model can be relit, but the truth is of that Sun
-            self._shared.change(lambda stand: replace(stand, sun=sun))
+            self._shared.change(lambda state: replace(state, sun=sun))
         view = self.session.view
         aspect = view.width / view.height if view else 1.0
-        self.look_from(found.camera.world_from_camera, fov_to_hold(found.camera, aspect))
+        self.look_from(record.camera.world_from_camera, fov_to_hold(record.camera, aspect))
 
-    def frusta(self, visible: bool) -> None:
+    def show_frusta(self, visible: bool) -> None:
         """See `Actions`."""
         for handle in self._frusta:
             handle.remove()
         self._frusta = []
         if visible and self._dataset is not None:
-            size = FRUSTUM * self._stage.bounds(self._shared.stand)[1]
-            self._frusta = add_frusta(self.handle.scene, self._dataset, size, self.jump)
+            size = FRUSTUM * self._renderer.bounds(self._shared.state)[1]
+            self._frusta = add_frusta(self.handle.scene, self._dataset, size, self.jump_to_frame)
 
-    def picture(self) -> None:
+    def save_picture(self) -> None:
         """See `Actions`."""
-        view, mode = self.session.view, self.session.look.mode
+        view, mode = self.session.view, self.session.settings.mode
         if view is not None and not self._closed:
-            self._loop.do(lambda: self._send_picture(view, mode), (self, "picture"))
+            self._loop.submit(lambda: self._send_picture(view, mode), (self, "picture"))
 
     def look_from(self, world_from_camera: np.ndarray, fov: float) -> None:
         """Move the client's camera to a pose [4, 4]; it goes round what is in the middle of the scene then."""
         camera = self.handle.camera
         place = world_from_camera[:3, 3]
-        centre = self._stage.bounds(self._shared.stand)[0]
+        centre = self._renderer.bounds(self._shared.state)[0]
         ahead = max(float((centre - place) @ world_from_camera[:3, 2]), 1e-3)
         with self.handle.atomic():
             camera.position = tuple(place)
@@ -116,27 +116,27 @@ class Client:
             camera.wxyz = tuple(quaternion_from_rotation(world_from_camera[:3, :3]))
             camera.fov = float(fov)
 
-    def _send_picture(self, view: View, mode: str) -> None:
+    def _send_picture(self, view: ViewerCamera, mode: str) -> None:
         """On the render thread: with square pixels, as large as the window; none while another is on its way."""
-        if files_wait(self.handle._websock_connection):
+        if has_pending_files(self.handle._websock_connection):
             return
-        scale = min(1.0, MOST_PICTURE / max(view.width, view.height))
+        scale = min(1.0, MAX_PICTURE_SIDE / max(view.width, view.height))
         width, height = (max(1, round(scale * side)) for side in (view.width, view.height))
-        _, picture, depths, _ = drawn(self._stage, self._shared.stand, view.camera(width, height), mode)
+        _, picture, depths, _ = draw_mode(self._renderer, self._shared.state, view.camera(width, height), mode)
         file = io.BytesIO()
-        Image.fromarray(with_scale(picture, depths) if depths else picture).save(file, "PNG")
+        Image.fromarray(add_color_bar(picture, depths) if depths else picture).save(file, "PNG")
         if not self._closed:
             name = f"{mode.replace(' ', '-')}.png"
             self.handle.send_file_download(name, file.getvalue(), save_immediately=True)
 
     async def _moved(self, camera: Any) -> None:
-        self._look(camera)
+        self._on_camera(camera)
 
-    def _look(self, camera: Any) -> None:
-        told = camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height
-        view = view_of(*told)
+    def _on_camera(self, camera: Any) -> None:
+        pose = camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height
+        view = parse_viewer_camera(*pose)
         if view is not None:
-            self.session.moved(view)
+            self.session.on_camera_moved(view)
 
 
 def fov_to_hold(camera: Camera, aspect: float) -> float:

@@ -10,18 +10,17 @@ import numpy as np
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
 from spacesim.splat.compose import Composition
-from spacesim.splat.compose.path import FPS, MOST_FRAMES, Keyframe, Orbit, PosedScene, Shot
-from spacesim.splat.compose.path import View as Place
-from spacesim.viewer.state import Stand, View
+from spacesim.splat.compose.path import FPS, MAX_FRAMES, CameraView, Keyframe, Orbit, PosedScene, SceneFrame
+from spacesim.viewer.state import SceneState, ViewerCamera
 
 RATE = 24.0  #: times a second that a path that is played moves the camera
-STEP = 2.0  #: seconds from one keyframe to the next at first, chosen
-MOST_KEYS = 1000
+STEP = 2.0  #: seconds from one keyframe to the next at first
+MAX_KEYS = 1000
 REFERENCE = Camera(np.eye(4), 512, 512, 512.0, 512.0, 256.0, 256.0)  #: of paths of scenes that name no camera
-UPRIGHT = 1e-3  #: sine of the angle of a line of sight to z, from which on z counts as up; chosen
+UPRIGHT = 1e-3  #: sine of the angle of a line of sight to z, from which on z counts as up
 
 
-def place_of(view: View, centre: Array, image: Camera = REFERENCE) -> Place:
+def keyframe_view(view: ViewerCamera, centre: Array, image: Camera = REFERENCE) -> CameraView:
     """Where a view is taken from. Its target is the point of its axis nearest to `centre` [3], if that is ahead. image:
     in whose pixels focal lengths are"""
     pose = view.world_from_camera
@@ -29,27 +28,28 @@ def place_of(view: View, centre: Array, image: Camera = REFERENCE) -> Place:
     length = float(0.5 * image.height / np.tan(0.5 * view.fov))
     ahead = float((centre - position) @ axis)
     if ahead <= 0:
-        return Place(pose, None, (length, length))
+        return CameraView(pose, None, (length, length))
     upright = abs(across[2]) < 1e-6 and above[2] > UPRIGHT
-    return Place.towards(position, position + ahead * axis, (0.0, 0.0, 1.0) if upright else above, (length, length))
+    return CameraView.towards(
+        position, position + ahead * axis, (0.0, 0.0, 1.0) if upright else above, (length, length)
+    )
 
 
-def fov_of(camera: Camera) -> float:
+def vertical_fov(camera: Camera) -> float:
     """Vertical field of view, radians."""
     return float(2 * np.arctan(0.5 * camera.height / camera.fy))
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
-    """What changes with time. keyframes: at rising times, seconds;  camera: of the scene's file, whose image focal
-    lengths of keyframes are in pixels of, or None;  orbit: in place of the keyframes' cameras;  frames: pictures that
-    the file asks for, None for as many as the keyframes take;  fps: pictures a second"""
+class CameraPath:
+    """What changes with time."""
 
-    keyframes: tuple[Keyframe, ...] = ()
+    keyframes: tuple[Keyframe, ...] = ()  #: at rising times, seconds
+    #: of the scene's file, whose image focal lengths of keyframes are in pixels of, or None
     camera: Camera | None = None
-    orbit: Orbit | None = None
-    frames: int | None = None
-    fps: float = FPS
+    orbit: Orbit | None = None  #: in place of the keyframes' cameras
+    frames: int | None = None  #: pictures that the file asks for, None for as many as the keyframes take
+    fps: float = FPS  #: pictures a second
 
     @property
     def image(self) -> Camera:
@@ -57,47 +57,47 @@ class Path:
         return self.camera or REFERENCE
 
     @property
-    def last(self) -> float:
+    def last_time(self) -> float:
         """Of the last keyframe, seconds."""
         return self.keyframes[-1].time if self.keyframes else 0.0
 
     @property
     def seconds(self) -> float:
         """That it takes to play: up to the last keyframe, or once through the orbit."""
-        return max(self.last, self.pictures / self.fps) if self.orbit else self.last
+        return max(self.last_time, self.picture_count / self.fps) if self.orbit else self.last_time
 
     @property
-    def pictures(self) -> int:
+    def picture_count(self) -> int:
         """As many as it is saved with."""
         if self.frames is not None:
             return self.frames
-        return min(MOST_FRAMES, int(self.last * self.fps + 0.5) + 1) if self.keyframes else 1
+        return min(MAX_FRAMES, int(self.last_time * self.fps + 0.5) + 1) if self.keyframes else 1
 
-    def added(self, place: Place, stand: Stand | None, names: list[str], step: float) -> "Path":
-        """With a keyframe `step` seconds after the last, and without an orbit. stand: whose Sun and poses (by `names`)
+    def with_keyframe(self, place: CameraView, state: SceneState | None, names: list[str], step: float) -> "CameraPath":
+        """With a keyframe `step` seconds after the last, and without an orbit. state: whose Sun and poses (by `names`)
         it holds, too, or None."""
-        if len(self.keyframes) >= MOST_KEYS:
+        if len(self.keyframes) >= MAX_KEYS:
             return self
-        when = self.last + step if self.keyframes else 0.0
+        when = self.last_time + step if self.keyframes else 0.0
         key = Keyframe(when, view=place)
-        if stand is not None:
-            key = Keyframe(when, stand.sun, place, dict(zip(names, stand.poses, strict=True)))
+        if state is not None:
+            key = Keyframe(when, state.sun, place, dict(zip(names, state.poses, strict=True)))
         return replace(self, keyframes=(*self.keyframes, key), orbit=None, frames=None)
 
-    def shorter(self) -> "Path":
+    def without_last(self) -> "CameraPath":
         """Without the last keyframe; without the orbit where there is none."""
         if self.keyframes:
             return replace(self, keyframes=self.keyframes[:-1], frames=self.frames if self.orbit else None)
-        return self.cleared()
+        return self.emptied()
 
-    def cleared(self) -> "Path":
+    def emptied(self) -> "CameraPath":
         """Without anything that moves."""
         return replace(self, keyframes=(), orbit=None, frames=None)
 
-    def at(self, composition: Composition, when: float) -> Shot:
+    def at(self, composition: Composition, when: float) -> SceneFrame:
         """Camera, Sun (None where no keyframe names one) and poses at a time."""
-        scene = PosedScene(composition, None, self.image, self.keyframes, self.orbit, self.pictures, self.fps)
-        return scene.at(when, min(when * self.fps / self.pictures, 1.0) if self.orbit else 0.0)
+        scene = PosedScene(composition, None, self.image, self.keyframes, self.orbit, self.picture_count, self.fps)
+        return scene.at(when, min(when * self.fps / self.picture_count, 1.0) if self.orbit else 0.0)
 
     @property
     def moves_camera(self) -> bool:
@@ -110,7 +110,7 @@ class Path:
         return any(key.sun is not None or key.poses for key in self.keyframes)
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """What it is, for the panel."""
         count = len(self.keyframes)
         parts = ["an orbit"] * (self.orbit is not None)
@@ -118,14 +118,14 @@ class Path:
         return f"{' and '.join(parts)}, {self.seconds:.4g} s"
 
 
-def path_of(scene: PosedScene) -> Path:
+def path_from_scene(scene: PosedScene) -> CameraPath:
     """What changes with time in a scene."""
     still = not scene.keyframes and scene.orbit is None and scene.frames == 1
     frames = None if still else scene.frames
-    return Path(tuple(scene.keyframes), scene.camera, scene.orbit, frames, scene.fps)
+    return CameraPath(tuple(scene.keyframes), scene.camera, scene.orbit, frames, scene.fps)
 
 
-def orbit_of(view: View, centre: Array) -> Orbit:
+def orbit_from_view(view: ViewerCamera, centre: Array) -> Orbit:
     """Once round `centre` [3] from where a view is."""
     offset = view.world_from_camera[:3, 3] - centre
     radius = max(float(np.linalg.norm(offset)), 1e-6)
@@ -135,18 +135,18 @@ def orbit_of(view: View, centre: Array) -> Orbit:
     return Orbit(radius, (x, y, z), min(max(elevation, -89.0), 89.0), azimuth)
 
 
-def scene_to_save(composition: Composition, stand: Stand, view: View, path: Path) -> PosedScene:
+def scene_to_save(composition: Composition, state: SceneState, view: ViewerCamera, path: CameraPath) -> PosedScene:
     """What `spacesim compose` draws: the path as it is played. Its image is that of the scene's file where that has one
     and the camera moves, else the view as the browser shows it, with square pixels."""
     camera, keys = path.camera, path.keyframes
     if camera is None or not path.moves_camera:
         camera = view.camera(view.width, view.height)
         scale = camera.height / path.image.height
-        keys = tuple(_scaled(key, scale) for key in keys)
-    return PosedScene(composition.posed(stand.poses), stand.sun, camera, keys, path.orbit, path.pictures, path.fps)
+        keys = tuple(_scale_keyframe(key, scale) for key in keys)
+    return PosedScene(composition.posed(state.poses), state.sun, camera, keys, path.orbit, path.picture_count, path.fps)
 
 
-def _scaled(key: Keyframe, scale: float) -> Keyframe:
+def _scale_keyframe(key: Keyframe, scale: float) -> Keyframe:
     """With focal lengths in pixels of an image `scale` times as high."""
     if key.view is None or key.view.focal is None:
         return key

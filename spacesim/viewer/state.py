@@ -15,29 +15,28 @@ from spacesim.splat.compose.pose import Pose
 MODES = ("colour", "depth", "accumulation", "visibility", "normals", "object id", "ellipsoids")
 COMPARISONS = ("off", "wipe", "beside", "difference")
 SIDES = (256, 512, 768, 1024, 1536, 2048)  #: pixels of a picture's longer side at rest that clients may choose
-MOST_WINDOW = 8192  #: pixels a side of a client's window, chosen: more is nonsense
-FIELDS_OF_VIEW = (np.radians(0.01), np.radians(170.0))  #: vertical, chosen
-FARTHEST = 1e7  #: metres of a camera in each coordinate, chosen
+MAX_WINDOW_SIDE = 8192  #: pixels a side of a client's window: more is nonsense
+FIELDS_OF_VIEW = (np.radians(0.01), np.radians(170.0))  #: vertical
+MAX_COORDINATE = 1e7  #: metres of a camera in each coordinate
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """Where a client looks from. world_from_camera: [4, 4] OpenCV axes, metres;  fov: vertical, radians;  width,
-    height: of the client's window, pixels. Raises InputError for what no camera can be."""
+class ViewerCamera:
+    """Where a client looks from. Raises InputError for what no camera can be."""
 
-    world_from_camera: Array
-    fov: float
-    width: int
-    height: int
+    world_from_camera: Array  #: [4, 4] OpenCV axes, metres
+    fov: float  #: vertical, radians
+    width: int  #: of the client's window, pixels
+    height: int  #: of the client's window, pixels
 
     def __post_init__(self) -> None:
         least, most = FIELDS_OF_VIEW
         if not least <= self.fov <= most:
             raise InputError(f"view: expected a field of view of at most 170 degrees, found {self.fov} radians")
-        if not (1 <= self.width <= MOST_WINDOW and 1 <= self.height <= MOST_WINDOW):
-            raise InputError(f"view: expected 1 to {MOST_WINDOW} pixels a side, found {self.width}x{self.height}")
-        if not np.all(np.abs(np.asarray(self.world_from_camera)[:3, 3]) <= FARTHEST):
-            raise InputError(f"view: expected a camera within {FARTHEST:g} metres, found one beyond")
+        if not (1 <= self.width <= MAX_WINDOW_SIDE and 1 <= self.height <= MAX_WINDOW_SIDE):
+            raise InputError(f"view: expected 1 to {MAX_WINDOW_SIDE} pixels a side, found {self.width}x{self.height}")
+        if not np.all(np.abs(np.asarray(self.world_from_camera)[:3, 3]) <= MAX_COORDINATE):
+            raise InputError(f"view: expected a camera within {MAX_COORDINATE:g} metres, found one beyond")
         self.camera(self.width, self.height)
 
     def camera(self, width: int, height: int) -> Camera:
@@ -47,7 +46,7 @@ class View:
         fx = focal * width * self.height / self.width
         return Camera(self.world_from_camera, width, height, fx, focal * height, 0.5 * width, 0.5 * height)
 
-    def same(self, other: "View | None") -> bool:
+    def same(self, other: "ViewerCamera | None") -> bool:
         """Whether both show the same, to single precision."""
         if other is None or (self.width, self.height) != (other.width, other.height):
             return False
@@ -55,47 +54,45 @@ class View:
         return pose and bool(np.isclose(self.fov, other.fov, rtol=1e-6))
 
 
-def view_of(wxyz: Any, position: Any, fov: Any, width: Any, height: Any) -> View | None:
+def parse_viewer_camera(wxyz: Any, position: Any, fov: Any, width: Any, height: Any) -> ViewerCamera | None:
     """The view that a client tells, or None where that is nonsense."""
     try:
         turn, place = np.array(wxyz, dtype=np.float64), np.array(position, dtype=np.float64)
-        if turn.shape != (4,) or place.shape != (3,) or not _turns(turn):
+        if turn.shape != (4,) or place.shape != (3,) or not _is_rotation(turn):
             return None
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(turn), place
-        return View(pose, float(fov), int(width), int(height))
+        return ViewerCamera(pose, float(fov), int(width), int(height))
     except (InputError, TypeError, ValueError, OverflowError):
         return None
 
 
-def _turns(quaternion: Array) -> bool:
+def _is_rotation(quaternion: Array) -> bool:
     """Whether [4] is about as long as a quaternion that a browser tells."""
     return bool(np.abs(quaternion).max() < 2 and 0.5 < np.linalg.norm(quaternion) < 2)
 
 
 @dataclass(frozen=True)
-class Look:
-    """How a client wants pictures. mode: of MODES;  compare: of COMPARISONS, with the truth;  wipe: share of the width
-    that shows the truth;  side: most pixels of the longer side;  samples: of the path tracer, a pixel. What is out of
-    range becomes the nearest in range, other words the default."""
+class DisplaySettings:
+    """How a client wants pictures. What is out of range becomes the nearest in range, other words the default."""
 
-    mode: str = MODES[0]
-    compare: str = COMPARISONS[0]
-    wipe: float = 0.5
-    side: int = 1024
-    samples: int = 32
+    mode: str = MODES[0]  #: of MODES
+    compare: str = COMPARISONS[0]  #: of COMPARISONS, with the truth
+    wipe: float = 0.5  #: share of the width that shows the truth
+    side: int = 1024  #: most pixels of the longer side
+    samples: int = 32  #: of the path tracer, a pixel
 
     def __post_init__(self) -> None:
         mode = self.mode if self.mode in MODES else MODES[0]
         compare = self.compare if self.compare in COMPARISONS else COMPARISONS[0]
-        changed = {"mode": mode, "compare": compare, "wipe": bounded(self.wipe, 0, 1, 0.5)}
-        changed["side"] = int(bounded(self.side, SIDES[0], SIDES[-1], 1024))
-        changed["samples"] = int(bounded(self.samples, 1, 4096, 32))
+        changed = {"mode": mode, "compare": compare, "wipe": clamp(self.wipe, 0, 1, 0.5)}
+        changed["side"] = int(clamp(self.side, SIDES[0], SIDES[-1], 1024))
+        changed["samples"] = int(clamp(self.samples, 1, 4096, 32))
         for name, value in changed.items():
             object.__setattr__(self, name, value)
 
 
-def bounded(value: Any, least: float, most: float, otherwise: float) -> float:
+def clamp(value: Any, least: float, most: float, otherwise: float) -> float:
     """`value` as a number from `least` to `most`; `otherwise` where it is no number."""
     try:
         number = float(value)
@@ -105,17 +102,17 @@ def bounded(value: Any, least: float, most: float, otherwise: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Stand:
-    """How the scene stands. poses: world_from_model of each model;  sun: None where nobody has said"""
+class SceneState:
+    """How the scene stands."""
 
-    poses: tuple[Pose, ...]
-    sun: Sun | None
+    poses: tuple[Pose, ...]  #: world_from_model of each model
+    sun: Sun | None  #: None where nobody has said
 
-    def placed(self, index: int, pose: Pose) -> "Stand":
+    def with_pose(self, index: int, pose: Pose) -> "SceneState":
         """With another pose of model `index`."""
         return replace(self, poses=(*self.poses[:index], pose, *self.poses[index + 1 :]))
 
-    def same(self, other: "Stand | None") -> bool:
+    def same(self, other: "SceneState | None") -> bool:
         """Whether both are the same scene."""
         if other is None or [pose.key for pose in self.poses] != [pose.key for pose in other.poses]:
             return False
@@ -125,34 +122,34 @@ class Stand:
 
 
 @dataclass
-class Shared:
-    """The one scene that all clients see and change, from any thread: each change is a whole new `Stand`."""
+class SharedScene:
+    """The one scene that all clients see and change, from any thread: each change is a whole new `SceneState`."""
 
-    stand: Stand
+    state: SceneState
     _lock: threading.Lock = field(default_factory=threading.Lock)
-    _listeners: list[Callable[[Stand], None]] = field(default_factory=list)
+    _listeners: list[Callable[[SceneState], None]] = field(default_factory=list)
 
-    def change(self, change: Callable[[Stand], Stand]) -> Stand:
+    def change(self, change: Callable[[SceneState], SceneState]) -> SceneState:
         """Put `change` of the scene in its place and tell the listeners, where it is another one."""
         with self._lock:
-            before, self.stand = self.stand, change(self.stand)
-            now, listeners = self.stand, tuple(self._listeners)
+            before, self.state = self.state, change(self.state)
+            now, listeners = self.state, tuple(self._listeners)
         if not now.same(before):
             for listener in listeners:
                 listener(now)
         return now
 
-    def listen(self, listener: Callable[[Stand], None]) -> None:
+    def listen(self, listener: Callable[[SceneState], None]) -> None:
         """From now on tell `listener` of changes, on the thread that makes them."""
         with self._lock:
             self._listeners.append(listener)
 
 
-def changed_pose(pose: Pose, wxyz: Sequence[float], position: Sequence[float]) -> Pose:
+def pose_from_handle(pose: Pose, wxyz: Sequence[float], position: Sequence[float]) -> Pose:
     """`pose` turned and placed as a handle says; unchanged where that is nonsense."""
     try:
         turn = np.asarray(wxyz, dtype=np.float64)
-        if turn.shape != (4,) or not _turns(turn):
+        if turn.shape != (4,) or not _is_rotation(turn):
             return pose
         return Pose(turn, np.asarray(position, dtype=np.float64), pose.scale)
     except (InputError, TypeError, ValueError):

@@ -230,7 +230,7 @@ def _is_quick(words: Sequence[str]) -> bool:
 
 
 WARM_UP = (
-    *(words for kind in corpus.KINDS for words in dict.fromkeys(kind.commands) if _is_quick(words)),
+    *dict.fromkeys(words for kind in corpus.KINDS for words in kind.commands if _is_quick(words)),
     ("sweep", "run", "--camera", "camera.json", "--frames", "2", "--size", "1024", "--out", "{out}"),
 )
 
@@ -287,10 +287,14 @@ def _writes_here(words: Sequence[str]) -> bool:
 
 
 def _listing(folder: Path) -> set[tuple[str, int, int]]:
+    """Of all below a folder: path, size of what is a file or leads to one, kind and permissions."""
     found = set()
-    for path in folder.rglob("*"):
-        told = path.lstat()
-        found.add((str(path.relative_to(folder)), told.st_size if path.is_file() else 0, told.st_mode))
+    for place, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = os.path.join(place, name)
+            told = os.lstat(path)
+            size = told.st_size if os.path.isfile(path) else 0
+            found.add((os.path.relpath(path, folder), size, told.st_mode))
     return found
 
 

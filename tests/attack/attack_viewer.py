@@ -24,7 +24,7 @@ from typing import Any
 
 PATIENCE = 60.0  #: seconds for a picture, or for the viewer to start
 ANSWER = 10.0  #: seconds for the answer to a request
-MOST_MEMORY = 500.0  #: MB that the viewer may take at any time, all that it needs by itself included
+MAX_MEMORY_MB = 500.0  #: MB that the viewer may take at any time, all that it needs by itself included
 MEBI = 2**20
 
 # Two balls without training. Told "state", it says how the scene stands and which controls all clients share.
@@ -34,13 +34,13 @@ from pathlib import Path
 import numpy as np
 import spacesim
 from spacesim.data.records import Sun
-from spacesim.splat.compose import Composition, Placed, Pose
+from spacesim.splat.compose import Composition, PlacedRun, Pose
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 exec(sys.argv[2])
-from spacesim.viewer.server import Show, Viewer
-from spacesim.viewer.stage import Stage
-from spacesim.viewer.state import Stand
+from spacesim.viewer.server import ViewerSetup, Viewer
+from spacesim.viewer.drawing.scene_renderer import SceneRenderer
+from spacesim.viewer.state import SceneState
 
 rng = np.random.default_rng(0)
 ways = rng.normal(size=(300, 3))
@@ -53,15 +53,15 @@ arrays = {
     "sh": np.zeros((300, 1, 3), np.float32),
 }
 run = Run(Path("ball"), {"method": "vanilla", "data": {"path": ""}}, {}, Gaussians.from_numpy(arrays), 0)
-models = [Placed(run, Pose(translation=np.array([0.0, side, 0])), str(side)) for side in (-1, 1)]
-stand = Stand(tuple(placed.pose for placed in models), Sun(np.array([0.0, 0, 1])))
-viewer = Viewer(Show(Stage(Composition(models)), stand, (None, None), None, Path(sys.argv[1])), port=0)
+models = [PlacedRun(run, Pose(translation=np.array([0.0, side, 0])), str(side)) for side in (-1, 1)]
+state = SceneState(tuple(placed.pose for placed in models), Sun(np.array([0.0, 0, 1])))
+viewer = Viewer(ViewerSetup(SceneRenderer(Composition(models)), state, (None, None), None, Path(sys.argv[1])), port=0)
 viewer.start()
 print(viewer.port, flush=True)
 for line in sys.stdin:
-    stand = viewer.shared.stand
+    state = viewer.shared.state
     labels = {handle.label: uuid for uuid, handle in viewer._server.gui._gui_input_handle_from_uuid.items()}
-    told = {"poses": [pose.matrix.tolist() for pose in stand.poses], "sun": stand.sun.direction.tolist()}
+    told = {"poses": [pose.matrix.tolist() for pose in state.poses], "sun": state.sun.direction.tolist()}
     print(json.dumps({**told, "shared": labels}), flush=True)
 """
 
@@ -180,8 +180,8 @@ def honest(one: Target, part: str) -> None:
     if not all(map(math.isfinite, numbers)):
         one.found(f"{part}: the scene has numbers that are none")
     memory = one.memory()
-    if memory is not None and memory[1] > MOST_MEMORY:
-        one.found(f"{part}: the viewer took {memory[1]:.0f} MB and has {memory[0]:.0f}, more than {MOST_MEMORY:.0f}")
+    if memory is not None and memory[1] > MAX_MEMORY_MB:
+        one.found(f"{part}: the viewer took {memory[1]:.0f} MB and has {memory[0]:.0f}, more than {MAX_MEMORY_MB:.0f}")
 
 
 # ---- what the other end speaks ----

@@ -1,6 +1,7 @@
 """The honest files that an attack damages, and the commands that read them. All as small as they can be."""
 
 import json
+import os
 import random
 import shutil
 from collections.abc import Callable, Sequence
@@ -157,13 +158,13 @@ KINDS = (
     Kind(
         "EXR", ("data/gt/test_00000.exr", "data/gt/train_00001.exr"), (m.of_bytes, m.of_floats, m.other_file),
         _words("verify data", "eval run --data data --out {out} --no-geometry",
-               f"{_TRAIN} --depth-weight 0.1", f"{_TRAIN} --method shadow-map --visibility-weight 0.1"),
+               f"{_TRAIN} --set depth_weight=0.1", f"{_TRAIN} --method shadow-map --set visibility_weight=0.1"),
     ),
     Kind(
         "PLY", ("data/points.ply", "data/mesh.ply"), (m.of_ply, m.of_bytes, m.of_floats, m.other_file),
         4 * _words("verify data", f"{_TRAIN} --init points", f"{_TRAIN} --init mesh", "export data --bop {out}",
-                   f"{_TRAIN} --prior mesh --depth-weight 0.1", f"{_TRAIN} --strategy mesh-aware")
-        + _words("eval run --data data --out {out}"),  # judges the shape, which takes seconds
+                   f"{_TRAIN} --set prior=mesh --set depth_weight=0.1", f"{_TRAIN} --strategy mesh-aware")
+        + _words("eval run --data data --out {out}"),  # evaluates the shape, which takes seconds
     ),
     Kind(
         "meshes", ("boat.obj", "boat.glb", "boat.gltf", "boat.stl", "words.stl", "boat.off", "boat.ply", "boat.mtl"),
@@ -198,17 +199,22 @@ _ANY = (
     "\udcff",
     "--",
 )
+_SETTINGS = (
+    *("views_per_step", "flatten_weight", "antialiased", "supersample", "init_box", "depth_weight", "normal_weight"),
+    *("prior", "random_background", "light.field.inputs", "light.bounce", "light.linear", "light.tone"),
+    *("light.exposure", "light.shadow.bias", "light.shadow.grazing", "light.shadow.method"),
+    *("light.shadow.method.filter", "light.shadow.method.sun_radius_deg", "light.shadow.size"),
+    *("light.shadow.method.gradients", "light.shadow.refine", "visibility_weight", "refinement.prune_opacity"),
+    *("refinement.split_screen_size", "strategy", "strategy.growth", "warm_start", "light", "rates"),
+)
 _LINES = (
     ("generate boat.obj --out {out} --views 1 --test-views 0 --resolution 8 --spp 1",
      ("--suns", "--sun", "--distance", "--exposure", "--seed", "--units", "--up", "--fov", "--test-suns",
       "--known-test-views", "--shared-test-views", "--resolution", "--resume", "--estimate", "--print", "--workers")),
     (_TRAIN,
-     ("--method", "--strategy", "--init", "--init-count", "--views-per-step", "--flatten", "--antialiased",
-      "--supersample", "--init-box", "--warm-start", "--depth-weight", "--normal-weight", "--prior", "--preset",
-      "--seed", "--black-background", "--resume", "--field", "--bounce", "--linear", "--tone", "--exposure",
-      "--shadow-bias", "--grazing", "--shadow-filter", "--sun-radius", "--light-size", "--shadow-gradients",
-      "--no-refinement", "--visibility-weight", "--max-gaussians", "--prune-opacity", "--split-screen-size",
-      "--method relight", "--method shadow-map", "--method shadow-splat", "--init random")),
+     ("--method", "--strategy", "--init", "--init-count", "--warm-start", "--preset", "--seed", "--resume", "--fields",
+      "--max-gaussians", "--method relight", "--method shadow-map", "--method shadow-splat", "--init random", "--set",
+      *(f"--set {key}={{}}" for key in _SETTINGS))),
     ("render run --camera camera.json --out {out}.png",
      ("--sun", "--kind", "--exposure", "--frame", "--data", "--out")),
     ("sweep run --camera camera.json --out {out} --frames 2",
@@ -231,9 +237,10 @@ def command_line(rng: random.Random) -> list[str]:
     for _ in range(rng.choice((1, 1, 2, 3))):
         kind = rng.randrange(5)
         if kind < 3:
-            words += rng.choice(options).split()
-            if rng.random() < 0.8:
-                words.append(rng.choice(_ANY))
+            option, any_ = rng.choice(options), rng.choice(_ANY)
+            words += option.replace("{}", any_).split(" ", 1)
+            if "{}" not in option and rng.random() < 0.8:
+                words.append(any_)
         elif kind == 3 and len(words) > 1:
             words[rng.randrange(1, len(words))] = rng.choice(_ANY)
         elif len(words) > 1:
@@ -263,8 +270,8 @@ def build(root: Path) -> Path:
     _call("generate", root / "boat.obj", "--out", data, *TINY)
     _call("train", data, "--out", root / "run", "--iterations", "4", *FEW, "--method", "shadow-map")
     _call("train", data, "--out", root / "plain", "--iterations", "4", *FEW)
-    for name in ("eval", "eval2"):
-        _call("eval", root / "run", "--data", data, "--out", root / name)
+    _call("eval", root / "run", "--data", data, "--out", root / "eval")
+    shutil.copytree(root / "eval", root / "eval2")
     config = replace(preset("demo"), init_count=40, iterations=12, checkpoint_every=10, warm_start=warm_start("demo"))
     train(read_dataset(data), root / "half", config)
     for name in ("model.safetensors", "training.json"):
@@ -304,11 +311,12 @@ def _encoded(content: str | bytes) -> bytes:
 
 def linked_copy(root: Path, target: Path) -> Path:
     """A copy of the corpus whose files are links to it: a program that replaces files harms none."""
-    return Path(shutil.copytree(root, target, copy_function=_link))
-
-
-def _link(source: str, target: str) -> None:
-    Path(target).hardlink_to(source)
+    for folder, _, files in os.walk(root):
+        copy = os.path.join(target, os.path.relpath(folder, root))
+        os.makedirs(copy)
+        for name in files:
+            os.link(os.path.join(folder, name), os.path.join(copy, name))
+    return target
 
 
 Namer = Callable[[Sequence[str]], str]

@@ -35,6 +35,7 @@ WEAK = """
 import os, time
 import numpy as np
 import spacesim.cli as cli
+from spacesim.cli import doctor
 WAYS = {
     "traceback": lambda: [][1],
     "code": lambda: 7,
@@ -45,7 +46,7 @@ WAYS = {
     "runtime": lambda: (_ for _ in ()).throw(RuntimeError("of no known reason")),
 }
 honest = cli.main
-cli._COMMANDS["doctor"] = lambda options, known=cli._COMMANDS["doctor"]: WAYS[way]() if way else known(options)
+doctor.run = lambda options, known=doctor.run: WAYS[way]() if way else known(options)
 way = ""
 
 def main(arguments):
@@ -103,7 +104,9 @@ def test_verdicts(answer, wrong):
 
 def test_it_finds_bytes_that_are_called_whole(root, tmp_path, monkeypatch):
     (tmp_path / "sitecustomize.py").write_text(
-        "import spacesim.data.verify as v\nv.differences = lambda root: {}\nv.verify_dataset = lambda path: []\n"
+        "import spacesim.data.integrity.verify as v\n"
+        "v.differences = lambda root: {}\n"
+        "v.find_unreadable_files = lambda path: []\n"
     )
     path = attack.ENVIRONMENT["PYTHONPATH"]
     monkeypatch.setitem(attack.ENVIRONMENT, "PYTHONPATH", f"{tmp_path}:{path}")

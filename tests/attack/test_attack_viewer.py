@@ -6,7 +6,7 @@ from attack_viewer import attack, floods, foreign_pages, rebinding, slow_sockets
 
 pytest.importorskip("viser", reason="viser is not installed")
 
-GATE = "import spacesim.viewer.gate as gate; "
+GATE = "import spacesim.viewer.network.message_filter as gate; "
 
 
 def test_nothing_gets_through(tmp_path):
@@ -20,7 +20,7 @@ def test_nothing_gets_through(tmp_path):
 
 def test_it_finds_that_pages_of_others_are_let_in(tmp_path):
     told = "; ".join(
-        attack(1, 0.1, tmp_path, (foreign_pages, rebinding), f"{GATE}gate.refusal = lambda *_: None").finds
+        attack(1, 0.1, tmp_path, (foreign_pages, rebinding), f"{GATE}gate.refusal_reason = lambda *_: None").finds
     )
     for words in (
         "another site got a connection",
@@ -34,8 +34,9 @@ def test_it_finds_that_pages_of_others_are_let_in(tmp_path):
 
 def test_it_finds_that_memory_has_no_bounds(tmp_path, monkeypatch):
     monkeypatch.setattr(attack_viewer, "ANSWER", 1.0)
-    monkeypatch.setattr(attack_viewer, "MOST_MEMORY", 50.0)
-    bounds = "gate.LARGEST_MESSAGE = 2**26; gate.MOST_FRAGMENTS = gate.MOST_ANSWERS = gate.MOST_CLIENTS = 10**9"
+    monkeypatch.setattr(attack_viewer, "MAX_MEMORY_MB", 50.0)
+    bounds = "gate.MAX_MESSAGE_BYTES = gate.MAX_REQUEST_BYTES = 2**26; "
+    bounds += "gate.MAX_FRAGMENTS = gate.MAX_PONG_BYTES = gate.MAX_CLIENTS = 10**9"
     told = "; ".join(attack(2, 0.1, tmp_path, (floods, slow_sockets), GATE + bounds).finds)
     for words in ("messages of 49 MB", "empty pieces", "all let in", "more than 50"):
         assert words in told
@@ -44,10 +45,10 @@ def test_it_finds_that_memory_has_no_bounds(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("weakened", "words"),
     [
-        ("import spacesim.viewer.loop as loop; loop.RenderLoop.wish = lambda *_: None", "no picture"),
-        (f"{GATE}gate.refusal = lambda *_: 'no'", "own page got no connection"),
-        (f"{GATE}gate.admitted = lambda _: False", "proves nothing"),
-        (f"import os; {GATE}gate.admitted = lambda _: os._exit(3)", "the viewer ended, code 3"),
+        ("import spacesim.viewer.drawing.loop as loop; loop.RenderLoop.request = lambda *_: None", "no picture"),
+        (f"{GATE}gate.refusal_reason = lambda *_: 'no'", "own page got no connection"),
+        (f"{GATE}gate.is_allowed = lambda _: False", "proves nothing"),
+        (f"import os; {GATE}gate.is_allowed = lambda _: os._exit(3)", "the viewer ended, code 3"),
     ],
 )
 def test_it_finds_that_nobody_gets_in_or_sees_anything(tmp_path, monkeypatch, weakened, words):

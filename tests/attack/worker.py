@@ -11,7 +11,9 @@ import sys
 import traceback
 from pathlib import Path
 
-from spacesim.cli import main
+from spacesim.cli import main  # names a libLLVM before drjit is imported
+
+import drjit  # isort: skip
 
 
 def peak() -> int:
@@ -36,6 +38,7 @@ def run(arguments: list[str]) -> dict[str, object]:
 
 def serve() -> None:
     """Answer until the input ends. "peak": bytes of memory that the command took at most."""
+    drjit.set_thread_count(1)  # as there is a worker a core: threads that wait for work keep one busy
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # what libraries print is no answer
     for line in sys.stdin:

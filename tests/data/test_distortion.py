@@ -7,13 +7,13 @@ import pytest
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
-from spacesim.data.images import Undistortion, distorted, load_image, undistorted
+from spacesim.data.images import Undistortion, distort_points, load_image, undistort_points
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import load_truth, read_dataset
 from spacesim.scenes import Renderer, build, generate, read_scene
-from spacesim.scenes.camera import CameraConfig
+from spacesim.scenes.cameras.camera import CameraConfig
+from spacesim.scenes.cameras.rig import FibonacciRig
 from spacesim.scenes.config import ObjectConfig, QualityConfig
-from spacesim.scenes.rig import FibonacciRig
 
 BARREL = (-0.35, 0.12, 0.004, -0.003, 0.0)
 LENSES = [BARREL, (0.25, 0.0, 0.0, 0.0, 0.0), (-0.3, 0.1, -0.004, 0.002, -0.02)]
@@ -37,14 +37,14 @@ def project(camera, points, lens):
 @pytest.mark.parametrize("lens", LENSES)
 def test_inverse_undoes_the_lens(lens):
     x, y = np.meshgrid(np.linspace(-0.6, 0.6, 41), np.linspace(-0.5, 0.5, 41))
-    u, v = undistorted(*distorted(x, y, lens), lens)
+    u, v = undistort_points(*distort_points(x, y, lens), lens)
     np.testing.assert_allclose([u, v], [x, y], atol=1e-12)
 
 
 def test_inverse_finds_the_solution_near_a_fold():
     lens = (-0.2, 0.0, 0.0, 0.0, 0.0)  # folds at r = sqrt(1 / 0.6) = 1.291
     r = np.linspace(0, 1.25, 100)
-    u, v = undistorted(*distorted(0.6 * r, 0.8 * r, lens), lens)
+    u, v = undistort_points(*distort_points(0.6 * r, 0.8 * r, lens), lens)
     np.testing.assert_allclose([u, v], [0.6 * r, 0.8 * r], atol=1e-6)
 
 
@@ -151,7 +151,7 @@ def test_rendered_vertices_are_where_the_model_puts_them():
     rows, columns = rows[keep], columns[keep]
     u = (columns + 0.5 - camera.cx) / camera.fx
     v = (rows + 0.5 - camera.cy) / camera.fy
-    x, y = undistorted(u, v, BARREL)
+    x, y = undistort_points(u, v, BARREL)
     z = truth.depth[rows, columns].astype(np.float64)
     world = np.stack([x * z, y * z, z], axis=1) @ camera.world_from_camera[:3, :3].T + camera.position
     _, distance, _ = scene.mesh.nearest.on_surface(world)

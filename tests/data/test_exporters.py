@@ -12,17 +12,17 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError
-from spacesim.data.exporters import Target, targets_of, write_bop, write_speedplus
-from spacesim.data.exporters.objects import opaque
+from spacesim.data.exporters import LabelledObject, labelled_objects, write_bop, write_speedplus
+from spacesim.data.exporters.objects import opaque_picture
 from spacesim.data.exporters.speedplus import _label
 from spacesim.data.files import read_json, write_json
 from spacesim.data.images import read_exr, read_png
 from spacesim.data.records import Camera, Frame
 from spacesim.data.store import load_truth, read_dataset
 from spacesim.scenes import generate, read_scene
+from spacesim.scenes.cameras.sensor import SensorConfig
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
-from spacesim.scenes.sensor import SensorConfig
-from spacesim.scenes.silhouette import outline
+from spacesim.scenes.silhouette import silhouette_finder
 
 TURN = (0.8, 0.1, -0.5, 0.3)  # of the second object, not normalised
 
@@ -45,12 +45,12 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def bop(data, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("three") / "bop"
-    write_bop(read_dataset(data), out, outline)
+    write_bop(read_dataset(data), out, silhouette_finder)
     return out
 
 
 def test_targets_have_their_meshes_in_their_own_frames(data):
-    first, second, third = targets_of(read_dataset(data))
+    first, second, third = labelled_objects(read_dataset(data))
     assert [target.name for target in (first, second, third)] == ["boxsat", "cubesat", "twin"]
     np.testing.assert_allclose(third.vertices, first.vertices, atol=1e-6)
     np.testing.assert_array_equal(third.faces, first.faces)
@@ -98,7 +98,7 @@ def test_speedplus_pose_by_hand():
     world_from_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     world_from_camera[:3, 3] = [-10, 0, 0]
     camera = Camera(world_from_camera, 64, 64, 100.0, 100.0, 32.0, 32.0)
-    target = Target(1, "any", np.eye(4), np.zeros((1, 3)), np.zeros((0, 3), int))
+    target = LabelledObject(1, "any", np.eye(4), np.zeros((1, 3)), np.zeros((0, 3), int))
     label = _label("a.png", Frame("images/a.png", camera), target)
     quaternion = np.array(label["q_vbs2tango_true"])
     np.testing.assert_allclose(quaternion * np.sign(quaternion[0]), [0.5, 0.5, -0.5, 0.5], atol=1e-12)
@@ -112,7 +112,7 @@ def srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def ace(linear: np.ndarray) -> np.ndarray:
-    """The curve of docs/cameras.md."""
+    """The curve of docs/how-to/cameras.md."""
     return linear * (2.51 * linear + 0.03) / (linear * (2.43 * linear + 0.59) + 0.14)
 
 
@@ -125,7 +125,7 @@ def test_pictures_are_what_a_camera_records_over_black(tmp_path, tone):
     dataset = read_dataset(tmp_path / "data")
     write_speedplus(dataset, tmp_path / "speedplus")
     if not lens:
-        write_bop(dataset, tmp_path / "bop", outline)
+        write_bop(dataset, tmp_path / "bop", silhouette_finder)
     apart = 0.0
     for image, frame in enumerate(dataset.train):
         layers = read_exr(dataset.root / frame.gt_path)  # as the lens shows them
@@ -229,12 +229,12 @@ def test_bop_visibility_depth_and_boxes_are_those_of_the_pictures(data, bop):
 
 def test_silhouettes_agree_with_an_independent_ray_caster(data):
     dataset = read_dataset(data)
-    targets = targets_of(dataset)
+    targets = labelled_objects(dataset)
     camera = dataset.train[0].camera
     columns, rows = np.meshgrid(np.arange(0, camera.width, 6), np.arange(0, camera.height, 6))
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ camera.world_from_camera[:3, :3].T
-    for target, silhouette in zip(targets, outline(targets)(camera), strict=True):
+    for target, silhouette in zip(targets, silhouette_finder(targets)(camera), strict=True):
         world = target.vertices @ target.world_from_object[:3, :3].T + target.world_from_object[:3, 3]
         mesh = trimesh.Trimesh(world, target.faces, process=False)
         hits = mesh.ray.intersects_any(np.broadcast_to(camera.position, rays.shape), rays).reshape(columns.shape)
@@ -243,11 +243,11 @@ def test_silhouettes_agree_with_an_independent_ray_caster(data):
 
 def test_what_cannot_be_exported_is_refused_in_a_sentence(data, tmp_path):
     dataset = read_dataset(data)
-    with pytest.raises(InputError, match="--object: expected one of 1 boxsat, 2 cubesat, 3 twin, found 'hubble'"):
+    with pytest.raises(InputError, match="object: expected one of 1 boxsat, 2 cubesat, 3 twin, found 'hubble'"):
         write_speedplus(dataset, tmp_path / "a", "hubble")
     (tmp_path / "full").mkdir()
     (tmp_path / "full/file").write_text("mine")
-    for write in (lambda out: write_speedplus(dataset, out), lambda out: write_bop(dataset, out, outline)):
+    for write in (lambda out: write_speedplus(dataset, out), lambda out: write_bop(dataset, out, silhouette_finder)):
         with pytest.raises(InputError, match="full: expected a new or empty folder"):
             write(tmp_path / "full")
     generate(
@@ -256,7 +256,7 @@ def test_what_cannot_be_exported_is_refused_in_a_sentence(data, tmp_path):
     )
     lens = read_dataset(tmp_path / "lens")
     with pytest.raises(InputError, match=r"train_00000\.png: expected an image without lens distortion"):
-        write_bop(lens, tmp_path / "b", outline)
+        write_bop(lens, tmp_path / "b", silhouette_finder)
     write_speedplus(lens, tmp_path / "c")
     assert json.loads((tmp_path / "c/camera.json").read_text())["distCoeffs"] == [0.1, 0, 0, 0, 0]
     shutil.copytree(data, tmp_path / "old")
@@ -264,7 +264,7 @@ def test_what_cannot_be_exported_is_refused_in_a_sentence(data, tmp_path):
     del scene["mesh"]
     write_json(tmp_path / "old/scene.json", scene)
     with pytest.raises(InputError, match=r"scene\.json: expected objects, their poses"):
-        targets_of(read_dataset(tmp_path / "old"))
+        labelled_objects(read_dataset(tmp_path / "old"))
     scene = read_json(data / "scene.json")
     del scene["exposure"]
     write_json(tmp_path / "old/scene.json", scene)
@@ -324,6 +324,6 @@ def test_pictures_of_one_name_in_two_folders_stay_two(data, tmp_path):
     for split, frames in (("train", dataset.train), ("validation", dataset.test)):
         labels = json.loads((tmp_path / f"plus/synthetic/{split}.json").read_text())
         for label, frame in zip(labels, frames, strict=True):
-            expected = opaque(dataset, frame)
+            expected = opaque_picture(dataset, frame)
             assert np.array_equal(read_png(tmp_path / "plus/synthetic/images" / label["filename"]), expected)
     assert written[0] == "test_r_0.png"

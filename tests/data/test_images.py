@@ -247,7 +247,7 @@ def test_undistortion_marks_what_is_outside(tmp_path):
     assert not folded.valid[0, 0]  # r (1 - 3 r^2) falls again past r = 1/3
 
 
-def test_undistortion_bleeds_no_colour_from_nothing():
+def test_undistortion_bleeds_no_color_from_nothing():
     camera = make_camera(64, 48, 60.0)
     alpha = np.zeros((48, 64), np.float32)
     alpha[:, 30:] = 1

@@ -8,30 +8,30 @@ import sys
 import pytest
 
 from spacesim.data.errors import InputError
-from spacesim.data.lock import locked
+from spacesim.data.lock import lock_folder
 
 fcntl = pytest.importorskip("fcntl", reason="this system has no flock")
 
 
 def test_one_at_a_time_and_nothing_stays(tmp_path):
     folder = tmp_path / "a/b"
-    with locked(folder):
+    with lock_folder(folder):
         with pytest.raises(InputError, match=r"b: expected no other run at work in the folder, found one"):
-            locked(folder).__enter__()
-        with locked(tmp_path / "a"):  # another folder
+            lock_folder(folder).__enter__()
+        with lock_folder(tmp_path / "a"):  # another folder
             pass
-    with pytest.raises(KeyError), locked(folder):
+    with pytest.raises(KeyError), lock_folder(folder):
         raise KeyError
-    with locked(folder):
+    with lock_folder(folder):
         assert not list(folder.iterdir())
 
 
 def test_a_process_started_within_does_not_hold_it(tmp_path):
     """Workers may outlive the process that planned: they must not keep the next one out."""
-    with locked(tmp_path):
+    with lock_folder(tmp_path):
         child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     try:
-        with locked(tmp_path):
+        with lock_folder(tmp_path):
             assert child.poll() is None
     finally:
         child.communicate(b"\n")
@@ -43,13 +43,13 @@ def test_where_folders_cannot_be_locked_work_goes_on(tmp_path, monkeypatch, code
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    with locked(tmp_path), locked(tmp_path):
+    with lock_folder(tmp_path), lock_folder(tmp_path):
         pass
 
 
 def test_a_folder_that_cannot_be_made_is_for_others_to_tell(tmp_path):
     (tmp_path / "file").write_text("a file, no folder")
     for place in (tmp_path / "file", tmp_path / "file/below"):
-        with locked(place):
+        with lock_folder(place):
             pass
     assert (tmp_path / "file").read_text() == "a file, no folder"

@@ -20,10 +20,10 @@ from spacesim.data.images import load_image, read_exr, write_exr
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import (
     DatasetWriter,
+    find_unreadable_files,
     load_truth,
     read_dataset,
     read_points,
-    verify_dataset,
     write_points,
 )
 
@@ -82,7 +82,7 @@ TRAIN, TEST = ["train_00000", "train_00001"], ["test_00000"]
 def write_dataset(root, resume=False, frames=None):
     writer = DatasetWriter(root, SCENE, resume)
     for seed, name in enumerate(TRAIN + TEST):
-        if not writer.has(name):
+        if not writer.has_frame(name):
             writer.write_frame(name, *make_frame(seed))
     frames = frames or make_frames(TRAIN + TEST)
     return writer.finish(frames[:2], frames[2:], POINTS, COLORS, trimesh.creation.box())
@@ -102,7 +102,7 @@ def test_layout(root):
     expected = {f"{folder}/{name}.{suffix}" for folder, suffix in FOLDERS.items() for name in TRAIN + TEST}
     assert set(contents(root)) == expected | {"transforms.json", "scene.json", "points.ply", "mesh.ply", "SHA256SUMS"}
     assert json.loads((root / "scene.json").read_text()) == SCENE
-    assert verify_dataset(root) == []
+    assert find_unreadable_files(root) == []
 
 
 def test_written_again_it_has_the_same_bytes(root, tmp_path):
@@ -205,8 +205,8 @@ def test_resume_completes_what_was_left(root, tmp_path):
     (root / "images/train_00000.png").write_bytes(b"")
     (root / "images" / ".train_00001.png.abcd.part").write_bytes(b"half")
     writer = DatasetWriter(root, SCENE, resume=True)
-    assert [writer.has(name) for name in TRAIN + TEST] == [False, False, False]
-    assert "go on with generate --resume" in verify_dataset(root)[0]
+    assert [writer.has_frame(name) for name in TRAIN + TEST] == [False, False, False]
+    assert "go on with generate --resume" in find_unreadable_files(root)[0]
     write_dataset(root, resume=True)
     assert contents(root) == whole
 
@@ -233,7 +233,7 @@ def test_a_killed_writer_leaves_whole_frames_only(tmp_path):
     process.stdout.close()
     writer = DatasetWriter(tmp_path / "data", SCENE, resume=True)
     names = sorted({path.stem for path in (tmp_path / "data").glob("*/*.png")})
-    complete = [name for name in names if writer.has(name)]
+    complete = [name for name in names if writer.has_frame(name)]
     assert len(names) - len(complete) <= 1  # the one that it was at
     for name in complete:
         np.testing.assert_array_equal(
@@ -243,7 +243,7 @@ def test_a_killed_writer_leaves_whole_frames_only(tmp_path):
 
 
 def test_writer_refuses_what_is_not_its_own(root, tmp_path):
-    with pytest.raises(InputError, match="--resume"):
+    with pytest.raises(InputError, match=r"resume: expected with .* which holds a dataset"):
         DatasetWriter(root, SCENE)
     with pytest.raises(InputError, match="'seed' differs"):
         DatasetWriter(root, {**SCENE, "seed": 4}, resume=True)
@@ -272,7 +272,7 @@ def test_unwritable_folder_and_full_disk(tmp_path, monkeypatch):
             patch.setattr("os.replace", refuse)
             with pytest.raises(expected, match=r"train_00000\.png"):
                 writer.write_frame("train_00000", *make_frame())
-        assert not writer.has("train_00000")
+        assert not writer.has_frame("train_00000")
     assert not list((tmp_path / "data").glob("**/.*.part"))
 
 
@@ -310,14 +310,14 @@ def test_verify_tells_all_that_is_wrong(root):
     (root / "shadow/train_00001.png").unlink()
     PillowImage.new("L", (3, 3)).save(root / "id/test_00000.png")
     (root / "points.ply").write_text("ply")
-    problems = verify_dataset(root)
+    problems = find_unreadable_files(root)
     names = ["gt/train_00000.exr", "shadow/train_00001.png", "id/test_00000.png", "points.ply"]
     assert len(problems) == len(names)
     for name, problem in zip(names, problems, strict=True):
         assert name in problem
         assert "\n" not in problem
     (root / "images/train_00000.png").unlink()
-    assert len(verify_dataset(root)) == 1  # not even to be read
+    assert len(find_unreadable_files(root)) == 1  # not even to be read
 
 
 def test_points_are_stored_as_other_trainers_read_them(tmp_path):

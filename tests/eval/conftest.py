@@ -26,7 +26,7 @@ def sphere(sun, size=SIZE):
 
 @pytest.fixture
 def dataset(tmp_path):
-    """Four test frames under two suns, with all truth that judging reads."""
+    """Four test frames under two suns, with all truth that evaluating reads."""
     root = tmp_path / "data"
     frames = []
     for index in range(4):
@@ -71,9 +71,10 @@ class FakeRun:
     change: object = staticmethod(lambda rgb: rgb)
     visibility: object = None
     path: Path = Path("runs/fake")
-    gaussians: int = 123
-    bytes: int = 45678
+    gaussian_count: int = 123
+    model_bytes: int = 45678
     backend: str = "llvm"
+    parts: tuple = ()
     config: dict = field(default_factory=lambda: {"method": "vanilla", "preset": "demo", "seed": 7})
     training: dict = field(
         default_factory=lambda: {

@@ -1,4 +1,4 @@
-"""A run judged end to end on a tiny dataset."""
+"""A run evaluated end to end on a tiny dataset."""
 
 import json
 from dataclasses import replace
@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spacesim.data.density import write_camera_density
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.geometry import look_at
 from spacesim.data.images import load_image, luminance, read_png, write_png
 from spacesim.data.records import Camera, Frame
 from spacesim.eval import pictures
@@ -29,14 +31,42 @@ def test_perfect_prediction(make_run, dataset, tmp_path):
     metrics = evaluate(make_run(), dataset, tmp_path / "eval")
     assert metrics == json.loads((tmp_path / "eval" / "metrics.json").read_text())
     for group in ("image", "image_full"):
-        assert metrics[group]["psnr"] is None
+        assert metrics[group]["psnr"] == {"mean": 100, "std": 0, "count": 4}
         assert metrics[group]["mae"] == {"mean": 0, "std": 0, "count": 4}
         assert metrics[group]["ssim"]["mean"] == pytest.approx(1)
         assert metrics[group]["flip"]["mean"] == 0
     assert metrics["shadow"]["ber"]["mean"] == 0
     assert metrics["shadow"]["sharpness_ratio"]["mean"] == 1
-    assert any("PSNR over the silhouette is null in 4 of 4 frames" in note for note in metrics["notes"])
+    assert not any("PSNR" in note for note in metrics["notes"])
     assert not read_png(tmp_path / "eval/frames/test_00000/error.png").any()
+
+
+def test_frames_that_are_equal_count_in_the_mean(make_run, dataset, tmp_path):
+    """Of four frames all but the last are equal to the truth; that one is off by 0.1, which is 20 dB."""
+    shown = []
+
+    def last_is_off(rgb):
+        shown.append(rgb)  # the first is predicted once more, before the frames
+        return rgb + np.float32(0.1) * (len(shown) == 5)
+
+    metrics = evaluate(make_run(last_is_off), dataset, tmp_path / "eval")
+    assert [frame["psnr"] for frame in metrics["frames"]] == pytest.approx([100, 100, 100, 20], abs=0.2)
+    assert metrics["image"]["psnr"]["count"] == 4
+    assert metrics["image"]["psnr"]["mean"] == pytest.approx(80, abs=0.1)
+
+
+def test_map_of_the_training_cameras(relightable, tmp_path):
+    run, dataset = relightable()
+    moved = Camera.from_fov(look_at([0, 0, 9], [0, 0, 0]), 8, 8, 40)
+    dataset = replace(dataset, train=(replace(dataset.train[0], camera=moved),), ply_file_path=None)
+    out = tmp_path / "eval"
+    evaluate(run, dataset, out)
+    picture = read_png(out / "camera_density.png")
+    write_camera_density(tmp_path / "map.png", dataset)
+    np.testing.assert_array_equal(picture, read_png(tmp_path / "map.png"))
+    lost = evaluate(run, replace(dataset, mesh_path="mesh.ply"), out)
+    assert any(note.startswith("There is no map of the training cameras") for note in lost["notes"])
+    assert not (out / "camera_density.png").exists()
 
 
 def test_shifted_prediction_is_worse(make_run, dataset, tmp_path):
@@ -53,16 +83,16 @@ def test_shifted_prediction_is_worse(make_run, dataset, tmp_path):
 def test_values_are_those_of_the_metrics(make_run, dataset, tmp_path):
     metrics = evaluate(make_run(shifted), dataset, tmp_path / "eval")
     decibels = []
-    for frame, judged in zip(dataset.test, metrics["frames"], strict=True):
+    for frame, evaluated in zip(dataset.test, metrics["frames"], strict=True):
         truth = load_image(dataset, frame).over(np.zeros(3))
         silhouette = read_png(dataset.root / frame.silhouette_path) == 255
         decibels.append(image.psnr(shifted(truth), truth, silhouette))
-        assert judged["file_path"] == frame.file_path
-        assert judged["sun"] == pytest.approx(frame.sun.angles)
-        assert judged["psnr"] == decibels[-1]
-        assert judged["image_full"]["ssim"] == pytest.approx(image.ssim(shifted(truth), truth))
+        assert evaluated["file_path"] == frame.file_path
+        assert evaluated["sun"] == pytest.approx(frame.sun.angles)
+        assert evaluated["psnr"] == decibels[-1]
+        assert evaluated["image_full"]["ssim"] == pytest.approx(image.ssim(shifted(truth), truth))
         expected = shadow.luminance_metrics(luminance(shifted(truth)), luminance(truth), silhouette)
-        assert {key: judged[key] for key in expected} == expected
+        assert {key: evaluated[key] for key in expected} == expected
     assert metrics["image"]["psnr"] == {"mean": np.mean(decibels), "std": np.std(decibels), "count": 4}
 
 
@@ -207,7 +237,7 @@ def test_nan_names_the_frame(make_run, dataset, tmp_path):
 
 def test_a_mesh_that_is_missing_costs_the_shape_alone(make_run, dataset, tmp_path):
     run = make_run()
-    run.model = object()
+    run.gaussians = object()
     metrics = evaluate(run, replace(dataset, mesh_path="gone.ply"), tmp_path / "eval")
     assert metrics["geometry"] is None
     assert metrics["image"]["ssim"]

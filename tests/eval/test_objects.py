@@ -1,21 +1,21 @@
-"""Objects judged one by one, and a composed scene in the place of a run."""
+"""Objects evaluated one by one, and a composed scene in the place of a run."""
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from spacesim.data.images import load_image, luminance, read_exr, write_exr
 from spacesim.data.store import read_dataset
-from spacesim.eval.composition import ComposedRun
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.metrics import image, shadow
 from spacesim.eval.metrics.geometry import GeometryConfig
 from spacesim.eval.notes import explain_objects
-from spacesim.eval.objects import GROUPS, object_names, other_order
+from spacesim.eval.objects import GROUPS, object_names, swapped_order
 from spacesim.eval.report.write import write_report
-from spacesim.splat.compose.scenefile import load_scene
+from spacesim.splat.compose import ComposedRun, load_scene
 from spacesim.splat.export.mesh import MeshConfig
 
 CUT = 24  #: column at which the second object begins
@@ -43,10 +43,10 @@ class FakeScene:
     """What `ComposedRun` asks a composition for."""
 
     def __init__(self, run, names):
-        self.run, self.gaussians, self.bytes, self.backend, self.relightable = run, 7, 8, "llvm", False
+        self.run, self.gaussian_count, self.model_bytes, self.backend, self.relightable = run, 7, 8, "llvm", False
         self.names = names
 
-    def predict(self, camera, sun, normals=False):
+    def predict(self, camera, sun, normals=False, exposure=None):
         return self.run.predict(camera, sun)
 
 
@@ -54,8 +54,8 @@ class Scene(ComposedRun):
     """With names and a configuration as the test wants."""
 
     @property
-    def names(self):
-        return self.composition.names
+    def parts(self):
+        return tuple(SimpleNamespace(name=name) for name in self.composition.names)
 
     @property
     def config(self):
@@ -78,15 +78,15 @@ def test_values_are_those_of_each_objects_pixels(make_run, pair, tmp_path):
         for index, frame in enumerate(pair.test):
             truth = load_image(pair, frame).over(np.zeros(3))
             mask = read_exr(pair.root / frame.gt_path)["object_id"] == number
-            judged = metrics["frames"][index]["objects"].get(one["name"])
-            assert (judged is None) == (not mask.any())
-            if judged is None:
+            evaluated = metrics["frames"][index]["objects"].get(one["name"])
+            assert (evaluated is None) == (not mask.any())
+            if evaluated is None:
                 continue
             found.append(image.psnr(shifted(truth), truth, mask))
-            assert judged["image"]["psnr"] == found[-1]
-            assert judged["image"]["ssim"] == pytest.approx(image.ssim(shifted(truth), truth, mask))
+            assert evaluated["image"]["psnr"] == found[-1]
+            assert evaluated["image"]["ssim"] == pytest.approx(image.ssim(shifted(truth), truth, mask))
             expected = shadow.luminance_metrics(luminance(shifted(truth)), luminance(truth), mask)
-            assert judged["shadow"] == expected
+            assert evaluated["shadow"] == expected
         found = [value for value in found if value is not None]  # where all is black, all is right
         assert one["image"]["psnr"] == {"mean": np.mean(found), "std": np.std(found), "count": len(found)}
         assert len(found) >= 2
@@ -150,9 +150,9 @@ def test_the_command_judges_a_scene(spacesim, tiny_run, tmp_path):
     text = f'{model}name = "a"\n{model}name = "b"\nposition = [-3, -3, -3]\n'
     (tmp_path / "pair.toml").write_text(text)
     line = ["eval", tmp_path / "pair.toml", "--data", tmp_path / "pair", "--out", tmp_path / "eval"]
-    judged = spacesim(*line, "--no-geometry", "--json")
-    assert judged.code == 0, judged.errors
-    assert '"name": "b"' in judged.output
+    evaluated = spacesim(*line, "--no-geometry", "--json")
+    assert evaluated.code == 0, evaluated.errors
+    assert '"name": "b"' in evaluated.output
     assert "Object by object" in (tmp_path / "eval" / "report.html").read_text()
     refused = spacesim("eval", tmp_path / "no.toml", "--data", tmp_path / "pair", "--out", tmp_path / "eval")
     assert refused.is_refusal("no.toml")
@@ -164,7 +164,7 @@ def test_the_command_judges_a_scene(spacesim, tiny_run, tmp_path):
     assert [one["geometry"]["size"] for one in metrics["objects"]] == pytest.approx([6.19, 6.19], abs=0.01)
     assert not any(note.startswith("Geometry") or "order" in note for note in metrics["notes"])
     swapped = ComposedRun(scene.composition.posed([one.pose for one in scene.composition.models[::-1]]), scene.path)
-    assert other_order(swapped, read_dataset(tmp_path / "pair")) == [2, 1]
+    assert swapped_order(swapped, read_dataset(tmp_path / "pair")) == [2, 1]
     (note,) = explain_objects({1: "a", 2: "b"}, [], ["a", "b"], [2, 1])[:1]
-    assert note.startswith("a, b stand where objects 2, 1 of the data are and are judged as objects 1, 2")
+    assert note.startswith("a, b stand where objects 2, 1 of the data are and are evaluated as objects 1, 2")
     assert (tmp_path / "shaped" / "geometry" / "reconstruction.ply").exists()

@@ -1,4 +1,4 @@
-"""Shape judged end to end on tiny runs: numbers, notes, pictures, the report's section, exported meshes."""
+"""Shape evaluated end to end on tiny runs: numbers, notes, pictures, the report's section, exported meshes."""
 
 import json
 import shutil
@@ -12,14 +12,13 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
 from spacesim.data.mesh import SignedDistance, read_mesh, write_mesh
 from spacesim.data.store import read_dataset
-from spacesim.eval.composition import ComposedRun
-from spacesim.eval.metrics.exterior import Sight
-from spacesim.eval.metrics.geometry import COMPARED, GeometryConfig, judge_geometry, judge_shape
-from spacesim.eval.objects import judge_object_shapes, object_names
+from spacesim.eval.metrics.exterior import ExteriorView
+from spacesim.eval.metrics.geometry import COMPARED, GeometryConfig, compare_geometry, compare_shape
+from spacesim.eval.objects import compare_object_shapes, object_names
 from spacesim.eval.report.surfaces import value_of
 from spacesim.eval.report.write import write_report
-from spacesim.eval.shape import BACKGROUND, COLOURS, cameras_of, coloured, write_shapes
-from spacesim.splat.compose import Composition, Placed, Pose
+from spacesim.eval.shape import BACKGROUND, COLORS, cameras_around_mesh, draw_distances, write_shapes
+from spacesim.splat.compose import ComposedRun, Composition, PlacedRun, Pose
 from spacesim.splat.compose.pose import rotation_about
 from spacesim.splat.export.mesh import MeshConfig, cameras_around
 from spacesim.splat.raster.gaussians import Gaussians
@@ -40,7 +39,7 @@ def tiny(tiny_run, tiny_data):
 
 
 def test_a_trained_run_has_numbers(tiny):
-    found = judge_geometry(*tiny, SMALL)
+    found = compare_geometry(*tiny, SMALL)
     assert found.note == ""
     values = found.values
     assert json.loads(json.dumps(values, allow_nan=False)) == values
@@ -51,7 +50,7 @@ def test_a_trained_run_has_numbers(tiny):
     assert 0.05 < values["iou"] < 1
     assert values["mesh"]["views"] == 6
     assert 0 < values["floaters"]["inside"] < 1
-    assert judge_geometry(*tiny, SMALL).values == values  # the same bits
+    assert compare_geometry(*tiny, SMALL).values == values  # the same bits
 
 
 def test_better_shapes_have_better_numbers(tiny):
@@ -61,7 +60,7 @@ def test_better_shapes_have_better_numbers(tiny):
     arrays["log_scales"] -= 0.4
     worse = {**arrays, "means": arrays["means"] * np.float32(1.2)}
     models = (Gaussians.from_numpy(one) for one in (arrays, worse))
-    good, bad = (judge_geometry(replace(run, model=model), dataset, SMALL).values for model in models)
+    good, bad = (compare_geometry(replace(run, gaussians=model), dataset, SMALL).values for model in models)
     assert bad["chamfer"] > 2 * good["chamfer"]
     assert bad["hausdorff99"] > good["hausdorff99"]
     assert bad["iou"] < good["iou"]
@@ -74,7 +73,7 @@ def test_better_shapes_have_better_numbers(tiny):
 def placed_pair(run, dataset, folder):
     """Two models of one run, the second turned, moved and twice as large, and data whose true mesh is theirs."""
     poses = Pose(), Pose(rotation_about([0, 0, 1], 90), [9.0, 0, 2], 2.0)
-    scene = ComposedRun(Composition([Placed(run, pose, f"model {k}") for k, pose in enumerate(poses)]), folder)
+    scene = ComposedRun(Composition([PlacedRun(run, pose, f"model {k}") for k, pose in enumerate(poses)]), folder)
     vertices, faces = read_mesh(dataset.root / dataset.mesh_path)
     second = 2 * vertices @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).T + [9, 0, 2]
     write_mesh(folder / "pair.ply", np.concatenate([vertices, second]), np.concatenate([faces, faces + len(vertices)]))
@@ -90,24 +89,24 @@ def test_models_of_a_scene_have_the_shapes_of_their_runs(tiny, tmp_path):
     """Twice as large: twice the lengths, four times the areas, all else as before."""
     run, dataset = tiny
     scene, pair = placed_pair(run, dataset, tmp_path)
-    names = object_names(pair, scene.names)
+    names = object_names(pair, [part.name for part in scene.parts])
     assert list(names.values()) == ["model 0", "model 1"]
-    cameras = cameras_around(run.model, SMALL.mesh.views)
-    alone = judge_shape(run.model, run.antialiased, cameras, read_mesh(dataset.root / dataset.mesh_path), SMALL)
-    first, second = judge_object_shapes(scene, pair, names, SMALL).values()
+    cameras = cameras_around(run.gaussians, SMALL.mesh.views)
+    alone = compare_shape(run.gaussians, run.antialiased, cameras, read_mesh(dataset.root / dataset.mesh_path), SMALL)
+    first, second = compare_object_shapes(scene, pair, names, SMALL).values()
     for key in ("chamfer", "hausdorff99", "iou", "size", "accuracy"):
         assert first[key] == pytest.approx(alone.values[key], rel=1e-3)
         factor = {"chamfer": 4, "iou": 1}.get(key, 2)
         assert second[key] == pytest.approx(factor * first[key], rel=0.15), key  # other views, other voxels
     assert second["floaters"]["inside"] == pytest.approx(first["floaters"]["inside"], abs=1e-3)
 
-    whole = judge_geometry(scene, pair, SMALL)
+    whole = compare_geometry(scene, pair, SMALL)
     assert whole.note == ""
     assert whole.values["mesh"]["views"] == SMALL.mesh.views
     assert whole.values["floaters"]["inside"] == pytest.approx(first["floaters"]["inside"], abs=1e-3)
     moved = replace(scene, composition=scene.composition.moved(1, Pose(translation=[9.0, 6.0, 2.0])))
-    assert judge_geometry(moved, pair, SMALL).values["chamfer"] > 10 * whole.values["chamfer"]
-    assert judge_object_shapes(moved, pair, names, SMALL)[1] == first
+    assert compare_geometry(moved, pair, SMALL).values["chamfer"] > 10 * whole.values["chamfer"]
+    assert compare_object_shapes(moved, pair, names, SMALL)[1] == first
 
 
 def test_objects_without_a_shape_of_their_own(tiny, tmp_path):
@@ -115,7 +114,7 @@ def test_objects_without_a_shape_of_their_own(tiny, tmp_path):
     run, dataset = tiny
     scene, pair = placed_pair(run, dataset, tmp_path)
     names = object_names(pair)
-    three = replace(scene, composition=Composition([*scene.composition.models, Placed(run)]))
+    three = replace(scene, composition=Composition([*scene.composition.models, PlacedRun(run)]))
     less = {key: value for key, value in pair.scene.items() if key != "mesh"}
     for who, what, config in (
         (run, pair, SMALL),
@@ -124,7 +123,7 @@ def test_objects_without_a_shape_of_their_own(tiny, tmp_path):
         (scene, replace(pair, mesh_path=None), SMALL),
         (scene, pair, None),
     ):
-        assert judge_object_shapes(who, what, names, config) == {}
+        assert compare_object_shapes(who, what, names, config) == {}
 
 
 def test_the_report_has_the_shape_of_each_object(tiny_eval, tmp_path):
@@ -140,17 +139,17 @@ def test_the_report_has_the_shape_of_each_object(tiny_eval, tmp_path):
         assert words in page
 
 
-# What cannot be judged
+# What cannot be evaluated
 
 
 def test_runs_without_a_surface_have_a_sentence(tiny):
     run, dataset = tiny
-    arrays = run.model.to_numpy()
-    faint = Gaussians.from_numpy({**arrays, "logit_opacities": np.full(run.gaussians, -12.0)})
+    arrays = run.gaussians.to_numpy()
+    faint = Gaussians.from_numpy({**arrays, "logit_opacities": np.full(run.gaussian_count, -12.0)})
     one = Gaussians.from_numpy({name: values[:1] for name, values in arrays.items()})
     none = Gaussians.from_numpy({name: values[:0] for name, values in arrays.items()})
     for model in (faint, one, none):
-        found = judge_geometry(replace(run, model=model), dataset, SMALL)
+        found = compare_geometry(replace(run, gaussians=model), dataset, SMALL)
         assert (found.values["chamfer"] is None) == (found.note != "")
         assert (found.values["floaters"] is None) == (model.count == 0)
         json.dumps(found.values, allow_nan=False)
@@ -159,25 +158,25 @@ def test_runs_without_a_surface_have_a_sentence(tiny):
 
 def test_what_cannot_be_judged_is_null_and_why(tiny, tmp_path):
     run, dataset = tiny
-    assert judge_geometry(run, dataset, None).note == "Geometry is null: it was not asked for."
-    without = judge_geometry(run, replace(dataset, mesh_path=None), SMALL)
+    assert compare_geometry(run, dataset, None).note == "Geometry is null: it was not asked for."
+    without = compare_geometry(run, replace(dataset, mesh_path=None), SMALL)
     assert (without.values, without.note) == (None, "Geometry is null: the data has no true mesh.")
     gone = replace(dataset, mesh_path="gone.ply")
     with pytest.raises(InputError, match=r"gone.ply: expected a mesh, found none"):
-        judge_geometry(run, gone, SMALL)
+        compare_geometry(run, gone, SMALL)
     (tmp_path / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nend_header\n0 0")
     with pytest.raises(InputError, match=r"broken.ply: expected a mesh"):
-        judge_geometry(run, replace(dataset, root=tmp_path, mesh_path="broken.ply"), SMALL)
+        compare_geometry(run, replace(dataset, root=tmp_path, mesh_path="broken.ply"), SMALL)
     write_mesh(tmp_path / "point.ply", np.zeros((3, 3)), np.array([[0, 1, 2]]))
     with pytest.raises(InputError, match=r"point.ply: expected a mesh, found no face with an area"):
-        judge_geometry(run, replace(dataset, root=tmp_path, mesh_path="point.ply"), SMALL)
+        compare_geometry(run, replace(dataset, root=tmp_path, mesh_path="point.ply"), SMALL)
 
 
-def test_colours_are_those_of_the_distance():
+def test_colors_are_those_of_the_distance():
     inner, outer = sphere(1.0), sphere(1.1)
-    camera = cameras_of(inner)[0]
-    for scale, expected in ((0.1, COLOURS[-1]), (0.2, COLOURS[2]), (1e9, COLOURS[0])):
-        image = coloured(inner, Sight(*inner), SignedDistance(*outer), camera, scale)
+    camera = cameras_around_mesh(inner)[0]
+    for scale, expected in ((0.1, COLORS[-1]), (0.2, COLORS[2]), (1e9, COLORS[0])):
+        image = draw_distances(inner, ExteriorView(*inner), SignedDistance(*outer), camera, scale)
         middle = image[camera.height // 2, camera.width // 2]  # it faces the camera: full light
         assert np.abs(middle.astype(int) - expected).max() <= 4
         assert tuple(image[0, 0]) == BACKGROUND
@@ -186,8 +185,10 @@ def test_colours_are_those_of_the_distance():
 def test_pictures_are_filled_by_the_object():
     vertices, faces = sphere(3.0)
     vertices = vertices * [1, 0.2, 0.5] + [100, 0, -7]
-    for camera in cameras_of((vertices, faces)):
-        image = coloured((vertices, faces), Sight(vertices, faces), SignedDistance(vertices, faces), camera, 1.0)
+    for camera in cameras_around_mesh((vertices, faces)):
+        image = draw_distances(
+            (vertices, faces), ExteriorView(vertices, faces), SignedDistance(vertices, faces), camera, 1.0
+        )
         rows, columns = np.nonzero((image != BACKGROUND).any(axis=2))
         fill = max(np.ptp(rows) / image.shape[0], np.ptp(columns) / image.shape[1])
         assert 0.9 < fill < 0.96
@@ -205,7 +206,14 @@ def test_eval_and_report_show_the_shape(tiny_eval, tmp_path):
     _, faces = read_mesh(tiny_eval / "geometry" / "reconstruction.ply")
     assert len(faces) == geometry["mesh"]["faces"]
     page = (tiny_eval / "report.html").read_text()
-    for words in ("<h2>Shape</h2>", "Hausdorff-99", "what is missing", "what is too much", "61.9 mm, 1 %"):
+    for words in (
+        "<h2>Shape</h2>",
+        "<dt>Hausdorff</dt>",
+        "Hausdorff-99",
+        "what is missing",
+        "what is too much",
+        "61.9 mm, 1 %",
+    ):
         assert words in page
 
     other = tmp_path / "without"
@@ -223,7 +231,7 @@ def test_eval_and_report_show_the_shape(tiny_eval, tmp_path):
 
 
 def test_nothing_is_written_without_a_comparison(tiny, tmp_path):
-    write_shapes(tmp_path / "geometry", judge_geometry(*tiny, None))
+    write_shapes(tmp_path / "geometry", compare_geometry(*tiny, None))
     assert not (tmp_path / "geometry").exists()
 
 

@@ -16,7 +16,7 @@ from spacesim.data.records import Camera, Frame, Sun
 from spacesim.data.store import read_dataset
 from spacesim.eval import relight
 from spacesim.eval.metrics import grazing
-from spacesim.eval.suns import count_suns, known_suns, trained_on
+from spacesim.eval.suns import count_suns, known_suns, training_frames
 
 FAR = Camera.from_fov(look_at([10.0, 0, 0], [0, 0, 0]), 16, 12, 30)
 """Looks along -x."""
@@ -29,10 +29,10 @@ def frame(sun=None, camera=FAR, name="a.png"):
 def test_a_sun_is_known_within_a_hundredth_of_a_degree():
     training = [frame((30, 20)), frame((200, -40)), frame()]
     suns = [(30, 20), (30, 20.009), (30, 20.011), (30 + 0.009 / math.cos(math.radians(20)), 20), (-160, -40), (20, 30)]
-    judged = [*map(frame, suns), frame()]
-    assert known_suns(judged, training) == [True, True, False, True, True, False, None]
-    assert known_suns(judged, [frame()]) == [None] * 7
-    assert known_suns(judged, []) == [None] * 7
+    evaluated = [*map(frame, suns), frame()]
+    assert known_suns(evaluated, training) == [True, True, False, True, True, False, None]
+    assert known_suns(evaluated, [frame()]) == [None] * 7
+    assert known_suns(evaluated, []) == [None] * 7
     assert count_suns([frame((30, 20)), frame((390, 20)), frame((30, 20.01)), frame()]) == 2
 
 
@@ -60,11 +60,11 @@ def test_known_suns_are_those_of_the_runs_own_data(tmp_path):
     config = {"data": {"path": str(own.root.resolve()), "digest": training_digest(own)}}
 
     def known(dataset):
-        trained, why = trained_on(config, dataset)
+        trained, why = training_frames(config, dataset)
         return known_suns([frame((30, 20)), frame((200, -40))], trained), why
 
     assert known(own) == ([True, False], "")
-    assert known(other) == ([True, False], "")  # not what the judged data would say
+    assert known(other) == ([True, False], "")  # not what the evaluated data would say
     shutil.copytree(own.root, tmp_path / "moved")
     shutil.rmtree(own.root)
     assert known(read_dataset(tmp_path / "moved")) == ([True, False], "")
@@ -72,7 +72,7 @@ def test_known_suns_are_those_of_the_runs_own_data(tmp_path):
     changed = lit_by(own.root, (30, 20), (1, 2))
     assert known(other)[0] == known(changed)[0] == [None, None]
     assert "has changed since" in known(changed)[1]
-    assert trained_on({"method": "vanilla"}, other) == (other.train, "")
+    assert training_frames({"method": "vanilla"}, other) == (other.train, "")
 
 
 def by_hand(truth, predicted, true, visibility, mask):
@@ -145,19 +145,19 @@ def test_phase_angle():
 
 def test_the_sweep_is_of_the_view_with_the_most_suns():
     other = Camera.from_fov(look_at([0.0, 10, 0], [0, 0, 0]), 16, 12, 30)
-    judged = [frame((90, 0), other), frame((120, 0)), frame((10, 0)), frame((40, 10))]
-    sweep = relight.plan_sweep(judged, [*judged, frame((170, 0)), frame((-60, 0))])
-    assert sweep.view is judged[2]
+    evaluated = [frame((90, 0), other), frame((120, 0)), frame((10, 0)), frame((40, 10))]
+    sweep = relight.plan_sweep(evaluated, [*evaluated, frame((170, 0)), frame((-60, 0))])
+    assert sweep.view is evaluated[2]
     assert [round(one.sun.angles[0]) for one in sweep.lit_as] == [10, 40, 300, 90, 120, 170]
-    assert sweep.truths == (judged[2], judged[3], None, None, judged[1], None)
+    assert sweep.truths == (evaluated[2], evaluated[3], None, None, evaluated[1], None)
 
 
 def test_the_sweep_spreads_over_many_suns():
     suns = [(azimuth, 0) for azimuth in range(0, 181)]
-    judged = [frame((3, 0)), frame((3, 0), name="again.png")]
-    sweep = relight.plan_sweep(judged, [*judged, *map(frame, suns)])
+    evaluated = [frame((3, 0)), frame((3, 0), name="again.png")]
+    sweep = relight.plan_sweep(evaluated, [*evaluated, *map(frame, suns)])
     phases = [relight.phase_deg(FAR, one) for one in sweep.lit_as]
-    assert len(phases) == relight.MOST_SUNS
+    assert len(phases) == relight.MAX_SUNS
     assert phases == sorted(phases)
     assert sum(truth is not None for truth in sweep.truths) == 1
     assert phases[0] <= 3
@@ -165,7 +165,7 @@ def test_the_sweep_spreads_over_many_suns():
     assert np.diff(phases[2:]).max() / np.diff(phases[2:]).min() < 1.2
     all_true = relight.plan_sweep(list(map(frame, suns)), [])
     assert None not in all_true.truths
-    assert len(all_true.truths) == relight.MOST_SUNS
+    assert len(all_true.truths) == relight.MAX_SUNS
 
 
 def test_no_sweep_without_two_suns():

@@ -17,7 +17,7 @@ import numpy as np
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes import Renderer, Scene, build, read_scene
 from spacesim.scenes.generation.generate import plan_views
-from spacesim.scenes.sun import SunConfig
+from spacesim.scenes.lights.sun import SunConfig
 
 NEAR_EDGE = 0.02
 """Pixels, chosen: an edge that is nearer to a pixel's centre may fall on either side of it."""

@@ -14,7 +14,7 @@ from trimesh.ray.ray_triangle import RayMeshIntersector
 from spacesim.data.records import Camera, Sun
 from spacesim.scenes import Renderer, Scene, build, read_scene
 from spacesim.scenes.generation.generate import plan_views
-from spacesim.scenes.sun import SunConfig
+from spacesim.scenes.lights.sun import SunConfig
 
 
 @pytest.mark.parametrize(

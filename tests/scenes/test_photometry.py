@@ -11,9 +11,9 @@ from spacesim.data.records import Camera, Sun
 from spacesim.data.store import SHADOW_SELF_CAST
 from spacesim.scenes import Part, Renderer, Scene, SceneObject, Spacecraft, build, read_scene, render
 from spacesim.scenes.generation.generate import plan_views
+from spacesim.scenes.lights.sun import EXPOSURE, SOLAR_IRRADIANCE, SunConfig
 from spacesim.scenes.materials.table import Material, material
 from spacesim.scenes.spacecraft import spacecraft
-from spacesim.scenes.sun import EXPOSURE, SOLAR_IRRADIANCE, SunConfig
 
 PARALLEL = SunConfig("directional")
 

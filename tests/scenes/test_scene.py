@@ -31,13 +31,13 @@ def named_materials(scene: Scene) -> list[tuple[str, list[float]]]:
 
 def test_mesh_files_of_one_name_keep_their_materials_apart(tmp_path):
     """Two files hull.obj, each with a material "paint": named apart in scene.json, and each seen in its own colour."""
-    colours = {"a": [0.7, 0.2, 0.1], "b": [0.1, 0.2, 0.7]}
-    for folder, colour in colours.items():
+    colors = {"a": [0.7, 0.2, 0.1], "b": [0.1, 0.2, 0.7]}
+    for folder, color in colors.items():
         (tmp_path / folder).mkdir()
         box = trimesh.creation.box((1, 1, 1))
         lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + [f"f {i + 1} {j + 1} {k + 1}" for i, j, k in box.faces]
         (tmp_path / folder / "hull.obj").write_text("\n".join(["mtllib hull.mtl", "o Hull", "usemtl paint", *lines]))
-        (tmp_path / folder / "hull.mtl").write_text(f"newmtl paint\nKd {' '.join(map(str, colour))}\n")
+        (tmp_path / folder / "hull.mtl").write_text(f"newmtl paint\nKd {' '.join(map(str, color))}\n")
     places = {"a": (0.0, -1.0, 0.0), "b": (0.0, 1.0, 0.0)}
     objects = [ObjectConfig(mesh=f"{key}/hull.obj", position=place) for key, place in places.items()]
     objects.append(ObjectConfig(mesh="a/hull.obj", position=(0.0, 5.0, 0.0)))
@@ -45,16 +45,16 @@ def test_mesh_files_of_one_name_keep_their_materials_apart(tmp_path):
     (first, red), (second, blue), again = named_materials(scene)
     assert first != second
     assert again == (first, red)
-    np.testing.assert_allclose([red, blue], list(colours.values()), atol=1e-6)
+    np.testing.assert_allclose([red, blue], list(colors.values()), atol=1e-6)
 
     camera = Camera.from_fov(look_at(np.array([10.0, 0, 0]), np.zeros(3)), 32, 32, 25.0)
     truth = Renderer(scene, spp=4).render(camera, Sun(np.array([1.0, 0, 0])), (0,))
-    for number, colour in enumerate(colours.values(), start=1):
+    for number, color in enumerate(colors.values(), start=1):
         at = truth.object_id == number
         assert at.sum() > 20
-        np.testing.assert_allclose(truth.albedo[at], np.broadcast_to(colour, (at.sum(), 3)), atol=1e-6)
+        np.testing.assert_allclose(truth.albedo[at], np.broadcast_to(color, (at.sum(), 3)), atol=1e-6)
         seen = np.median(truth.radiance[at], axis=0)
-        np.testing.assert_allclose(seen / seen.sum(), colour, rtol=1e-3)
+        np.testing.assert_allclose(seen / seen.sum(), color, rtol=1e-3)
 
 
 def test_a_material_of_the_scene_may_have_a_presets_name():

@@ -1,5 +1,7 @@
 """Scene files: lines of keys, values to dataclasses and back, what is refused and how, the page that describes them."""
 
+import ast
+import importlib.util
 import random
 import re
 import warnings
@@ -15,16 +17,17 @@ from spacesim.data import toml
 from spacesim.data.errors import InputError
 from spacesim.data.structure import keys_of
 from spacesim.scenes.build import build
-from spacesim.scenes.camera import CameraConfig
+from spacesim.scenes.cameras.camera import CameraConfig
+from spacesim.scenes.cameras.rig import RIGS, RigConfig
+from spacesim.scenes.cameras.sensor import SensorConfig
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, QualityConfig, SceneConfig
-from spacesim.scenes.earth import EarthConfig
 from spacesim.scenes.generation.generate import plan_views
-from spacesim.scenes.rig import RIGS, RigConfig
+from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.scenes.lights.sun import SunConfig
 from spacesim.scenes.scenefile import BUILT_IN_SCENES, RULES, SCENES, read_scene, scene_text
-from spacesim.scenes.sensor import SensorConfig
-from spacesim.scenes.sun import SunConfig
 
-PAGE = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "reference" / "scene-files.md").read_text(encoding="utf-8")
 
 EVERYTHING = '''\
 # every way to write a key
@@ -519,48 +522,49 @@ def test_objects_that_single_precision_cannot_hold_are_named():
     assert sized(ObjectConfig(spacecraft="boxsat", scale=1e6)).bounding_sphere[1] > 1e6
 
 
-ROW = re.compile(r"^\| `(\w+)` \|[^|]*\| ([^|]*?) \|", re.MULTILINE)
+FIELD = re.compile(r"^(\w+): [^=\n]+(?:= ([^#\n]*))?", re.MULTILINE)
 TABLES = {
-    **{"The scene": SceneConfig, "`[[objects]]`": ObjectConfig, "`[materials.NAME]`": MaterialConfig},
-    **{"`[sun]`": SunConfig, "`[earth]`": EarthConfig, "`[camera]`": CameraConfig, "`[camera.sensor]`": SensorConfig},
-    **{f"`{kind}`": rig for kind, rig in RIGS.items()},
-    "`[quality]`": QualityConfig,
+    **{"The scene": SceneConfig, "[[objects]]": ObjectConfig, "[materials.NAME]": MaterialConfig},
+    **{"[sun]": SunConfig, "[earth]": EarthConfig, "[camera]": CameraConfig, "[camera.sensor]": SensorConfig},
+    **{f'[rig] kind = "{kind}"': rig for kind, rig in RIGS.items()},
+    "[quality]": QualityConfig,
 }
 
 
-def rows_of(title):
-    """Keys and defaults in the tables of the page below a title."""
-    section = re.search(rf"^##+ {re.escape(title)}\n(.*?)(?=^##|\Z)", PAGE, re.MULTILINE | re.DOTALL)
-    return dict(ROW.findall(section.group(1)))
+@pytest.fixture(scope="module")
+def generated():
+    """The page of all keys, as the documentation site has it."""
+    spec = importlib.util.spec_from_file_location("generate_scene_page", DOCS / "generate.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.scene_page()
+
+
+def rows_of(page, title):
+    """Keys and defaults, as text, in the Python below a title of the page."""
+    section = re.search(rf"^## {re.escape(title)}\n.*?^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    return {key: default.strip() for key, default in FIELD.findall(section.group(1))}
 
 
 @pytest.mark.parametrize("title", TABLES)
-def test_the_page_has_every_key_and_its_default(title):
+def test_the_page_has_every_key_and_its_default(title, generated):
     cls = TABLES[title]
-    rows = rows_of(title)
+    rows = rows_of(generated, title)
     if issubclass(cls, RigConfig):
-        rows = {**rows_of("`[rig]`"), **rows}
-        assert rows.pop("kind") == '`"fibonacci"`'
-    if cls is SceneConfig:
-        tables = {"sun", "earth", "rig", "camera", "quality"}
-        assert all(f"`{name}`" in PAGE for name in tables)
-        rows.update(dict.fromkeys(tables, "tables"))
-        assert rows.pop("name") == "the file's name"
-        rows["name"] = "required"
+        rows = {**rows_of(generated, "[rig]"), **rows}
     assert set(rows) == set(keys_of(cls, RULES))
-    for f in (f for f in fields(cls) if f.name in rows and rows[f.name] != "tables"):
-        default = f.default if f.default_factory is MISSING else f.default_factory()
-        if default is MISSING or default is None:
-            assert rows[f.name] == ("required" if default is MISSING else "none"), f.name
+    stated = [f for f in fields(cls) if f.name in rows and f.default_factory is MISSING]
+    assert len(stated) >= 2
+    for f in stated:
+        if f.default is MISSING:
+            assert rows[f.name] == "", f.name
         else:
-            stated = toml.parse(f"x = {rows[f.name].strip('`')}", "page").values["x"]
-            plain = list(default) if isinstance(default, tuple) else default
-            assert stated == (pytest.approx(plain, rel=1e-5) if isinstance(plain, float) else plain), f.name
+            value = ast.literal_eval(rows[f.name])
+            assert value == (pytest.approx(f.default, rel=1e-5) if isinstance(value, float) else f.default), f.name
 
 
-def test_every_table_of_the_page_is_checked():
-    titles = set(re.findall(r"^##+ (.*)$", PAGE, re.MULTILINE))
-    assert {title for title in titles if rows_of(title)} == {*TABLES, "`[rig]`"}
+def test_every_table_of_the_page_is_checked(generated):
+    assert set(re.findall(r"^## (.*)$", generated, re.MULTILINE)) == {*TABLES, "[rig]"}
 
 
 BLOCKS = re.findall(r"^```toml\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)

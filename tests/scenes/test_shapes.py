@@ -31,7 +31,7 @@ def test_sector_is_its_share_of_the_ring():
 
 def test_dome_is_half_an_ellipsoid():
     profile = shapes.dome(2.0, 0.5, rings=400)
-    half = shapes.revolved([(0.0, 0.0), *profile], segments=800)
+    half = shapes.revolve([(0.0, 0.0), *profile], segments=800)
     assert _is_solid(half)
     assert half.volume == pytest.approx(2.0 / 3.0 * np.pi * 2.0**2 * 0.5, rel=1e-4)
 
@@ -65,15 +65,15 @@ def test_handrail_stands_off_and_comes_back():
 
 def test_turned_and_moved_leave_the_original():
     box = shapes.box([1, 2, 3])
-    turned = shapes.turned(box, 90.0, [0, 0, 1], about=[1, 0, 0])
+    turned = shapes.rotate_mesh(box, 90.0, [0, 0, 1], about=[1, 0, 0])
     np.testing.assert_allclose(turned.bounds, [[0, -1.5, -1.5], [2, -0.5, 1.5]], atol=1e-12)
-    moved = shapes.moved(box, [1, 2, 3])
+    moved = shapes.translate_mesh(box, [1, 2, 3])
     np.testing.assert_allclose(moved.bounds, [[0.5, 1, 1.5], [1.5, 3, 4.5]])
     np.testing.assert_allclose(box.bounds, [[-0.5, -1, -1.5], [0.5, 1, 1.5]])
 
 
 def test_joined_keeps_every_solid():
-    both = shapes.joined((shapes.box([1, 1, 1]), shapes.box([1, 1, 1], [3, 0, 0])))
+    both = shapes.join_meshes((shapes.box([1, 1, 1]), shapes.box([1, 1, 1], [3, 0, 0])))
     assert isinstance(both, trimesh.Trimesh)
     assert both.volume == pytest.approx(2.0)
 
@@ -81,7 +81,7 @@ def test_joined_keeps_every_solid():
 def test_whole_cells_begin_and_end_at_borders():
     """Of boxes turned and moved: broad faces are whole numbers of cells, in the proportions of the face."""
     boxes = [shapes.box([0.5, 0.01, 0.33], [1, 2, 3]), shapes.box([0.19, 0.11, 0.02])]
-    mesh = shapes.turned(shapes.joined(boxes), 40.0, [1, 2, 3], [5, 6, 7])
+    mesh = shapes.rotate_mesh(shapes.join_meshes(boxes), 40.0, [1, 2, 3], [5, 6, 7])
     flat = shapes.whole_cells(mesh, (0.08, 0.04)).reshape(2, 12, 3, 2)
     broad = np.sort(mesh.area_faces.reshape(2, 12).argsort(axis=1)[:, -4:])  # the two largest sides, two facets each
     for corners, faces, (columns, rows) in zip(flat, broad, [(6, 8), (2, 3)], strict=True):

@@ -17,7 +17,7 @@ from spacesim.scenes.spacecraft.small_body import DIAMETER, crater_profile, nois
 
 CRAFT = {name: spacecraft(name) for name in SPACECRAFT}
 PARTS = [(name, part) for name, craft in CRAFT.items() for part in craft.parts]
-MOST_PARTS, MOST_FACES = 120, 120_000
+MAX_PARTS, MAX_FACES = 120, 120_000
 
 
 def _mesh(name, *parts):
@@ -49,9 +49,9 @@ def test_counts_and_names(name):
     craft = CRAFT[name]
     names = [part.name for part in craft.parts]
     assert craft.name == name
-    assert len(set(names)) == len(names) <= MOST_PARTS
+    assert len(set(names)) == len(names) <= MAX_PARTS
     assert all(re.fullmatch(r"[a-z][a-z0-9_]*", item) for item in names)
-    assert len(_mesh(name).faces) <= MOST_FACES
+    assert len(_mesh(name).faces) <= MAX_FACES
 
 
 @pytest.mark.parametrize("name", SPACECRAFT)

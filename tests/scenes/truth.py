@@ -5,7 +5,7 @@ python tests/scenes/truth.py --labels boxsat FILE.glb           labels of scenes
 python tests/scenes/truth.py --penumbrae boxsat telescope       visibility of the solar disc, against the same
 python tests/scenes/truth.py --whole boxsat                     whole renders, `whole.py`
 
-These are the figures of docs/truth.md.
+These are the figures of docs/research/truth.md.
 """
 
 import argparse
@@ -21,10 +21,10 @@ import whole
 from spacesim.data.geometry import direction_from_angles, look_at
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes import Part, Renderer, Scene, SceneObject, Spacecraft
-from spacesim.scenes.earth import EARTH_RADIUS_KM, EarthConfig
+from spacesim.scenes.lights.earth import EARTH_RADIUS_KM, EarthConfig
+from spacesim.scenes.lights.sun import SOLAR_IRRADIANCE, SunConfig
 from spacesim.scenes.materials.table import lambertian
 from spacesim.scenes.scenefile import BUILT_IN_SCENES
-from spacesim.scenes.sun import SOLAR_IRRADIANCE, SunConfig
 
 SOLAR_RADIUS = math.asin(695_700.0 / 149_597_870.7)  # radians
 OVERHEAD = Sun.from_angles(0, 90)

@@ -7,11 +7,11 @@ import numpy as np
 
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes import Renderer, Scene, build, read_scene
-from spacesim.scenes.earth import EarthConfig
 from spacesim.scenes.generation.generate import plan_views
+from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.scenes.lights.sun import SunConfig
 from spacesim.scenes.materials import spectra
-from spacesim.scenes.materials.table import Material, customised, lambertian
-from spacesim.scenes.sun import SunConfig
+from spacesim.scenes.materials.table import Material, customise, lambertian
 
 EARTH = EarthConfig(azimuth_deg=200.0, elevation_deg=-40.0, altitude_km=500.0)
 
@@ -83,7 +83,7 @@ def at_wavelengths(scene: Scene, wavelengths: np.ndarray | None) -> Scene:
             made[name] = material
         else:
             red, green, blue = spectra.reflectance_at(material.reflectance, wavelengths).tolist()
-            made[name] = customised(name, name, albedo=(red, green, blue))
+            made[name] = customise(name, name, albedo=(red, green, blue))
         return made[name]
 
     objects = [

@@ -1,6 +1,6 @@
-"""The rasterizer's figures of docs/rasterizer.md: python tests/splat/accuracy.py      20 seconds on two cores
+"""The rasterizer's figures of docs/research/rasterizer.md: python tests/splat/accuracy.py      20 seconds on two cores
 
-Pictures and gradients against the float64 twin, crops against whole pictures, the brightness of pictures zoomed out.
+Pictures and gradients against the float64 reference, crops against whole pictures, brightness of pictures zoomed out.
 """
 
 from dataclasses import replace
@@ -24,8 +24,9 @@ from test_cameras import (
 
 from spacesim.backend import ad
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
+from spacesim.splat.raster.output import OUTPUTS
 from spacesim.splat.raster.reference import render_reference
-from spacesim.splat.raster.render import OUTPUTS, render
+from spacesim.splat.raster.render import render
 
 INTRINSICS = {"perspective": ("fx", "fy", "cx", "cy"), "orthographic": ("scale_x", "scale_y", "cx", "cy")}
 
@@ -66,7 +67,7 @@ def pictures(kind: str, antialiased: bool) -> list[str]:
         arrays = random_splats(300, seed)
         twin = render_reference(arrays, view, antialiased=antialiased)
         ours = render(Gaussians.from_numpy(arrays), upload(view), outputs=OUTPUTS, antialiased=antialiased)
-        apart = np.abs(ours.image("colour") - twin.colour).max(axis=-1)
+        apart = np.abs(ours.image("color") - twin.color).max(axis=-1)
         cut = apart > 1e-5  # one Gaussian's alpha is 1/255 but for rounding, and one side leaves it out
         solid = (twin.alpha > 0.05) & ~cut
         normal = ours.image("normal").astype(np.float64)

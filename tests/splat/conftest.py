@@ -1,4 +1,4 @@
-"""A small dataset whose truth is known: pictures of random Gaussians by the float64 twin, in Nerfstudio's layout."""
+"""A small dataset of known truth: pictures of random Gaussians by the float64 reference, in Nerfstudio's layout."""
 
 import json
 from dataclasses import replace
@@ -70,7 +70,7 @@ def _write_dataset(root: Path, gaussians: dict[str, np.ndarray]) -> Dataset:
         camera = Camera.from_fov(look_at(3 * direction, np.zeros(3)), SIZE, SIZE, 35)
         picture = render_reference(gaussians, camera)
         alpha = picture.alpha[..., None]
-        straight = np.where(alpha > 0, picture.colour / np.maximum(alpha, 1e-9), 0)
+        straight = np.where(alpha > 0, picture.color / np.maximum(alpha, 1e-9), 0)
         rgba = np.rint(255 * np.clip(np.concatenate([straight, alpha], axis=-1), 0, 1)).astype(np.uint8)
         name = f"images/{'test' if index % 5 == 4 else 'train'}_{index:02d}.png"
         Image.fromarray(rgba).save(root / name)

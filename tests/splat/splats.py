@@ -9,7 +9,7 @@ def light_of(values: np.ndarray) -> np.ndarray:
 
 
 def srgb_of(light: np.ndarray) -> np.ndarray:
-    """The inverse of `light_of`."""
+    """The inverse of `frame_light`."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
 
 

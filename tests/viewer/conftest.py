@@ -8,13 +8,13 @@ import pytest
 import spacesim  # noqa: F401  names libLLVM before drjit is imported
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Sun
-from spacesim.splat.compose import Composition, Placed, Pose
+from spacesim.splat.compose import Composition, PlacedRun, Pose
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
-from spacesim.viewer.opened import opened
+from spacesim.viewer.drawing.scene_renderer import SceneRenderer
+from spacesim.viewer.load import load_setup
 from spacesim.viewer.server import Viewer
-from spacesim.viewer.stage import Stage
-from spacesim.viewer.state import Stand, View
+from spacesim.viewer.state import SceneState, ViewerCamera
 
 SCENE = """
 [[models]]
@@ -36,13 +36,13 @@ fov_deg = 35.0
 """
 
 
-def ball_run(name: str, colour: tuple[float, float, float], count: int = 400, radius: float = 0.5) -> Run:
+def ball_run(name: str, color: tuple[float, float, float], count: int = 400, radius: float = 0.5) -> Run:
     """A vanilla run: a ball about the origin, opaque, of one colour."""
     rng = np.random.default_rng(len(name))
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     sh = np.zeros((count, 1, 3), np.float32)
-    sh[:, 0] = (np.array(colour) - 0.5) / 0.28209479177387814
+    sh[:, 0] = (np.array(color) - 0.5) / 0.28209479177387814
     arrays = {
         "means": radius * directions,
         "log_scales": np.full((count, 3), np.log(0.12 * radius)),
@@ -54,24 +54,24 @@ def ball_run(name: str, colour: tuple[float, float, float], count: int = 400, ra
 
 
 @pytest.fixture(scope="session")
-def stage() -> Stage:
+def renderer() -> SceneRenderer:
     """A red ball on the left, a green one on the right, seen along +x with z up."""
     red, green = ball_run("red", (0.9, 0.1, 0.1)), ball_run("green", (0.1, 0.9, 0.1))
     left, right = Pose(translation=np.array([0.0, 1, 0])), Pose(translation=np.array([0.0, -1, 0]))
-    return Stage(Composition([Placed(red, left, "red"), Placed(green, right, "green")]))
+    return SceneRenderer(Composition([PlacedRun(red, left, "red"), PlacedRun(green, right, "green")]))
 
 
 @pytest.fixture(scope="session")
-def stand(stage) -> Stand:
-    """The scene as `stage` has it, the Sun overhead."""
-    poses = tuple(placed.pose for placed in stage.composition.models)
-    return Stand(poses, Sun(np.array([0.0, 0, 1])))
+def state(renderer) -> SceneState:
+    """The scene as `renderer` has it, the Sun overhead."""
+    poses = tuple(placed.pose for placed in renderer.composition.models)
+    return SceneState(poses, Sun(np.array([0.0, 0, 1])))
 
 
 @pytest.fixture(scope="session")
-def view() -> View:
+def view() -> ViewerCamera:
     """From 5 m on the -x side, window 4:3."""
-    return View(look_at([-5.0, 0, 0], [0.0, 0, 0]), np.radians(40), 640, 480)
+    return ViewerCamera(look_at([-5.0, 0, 0], [0.0, 0, 0]), np.radians(40), 640, 480)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def viewer(tiny_run, tiny_data, tmp_path_factory):
     pytest.importorskip("viser", reason="viser is not installed")
     folder = tmp_path_factory.mktemp("viewer")
     (folder / "pair.toml").write_text(SCENE.format(run=tiny_run))
-    one = Viewer(opened(folder / "pair.toml", tiny_data, folder), port=0)
+    one = Viewer(load_setup(folder / "pair.toml", tiny_data, folder), port=0)
     one.start()
     yield one
     one.stop()
@@ -89,5 +89,5 @@ def viewer(tiny_run, tiny_data, tmp_path_factory):
 @pytest.fixture
 def at_start(viewer):
     """The scene as it was opened."""
-    viewer.put(viewer.show.stand)
-    return viewer.show.stand
+    viewer.set_state(viewer.setup.state)
+    return viewer.setup.state

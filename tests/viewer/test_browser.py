@@ -10,9 +10,9 @@ from browser import CHROMIUM, PATIENCE, Browser, choose, fill, press, wait_for
 from spacesim.data.images import read_png
 from spacesim.data.records import Sun
 from spacesim.splat.compose import Pose
-from spacesim.viewer.frames import drawn
-from spacesim.viewer.handles import GIZMO, SUN_AWAY
-from spacesim.viewer.paint import PALETTE
+from spacesim.viewer.drawing.frames import draw_mode
+from spacesim.viewer.drawing.paint import PALETTE
+from spacesim.viewer.panels.handles import GIZMO, SUN_AWAY
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def settled(page, client):
 def choose_mode(tab, mode):
     """In the panel, until the viewer knows."""
     choose(tab.page, tab.client.controls.mode._impl.uuid, mode)
-    wait_for(lambda: tab.client.session.look.mode == mode, mode)
+    wait_for(lambda: tab.client.session.settings.mode == mode, mode)
 
 
 def on_page(client, point):
@@ -84,7 +84,7 @@ def test_it_opens_with_the_scene(viewer, tab):
     picture = settled(tab.page, tab.client)
     view = tab.client.session.view
     assert view.width > 300
-    camera = viewer.show.camera
+    camera = viewer.setup.camera
     assert np.allclose(view.world_from_camera, camera.world_from_camera, atol=1e-4)
     assert (picture.max(axis=-1) > 60).mean() > 0.01
     text = tab.page.text()
@@ -95,32 +95,32 @@ def test_it_opens_with_the_scene(viewer, tab):
 def test_a_dragged_gizmo_moves_its_model(viewer, tab, at_start):
     choose_mode(tab, "object id")
     before = settled(tab.page, tab.client)
-    pose, radius = at_start.poses[1], viewer.show.stage.models[1].radius
+    pose, radius = at_start.poses[1], viewer.setup.renderer.models[1].radius
     up, grab = np.array([0, 0, 1]), 0.3 * GIZMO * pose.scale * radius  # between the other handles
     start, end = (on_page(tab.client, pose.translation + length * up) for length in (grab, grab + 0.5))
     tab.page.drag(start, end)
-    wait_for(lambda: viewer.shared.stand.poses[1].translation[2] > pose.translation[2] + 0.3, "the model to be moved")
+    wait_for(lambda: viewer.shared.state.poses[1].translation[2] > pose.translation[2] + 0.3, "the model to be moved")
     settled(tab.page, tab.client)
-    moved = viewer.shared.stand.poses[1].translation
+    moved = viewer.shared.state.poses[1].translation
     assert moved[:2] == pytest.approx(pose.translation[:2], abs=0.02)
     assert 0.3 < moved[2] - pose.translation[2] < 0.7
     after = settled(tab.page, tab.client)
     blue = [np.argwhere((p[..., 2] > 180) & (p[..., 0] < 130)) for p in (before, after)]
     top, lower = (rows[:, 0].mean() for rows in (blue[1], blue[0]))
     assert top < lower - 20  # pixels: it has gone up
-    viewer.put(at_start)
+    viewer.set_state(at_start)
 
 
 def test_a_dragged_sun_moves_the_shadow(viewer, tab, at_start):
     choose_mode(tab, "visibility")
     before = settled(tab.page, tab.client)
-    centre, radius = viewer.show.stage.bounds(at_start)
+    centre, radius = viewer.setup.renderer.bounds(at_start)
     ball = centre + SUN_AWAY * radius * at_start.sun.direction
     other = centre + SUN_AWAY * radius * Sun.from_angles(320, 20).direction
     tab.page.drag(on_page(tab.client, ball), on_page(tab.client, other), steps=12)
-    wait_for(lambda: np.abs(np.subtract(viewer.shared.stand.sun.angles, (320, 20))).max() < 8, "the Sun to be there")
+    wait_for(lambda: np.abs(np.subtract(viewer.shared.state.sun.angles, (320, 20))).max() < 8, "the Sun to be there")
     after = settled(tab.page, tab.client)
-    azimuth, _ = viewer.shared.stand.sun.angles
+    azimuth, _ = viewer.shared.state.sun.angles
     model = grey(before) & grey(after)  # handles are coloured
     changed = np.abs(after - before).max(axis=-1)[model] > 20
     assert changed.mean() > 0.03
@@ -128,7 +128,7 @@ def test_a_dragged_sun_moves_the_shadow(viewer, tab, at_start):
     assert float(sliders.azimuth.value) == pytest.approx(azimuth, abs=0.1)
     fill(tab.page, sliders.azimuth._impl.uuid, "20")
     fill(tab.page, sliders.elevation._impl.uuid, "60")
-    wait_for(lambda: viewer.shared.stand.sun.angles == pytest.approx((20, 60), abs=1e-6), "the typed Sun")
+    wait_for(lambda: viewer.shared.state.sun.angles == pytest.approx((20, 60), abs=1e-6), "the typed Sun")
     again = settled(tab.page, tab.client)
     model = grey(before) & grey(again)
     assert (np.abs(again - before).max(axis=-1)[model] > 20).mean() < 0.005
@@ -138,7 +138,7 @@ def test_the_truth_appears(viewer, tab, at_start):
     controls = tab.client.controls
     choose_mode(tab, "colour")
     plain = settled(tab.page, tab.client)
-    tab.client.session.set(samples=8)
+    tab.client.session.change_settings(samples=8)
     choose(tab.page, controls.compare._impl.uuid, "wipe")
     wait_for(lambda: "path-traced, 8 samples" in tab.page.text(), "the truth")
     wiped = settled(tab.page, tab.client)
@@ -146,39 +146,39 @@ def test_the_truth_appears(viewer, tab, at_start):
     assert np.abs(wiped[:, half + 3 :] - plain[:, half + 3 :]).mean() < 1.5
     assert np.abs(wiped[:, : half - 3] - plain[:, : half - 3]).mean() > 2
     choose(tab.page, controls.compare._impl.uuid, "off")
-    wait_for(lambda: tab.client.session.look.compare == "off", "no comparison")
+    wait_for(lambda: tab.client.session.settings.compare == "off", "no comparison")
     back = settled(tab.page, tab.client)
     assert np.abs(back - plain).mean() < 1.5
 
 
 def test_what_is_saved_is_drawn_by_the_command_line(viewer, tab, at_start, spacesim, tmp_path, monkeypatch):
     monkeypatch.setattr(viewer.loop, "_tidy", lambda: None)  # two threads must not call Dr.Jit
-    viewer.put(at_start.placed(1, at_start.poses[0]))  # something else than what was opened
-    viewer.put(at_start.placed(1, Pose(translation=np.array([0.1, 0.9, 1.0]), scale=0.7)))
+    viewer.set_state(at_start.with_pose(1, at_start.poses[0]))  # something else than what was opened
+    viewer.set_state(at_start.with_pose(1, Pose(translation=np.array([0.1, 0.9, 1.0]), scale=0.7)))
     press(tab.page, "Files")
     uuid = viewer.files.name._impl.uuid
     wait_for(lambda: tab.page.evaluate(f"!!document.querySelector(\"label[for='{uuid}']\")"), "the folder")
     fill(tab.page, uuid, "saved.toml")
     wait_for(lambda: viewer.files.name.value == "saved.toml", "the name")
     press(tab.page, "Save scene")
-    path = viewer.show.out / "saved.toml"
+    path = viewer.setup.out / "saved.toml"
     wait_for(path.exists, "the file")
     settled(tab.page, tab.client)  # nothing is drawn from here on
     done = spacesim("compose", path, "--out", tmp_path / "frames")
     assert done.code == 0, done.errors
     picture = read_png(tmp_path / "frames" / "rgb" / "0000.png").astype(np.float64)
     over_black = np.rint(picture[..., :3] * picture[..., 3:] / 255)
-    view, stand = tab.client.session.view, viewer.shared.stand
-    _, ours, _, _ = drawn(viewer.show.stage, stand, view.camera(view.width, view.height), "colour")
+    view, stand = tab.client.session.view, viewer.shared.state
+    _, ours, _, _ = draw_mode(viewer.setup.renderer, stand, view.camera(view.width, view.height), "colour")
     assert ours.shape == over_black.shape
     assert np.abs(ours - over_black).max() <= 2  # straight alpha is rounded twice
-    viewer.files.told.content = ""
+    viewer.files.status.content = ""
     press(tab.page, "Save scene")  # our own file may be written again, others' not
-    wait_for(lambda: viewer.files.told.content.startswith("saved"), "the file again")
+    wait_for(lambda: viewer.files.status.content.startswith("saved"), "the file again")
     fill(tab.page, uuid, "pair.toml")
     wait_for(lambda: viewer.files.name.value == "pair.toml", "the name")
     press(tab.page, "Save scene")
-    wait_for(lambda: "not saved" in viewer.files.told.content, "the refusal")
+    wait_for(lambda: "not saved" in viewer.files.status.content, "the refusal")
 
 
 def test_two_clients_at_once(viewer, browser, tab, at_start):
@@ -188,19 +188,19 @@ def test_two_clients_at_once(viewer, browser, tab, at_start):
         choose_mode(other, "object id")
         ids = settled(other.page, other.client)
         mine = settled(tab.page, tab.client)
-        assert tab.client.session.look.mode == "colour"
+        assert tab.client.session.settings.mode == "colour"
         palette = np.array([(0, 0, 0), *PALETTE[:2]])
         near = np.abs(ids[:, :, None] - palette).max(axis=-1).min(axis=-1) < 30
         assert near.mean() > 0.9  # but for handles
         x, y = other.client.session.view.width / 2, 60.0
         other.page.drag((x, y), (x + 80, y))
         wait_for(lambda: not other.client.session.view.same(tab.client.session.view), "another view")
-        viewer.put(at_start.placed(1, Pose(translation=np.array([0.0, 1.2, 1.0]))))
+        viewer.set_state(at_start.with_pose(1, Pose(translation=np.array([0.0, 1.2, 1.0]))))
         assert np.abs(settled(tab.page, tab.client) - mine).mean() > 1
         assert np.abs(settled(other.page, other.client) - ids).mean() > 1
     finally:
         count = len(viewer.clients)
         other.page.close()
     wait_for(lambda: len(viewer.clients) == count - 1, "the client to go")
-    viewer.put(at_start)
+    viewer.set_state(at_start)
     assert settled(tab.page, tab.client).max() > 40

@@ -18,11 +18,11 @@ from browser import PATIENCE, wait_for
 
 from spacesim.data.geometry import look_at, quaternion_from_rotation
 from spacesim.data.records import Sun
-from spacesim.splat.compose.pose import LARGEST, SMALLEST, Pose
-from spacesim.viewer import gate
+from spacesim.splat.compose.pose import MAX_SCALE, MIN_SCALE, Pose
 from spacesim.viewer.client import Client
-from spacesim.viewer.memory import give_back
-from spacesim.viewer.state import FARTHEST, Shared, Stand
+from spacesim.viewer.drawing.memory import give_back
+from spacesim.viewer.network import message_filter
+from spacesim.viewer.state import MAX_COORDINATE, SceneState, SharedScene
 
 viser = pytest.importorskip("viser", reason="viser is not installed")
 msgspec, zstandard = (pytest.importorskip(name) for name in ("msgspec", "zstandard"))  # which it brings
@@ -137,11 +137,11 @@ def test_nonsense_of_a_client_harms_no_other(viewer, at_start, caplog, capfd):
         good.send(camera_message(0.3))
         pictures(good, 1)
     wait_for(lambda: not viewer.clients, "all of them to be gone")
-    stand = viewer.shared.stand
+    state = viewer.shared.state
     assert viewer.shared is shared_before
-    assert viewer.shared.stand is stand
-    assert all(np.isfinite(pose.matrix).all() for pose in stand.poses)
-    assert np.linalg.norm(stand.sun.direction) == pytest.approx(1)
+    assert viewer.shared.state is state
+    assert all(np.isfinite(pose.matrix).all() for pose in state.poses)
+    assert np.linalg.norm(state.sun.direction) == pytest.approx(1)
     assert viewer.loop._thread.is_alive()
     assert viewer._server._share_tunnel is None  # nobody can open a way in from outside
     said = caplog.text + "".join(capfd.readouterr())
@@ -157,7 +157,7 @@ def test_messages_that_come_at_once_are_handled_one_by_one(viewer, monkeypatch):
     """Else one client's would pile up, and others would wait until all of them are done."""
     tasks = []
     with connected(viewer) as one:
-        monkeypatch.setattr(gate, "admitted", lambda _: tasks.append(len(asyncio.all_tasks())))
+        monkeypatch.setattr(message_filter, "is_allowed", lambda _: tasks.append(len(asyncio.all_tasks())))
         one.socket.sendall(200 * frame(camera_message()))
         wait_for(lambda: len(tasks) == 400, "all of them")  # viser asks twice
     assert max(tasks) < 50
@@ -166,7 +166,7 @@ def test_messages_that_come_at_once_are_handled_one_by_one(viewer, monkeypatch):
 def test_pages_of_other_sites_are_refused_before_they_are_clients(viewer, monkeypatch, caplog):
     """Not even what they send with the request, before any answer, comes to a handler."""
     seen = []
-    monkeypatch.setattr("spacesim.viewer.gate.admitted", seen.append)
+    monkeypatch.setattr("spacesim.viewer.network.message_filter.is_allowed", seen.append)
     monkeypatch.setattr(viewer._server._websock_server, "_client_connect_cb", [seen.append])
     lines = ["GET / HTTP/1.1", f"Host: 127.0.0.1:{viewer.port}", "Origin: https://example.org", "Upgrade: websocket"]
     lines += ["Connection: Upgrade", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA=="]
@@ -191,7 +191,7 @@ def test_a_message_that_is_too_large_ends_one_client_alone(viewer, at_start):
         for socket_ in (good, bad):
             socket_.send(camera_message())
             pictures(socket_, 1)
-        bad.send(bytes(gate.LARGEST_MESSAGE + 1))
+        bad.send(bytes(message_filter.MAX_MESSAGE_BYTES + 1))
         with pytest.raises(websockets.exceptions.ConnectionClosedError, match="1009"):
             pictures(bad, 100)
         good.send(camera_message(0.4))
@@ -200,7 +200,7 @@ def test_a_message_that_is_too_large_ends_one_client_alone(viewer, at_start):
 
 def test_clients_too_many_are_told_so(viewer, monkeypatch):
     wait_for(lambda: not viewer._server._websock_server._live_connections, "those of other tests to be gone")
-    monkeypatch.setattr(gate, "MOST_CLIENTS", 2)
+    monkeypatch.setattr(message_filter, "MAX_CLIENTS", 2)
     with connected(viewer), connected(viewer):
         with pytest.raises(websockets.exceptions.InvalidStatus, match="503") as refused:
             connected(viewer)
@@ -208,7 +208,7 @@ def test_clients_too_many_are_told_so(viewer, monkeypatch):
 
 
 def test_sockets_that_say_nothing_make_room(viewer, monkeypatch):
-    monkeypatch.setattr(gate, "MOST_SOCKETS", 4)
+    monkeypatch.setattr(message_filter, "MAX_SOCKETS", 4)
     with contextlib.ExitStack() as held:
         good = held.enter_context(connected(viewer))
         address = ("127.0.0.1", viewer.port)
@@ -218,9 +218,17 @@ def test_sockets_that_say_nothing_make_room(viewer, monkeypatch):
         pictures(good, 1)
 
 
+def test_a_request_of_endless_headers_is_ended(viewer):
+    with socket.create_connection(("127.0.0.1", viewer.port), PATIENCE) as one:
+        one.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{viewer.port}\r\n".encode())
+        one.sendall((b"X: " + b"x" * 8000 + b"\r\n") * 10)  # websockets alone would take a megabyte
+        with contextlib.suppress(ConnectionResetError):
+            assert one.recv(1) == b""
+
+
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="the system cannot tell who reads nothing")
 def test_clients_that_read_nothing_are_sent_away(viewer, at_start, monkeypatch):
-    monkeypatch.setattr(gate, "PATIENCE_UNREAD", 1.0)
+    monkeypatch.setattr(message_filter, "SEND_TIMEOUT", 1.0)
     before = set(viewer.clients)
     deaf = socket.socket()
     deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -243,27 +251,27 @@ def test_clients_that_read_nothing_are_sent_away(viewer, at_start, monkeypatch):
 
 def test_one_file_at_a_time_waits_for_a_client(viewer):
     connection = viewer._server._websock_server
-    assert not gate.files_wait(connection)
+    assert not message_filter.has_pending_files(connection)
     buffer = type(connection.get_message_buffer())(connection._background_event_loop, persistent_messages=False)
     slow = SimpleNamespace(get_message_buffer=lambda: buffer)
     buffer.push(viser._messages.FileTransferPart(None, "a", 0, b"x"))
-    assert gate.files_wait(slow)
+    assert message_filter.has_pending_files(slow)
     with buffer.buffer_lock:
         buffer.pop_message_locked(0)
-    assert not gate.files_wait(slow)
+    assert not message_filter.has_pending_files(slow)
 
 
-@pytest.mark.parametrize("scales", [(SMALLEST, 1.0), (1.0, SMALLEST), (LARGEST, SMALLEST), (LARGEST, LARGEST)])
+@pytest.mark.parametrize("scales", [(MIN_SCALE, 1.0), (1.0, MIN_SCALE), (MAX_SCALE, MIN_SCALE), (MAX_SCALE, MAX_SCALE)])
 def test_models_of_any_size_that_the_panel_takes_are_drawn(viewer, at_start, caplog, scales):
     poses = [Pose(pose.rotation, pose.translation, scale) for pose, scale in zip(at_start.poses, scales, strict=True)]
     with connected(viewer) as socket:
         socket.send(camera_message(0.4))
         pictures(socket, 1)
-        viewer.put(Stand(tuple(poses), at_start.sun))
+        viewer.set_state(SceneState(tuple(poses), at_start.sun))
         pictures(socket, 1)  # a second one may take its place before it is sent
         wait_for(lambda: viewer.loop.idle, "the picture at rest")
     assert "a picture failed" not in caplog.text
-    viewer.put(at_start)
+    viewer.set_state(at_start)
 
 
 def test_wild_values_that_are_admitted_fail_no_picture(viewer, at_start, caplog):
@@ -277,7 +285,7 @@ def test_wild_values_that_are_admitted_fail_no_picture(viewer, at_start, caplog)
         return (lambda q: (q / np.linalg.norm(q)).tolist())(rng.normal(size=4))
 
     def place():
-        return (rng.choice([-1, 0, 1], 3) * size(1e-3, FARTHEST)).tolist()
+        return (rng.choice([-1, 0, 1], 3) * size(1e-3, MAX_COORDINATE)).tolist()
 
     scales = viewer._models.scales
     with connected(viewer) as wild, connected(viewer) as good:
@@ -289,7 +297,7 @@ def test_wild_values_that_are_admitted_fail_no_picture(viewer, at_start, caplog)
             model = int(rng.integers(2))
             handle = {"type": "TransformControlsUpdateMessage", "name": f"/models/{model}", "owner": ""}
             wild.send(msgspec.msgpack.encode({**handle, "wxyz": turn(), "position": place()}))
-            press(wild, scales[model], size(SMALLEST, LARGEST))
+            press(wild, scales[model], size(MIN_SCALE, MAX_SCALE))
             press(wild, viewer._sun.azimuth, float(rng.uniform(0, 360)))
             press(wild, viewer._sun.elevation, float(rng.choice([-90, 90, 0])))
             width, height = (round(size(1, 8192)) for _ in range(2))
@@ -300,8 +308,8 @@ def test_wild_values_that_are_admitted_fail_no_picture(viewer, at_start, caplog)
             wait_for(lambda: viewer.loop.idle, "all pictures")
             assert "no picture" not in viewer.clients[number].controls.status.content
     assert "a picture failed" not in caplog.text
-    assert any(pose.key != old.key for pose, old in zip(viewer.shared.stand.poses, at_start.poses, strict=True))
-    viewer.put(at_start)
+    assert any(pose.key != old.key for pose, old in zip(viewer.shared.state.poses, at_start.poses, strict=True))
+    viewer.set_state(at_start)
 
 
 def test_clients_that_leave_in_the_middle(viewer, at_start):
@@ -355,7 +363,7 @@ def memory(viewer):
         found.append(told.mapped + told.used)
         done.set()
 
-    viewer.loop.do(read)
+    viewer.loop.submit(read)
     assert done.wait(PATIENCE)
     return found[0]
 
@@ -365,7 +373,7 @@ def test_looking_around_takes_no_memory(viewer, at_start, monkeypatch):
     """60 pictures under some Suns for clients that come and go, after as many to warm up; and a viewer that kept its
     pictures would be found out. What is in use goes up and down by some MiB as Dr.Jit's recordings come and go."""
     kept, show = [], Client.show
-    monkeypatch.setattr("spacesim.viewer.frames.BUDGET", 1e9)  # all pictures in full resolution, however slow
+    monkeypatch.setattr("spacesim.viewer.drawing.frames.BUDGET", 1e9)  # all pictures in full resolution, however slow
 
     def keep(self, picture, sharp):
         kept.append(picture.copy())
@@ -373,7 +381,7 @@ def test_looking_around_takes_no_memory(viewer, at_start, monkeypatch):
 
     def look_around():
         for k in range(3):
-            viewer.put(Stand(at_start.poses, Sun.from_angles(40 * k, 30)))
+            viewer.set_state(SceneState(at_start.poses, Sun.from_angles(40 * k, 30)))
             with connected(viewer) as socket:
                 for j in range(20):
                     socket.send(camera_message(0.02 * j + k))
@@ -481,7 +489,7 @@ def test_a_path_is_played_by_the_camera_of_who_asks(viewer, at_start, monkeypatc
 
 
 def test_a_click_on_a_camera_of_the_data_looks_from_there(viewer, at_start):
-    frame = viewer.show.dataset.frames[3]
+    frame = viewer.setup.dataset.frames[3]
     with connected(viewer) as socket:
         before = set(viewer.clients)
         socket.send(camera_message())
@@ -496,7 +504,7 @@ def test_a_click_on_a_camera_of_the_data_looks_from_there(viewer, at_start):
                     owner = message["owner"]
                 if message["type"] == "SetCameraPositionMessage" and not message["initial"]:
                     place = message["position"]
-            if len(names) == len(viewer.show.dataset.frames):
+            if len(names) == len(viewer.setup.dataset.frames):
                 rays = {"ray_origin": [0.0] * 3, "ray_direction": [0.0, 0, 1], "screen_pos": [0.5, 0.5]}
                 click = {"name": "/cameras/3", "instance_index": None, "modifier": None, "owner": owner, **rays}
                 socket.send(msgspec.msgpack.encode({"type": "SceneNodeClickMessage", **click}))
@@ -555,18 +563,18 @@ def test_a_player_that_was_stopped_does_not_end_the_next(viewer):
     paths.forget(-1)
     paths._start(-1, lambda when: None, 60.0)
     first._thread.join(PATIENCE)
-    assert paths._stopped(-1)
+    assert paths._stop_playing(-1)
     wait_for(lambda: not paths._players, "the end")
 
 
 def test_a_frame_brings_its_sun_where_no_model_can_be_relit(viewer, at_start):
     """As its truth is of that Sun, though the models' colours are not."""
-    dataset, shared = viewer.show.dataset, Shared(at_start)
+    dataset, shared = viewer.setup.dataset, SharedScene(at_start)
     before = at_start.sun.direction
     number = next(k for k, frame in enumerate(dataset.frames) if not np.allclose(frame.sun.direction, before))
     session = SimpleNamespace(view=None)
     one = SimpleNamespace(
         _dataset=dataset, _sun=None, _shared=shared, session=session, look_from=lambda pose, fov: None
     )
-    Client.jump(one, number)
-    assert shared.stand.sun is dataset.frames[number].sun
+    Client.jump_to_frame(one, number)
+    assert shared.state.sun is dataset.frames[number].sun

@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
 from spacesim.data.errors import InputError
-from spacesim.data.exporters.objects import Progress, Target, new_folder, opaque, targets_of
+from spacesim.data.exporters.objects import ExportProgress, LabelledObject, labelled_objects, new_folder, opaque_picture
 from spacesim.data.files import write_bytes, write_json
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame
@@ -33,12 +33,11 @@ SEEN_ENOUGH = 0.1  #: visible fraction from which on an instance is a target of 
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """Of one object as if it were alone. mask: [H, W] bool, in the image; count: pixels, those outside of the image
-    too; box: (x, y, width, height) of all of them, pixels."""
+    """Of one object as if it were alone."""
 
-    mask: np.ndarray
-    count: int
-    box: tuple[int, int, int, int]
+    mask: np.ndarray  #: [H, W] bool, in the image
+    count: int  #: pixels, those outside of the image too
+    box: tuple[int, int, int, int]  #: (x, y, width, height) of all of them, pixels
 
 
 Outline = Callable[[Camera], Sequence[Silhouette]]  #: silhouettes of all targets, in their order
@@ -47,9 +46,9 @@ Outline = Callable[[Camera], Sequence[Silhouette]]  #: silhouettes of all target
 def write_bop(
     dataset: Dataset,
     out: Path,
-    outline: Callable[[list[Target]], Outline],
-    progress: Progress | None = None,
-) -> list[Target]:
+    outline: Callable[[list[LabelledObject]], Outline],
+    progress: ExportProgress | None = None,
+) -> list[LabelledObject]:
     """Write `dataset` into the new folder `out`; returns the objects whose poses are labels.
 
     outline: makes what finds silhouettes, which takes rays (see `spacesim.scenes.silhouette`). Raises InputError for
@@ -58,7 +57,7 @@ def write_bop(
     for frame in dataset.frames:
         if any(frame.distortion):
             raise InputError(f"{frame.file_path}: expected an image without lens distortion, which BOP does not know")
-    targets = targets_of(dataset)
+    targets = labelled_objects(dataset)
     out = new_folder(out)
     models = _models(targets)
     _write_models(out / "models", targets, models)
@@ -84,11 +83,11 @@ def write_bop(
 
 
 def _write_frame(
-    scene: Path, image: int, dataset: Dataset, frame: Frame, targets: list[Target], find: Outline
+    scene: Path, image: int, dataset: Dataset, frame: Frame, targets: list[LabelledObject], find: Outline
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Write the pictures of a frame; returns its entries of scene_camera.json and scene_gt_info.json."""
     truth = load_truth(dataset, frame)
-    picture = opaque(dataset, frame)
+    picture = opaque_picture(dataset, frame)
     write_png(scene / ("rgb" if picture.ndim == 3 else "gray") / f"{image:06d}.png", picture, durable=False)
     depth = np.where(truth.object_id > 0, truth.depth, 0) * MM
     scale = _depth_scale(float(depth.max()))
@@ -105,7 +104,7 @@ def _write_frame(
         infos.append(
             {
                 "bbox_obj": list(silhouette.box if visible.any() else _NO_BOX),
-                "bbox_visib": list(box_of(visible)),
+                "bbox_visib": list(bounding_box(visible)),
                 "px_count_all": count,
                 "px_count_valid": int((stored[mask] > 0).sum()),
                 "px_count_visib": int(visible.sum()),
@@ -125,7 +124,7 @@ def _write_frame(
 _NO_BOX = (-1, -1, -1, -1)
 
 
-def box_of(pixels: np.ndarray, origin: tuple[int, int] = (0, 0)) -> tuple[int, int, int, int]:
+def bounding_box(pixels: np.ndarray, origin: tuple[int, int] = (0, 0)) -> tuple[int, int, int, int]:
     """(x, y, width, height) of what is set in [H, W] bool whose first pixel is at `origin`; -1 each for none."""
     if not pixels.any():
         return _NO_BOX
@@ -134,7 +133,7 @@ def box_of(pixels: np.ndarray, origin: tuple[int, int] = (0, 0)) -> tuple[int, i
     return x + origin[0], y + origin[1], int(columns[-1]) - x + 1, int(rows[-1]) - y + 1
 
 
-def _pose(camera: Camera, target: Target, model: int) -> dict[str, Any]:
+def _pose(camera: Camera, target: LabelledObject, model: int) -> dict[str, Any]:
     pose = target.camera_from_object(camera)
     return {
         "cam_R_m2c": pose[:3, :3].ravel().tolist(),
@@ -160,7 +159,7 @@ def _depth_scale(farthest: float) -> float:
     return round(scale, 1)
 
 
-def _models(targets: list[Target]) -> list[int]:
+def _models(targets: list[LabelledObject]) -> list[int]:
     """Number of each target's model, from 1: objects of the same shape are instances of one model."""
     numbers: list[int] = []
     for i, target in enumerate(targets):
@@ -169,13 +168,13 @@ def _models(targets: list[Target]) -> list[int]:
     return numbers
 
 
-def _is_same(one: Target, other: Target) -> bool:
-    if one.vertices.shape != other.vertices.shape or not np.array_equal(one.faces, other.faces):
+def _is_same(first: LabelledObject, second: LabelledObject) -> bool:
+    if first.vertices.shape != second.vertices.shape or not np.array_equal(first.faces, second.faces):
         return False
-    return bool(np.abs(one.vertices - other.vertices).max() < 1e-5 * np.ptp(one.vertices, axis=0).max())
+    return bool(np.abs(first.vertices - second.vertices).max() < 1e-5 * np.ptp(first.vertices, axis=0).max())
 
 
-def _write_models(folder: Path, targets: list[Target], models: list[int]) -> None:
+def _write_models(folder: Path, targets: list[LabelledObject], models: list[int]) -> None:
     infos = {}
     for number in dict.fromkeys(models):
         target = targets[models.index(number)]
@@ -203,11 +202,11 @@ def _diameter(points: np.ndarray) -> float:
 
 def _test_targets(infos: dict[str, list[dict[str, Any]]], models: list[int]) -> list[dict[str, int]]:
     """How many instances of each model are to be found in each test image."""
-    found = []
+    entries_found = []
     for image, entries in infos.items():
         seen = [model for model, info in zip(models, entries, strict=True) if info["visib_fract"] >= SEEN_ENOUGH]
-        found += [
+        entries_found += [
             {"im_id": int(image), "inst_count": seen.count(model), "obj_id": model, "scene_id": 0}
             for model in sorted(set(seen))
         ]
-    return found
+    return entries_found

@@ -11,30 +11,29 @@ from spacesim.data.errors import InputError, expect
 from spacesim.data.files import holds_files
 from spacesim.data.geometry import Array
 from spacesim.data.images import read_exr, read_png
-from spacesim.data.mesh import FARTHEST, check_places, load_trimesh
+from spacesim.data.mesh import MAX_COORDINATE, check_points, load_trimesh
 from spacesim.data.records import Camera, Dataset, Frame
-from spacesim.data.tone import TONES, as_bytes, displayed
+from spacesim.data.tone import TONES, as_bytes, display_values
 
-Progress = Callable[[int, int, str], None]  #: frames done, frames in all, name of the frame
+ExportProgress = Callable[[int, int, str], None]  #: frames done, frames in all, name of the frame
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
-    """An object whose pose is a label. id: in the label pictures, from 1; world_from_object: [4, 4] rigid, metres;
-    vertices: [V, 3] metres, body frame, as large as in the scene; faces: [F, 3]."""
+class LabelledObject:
+    """An object whose pose is a label."""
 
-    id: int
+    id: int  #: in the label pictures, from 1
     name: str
-    world_from_object: Array
-    vertices: Array
-    faces: np.ndarray
+    world_from_object: Array  #: [4, 4] rigid, metres
+    vertices: Array  #: [V, 3] metres, body frame, as large as in the scene
+    faces: np.ndarray  #: [F, 3]
 
     def camera_from_object(self, camera: Camera) -> Array:
         """[4, 4] rigid, OpenCV's camera axes, metres."""
         return camera.camera_from_world @ self.world_from_object
 
 
-def targets_of(dataset: Dataset) -> list[Target]:
+def labelled_objects(dataset: Dataset) -> list[LabelledObject]:
     """The objects of a dataset. Raises InputError where scene.json or mesh.ply do not tell them apart."""
     path = dataset.root / "scene.json"
     try:
@@ -50,7 +49,7 @@ def targets_of(dataset: Dataset) -> list[Target]:
     mesh = load_trimesh(source)
     if not isinstance(mesh, trimesh.Trimesh):
         raise InputError(f"{source}: expected the mesh of the dataset, found points without faces")
-    check_places(mesh.vertices, source, FARTHEST)
+    check_points(mesh.vertices, source, MAX_COORDINATE)
     if not objects or [sum(size) for size in zip(*sizes, strict=True)] != [len(mesh.vertices), len(mesh.faces)]:
         raise InputError(f"{path}: expected the vertices and faces of mesh.ply, found other numbers of them")
     targets = []
@@ -60,34 +59,39 @@ def targets_of(dataset: Dataset) -> list[Target]:
         rigid = pose.copy()
         rigid[:3, :3] /= scale
         world = np.asarray(mesh.vertices[first_vertex : first_vertex + vertices])
-        own = np.asarray(mesh.faces[first_face : first_face + faces]) - first_vertex
-        if own.min() < 0 or own.max() >= vertices or not (np.ptp(world, axis=0) > 0).any():
+        object_faces = np.asarray(mesh.faces[first_face : first_face + faces]) - first_vertex
+        if object_faces.min() < 0 or object_faces.max() >= vertices or not (np.ptp(world, axis=0) > 0).any():
             raise InputError(f"{source}: expected a mesh with a size as object {number}, found none")
-        targets.append(Target(number, name, rigid, (world - rigid[:3, 3]) @ rigid[:3, :3], own))
+        targets.append(LabelledObject(number, name, rigid, (world - rigid[:3, 3]) @ rigid[:3, :3], object_faces))
         first_vertex, first_face = first_vertex + vertices, first_face + faces
     return targets
 
 
 def _is_similarity(pose: Array) -> bool:
-    """Rotation, one scale from 1e-9 to 1e9 and a translation within FARTHEST, [4, 4]."""
+    """Rotation, one scale from 1e-9 to 1e9 and a translation within MAX_COORDINATE, [4, 4]."""
     with np.errstate(all="ignore"):
         square = pose[:3, :3] @ pose[:3, :3].T
         scale2 = float(np.trace(square)) / 3
         alike = bool(np.abs(square - scale2 * np.eye(3)).max() <= 1e-4 * scale2) and 1e-18 <= scale2 <= 1e18
         right = bool(np.linalg.det(pose[:3, :3]) > 0)
-        return alike and right and bool(np.abs(pose[:3, 3]).max() <= FARTHEST) and bool((pose[3] == (0, 0, 0, 1)).all())
+        return (
+            alike
+            and right
+            and bool(np.abs(pose[:3, 3]).max() <= MAX_COORDINATE)
+            and bool((pose[3] == (0, 0, 0, 1)).all())
+        )
 
 
-def chosen(targets: list[Target], wanted: str | None) -> Target:
+def select_object(targets: list[LabelledObject], name: str | None) -> LabelledObject:
     """The target of that number or name; without one the first. Raises InputError where there is none."""
     for target in targets:
-        if wanted is None or wanted in (str(target.id), target.name):
+        if name is None or name in (str(target.id), target.name):
             return target
-    known = ", ".join(f"{target.id} {target.name}" for target in targets)
-    raise InputError(f"--object: expected one of {known}, found {wanted!r}")
+    names = ", ".join(f"{target.id} {target.name}" for target in targets)
+    raise InputError(f"object: expected one of {names}, found {name!r}")
 
 
-def opaque(dataset: Dataset, frame: Frame) -> np.ndarray:
+def opaque_picture(dataset: Dataset, frame: Frame) -> np.ndarray:
     """[H, W] or [H, W, 3] uint8: the picture of `frame` over black, as its camera records it in space.
 
     A sensor's picture is that already. One with alpha is made anew from the radiance in gt/, by the exposure and the
@@ -104,7 +108,7 @@ def opaque(dataset: Dataset, frame: Frame) -> np.ndarray:
     radiance = read_exr(path).get("radiance")
     if radiance is None or radiance.shape != (*pixels.shape[:2], 3):
         raise InputError(f"{path}: expected radiance of {pixels.shape[1]}x{pixels.shape[0]} pixels, found none")
-    return as_bytes(displayed(exposure * radiance, tone))
+    return as_bytes(display_values(exposure * radiance, tone))
 
 
 def _development(dataset: Dataset) -> tuple[float, str]:

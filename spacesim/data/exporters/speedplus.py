@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError
-from spacesim.data.exporters.objects import Progress, Target, chosen, new_folder, opaque, targets_of
+from spacesim.data.exporters.objects import (
+    ExportProgress,
+    LabelledObject,
+    labelled_objects,
+    new_folder,
+    opaque_picture,
+    select_object,
+)
 from spacesim.data.files import write_json
 from spacesim.data.geometry import quaternion_from_rotation
 from spacesim.data.identity import frame_names
@@ -25,19 +32,21 @@ PIXEL_PITCH = 5.86e-6
 """Metres: that of the camera of SPEED+. We know focal lengths in pixels alone; SPEED+ gives them in metres as well."""
 
 
-def write_speedplus(dataset: Dataset, out: Path, wanted: str | None = None, progress: Progress | None = None) -> Target:
+def write_speedplus(
+    dataset: Dataset, out: Path, target_name: str | None = None, progress: ExportProgress | None = None
+) -> LabelledObject:
     """Write `dataset` into the new folder `out`; returns the object whose poses the labels are.
 
-    wanted: number or name of the object, None the first. Raises InputError for another object, for frames of several
-    cameras, which SPEED+ does not know, and for a folder that is not empty.
+    target_name: number or name of the object, None the first. Raises InputError for another object, for frames of
+    several cameras, which SPEED+ does not know, and for a folder that is not empty.
     """
-    target = chosen(targets_of(dataset), wanted)
+    target = select_object(labelled_objects(dataset), target_name)
     camera = _camera(dataset.frames)
     out = new_folder(out)
     frames = dataset.frames
     names = [f"{name}.png" for name in frame_names(frames)]
     for number, (name, frame) in enumerate(zip(names, frames, strict=True), start=1):
-        write_png(out / "synthetic/images" / name, opaque(dataset, frame), durable=False)
+        write_png(out / "synthetic/images" / name, opaque_picture(dataset, frame), durable=False)
         if progress is not None:
             progress(number, len(frames), frame.file_path)
     labels = [_label(name, frame, target) for name, frame in zip(names, frames, strict=True)]
@@ -47,7 +56,7 @@ def write_speedplus(dataset: Dataset, out: Path, wanted: str | None = None, prog
     return target
 
 
-def _label(name: str, frame: Frame, target: Target) -> dict[str, Any]:
+def _label(name: str, frame: Frame, target: LabelledObject) -> dict[str, Any]:
     pose = target.camera_from_object(frame.camera)
     return {
         "filename": name,

@@ -9,22 +9,23 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from spacesim import backend
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array, fibonacci_sphere
 
 DIRECTIONS = 128  #: from which a point may be seen; on boxsat 64 find what 4096 do but for 0.1 % of the faces
 LIFT = 1e-4  #: of the box's diagonal: how far from the surface rays start
-LEAST_SHARE = 1e-3  #: of the area that must be visible; with less, sampling would go on for ever
+MIN_VISIBLE_SHARE = 1e-3  #: of the area that must be visible; with less, sampling would go on for ever
 LOW_SHARE = 0.5  #: with less of it visible, whole pieces of the surface are looked for that are not
-HIDDEN = 300  #: points of a piece, none of them visible, after which none is drawn from it: chosen
+HIDDEN = 300  #: points of a piece, none of them visible, after which none is drawn from it
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """points: [N, 3] metres;  normals: [N, 3] unit, towards a side that can be seen;  faces: [N], which they lie on"""
+    """Points on a surface that can be seen from outside."""
 
-    points: Array
-    normals: Array
-    faces: np.ndarray
+    points: Array  #: [N, 3] metres
+    normals: Array  #: [N, 3] unit, towards a side that can be seen
+    faces: np.ndarray  #: [N], which they lie on
 
 
 def exterior_samples(vertices: Array, faces: np.ndarray, count: int, seed: int) -> Samples | None:
@@ -40,26 +41,26 @@ def exterior_samples(vertices: Array, faces: np.ndarray, count: int, seed: int) 
     solid = doubled > 0
     corners, doubled, index = corners[solid], doubled[solid], np.flatnonzero(solid)
     normals = across[solid] / doubled[:, None]
-    sight, rest = Sight(vertices, faces), _Rest(corners, doubled)
+    sight, rest = ExteriorView(vertices, faces), _CandidateFaces(corners, doubled)
     rng = np.random.default_rng([seed, 5])
-    found: list[tuple[Array, Array, np.ndarray]] = []
+    batches: list[tuple[Array, Array, np.ndarray]] = []
     missing = count
     while missing > 0:
-        share = max((count - missing) / rest.drawn, LEAST_SHARE) if rest.drawn else 1.0
+        share = max((count - missing) / rest.drawn, MIN_VISIBLE_SHARE) if rest.drawn else 1.0
         number = min(int(1.05 * missing / share) + 16, 4 * count)
         face = rest.draw(number, rng)
-        points = _on(corners[face], rng.random((2, number)))
-        side = sight.sides(points, normals[face])
-        kept = np.flatnonzero(side)[:missing]
-        found.append((points[kept], normals[face[kept]] * side[kept, None], index[face[kept]]))
-        missing -= len(kept)
-        rest.learn(face, side != 0)
-        if rest.drawn == 0 or (count - missing < LEAST_SHARE * rest.drawn and rest.drawn >= count):
+        points = _points_on(corners[face], rng.random((2, number)))
+        side = sight.visible_sides(points, normals[face])
+        visible = np.flatnonzero(side)[:missing]
+        batches.append((points[visible], normals[face[visible]] * side[visible, None], index[face[visible]]))
+        missing -= len(visible)
+        rest.drop_hidden(face, side != 0)
+        if rest.drawn == 0 or (count - missing < MIN_VISIBLE_SHARE * rest.drawn and rest.drawn >= count):
             return None
-    return Samples(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return Samples(*(np.concatenate(parts) for parts in zip(*batches, strict=True)))
 
 
-class _Rest:
+class _CandidateFaces:
     """Faces that points are drawn from, even over their area: all, until there are pieces of which none is visible.
 
     drawn: how many points were drawn from those that are left
@@ -75,7 +76,7 @@ class _Rest:
         ends = np.cumsum(self.area / self.area.sum())
         return np.minimum(np.searchsorted(ends, rng.random(number), side="right"), len(ends) - 1)
 
-    def learn(self, face: np.ndarray, visible: np.ndarray) -> None:
+    def drop_hidden(self, face: np.ndarray, visible: np.ndarray) -> None:
         """Of points [N] that were drawn, their faces and whether they are visible, [N] bool."""
         if self.drawn == 0 and visible.mean() < LOW_SHARE:
             self.pieces = _pieces(self.corners)
@@ -99,14 +100,14 @@ def _pieces(corners: Array) -> np.ndarray:
     return np.asarray(connected_components(graph, directed=False)[1])[faces[:, 0]]
 
 
-def _on(corners: Array, uniform: Array) -> Array:
+def _points_on(corners: Array, uniform: Array) -> Array:
     """[N, 3] points even over triangles [N, 3, 3], of two uniform numbers each [2, N]."""
     root = np.sqrt(uniform[0])[:, None]
     second = uniform[1][:, None] * root
     return corners[:, 0] * (1 - root) + corners[:, 1] * (root - second) + corners[:, 2] * second
 
 
-class Sight:
+class ExteriorView:
     """What something far away can see past a surface, by rays to `DIRECTIONS` directions."""
 
     def __init__(self, vertices: Array, faces: np.ndarray) -> None:
@@ -118,31 +119,31 @@ class Sight:
         directions = fibonacci_sphere(DIRECTIONS, seed=0)
         self.directions = np.random.default_rng(0).permutation(directions)  # any first few are even
 
-    def sides(self, points: Array, normals: Array) -> np.ndarray:
+    def visible_sides(self, points: Array, normals: Array) -> np.ndarray:
         """[N] int8, of points [N, 3] on the surface with unit normals [N, 3]: the side from which one is seen, 1 or -1,
         or 0 where it is seen from none."""
-        return self._look(points, normals)
+        return self._visible_side(points, normals)
 
-    def seen(self, points: Array) -> np.ndarray:
+    def is_seen(self, points: Array) -> np.ndarray:
         """[N] bool, of points [N, 3] that are not on the surface: whether anything far away sees them."""
-        return self._look(points, np.zeros_like(points)) != 0
+        return self._visible_side(points, np.zeros_like(points)) != 0
 
-    def first(self, start: Array, towards: Array) -> tuple[Array, np.ndarray]:
+    def first_hit(self, start: Array, towards: Array) -> tuple[Array, np.ndarray]:
         """Where rays from points [N, 3] metres in directions [N, 3] meet the surface: (distances [N] in lengths of the
         directions, infinite where they do not; the faces [N])."""
         mi = backend.mitsuba()
         origin, ray = (
             np.ascontiguousarray(values.T, np.float32) for values in (self._unit(start), towards / self.size)
         )
-        found = self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(ray)))
-        hit = np.array(found.is_valid())
-        return np.where(hit, np.array(found.t, np.float64), np.inf), np.where(hit, np.array(found.prim_index), 0)
+        hits = self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(ray)))
+        hit = np.array(hits.is_valid())
+        return np.where(hit, np.array(hits.t, np.float64), np.inf), np.where(hit, np.array(hits.prim_index), 0)
 
     def _unit(self, points: Array) -> Array:
         """In units of the surface's size, about its centre: single precision resolves any scene."""
         return np.asarray((points - self.centre) / self.size, np.float64)
 
-    def _look(self, points: Array, normals: Array) -> np.ndarray:
+    def _visible_side(self, points: Array, normals: Array) -> np.ndarray:
         """[N] int8: the first direction in which nothing is in the way, as the sign of its cosine with the normal; 0
         where there is none. A lane a point."""
         if len(points) == 0:
@@ -153,7 +154,7 @@ class Sight:
             for kind, values in ((mi.Point3f, self._unit(points)), (mi.Vector3f, normals))
         )
         last = mi.UInt32([len(self.directions)])
-        table = mi.Float(self.directions.astype(np.float32).ravel())
+        table = upload(self.directions)
 
         def hidden(k: Any, side: Any) -> Any:
             return (k < dr.gather(mi.UInt32, last, mi.UInt32(0))) & (side == 0)
@@ -174,7 +175,7 @@ def _scene(corners: Array) -> Any:
     mi = backend.mitsuba()
     mesh = mi.Mesh("surface", 3 * len(corners), len(corners))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float(corners.astype(np.float32).ravel())
-    parameters["faces"] = mi.UInt32(np.arange(3 * len(corners), dtype=np.uint32))
+    parameters["vertex_positions"] = upload(corners)
+    parameters["faces"] = dr.arange(mi.UInt32, 3 * len(corners))
     parameters.update()
     return mi.load_dict({"type": "scene", "mesh": mesh})

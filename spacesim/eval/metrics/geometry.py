@@ -12,21 +12,20 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.mesh import SignedDistance, read_mesh
 from spacesim.data.records import Camera, Dataset
-from spacesim.eval.composition import ComposedRun
 from spacesim.eval.metrics.exterior import Samples, exterior_samples
-from spacesim.eval.metrics.solid import filled
+from spacesim.eval.metrics.solid import filled_beyond, filled_voxels
 from spacesim.splat.export.fusion import Grid
 from spacesim.splat.export.mesh import MeshConfig, RunMesh, cameras_around, mesh_of
 
 if TYPE_CHECKING:
     from spacesim.splat.raster.gaussians import Gaussians
-    from spacesim.splat.run import Run
+    from spacesim.splat.run import Predictor
 
-QUANTILE = 0.99  #: of the distances: the Hausdorff distance without its outliers
+QUANTILE = 0.99  #: of the distances: the Hausdorff distance without its outliers (5.2.3)
 
 NO_SURFACE = "no view of the run shows an opaque surface"
 
-COMPARED = ("chamfer", "hausdorff99", "iou", "precision_recall", "normals_deg", "accuracy", "completeness")
+COMPARED = ("chamfer", "hausdorff", "hausdorff99", "iou", "precision_recall", "normals_deg", "accuracy", "completeness")
 """What is null without two surfaces."""
 
 Mesh = tuple[Array, np.ndarray]
@@ -35,15 +34,13 @@ Mesh = tuple[Array, np.ndarray]
 
 @dataclass(frozen=True)
 class GeometryConfig:
-    """samples: points on each surface;  share: of the object's size, the distance of precision, recall and floaters
-    voxels: of the overlap, along the object's size;  seed: of the samples;  mesh: how the run's surface is found.
-    All chosen."""
+    """How shapes are compared."""
 
-    samples: int = 100_000
-    share: float = 0.01
-    voxels: int = 128
-    seed: int = 0
-    mesh: MeshConfig = field(default_factory=MeshConfig)
+    samples: int = 100_000  #: points on each surface
+    share: float = 0.01  #: of the object's size, the distance of precision, recall and floaters
+    voxels: int = 128  #: of the overlap, along the object's size
+    seed: int = 0  #: of the samples
+    mesh: MeshConfig = field(default_factory=MeshConfig)  #: how the run's surface is found. All chosen.
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.voxels < 2 or not 0 < self.share < 1:
@@ -63,71 +60,70 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """values: as metrics.json has them;  truth, predicted: samples with their distances;  size: metres, the diagonal of
-    the box around the truth"""
+    """Two surfaces compared."""
 
-    values: dict[str, Any]
-    truth: Shape
-    predicted: Shape
-    size: float
+    values: dict[str, Any]  #: as metrics.json has them
+    truth: Shape  #: samples with their distances
+    predicted: Shape  #: samples with their distances
+    size: float  #: metres, the diagonal of the box around the truth
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedShape:
-    """values: metrics.json's "geometry", or None;  note: a sentence where it, or a part of it, is None, else "";
-    comparison: None where the surfaces cannot be compared;  truth, found: both surfaces, None where there is none"""
+class ShapeResult:
+    """The shape of a run against the truth."""
 
-    values: dict[str, Any] | None
-    note: str
+    values: dict[str, Any] | None  #: metrics.json's "geometry", or None
+    note: str  #: a sentence where it, or a part of it, is None, else ""
+    #: None where the surfaces cannot be compared; truth, found: both surfaces, None where there is none
     comparison: Comparison | None = None
     truth: Mesh | None = None
-    found: RunMesh | None = None
+    predicted: RunMesh | None = None
 
 
-def judge_geometry(run: "Run", dataset: Dataset, config: GeometryConfig | None) -> JudgedShape:
-    """The shape of a run, or of a `ComposedRun` as a whole, against the dataset's mesh. The views are the dataset's
-    training cameras; around a composed scene cameras stand on a sphere. config: None for no judgement, only the
+def compare_geometry(run: "Predictor", dataset: Dataset, config: GeometryConfig | None) -> ShapeResult:
+    """The shape of a run, or of a composed scene as a whole, against the dataset's mesh. The views are the dataset's
+    training cameras; around a composed scene cameras stand on a sphere. config: None for no evaluation, only the
     sentence that says so.
 
     Raises InputError where the file of the mesh is missing or holds none, or the grid does not fit into memory.
     """
     if config is None:
-        return JudgedShape(None, "Geometry is null: it was not asked for.")
+        return ShapeResult(None, "Geometry is null: it was not asked for.")
     if dataset.mesh_path is None:
-        return JudgedShape(None, "Geometry is null: the data has no true mesh.")
+        return ShapeResult(None, "Geometry is null: the data has no true mesh.")
     path = dataset.root / dataset.mesh_path
     truth = read_mesh(path)
     try:
         size_of(*truth)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    model = run.model
-    if isinstance(run, ComposedRun):  # trained on other data: what this dataset looks at says nothing
+    model = run.gaussians
+    if run.parts:  # trained on other data: what this dataset looks at says nothing
         cameras = cameras_around(model, config.mesh.views)
     else:
         cameras = [frame.camera for frame in dataset.train or dataset.frames]
-    return judge_shape(model, run.antialiased, cameras, truth, config)
+    return compare_shape(model, run.antialiased, cameras, truth, config)
 
 
-def judge_shape(
+def compare_shape(
     model: "Gaussians", antialiased: Any, cameras: Sequence[Camera], truth: Mesh, config: GeometryConfig
-) -> JudgedShape:
+) -> ShapeResult:
     """The shape of Gaussians, as `cameras` see it, against a true mesh. antialiased: see `project`
 
     Raises InputError where the truth is a point or the grid does not fit into memory.
     """
     size = size_of(*truth)
-    found = mesh_of(model, cameras, config.mesh, antialiased)
-    answer = compare(truth, (found.vertices, found.faces), config) if len(found.faces) else NO_SURFACE
+    mesh = mesh_of(model, cameras, config.mesh, antialiased)
+    answer = compare_meshes(truth, (mesh.vertices, mesh.faces), config) if len(mesh.faces) else NO_SURFACE
     compared = answer if isinstance(answer, Comparison) else None
     note = "" if compared else f"Geometry is null but for its floaters: {answer}."
     values = {
         **(compared.values if compared else dict.fromkeys(COMPARED)),
         "floaters": floaters(model.to_numpy(), SignedDistance(*truth), config.share * size),
         "size": size,
-        "mesh": {"faces": len(found.faces), "voxel": found.voxel, "views": found.views, "depth": config.mesh.depth},
+        "mesh": {"faces": len(mesh.faces), "voxel": mesh.voxel, "views": mesh.views, "depth": config.mesh.depth},
     }
-    return JudgedShape(values, note, compared, truth, found)
+    return ShapeResult(values, note, compared, truth, mesh)
 
 
 def size_of(vertices: Array, faces: np.ndarray) -> float:
@@ -139,7 +135,7 @@ def size_of(vertices: Array, faces: np.ndarray) -> float:
     return size
 
 
-def compare(truth: Mesh, predicted: Mesh, config: GeometryConfig | None = None) -> Comparison | str:
+def compare_meshes(truth: Mesh, predicted: Mesh, config: GeometryConfig | None = None) -> Comparison | str:
     """Compare two surfaces; a sentence where one of them has nothing that can be seen from outside.
 
     Raises InputError where the truth is a point.
@@ -147,30 +143,40 @@ def compare(truth: Mesh, predicted: Mesh, config: GeometryConfig | None = None) 
     config = config or GeometryConfig()
     size = size_of(*truth)
     sides = [exterior_samples(*mesh, config.samples, config.seed + k) for k, mesh in enumerate((truth, predicted))]
-    true, found = sides
-    if true is None or found is None:
+    true, predicted_samples = sides
+    if true is None or predicted_samples is None:
         return f"nothing of the {'true' if true is None else 'reconstructed'} surface can be seen from outside"
-    there, nearest_found = _nearest(true.points, found.points)
-    back, nearest_true = _nearest(found.points, true.points)
+    there, nearest_predicted = _nearest(true.points, predicted_samples.points)
+    back, nearest_true = _nearest(predicted_samples.points, true.points)
     within = config.share * size
     turned = np.concatenate(
-        [angles(true.normals, found.normals[nearest_found]), angles(found.normals, true.normals[nearest_true])]
+        [
+            angles(true.normals, predicted_samples.normals[nearest_predicted]),
+            angles(predicted_samples.normals, true.normals[nearest_true]),
+        ]
     )
     values = {
         "chamfer": chamfer(there, back),
-        "hausdorff99": float(max(np.quantile(there, QUANTILE), np.quantile(back, QUANTILE))),
+        "hausdorff": hausdorff(there, back),
+        "hausdorff99": hausdorff(there, back, QUANTILE),
         "iou": overlap(truth, predicted, size / config.voxels),
         "precision_recall": precision_recall(there, back, within),
         "normals_deg": float(turned.mean()),
         "accuracy": float(back.mean()),
         "completeness": float(there.mean()),
     }
-    return Comparison(values, Shape(true, there), Shape(found, back), size)
+    return Comparison(values, Shape(true, there), Shape(predicted_samples, back), size)
 
 
 def chamfer(there: Array, back: Array) -> float:
     """Square metres, of the distances from each set to the nearest of the other: means of squares, added (2.27)."""
     return float(np.mean(np.square(there)) + np.mean(np.square(back)))
+
+
+def hausdorff(there: Array, back: Array, quantile: float = 1.0) -> float:
+    """Metres, of the distances from each set to the nearest of the other: the largest, the worse way (2.28). Below 1,
+    `quantile` of the distances of each way stands in for its largest."""
+    return float(max(np.quantile(there, quantile), np.quantile(back, quantile)))
 
 
 def precision_recall(there: Array, back: Array, within: float) -> dict[str, float]:
@@ -187,16 +193,17 @@ def angles(normals: Array, others: Array) -> Array:
 
 
 def overlap(truth: Mesh, predicted: Mesh, voxel: float) -> float | None:
-    """Intersection over union of the voxels that both fill (2.29), a common grid of side `voxel` (metres) around both;
-    None where neither fills one. What lies farther from the truth than its box is wide does not count."""
+    """Intersection over union of the voxels that both fill (2.29), of side `voxel` (metres); None where neither fills
+    one. The common grid reaches at most as far around the truth's box as that is wide; what the prediction fills
+    beyond is in the union, too, as `filled_beyond` counts it."""
     corners = [vertices[np.unique(faces)] for vertices, faces in (truth, predicted)]
     low, high = corners[0].min(axis=0), corners[0].max(axis=0)
     reach = high - low
     low = np.minimum(low, np.maximum(corners[1].min(axis=0), low - reach))
     high = np.maximum(high, np.minimum(corners[1].max(axis=0), high + reach))
     grid = Grid.around(low, high, voxel, 3 * voxel)
-    one, other = (filled(*mesh, grid) for mesh in (truth, predicted))
-    either = int((one | other).sum())
+    one, other = (filled_voxels(*mesh, grid) for mesh in (truth, predicted))
+    either = int((one | other).sum()) + filled_beyond(*predicted, grid)
     return int((one & other).sum()) / either if either else None
 
 
@@ -216,5 +223,6 @@ def floaters(model: Mapping[str, np.ndarray], surface: SignedDistance, within: f
 
 def _nearest(points: Array, others: Array) -> tuple[Array, np.ndarray]:
     """Of each of `points`, the distance to the nearest of `others` and which that is."""
-    distance, index = cKDTree(others).query(points, workers=-1)
+    # from far away all of a small surface is about as near: points are then cheaper than branches
+    distance, index = cKDTree(others, leafsize=128).query(points, workers=-1)
     return distance, index

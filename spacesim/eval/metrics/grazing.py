@@ -17,7 +17,7 @@ from spacesim.data.store import SHADOW_SELF_CAST
 from spacesim.eval.metrics.image import Mask
 
 EDGES_DEG = (0, 5, 10, 20, 40, 90)
-"""Of the bins, degrees (chosen: finest where shadow tests are hardest)."""
+"""Of the bins, degrees (finest where shadow tests are hardest)."""
 
 _ROWS = ("pixels", "luminance_error", "predicted", "visibility_error", "lit", "false", "shadowed", "missed")
 
@@ -49,7 +49,7 @@ def summary(tallies: Iterable[Array | None]) -> list[dict[str, Any]] | None:
     false_shadow: share of lit pixels predicted dark; missed_shadow: share of cast shadow predicted lit. None for a mean
     over no pixel.
     """
-    present = [one for one in tallies if one is not None]
+    present = [tally for tally in tallies if tally is not None]
     if not present:
         return None
     sums = dict(zip(_ROWS, np.sum(present, axis=0), strict=True))

@@ -15,6 +15,9 @@ from spacesim.data.geometry import Array
 
 Mask = NDArray[np.bool_]
 
+LEAST_MSE = 1e-10
+"""Of PSNR, where (2.18) has no bound: equal pictures have 100 dB, and so count in means."""
+
 SSIM_RADIUS = 5
 """Half width of the 11 x 11 window of SSIM, pixels; its Gaussian has a standard deviation of 1.5 pixels."""
 
@@ -32,9 +35,9 @@ def rmse(prediction: np.ndarray, truth: np.ndarray, mask: Mask | None = None) ->
 
 
 def psnr(prediction: np.ndarray, truth: np.ndarray, mask: Mask | None = None) -> float | None:
-    """Peak signal-to-noise ratio (2.18), dB, MAX = 1. None also for equal pictures, where it is infinite."""
+    """Peak signal-to-noise ratio (2.18), dB, MAX = 1, of a mean squared error of at least `LEAST_MSE`."""
     error = rmse(prediction, truth, mask)
-    return -20.0 * math.log10(error) if error else None
+    return None if error is None else -10.0 * math.log10(max(error**2, LEAST_MSE))
 
 
 def ssim_map(prediction: np.ndarray, truth: np.ndarray) -> Array:
@@ -69,18 +72,18 @@ def interior(shape: tuple[int, ...]) -> Mask:
 
 
 def flip(prediction: np.ndarray, truth: np.ndarray, mask: Mask | None = None) -> float | None:
-    """Mean LDR FLIP (Andersson et al. 2020), in [0, 1], of both pictures `cropped` to the mask.
+    """Mean LDR FLIP (Andersson et al. 2020), in [0, 1], of both pictures `crop_to_mask` to the mask.
 
     Viewed as its authors assume by default: 67 pixels per degree, a 0.7 m wide 4K display at 0.7 m.
     """
     if mask is not None and not mask.any():
         return None
-    reference, test = (np.ascontiguousarray(cropped(p, mask), dtype=np.float32) for p in (truth, prediction))
+    reference, test = (np.ascontiguousarray(crop_to_mask(p, mask), dtype=np.float32) for p in (truth, prediction))
     _, mean, _ = flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False, parameters={})
     return float(mean)
 
 
-def cropped(picture: np.ndarray, mask: Mask | None) -> np.ndarray:
+def crop_to_mask(picture: np.ndarray, mask: Mask | None) -> np.ndarray:
     """The bounding box [h, w, 3] of the mask's pixels, black outside the mask; the mask must not be empty."""
     if mask is None:
         return picture

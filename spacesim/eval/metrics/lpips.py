@@ -18,7 +18,7 @@ from safetensors.numpy import load as load_tensors
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_bytes
 
-LARGEST_WEIGHTS = 1 << 30  #: bytes, chosen: those of AlexNet take 244 MB
+MAX_WEIGHTS_BYTES = 1 << 30  #: bytes: those of AlexNet take 244 MB
 
 BACKBONE_FILE = "alexnet-owt-7be5be79.pth"
 """AlexNet on ImageNet, as torchvision publishes it."""
@@ -26,7 +26,7 @@ BACKBONE_FILE = "alexnet-owt-7be5be79.pth"
 LINEAR_FILE = "alex.pth"
 """The linear layers, `lpips/weights/v0.1/alex.pth` of the authors' repository."""
 
-MINIMUM_SIZE = 31
+MIN_SIDE = 31
 """Smallest height and width, pixels, that leave AlexNet's second pooling something to pool."""
 
 INSTALL = "pip install torch"
@@ -50,13 +50,13 @@ for _index, (_place, _shape, *_rest) in enumerate(_LAYERS):
 
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """The network. weights: torch tensors by their names in the published files."""
+    """The network."""
 
-    weights: Mapping[str, Any]
+    weights: Mapping[str, Any]  #: torch tensors by their names in the published files
 
     def __call__(self, prediction: np.ndarray, truth: np.ndarray) -> float | None:
-        """Distance of pictures [H, W, 3] of sRGB values in [0, 1]; None if a side is below `MINIMUM_SIZE`."""
-        if min(truth.shape[:2]) < MINIMUM_SIZE:
+        """Distance of pictures [H, W, 3] of sRGB values in [0, 1]; None if a side is below `MIN_SIDE`."""
+        if min(truth.shape[:2]) < MIN_SIDE:
             return None
         total = 0.0
         pairs = zip(self._features(prediction), self._features(truth), strict=True)
@@ -95,13 +95,13 @@ def find_weights(path: Path | None = None) -> tuple[Path | None, str]:
         return folder, f"weights in {folder}"
     if path is not None:
         raise InputError(
-            f"--lpips-weights {path}: expected a .safetensors file or a folder with {BACKBONE_FILE} and "
-            f"{LINEAR_FILE}, found no {' and no '.join(missing)}"
+            f"lpips_weights: expected a .safetensors file or a folder with {BACKBONE_FILE} and {LINEAR_FILE}, found "
+            f"no {' and no '.join(missing)} in {path}"
         )
     files = " and ".join(missing)
     return (
         None,
-        f"its weights are missing: put {files} into {folder} or name their folder with --lpips-weights",
+        f"its weights are missing: put {files} into {folder} or name their folder as lpips_weights",
     )
 
 
@@ -126,14 +126,14 @@ def load(path: Path | None = None) -> tuple[Lpips | None, str]:
         arrays = {**_read_pth(backbone), **_read_pth(linear)}
         sources = {name: linear if name.startswith("lin") else backbone for name in _SHAPES}
     for name, shape in _SHAPES.items():
-        found = tuple(arrays[name].shape) if name in arrays else "none"
-        if found != shape:
-            raise InputError(f"{sources[name]}: expected a tensor {name} of shape {shape}, found {found}")
+        shape_read = tuple(arrays[name].shape) if name in arrays else "none"
+        if shape_read != shape:
+            raise InputError(f"{sources[name]}: expected a tensor {name} of shape {shape}, found {shape_read}")
     return Lpips({name: torch.as_tensor(arrays[name], dtype=torch.float32) for name in _SHAPES}), sentence
 
 
 def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
-    content = read_bytes(path, "a safetensors file", LARGEST_WEIGHTS)
+    content = read_bytes(path, "a safetensors file", MAX_WEIGHTS_BYTES)
     try:
         return dict(load_tensors(content))
     except Exception as error:  # of damaged headers, numbers that numpy lacks
@@ -144,7 +144,7 @@ def _read_pth(path: Path) -> dict[str, Any]:
     import torch
 
     try:
-        file = io.BytesIO(read_bytes(path, "a file of tensors", LARGEST_WEIGHTS))
+        file = io.BytesIO(read_bytes(path, "a file of tensors", MAX_WEIGHTS_BYTES))
         content = torch.load(file, map_location="cpu", weights_only=True)
     except InputError:
         raise

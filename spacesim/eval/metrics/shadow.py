@@ -69,7 +69,7 @@ def visibility_metrics(prediction: np.ndarray, truth: np.ndarray, mask: Mask) ->
 
     At least one half is lit. error_rate: wrong pixels by all;  balanced_error_rate: mean of the error rates
     of truly shadowed and truly lit pixels;  iou: of the shadows;  visibility_mae: mean |prediction - truth|;
-    pixels: how many are judged.
+    pixels: how many are evaluated.
     """
     predicted, shadowed = prediction < 0.5, truth < 0.5
     missed, invented = _mean(~predicted, mask & shadowed), _mean(predicted, mask & ~shadowed)

@@ -4,21 +4,24 @@ import numpy as np
 from scipy import ndimage
 
 from spacesim.data.geometry import Array
-from spacesim.data.mesh import SignedDistance
-from spacesim.eval.metrics.exterior import Sight
+from spacesim.data.mesh import SignedDistance, drawable_faces
+from spacesim.eval.metrics.exterior import ExteriorView
 from spacesim.splat.export.fusion import Grid
 
+MAX_VOXELS = 2**23  #: of a grid beyond the common one; with more, its voxels are twice, four times... as wide
+MAX_SIDE = 1024  #: voxels along a side of it, likewise
+APART = 4  #: voxels between parts of a surface that are counted on their own: too many for them to enclose anything
 PROBES = 64  #: voxels of a region that are asked whether anything far away sees it
 
 
-def filled(vertices: Array, faces: np.ndarray, grid: Grid) -> np.ndarray:
+def filled_voxels(vertices: Array, faces: np.ndarray, grid: Grid) -> np.ndarray:
     """[Z, Y, X] bool: whether the centre of each voxel is inside, by the winding number, or enclosed: cut off from
     outside by the surface, so that nothing far away can see it. A closed box is full whatever is in it, and faces
     turned inside out change nothing.
 
     vertices: [V, 3] metres;  faces: [F, 3];  grid: what lies beyond it does not count
     """
-    distance, sight, closed = SignedDistance(vertices, faces), Sight(vertices, faces), _closed(vertices, faces)
+    distance, sight, closed = SignedDistance(vertices, faces), ExteriorView(vertices, faces), _closed(vertices, faces)
     near = _near(vertices[faces], grid)
     regions, count = ndimage.label(~near)
     outside = np.zeros(count + 1, bool)
@@ -33,15 +36,69 @@ def filled(vertices: Array, faces: np.ndarray, grid: Grid) -> np.ndarray:
         members = order[ends[region - 1] : ends[region]]
         inside = distance.inside(_centres(members[:1] if closed else members, grid))
         probes = members[np.linspace(0, len(members) - 1, min(PROBES, len(members))).astype(np.intp)]
-        hidden[region] = not (inside.all() or outside[region] or sight.seen(_centres(probes, grid)).any())
+        hidden[region] = not (inside.all() or outside[region] or sight.is_seen(_centres(probes, grid)).any())
         full[members] = hidden[region] or inside
     layer = np.flatnonzero(near)
     full[layer] = distance.inside(_centres(layer, grid))
     if hidden.any():
         around = ndimage.binary_dilation(hidden[regions], np.ones((5, 5, 5), bool))
         beside = layer[(around.ravel() & ~full)[layer]]
-        full[beside] = ~sight.seen(_centres(beside, grid))
+        full[beside] = ~sight.is_seen(_centres(beside, grid))
     return full.reshape(near.shape)
+
+
+def filled_beyond(vertices: Array, faces: np.ndarray, grid: Grid) -> float:
+    """How many voxels of `grid`'s lattice a surface fills beyond `grid`.
+
+    Parts of the surface that lie apart have a grid of their own on that lattice, one after the other, so that memory is
+    bounded. Where that takes more than `MAX_VOXELS`, wider voxels are counted by their volume.
+
+    vertices: [V, 3] metres;  faces: [F, 3]
+    """
+    low, high = grid.origin - 0.5 * grid.voxel, grid.origin + (np.array(grid.shape) - 0.5) * grid.voxel
+    faces = drawable_faces(vertices, faces)
+    corners = vertices[faces]
+    lowest, highest = corners.min(axis=1), corners.max(axis=1)
+    total = 0.0
+    for part in _apart(lowest, highest, APART * grid.voxel):
+        ends = lowest[part].min(axis=0), highest[part].max(axis=0)
+        if (ends[0] >= low).all() and (ends[1] <= high).all():
+            continue
+        own = _on_lattice(*ends, grid)
+        centres = _centres(np.flatnonzero(filled_voxels(vertices, faces[part], own)), own)
+        beyond = ~((centres > low) & (centres < high)).all(axis=1)
+        total += int(beyond.sum()) * (own.voxel / grid.voxel) ** 3
+    return total
+
+
+def _apart(low: Array, high: Array, gap: float) -> list[np.ndarray]:
+    """Indices of boxes from `low` to `high` [N, 3], in sets between which planes across the axes leave more than `gap`
+    metres free. Boxes that touch are in one set."""
+    pending, found = [np.arange(len(low))] if len(low) else [], []
+    while pending:
+        index = pending.pop()
+        for axis in range(3):
+            order = index[np.argsort(low[index, axis], kind="stable")]
+            ends = np.maximum.accumulate(high[order, axis])
+            cuts = np.flatnonzero(low[order[1:], axis] > ends[:-1] + gap) + 1
+            if len(cuts):
+                pending += np.split(order, cuts)
+                break
+        else:
+            found.append(index)
+    return found
+
+
+def _on_lattice(low: Array, high: Array, grid: Grid) -> Grid:
+    """Around the box from `low` to `high` [3], voxels at the places where those of `grid` would go on; wider ones where
+    there would be too many."""
+    voxel = grid.voxel
+    while True:
+        first = np.floor((low - grid.origin) / voxel).astype(np.int64) - 3
+        x, y, z = (int(side) for side in np.ceil((high - grid.origin) / voxel).astype(np.int64) + 4 - first)
+        if max(x, y, z) <= MAX_SIDE and x * y * z <= MAX_VOXELS:
+            return Grid(grid.origin + voxel * first, voxel, (x, y, z))
+        voxel *= 2
 
 
 def _closed(vertices: Array, faces: np.ndarray) -> bool:

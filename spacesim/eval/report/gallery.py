@@ -11,10 +11,10 @@ from spacesim.eval.pictures import (
     SHADOWED,
     WRONGLY_LIT,
     WRONGLY_SHADOWED,
-    error_colours,
+    error_colors,
 )
 from spacesim.eval.report.html import escape, picture
-from spacesim.eval.report.read import Judged
+from spacesim.eval.report.read import Evaluation
 
 Panels = Mapping[str, str]
 """Captions of a frame's pictures by their names."""
@@ -34,7 +34,7 @@ MISTAKES = {
 }
 
 
-def gallery(runs: Sequence[Judged]) -> str:
+def gallery(runs: Sequence[Evaluation]) -> str:
     """HTML of the frames chosen by PSNR over the silhouette."""
 
     def psnr(frame: Mapping[str, Any]) -> float | None:
@@ -44,7 +44,7 @@ def gallery(runs: Sequence[Judged]) -> str:
     def words(frame: Mapping[str, Any]) -> str:
         return "" if frame["psnr"] is None else f"PSNR {frame['psnr']:.2f} dB"
 
-    stops = ", ".join(css(colour) for colour in error_colours(np.linspace(0, 1, 17)))
+    stops = ", ".join(css(color) for color in error_colors(np.linspace(0, 1, 17)))
     bar = f'<span class="bar" style="background: linear-gradient(90deg, {stops})"></span>'
     keys = (
         f'<p class="key"><span>Error, mean of the channels: 0 {bar} {ERROR_SCALE} and more</span></p>'
@@ -54,9 +54,9 @@ def gallery(runs: Sequence[Judged]) -> str:
 
 
 def strips(
-    runs: Sequence[Judged],
+    runs: Sequence[Evaluation],
     panels: Panels,
-    judged_panel: str,
+    score_panel: str,
     score: Callable[[Mapping[str, Any]], float | None],
     words: Callable[[Mapping[str, Any]], str],
 ) -> str:
@@ -64,7 +64,7 @@ def strips(
     run's own.
 
     score: of a frame, the higher the better, None where it has none; words: what is said of it, beside the
-    run's name or below the panel `judged_panel`
+    run's name or below the panel `score_panel`
     """
     limit = 480 if len(runs) <= 2 else 320  # pixels a side; keeps the page small
     parts = []
@@ -75,7 +75,7 @@ def strips(
             scores = [value for run in group if (value := score(run.frames[name])) is not None]
             if len(scores) == len(group):
                 rank[name] = sum(scores) / len(scores)
-        for title, name in _chosen(rank or dict.fromkeys(sorted(shared), 0.0)):
+        for title, name in _select_frames(rank or dict.fromkeys(sorted(shared), 0.0)):
             frame = group[0].frames[name]
             parts.append(f"<h3>{title} <small>{escape(frame['file_path'])}{sun_of(frame)}</small></h3>")
             for run in group:
@@ -84,7 +84,7 @@ def strips(
                     parts.append(f"<h4>{run.label} <small>{said}</small></h4>")
                 captions = dict(panels)
                 if len(runs) == 1 and said:
-                    captions[judged_panel] += f", {said}"
+                    captions[score_panel] += f", {said}"
                 parts.append(_strip(run, name, panels, captions, limit))
     return "".join(parts)
 
@@ -97,19 +97,19 @@ def sun_of(frame: Mapping[str, Any]) -> str:
     return f" · Sun {azimuth:.1f}°, {elevation:.1f}°{', unseen' * (frame.get('known_sun') is False)}"
 
 
-def swatches(colours: Mapping[str, Sequence[int]]) -> str:
+def swatches(colors: Mapping[str, Sequence[int]]) -> str:
     """HTML of what each colour means."""
     return "".join(
-        f'<span><b style="background: {css(colour)}"></b>{escape(label)}</span>' for label, colour in colours.items()
+        f'<span><b style="background: {css(color)}"></b>{escape(label)}</span>' for label, color in colors.items()
     )
 
 
-def css(colour: Sequence[int] | np.ndarray) -> str:
+def css(color: Sequence[int] | np.ndarray) -> str:
     """A colour of three bytes as style sheets write it."""
-    return "rgb({}, {}, {})".format(*map(int, colour))
+    return "rgb({}, {}, {})".format(*map(int, color))
 
 
-def _comparable(runs: Sequence[Judged]) -> list[list[Judged]]:
+def _comparable(runs: Sequence[Evaluation]) -> list[list[Evaluation]]:
     """All runs as one group if they share frames of the same data, else each on its own."""
     shared = set.intersection(*(set(run.frames) for run in runs))
     if shared and len({run.metrics["data"] for run in runs}) == 1:
@@ -117,7 +117,7 @@ def _comparable(runs: Sequence[Judged]) -> list[list[Judged]]:
     return [[run] for run in runs]
 
 
-def _chosen(rank: Mapping[str, float]) -> list[tuple[str, str]]:
+def _select_frames(rank: Mapping[str, float]) -> list[tuple[str, str]]:
     """(what it is, frame) of the best, the median and the worst frame; fewer where there are fewer frames."""
     ordered = sorted(rank, key=lambda name: (-rank[name], name))
     picks = {"Best": ordered[0], "Worst": ordered[-1], "Median": ordered[len(ordered) // 2]}
@@ -126,7 +126,7 @@ def _chosen(rank: Mapping[str, float]) -> list[tuple[str, str]]:
     return [(title, titles[title]) for title in ("Best", "Median", "Worst") if title in titles]
 
 
-def _strip(run: Judged, name: str, panels: Panels, captions: Panels, limit: int) -> str:
+def _strip(run: Evaluation, name: str, panels: Panels, captions: Panels, limit: int) -> str:
     """HTML of one run's pictures of a frame."""
     frame = run.frames[name]
     small = "small " if max(run.metrics["dataset"]["resolution"]) < 200 else ""

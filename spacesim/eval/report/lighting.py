@@ -10,13 +10,13 @@ from spacesim.eval.pictures import ATTACHED, ATTACHED_LIT, LIT, OTHER_CAST, SELF
 from spacesim.eval.report.charts import bar_chart
 from spacesim.eval.report.gallery import MISTAKES, Panels, css, strips, sun_of, swatches
 from spacesim.eval.report.html import escape, picture, table
-from spacesim.eval.report.read import Judged, legend
+from spacesim.eval.report.read import Evaluation, legend
 
-MOST_PAIRS = 24
-"""Frames whose masks stand side by side in small (chosen); of more, evenly picked ones."""
+MAX_SUN_PAIRS = 24
+"""Frames whose masks stand side by side in small; of more, evenly picked ones."""
 
-FEWEST = 0.1
-"""Lit and cast-shadow pixels of a frame that can be best or worst, as a share of the median frame's (chosen)."""
+MIN_PIXEL_SHARE = 0.1
+"""Lit and cast-shadow pixels of a frame that can be best or worst, as a share of the median frame's."""
 
 _PANELS: Panels = {
     "truth": "Truth",
@@ -37,17 +37,17 @@ _BIN_COLUMNS = {
 _NULL = '<span class="none">–</span>'
 
 
-def relighting(runs: Sequence[Judged]) -> str:
+def relighting(runs: Sequence[Evaluation]) -> str:
     """HTML of the strips: a column a Sun; runs with the same view and Suns below one row of truth. "" without any."""
-    groups: dict[tuple[Any, ...], list[Judged]] = {}
+    groups: dict[tuple[Any, ...], list[Evaluation]] = {}
     for run in runs:
         if sweep := run.metrics.get("relight"):
-            suns = tuple((*one["sun"], one["truth"]) for one in sweep["suns"])
+            suns = tuple((*step["sun"], step["truth"]) for step in sweep["suns"])
             groups.setdefault((run.metrics["data"], sweep["view"], suns), []).append(run)
     return "".join(_sweep(group, titled=len(groups) > 1 or len(group) < len(runs)) for group in groups.values())
 
 
-def _sweep(runs: Sequence[Judged], titled: bool) -> str:
+def _sweep(runs: Sequence[Evaluation], titled: bool) -> str:
     """titled: whether the runs are named though there is only one."""
     sweep = runs[0].metrics["relight"]
     steps = sweep["suns"]
@@ -74,7 +74,7 @@ def _sweep(runs: Sequence[Judged], titled: bool) -> str:
         lead += "The data shows the truth of this very view under each of these Suns."
     else:
         lead += f"The data shows the truth of this very view under {true} of these {len(steps)} Suns; data that is "
-        lead += "generated with --shared-test-views does so under every test Sun."
+        lead += "generated with shared test views does so under every test Sun."
     return (
         f'<p class="lead">{escape(lead)}</p><div class="scroll" tabindex="0" role="region" aria-label="One view under '
         f'many Suns"><div class="sweep" style="--suns: {len(steps)}">{"".join(cells)}</div></div>'
@@ -83,24 +83,24 @@ def _sweep(runs: Sequence[Judged], titled: bool) -> str:
 
 def _sun_words(step: Mapping[str, Any]) -> str:
     azimuth, elevation = step["sun"]
-    known = {True: "known", False: "unseen", None: ""}[step["known_sun"]]
-    return f"{azimuth:.0f}°, {elevation:.0f}°<br><small>{known}</small>"
+    kind = {True: "known", False: "unseen", None: ""}[step["known_sun"]]
+    return f"{azimuth:.0f}°, {elevation:.0f}°<br><small>{kind}</small>"
 
 
-def _cell(run: Judged, name: str, index: int, step: Mapping[str, Any], caption: str) -> str:
+def _cell(run: Evaluation, name: str, index: int, step: Mapping[str, Any], caption: str) -> str:
     azimuth, elevation = step["sun"]
     alt = f"{name} under the Sun at {azimuth:.1f}°, {elevation:.1f}°, {run.name}"
     return picture(run.folder / "relight" / f"{name}_{index:02d}.png", alt, caption, 240)
 
 
-def shadow_masks(runs: Sequence[Judged]) -> str:
+def shadow_masks(runs: Sequence[Evaluation]) -> str:
     """HTML of masks side by side, of the runs that predict visibility; "" where none does."""
     predicting = [run for run in runs if run.metrics["shadow_mask"] is not None]
     if not predicting:
         return ""
 
     frames = [frame for run in predicting for frame in run.frames.values() if frame["shadow_mask"] is not None]
-    least = FEWEST * float(np.median([_rate(frame, "pixels") or 0 for frame in frames]))
+    least = MIN_PIXEL_SHARE * float(np.median([_rate(frame, "pixels") or 0 for frame in frames]))
 
     def score(frame: Mapping[str, Any]) -> float | None:
         value = _rate(frame, "balanced_error_rate")
@@ -122,10 +122,10 @@ def _rate(frame: Mapping[str, Any], key: str) -> float | None:
     return value
 
 
-def _pairs(run: Judged, named: bool) -> str:
+def _pairs(run: Evaluation, named: bool) -> str:
     """HTML of the run's masks in small, truth left and prediction right."""
     names = [name for name, frame in run.frames.items() if frame["shadow_mask"] is not None]
-    places = np.unique(np.linspace(0, len(names) - 1, min(MOST_PAIRS, len(names))).round().astype(int))
+    places = np.unique(np.linspace(0, len(names) - 1, min(MAX_SUN_PAIRS, len(names))).round().astype(int))
     small = " small" if max(run.metrics["dataset"]["resolution"]) < 200 else ""
     parts = []
     for name in (names[place] for place in places):
@@ -152,34 +152,34 @@ def _visibility_bar() -> str:
     return f'<p class="key"><span>Predicted visibility: 0 {bar} 1</span></p>'
 
 
-def by_grazing_angle(runs: Sequence[Judged]) -> str:
+def by_grazing_angle(runs: Sequence[Evaluation]) -> str:
     """HTML of charts and tables of the error by grazing angle; "" where no run has them."""
-    judged = [run for run in runs if run.metrics.get("by_grazing_angle")]
-    if not judged:
+    with_bins = [run for run in runs if run.metrics.get("by_grazing_angle")]
+    if not with_bins:
         return ""
-    bins: list[list[dict[str, Any]]] = [run.metrics["by_grazing_angle"] for run in judged]
-    present = [key for key in _BIN_COLUMNS if any(one[key] is not None for part in bins for one in part)]
-    labels = [_range(one) for one in bins[0]]
+    bins: list[list[dict[str, Any]]] = [run.metrics["by_grazing_angle"] for run in with_bins]
+    present = [key for key in _BIN_COLUMNS if any(entry[key] is not None for part in bins for entry in part)]
+    labels = [_range(entry) for entry in bins[0]]
     charts = [
         bar_chart(
             f"{_BIN_COLUMNS[key]} {LOWER}",
             "grazing angle",
             labels,
-            [(run.index, [one[key] for one in part]) for run, part in zip(judged, bins, strict=True)],
+            [(run.index, [entry[key] for entry in part]) for run, part in zip(with_bins, bins, strict=True)],
         )
         for key in ("luminance_mae", "false_shadow", "missed_shadow")
         if key in present
     ]
     head = ["Grazing angle", "Pixels", *(f"{_BIN_COLUMNS[key]} {LOWER}" for key in present)]
-    names = [run.name if len(runs) > 1 else "" for run in judged]
-    bodies = [(name, [_bin_row(one, present) for one in part]) for name, part in zip(names, bins, strict=True)]
+    names = [run.name if len(runs) > 1 else "" for run in with_bins]
+    bodies = [(name, [_bin_row(entry, present) for entry in part]) for name, part in zip(names, bins, strict=True)]
     return f'{legend(runs)}<div class="charts three">{"".join(charts)}</div>{table("By grazing angle", head, bodies)}'
 
 
-def _bin_row(one: Mapping[str, Any], columns: Sequence[str]) -> list[str]:
-    values = [_NULL if one[key] is None else f"{one[key]:.4f}" for key in columns]
-    return [_range(one), f"{one['pixels']:,}", *values]
+def _bin_row(entry: Mapping[str, Any], columns: Sequence[str]) -> list[str]:
+    values = [_NULL if entry[key] is None else f"{entry[key]:.4f}" for key in columns]
+    return [_range(entry), f"{entry['pixels']:,}", *values]
 
 
-def _range(one: Mapping[str, Any]) -> str:
-    return f"{one['from_deg']:g}–{one['to_deg']:g}°"
+def _range(entry: Mapping[str, Any]) -> str:
+    return f"{entry['from_deg']:g}–{entry['to_deg']:g}°"

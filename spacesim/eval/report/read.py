@@ -6,20 +6,20 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import LARGEST_LIST
+from spacesim.data.files import MAX_LIST_BYTES
 from spacesim.data.structure import read_record
 from spacesim.eval.report.html import escape, swatch
 from spacesim.eval.schema import RULES, Metrics
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """index: place in the report;  name: the run's, unique there;  metrics: what metrics.json holds"""
+class Evaluation:
+    """An evaluation on disk, as the report reads it."""
 
     folder: Path
-    index: int
-    name: str
-    metrics: dict[str, Any]
+    index: int  #: place in the report
+    name: str  #: the run's, unique there
+    metrics: dict[str, Any]  #: what metrics.json holds
 
     @property
     def label(self) -> str:
@@ -28,7 +28,7 @@ class Judged:
 
     @property
     def frames(self) -> dict[str, dict[str, Any]]:
-        """The judged frames by the names of their folders."""
+        """The evaluated frames by the names of their folders."""
         return {frame["name"]: frame for frame in self.metrics["frames"]}
 
     @property
@@ -48,17 +48,17 @@ class Judged:
         return ((where or {}).get(group) or {}).get(metric)
 
 
-def read_evals(folders: Sequence[Path]) -> list[Judged]:
+def read_evals(folders: Sequence[Path]) -> list[Evaluation]:
     """The evaluations in `folders`. Raises InputError where there is none or a folder holds no such."""
     if not folders:
         raise InputError("report: expected at least one EVAL folder, found none")
-    found = [_read_metrics(Path(folder)) for folder in folders]
-    names = _unique_names(found, [Path(folder) for folder in folders])
-    together = zip(folders, names, found, strict=True)
-    return [Judged(Path(folder), index, name, metrics) for index, (folder, name, metrics) in enumerate(together)]
+    contents = [_read_metrics(Path(folder)) for folder in folders]
+    names = _unique_names(contents, [Path(folder) for folder in folders])
+    together = zip(folders, names, contents, strict=True)
+    return [Evaluation(Path(folder), index, name, metrics) for index, (folder, name, metrics) in enumerate(together)]
 
 
-def legend(runs: Sequence[Judged]) -> str:
+def legend(runs: Sequence[Evaluation]) -> str:
     """HTML that names the colours of several runs; "" for one."""
     if len(runs) == 1:
         return ""
@@ -66,14 +66,14 @@ def legend(runs: Sequence[Judged]) -> str:
 
 
 def _read_metrics(folder: Path) -> dict[str, Any]:
-    return read_record(folder / "metrics.json", Metrics, RULES, LARGEST_LIST)[1]
+    return read_record(folder / "metrics.json", Metrics, RULES, MAX_LIST_BYTES)[1]
 
 
-def _unique_names(found: Sequence[dict[str, Any]], folders: Sequence[Path]) -> list[str]:
+def _unique_names(contents: Sequence[dict[str, Any]], folders: Sequence[Path]) -> list[str]:
     """The runs' last path components if these differ, else the runs' paths, else those of the folders."""
     for names in (
-        [Path(metrics["run"]).name for metrics in found],
-        [str(metrics["run"]) for metrics in found],
+        [Path(metrics["run"]).name for metrics in contents],
+        [str(metrics["run"]) for metrics in contents],
         [str(folder) for folder in folders],
     ):
         if len(set(names)) == len(names) and all(names):

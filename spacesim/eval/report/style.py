@@ -65,6 +65,8 @@ th:last-child, td:last-child { padding-right: 0; }
 thead th { font-weight: 600; vertical-align: bottom; border-bottom: 2px solid var(--ink); }
 thead small, td small { color: var(--muted); font-weight: 400; font-size: 0.86em; }
 tbody th { font-weight: 400; }
+.dense th, .dense td { padding: 0.4rem 0.5rem; font-size: 0.84rem; }
+.dense th:first-child { padding-left: 0; } .dense th:last-child, .dense td:last-child { padding-right: 0; }
 tr.group th { color: var(--muted); font-size: 0.86rem; padding-top: 1rem; }
 .best { font-weight: 700; }
 .facts td, .facts th, .facts th:last-child {

@@ -8,9 +8,9 @@ import numpy as np
 from spacesim.eval.labels import HIGHER, LOWER, Metric
 from spacesim.eval.report.gallery import css
 from spacesim.eval.report.html import escape, picture, table
-from spacesim.eval.report.read import Judged
+from spacesim.eval.report.read import Evaluation
 from spacesim.eval.report.tables import Cell, best_in_bold
-from spacesim.eval.shape import DIRECTIONS, SCALE, WIDTH, colours
+from spacesim.eval.shape import DIRECTIONS, SCALE, WIDTH, colors
 
 NUMBERS: tuple[Metric, ...] = (
     Metric(
@@ -18,8 +18,12 @@ NUMBERS: tuple[Metric, ...] = (
         "Mean squared distance to the nearest point of the other surface, both ways added (2.27).",
     ),
     Metric(
+        "hausdorff", "Hausdorff", "", LOWER, 1,
+        "Largest distance of a point to the other surface, the worse way (2.28): one stray point decides.",
+    ),
+    Metric(
         "hausdorff99", "Hausdorff-99", "", LOWER, 1,
-        "What 99 % of the points keep within of the other surface, the worse way (2.28).",
+        "What 99 % of the points keep within of the other surface, the worse way (5.2.3).",
     ),
     Metric("iou", "IoU", "", HIGHER, 4, "Overlap of what both fill: voxels of both by voxels of either (2.29)."),
     Metric(
@@ -40,22 +44,22 @@ NUMBERS: tuple[Metric, ...] = (
     ),
 )  # fmt: skip
 _TABLES = {
-    "Distances": ("chamfer", "hausdorff99", "accuracy", "completeness", "normals_deg"),
+    "Distances": ("chamfer", "hausdorff", "hausdorff99", "accuracy", "completeness", "normals_deg"),
     "Overlap": ("iou", "precision", "recall", "f", "outside"),
 }
-_LENGTHS = ("hausdorff99", "accuracy", "completeness")
+_LENGTHS = ("hausdorff", "hausdorff99", "accuracy", "completeness")
 
 
-def shapes(runs: Sequence[Judged]) -> str:
-    """HTML of the numbers and the pictures, of the runs whose shape was judged; "" where none was."""
-    judged = [run for run in runs if run.metrics.get("geometry")]
-    if not judged:
+def shapes(runs: Sequence[Evaluation]) -> str:
+    """HTML of the numbers and the pictures, of the runs whose shape was evaluated; "" where none was."""
+    with_shape = [run for run in runs if run.metrics.get("geometry")]
+    if not with_shape:
         return ""
-    compared = [run for run in judged if run.metrics["geometry"]["chamfer"] is not None]
-    return _table(judged) + "".join(_pictures(run, named=len(runs) > 1) for run in compared)
+    compared = [run for run in with_shape if run.metrics["geometry"]["chamfer"] is not None]
+    return _table(with_shape) + "".join(_pictures(run, named=len(runs) > 1) for run in compared)
 
 
-def _table(runs: Sequence[Judged]) -> str:
+def _table(runs: Sequence[Evaluation]) -> str:
     """Two tables, a row a run, over the whole and then over each object of a composed scene, and what the columns
     mean."""
     factor, unit = _unit(max(run.metrics["geometry"]["size"] for run in runs))
@@ -71,16 +75,18 @@ def _table(runs: Sequence[Judged]) -> str:
     return "".join(parts)
 
 
-def _groups(runs: Sequence[Judged]) -> list[tuple[str, list[tuple[str, Mapping[str, Any]]]]]:
+def _groups(runs: Sequence[Evaluation]) -> list[tuple[str, list[tuple[str, Mapping[str, Any]]]]]:
     """(title, rows), rows: (a run's label, its numbers), first of the whole, then of each object that has a shape."""
-    whole = [(run.label, run.metrics["geometry"]) for run in runs]
-    every = [(run.label, one) for run in runs for one in run.metrics.get("objects") or [] if one.get("geometry")]
-    found = []
-    for number in sorted({one["id"] for _, one in every}):
-        own = [(label, one) for label, one in every if one["id"] == number]
-        title = f"{' or '.join(dict.fromkeys(one['name'] for _, one in own))} alone"
-        found.append((title, [(label, one["geometry"]) for label, one in own]))
-    return [("All models" if found else "", whole), *found]
+    scene_rows = [(run.label, run.metrics["geometry"]) for run in runs]
+    entries = [
+        (run.label, entry) for run in runs for entry in run.metrics.get("objects") or [] if entry.get("geometry")
+    ]
+    objects = []
+    for number in sorted({entry["id"] for _, entry in entries}):
+        rows = [(label, entry) for label, entry in entries if entry["id"] == number]
+        title = f"{' or '.join(dict.fromkeys(entry['name'] for _, entry in rows))} alone"
+        objects.append((title, [(label, entry["geometry"]) for label, entry in rows]))
+    return [("All models" if objects else "", scene_rows), *objects]
 
 
 def _rows(group: Sequence[tuple[str, Mapping[str, Any]]], metrics: Sequence[Metric], factor: float) -> list[list[str]]:
@@ -114,13 +120,13 @@ def value_of(geometry: Mapping[str, Any], key: str) -> float | None:
     return value
 
 
-def _pictures(run: Judged, named: bool) -> str:
+def _pictures(run: Evaluation, named: bool) -> str:
     """HTML of both surfaces from all sides, with the colours' scale."""
     geometry = run.metrics["geometry"]
     factor, unit = _unit(geometry["size"])
     within = geometry["precision_recall"]["distance"]
     share = 100 * within / geometry["size"]
-    stops = ", ".join(css(colour) for colour in np.rint(colours(np.linspace(0, 1, 17))))
+    stops = ", ".join(css(color) for color in np.rint(colors(np.linspace(0, 1, 17))))
     gradient = f'<span class="bar" style="background: linear-gradient(90deg, {stops})"></span>'
     bar = (
         f'<p class="key"><span>Distance: 0 {gradient} '

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import Any
 
-from spacesim.eval.labels import GROUPS, IMAGE, RECALL, SHADOW, SHADOW_KIND, SHADOW_MASK, Metric
+from spacesim.eval.labels import GROUPS, IMAGE, RECALL, SHADOW, SHADOW_KIND, SHADOW_MASK, Metric, metric_of
 from spacesim.eval.metrics.shadow import KINDS
 from spacesim.eval.report.html import escape, table
-from spacesim.eval.report.read import Judged
+from spacesim.eval.report.read import Evaluation
 
 Cell = tuple[float | None, str, str]
 """A mean, its HTML, and the HTML of its spread."""
@@ -29,25 +29,25 @@ _OBJECT_TABLES: tuple[tuple[str, str, tuple[Metric, ...]], ...] = (
 """Of each object: caption, group, columns."""
 
 
-def results(runs: Sequence[Judged]) -> str:
+def results(runs: Sequence[Evaluation]) -> str:
     """HTML of every group's table with what its metrics mean; groups that no run has are left out."""
     parts = []
-    for caption, metrics, groups, told in _TABLES:
+    for caption, metrics, groups, described in _TABLES:
         present = [group for group in groups if any(run.metrics.get(group) is not None for run in runs)]
         if not present:
             continue
         head = ["", *(_heading(metric) for metric in metrics)]
         columns = {group: [(group, metric) for metric in metrics] for group in present}
         bodies = [(_sentence_case(GROUPS[group][0]), _rows(runs, columns[group])) for group in present]
-        parts += [table(caption, head, bodies), _meanings(told)]
+        parts += [table(caption, head, bodies), _meanings(described)]
     return "".join(parts)
 
 
-def results_by_suns(runs: Sequence[Judged]) -> str:
+def results_by_suns(runs: Sequence[Evaluation]) -> str:
     """HTML of two tables: views of known Suns, and views of Suns never seen; "" where no run tells them apart."""
     if not any(run.metrics.get(suns) for run in runs for suns in ("known_suns", "unseen_suns")):
         return ""
-    psnr, ssim, lpips, *_, flip = IMAGE
+    psnr, ssim, lpips, flip = (metric_of(key, IMAGE) for key in ("psnr", "ssim", "lpips", "flip"))
     perceived = lpips if any(run.mean("image", "lpips") is not None for run in runs) else flip
     columns = [("image", metric) for metric in (psnr, ssim, perceived)]
     columns += [("shadow", SHADOW[0]), ("shadow", SHADOW[2])]
@@ -58,7 +58,7 @@ def results_by_suns(runs: Sequence[Judged]) -> str:
     for suns, what in (("known_suns", "Known Suns"), ("unseen_suns", "Suns never seen in training")):
         counts = {(part["frames"], part["suns"]) for run in runs if (part := run.metrics.get(suns))}
         if not counts:
-            parts.append(f'<p class="lead">{what}: no judged frame has one.</p>')
+            parts.append(f'<p class="lead">{what}: no evaluated frame has one.</p>')
             continue
         size = "views and Suns of each run's own"
         if len(counts) == 1:
@@ -68,7 +68,7 @@ def results_by_suns(runs: Sequence[Judged]) -> str:
     return "".join(parts)
 
 
-def by_object(runs: Sequence[Judged]) -> str:
+def by_object(runs: Sequence[Evaluation]) -> str:
     """HTML: of each object the tables 4.6 and 4.7, a row for each run; "" where no run tells objects apart."""
     every = [entry for run in runs for entry in run.metrics.get("objects") or []]
     numbers = sorted({entry["id"] for entry in every})
@@ -82,8 +82,8 @@ def by_object(runs: Sequence[Judged]) -> str:
     return "".join(parts)
 
 
-def summary_cell(run: Judged, group: str, metric: Metric, suns: str = "") -> Cell:
-    """A metric's cell; suns: as `Judged.summary` takes it."""
+def summary_cell(run: Evaluation, group: str, metric: Metric, suns: str = "") -> Cell:
+    """A metric's cell; suns: as `Evaluation.summary` takes it."""
     return _cell(run.summary(group, metric.key, suns), metric)
 
 
@@ -109,20 +109,21 @@ def best_in_bold(metric: Metric, cells: Sequence[Cell]) -> list[str]:
     ]
 
 
-def _rows(runs: Sequence[Judged], columns: Sequence[tuple[str, Metric]], suns: str = "") -> list[list[str]]:
+def _rows(runs: Sequence[Evaluation], columns: Sequence[tuple[str, Metric]], suns: str = "") -> list[list[str]]:
     """A row for each run; columns: (group, metric)."""
-    made = []
+    cells_by_column = []
     for group, metric in columns:
         cells = [summary_cell(run, group, metric, suns) for run in runs]
         numbers = best_in_bold(metric, cells)
-        made.append([f"{n} <small>{cell[2]}</small>" for n, cell in zip(numbers, cells, strict=True)])
-    return [[run.label, *row] for run, *row in zip(runs, *made, strict=True)]
+        cells_by_column.append([f"{n} <small>{cell[2]}</small>" for n, cell in zip(numbers, cells, strict=True)])
+    return [[run.label, *row] for run, *row in zip(runs, *cells_by_column, strict=True)]
 
 
-def _object_rows(runs: Sequence[Judged], number: int, group: str, metrics: Sequence[Metric]) -> list[list[str]]:
+def _object_rows(runs: Sequence[Evaluation], number: int, group: str, metrics: Sequence[Metric]) -> list[list[str]]:
     """A row for each run; [] where none has the group."""
     summaries = [
-        next((one.get(group) for one in run.metrics.get("objects") or [] if one["id"] == number), None) for run in runs
+        next((entry.get(group) for entry in run.metrics.get("objects") or [] if entry["id"] == number), None)
+        for run in runs
     ]
     if all(summary is None for summary in summaries):
         return []

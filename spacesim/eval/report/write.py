@@ -1,4 +1,4 @@
-"""The report: one self-contained HTML page about one or several judged runs, side by side."""
+"""The report: one self-contained HTML page about one or several evaluated runs, side by side."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -7,19 +7,22 @@ from typing import Any
 
 import numpy as np
 
+from spacesim.data import density
 from spacesim.data.errors import InputError
-from spacesim.data.files import write_bytes
-from spacesim.eval.labels import IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric
+from spacesim.data.files import read_bytes, write_bytes
+from spacesim.eval.labels import IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric, metric_of
 from spacesim.eval.report.charts import column_histograms, histogram, line_chart, shared_edges
 from spacesim.eval.report.gallery import gallery
-from spacesim.eval.report.html import escape, page, section, table
+from spacesim.eval.report.html import escape, page, picture, section, table
 from spacesim.eval.report.lighting import by_grazing_angle, relighting, shadow_masks
-from spacesim.eval.report.read import Judged, legend, read_evals
+from spacesim.eval.report.read import Evaluation, legend, read_evals
 from spacesim.eval.report.surfaces import shapes
 from spacesim.eval.report.tables import Cell, best_in_bold, by_object, results, results_by_suns, summary_cell
 
 MANY_SUNS = 12
 """With more Suns than this, histograms become columns of one chart."""
+
+MAP_WIDTH = 960  #: pixels of the map of training cameras
 
 _GAUSSIANS = Metric("gaussians", "Gaussians", "", LOWER, 0, "")
 _RENDER = Metric("render_ms", "Render time", "ms", LOWER, 1, "")
@@ -38,7 +41,7 @@ def write_report(evals: Sequence[Path], out: Path) -> None:
     write_bytes(Path(out), content.encode("utf-8", "backslashreplace"))
 
 
-def _content(runs: Sequence[Judged]) -> str:
+def _content(runs: Sequence[Evaluation]) -> str:
     """The page."""
     scenes = " and ".join(sorted({run.scene for run in runs}))
     body = [
@@ -88,6 +91,12 @@ def _content(runs: Sequence[Judged]) -> str:
             _histograms(runs),
             "How many frames reach which PSNR [dB] over the silhouette, by azimuth and elevation.",
         ),
+        _section(
+            "Training cameras",
+            _camera_density(runs),
+            "From where the training cameras look at the object, in views per steradian: of sides that none has seen a "
+            "run knows nothing.",
+        ),
         _training(runs),
         section("How it was made", _making(runs)),
         section("Notes", _notes(runs)),
@@ -101,11 +110,11 @@ def _section(title: str, body: str, lead: str) -> str:
     return section(title, body, lead) if body else ""
 
 
-def _header(runs: Sequence[Judged], scenes: str) -> str:
+def _header(runs: Sequence[Evaluation], scenes: str) -> str:
     counts = {f"{run.metrics['dataset']['frames']} {run.metrics['split']}" for run in runs}
     frames = counts.pop() if len(counts) == 1 else "their"
     what = "One reconstruction" if len(runs) == 1 else f"{len(runs)} reconstructions"
-    lead = f"{what}, judged on {frames} frames against the truth."
+    lead = f"{what}, evaluated on {frames} frames against the truth."
     width, height = runs[0].metrics["dataset"]["resolution"]
     suns = runs[0].metrics["dataset"]["suns"]
     facts = [f"{width} × {height} pixels"]
@@ -119,9 +128,9 @@ def _header(runs: Sequence[Judged], scenes: str) -> str:
     )
 
 
-def _headlines(runs: Sequence[Judged]) -> str:
+def _headlines(runs: Sequence[Evaluation]) -> str:
     """A card for each number that people ask for first."""
-    psnr, ssim, lpips, *_, flip = IMAGE
+    psnr, ssim, lpips, flip = (metric_of(key, IMAGE) for key in ("psnr", "ssim", "lpips", "flip"))
     perceived = lpips if any(run.mean("image", "lpips") is not None for run in runs) else flip
     chosen = [("image", psnr), ("image", ssim), ("image", perceived), ("shadow", SHADOW[0])]
     if any(run.metrics["shadow_mask"] is not None for run in runs):
@@ -139,7 +148,7 @@ def _headlines(runs: Sequence[Judged]) -> str:
     return f'<div class="cards{many}">{"".join(cards)}</div><p class="lead">{lead}</p>'
 
 
-def _card(metric: Metric, runs: Sequence[Judged], cells: Sequence[Cell]) -> str:
+def _card(metric: Metric, runs: Sequence[Evaluation], cells: Sequence[Cell]) -> str:
     goal = f" {metric.goal}" if metric is not _GAUSSIANS else ""
     unit = f" <small>{escape(metric.unit)}</small>" if metric.unit else ""
     if len(runs) == 1:
@@ -156,12 +165,12 @@ def _card_numbers(metric: Metric, cells: Sequence[Cell]) -> list[str]:
     return [number for _, number, _ in cells] if metric is _GAUSSIANS else best_in_bold(metric, cells)
 
 
-def _model_cell(run: Judged, metric: Metric) -> Cell:
+def _model_cell(run: Evaluation, metric: Metric) -> Cell:
     value = run.metrics["model"][metric.key]
     return value, f"{value:,.{metric.digits}f}", ""
 
 
-def _histograms(runs: Sequence[Judged]) -> str:
+def _histograms(runs: Sequence[Evaluation]) -> str:
     by_sun = [_by_sun(run) for run in runs]
     every = [value for suns in by_sun for values in suns.values() for value in values]
     if not every:
@@ -189,7 +198,7 @@ def _histograms(runs: Sequence[Judged]) -> str:
     return legend(runs) + f'<div class="multiples">{"".join(charts)}</div>'
 
 
-def _by_sun(run: Judged) -> dict[tuple[float, ...], list[float]]:
+def _by_sun(run: Evaluation) -> dict[tuple[float, ...], list[float]]:
     """PSNR of the frames by the Sun's (azimuth, elevation), () where there is none."""
     groups: dict[tuple[float, ...], list[float]] = {}
     for frame in run.metrics["frames"]:
@@ -206,7 +215,7 @@ def _sun_name(sun: tuple[float, ...]) -> str:
     return "{:.0f}°, {:.0f}°".format(*sun) if sun else "Sun not known"
 
 
-def _training(runs: Sequence[Judged]) -> str:
+def _training(runs: Sequence[Evaluation]) -> str:
     histories = [run.metrics["training"].get("history") or [] for run in runs]
     if not any(histories):
         return ""
@@ -224,9 +233,24 @@ def _training(runs: Sequence[Judged]) -> str:
     return section("Training", legend(runs) + f'<div class="charts">{"".join(charts)}</div>')
 
 
-def _making(runs: Sequence[Judged]) -> str:
+def _camera_density(runs: Sequence[Evaluation]) -> str:
+    """The maps that evaluating has written, each once, with the runs that it is of."""
+    of_map: dict[bytes, list[Evaluation]] = {}
+    for run in runs:
+        path = run.folder / density.NAME
+        if path.is_file():
+            of_map.setdefault(read_bytes(path, "a picture"), []).append(run)
+    figures = []
+    for group in of_map.values():
+        names = ", ".join(run.name for run in group)
+        caption = " ".join(run.label for run in group) if len(runs) > 1 else ""
+        figures.append(picture(group[0].folder / density.NAME, f"Camera density, {names}", caption, MAP_WIDTH))
+    return "".join(figures)
+
+
+def _making(runs: Sequence[Evaluation]) -> str:
     """Tables of data, configuration and software, a column for each run; rows that differ stand out."""
-    tables: list[tuple[str, Callable[[Judged], Mapping[str, Any]]]] = [
+    tables: list[tuple[str, Callable[[Evaluation], Mapping[str, Any]]]] = [
         ("Data", _data_facts),
         ("Model and time", _model_facts),
         ("Training configuration", lambda run: run.metrics["config"]),
@@ -246,20 +270,20 @@ def _making(runs: Sequence[Judged]) -> str:
     return "".join(parts)
 
 
-def _data_facts(run: Judged) -> dict[str, Any]:
+def _data_facts(run: Evaluation) -> dict[str, Any]:
     data = run.metrics["dataset"]
     width, height = data["resolution"]
     facts = {
         "folder": run.metrics["data"],
         "scene": data.get("scene"),
-        "judged frames": f"{data['frames']} ({run.metrics['split']})",
+        "evaluated frames": f"{data['frames']} ({run.metrics['split']})",
         "training frames": data["train_frames"],
         "resolution": f"{width} × {height}",
     }
     return facts | {key: value for key, value in (data.get("config") or {}).items() if key not in facts}
 
 
-def _model_facts(run: Judged) -> dict[str, Any]:
+def _model_facts(run: Evaluation) -> dict[str, Any]:
     model, training = run.metrics["model"], run.metrics["training"]
     seconds = training.get("seconds")
     return {
@@ -273,7 +297,7 @@ def _model_facts(run: Judged) -> dict[str, Any]:
     }
 
 
-def _facts_table(caption: str, runs: Sequence[Judged], facts: Sequence[Mapping[str, str]]) -> str:
+def _facts_table(caption: str, runs: Sequence[Evaluation], facts: Sequence[Mapping[str, str]]) -> str:
     keys = list(dict.fromkeys(key for column in facts for key in column))
     if not keys:
         return ""
@@ -297,7 +321,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return flat
 
 
-def _notes(runs: Sequence[Judged]) -> str:
+def _notes(runs: Sequence[Evaluation]) -> str:
     parts = []
     for run in runs:
         items = "".join(f"<li>{escape(note)}</li>" for note in run.metrics["notes"])

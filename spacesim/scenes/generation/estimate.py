@@ -9,7 +9,7 @@ from pathlib import Path
 
 from spacesim.data.errors import WorkError
 from spacesim.data.files import existing_parent
-from spacesim.scenes.generation.frames import FrameMaker, Shot
+from spacesim.scenes.generation.frames import FrameMaker, FrameSpec
 
 SAMPLES = 5
 """Frames that are measured; the first one of them, which compiles the kernels, not for time."""
@@ -20,12 +20,12 @@ _BLOCK = 4096  # bytes in whose multiples most file systems store
 
 @dataclass(frozen=True)
 class Estimate:
-    """frames: left to render; seconds: that one process on this machine takes for them; needed, free: bytes of disk."""
+    """What a dataset will take."""
 
-    frames: int
-    seconds: float
-    needed: int
-    free: int
+    frames: int  #: left to render
+    seconds: float  #: that one process on this machine takes for them
+    needed: int  #: bytes of disk
+    free: int  #: bytes of disk
 
     def __str__(self) -> str:
         return (
@@ -41,21 +41,21 @@ class Estimate:
             )
 
 
-def samples(shots: Sequence[Shot]) -> list[Shot]:
-    """A few of `shots`, spread evenly over them."""
-    count = min(SAMPLES, len(shots))
-    return [shots[i * len(shots) // count] for i in range(count)]
+def samples(specs: Sequence[FrameSpec]) -> list[FrameSpec]:
+    """A few of `specs`, spread evenly over them."""
+    count = min(SAMPLES, len(specs))
+    return [specs[i * len(specs) // count] for i in range(count)]
 
 
-def measure(maker: FrameMaker, shots: Sequence[Shot], left: Sequence[Shot], root: Path) -> Estimate:
-    """Make `shots` and reckon from them what those that are `left` in `root` take: time by samples, disk by frames."""
-    list(maker.make(shots[:1]))
+def measure(maker: FrameMaker, specs: Sequence[FrameSpec], left: Sequence[FrameSpec], root: Path) -> Estimate:
+    """Make `specs` and reckon from them what those that are `left` in `root` take: time by samples, disk by frames."""
+    list(maker.make(specs[:1]))
     start = time.monotonic()
-    list(maker.make(shots[1:]))
-    seconds = (time.monotonic() - start) / max(1, sum(shot.spp for shot in shots[1:]))
-    stored = sum(_stored(path) for shot in shots for path in maker.root.glob(f"*/{shot.name}*"))
+    list(maker.make(specs[1:]))
+    seconds = (time.monotonic() - start) / max(1, sum(spec.spp for spec in specs[1:]))
+    stored = sum(_stored(path) for spec in specs for path in maker.root.glob(f"*/{spec.name}*"))
     free = shutil.disk_usage(existing_parent(root)).free
-    return Estimate(len(left), seconds * sum(shot.spp for shot in left), len(left) * stored // len(shots), free)
+    return Estimate(len(left), seconds * sum(spec.spp for spec in left), len(left) * stored // len(specs), free)
 
 
 def _stored(path: Path) -> int:

@@ -13,41 +13,40 @@ from pathlib import Path
 import spacesim
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, FrameWriter
-from spacesim.scenes.camera import CameraConfig
+from spacesim.scenes.cameras.camera import CameraConfig
+from spacesim.scenes.cameras.exposure import record_image
 from spacesim.scenes.config import QualityConfig
-from spacesim.scenes.record import record
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
 
-MOST_THREADS = 16
+MAX_THREADS = 16
 IN_FLIGHT = 1 << 30
-"""Bytes that frames which wait for a thread may hold, chosen: 57 frames of 512 x 512."""
+"""Bytes that frames which wait for a thread may hold: 57 frames of 512 x 512."""
 BYTES_A_PIXEL = 72
 """Of a frame's truth: 18 numbers, float32."""
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
-    """One frame to render. index: among all frames of the dataset, it makes the noise; name: e.g. "train_00012";
-    spp: samples a pixel."""
+class FrameSpec:
+    """One frame to render."""
 
-    index: int
-    name: str
+    index: int  #: among all frames of the dataset, it makes the noise
+    name: str  #: e.g. "train_00012"
     camera: Camera
     sun: Sun
-    spp: int
+    spp: int  #: samples a pixel
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What every process that takes part has to know. root: the dataset's folder; threads: that encode, a process."""
+    """What every process that takes part has to know."""
 
     scene: Scene
     camera: CameraConfig
     quality: QualityConfig
     seed: int
-    root: Path
-    threads: int
+    root: Path  #: the dataset's folder
+    threads: int  #: that encode, a process
 
     @property
     def writer(self) -> FrameWriter:
@@ -56,7 +55,7 @@ class Job:
 
 
 def raw_suffixes(camera: CameraConfig) -> tuple[str, ...]:
-    """Of the files in raw/ that `record` makes a frame."""
+    """Of the files in raw/ that `record_image` makes a frame."""
     if camera.sensor is None:
         return ()
     return RAW_MONOCHROME if camera.sensor.monochrome else RAW_COLOR
@@ -75,7 +74,7 @@ def cores() -> int:
 
 def writing_threads(processes: int) -> int:
     """Threads that encode in each of so many processes on this machine."""
-    return min(MOST_THREADS, max(1, math.ceil(cores() / processes)))
+    return min(MAX_THREADS, max(1, math.ceil(cores() / processes)))
 
 
 class FrameMaker:
@@ -90,7 +89,7 @@ class FrameMaker:
         pixels = math.prod(job.camera.resolution)
         self._most = max(1, min(job.threads + 1, IN_FLIGHT // (BYTES_A_PIXEL * pixels)))
 
-    def make(self, shots: Sequence[Shot]) -> Iterator[str]:
+    def make(self, specs: Sequence[FrameSpec]) -> Iterator[str]:
         """Make the frames that are not whole on disk yet; yields the name of each once it is there, in order.
 
         The first error, of rendering or writing, ends it: what is being written then is finished first.
@@ -98,20 +97,20 @@ class FrameMaker:
         waiting: deque[Future[str]] = deque()
         with ThreadPoolExecutor(self._job.threads, "write") as pool:
             try:
-                for shot in shots:
-                    if self._writer.has(shot.name):
-                        yield shot.name
+                for spec in specs:
+                    if self._writer.has_frame(spec.name):
+                        yield spec.name
                         continue
                     while waiting and (waiting[0].done() or len(waiting) >= self._most):
                         yield waiting.popleft().result()
-                    truth = self._renderer.render(shot.camera, shot.sun, (self._job.seed, shot.index), shot.spp)
-                    waiting.append(pool.submit(self._write, shot, truth))
+                    truth = self._renderer.render(spec.camera, spec.sun, (self._job.seed, spec.index), spec.spp)
+                    waiting.append(pool.submit(self._write, spec, truth))
                 while waiting:
                     yield waiting.popleft().result()
             finally:
                 pool.shutdown(cancel_futures=True)
 
-    def _write(self, shot: Shot, truth: Truth) -> str:
-        recording = record(truth.radiance, truth.alpha, self._job.camera, (self._job.seed, shot.index))
-        self._writer.write_frame(shot.name, truth, recording.image, recording.raw)
-        return shot.name
+    def _write(self, spec: FrameSpec, truth: Truth) -> str:
+        recording = record_image(truth.radiance, truth.alpha, self._job.camera, (self._job.seed, spec.index))
+        self._writer.write_frame(spec.name, truth, recording.image, recording.raw)
+        return spec.name

@@ -13,25 +13,25 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.errors import InputError, expect
-from spacesim.data.files import LARGEST_LIST, read_json, write_json
-from spacesim.data.lock import locked
+from spacesim.data.files import MAX_LIST_BYTES, read_json, write_json
+from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import DatasetWriter
 from spacesim.scenes.build import build
+from spacesim.scenes.cameras.rig import PlannedView, TargetSphere, plan
 from spacesim.scenes.config import SceneConfig
 from spacesim.scenes.generation.estimate import LONG, Estimate, measure, samples
-from spacesim.scenes.generation.frames import FrameMaker, Job, Shot, raw_suffixes, versions, writing_threads
+from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, raw_suffixes, versions, writing_threads
 from spacesim.scenes.generation.overview import write_overview
-from spacesim.scenes.generation.points import surface_points
+from spacesim.scenes.generation.points import sample_surface_points
 from spacesim.scenes.render import Renderer
-from spacesim.scenes.rig import Target, View, plan
 from spacesim.scenes.scene import Scene
 
 SCHEMA = 2  #: of scene.json
 
-Progress = Callable[[int, int, str], None]
-Crew = Callable[[Job, Sequence[Shot]], Iterator[str]]  #: makes frames and yields their names
-Named = list[tuple[str, View]]  #: views with the names of their frames
+GenerationProgress = Callable[[int, int, str], None]
+MakeFrames = Callable[[Job, Sequence[FrameSpec]], Iterator[str]]  #: makes frames and yields their names
+NamedViews = list[tuple[str, PlannedView]]  #: views with the names of their frames
 
 _log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ def generate(
     config: SceneConfig,
     out: Path,
     resume: bool = False,
-    progress: Progress | None = None,
+    progress: GenerationProgress | None = None,
     workers: int = 1,
     ray: str | None = None,
 ) -> Dataset:
@@ -54,40 +54,40 @@ def generate(
     """
     expect(workers >= 1, "workers", "at least 1", workers)
     expect(ray is None or workers == 1, "workers", "none beside ray, which counts for itself", workers)
-    sweep = _Sweep(config)
+    sweep = _DatasetPlan(config)
     job = replace(sweep.job, root=Path(out).absolute())
     described = describe(sweep.scene, config, sweep.train, sweep.test)
     with ExitStack() as alone:
-        with _crew(sweep.renderer, workers, ray) as make:
-            alone.enter_context(locked(job.root))
+        with _frame_maker(sweep.renderer, workers, ray) as make:
+            alone.enter_context(lock_folder(job.root))
             writer = _open(Path(out), described, resume, sweep)
-            left = [shot for shot in sweep.shots if not writer.has(shot.name)]
-            total, whole = len(sweep.shots), len(sweep.shots) - len(left)
-            if progress is not None and whole:
-                progress(whole, total, "")
-            for done, name in enumerate(_made(make, job, left, sweep.renderer), start=whole + 1):
+            missing = [spec for spec in sweep.specs if not writer.has_frame(spec.name)]
+            total, complete = len(sweep.specs), len(sweep.specs) - len(missing)
+            if progress is not None and complete:
+                progress(complete, total, "")
+            for done, name in enumerate(_make_frames(make, job, missing, sweep.renderer), start=complete + 1):
                 if progress is not None:
                     progress(done, total, name)
-        points, colors = surface_points(sweep.renderer, config.quality.points, config.seed)
-        listed = _listed(sweep.train), _listed(sweep.test)
+        points, colors = sample_surface_points(sweep.renderer, config.quality.points, config.seed)
+        listed = _view_records(sweep.train), _view_records(sweep.test)
         lens = config.camera.distortion
         return writer.finish(*listed, points, colors, sweep.scene.mesh, lens, lambda d: write_overview(d.root, d))
 
 
-def _open(root: Path, described: dict[str, Any], resume: bool, sweep: "_Sweep") -> DatasetWriter:
+def _open(root: Path, described: dict[str, Any], resume: bool, sweep: "_DatasetPlan") -> DatasetWriter:
     """The writer of the folder. Only scene.json tells which scene frames are of. Where it is broken, nothing is
     resumed; where it is gone, resuming says that they are of the scene asked for, and it is written again."""
     path = root / "scene.json"
     if resume and path.exists():
         try:
-            read_json(path, LARGEST_LIST)
+            read_json(path, MAX_LIST_BYTES)
         except InputError as error:
             raise InputError(
                 f"{error}; if the frames there are of the scene asked for, delete this file and resume again, "
                 "else choose another folder"
             ) from None
-    frames = {found.stem for found in root.glob("gt/*.exr")} if resume and not path.exists() else set()
-    if frames and frames <= {shot.name for shot in sweep.shots}:
+    frames = {file.stem for file in root.glob("gt/*.exr")} if resume and not path.exists() else set()
+    if frames and frames <= {spec.name for spec in sweep.specs}:
         _log.warning("%s is missing: the frames there are taken to be of the scene asked for", path)
         write_json(path, described)
     return DatasetWriter(root, described, resume, raw_suffixes(sweep.job.camera))
@@ -98,44 +98,44 @@ def estimate(config: SceneConfig, out: Path) -> Estimate:
 
     Raises InputError as `generate` does.
     """
-    sweep = _Sweep(config)
+    sweep = _DatasetPlan(config)
     there = replace(sweep.job, root=Path(out).absolute()).writer
-    left = [shot for shot in sweep.shots if not there.has(shot.name)]
+    left = [spec for spec in sweep.specs if not there.has_frame(spec.name)]
     with TemporaryDirectory(prefix="spacesim-") as folder:
         maker = FrameMaker(replace(sweep.job, root=Path(folder)), sweep.renderer)
-        return measure(maker, samples(left or sweep.shots), left, there.root)
+        return measure(maker, samples(left or sweep.specs), left, there.root)
 
 
 @contextmanager
-def _crew(renderer: Renderer, workers: int, ray: str | None) -> Iterator[Crew]:
+def _frame_maker(renderer: Renderer, workers: int, ray: str | None) -> Iterator[MakeFrames]:
     """Who makes the frames: a Ray cluster, several processes or this one, with its renderer."""
     if ray is not None:
-        from spacesim.scenes.generation.cluster import joined, make_on_cluster
+        from spacesim.scenes.generation.cluster import join_cluster, make_on_cluster
 
-        with joined(ray):
+        with join_cluster(ray):
             yield make_on_cluster
     elif workers > 1:
         from spacesim.scenes.generation.workers import make_in_processes
 
         yield partial(make_in_processes, count=workers)
     else:
-        yield lambda job, shots: FrameMaker(job, renderer).make(shots)
+        yield lambda job, specs: FrameMaker(job, renderer).make(specs)
 
 
-def _made(make: Crew, job: Job, shots: Sequence[Shot], renderer: Renderer) -> Iterator[str]:
+def _make_frames(make: MakeFrames, job: Job, specs: Sequence[FrameSpec], renderer: Renderer) -> Iterator[str]:
     """Frames, as they are made. A long run begins with a few that tell how long and how large it will be."""
     names: set[str] = set()
-    if len(shots) > LONG:
-        first = samples(shots)
-        found = measure(FrameMaker(job, renderer), first, shots, job.root)
-        _log.info("generate: %s", found)
-        found.check(job.root)
-        names = {shot.name for shot in first}
+    if len(specs) > LONG:
+        first = samples(specs)
+        estimated = measure(FrameMaker(job, renderer), first, specs, job.root)
+        _log.info("generate: %s", estimated)
+        estimated.check(job.root)
+        names = {spec.name for spec in first}
         yield from sorted(names)
-    yield from make(job, [shot for shot in shots if shot.name not in names])
+    yield from make(job, [spec for spec in specs if spec.name not in names])
 
 
-class _Sweep:
+class _DatasetPlan:
     """A scene that is built and loaded, with all of its frames. Raises InputError for a camera within an object."""
 
     def __init__(self, config: SceneConfig) -> None:
@@ -143,52 +143,54 @@ class _Sweep:
         self.train, self.test = plan_views(self.scene, config)
         quality = config.quality
         self.renderer = Renderer(self.scene, quality.spp, quality.max_depth, config.camera.distortion)
-        views = [(quality.spp, *one) for one in self.train] + [(quality.judged_spp, *one) for one in self.test]
-        self.shots = [Shot(i, name, view.camera, view.sun, spp) for i, (spp, name, view) in enumerate(views)]
+        views = [(quality.spp, *planned) for planned in self.train] + [
+            (quality.resolved_test_spp, *planned) for planned in self.test
+        ]
+        self.specs = [FrameSpec(i, name, view.camera, view.sun, spp) for i, (spp, name, view) in enumerate(views)]
         self.job = Job(self.scene, config.camera, quality, config.seed, Path(), writing_threads(1))
-        inside = self.renderer.inside(np.stack([shot.camera.position for shot in self.shots]))
+        inside = self.renderer.inside(np.stack([spec.camera.position for spec in self.specs]))
         if inside.any():
-            name = self.shots[int(inside.argmax())].name
+            name = self.specs[int(inside.argmax())].name
             raise InputError(f"distance: expected cameras outside of {config.name}, found that of {name} within a part")
 
 
-def plan_views(scene: Scene, config: SceneConfig) -> tuple[Named, Named]:
+def plan_views(scene: Scene, config: SceneConfig) -> tuple[NamedViews, NamedViews]:
     """The named training and test views."""
-    train, test = plan(config.rig, Target(*scene.bounding_sphere), config.camera, config.seed)
+    train, test = plan(config.rig, TargetSphere(*scene.bounding_sphere), config.camera, config.seed)
     return (
         [(f"train_{i:05d}", view) for i, view in enumerate(train)],
         [(f"test_{i:05d}", view) for i, view in enumerate(test)],
     )
 
 
-def describe(scene: Scene, config: SceneConfig, train: Named, test: Named) -> dict[str, Any]:
+def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedViews) -> dict[str, Any]:
     """scene.json: all that is needed to render the same dataset again."""
     return {
         "schema": SCHEMA,
         **scene.describe(),
-        "mesh": [_share_of_mesh(scene, i) for i in range(1, len(scene.objects) + 1)],
+        "mesh": [_mesh_counts(scene, i) for i in range(1, len(scene.objects) + 1)],
         "suns": {"train": _angles(train), "test": _angles(test)},
         "exposure": config.camera.exposure,
         "seed": config.seed,
         "spp": config.quality.spp,
-        "test_spp": config.quality.judged_spp,
+        "test_spp": config.quality.resolved_test_spp,
         "config": config.to_json(),
         "backend": backend.select(),
         "versions": versions(),
     }
 
 
-def _share_of_mesh(scene: Scene, object_id: int) -> dict[str, int]:
+def _mesh_counts(scene: Scene, object_id: int) -> dict[str, int]:
     """How many vertices and faces of mesh.ply, where objects stand in the order of their ids, are an object's."""
     meshes = [placed.mesh for placed in scene.parts if placed.object_id == object_id]
     vertices, faces = (sum(len(getattr(mesh, name)) for mesh in meshes) for name in ("vertices", "faces"))
     return {"object": object_id, "vertices": vertices, "faces": faces}
 
 
-def _angles(named: Named) -> list[list[float]]:
+def _angles(named: NamedViews) -> list[list[float]]:
     """Azimuth and elevation, degrees, of each Sun once, in the order of the views."""
     return [list(angles) for angles in dict.fromkeys(view.sun.angles for _, view in named)]
 
 
-def _listed(named: Named) -> list[tuple[str, Camera, Sun]]:
+def _view_records(named: NamedViews) -> list[tuple[str, Camera, Sun]]:
     return [(name, view.camera, view.sun) for name, view in named]

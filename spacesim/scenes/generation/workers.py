@@ -25,16 +25,16 @@ from typing import Any
 from spacesim import backend
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import remove_leftovers
-from spacesim.scenes.generation.frames import FrameMaker, Job, Shot, cores, writing_threads
+from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, cores, writing_threads
 
 ATTEMPTS = 3  #: times that a task is given out before its death counts as its own fault
-MOST_FRAMES = 16  #: of a task: what a process that dies has to do again
+MAX_FRAMES = 16  #: of a task: what a process that dies has to do again
 PATIENCE = 5.0  #: seconds in which a process that is told to go has gone
 
 
 @dataclass(eq=False)
 class _Task:
-    shots: list[Shot]
+    specs: list[FrameSpec]
     attempts: int = 0
 
 
@@ -47,35 +47,35 @@ class _Worker:
     task: _Task | None
     outbox: list[Any]
 
-    def tell(self) -> None:
+    def send_next(self) -> None:
         """Send the next message. Where the process is dead already, reading from it will tell."""
         with suppress(OSError):
             self.connection.send(self.outbox.pop(0))
 
 
-def make_in_processes(job: Job, shots: Sequence[Shot], count: int) -> Iterator[str]:
+def make_in_processes(job: Job, specs: Sequence[FrameSpec], count: int) -> Iterator[str]:
     """Make frames in `count` processes; yields the name of each once it is on the disk, in no fixed order.
 
     Raises what a process raises, and WorkError where processes die over the same frames again and again.
     """
-    if not shots:
+    if not specs:
         return
-    size = max(1, min(MOST_FRAMES, len(shots) // (4 * count)))
-    tasks = deque(_Task(list(shots[i : i + size])) for i in range(0, len(shots), size))
+    size = max(1, min(MAX_FRAMES, len(specs) // (4 * count)))
+    tasks = deque(_Task(list(specs[i : i + size])) for i in range(0, len(specs), size))
     count = min(count, len(tasks))
     job = replace(job, threads=writing_threads(count))
-    told: set[str] = set()
+    reported: set[str] = set()
     workers: list[_Worker] = []
     try:
         while tasks or any(worker.task for worker in workers):
             for worker in workers:
                 if worker.task is None and tasks:
-                    _give(worker, tasks.popleft())
+                    _assign(worker, tasks.popleft())
             while tasks and len(workers) < count:
                 workers.append(_start(job, tasks.popleft(), len(workers), count))
-            for name in _hear(workers, tasks):
-                if name not in told:
-                    told.add(name)
+            for name in _receive(workers, tasks):
+                if name not in reported:
+                    reported.add(name)
                     yield name
     except BaseException:
         _stop(workers)
@@ -85,7 +85,7 @@ def make_in_processes(job: Job, shots: Sequence[Shot], count: int) -> Iterator[s
         _stop(workers)
 
 
-def _hear(workers: list[_Worker], tasks: deque[_Task]) -> Iterator[str]:
+def _receive(workers: list[_Worker], tasks: deque[_Task]) -> Iterator[str]:
     """Wait for messages: the name of a frame that is done, None for "what next?", or an error to raise."""
     for ready in wait([worker.connection for worker in workers]):
         worker = next(worker for worker in workers if worker.connection is ready)
@@ -93,14 +93,14 @@ def _hear(workers: list[_Worker], tasks: deque[_Task]) -> Iterator[str]:
             message = worker.connection.recv()
         except (EOFError, OSError):
             workers.remove(worker)
-            _bury(worker, tasks)
+            _requeue(worker, tasks)
             continue
         if isinstance(message, BaseException):
             raise message
         if message is not None:
             yield message
         elif worker.outbox:
-            worker.tell()
+            worker.send_next()
         else:
             worker.task = None
 
@@ -122,16 +122,16 @@ def _start(job: Job, task: _Task, number: int, count: int) -> _Worker:
         )
     task.attempts += 1
     start = (backend.select(), max(1, cores() // count), job)
-    return _Worker(process, Connection(ours.detach()), task, [start, task.shots])
+    return _Worker(process, Connection(ours.detach()), task, [start, task.specs])
 
 
-def _give(worker: _Worker, task: _Task) -> None:
+def _assign(worker: _Worker, task: _Task) -> None:
     task.attempts += 1
-    worker.task, worker.outbox = task, [task.shots]
-    worker.tell()
+    worker.task, worker.outbox = task, [task.specs]
+    worker.send_next()
 
 
-def _bury(worker: _Worker, tasks: deque[_Task]) -> None:
+def _requeue(worker: _Worker, tasks: deque[_Task]) -> None:
     """A process has ended by itself: its task is for another one."""
     worker.connection.close()
     code = worker.process.wait()
@@ -140,11 +140,11 @@ def _bury(worker: _Worker, tasks: deque[_Task]) -> None:
     if worker.task.attempts < ATTEMPTS:
         tasks.appendleft(worker.task)
         return
-    first, last = worker.task.shots[0].name, worker.task.shots[-1].name
+    first, last = worker.task.specs[0].name, worker.task.specs[-1].name
     how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
     raise WorkError(
         f"{first} to {last}: {ATTEMPTS} processes ended over these frames, the last {how}; where the memory is short, "
-        "fewer --workers help"
+        "fewer workers help"
     )
 
 
@@ -175,7 +175,7 @@ def cuda_devices() -> list[str]:
 _ROOT = str(Path(__file__).parents[3])
 
 
-def linked(connection: Connection) -> tuple[queue.SimpleQueue[Any], Callable[[Any], None]]:
+def connect_to_parent(connection: Connection) -> tuple[queue.SimpleQueue[Any], Callable[[Any], None]]:
     """(what the parent has sent, a way to tell it something). Ends this process as soon as the parent has
     gone, whatever it is doing."""
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -209,7 +209,7 @@ def select_backend(name: str, threads: int) -> None:
 
 def _work(connection: Connection) -> None:
     """What a worker does: frames of each task, until there are no more."""
-    inbox, tell = linked(connection)
+    inbox, tell = connect_to_parent(connection)
 
     def ask() -> Any:
         tell(None)
@@ -223,11 +223,11 @@ def _work(connection: Connection) -> None:
             for done in maker.make(ask()):
                 tell(done)
     except Exception as error:
-        tell(_told(error))
+        tell(_picklable(error))
         threading.Event().wait()  # for the parent to close the connection
 
 
-def _told(error: Exception) -> Exception:
+def _picklable(error: Exception) -> Exception:
     """`error`, if the parent can raise it as it is; else its text."""
     if isinstance(error, InputError | WorkError | MemoryError | backend.BackendError):
         with suppress(Exception):

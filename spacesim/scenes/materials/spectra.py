@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
-from spacesim.scenes.sun import ASTRONOMICAL_UNIT_KM, SOLAR_IRRADIANCE, SOLAR_RADIUS_KM
+from spacesim.scenes.lights.sun import ASTRONOMICAL_UNIT_KM, SOLAR_IRRADIANCE, SOLAR_RADIUS_KM
 
 TABLE = Path(__file__).parents[2] / "assets" / "solar_spectrum.csv"
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -27,11 +27,11 @@ TABLE = Path(__file__).parents[2] / "assets" / "materials.toml"
 SOLAR_CELL = (0.08, 0.04)  #: width and height of a cell of the preset solar-cell, metres: 2 x 4 in its tile
 
 WHITEST = 0.9
-"""Most base colour of a coated surface and of a dielectric, chosen: above it Mitsuba's principled BSDF, which adds its
+"""Most base colour of a coated surface and of a dielectric: above it Mitsuba's principled BSDF, which adds its
 gloss to an undiminished diffuse base, can reflect more of an even sky than it gets (index 1.7, GGX alpha 0.1: from
 0.903)."""
 
-SMOOTHEST = 0.05  #: least `roughness` of `principled`, chosen: smoother facets would hardly ever meet the Sun
+SMOOTHEST = 0.05  #: least `roughness` of `principled`: smoother facets would hardly ever meet the Sun
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +64,13 @@ def metal(name: str, albedo: Color, alpha: float, source: str) -> Material:
     """A rough metal of GGX roughness `alpha` whose reflectance at normal incidence is `albedo`, at other angles
     within a few per cent of it. Microfacets of one bounce lose the light that meets a second facet (17 % at alpha
     0.35), so each facet reflects `albedo` / `facet_albedo(alpha)`, at most 1."""
-    kept = facet_albedo(alpha)
+    facets = facet_albedo(alpha)
     bsdf = {
         "type": "roughconductor",
         "material": "none",
         "distribution": "ggx",
         "alpha": alpha,
-        "specular_reflectance": _rgb(_color(min(x / kept, 1.0) for x in albedo)),
+        "specular_reflectance": _rgb(_color(min(x / facets, 1.0) for x in albedo)),
     }
     return Material(name, albedo, bsdf, source)
 
@@ -144,11 +144,14 @@ def principled(
     return Material(name, albedo, bsdf, source, images, tile)
 
 
+Kind = Literal["diffuse", "coated", "metal"]
+
+
 @dataclass(frozen=True)
-class Preset:
+class MaterialPreset:
     """A row of the table; its columns are explained there."""
 
-    kind: str
+    kind: Kind
     source: str
     albedo: Color
     absorptance: float | None = None
@@ -162,24 +165,24 @@ class Preset:
     def material(self, name: str) -> Material:
         """The row as a Material of that name."""
         if self.kind == "coated":
-            made = coated(name, self.albedo, self.roughness or 0.0, self.source, self.ior or 1.5)
+            result = coated(name, self.albedo, self.roughness or 0.0, self.source, self.ior or 1.5)
         elif self.kind == "metal":
-            made = metal(name, self.albedo, self.roughness or 0.0, self.source)
+            result = metal(name, self.albedo, self.roughness or 0.0, self.source)
         else:
-            made = lambertian(name, self.albedo, self.source)
+            result = lambertian(name, self.albedo, self.source)
         if self.pattern is not None:
-            made = _patterned(made, self.pattern)
+            result = _with_pattern(result, self.pattern)
         if self.normals is not None:
-            images = {**made.images, self.normals: NORMALS[self.normals]()}
-            made = replace(made, bsdf=_with_normals(made.bsdf, self.normals), images=images)
-        return replace(made, tile=self.tile, reflectance=self.spectrum)
+            images = {**result.images, self.normals: NORMALS[self.normals]()}
+            result = replace(result, bsdf=_with_normals(result.bsdf, self.normals), images=images)
+        return replace(result, tile=self.tile, reflectance=self.spectrum)
 
 
 NORMALS = {"crinkle": textures.crinkle, "grain": textures.grain}
 PATTERNS = {"cells": textures.cells}
 
 
-def _patterned(plain: Material, pattern: str) -> Material:
+def _with_pattern(plain: Material, pattern: str) -> Material:
     """`plain`, diffuse or coated, with the image of a pattern of its albedo."""
     image = PATTERNS[pattern](plain.albedo)
     key = "base_color" if "base_color" in plain.bsdf else "reflectance"
@@ -189,14 +192,20 @@ def _patterned(plain: Material, pattern: str) -> Material:
 
 
 @cache
-def _table() -> dict[str, Preset]:
+def _table() -> dict[str, MaterialPreset]:
     toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
-    return {name: _preset_of(values) for name, values in toml.loads(TABLE.read_text(encoding="utf-8")).items()}
+    return {
+        name: _material_preset(name, values) for name, values in toml.loads(TABLE.read_text(encoding="utf-8")).items()
+    }
 
 
-def _preset_of(values: Mapping[str, Any]) -> Preset:
+def _material_preset(name: str, values: Mapping[str, Any]) -> MaterialPreset:
+    """The row called `name`; InputError where its kind is none of `Kind`."""
+    if values.get("kind") not in get_args(Kind):
+        kinds = ", ".join(get_args(Kind))
+        raise InputError(f"{TABLE.name}: {name}: kind: expected one of {kinds}, found {values.get('kind')!r}")
     spectrum = tuple((float(nm), float(value)) for nm, value in values.get("spectrum", ()))
-    return Preset(**{**values, "albedo": _color(values["albedo"]), "spectrum": spectrum})
+    return MaterialPreset(**{**values, "albedo": _color(values["albedo"]), "spectrum": spectrum})
 
 
 def material_names() -> tuple[str, ...]:
@@ -204,7 +213,7 @@ def material_names() -> tuple[str, ...]:
     return tuple(_table())
 
 
-def preset(name: str) -> Preset:
+def material_preset(name: str) -> MaterialPreset:
     """The row called `name`; InputError lists the names where there is none."""
     if name not in _table():
         raise InputError(f"material: expected one of {', '.join(material_names())}, found {name!r}")
@@ -214,10 +223,10 @@ def preset(name: str) -> Preset:
 @cache
 def material(name: str) -> Material:
     """The preset called `name`; InputError lists the names where there is none."""
-    return preset(name).material(name)
+    return material_preset(name).material(name)
 
 
-def customised(
+def customise(
     name: str,
     base: str,
     albedo: Color | None = None,
@@ -231,21 +240,21 @@ def customised(
     refractive index of the coat; tile: metres. Raises InputError for an unknown preset, a number out of range or one
     that the preset has not.
     """
-    row = changed(name, base, albedo, roughness, ior, tile)
-    return replace(material(base), name=name) if row is preset(base) else row.material(name)
+    row = customise_preset(name, base, albedo, roughness, ior, tile)
+    return replace(material(base), name=name) if row is material_preset(base) else row.material(name)
 
 
-def changed(
+def customise_preset(
     name: str,
     base: str,
     albedo: Color | None = None,
     roughness: float | None = None,
     ior: float | None = None,
     tile: float | None = None,
-) -> Preset:
-    """The row `base` with other numbers, as `customised` takes them, for a material called `name`; itself where all are
-    None. Raises InputError as `customised` does."""
-    row = preset(base)
+) -> MaterialPreset:
+    """The row `base` with other numbers, as `customise` takes them, for a material called `name`; itself where all are
+    None. Raises InputError as `customise` does."""
+    row = material_preset(base)
     changes: dict[str, Any] = {}
     if albedo is not None:
         _check_unit(f"material {name}: albedo", albedo)

@@ -63,10 +63,10 @@ def cells(cell: Color, gap: Color = (0.06, 0.06, 0.065), metal: Color = (0.45, 0
     color = color + glass[..., None] * 0.04
     color = color + busbar[..., None] * (np.asarray(metal) - color)
     color = np.asarray(gap) + inside[..., None] * (color - np.asarray(gap))
-    return _encoded(color, seed=6)
+    return _encode(color, seed=6)
 
 
-def _encoded(color: Array, seed: int) -> np.ndarray:
+def _encode(color: Array, seed: int) -> np.ndarray:
     """Linear [H, W, 3] as sRGB bytes, rounded at random so that dark colours keep their mean."""
     noise = np.random.default_rng(seed).uniform(0.0, 1.0, color.shape)
     encoded = 255.0 * np.asarray(srgb_from_linear(np.clip(color, 0.0, 1.0)), np.float64)

@@ -17,10 +17,10 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import read_bytes
 from spacesim.scenes.meshes.gltf_surface import UV_SET, Surfaces
 from spacesim.scenes.meshes.parts import RawPart
-from spacesim.scenes.meshes.textures import LARGEST_FILE, Folder, Notes, embedded
+from spacesim.scenes.meshes.textures import MAX_FILE_BYTES, Folder, Notes, decode_data_uri
 
-LARGEST_IMPLIED = 1 << 24  #: bytes of an accessor without a buffer view, all zeros but for what is sparse; chosen
-MOST_CORNERS = 30_000_000  #: of what the nodes place, chosen: ten million faces of shared vertices
+MAX_IMPLIED_BYTES = 1 << 24  #: bytes of an accessor without a buffer view, all zeros but for what is sparse
+MAX_CORNERS = 30_000_000  #: of what the nodes place: ten million faces of shared vertices
 A_CORNER = 200  #: bytes of memory that a vertex, or a corner of a face, takes while it is read; 140 were seen
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -43,12 +43,12 @@ def read_gltf(path: Path, notes: Notes) -> list[RawPart]:
             part = _part(file, surfaces, primitive, transform, notes)
             if part is not None:
                 corners += len(part.vertices) + part.faces.size  # nodes may place one mesh any number of times
-                if corners > MOST_CORNERS:
-                    raise InputError(f"expected at most {MOST_CORNERS:,} vertices and corners, found more")
+                if corners > MAX_CORNERS:
+                    raise InputError(f"expected at most {MAX_CORNERS:,} vertices and corners, found more")
                 check_memory(A_CORNER * corners, f"{path}: its mesh")
-                own = name or str(mesh.get("name", ""))
+                part_name = name or str(mesh.get("name", ""))
                 several = len(mesh["primitives"]) > 1 and part.surface is not None
-                parts.append(part.named(f"{own}_{part.surface.name}" if several and part.surface else own))
+                parts.append(part.named(f"{part_name}_{part.surface.name}" if several and part.surface else part_name))
     return parts
 
 
@@ -122,7 +122,7 @@ class _File:
             if "uri" not in entry:
                 data = self._body if index == 0 and self._body is not None else b""
             elif str(entry["uri"])[:5] == "data:":
-                data = embedded(str(entry["uri"]))
+                data = decode_data_uri(str(entry["uri"]))
             else:
                 data = self.folder.read(str(entry["uri"]))
             if len(data) < _index(entry["byteLength"]):
@@ -148,7 +148,7 @@ class _File:
         if width not in widths:
             raise InputError(f"accessor {index}: expected {widths} components, found {str(entry['type'])[:20]}")
         count = _index(entry["count"])
-        most = LARGEST_FILE if "bufferView" in entry else LARGEST_IMPLIED
+        most = MAX_FILE_BYTES if "bufferView" in entry else MAX_IMPLIED_BYTES
         if count * width * dtype.itemsize > most:
             raise InputError(f"accessor {index}: expected at most {most:,} bytes, found {count:,} elements")
         if "bufferView" in entry:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.scenes.meshes.textures import Folder, Notes, Surface, decoded, embedded, unit
+from spacesim.scenes.meshes.textures import Folder, Notes, Surface, clip_to_unit, decode_data_uri, decode_image
 
 UV_SET = "TEXCOORD_{}"
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -57,7 +57,7 @@ class Surfaces:
         return self._known[index]
 
     def _note_the_unused(self, entry: dict[str, Any], name: str) -> None:
-        if any(unit(c, 0.0) > 0 for c in entry.get("emissiveFactor", ())):
+        if any(clip_to_unit(c, 0.0) > 0 for c in entry.get("emissiveFactor", ())):
             self._notes.drop("surfaces do not glow, emission is not used", name)
         if "occlusionTexture" in entry:
             self._notes.drop("baked occlusion is not used, the path tracer finds it", name)
@@ -73,12 +73,15 @@ class Surfaces:
         if old is not None and "pbrMetallicRoughness" not in entry:
             self._notes.change("specular-glossiness materials become dielectrics of their diffuse colour", name)
             color, color_texture = old.get("diffuseFactor", (1, 1, 1)), old.get("diffuseTexture")
-            metallic, roughness, other = 0.0, 1.0 - unit(old.get("glossinessFactor", 1.0)), None
+            metallic, roughness, other = 0.0, 1.0 - clip_to_unit(old.get("glossinessFactor", 1.0)), None
         else:
             color, color_texture = plain.get("baseColorFactor", (1, 1, 1)), plain.get("baseColorTexture")
-            metallic, roughness = unit(plain.get("metallicFactor", 1.0)), unit(plain.get("roughnessFactor", 1.0))
+            metallic, roughness = (
+                clip_to_unit(plain.get("metallicFactor", 1.0)),
+                clip_to_unit(plain.get("roughnessFactor", 1.0)),
+            )
             other = plain.get("metallicRoughnessTexture")
-        used = _Used(self, name)
+        used = _MaterialTextures(self, name)
         base = used.take(color_texture, "base colour")
         combined = used.take(other, "metallic and roughness")
         normal = used.take(entry.get("normalTexture"), "normals")
@@ -89,7 +92,7 @@ class Surfaces:
             pictures["roughness"], pictures["metallic"] = combined[..., 1].copy(), combined[..., 2].copy()
         if normal is not None:
             pictures["normal"] = _scaled_normals(normal, entry["normalTexture"].get("scale", 1.0))
-        red, green, blue = (unit(c) for c in list(color)[:3])
+        red, green, blue = (clip_to_unit(c) for c in list(color)[:3])
         surface = Surface(name, (red, green, blue), metallic, roughness, pictures, used.wrap)
         return surface, used.uv or UvSet(0, np.eye(2, 3))
 
@@ -110,11 +113,11 @@ class Surfaces:
             if "bufferView" in image:
                 data = self._view(image["bufferView"])
             else:
-                data = embedded(uri) if uri.startswith("data:") else self._folder.read(uri)
+                data = decode_data_uri(uri) if uri.startswith("data:") else self._folder.read(uri)
         except InputError as error:
             self._notes.drop("textures that cannot be had are not used", str(error))
             return None
-        return decoded(data, what, self._notes)
+        return decode_image(data, what, self._notes)
 
     def wrap(self, texture: dict[str, Any]) -> str:
         """How a texture continues outside of [0, 1]: "repeat", "clamp" or "mirror"."""
@@ -136,7 +139,7 @@ class Surfaces:
         self._notes.drop(f"textures with other coordinates than the material's first are not used ({what})", name)
 
 
-class _Used:
+class _MaterialTextures:
     """The textures that one material takes: all with the coordinates of the first."""
 
     def __init__(self, surfaces: Surfaces, name: str) -> None:

@@ -7,25 +7,24 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from spacesim.data.mesh import FARTHEST
+from spacesim.data.mesh import MAX_COORDINATE
 from spacesim.scenes.meshes.textures import Notes, Surface
 
 ABSENT = "faces that name vertices which are not there are dropped"
-FLAT = math.radians(0.5)  #: normals of vertices this near to their faces' are theirs, chosen
-MOST_ANGLES = 20_000_000  #: solid angles worth computing to tell cavities from inverted surfaces, chosen
+FLAT = math.radians(0.5)  #: normals of vertices this near to their faces' are theirs
+MAX_SOLID_ANGLES = 20_000_000  #: solid angles worth computing to tell cavities from inverted surfaces
 
 
 @dataclass(frozen=True, eq=False)
 class RawPart:
-    """vertices: [V, 3]; faces: [F, 3] int; uv: [V, 2], v down from the picture's top row, or None; surface: None where
-    the file says nothing of it; normals: [F, 3, 3] at the corners of each face, of any length, or None."""
+    """A part of a mesh file, as it stands there."""
 
     name: str
-    vertices: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray | None = None
-    surface: Surface | None = None
-    normals: np.ndarray | None = None
+    vertices: np.ndarray  #: [V, 3]
+    faces: np.ndarray  #: [F, 3] int
+    uv: np.ndarray | None = None  #: [V, 2], v down from the picture's top row, or None
+    surface: Surface | None = None  #: None where the file says nothing of it
+    normals: np.ndarray | None = None  #: [F, 3, 3] at the corners of each face, of any length, or None
 
     def named(self, name: str) -> "RawPart":
         """The same under another name."""
@@ -37,18 +36,18 @@ class RawPart:
         return replace(self, faces=self.faces[chosen], normals=normals)
 
 
-def sound(part: RawPart, notes: Notes, open_too: bool = False) -> RawPart | None:
+def clean_part(part: RawPart, notes: Notes, open_too: bool = False) -> RawPart | None:
     """`part` (metres) without broken faces, equal corners joined, wound outward where it is closed; None where no face
     is left. open_too: also makes the winding of open surfaces consistent."""
     part = _without_broken_faces(part, notes)
     if not len(part.faces):
         return None
-    part = _joined(part)
+    part = _merge_vertices(part)
     part = _without_repeated_faces(part, notes)
-    return _smooth(_wound(part, notes, open_too))
+    return _smooth(_orient_faces(part, notes, open_too))
 
 
-def merged(parts: list[RawPart]) -> RawPart:
+def merge_parts(parts: list[RawPart]) -> RawPart:
     """Parts of one surface as one part, under the first one's name."""
     shifts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     uvs = [part.uv for part in parts if part.uv is not None]
@@ -80,21 +79,21 @@ def _edges(faces: np.ndarray) -> np.ndarray:
 
 def _without_broken_faces(part: RawPart, notes: Notes) -> RawPart:
     faces = part.faces
-    known = ((faces >= 0) & (faces < len(part.vertices))).all(axis=1)
-    if not known.all():
-        notes.drop(ABSENT, f"{(~known).sum():,} of {part.name}")
-        part = part.with_faces(np.flatnonzero(known))
+    in_range = ((faces >= 0) & (faces < len(part.vertices))).all(axis=1)
+    if not in_range.all():
+        notes.drop(ABSENT, f"{(~in_range).sum():,} of {part.name}")
+        part = part.with_faces(np.flatnonzero(in_range))
     with np.errstate(invalid="ignore"):
-        fine = (np.abs(part.vertices) <= FARTHEST).all(axis=1)
+        fine = (np.abs(part.vertices) <= MAX_COORDINATE).all(axis=1)
     uv = part.uv
     if uv is not None:
         with np.errstate(invalid="ignore"):
             uv = np.where(np.abs(uv) <= 1e6, uv, 0.0)
-    whole = fine[part.faces].all(axis=1)
-    if not whole.all():
-        kind = f"faces with a vertex that is not finite or beyond {FARTHEST:g} m are dropped"
-        notes.drop(kind, f"{(~whole).sum():,} of {part.name}")
-        part = part.with_faces(whole)
+    finite = fine[part.faces].all(axis=1)
+    if not finite.all():
+        kind = f"faces with a vertex that is not finite or beyond {MAX_COORDINATE:g} m are dropped"
+        notes.drop(kind, f"{(~finite).sum():,} of {part.name}")
+        part = part.with_faces(finite)
     corners = np.where(fine[:, None], part.vertices, 0.0)[part.faces]
     sides = corners - np.roll(corners, 1, axis=1)
     doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
@@ -105,7 +104,7 @@ def _without_broken_faces(part: RawPart, notes: Notes) -> RawPart:
     return replace(part, uv=uv)
 
 
-def _joined(part: RawPart) -> RawPart:
+def _merge_vertices(part: RawPart) -> RawPart:
     """Equal vertices as one, where their texture coordinates are equal, too; no vertex without a face."""
     used, faces = np.unique(part.faces, return_inverse=True)
     faces = faces.reshape(-1, 3)
@@ -116,9 +115,11 @@ def _joined(part: RawPart) -> RawPart:
     order = np.argsort(first, kind="stable")  # the file's order
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    kept = first[order]
+    representatives = first[order]
     faces = rank[inverse.reshape(-1)][faces]
-    return replace(part, vertices=vertices[kept], faces=faces, uv=None if uv is None else uv[kept])
+    return replace(
+        part, vertices=vertices[representatives], faces=faces, uv=None if uv is None else uv[representatives]
+    )
 
 
 def _without_repeated_faces(part: RawPart, notes: Notes) -> RawPart:
@@ -132,12 +133,12 @@ def _without_repeated_faces(part: RawPart, notes: Notes) -> RawPart:
     return part.with_faces(first)
 
 
-def _wound(part: RawPart, notes: Notes, open_too: bool) -> RawPart:
+def _orient_faces(part: RawPart, notes: Notes, open_too: bool) -> RawPart:
     """Consistent winding on each connected piece that is closed, and outward (open_too: on open ones, consistent)."""
     faces = corner_ids(part.vertices)[part.faces]
     _, edge_of, uses = np.unique(_edges(faces), return_inverse=True, return_counts=True)
     edge_of = edge_of.reshape(-1)
-    turned, piece = _agreement(faces, edge_of, uses)
+    turned, piece = _consistent_winding(faces, edge_of, uses)
     pieces = int(piece.max()) + 1
     is_open = np.zeros(pieces, dtype=bool)
     np.logical_or.at(is_open, np.repeat(piece, 3), uses[edge_of] != 2)
@@ -184,7 +185,7 @@ def _smooth(part: RawPart) -> RawPart:
     return replace(part, normals=np.where(fine[..., None], side[..., None] * normals, facets))
 
 
-def _agreement(faces: np.ndarray, edge_of: np.ndarray, uses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _consistent_winding(faces: np.ndarray, edge_of: np.ndarray, uses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """([F] bool: to be turned, so that neighbours agree; [F] connected piece).
 
     Faces with a common edge of two agree where they run along it in opposite senses. Each face stands twice in a graph,
@@ -217,7 +218,7 @@ def _inverted(vertices: np.ndarray, faces: np.ndarray, piece: np.ndarray, is_ope
     volumes = np.bincount(piece, np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0
     inverted = ~is_open & (volumes < 0)
     outer = ~is_open & (volumes > 0)
-    if not outer.any() or inverted.sum() * outer[piece].sum() > MOST_ANGLES:
+    if not outer.any() or inverted.sum() * outer[piece].sum() > MAX_SOLID_ANGLES:
         return inverted
     shell = corners[outer[piece]]
     for index in np.flatnonzero(inverted):

@@ -13,12 +13,12 @@ from spacesim.data.errors import InputError
 from spacesim.scenes.config import UNITS, UP_AXES
 from spacesim.scenes.materials.table import Material
 from spacesim.scenes.meshes.gltf import read_gltf
-from spacesim.scenes.meshes.parts import RawPart, corner_ids, is_closed, merged, sound
+from spacesim.scenes.meshes.parts import RawPart, clean_part, corner_ids, is_closed, merge_parts
 from spacesim.scenes.meshes.table import read_table
-from spacesim.scenes.meshes.textures import LARGEST_FILE, UNTOLD, Notes, Surface, material_of, plain_name
+from spacesim.scenes.meshes.textures import DEFAULT_PRESET, MAX_FILE_BYTES, Notes, Surface, material_of, plain_name
 from spacesim.scenes.spacecraft import Part, Spacecraft
 
-MOST_PARTS = 255  #: part ids are bytes
+MAX_PARTS = 255  #: part ids are bytes
 
 _READERS: dict[str, Callable[[Path, Notes], list[RawPart]]] = {
     ".glb": read_gltf,
@@ -93,19 +93,19 @@ def read_mesh(
     try:
         with np.errstate(all="ignore"):
             raw = reader(path, notes)
-            raw = [_turned(part, factor, _TURNS[axis]) for part in raw]
-            parts = _sound_parts(path, raw, notes, two_sided)
+            raw = [_convert_axes(part, factor, _TURNS[axis]) for part in raw]
+            parts = _clean_parts(path, raw, notes, two_sided)
             keep = [None if _is_replaced(part, replaced) else part.surface for part in parts]
             if any(part.surface is None and not _is_replaced(part, replaced) for part in parts):
-                notes.change(f"parts without a material get the preset {UNTOLD}")
+                notes.change(f"parts without a material get the preset {DEFAULT_PRESET}")
             return _spacecraft(path, parts, keep, notes, two_sided is True)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except MemoryError:
         raise InputError(f"{path}: expected a mesh that fits into memory, found a larger one") from None
     except Exception as error:  # trimesh and damaged documents raise what they like
-        found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise InputError(f"{path}: expected a sound {path.suffix.lower()} file, found damage ({found})") from None
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise InputError(f"{path}: expected a sound {path.suffix.lower()} file, found damage ({reason})") from None
 
 
 def _reader(path: Path) -> Callable[[Path, Notes], list[RawPart]]:
@@ -128,12 +128,12 @@ def _reader(path: Path) -> Callable[[Path, Notes], list[RawPart]]:
         raise InputError(f"{path}: expected a mesh file, found {getattr(error, 'strerror', None) or error}") from None
     if not size:
         raise InputError(f"{path}: expected a mesh file, found an empty one")
-    if size > LARGEST_FILE:
-        raise InputError(f"{path}: expected at most {LARGEST_FILE:,} bytes, found {size:,}")
+    if size > MAX_FILE_BYTES:
+        raise InputError(f"{path}: expected at most {MAX_FILE_BYTES:,} bytes, found {size:,}")
     return reader
 
 
-def _turned(part: RawPart, factor: float, turn: np.ndarray) -> RawPart:
+def _convert_axes(part: RawPart, factor: float, turn: np.ndarray) -> RawPart:
     normals = None if part.normals is None else part.normals @ turn.T
     return replace(part, vertices=factor * part.vertices @ turn.T, normals=normals)
 
@@ -146,17 +146,17 @@ def _factor(units: str, scale: float) -> float:
     return UNITS[units] * float(scale)
 
 
-def _sound_parts(path: Path, raw: list[RawPart], notes: Notes, two_sided: bool | None) -> list[RawPart]:
-    """Parts with faces, under plain and different names, at most MOST_PARTS."""
+def _clean_parts(path: Path, raw: list[RawPart], notes: Notes, two_sided: bool | None) -> list[RawPart]:
+    """Parts with faces, under plain and different names, at most MAX_PARTS."""
     if not any(len(part.faces) for part in raw):
         raise InputError("expected faces, found none")
     named = [part.named(plain_name(part.name) or "part") for part in raw if len(part.faces)]
-    cleaned = [sound(part, notes, two_sided is False) for part in named]
+    cleaned = [clean_part(part, notes, two_sided is False) for part in named]
     parts = [part for part in cleaned if part is not None]
     if not parts:
         raise InputError("expected faces with an area and finite vertices, found none")
-    if len(parts) > MOST_PARTS:
-        parts = _fewer(parts, notes)
+    if len(parts) > MAX_PARTS:
+        parts = _merge_by_material(parts, notes)
     taken: set[str] = set()
     for part in parts:
         _note_mirrored(part, notes)
@@ -174,16 +174,16 @@ def _note_mirrored(part: RawPart, notes: Notes) -> None:
         notes.change(kind, f"{mirrored.sum():,} faces of {part.name}")
 
 
-def _fewer(parts: list[RawPart], notes: Notes) -> list[RawPart]:
+def _merge_by_material(parts: list[RawPart], notes: Notes) -> list[RawPart]:
     """Parts of the same material as one."""
     groups: dict[tuple[int, bool], list[RawPart]] = {}
     for part in parts:
         groups.setdefault((id(part.surface), part.uv is None), []).append(part)
-    if len(groups) > MOST_PARTS:
-        raise InputError(f"expected at most {MOST_PARTS} materials in {len(parts):,} parts, found {len(groups):,}")
-    notes.change(f"{len(parts):,} parts are more than {MOST_PARTS}: those of one material become one part")
-    joined = [merged(group) for group in groups.values()]
-    names = [plain_name(part.surface.name) if part.surface is not None else UNTOLD for part in joined]
+    if len(groups) > MAX_PARTS:
+        raise InputError(f"expected at most {MAX_PARTS} materials in {len(parts):,} parts, found {len(groups):,}")
+    notes.change(f"{len(parts):,} parts are more than {MAX_PARTS}: those of one material become one part")
+    joined = [merge_parts(group) for group in groups.values()]
+    names = [plain_name(part.surface.name) if part.surface is not None else DEFAULT_PRESET for part in joined]
     return [part.named(name or "part") for part, name in zip(joined, names, strict=True)]
 
 
@@ -205,23 +205,23 @@ def _spacecraft(
 ) -> tuple[Spacecraft, MeshReport]:
     """The parts `raw` with the materials of `surfaces`, one each, None UNTOLD."""
     name = plain_name(path.stem) or "mesh"
-    made: dict[tuple[int, bool], Material] = {}
+    materials: dict[tuple[int, bool], Material] = {}
     parts = []
     for part, surface in zip(raw, surfaces, strict=True):
         wrap = both_sides and is_closed(part.faces)
         key = (id(surface), wrap)
-        if key not in made:
-            found = material_of(surface, name, path.name, notes)
-            made[key] = both_sided(found) if wrap else found
+        if key not in materials:
+            material = material_of(surface, name, path.name, notes)
+            materials[key] = make_two_sided(material) if wrap else material
         normals = None if part.normals is None else part.normals.reshape(-1, 3)
-        parts.append(Part(part.name, _trimesh(part), made[key], normals=normals))
+        parts.append(Part(part.name, _trimesh(part), materials[key], normals=normals))
     vertices = np.concatenate([part.vertices for part in raw])
-    whole = merged([replace(part, uv=None) for part in raw])
+    merged = merge_parts([replace(part, uv=None) for part in raw])
     report = MeshReport(
         file=path.name,
         parts=len(parts),
         faces=sum(len(part.faces) for part in raw),
-        watertight=is_closed(corner_ids(whole.vertices)[whole.faces]),
+        watertight=is_closed(corner_ids(merged.vertices)[merged.faces]),
         bounds=np.stack([vertices.min(axis=0), vertices.max(axis=0)]),
         materials=tuple(dict.fromkeys(part.material.name for part in parts)),
         textures=len({id(picture) for surface in surfaces if surface for picture in surface.pictures.values()}),
@@ -231,7 +231,7 @@ def _spacecraft(
     return Spacecraft(name, tuple(parts)), report
 
 
-def both_sided(material: Material) -> Material:
+def make_two_sided(material: Material) -> Material:
     """`material` that is the same from behind."""
     if material.bsdf["type"] == "twosided":
         return material

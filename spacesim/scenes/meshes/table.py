@@ -12,10 +12,10 @@ import trimesh
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_bytes
 from spacesim.data.images import linear_from_srgb
-from spacesim.data.mesh import Beside, check_promise
+from spacesim.data.mesh import MeshFolderResolver, check_header_counts
 from spacesim.scenes.materials.table import Color
 from spacesim.scenes.meshes.parts import ABSENT, RawPart
-from spacesim.scenes.meshes.textures import NORMALS, Folder, Notes, Surface, check_picture, decoded, unit
+from spacesim.scenes.meshes.textures import NORMALS, Folder, Notes, Surface, check_picture, clip_to_unit, decode_image
 
 _UNUSED = ("ke", "map_ke", "map_ks", "map_ka", "map_bump", "bump", "map_d", "disp", "norm", "map_ns", "refl")
 
@@ -24,7 +24,7 @@ def read_table(path: Path, notes: Notes) -> list[RawPart]:
     """The triangles of an obj, stl, ply or off file. Raises InputError, or whatever trimesh raises on damaged data."""
     kind = path.suffix.lower().lstrip(".")
     data = read_bytes(path)
-    check_promise(kind, data)
+    check_header_counts(kind, data)
     smooth = (kind == "obj" and b"\nvn " in data) or (kind == "ply" and b" nx" in data[: data.find(b"end_header")])
     if not data.isascii():
         data = _as_utf8(kind, data)
@@ -32,34 +32,34 @@ def read_table(path: Path, notes: Notes) -> list[RawPart]:
         data = _with_plain_indices(data, path.stem, notes)
     resolver = _Files(path, notes)
     try:
-        scene = _loaded(data, kind, resolver)
+        scene = _load(data, kind, resolver)
     except IndexError:
         if kind != "obj":
             raise
-        scene = _loaded(_with_plain_indices(data, path.stem, notes), kind, resolver)
+        scene = _load(_with_plain_indices(data, path.stem, notes), kind, resolver)
     parts = []
     for name, mesh in scene.geometry.items():
         if not isinstance(mesh, trimesh.Trimesh):
             notes.drop("points and lines are not rendered")
         elif len(mesh.faces):
-            own = name if len(scene.geometry) > 1 else path.stem
+            part_name = name if len(scene.geometry) > 1 else path.stem
             surface = _surface(mesh, resolver, notes)
             uv = _uv(mesh) if surface is not None and surface.pictures else None
             if surface is not None and surface.pictures and uv is None:
                 notes.drop("textures of parts without texture coordinates are not used", surface.name)
                 surface = surface.bare()
             normals = _normals(mesh, notes) if smooth else None
-            parts.append(RawPart(own, np.array(mesh.vertices), np.array(mesh.faces), uv, surface, normals))
+            parts.append(RawPart(part_name, np.array(mesh.vertices), np.array(mesh.faces), uv, surface, normals))
     return parts
 
 
-def _loaded(data: bytes, kind: str, resolver: "_Files") -> trimesh.Scene:
+def _load(data: bytes, kind: str, resolver: "_Files") -> trimesh.Scene:
     options = {"split_objects": True} if kind == "obj" else {}
     # `load` with force="scene": its successor load_scene is not in trimesh 4.5
     return trimesh.load(io.BytesIO(data), kind, resolver=resolver, force="scene", process=False, **options)
 
 
-class _Files(Beside):
+class _Files(MeshFolderResolver):
     """What trimesh may open while it reads a file: what `Folder` allows; the rest is noted."""
 
     def __init__(self, path: Path, notes: Notes) -> None:
@@ -120,12 +120,14 @@ def _with_plain_indices(data: bytes, name: str, notes: Notes) -> bytes:
             for column, total in zip(columns, totals, strict=False)
         ]
         texts = (
-            b"/".join(b"%d" % index if known and index else b"" for index, known in zip(corner, there, strict=False))
+            b"/".join(
+                b"%d" % index if present and index else b"" for index, present in zip(corner, there, strict=False)
+            )
             for corner in corners
         )
-        kept = any(there[:1])
-        missing += not kept
-        lines[i] = b"f " + b" ".join(text.rstrip(b"/") for text in texts) if kept else b""
+        keeps_index = any(there[:1])
+        missing += not keeps_index
+        lines[i] = b"f " + b" ".join(text.rstrip(b"/") for text in texts) if keeps_index else b""
     if missing:
         notes.drop(ABSENT, f"{missing:,} of {name}")
     return b"\n".join(lines) + b"\n"
@@ -151,11 +153,11 @@ def _uv(mesh: trimesh.Trimesh) -> np.ndarray | None:
 def _normals(mesh: trimesh.Trimesh, notes: Notes) -> np.ndarray | None:
     """[F, 3, 3] normals at the corners of faces, as the file has them; None (and a note) where trimesh did not keep
     them. Its `vertex_normals` would make up others."""
-    found = mesh._cache["vertex_normals"]  # None where there is nothing
-    if np.shape(found) != np.shape(mesh.vertices):
+    normals = mesh._cache["vertex_normals"]  # None where there is nothing
+    if np.shape(normals) != np.shape(mesh.vertices):
         notes.drop(NORMALS)
         return None
-    return np.asarray(found, dtype=np.float64)[mesh.faces]
+    return np.asarray(normals, dtype=np.float64)[mesh.faces]
 
 
 def _surface(mesh: trimesh.Trimesh, files: _Files, notes: Notes) -> Surface | None:
@@ -165,14 +167,14 @@ def _surface(mesh: trimesh.Trimesh, files: _Files, notes: Notes) -> Surface | No
         mean = linear_from_srgb(np.asarray(colors)[:, :3] / 255.0).mean(axis=0)
         notes.change("colours of vertices or faces become one mean colour, taken as sRGB and matt")
         return Surface("colour", _color(mean), matt=True)
-    found = getattr(visual, "material", None)
-    if found is None or type(found).__name__ != "SimpleMaterial":
+    material = getattr(visual, "material", None)
+    if material is None or type(material).__name__ != "SimpleMaterial":
         return None
-    values = {str(key).lower(): value for key, value in (found.kwargs or {}).items()}
-    image = found.image if getattr(found.image, "fp", None) is not None else None  # else trimesh's own stand-in
+    values = {str(key).lower(): value for key, value in (material.kwargs or {}).items()}
+    image = material.image if getattr(material.image, "fp", None) is not None else None  # else trimesh's own stand-in
     if image is None and not values:
         return None  # texture coordinates alone
-    name = str(values.get("name") or getattr(found, "name", None) or "texture")[:80]
+    name = str(values.get("name") or getattr(material, "name", None) or "texture")[:80]
     return _obj_surface(name, values, image, files, notes)
 
 
@@ -192,12 +194,12 @@ def _obj_surface(name: str, values: dict[str, Any], image: Any, files: _Files, n
             pictures["base_color"] = picture
     default = 1.0 if pictures else 0.8
     color = _color((_numbers(values.get("kd"), default) * 3)[:3])
-    metallic = unit(_numbers(values.get("pm"), 0.0)[0])
+    metallic = clip_to_unit(_numbers(values.get("pm"), 0.0)[0])
     glossy = metallic > 0 or "pr" in values or max(_numbers(values.get("ks"), 0.0)) > 0
     exponent = max(_numbers(values.get("ns"), 0.0)[0], 0.0)
     roughness = math.sqrt(math.sqrt(2.0 / (exponent + 2.0)))
     if "pr" in values:
-        roughness = unit(_numbers(values["pr"], 1.0)[0])
+        roughness = clip_to_unit(_numbers(values["pr"], 1.0)[0])
     return Surface(name, color, metallic, roughness, pictures, matt=not glossy)
 
 
@@ -205,7 +207,7 @@ def _picture(image: Any, name: str, files: _Files, notes: Notes) -> np.ndarray |
     """trimesh has opened the image; its pixels are read here, where damage and size are looked after."""
     if id(image) not in files.pictures:
         image.fp.seek(0)
-        files.pictures[id(image)] = decoded(image.fp.read(), name, notes)
+        files.pictures[id(image)] = decode_image(image.fp.read(), name, notes)
     return files.pictures[id(image)]
 
 
@@ -221,5 +223,5 @@ def _numbers(value: Any, default: float) -> list[float]:
 
 
 def _color(values: Any) -> Color:
-    red, green, blue = (unit(float(v)) for v in values)
+    red, green, blue = (clip_to_unit(float(v)) for v in values)
     return red, green, blue

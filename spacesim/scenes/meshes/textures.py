@@ -21,17 +21,17 @@ from spacesim.data.files import read_bytes
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.scenes.materials.table import SMOOTHEST, WHITEST, Color, Material, lambertian, material, principled
 
-LARGEST_FILE = 2 << 30  #: bytes of a file that is read, chosen
-LARGEST_PICTURE = 1 << 26  #: pixels of a texture that is read (8192 x 8192), chosen
-MOST_TEXTURE_PIXELS = 1 << 27  #: of all textures of a file, chosen: eight of 4096 x 4096
+MAX_FILE_BYTES = 2 << 30  #: bytes of a file that is read
+MAX_PICTURE_PIXELS = 1 << 26  #: pixels of a texture that is read (8192 x 8192)
+MAX_TEXTURE_PIXELS = 1 << 27  #: of all textures of a file: eight of 4096 x 4096
 DECODING = 20  #: bytes that a pixel takes while it is decoded, at most
-WIDEST_PICTURE = 4096  #: pixels; wider or higher textures are reduced to it, chosen
+MAX_TEXTURE_SIDE = 4096  #: pixels; wider or higher textures are reduced to it
 
 NORMALS = "normals of vertices are not used, facets are flat"
 
 _UNDECODED = "textures that cannot be decoded are not used"
 
-UNTOLD = "grey-paint"  #: preset of parts whose file says nothing of their surface, chosen
+DEFAULT_PRESET = "grey-paint"  #: preset of parts whose file says nothing of their surface
 
 
 class Notes:
@@ -58,8 +58,8 @@ def _sentence(kind: str, subjects: list[str]) -> str:
     named = [name for name in subjects if name]
     if not named:
         return kind
-    more = f" and {len(named) - 5} more" if len(named) > 5 else ""
-    return f"{kind}: {', '.join(named[:5])}{more}"
+    others = f" and {len(named) - 5} more" if len(named) > 5 else ""
+    return f"{kind}: {', '.join(named[:5])}{others}"
 
 
 def plain_name(name: Any) -> str:
@@ -88,15 +88,15 @@ class Folder:
                 if relative.is_absolute() or not target.is_relative_to(self.root):
                     raise InputError(f"{uri[:80]!r} lies outside of the mesh's folder")
                 if target.is_file():
-                    return read_bytes(target, "a file", LARGEST_FILE)
+                    return read_bytes(target, "a file", MAX_FILE_BYTES)
             except (OSError, ValueError, RuntimeError) as error:  # a name with NUL, a loop of links, no permission
                 if isinstance(error, InputError):
                     raise
                 raise InputError(f"{uri[:80]!r} cannot be read ({type(error).__name__})") from None
-        raise InputError(f"{uri[:80]!r} is not there")
+        raise InputError(f"{uri[:80]!r} is {'no regular file' if target.exists() else 'not there'}")
 
 
-def embedded(uri: str) -> bytes:
+def decode_data_uri(uri: str) -> bytes:
     """The bytes in a data URI; InputError where they are not base64."""
     head, _, payload = uri.partition(",")
     try:
@@ -107,16 +107,16 @@ def embedded(uri: str) -> bytes:
         raise InputError("expected base64 data in a data URI, found something else") from None
 
 
-def decoded(data: bytes, what: str, notes: Notes) -> np.ndarray | None:
+def decode_image(data: bytes, what: str, notes: Notes) -> np.ndarray | None:
     """[H, W, 3] uint8 picture of an encoded image, None (and a note) where it cannot be had.
 
-    Alpha is left out, 16 bits are cut to 8, and what is wider than WIDEST_PICTURE is reduced.
+    Alpha is left out, 16 bits are cut to 8, and what is wider than MAX_TEXTURE_SIDE is reduced.
     """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             image = Image.open(io.BytesIO(data))
-            if image.width * image.height <= LARGEST_PICTURE and notes.pixels < MOST_TEXTURE_PIXELS:
+            if image.width * image.height <= MAX_PICTURE_PIXELS and notes.pixels < MAX_TEXTURE_PIXELS:
                 check_memory(DECODING * image.width * image.height, f"{what}: decoding it")
                 notes.pixels += image.width * image.height
                 return _rgb_picture(image, what, notes)
@@ -125,7 +125,7 @@ def decoded(data: bytes, what: str, notes: Notes) -> np.ndarray | None:
     except Exception as error:  # Pillow raises what it likes on damaged data
         notes.drop(_UNDECODED, f"{what} ({type(error).__name__})")
         return None
-    limit = f"{LARGEST_PICTURE:,} pixels, or {MOST_TEXTURE_PIXELS:,} in all"
+    limit = f"{MAX_PICTURE_PIXELS:,} pixels, or {MAX_TEXTURE_PIXELS:,} in all"
     notes.drop(f"textures of more than {limit} are not used", what)
     return None
 
@@ -146,8 +146,8 @@ def _rgb_picture(image: Any, what: str, notes: Notes) -> np.ndarray:
         values = np.asarray(image, dtype=np.float64)
         grey = np.clip(values / (257.0 if image.mode.startswith("I") else 1.0 / 255.0), 0, 255)
         image = Image.fromarray(np.round(grey).astype(np.uint8))
-    if max(image.size) > WIDEST_PICTURE:
-        factor = WIDEST_PICTURE / max(image.size)
+    if max(image.size) > MAX_TEXTURE_SIDE:
+        factor = MAX_TEXTURE_SIDE / max(image.size)
         size = (max(1, round(image.width * factor)), max(1, round(image.height * factor)))
         notes.change(
             "textures are reduced in size", f"{what} from {image.width} x {image.height} to {size[0]} x {size[1]}"
@@ -162,24 +162,21 @@ def _rgb_picture(image: Any, what: str, notes: Notes) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A material as its file gives it, already free of what cannot be had.
-
-    base_color: linear RGB; pictures: "base_color" [H, W, 3] sRGB-encoded, "metallic" and "roughness" [H, W],
-    "normal" [H, W, 3], all uint8; the numbers multiply the pictures. wrap: "repeat", "clamp" or "mirror".
-    matt: without gloss and metal, an ideally diffuse surface.
-    """
+    """A material as its file gives it, already free of what cannot be had."""
 
     name: str
-    base_color: Color = (1.0, 1.0, 1.0)
+    base_color: Color = (1.0, 1.0, 1.0)  #: linear RGB
     metallic: float = 0.0
     roughness: float = 1.0
+    #: "base_color" [H, W, 3] sRGB-encoded, "metallic" and "roughness" [H, W], "normal" [H, W, 3], all uint8; the
+    #: numbers multiply the pictures
     pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
-    wrap: str = "repeat"
-    matt: bool = False
+    wrap: str = "repeat"  #: "repeat", "clamp" or "mirror"
+    matt: bool = False  #: without gloss and metal, an ideally diffuse surface
 
     def tinted(self, tint: Any) -> "Surface":
         """The same under a factor [3] on its colour."""
-        red, green, blue = (float(a) * unit(b) for a, b in zip(self.base_color, tint, strict=True))
+        red, green, blue = (float(a) * clip_to_unit(b) for a, b in zip(self.base_color, tint, strict=True))
         return replace(self, base_color=(red, green, blue))
 
     def bare(self) -> "Surface":
@@ -187,7 +184,7 @@ class Surface:
         return replace(self, pictures={})
 
 
-def unit(value: Any, default: float = 1.0) -> float:
+def clip_to_unit(value: Any, default: float = 1.0) -> float:
     """`value` clipped to [0, 1]; `default` where it is no finite number."""
     number = float(value) if isinstance(value, (int, float, np.number)) else math.nan
     return min(max(number, 0.0), 1.0) if math.isfinite(number) else default
@@ -196,11 +193,11 @@ def unit(value: Any, default: float = 1.0) -> float:
 def material_of(surface: Surface | None, prefix: str, file: str, notes: Notes) -> Material:
     """The Material of a surface (None: the preset UNTOLD). Its name begins with `prefix`, its source names `file`."""
     if surface is None:
-        return material(UNTOLD)
+        return material(DEFAULT_PRESET)
     name = f"{prefix}/{plain_name(surface.name) or 'material'}"
     source = f"material {surface.name!r} of {file}: its maker's numbers, not measured"
-    made = _matt(surface, name, source) if surface.matt else _glossy(surface, name, source, notes)
-    return replace(made, bsdf=_wrapped(made.bsdf, surface.wrap))
+    result = _matt(surface, name, source) if surface.matt else _glossy(surface, name, source, notes)
+    return replace(result, bsdf=_with_wrap_mode(result.bsdf, surface.wrap))
 
 
 def _matt(surface: Surface, name: str, source: str) -> Material:
@@ -253,9 +250,9 @@ def _tinted_picture(picture: np.ndarray, factor: Color, most: float) -> tuple[np
     return tinted, (mean[0] / pixels, mean[1] / pixels, mean[2] / pixels)
 
 
-def _wrapped(bsdf: Mapping[str, Any], wrap: str) -> Mapping[str, Any]:
+def _with_wrap_mode(bsdf: Mapping[str, Any], wrap: str) -> Mapping[str, Any]:
     """`bsdf` with the wrap mode of its bitmaps, where it is not Mitsuba's own, "repeat"."""
     if wrap == "repeat":
         return bsdf
-    nested = {key: _wrapped(value, wrap) if isinstance(value, Mapping) else value for key, value in bsdf.items()}
+    nested = {key: _with_wrap_mode(value, wrap) if isinstance(value, Mapping) else value for key, value in bsdf.items()}
     return {**nested, "wrap_mode": wrap} if nested.get("type") == "bitmap" else nested

@@ -33,14 +33,14 @@ def _bus() -> list[Part]:
     x, y, z = 0.5 * BUS
     deck = [BUS[0] + 0.09, BUS[1] + 0.09, 0.04]
     ring = s.tube([0, 0, -z - 0.14], [0, 0, -z - 0.03], 0.38, 0.43)
-    nozzle = s.revolved([(0.155, -0.26), (0.17, -0.26), (0.05, 0), (0.035, 0)])
+    nozzle = s.revolve([(0.155, -0.26), (0.17, -0.26), (0.05, 0), (0.035, 0)])
     nozzle.apply_translation([0, 0, -z - 0.03])
     rails = [s.box([0.05, 0.05, BUS[2]], [i * x, j * y, 0]) for i in (-1, 1) for j in (-1, 1)]
     return [
         Part("bus", s.crumpled_box(BUS, levels=4, depth=0.007, seed=1), material("gold-mli")),
         Part("deck_top", s.box(deck, [0, 0, z + 0.01]), material("carbon-fibre")),
         Part("deck_bottom", s.box(deck, [0, 0, -z - 0.01]), material("carbon-fibre")),
-        Part("rails", s.joined(rails), material("bare-aluminium")),
+        Part("rails", s.join_meshes(rails), material("bare-aluminium")),
         Part("radiator", s.box([0.03, 0.9, 1.0], [-x - 0.01, 0, 0.1]), material("white-paint")),
         Part("adapter_ring", ring, material("bare-aluminium")),
         Part("nozzle", nozzle, material("bare-aluminium")),
@@ -70,7 +70,7 @@ def _panel(name: str, side: float) -> list[Part]:
     ]
     solids = [
         ("panel", substrate, material("carbon-fibre")),
-        ("cells", s.joined(cells), material("solar-cell")),
+        ("cells", s.join_meshes(cells), material("solar-cell")),
         ("yoke", bar, material("bare-aluminium")),
         ("hinge", hub, material("bare-aluminium")),
         ("strut_1", struts[0], material("bare-aluminium")),
@@ -85,19 +85,19 @@ def _panel(name: str, side: float) -> list[Part]:
 def _camera() -> list[Part]:
     """A barrel with a black recess, 0.37 m deep, and a lens at its bottom."""
     start, axis = [0.5 * BUS[0] - 0.03, 0.05, -0.1], [1, 0, 0]
-    barrel = s.revolved([(0.26, 0), (0.26, 0.45), (0.225, 0.45), (0.225, 0)])
-    flange = s.revolved([(0.24, 0), (0.33, 0), (0.33, 0.06), (0.24, 0.06)])
-    recess = s.revolved([(0, 0.02), (0.235, 0.02), (0.235, 0.44), (0.205, 0.44), (0.205, 0.07), (0, 0.07)])
+    barrel = s.revolve([(0.26, 0), (0.26, 0.45), (0.225, 0.45), (0.225, 0)])
+    flange = s.revolve([(0.24, 0), (0.33, 0), (0.33, 0.06), (0.24, 0.06)])
+    recess = s.revolve([(0, 0.02), (0.235, 0.02), (0.235, 0.44), (0.205, 0.44), (0.205, 0.07), (0, 0.07)])
     angle = np.linspace(0.0, np.arcsin(0.17 / 0.4), 9)
     bulge = np.stack([0.4 * np.sin(angle), 0.05 + 0.4 * np.cos(angle) - 0.4 * np.cos(angle[-1])], axis=-1)
-    lens = s.revolved(np.concatenate([[(0, 0.05)], bulge[::-1]]))
+    lens = s.revolve(np.concatenate([[(0, 0.05)], bulge[::-1]]))
     solids = [
         ("camera_barrel", barrel, material("white-paint")),
         ("camera_flange", flange, material("bare-aluminium")),
         ("camera_recess", recess, material("black-paint")),
         ("camera_lens", lens, material("glass")),
     ]
-    return [Part(name, s.placed(mesh, start, axis), surface) for name, mesh, surface in solids]
+    return [Part(name, s.place_mesh(mesh, start, axis), surface) for name, mesh, surface in solids]
 
 
 def _dish() -> list[Part]:
@@ -107,14 +107,14 @@ def _dish() -> list[Part]:
     vertex = foot + np.array([0.0, 0.0, 0.48])
     axis = normalize([0.55, -0.2, 1.0])
     focal = 0.36
-    place = s.frame(vertex, axis)
+    place = s.axis_frame(vertex, axis)
     feed = [0.0, 0.0, focal]
     rim = [(0.4 * np.cos(a), 0.4 * np.sin(a)) for a in np.radians([30.0, 150.0, 270.0])]
     struts = [s.rod([x, y, 0.16 / (4 * focal) - 0.005], feed, 0.008, 12) for x, y in rim]
-    horn = s.revolved([(0, focal - 0.04), (0.055, focal - 0.04), (0.035, focal + 0.05), (0, focal + 0.05)])
+    horn = s.revolve([(0, focal - 0.04), (0.055, focal - 0.04), (0.035, focal + 0.05), (0, focal + 0.05)])
     solids = [
         ("dish", s.dish(0.9, focal, 0.015), material("white-paint-matt")),
-        ("dish_struts", s.joined(struts), material("carbon-fibre")),
+        ("dish_struts", s.join_meshes(struts), material("carbon-fibre")),
         ("dish_feed", horn, material("bare-aluminium")),
         ("dish_hub", s.rod([0, 0, -0.12], [0, 0, -0.01], 0.09, s.SEGMENTS), material("bare-aluminium")),
     ]
@@ -126,9 +126,9 @@ def _dish() -> list[Part]:
 def _sensors() -> list[Part]:
     """Two star trackers with black baffles and a patch antenna on the top deck, a sun sensor on the front."""
     top = 0.5 * BUS[2] + 0.03
-    baffle = s.revolved([(0, 0), (0.06, 0), (0.105, 0.2), (0.098, 0.2), (0.054, 0.03), (0, 0.03)])
+    baffle = s.revolve([(0, 0), (0.06, 0), (0.105, 0.2), (0.098, 0.2), (0.054, 0.03), (0, 0.03)])
     trackers = [
-        s.placed(baffle, [0.42, y, top + 0.1], direction)
+        s.place_mesh(baffle, [0.42, y, top + 0.1], direction)
         for y, direction in ((0.38, [0.5, 0.7, 0.8]), (-0.38, [0.5, -0.7, 0.8]))
     ]
     blocks = [s.box([0.16, 0.16, 0.13], [0.42, y, top + 0.06]) for y in (0.38, -0.38)]

@@ -55,10 +55,10 @@ def _body() -> list[Part]:
     sides = [s.box([0.15, 0.003, 0.074], [x, i * (_Y - 0.0035), 0]) for x in (-0.085, 0.085) for i in (-1, 1)]
     return [
         Part("structure", core, material("black-paint")),
-        Part("rails", s.joined(rails), material("anodised-aluminium")),
-        Part("end_frames", s.joined([*ends, *posts]), material("anodised-aluminium")),
-        Part("ribs", s.joined(ribs), material("anodised-aluminium")),
-        Part("side_panels", s.joined(sides), material("gold-mli")),
+        Part("rails", s.join_meshes(rails), material("anodised-aluminium")),
+        Part("end_frames", s.join_meshes([*ends, *posts]), material("anodised-aluminium")),
+        Part("ribs", s.join_meshes(ribs), material("anodised-aluminium")),
+        Part("side_panels", s.join_meshes(sides), material("gold-mli")),
         Part("radiator", s.box([0.10, 0.19, 0.003], [0.0, 0, -_Z + 0.0033]), material("white-paint")),
     ]
 
@@ -85,33 +85,33 @@ def _wing(name: str, side: float) -> list[Part]:
             hinges.append(s.rod([x - 0.014, side * y, z - 0.001], [x + 0.014, side * y, z - 0.001], 0.0045, 16))
             hinges.append(s.box([0.02, outer - inner + 0.02, 0.002], [x, side * y, z - 0.5 * thick - 0.0008]))
     return [
-        Part(f"wing_boards_{name}", s.joined(boards), material("carbon-fibre")),
-        Part(f"wing_cells_{name}", s.joined(cells), material("solar-cell")),
-        Part(f"wing_diodes_{name}", s.joined(diodes), material("kapton")),
-        Part(f"wing_hinges_{name}", s.joined(hinges), material("bare-aluminium")),
+        Part(f"wing_boards_{name}", s.join_meshes(boards), material("carbon-fibre")),
+        Part(f"wing_cells_{name}", s.join_meshes(cells), material("solar-cell")),
+        Part(f"wing_diodes_{name}", s.join_meshes(diodes), material("kapton")),
+        Part(f"wing_hinges_{name}", s.join_meshes(hinges), material("bare-aluminium")),
     ]
 
 
 def _front() -> list[Part]:
     """+x: a telescope with its hood, a laser rangefinder, a patch antenna."""
     start = [_X - 0.012, 0.055, 0.0]
-    barrel = s.revolved([(0.036, 0), (0.043, 0), (0.043, 0.062), (0.041, 0.062), (0.036, 0.03)])
-    flange = s.revolved([(0.04, 0.005), (0.047, 0.005), (0.047, 0.018), (0.04, 0.018)])
+    barrel = s.revolve([(0.036, 0), (0.043, 0), (0.043, 0.062), (0.041, 0.062), (0.036, 0.03)])
+    flange = s.revolve([(0.04, 0.005), (0.047, 0.005), (0.047, 0.018), (0.04, 0.018)])
     angle = np.linspace(0.0, np.arcsin(0.036 / 0.08), 9)
     bulge = np.stack([0.08 * np.sin(angle), 0.016 + 0.08 * (np.cos(angle) - np.cos(angle[-1]))], axis=-1)
-    lens = s.revolved([(0, 0.012), (0.0365, 0.012), (0.0365, 0.016), *bulge[::-1]])
+    lens = s.revolve([(0, 0.012), (0.0365, 0.012), (0.0365, 0.016), *bulge[::-1]])
     finder = s.box([0.018, 0.07, 0.036], [_X - 0.003, -0.058, 0.024])
     eyes = [s.rod([_X + 0.004, y, 0.024], [_X + 0.016, y, 0.024], 0.012, 32) for y in (-0.075, -0.041)]
     board = s.box([0.003, 0.074, 0.038], [_X - 0.004, -0.058, -0.024])
     patches = [s.box([0.0016, 0.028, 0.028], [_X - 0.002, y, -0.024]) for y in (-0.076, -0.04)]
     return [
-        Part("camera_barrel", s.placed(barrel, start, [1, 0, 0]), material("black-paint")),
-        Part("camera_flange", s.placed(flange, start, [1, 0, 0]), material("bare-aluminium")),
-        Part("camera_lens", s.placed(lens, start, [1, 0, 0]), material("glass")),
+        Part("camera_barrel", s.place_mesh(barrel, start, [1, 0, 0]), material("black-paint")),
+        Part("camera_flange", s.place_mesh(flange, start, [1, 0, 0]), material("bare-aluminium")),
+        Part("camera_lens", s.place_mesh(lens, start, [1, 0, 0]), material("glass")),
         Part("rangefinder", finder, material("anodised-aluminium")),
-        Part("rangefinder_eyes", s.joined(eyes), material("glass")),
+        Part("rangefinder_eyes", s.join_meshes(eyes), material("glass")),
         Part("patch_board", board, material("white-paint")),
-        Part("patches", s.joined(patches), material("gold-mli")),
+        Part("patches", s.join_meshes(patches), material("gold-mli")),
     ]
 
 
@@ -123,13 +123,13 @@ def _back() -> list[Part]:
             foot = np.array([-_X - 0.002, i * 0.085, j * 0.032])
             rods.append(s.rod(foot, foot + 0.17 * normalize([-0.35, i * 1.0, j * 0.75]), 0.0016, 10))
             feet.append(s.box([0.014, 0.016, 0.012], foot + np.array([0.002, 0, 0])))
-    nozzle = s.revolved([(0.005, -0.002), (0.007, -0.002), (0.013, 0.024), (0.0115, 0.024)])
-    nozzles = [s.placed(nozzle, [-_X - 0.006, y, z], [-1, 0, 0]) for y in (-0.03, 0.03) for z in (-0.018, 0.018)]
+    nozzle = s.revolve([(0.005, -0.002), (0.007, -0.002), (0.013, 0.024), (0.0115, 0.024)])
+    nozzles = [s.place_mesh(nozzle, [-_X - 0.006, y, z], [-1, 0, 0]) for y in (-0.03, 0.03) for z in (-0.018, 0.018)]
     return [
-        Part("monopoles", s.joined(rods), material("bare-aluminium")),
-        Part("monopole_feet", s.joined(feet), material("white-paint")),
+        Part("monopoles", s.join_meshes(rods), material("bare-aluminium")),
+        Part("monopole_feet", s.join_meshes(feet), material("white-paint")),
         Part("thruster_block", s.box([0.014, 0.1, 0.07], [-_X - 0.001, 0, 0]), material("bare-aluminium")),
-        Part("nozzles", s.joined(nozzles), material("nozzle-alloy")),
+        Part("nozzles", s.join_meshes(nozzles), material("nozzle-alloy")),
         Part("plug", s.box([0.008, 0.02, 0.026], [-_X + 0.004, -0.064, 0.0]), material("black-paint")),
     ]
 
@@ -138,9 +138,9 @@ def _top() -> list[Part]:
     """+z: body cells, a star tracker with its baffle, a GNSS antenna, sun sensors."""
     plate = s.box([0.17, 0.172, 0.0025], [-0.08, 0, _Z - 0.0025])
     cells = s.box([2 * SOLAR_CELL[0], 4 * SOLAR_CELL[1], 0.001], [-0.08, 0, _Z - 0.0009])
-    baffle = s.revolved([(0, 0), (0.02, 0), (0.034, 0.06), (0.0325, 0.06), (0.018, 0.012), (0, 0.012)])
+    baffle = s.revolve([(0, 0), (0.02, 0), (0.034, 0.06), (0.0325, 0.06), (0.018, 0.012), (0, 0.012)])
     block = s.box([0.055, 0.055, 0.026], [0.10, 0.05, _Z + 0.008])
-    tracker = s.placed(baffle, [0.10, 0.054, _Z + 0.016], [0.25, 0.45, 1.0])
+    tracker = s.place_mesh(baffle, [0.10, 0.054, _Z + 0.016], [0.25, 0.45, 1.0])
     sensors = [
         s.box([0.016, 0.016, 0.006], [x, y, _Z + 0.001]) for x, y in ((0.155, -0.09), (0.155, 0.09), (0.04, -0.09))
     ]
@@ -150,5 +150,5 @@ def _top() -> list[Part]:
         Part("tracker_block", block, material("anodised-aluminium")),
         Part("tracker_baffle", tracker, material("black-paint")),
         Part("navigation_antenna", s.box([0.045, 0.045, 0.009], [0.10, -0.045, _Z + 0.001]), material("white-paint")),
-        Part("sun_sensors", s.joined(sensors), material("glass")),
+        Part("sun_sensors", s.join_meshes(sensors), material("glass")),
     ]

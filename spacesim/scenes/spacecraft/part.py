@@ -10,16 +10,18 @@ from spacesim.scenes.materials.table import Material
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A named solid. mesh: body frame, metres, faces outward, watertight in all that is built in; it may carry
-    texture coordinates `mesh.visual.uv` [V, 2]. flat: [3 F, 2] metres, the corners of its faces laid out in the plane
-    where materials with a `tile` repeat; None: each face as seen along the axis that it is nearest to. normals:
-    [3 F, 3] unit, body frame, at the same corners: of the smooth surface that facets stand for in shading; None: facets
-    are flat."""
+    """A named solid."""
 
     name: str
+    #: body frame, metres, faces outward, watertight in all that is built in; it may carry texture coordinates
+    #: `mesh.visual.uv` [V, 2]
     mesh: trimesh.Trimesh
     material: Material
+    #: [3 F, 2] metres, the corners of its faces laid out in the plane where materials with a `tile` repeat; None: each
+    #: face as seen along the axis that it is nearest to
     flat: Array | None = None
+    #: [3 F, 3] unit, body frame, at the same corners: of the smooth surface that facets stand for in shading; None:
+    #: facets are flat
     normals: Array | None = None
 
 

@@ -25,9 +25,9 @@ _SUBDIVISIONS = 6  # 81,920 facets
 _AXES = np.array([1.16, 1.0, 0.87])
 _CRATERS, _CRATER_DIAMETERS = 190, (34.0, 210.0)
 _BOULDERS, _BOULDER_DIAMETERS = 240, (6.0, 40.0)
-_GROUND = 120.0  # metres that the pattern of pits and grains covers: pits of 3 to 17 m, below the least crater, chosen
+_GROUND = 120.0  # metres that the pattern of pits and grains covers: pits of 3 to 17 m, below the least crater
 _DEPTH, _RIM = 0.196, 0.036  # of a fresh simple crater, in diameters (Pike 1977)
-_SHARPNESS = 100.0  # of the rim, chosen
+_SHARPNESS = 100.0  # of the rim
 
 
 def small_body() -> Spacecraft:

@@ -27,7 +27,7 @@ _FRONT, _SHELL, _BAY, _SHROUD, _AFT = 0.5 * LENGTH, 2.6, -1.5, -3.1, -0.5 * LENG
 _TUBE, _WALL = 1.55, 0.06  # radius of light shield and forward shell; thickness
 _BAYS = 12
 
-_SOLAR_TURN_DEG = 20.0  # of the arrays about V2, cells from +V3 towards +V1, chosen
+_SOLAR_TURN_DEG = 20.0  # of the arrays about V2, cells from +V3 towards +V1
 _V1_FROM_Z = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 
 HANDRAIL = lambertian("handrail-yellow", (0.62, 0.42, 0.04), "yellow paint of handrails, chosen after photographs")
@@ -71,8 +71,8 @@ def _tube() -> Solids:
     return [
         ("light_shield", shield, material("silver-mli")),
         ("forward_shell", shell, material("silver-mli")),
-        ("shell_rings", s.joined(rings), material("white-paint")),
-        ("blanket_seams", s.joined(seams), material("anodised-aluminium")),
+        ("shell_rings", s.join_meshes(rings), material("white-paint")),
+        ("blanket_seams", s.join_meshes(seams), material("anodised-aluminium")),
         ("aperture_rim", _ring(_FRONT - 0.09, _TUBE + 0.05, 0.1), material("white-paint")),
         ("interior", _interior(inner), material("black-paint")),
     ]
@@ -86,7 +86,7 @@ def _interior(radius: float) -> trimesh.Trimesh:
         reach = 0.07 + 0.012 * (_FRONT - z)
         teeth += [(lining, z), (lining - reach, z - 0.006), (lining - reach, z - 0.014), (lining, z - 0.02)]
     outside = [(0.0, back), (radius + 0.01, back), (radius + 0.01, _FRONT - 0.02)]
-    return s.revolved([*outside, *teeth, (lining, back + 0.02), (0.0, back + 0.02)])
+    return s.revolve([*outside, *teeth, (lining, back + 0.02), (0.0, back + 0.02)])
 
 
 def _ring(z: float, radius: float, width: float) -> trimesh.Trimesh:
@@ -99,13 +99,14 @@ def _optics() -> Solids:
     vertex, curvature, secondary = -2.1, 11.04, 2.8
     radius = np.linspace(0.3, 1.2, 13)
     face = np.stack([radius, vertex + radius**2 / (2.0 * curvature)], axis=-1)
-    primary = s.revolved([(0.3, vertex - 0.3), (1.2, vertex - 0.3), *face[::-1]])
-    chimney = s.revolved([(0.27, vertex - 0.32), (0.3, vertex - 0.32), (0.19, vertex + 2.9), (0.17, vertex + 2.9)])
-    cone = s.revolved([(0.34, secondary - 0.45), (0.35, secondary - 0.45), (0.29, secondary), (0.28, secondary)])
-    hub = s.revolved([(0, secondary - 0.02), (0.3, secondary - 0.02), (0.3, secondary + 0.45), (0, secondary + 0.45)])
-    mirror = s.revolved([(0, secondary - 0.06), (0.15, secondary - 0.05), (0.15, secondary), (0, secondary)])
+    primary = s.revolve([(0.3, vertex - 0.3), (1.2, vertex - 0.3), *face[::-1]])
+    chimney = s.revolve([(0.27, vertex - 0.32), (0.3, vertex - 0.32), (0.19, vertex + 2.9), (0.17, vertex + 2.9)])
+    cone = s.revolve([(0.34, secondary - 0.45), (0.35, secondary - 0.45), (0.29, secondary), (0.28, secondary)])
+    hub = s.revolve([(0, secondary - 0.02), (0.3, secondary - 0.02), (0.3, secondary + 0.45), (0, secondary + 0.45)])
+    mirror = s.revolve([(0, secondary - 0.06), (0.15, secondary - 0.05), (0.15, secondary), (0, secondary)])
     vanes = [
-        s.turned(s.box([1.2, 0.02, 0.14], [0.88, 0, secondary + 0.2]), 45.0 + 90.0 * i, [0, 0, 1]) for i in range(4)
+        s.rotate_mesh(s.box([1.2, 0.02, 0.14], [0.88, 0, secondary + 0.2]), 45.0 + 90.0 * i, [0, 0, 1])
+        for i in range(4)
     ]
     return [
         ("primary_mirror", primary, material("bare-aluminium")),
@@ -113,7 +114,7 @@ def _optics() -> Solids:
         ("secondary_mirror", mirror, material("bare-aluminium")),
         ("secondary_baffle", cone, material("black-paint")),
         ("secondary_hub", hub, material("black-paint")),
-        ("spider", s.joined(vanes), material("black-paint")),
+        ("spider", s.join_meshes(vanes), material("black-paint")),
     ]
 
 
@@ -131,12 +132,12 @@ def _door() -> Solids:
     swung = [
         ("door", plate, material("silver-mli")),
         ("door_inside", lining, material("black-paint")),
-        ("door_ribs", s.joined(ribs), material("anodised-aluminium")),
-        ("door_arms", s.joined(arms), material("bare-aluminium")),
+        ("door_ribs", s.join_meshes(ribs), material("anodised-aluminium")),
+        ("door_arms", s.join_meshes(arms), material("bare-aluminium")),
     ]
     return [
-        *((name, s.turned(mesh, -DOOR_DEG, [1, 0, 0], hinge), surface) for name, mesh, surface in swung),
-        ("door_lugs", s.joined(lugs), material("bare-aluminium")),
+        *((name, s.rotate_mesh(mesh, -DOOR_DEG, [1, 0, 0], hinge), surface) for name, mesh, surface in swung),
+        ("door_lugs", s.join_meshes(lugs), material("bare-aluminium")),
         ("door_axle", axle, material("bare-aluminium")),
     ]
 
@@ -146,22 +147,22 @@ def _equipment() -> Solids:
     corner, width = 2.06, _BAY - _SHROUD
     flat = corner * np.cos(np.pi / _BAYS)
     inner = _TUBE - _WALL
-    body = s.revolved([(inner, _SHROUD), (corner, _SHROUD), (corner, _BAY), (inner, _BAY)], _BAYS)
+    body = s.revolve([(inner, _SHROUD), (corner, _SHROUD), (corner, _BAY), (inner, _BAY)], _BAYS)
     middle = 0.5 * (_BAY + _SHROUD)
     doors: dict[str, list[trimesh.Trimesh]] = {"silver": [], "white": []}
     latches = []
     for i in range(_BAYS):
         angle = (i + 0.5) * 360.0 / _BAYS
         door = s.box([0.04, 0.88, width - 0.22], [flat, 0, middle])
-        doors["white" if i % 3 == 1 else "silver"].append(s.turned(door, angle, [0, 0, 1]))
+        doors["white" if i % 3 == 1 else "silver"].append(s.rotate_mesh(door, angle, [0, 0, 1]))
         for z in (middle - 0.5, middle + 0.5):
             for y in (-0.36, 0.36):
-                latches.append(s.turned(s.box([0.03, 0.07, 0.07], [flat + 0.03, y, z]), angle, [0, 0, 1]))
+                latches.append(s.rotate_mesh(s.box([0.03, 0.07, 0.07], [flat + 0.03, y, z]), angle, [0, 0, 1]))
     return [
         ("equipment_section", body, material("grey-paint")),
-        ("bay_doors_silver", s.joined(doors["silver"]), material("silver-mli")),
-        ("bay_doors_white", s.joined(doors["white"]), material("white-paint")),
-        ("bay_latches", s.joined(latches), material("anodised-aluminium")),
+        ("bay_doors_silver", s.join_meshes(doors["silver"]), material("silver-mli")),
+        ("bay_doors_white", s.join_meshes(doors["white"]), material("white-paint")),
+        ("bay_latches", s.join_meshes(latches), material("anodised-aluminium")),
         (
             "forward_collar",
             s.tube([0, 0, _BAY - 0.01], [0, 0, _BAY + 0.12], _TUBE - 0.02, 1.72),
@@ -174,7 +175,7 @@ def _shroud() -> Solids:
     """The aft shroud: a cylinder with doors, bands, vents and two radiators."""
     radius = 0.5 * DIAMETER
     skin = radius - 0.03
-    body = s.revolved([(0, _AFT), (skin - 0.04, _AFT), (skin, _AFT + 0.04), (skin, _SHROUD), (0, _SHROUD)])
+    body = s.revolve([(0, _AFT), (skin - 0.04, _AFT), (skin, _AFT + 0.04), (skin, _SHROUD), (0, _SHROUD)])
     bands = [
         s.tube([0, 0, z], [0, 0, z + 0.07], skin - 0.01, radius) for z in (_AFT + 0.06, _AFT + 1.72, _SHROUD - 0.09)
     ]
@@ -184,13 +185,13 @@ def _shroud() -> Solids:
     vents = [_patch(skin, 0.05, low + 0.3, low + 0.75, a - 4, a + 4, 4) for a in (8, 172, 188, 352)]
     return [
         ("aft_shroud", body, material("silver-mli")),
-        ("shroud_bands", s.joined(bands), material("white-paint")),
-        ("guidance_doors", s.joined(upper), material("anodised-aluminium")),
-        ("instrument_doors", s.joined(lower), material("anodised-aluminium")),
-        ("vents", s.joined(vents), material("black-paint")),
+        ("shroud_bands", s.join_meshes(bands), material("white-paint")),
+        ("guidance_doors", s.join_meshes(upper), material("anodised-aluminium")),
+        ("instrument_doors", s.join_meshes(lower), material("anodised-aluminium")),
+        ("vents", s.join_meshes(vents), material("black-paint")),
         ("camera_radiator", _patch(skin, 0.08, low + 1.75, high - 0.1, 241, 254), material("white-paint")),
         ("cooling_radiator", _patch(skin + 0.05, 0.04, low + 0.1, high - 0.2, 62, 82), material("white-paint")),
-        ("radiator_feet", s.joined(_feet(skin, low, high)), material("anodised-aluminium")),
+        ("radiator_feet", s.join_meshes(_feet(skin, low, high)), material("anodised-aluminium")),
     ]
 
 
@@ -222,7 +223,7 @@ def _aft() -> Solids:
         )
         for a in np.radians([10.0, 130.0, 250.0])
     ]
-    cone = s.revolved([(0, 0), (0.11, 0), (0.04, 0.3), (0, 0.3)])
+    cone = s.revolve([(0, 0), (0.11, 0), (0.04, 0.3), (0, 0.3)])
     return [
         (
             "aft_bulkhead",
@@ -230,10 +231,10 @@ def _aft() -> Solids:
             material("white-paint-matt"),
         ),
         ("capture_ring", ring, material("bare-aluminium")),
-        ("capture_posts", s.joined(posts), material("bare-aluminium")),
-        ("berthing_pins", s.joined(pins), material("bare-aluminium")),
-        ("aft_boxes", s.joined(boxes), material("silver-mli")),
-        ("low_gain_antenna_aft", s.placed(cone, [1.2, -0.9, _AFT - 0.01], [0, 0, -1]), material("white-paint")),
+        ("capture_posts", s.join_meshes(posts), material("bare-aluminium")),
+        ("berthing_pins", s.join_meshes(pins), material("bare-aluminium")),
+        ("aft_boxes", s.join_meshes(boxes), material("silver-mli")),
+        ("low_gain_antenna_aft", s.place_mesh(cone, [1.2, -0.9, _AFT - 0.01], [0, 0, -1]), material("white-paint")),
     ]
 
 
@@ -262,16 +263,16 @@ def _array(name: str, side: float) -> Solids:
         for z in (-0.2, 0.2)
     ]
     solids = [
-        (f"array_plates_{name}", s.joined(plates), material("grey-paint")),
-        (f"array_frames_{name}", s.joined(frames), material("anodised-aluminium")),
-        (f"array_cells_{name}", s.joined(cells), material("solar-cell")),
+        (f"array_plates_{name}", s.join_meshes(plates), material("grey-paint")),
+        (f"array_frames_{name}", s.join_meshes(frames), material("anodised-aluminium")),
+        (f"array_cells_{name}", s.join_meshes(cells), material("solar-cell")),
         (f"array_mast_{name}", mast, material("bare-aluminium")),
-        (f"array_braces_{name}", s.joined(braces), material("bare-aluminium")),
+        (f"array_braces_{name}", s.join_meshes(braces), material("bare-aluminium")),
         (f"array_arm_{name}", arm, material("white-paint")),
         (f"array_drive_{name}", s.rod([side * 1.5, 0, 0], [side * 1.72, 0, 0], 0.2, 48), material("silver-mli")),
     ]
     return [
-        (part, s.moved(s.turned(mesh, _SOLAR_TURN_DEG, [1, 0, 0]), [0, 0, middle]), surface)
+        (part, s.translate_mesh(s.rotate_mesh(mesh, _SOLAR_TURN_DEG, [1, 0, 0]), [0, 0, middle]), surface)
         for part, mesh, surface in solids
     ]
 
@@ -280,7 +281,7 @@ def _antenna(name: str, side: float) -> Solids:
     """A high-gain antenna dish at the end of a boom along V3."""
     foot = np.array([0.0, side * (_TUBE - 0.02), 1.75])
     tip = foot + np.array([0.0, side * 3.6, 0.0])
-    place = s.frame(tip + np.array([0, side * 0.15, 0.3]), [0.25 * side, 0.35 * side, 1.0])
+    place = s.axis_frame(tip + np.array([0, side * 0.15, 0.3]), [0.25 * side, 0.35 * side, 1.0])
     focal, rim = 0.5, 0.52
     feed = [0.0, 0.0, focal]
     legs = [
@@ -291,7 +292,7 @@ def _antenna(name: str, side: float) -> Solids:
     hub = s.rod([0, 0, -0.2], [0, 0, -0.01], 0.14, 48)
     dish = [
         (f"dish_{name}", s.dish(1.3, focal, 0.02), material("white-paint-matt")),
-        (f"dish_feed_{name}", s.joined([horn, *legs]), material("anodised-aluminium")),
+        (f"dish_feed_{name}", s.join_meshes([horn, *legs]), material("anodised-aluminium")),
         (f"dish_hub_{name}", hub, material("silver-mli")),
     ]
     hinge = s.box([0.3, 0.2, 0.36], foot + np.array([0, side * 0.07, 0]))
@@ -311,26 +312,28 @@ def _fittings() -> Solids:
     """Magnetic torquers, grapple fixtures, boxes and a low-gain antenna on the tube."""
     torquers, brackets, grapples, pads, boxes = [], [], [], [], []
     for angle in (40.0, 140.0, 220.0, 320.0):
-        torquers.append(s.turned(s.rod([_TUBE + 0.14, 0, -0.85], [_TUBE + 0.14, 0, 1.65], 0.043), angle, [0, 0, 1]))
+        torquers.append(
+            s.rotate_mesh(s.rod([_TUBE + 0.14, 0, -0.85], [_TUBE + 0.14, 0, 1.65], 0.043), angle, [0, 0, 1])
+        )
         for z in (-0.6, 0.4, 1.4):
-            brackets.append(s.turned(s.box([0.16, 0.1, 0.1], [_TUBE + 0.06, 0, z]), angle, [0, 0, 1]))
-        boxes.append(s.turned(s.box([0.2, 0.3, 0.24], [_TUBE + 0.08, 0, _FRONT - 0.5]), angle, [0, 0, 1]))
+            brackets.append(s.rotate_mesh(s.box([0.16, 0.1, 0.1], [_TUBE + 0.06, 0, z]), angle, [0, 0, 1]))
+        boxes.append(s.rotate_mesh(s.box([0.2, 0.3, 0.24], [_TUBE + 0.08, 0, _FRONT - 0.5]), angle, [0, 0, 1]))
     for angle in (65.0, 295.0):
-        pads.append(s.turned(s.rod([_TUBE - 0.02, 0, -0.2], [_TUBE + 0.05, 0, -0.2], 0.28, 48), angle, [0, 0, 1]))
-        grapples.append(s.turned(s.rod([_TUBE + 0.04, 0, -0.2], [_TUBE + 0.4, 0, -0.2], 0.02), angle, [0, 0, 1]))
+        pads.append(s.rotate_mesh(s.rod([_TUBE - 0.02, 0, -0.2], [_TUBE + 0.05, 0, -0.2], 0.28, 48), angle, [0, 0, 1]))
+        grapples.append(s.rotate_mesh(s.rod([_TUBE + 0.04, 0, -0.2], [_TUBE + 0.4, 0, -0.2], 0.02), angle, [0, 0, 1]))
     electronics = [
-        s.turned(s.box([0.22, 0.5, 0.7], [_TUBE + 0.09, 0, z]), a, [0, 0, 1])
+        s.rotate_mesh(s.box([0.22, 0.5, 0.7], [_TUBE + 0.09, 0, z]), a, [0, 0, 1])
         for z, a in ((-0.9, 20.0), (-0.9, 160.0), (1.05, 10.0), (1.05, 190.0), (-0.9, 250.0))
     ]
-    cone = s.revolved([(0, 0), (0.11, 0), (0.04, 0.3), (0, 0.3)])
+    cone = s.revolve([(0, 0), (0.11, 0), (0.04, 0.3), (0, 0.3)])
     return [
-        ("torquers", s.joined(torquers), material("anodised-aluminium")),
-        ("torquer_brackets", s.joined(brackets), material("white-paint")),
-        ("sun_sensors", s.joined(boxes), material("white-paint")),
-        ("grapple_pads", s.joined(pads), material("white-paint")),
-        ("grapple_pins", s.joined(grapples), material("bare-aluminium")),
-        ("electronics", s.joined(electronics), material("silver-mli")),
-        ("low_gain_antenna_front", s.placed(cone, [0, -_TUBE + 0.01, 5.9], [0, -1, 0]), material("white-paint")),
+        ("torquers", s.join_meshes(torquers), material("anodised-aluminium")),
+        ("torquer_brackets", s.join_meshes(brackets), material("white-paint")),
+        ("sun_sensors", s.join_meshes(boxes), material("white-paint")),
+        ("grapple_pads", s.join_meshes(pads), material("white-paint")),
+        ("grapple_pins", s.join_meshes(grapples), material("bare-aluminium")),
+        ("electronics", s.join_meshes(electronics), material("silver-mli")),
+        ("low_gain_antenna_front", s.place_mesh(cone, [0, -_TUBE + 0.01, 5.9], [0, -1, 0]), material("white-paint")),
     ]
 
 
@@ -350,4 +353,4 @@ def _handrails() -> trimesh.Trimesh:
         a, b = np.radians([angle - 11.0, angle + 11.0])
         ends = [1.98 * np.array([np.cos(x), np.sin(x), 0.0]) + [0, 0, _BAY - 0.06] for x in (a, b)]
         rails.append(s.handrail(ends[0], ends[1], ends[0] + ends[1] - [0, 0, 2 * _BAY - 0.12], 0.13, 0.016))
-    return s.joined(rails)
+    return s.join_meshes(rails)

@@ -53,14 +53,14 @@ def _hydrogen_tank() -> Solids:
     wall = [(_RADIUS - 0.03, z) for z in heights]
     front = [(r, _FRONT + z) for r, z in s.dome(_RADIUS - 0.03, 0.38)[1:]]
     back = [(r, _BACK - z) for r, z in s.dome(_RADIUS - 0.03, 0.55)[:0:-1]]
-    tank = s.revolved([*back, *wall, *front], 144)
+    tank = s.revolve([*back, *wall, *front], 144)
     vertices = np.array(tank.vertices)
     radius = np.linalg.norm(vertices[:, :2], axis=1)
     rough = np.random.default_rng(3).uniform(-1.0, 1.0, len(vertices))
     vertices[:, :2] *= (1.0 + 0.006 * rough * (radius > 0.5) / np.maximum(radius, 0.5))[:, None]
     foam = trimesh.Trimesh(vertices, tank.faces, process=False)
     seams = [s.tube([0, 0, z - 0.03], [0, 0, z + 0.03], _RADIUS - 0.06, _RADIUS - 0.012) for z in (1.0, 2.0, 3.0)]
-    return [("hydrogen_tank", foam, FOAM), ("tank_seams", s.joined(seams), FOAM)]
+    return [("hydrogen_tank", foam, FOAM), ("tank_seams", s.join_meshes(seams), FOAM)]
 
 
 def _skirts() -> Solids:
@@ -73,15 +73,15 @@ def _skirts() -> Solids:
         for z in (_SHELF - 0.03, _FRONT - 0.05, _BACK + 0.05, _SKIRT + 0.03)
     ]
     stringers = [
-        s.turned(s.box([0.03, 0.03, high - low], [_RADIUS + 0.005, 0, 0.5 * (low + high)]), angle, [0, 0, 1])
+        s.rotate_mesh(s.box([0.03, 0.03, high - low], [_RADIUS + 0.005, 0, 0.5 * (low + high)]), angle, [0, 0, 1])
         for low, high in ((_FRONT - 0.02, _SHELF - 0.06), (_SKIRT + 0.06, _BACK + 0.02))
         for angle in np.arange(0, 360, 7.5)
     ]
     return [
         ("front_skirt", front, material("white-paint")),
         ("aft_skirt", back, material("white-paint")),
-        ("skirt_frames", s.joined(frames), material("anodised-aluminium")),
-        ("skirt_stringers", s.joined(stringers), material("anodised-aluminium")),
+        ("skirt_frames", s.join_meshes(frames), material("anodised-aluminium")),
+        ("skirt_stringers", s.join_meshes(stringers), material("anodised-aluminium")),
     ]
 
 
@@ -89,27 +89,27 @@ def _adapter() -> Solids:
     """The equipment shelf with its boxes, and the payload adapter: an open cone with a clamp-band ring."""
     foot, top, wall = 1.35, 0.5 * ADAPTER, 0.02
     low, high = _SHELF - 0.07, _SHELF - 0.02
-    shelf = s.revolved([(1.2, low), (_RADIUS - 0.08, low), (_RADIUS - 0.08, high), (1.2, high)])
-    cone = s.revolved([(foot - wall, high - 0.02), (foot, high - 0.02), (top, _TOP - 0.1), (top - wall, _TOP - 0.1)])
+    shelf = s.revolve([(1.2, low), (_RADIUS - 0.08, low), (_RADIUS - 0.08, high), (1.2, high)])
+    cone = s.revolve([(foot - wall, high - 0.02), (foot, high - 0.02), (top, _TOP - 0.1), (top - wall, _TOP - 0.1)])
     ring = s.tube([0, 0, _TOP - 0.12], [0, 0, _TOP], top - 0.05, top)
     collar = s.tube([0, 0, high - 0.01], [0, 0, high + 0.05], foot - 0.04, foot + 0.03)
     ribs = []
     for angle in range(0, 360, 15):
         spine = s.pipe([[foot - 0.012, 0, high], [top + 0.008, 0, _TOP - 0.12]], 0.02, 8)
-        ribs.append(s.turned(spine, angle + 7.5, [0, 0, 1]))
+        ribs.append(s.rotate_mesh(spine, angle + 7.5, [0, 0, 1]))
     boxes: dict[str, list[trimesh.Trimesh]] = {"black": [], "silver": [], "white": []}
     for i, (angle, width, height) in enumerate(_AVIONICS):
         case = s.box([0.32, width, height], [1.65, 0, high + 0.5 * height - 0.01])
-        boxes[("black", "silver", "white")[i % 3]].append(s.turned(case, angle, [0, 0, 1]))
+        boxes[("black", "silver", "white")[i % 3]].append(s.rotate_mesh(case, angle, [0, 0, 1]))
     return [
         ("equipment_shelf", shelf, material("anodised-aluminium")),
         ("payload_adapter", cone, material("carbon-fibre")),
-        ("adapter_ribs", s.joined(ribs), material("anodised-aluminium")),
+        ("adapter_ribs", s.join_meshes(ribs), material("anodised-aluminium")),
         ("adapter_ring", ring, material("bare-aluminium")),
         ("adapter_collar", collar, material("bare-aluminium")),
-        ("avionics_black", s.joined(boxes["black"]), material("black-paint")),
-        ("avionics_silver", s.joined(boxes["silver"]), material("silver-mli")),
-        ("avionics_white", s.joined(boxes["white"]), material("white-paint")),
+        ("avionics_black", s.join_meshes(boxes["black"]), material("black-paint")),
+        ("avionics_silver", s.join_meshes(boxes["silver"]), material("silver-mli")),
+        ("avionics_white", s.join_meshes(boxes["white"]), material("white-paint")),
     ]
 
 
@@ -117,7 +117,7 @@ def _oxygen_tank() -> Solids:
     """The ellipsoidal tank under its blanket, hung on a truss of struts from the aft skirt."""
     lower = [(r, _OXYGEN - z) for r, z in s.dome(_OXYGEN_RADIUS, _OXYGEN_HALF, 20)[::-1]]
     upper = [(r, _OXYGEN + z) for r, z in s.dome(_OXYGEN_RADIUS, _OXYGEN_HALF, 20)[1:]]
-    tank = s.revolved([*lower, *upper])
+    tank = s.revolve([*lower, *upper])
     belt = s.tube([0, 0, _OXYGEN - 0.16], [0, 0, _OXYGEN - 0.02], _OXYGEN_RADIUS - 0.03, _OXYGEN_RADIUS + 0.05)
     struts = []
     for i in range(16):
@@ -129,7 +129,7 @@ def _oxygen_tank() -> Solids:
     return [
         ("oxygen_tank", tank, material("gold-mli")),
         ("oxygen_belt", belt, material("anodised-aluminium")),
-        ("truss", s.joined(struts), material("carbon-fibre")),
+        ("truss", s.join_meshes(struts), material("carbon-fibre")),
     ]
 
 
@@ -146,19 +146,19 @@ def _engine() -> Solids:
     z = _THROAT + along * (_EXIT - _THROAT)
     outside = np.stack([contour + wall, z], axis=-1)
     inside = np.stack([contour, z], axis=-1)
-    bell = s.revolved([*inside, *outside[::-1]])
+    bell = s.revolve([*inside, *outside[::-1]])
     bands = [
-        s.revolved([(r + 0.004, h - 0.02), (r + 0.05, h - 0.02), (r + 0.05, h + 0.02), (r + 0.004, h + 0.02)])
+        s.revolve([(r + 0.004, h - 0.02), (r + 0.05, h - 0.02), (r + 0.05, h + 0.02), (r + 0.004, h + 0.02)])
         for r, h in ((np.interp(-h, -z, contour), h) for h in (-5.46, -4.8, -4.2, -3.75))
     ]
-    chamber = s.revolved(
+    chamber = s.revolve(
         [(0, _THROAT - 0.02), (throat + 0.02, _THROAT - 0.02), (throat + 0.04, _THROAT + 0.06), (0.2, _THROAT + 0.2),
          (0.2, _THROAT + 0.45), (0.27, _THROAT + 0.46), (0.27, _THROAT + 0.54), (0, _THROAT + 0.54)]
     )  # fmt: skip
-    cone = s.revolved([(0.2, -2.68), (0.26, -2.68), (0.76, -2.32), (0.7, -2.32)])
+    cone = s.revolve([(0.2, -2.68), (0.26, -2.68), (0.76, -2.32), (0.7, -2.32)])
     mount = s.rod([0, 0, _THROAT + 0.5], [0, 0, -2.47], 0.09, 36)
     pumps = [
-        s.joined([s.rod([x, y, -3.42], [x, y, -2.75], 0.13, 36), s.rod([x, y, -3.2], [x, y, -3.08], 0.2, 36)])
+        s.join_meshes([s.rod([x, y, -3.42], [x, y, -2.75], 0.13, 36), s.rod([x, y, -3.2], [x, y, -3.08], 0.2, 36)])
         for x, y in ((0.48, 0.12), (-0.46, -0.18))
     ]
     ducts = [
@@ -169,21 +169,22 @@ def _engine() -> Solids:
     actuators = [s.rod(_around(0.23, a, _THROAT + 0.4), _around(1.15, a, -2.15), 0.04, 16) for a in (100.0, 190.0)]
     return [
         ("nozzle", bell, material("nozzle-alloy")),
-        ("nozzle_bands", s.joined(bands), material("nozzle-alloy")),
+        ("nozzle_bands", s.join_meshes(bands), material("nozzle-alloy")),
         ("chamber", chamber, material("nozzle-alloy")),
         ("thrust_cone", cone, material("anodised-aluminium")),
         ("engine_mount", mount, material("bare-aluminium")),
-        ("turbopumps", s.joined(pumps), material("bare-aluminium")),
-        ("engine_ducts", s.joined(ducts), material("bare-aluminium")),
-        ("actuators", s.joined(actuators), material("anodised-aluminium")),
+        ("turbopumps", s.join_meshes(pumps), material("bare-aluminium")),
+        ("engine_ducts", s.join_meshes(ducts), material("bare-aluminium")),
+        ("actuators", s.join_meshes(actuators), material("anodised-aluminium")),
     ]
 
 
 def _fittings() -> Solids:
     """Lines and a cable tunnel along the tank, helium bottles and thrusters around the aft skirt, antennas."""
-    tunnel = s.turned(s.box([0.16, 0.34, 4.6], [_RADIUS + 0.03, 0, 2.0]), 35.0, [0, 0, 1])
+    tunnel = s.rotate_mesh(s.box([0.16, 0.34, 4.6], [_RADIUS + 0.03, 0, 2.0]), 35.0, [0, 0, 1])
     covers = [
-        s.turned(s.box([0.12, 0.42, 0.07], [_RADIUS + 0.06, 0, z]), 35.0, [0, 0, 1]) for z in (0.25, 1.4, 2.6, 3.75)
+        s.rotate_mesh(s.box([0.12, 0.42, 0.07], [_RADIUS + 0.06, 0, z]), 35.0, [0, 0, 1])
+        for z in (0.25, 1.4, 2.6, 3.75)
     ]
     way = [(0.6, -2.6), (1.6, -2.2), (_RADIUS + 0.1, -0.9), (_RADIUS + 0.1, 3.5), (_RADIUS - 0.05, 3.7)]
     line = s.pipe([[0.48, 0.12, -2.8], *([x, 0, z] for x, z in way)], 0.075, 20)
@@ -191,29 +192,31 @@ def _fittings() -> Solids:
     bottles, straps, brackets = [], [], []
     for a in (67.5, 112.5, 247.5, 292.5):
         centre = _around(1.8, a, -2.1)
-        bottles.append(s.moved(trimesh.creation.icosphere(subdivisions=3, radius=0.3), centre))
-        straps.append(s.moved(s.tube([0, 0, -0.03], [0, 0, 0.03], 0.29, 0.315, 48), centre))
+        bottles.append(s.translate_mesh(trimesh.creation.icosphere(subdivisions=3, radius=0.3), centre))
+        straps.append(s.translate_mesh(s.tube([0, 0, -0.03], [0, 0, 0.03], 0.29, 0.315, 48), centre))
         brackets += [
             s.rod(_around(1.55, a + side, -1.66), _around(1.8, a + side, -1.95), 0.025, 12) for side in (-5, 5)
         ]
     pods, jets = [], []
-    jet = s.revolved([(0.015, -0.01), (0.02, -0.01), (0.055, 0.12), (0.05, 0.12)])
+    jet = s.revolve([(0.015, -0.01), (0.02, -0.01), (0.055, 0.12), (0.05, 0.12)])
     for a in (90.0, 270.0):
-        pods.append(s.turned(s.box([0.26, 0.5, 0.42], [_RADIUS + 0.1, 0, -0.2]), a, [0, 0, 1]))
+        pods.append(s.rotate_mesh(s.box([0.26, 0.5, 0.42], [_RADIUS + 0.1, 0, -0.2]), a, [0, 0, 1]))
         for y, axis in ((0.25, [0, 1, 0]), (-0.25, [0, -1, 0])):
-            jets += [s.turned(s.placed(jet, [_RADIUS + 0.14, y, -0.2 + h], axis), a, [0, 0, 1]) for h in (-0.1, 0.1)]
-        jets.append(s.turned(s.placed(jet, [_RADIUS + 0.14, 0, -0.41], [0, 0, -1]), a, [0, 0, 1]))
+            jets += [
+                s.rotate_mesh(s.place_mesh(jet, [_RADIUS + 0.14, y, -0.2 + h], axis), a, [0, 0, 1]) for h in (-0.1, 0.1)
+            ]
+        jets.append(s.rotate_mesh(s.place_mesh(jet, [_RADIUS + 0.14, 0, -0.41], [0, 0, -1]), a, [0, 0, 1]))
     antennas = [
-        s.turned(s.box([0.05, 0.2, 0.2], [_RADIUS + 0.02, 0, 4.22]), a, [0, 0, 1]) for a in (60.0, 180.0, 300.0)
+        s.rotate_mesh(s.box([0.05, 0.2, 0.2], [_RADIUS + 0.02, 0, 4.22]), a, [0, 0, 1]) for a in (60.0, 180.0, 300.0)
     ]
     return [
         ("cable_tunnel", tunnel, material("white-paint")),
-        ("tunnel_covers", s.joined(covers), material("anodised-aluminium")),
+        ("tunnel_covers", s.join_meshes(covers), material("anodised-aluminium")),
         ("feed_line", line, material("bare-aluminium")),
-        ("feed_line_clamps", s.joined(clamps), material("anodised-aluminium")),
-        ("helium_bottles", s.joined(bottles), material("carbon-fibre")),
-        ("bottle_straps", s.joined([*straps, *brackets]), material("bare-aluminium")),
-        ("thruster_pods", s.joined(pods), material("gold-mli")),
-        ("thrusters", s.joined(jets), material("nozzle-alloy")),
-        ("antennas", s.joined(antennas), material("kapton")),
+        ("feed_line_clamps", s.join_meshes(clamps), material("anodised-aluminium")),
+        ("helium_bottles", s.join_meshes(bottles), material("carbon-fibre")),
+        ("bottle_straps", s.join_meshes([*straps, *brackets]), material("bare-aluminium")),
+        ("thruster_pods", s.join_meshes(pods), material("gold-mli")),
+        ("thrusters", s.join_meshes(jets), material("nozzle-alloy")),
+        ("antennas", s.join_meshes(antennas), material("kapton")),
     ]

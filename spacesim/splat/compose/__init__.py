@@ -1,22 +1,25 @@
 """Trained runs in one scene: poses, pictures, scene files."""
 
-from spacesim.splat.compose.path import Keyframe, Orbit, PosedScene, Shot, View
+from spacesim.splat.compose.path import CameraView, Keyframe, Orbit, PosedScene, SceneFrame
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.compose.scene import ComposeConfig, ComposedPrediction, Composition, Drawn, Placed
+from spacesim.splat.compose.run import ComposedRun, load_predictor
+from spacesim.splat.compose.scene import ComposeConfig, ComposedPrediction, Composition, DrawnView, PlacedRun
 from spacesim.splat.compose.scenefile import load_scene, save_scene
 
 __all__ = [
+    "CameraView",
     "ComposeConfig",
     "ComposedPrediction",
+    "ComposedRun",
     "Composition",
-    "Drawn",
+    "DrawnView",
     "Keyframe",
     "Orbit",
-    "Placed",
+    "PlacedRun",
     "Pose",
     "PosedScene",
-    "Shot",
-    "View",
+    "SceneFrame",
+    "load_predictor",
     "load_scene",
     "save_scene",
 ]

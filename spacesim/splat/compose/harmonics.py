@@ -1,7 +1,7 @@
 """Spherical harmonics that turn with their model (Ivanic and Ruedenberg 1996, with the corrections of 1998).
 
 The rotation of a band of degree l follows from that of degree l - 1 and of degree 1, which is the rotation matrix
-itself; no function is sampled. Basis and signs are those of docs/conventions.md.
+itself; no function is sampled. Basis and signs are those of docs/explanation/conventions.md.
 """
 
 from functools import lru_cache
@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike
 from spacesim.data.geometry import Array
 
 
-def rotated_harmonics(coefficients: ArrayLike, rotation: ArrayLike) -> Array:
+def rotate_harmonics(coefficients: ArrayLike, rotation: ArrayLike) -> Array:
     """Coefficients [N, K, C] of f(R^-1 d), of those of f(d): what a model's colours become when it is turned by R.
 
     coefficients: [N, K, C], K = (L + 1)^2;  rotation: [3, 3], R, world from model. float64
     """
-    given = np.asarray(coefficients, np.float64)
-    bands = band_rotations(rotation, round(given.shape[1] ** 0.5) - 1)
-    turned = [np.einsum("mn,inc->imc", band, given[:, k * k : (k + 1) ** 2]) for k, band in enumerate(bands)]
-    return np.concatenate(turned, axis=1) if turned else given
+    values = np.asarray(coefficients, np.float64)
+    bands = band_rotations(rotation, round(values.shape[1] ** 0.5) - 1)
+    turned = [np.einsum("mn,inc->imc", band, values[:, k * k : (k + 1) ** 2]) for k, band in enumerate(bands)]
+    return np.concatenate(turned, axis=1) if turned else values
 
 
 def band_rotations(rotation: ArrayLike, degree: int) -> list[Array]:

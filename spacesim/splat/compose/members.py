@@ -14,43 +14,41 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad, recorded
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.light.model import Sunlight
+from spacesim.splat.light.model import Sunlight, robust_radius
 from spacesim.splat.light.shadow.cast import ShadowConfig
-from spacesim.splat.raster.bin import RECORDINGS
+from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.raster.cameras import Pinhole
-from spacesim.splat.raster.gaussians import Gaussians, uploaded
+from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import ALPHA_MIN
-from spacesim.splat.raster.render import view_colours
-from spacesim.splat.raster.tone import picture_of
+from spacesim.splat.raster.render import view_colors
+from spacesim.splat.raster.tone import tone_map
 from spacesim.splat.run import Run
 
 PLAIN_SHADOWS = ShadowConfig(refine=None)
-"""Of a run that was trained without any: a depth test (chosen)."""
+"""Of a run that was trained without any: a depth test."""
 MODEL_DISTANCE = 5.0  #: farthest training camera of such a run, in its radii: chosen, only the softness depends on it
 
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """A run as it takes part in scenes; its frame is the model's. rows: 11 Floats [N], `Gaussians.shape_rows`;
-    centre: [3] metres;  radius: metres, of a sphere about the centre that holds every Gaussian to three standard
-    deviations;  shadow: its own kind of shadows;  distance, extent: metres, of the farthest training camera,
-    and of the Gaussians, as `TrainingFrame` has distance and radius;  key: equal for equal contents"""
+    """A run as it takes part in scenes; its frame is the model's."""
 
     run: Run
-    rows: list[Any]
-    centre: Array
-    radius: float
-    shadow: ShadowConfig
-    distance: float
-    extent: float
-    key: str
+    rows: list[Any]  #: 11 Floats [N], `Gaussians.shape_rows`
+    centre: Array  #: [3] metres
+    radius: float  #: metres, of a sphere about the centre that holds every Gaussian to three standard deviations
+    shadow: ShadowConfig  #: its own kind of shadows
+    distance: float  #: metres, of the farthest training camera, as `TrainingFrame.distance`
+    extent: float  #: metres, of the Gaussians, as `TrainingFrame.radius`
+    key: str  #: equal for equal contents
 
     @staticmethod
     def of(run: Run) -> "Member":
         """What scenes know of a run."""
-        arrays = run.model.to_numpy()
+        arrays = run.gaussians.to_numpy()
         means, spread = arrays["means"].astype(np.float64), 3 * np.exp(arrays["log_scales"].astype(np.float64).max(1))
         shown = arrays["logit_opacities"] >= np.log(ALPHA_MIN / (1 - ALPHA_MIN))
         means, spread = (means[shown], spread[shown]) if shown.any() else (np.zeros((1, 3)), np.zeros(1))
@@ -58,25 +56,25 @@ class Member:
         away = np.linalg.norm(means - centre, axis=1)
         light = run.light
         shadow = light.config.shadow if light and light.config.shadow else PLAIN_SHADOWS
-        extent = max(light.frame.radius if light else float(np.percentile(away, 99)), 1e-9)
+        extent = light.frame.radius if light else robust_radius(means)
         distance = light.frame.distance if light else MODEL_DISTANCE * extent
-        rows = [ad.Float(row) for row in run.model.shape_rows()]
+        rows = [ad.Float(row) for row in run.gaussians.shape_rows()]
         return Member(run, rows, centre, float((away + spread).max()), shadow, distance, extent, _digest(run))
 
     @property
     def count(self) -> int:
         """N."""
-        return self.run.gaussians
+        return self.run.gaussian_count
 
     @property
-    def received(self) -> ShadowConfig:
+    def cross_shadow_config(self) -> ShadowConfig:
         """How shadows of other models fall on it: as its own, but where the Sun's picture shows the others alone, a
         depth test must know how much of a pixel they cover, as a faint rim is no wall and a veil lets light through.
         Neither bias nor lifted points are needed, as no surface is tested against itself."""
-        mapping = self.shadow.mapping
-        if mapping.filter in ("bilinear", "median"):
-            mapping = replace(mapping, filter="percentage-closer", radius=0.5)
-        return replace(self.shadow, bias=0.0, grazing="none", mapping=mapping)
+        method = self.shadow.method
+        if isinstance(method, MappingConfig) and method.filter in ("bilinear", "median"):
+            method = replace(method, filter="percentage-closer", radius=0.5)
+        return replace(self.shadow, bias=0.0, grazing="none", method=method)
 
     @property
     def curve(self) -> tuple[str, float] | None:
@@ -89,26 +87,24 @@ class Member:
         return self.run.light is not None and self.run.light.config.shadow is not None
 
     def sunlight(self, sun: Array | None) -> Sunlight | None:
-        """In its own shadows; None for a run that no Sun relights. sun: [3] in the model's frame"""
+        """In its own shadows; None for a run without light. sun: [3] in the model's frame"""
         light = self.run.light
-        return None if light is None or sun is None else light.sunlight(self.run.model, sun, adaptive=True)
+        return None if light is None else light.sunlight(self.run.gaussians, sun)
 
     def shade(self, camera: Pinhole, sun: Array | None, sunlight: Sunlight | None) -> tuple[list[Any], Any]:
         """(colours, three Floats [N], visibility of the Sun [N] or None) as the run alone has them. camera, sun: in the
         model's frame, the latter unused by a run that knows one light;  sunlight: `sunlight` of this Sun"""
         run = self.run
         if run.light is None:
-            colours = _harmonic_colours if self.count > 1 else _trace_harmonic_colours
-            return list(colours(run.model.rows(), camera)), None
-        assert sun is not None, "the scene asks for a Sun first"
-        return run.light.lit(run.model, camera, sun, adaptive=True, known=sunlight)
+            return list(_harmonic_colors(run.gaussians.rows(), camera)), None
+        return run.light.shade_picture(run.gaussians, camera, sun, sunlight=sunlight)
 
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Members one after another as one set of N Gaussians. members: in an order that does not depend on how they were
-    named, so that composing [A, B] and [B, A] is one and the same"""
+    """Members one after another as one set of N Gaussians."""
 
+    #: in an order that does not depend on how they were named, so that composing [A, B] and [B, A] is one and the same
     members: Sequence[Member]
     starts: Sequence[int] = field(init=False)
 
@@ -134,13 +130,13 @@ class Ensemble:
     def owner(self) -> Any:
         """UInt32 [N]: whose each Gaussian is."""
         numbers = [np.full(member.count, k, np.uint32) for k, member in enumerate(self.members)]
-        return uploaded(np.concatenate(numbers), ad.UInt32)
+        return upload(np.concatenate(numbers), ad.UInt32)
 
     @cached_property
     def indices(self) -> list[Any]:
         """UInt32 of each member: where its Gaussians stand in the set."""
         pairs = zip(self.starts, self.members, strict=True)
-        return [uploaded(np.arange(start, start + member.count), ad.UInt32) for start, member in pairs]
+        return [upload(np.arange(start, start + member.count), ad.UInt32) for start, member in pairs]
 
     @cached_property
     def shares(self) -> list[Any]:
@@ -171,7 +167,7 @@ class Ensemble:
         if len(set(flags)) < 2:
             return any(flags)
         of_each = [np.full(m.count, f) for m, f in zip(self.members, flags, strict=True)]
-        return uploaded(np.concatenate(of_each), ad.Bool)
+        return upload(np.concatenate(of_each), ad.Bool)
 
     @cached_property
     def curve(self) -> tuple[str, float] | None:
@@ -186,8 +182,7 @@ class Ensemble:
             return Gaussians.from_rows(none)
         numbers = [[*p.rotation.ravel(), *p.translation, p.scale, np.log(p.scale), *p.quaternion] for p in poses]
         table = ad.Float([float(number) for row in numbers for number in row])
-        run = _placed if self.count > 1 else _trace_placed  # a recording takes one number for a constant
-        return Gaussians.from_rows([*run(self.rows[:10], self.owner, table), self.rows[10]])
+        return Gaussians.from_rows([*_placed(self.rows[:10], self.owner, table), self.rows[10]])
 
     def joined(self, parts: Sequence[Sequence[Any]]) -> list[Any]:
         """Floats [N] of each member's, row by row. parts: of each member the same number of Floats."""
@@ -199,13 +194,16 @@ class Ensemble:
         return masks
 
 
-def display_colours(colours: list[Any], own: tuple[str, float] | None, whole: tuple[str, float] | None) -> list[Any]:
-    """Colours as they are blended: linear ones become sRGB values first where not all are alike. own, whole: `curve` of
-    the member and of the ensemble"""
-    return [picture_of(colour, own[0]) for colour in colours] if own and not whole else colours
+def display_colors(
+    colors: list[Any], model_curve: tuple[str, float] | None, scene_curve: tuple[str, float] | None
+) -> list[Any]:
+    """Colours as they are blended: linear ones become sRGB values first where not all are alike. model_curve,
+    scene_curve: `curve` of the member and of the ensemble"""
+    return [tone_map(color, model_curve[0]) for color in colors] if model_curve and not scene_curve else colors
 
 
-def _trace_placed(rows: list[Any], owner: Any, table: Any) -> list[Any]:
+@recorded
+def _placed(rows: list[Any], owner: Any, table: Any) -> list[Any]:
     """The first 10 of `Gaussians.shape_rows`, each by its owner's numbers: R (9), t (3), s, ln s, quaternion (4)."""
     of = [dr.gather(ad.Float, table, owner * _NUMBERS + i) for i in range(_NUMBERS)]
     x, y, z = rows[:3]
@@ -221,15 +219,16 @@ def _trace_placed(rows: list[Any], owner: Any, table: Any) -> list[Any]:
     return [*means, *(log_scale + of[13] for log_scale in rows[3:6]), *quaternion]  # 3.13
 
 
-def _trace_harmonic_colours(rows: list[Any], camera: Pinhole) -> Any:
-    return view_colours(Gaussians.from_rows(rows), camera)
+@recorded
+def _harmonic_colors(rows: list[Any], camera: Pinhole) -> Any:
+    return view_colors(Gaussians.from_rows(rows), camera)
 
 
 def _digest(run: Run) -> str:
     """Of everything that a picture of the run depends on."""
     drawn = run.antialiased, run.supersample, run.light.config if run.light else None
     digest = hashlib.sha256(repr(drawn).encode())
-    tensors = run.model.to_numpy() | (run.light.tensors() if run.light else {})
+    tensors = run.gaussians.to_numpy() | (run.light.tensors() if run.light else {})
     for name in sorted(tensors):
         digest.update(f"{name}{tensors[name].shape}".encode())
         digest.update(np.ascontiguousarray(tensors[name]).tobytes())
@@ -237,5 +236,3 @@ def _digest(run: Run) -> str:
 
 
 _NUMBERS = 18  # of a pose's row in the table
-_placed = recorded(_trace_placed, RECORDINGS)
-_harmonic_colours = recorded(_trace_harmonic_colours, RECORDINGS)

@@ -23,15 +23,15 @@ from spacesim import __version__, backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, read_json, remove_leftovers, write_bytes, write_json
 from spacesim.data.images import read_png, write_exr, write_png
-from spacesim.data.integrity import is_whole
-from spacesim.data.lock import locked
-from spacesim.data.sheet import DARK_PAGE, Tile, contact_sheet, fitted
+from spacesim.data.integrity.whole import is_whole
+from spacesim.data.lock import lock_folder
+from spacesim.data.sheet import DARK_PAGE, Tile, contact_sheet, fit_picture
 from spacesim.data.store import intrinsics_of
 from spacesim.data.tone import as_bytes
-from spacesim.splat.compose.path import PosedScene, Shot
+from spacesim.splat.compose.path import PosedScene, SceneFrame
 from spacesim.splat.compose.scene import ComposedPrediction
 from spacesim.splat.export.pictures import write_picture
-from spacesim.splat.export.sweep import COLUMNS, MOST_TILES, SIDE, resized, sky_mark
+from spacesim.splat.export.sweep import COLUMNS, MAX_TILES, SIDE, resize_camera, sky_mark
 from spacesim.splat.export.video import INSTALL, Video, encoder
 
 SHOTS = "shots"
@@ -42,14 +42,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Composed:
-    """What is on the disk. rendered: frames that were not there yet, of `frames`;  note: why there is no video, or
-    None where there is one, or one picture"""
+    """What `compose` has written."""
 
-    frames: int
-    rendered: int
-    sheet: Path
-    video: Path | None
-    note: str | None
+    frames: int  #: of the scene
+    rendered: int  #: frames that were not there yet, of `frames`
+    sheet: Path  #: the contact sheet
+    video: Path | None  #: None of one picture, and without an encoder
+    note: str | None  #: why there is no video, or None where there is one, or one picture
 
 
 def compose(
@@ -73,43 +72,43 @@ def compose(
             f"{out}: expected an empty or new folder, or one of an earlier compose, found other files in it"
         )
     if scene.camera is not None and size is not None:
-        scene = scene.seen_by(resized(scene.camera, size))
-    shot = scene.shot(0)
-    if shot.sun is None and shot.composition.relightable:
-        told = scene.composition.path or "scene"
-        raise InputError(f"{told}: expected the Sun's direction for a scene that it changes, found none; add [sun]")
-    shot.composition.stops(exposure)
-    with locked(out):
+        scene = scene.seen_by(resize_camera(scene.camera, size))
+    frame = scene.frame(0)
+    if frame.sun is None and frame.composition.relightable:
+        source = scene.composition.path or "scene"
+        raise InputError(f"{source}: expected the Sun's direction for a scene that it changes, found none; add [sun]")
+    frame.composition.stops(exposure)
+    with lock_folder(out):
         _make(out)
         remove_leftovers(out)
-        return _rendered(scene, out, report, exposure)
+        return _render_frames(scene, out, report, exposure)
 
 
-def _rendered(
+def _render_frames(
     scene: PosedScene, out: Path, report: Callable[[int, int], None] | None, exposure: float | None
 ) -> Composed:
     many = scene.frames > 1
-    film = _film(scene) if many else None
-    count = min(MOST_TILES, scene.frames)
+    film = _open_video(scene) if many else None
+    count = min(MAX_TILES, scene.frames)
     shown = {k * scene.frames // count for k in range(count)}
     tiles: list[Tile] = []
     rendered = 0
     _forget(out, scene.frames)
     for index in range(scene.frames):
-        shot = scene.shot(index)
-        what = _described(shot, exposure)
-        if not _is_there(out, index, what):
-            _write(out, index, shot, what, exposure)
+        frame = scene.frame(index)
+        what = _describe_frame(frame, exposure)
+        if not _is_up_to_date(out, index, what):
+            _write(out, index, frame, what, exposure)
             rendered += 1
         if film is not None or index in shown:
             picture = read_png(out / "rgb" / f"{index:04d}.png")
             if film is not None:
                 film.add(_over_black(picture))
             if index in shown:
-                tiles.append(_tile(picture, shot))
+                tiles.append(_tile(picture, frame))
         if report is not None:
             report(index + 1, scene.frames)
-    camera = scene.shot(0).camera
+    camera = scene.frame(0).camera
     title = f"{_title(scene)}, {scene.frames} frame{'s' * many}, {camera.width} x {camera.height} px"
     columns = math.ceil(len(tiles) / math.ceil(len(tiles) / COLUMNS))
     aspect = camera.height / camera.width
@@ -127,33 +126,33 @@ def _make(out: Path) -> None:
     try:
         (out / SHOTS).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{out}: expected a folder that can be written, found none ({error.strerror})") from None
+        raise InputError(f"{out}: expected a folder that can be written ({error.strerror})") from None
 
 
-def _film(scene: PosedScene) -> Video | None:
+def _open_video(scene: PosedScene) -> Video | None:
     if encoder() is None:
         return None
-    camera = scene.shot(0).camera
+    camera = scene.frame(0).camera
     return Video(camera.width, camera.height, scene.fps)
 
 
 def _forget(out: Path, frames: int) -> None:
     """Take away frames beyond the scene's, of an earlier and longer one."""
-    for shot in (out / SHOTS).glob("*.json"):
-        if shot.stem.isdigit() and int(shot.stem) >= frames:
-            shot.unlink()
+    for frame in (out / SHOTS).glob("*.json"):
+        if frame.stem.isdigit() and int(frame.stem) >= frames:
+            frame.unlink()
             for kind, suffix in PICTURES.items():
-                (out / kind / f"{shot.stem}{suffix}").unlink(missing_ok=True)
+                (out / kind / f"{frame.stem}{suffix}").unlink(missing_ok=True)
 
 
-def _described(shot: Shot, exposure: float | None) -> dict[str, Any]:
+def _describe_frame(frame: SceneFrame, exposure: float | None) -> dict[str, Any]:
     """What a frame shows: as shots/*.json has it, with a digest of all that the pictures depend on."""
-    camera = shot.camera
+    camera = frame.camera
     values: dict[str, Any] = {
-        "time": shot.time,
+        "time": frame.time,
         "transform_matrix": camera.opengl.tolist(),
         **intrinsics_of(camera),
-        "sun_direction": None if shot.sun is None else shot.sun.direction.tolist(),
+        "sun_direction": None if frame.sun is None else frame.sun.direction.tolist(),
         "models": [
             {
                 "name": model.name,
@@ -161,10 +160,10 @@ def _described(shot: Shot, exposure: float | None) -> dict[str, Any]:
                 "rotation_wxyz": model.pose.quaternion.tolist(),
                 "scale": model.pose.scale,
             }
-            for model in shot.composition.models
+            for model in frame.composition.models
         ],
     }
-    composition = shot.composition
+    composition = frame.composition
     made_by: list[Any] = [__version__, backend.select(), composition.config.shadows, composition.contents]
     if exposure is not None:
         made_by.append(exposure)
@@ -172,25 +171,25 @@ def _described(shot: Shot, exposure: float | None) -> dict[str, Any]:
     return {"digest": hashlib.sha256(text.encode()).hexdigest(), **values}
 
 
-def _is_there(out: Path, index: int, what: dict[str, Any]) -> bool:
+def _is_up_to_date(out: Path, index: int, what: dict[str, Any]) -> bool:
     path = out / SHOTS / f"{index:04d}.json"
     try:
-        told = read_json(path)
+        record = read_json(path)
     except InputError:
         return False
-    if not isinstance(told, dict) or told.get("digest") != what["digest"]:
+    if not isinstance(record, dict) or record.get("digest") != what["digest"]:
         return False
-    kinds = told.get("pictures")
+    kinds = record.get("pictures")
     if not isinstance(kinds, list) or not {"rgb", "depth", "id"} <= {kind for kind in kinds if kind in tuple(PICTURES)}:
         return False
     return all(kind in tuple(PICTURES) and is_whole(out / kind / f"{index:04d}{PICTURES[kind]}") for kind in kinds)
 
 
-def _write(out: Path, index: int, shot: Shot, what: dict[str, Any], exposure: float | None) -> None:
+def _write(out: Path, index: int, frame: SceneFrame, what: dict[str, Any], exposure: float | None) -> None:
     """The pictures of a frame, then its shots/*.json; while they are written, an earlier one is gone."""
     record = out / SHOTS / f"{index:04d}.json"
     record.unlink(missing_ok=True)
-    prediction = shot.composition.predict(shot.camera, shot.sun, exposure=exposure)
+    prediction = frame.composition.predict(frame.camera, frame.sun, exposure=exposure)
     planes = _planes(prediction)
     write_picture(prediction, "rgb", out / "rgb" / f"{index:04d}.png")
     write_exr(out / "depth" / f"{index:04d}.exr", {"depth": prediction.depth, "alpha": prediction.alpha})
@@ -213,16 +212,16 @@ def _planes(prediction: ComposedPrediction) -> dict[str, np.ndarray]:
 
 
 def _over_black(picture: np.ndarray) -> np.ndarray:
-    return np.asarray(fitted(picture, picture.shape[1], picture.shape[0]))
+    return np.asarray(fit_picture(picture, picture.shape[1], picture.shape[0]))
 
 
-def _tile(picture: np.ndarray, shot: Shot) -> Tile:
-    small = np.asarray(fitted(picture, SIDE, SIDE))
-    when = f"{shot.time:.2f} s"
-    if shot.sun is None:
+def _tile(picture: np.ndarray, frame: SceneFrame) -> Tile:
+    small = np.asarray(fit_picture(picture, SIDE, SIDE))
+    when = f"{frame.time:.2f} s"
+    if frame.sun is None:
         return Tile(small, when)
-    azimuth, elevation = (f"{round(angle, 1) + 0.0:g}°" for angle in shot.sun.angles)
-    return Tile(small, when, f"Sun {azimuth}, {elevation}", sky_mark(shot.sun))
+    azimuth, elevation = (f"{round(angle, 1) + 0.0:g}°" for angle in frame.sun.angles)
+    return Tile(small, when, f"Sun {azimuth}, {elevation}", sky_mark(frame.sun))
 
 
 def _title(scene: PosedScene) -> str:

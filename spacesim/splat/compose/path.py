@@ -11,25 +11,25 @@ from numpy.typing import ArrayLike
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, direction_from_angles, look_at, normalize
 from spacesim.data.records import Camera, Sun
-from spacesim.splat.compose.pose import Pose, between, slerp, turned_between
+from spacesim.splat.compose.pose import Pose, interpolate_pose, interpolate_rotation, slerp
 from spacesim.splat.compose.scene import Composition
 
-FPS = 24.0  #: pictures a second where nothing is said, chosen
-ORBIT_FRAMES = 120  #: of an orbit where nothing is said: five seconds, chosen
-MOST_FRAMES = 100_000  #: chosen
+FPS = 24.0  #: pictures a second where nothing is said
+ORBIT_FRAMES = 120  #: of an orbit where nothing is said: five seconds
+MAX_FRAMES = 100_000
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """Where a camera stands, and what it looks at. world_from_camera: [4, 4] OpenCV axes, metres;  target: [3] metres,
-    a point that stays in the middle on the way to another view that has one, or None;  focal: (fx, fy) pixels, or None
-    for those of the scene's camera;  up: [3], a direction that the target's picture has upwards"""
+class CameraView:
+    """Where a camera stands, and what it looks at."""
 
-    world_from_camera: Array
+    world_from_camera: Array  #: [4, 4] OpenCV axes, metres
+    #: [3] metres, a point that stays in the middle on the way to another view that has one, or None
     target: Array | None = None
-    focal: tuple[float, float] | None = None
+    focal: tuple[float, float] | None = None  #: (fx, fy) pixels, or None for those of the scene's camera
+    #: [3], a direction that the target's picture has upwards
     up: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     @staticmethod
@@ -38,12 +38,12 @@ class View:
         target: Array,
         up: ArrayLike = (0.0, 0.0, 1.0),
         focal: tuple[float, float] | None = None,
-    ) -> "View":
+    ) -> "CameraView":
         """From a position on a target, [3] metres each."""
         up = np.asarray(up, np.float64)
-        return View(look_at(position, target, up), np.asarray(target, np.float64), focal, up)
+        return CameraView(look_at(position, target, up), np.asarray(target, np.float64), focal, up)
 
-    def focused(self, camera: Camera) -> "View":
+    def focused(self, camera: Camera) -> "CameraView":
         """With `camera`'s focal lengths where it names none."""
         return self if self.focal else replace(self, focal=(camera.fx, camera.fy))
 
@@ -55,25 +55,23 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """What is where at a time, seconds; what it does not name goes on as the keyframes around say. poses: by the names
-    of models"""
+    """What is where at a time, seconds; what it does not name goes on as the keyframes around say."""
 
     time: float
     sun: Sun | None = None
-    view: View | None = None
-    poses: Mapping[str, Pose] = field(default_factory=dict)
+    view: CameraView | None = None
+    poses: Mapping[str, Pose] = field(default_factory=dict)  #: by the names of models
 
 
 @dataclass(frozen=True)
 class Orbit:
-    """A camera that goes round and looks at the middle. radius: metres, of the sphere;  centre: metres;  elevation_deg,
-    azimuth_deg: where it starts, seen from the centre;  turns: rounds in all, negative ones clockwise seen from +z"""
+    """A camera that goes round and looks at the middle."""
 
-    radius: float
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    elevation_deg: float = 20.0
-    azimuth_deg: float = 0.0
-    turns: float = 1.0
+    radius: float  #: metres, of the sphere
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: metres
+    elevation_deg: float = 20.0  #: where it starts, seen from the centre
+    azimuth_deg: float = 0.0  #: where it starts, seen from the centre
+    turns: float = 1.0  #: rounds in all, negative ones clockwise seen from +z
 
     def __post_init__(self) -> None:
         if not 0 < self.radius < np.inf:
@@ -81,33 +79,33 @@ class Orbit:
         if not abs(self.elevation_deg) <= 90:
             raise InputError(f"elevation_deg: expected -90 to 90 degrees, found {self.elevation_deg}")
 
-    def view(self, share: float) -> View:
+    def view(self, share: float) -> CameraView:
         """After a share of the way, 0 to 1."""
         direction = direction_from_angles(self.azimuth_deg + 360 * self.turns * share, self.elevation_deg)
         centre = np.array(self.centre)
-        return View.towards(centre + self.radius * direction, centre)
+        return CameraView.towards(centre + self.radius * direction, centre)
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
-    """One picture of a scene. time: seconds;  composition: with the poses of that time"""
+class SceneFrame:
+    """One picture of a scene."""
 
-    time: float
-    composition: Composition
+    time: float  #: seconds
+    composition: Composition  #: with the poses of that time
     camera: Camera
     sun: Sun | None
 
 
 @dataclass(frozen=True, eq=False)
 class PosedScene:
-    """All that a scene file says. sun, camera: None where it names none;  frames: pictures, 1 / fps seconds apart"""
+    """All that a scene file says (docs/reference/composed-scenes.md)."""
 
-    composition: Composition
-    sun: Sun | None = None
-    camera: Camera | None = None
+    composition: Composition  #: runs with their poses
+    sun: Sun | None = None  #: None where it names none
+    camera: Camera | None = None  #: None where it names none
     keyframes: Sequence[Keyframe] = ()
     orbit: Orbit | None = None
-    frames: int = 1
+    frames: int = 1  #: pictures, 1 / fps seconds apart
     fps: float = FPS
 
     def __post_init__(self) -> None:
@@ -118,27 +116,27 @@ class PosedScene:
         """Of the models."""
         return [model.name for model in self.composition.models]
 
-    def shot(self, index: int) -> Shot:
+    def frame(self, index: int) -> SceneFrame:
         """Picture `index`, from 0. Raises InputError where the scene has no camera."""
         share = index / self.frames if self.orbit else 0.0
         return self.at(index / self.fps, share)
 
-    def at(self, time: float, share: float = 0.0) -> Shot:
+    def at(self, time: float, share: float = 0.0) -> SceneFrame:
         """The scene at a time, seconds; share: of an orbit, 0 to 1. Raises InputError where the scene has no camera."""
         if self.camera is None:
-            told = self.composition.path or "scene"
-            raise InputError(f"{told}: expected a camera, found none; add a table [camera]")
+            source = self.composition.path or "scene"
+            raise InputError(f"{source}: expected a camera, found none; add a table [camera]")
         view = self.orbit.view(share) if self.orbit else self._view(self.camera, time)
-        return Shot(time, self.posed_at(time), view.of(self.camera) if view else self.camera, self.sun_at(time))
+        return SceneFrame(time, self.posed_at(time), view.of(self.camera) if view else self.camera, self.sun_at(time))
 
     def sun_at(self, time: float) -> Sun | None:
         """The Sun at a time, seconds; None where nobody has said."""
-        return self._track(lambda key: key.sun, sun_between, time) or self.sun
+        return self._track(lambda key: key.sun, interpolate_sun, time) or self.sun
 
     def posed_at(self, time: float) -> Composition:
         """The models where they are at a time, seconds."""
         poses = [
-            self._track(lambda key, name=model.name: key.poses.get(name), between, time) or model.pose  # type: ignore[misc]
+            self._track(lambda key, name=model.name: key.poses.get(name), interpolate_pose, time) or model.pose  # type: ignore[misc]
             for model in self.composition.models
         ]
         return self.composition.posed(poses)
@@ -156,18 +154,18 @@ class PosedScene:
 
         return replace(self, camera=camera, keyframes=[follow(key) for key in self.keyframes])
 
-    def _view(self, camera: Camera, time: float) -> View | None:
+    def _view(self, camera: Camera, time: float) -> CameraView | None:
         """What the keyframes say of the camera; those without focal lengths have `camera`'s where others name some."""
         named = any(key.view is not None and key.view.focal for key in self.keyframes)
 
-        def view(key: Keyframe) -> View | None:
+        def view(key: Keyframe) -> CameraView | None:
             return key.view.focused(camera) if key.view is not None and named else key.view
 
-        return self._track(view, view_between, time)
+        return self._track(view, interpolate_view, time)
 
     def _track(self, value: Callable[[Keyframe], T | None], blend: Callable[[T, T, float], T], time: float) -> T | None:
         """What the keyframes that name it say of a value; None where none does."""
-        named = [(key.time, found) for key in self.keyframes if (found := value(key)) is not None]
+        named = [(key.time, named_value) for key in self.keyframes if (named_value := value(key)) is not None]
         return Track([when for when, _ in named], [what for _, what in named], blend).at(time) if named else None
 
 
@@ -191,28 +189,28 @@ class Track(Generic[T]):
         return self.blend(self.values[before], self.values[after], share)
 
 
-def sun_between(one: Sun, other: Sun, share: float) -> Sun:
+def interpolate_sun(first: Sun, second: Sun, share: float) -> Sun:
     """On the great circle from one to the other."""
-    return Sun(slerp(one.direction, other.direction, share))
+    return Sun(slerp(first.direction, second.direction, share))
 
 
-def view_between(one: View, other: View, share: float) -> View:
+def interpolate_view(first: CameraView, second: CameraView, share: float) -> CameraView:
     """Position along a line; the target, where both have one, too, and what is up on the great circle, else the camera
     turns by the shortest way; focal lengths by even factors, where both name them."""
-    position = _line(one.world_from_camera[:3, 3], other.world_from_camera[:3, 3], share)
-    focal = one.focal
-    if one.focal is not None and other.focal is not None:
-        focal = tuple(a ** (1 - share) * b**share for a, b in zip(one.focal, other.focal, strict=True))
-    if one.target is not None and other.target is not None:
-        target = _line(one.target, other.target, share)
-        up = slerp(normalize(one.up), normalize(other.up), share)
+    position = _line(first.world_from_camera[:3, 3], second.world_from_camera[:3, 3], share)
+    focal = first.focal
+    if first.focal is not None and second.focal is not None:
+        focal = tuple(a ** (1 - share) * b**share for a, b in zip(first.focal, second.focal, strict=True))
+    if first.target is not None and second.target is not None:
+        target = _line(first.target, second.target, share)
+        up = slerp(normalize(first.up), normalize(second.up), share)
         if np.linalg.norm(target - position) > 0:
-            return View.towards(position, target, up, focal)
+            return CameraView.towards(position, target, up, focal)
     pose = np.eye(4)
-    pose[:3, :3] = turned_between(one.world_from_camera[:3, :3], other.world_from_camera[:3, :3], share)
+    pose[:3, :3] = interpolate_rotation(first.world_from_camera[:3, :3], second.world_from_camera[:3, :3], share)
     pose[:3, 3] = position
-    return View(pose, None, focal)
+    return CameraView(pose, None, focal)
 
 
-def _line(one: Array, other: Array, share: float) -> Array:
-    return (1 - share) * one + share * other
+def _line(first: Array, second: Array, share: float) -> Array:
+    return (1 - share) * first + share * second

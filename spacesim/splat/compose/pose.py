@@ -9,42 +9,43 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
 
-FARTHEST = 1e8  #: metres of a position at most, chosen: single precision tells places 10 m apart there
-SMALLEST, LARGEST = 1e-6, 1e6  #: of a scale, chosen: squares of lengths in any model's frame stay in single precision
+MAX_COORDINATE = 1e8  #: metres of a position at most: single precision tells places 10 m apart there
+MIN_SCALE, MAX_SCALE = 1e-6, 1e6  #: of a scale: squares of lengths in any model's frame stay in single precision
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
     """x_world = scale R x_model + translation (3.11).
 
-    rotation: [3, 3], R, or [4], a quaternion (w, x, y, z) of any length; kept as R, float64
-    translation: [3] metres;  scale: metres in the world for one of the model's
     Raises InputError for what is no rotation, not finite, or beyond the bounds named above; poses that follow from
     others (`after`, `inverse`) may be beyond them.
     """
 
+    #: [3, 3], R, or [4], a quaternion (w, x, y, z) of any length; kept as R, float64
     rotation: Array = field(default_factory=lambda: np.eye(3))
-    translation: Array = field(default_factory=lambda: np.zeros(3))
-    scale: float = 1.0
+    translation: Array = field(default_factory=lambda: np.zeros(3))  #: [3] metres
+    scale: float = 1.0  #: metres in the world for one of the model's
 
     def __post_init__(self) -> None:
         rotation, quaternion = _rotation(self.rotation)
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "_quaternion", quaternion)
         translation = _numbers(self.translation)
-        if translation.shape != (3,) or not np.all(np.abs(translation) <= FARTHEST):
-            raise InputError(f"position: expected 3 numbers of at most {FARTHEST:g} metres, found {self.translation!r}")
+        if translation.shape != (3,) or not np.all(np.abs(translation) <= MAX_COORDINATE):
+            raise InputError(
+                f"position: expected 3 numbers of at most {MAX_COORDINATE:g} metres, found {self.translation!r}"
+            )
         object.__setattr__(self, "translation", translation)
-        if not SMALLEST <= self.scale <= LARGEST:
-            raise InputError(f"scale: expected a factor from {SMALLEST:g} to {LARGEST:g}, found {self.scale}")
+        if not MIN_SCALE <= self.scale <= MAX_SCALE:
+            raise InputError(f"scale: expected a factor from {MIN_SCALE:g} to {MAX_SCALE:g}, found {self.scale}")
         object.__setattr__(self, "scale", float(self.scale))
 
     @property
     def quaternion(self) -> Array:
         """[4] unit (w, x, y, z): the one that was given, so that a file that holds it means the same pose to the bit,
         or that of the matrix, w >= 0, (1, 0, 0, 0) exactly where nothing is turned."""
-        given: Array = self._quaternion  # type: ignore[attr-defined]
-        return given
+        quaternion: Array = self._quaternion  # type: ignore[attr-defined]
+        return quaternion
 
     @property
     def matrix(self) -> Array:
@@ -66,12 +67,12 @@ class Pose:
 
     def after(self, first: "Pose") -> "Pose":
         """The pose that does `first`, then this one."""
-        return _derived(self.rotation @ first.rotation, self.points(first.translation), self.scale * first.scale)
+        return _unchecked_pose(self.rotation @ first.rotation, self.points(first.translation), self.scale * first.scale)
 
     def inverse(self) -> "Pose":
         """model_from_world."""
         scale = 1 / self.scale
-        return _derived(self.rotation.T, -scale * (self.rotation.T @ self.translation), scale)
+        return _unchecked_pose(self.rotation.T, -scale * (self.rotation.T @ self.translation), scale)
 
     def direction_in_model(self, direction: ArrayLike) -> Array:
         """[3], a direction of the world in the model's axes; the same numbers where nothing is turned."""
@@ -87,7 +88,7 @@ class Pose:
         return Camera(place, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def _derived(rotation: Array, translation: Array, scale: float) -> Pose:
+def _unchecked_pose(rotation: Array, translation: Array, scale: float) -> Pose:
     """What follows from poses within the bounds; of two models, one seen from the other may be beyond them."""
     pose = Pose(rotation)
     object.__setattr__(pose, "translation", translation)
@@ -95,27 +96,27 @@ def _derived(rotation: Array, translation: Array, scale: float) -> Pose:
     return pose
 
 
-def between(one: Pose, other: Pose, share: float) -> Pose:
+def interpolate_pose(first: Pose, second: Pose, share: float) -> Pose:
     """The pose `share` of the way (0 to 1): rotation by the shortest way at even speed (slerp, Shoemake 1985), position
     along a line, scale by even factors."""
-    rotation = turned_between(one.rotation, other.rotation, share)
-    translation = (1 - share) * one.translation + share * other.translation
-    return Pose(rotation, translation, one.scale ** (1 - share) * other.scale**share)
+    rotation = interpolate_rotation(first.rotation, second.rotation, share)
+    translation = (1 - share) * first.translation + share * second.translation
+    return Pose(rotation, translation, first.scale ** (1 - share) * second.scale**share)
 
 
-def turned_between(one: Array, other: Array, share: float) -> Array:
+def interpolate_rotation(first: Array, second: Array, share: float) -> Array:
     """The rotation [3, 3] `share` of the way from one to the other, by the shortest way; the ends exactly."""
-    if share <= 0 or np.array_equal(one, other):
-        return one
+    if share <= 0 or np.array_equal(first, second):
+        return first
     if share >= 1:
-        return other
-    return rotation_from_quaternion(slerp(quaternion_from_rotation(one), quaternion_from_rotation(other), share))
+        return second
+    return rotation_from_quaternion(slerp(quaternion_from_rotation(first), quaternion_from_rotation(second), share))
 
 
-def slerp(one: ArrayLike, other: ArrayLike, share: float) -> Array:
-    """The unit vector [n] `share` of the way on the great circle from unit vector `one` to `other`; quaternions, [4],
-    by the shorter way of both that mean the same rotations. Of opposite directions some way round."""
-    start, end = (np.asarray(values, np.float64) for values in (one, other))
+def slerp(first: ArrayLike, second: ArrayLike, share: float) -> Array:
+    """The unit vector [n] `share` of the way on the great circle from unit vector `first` to `second`; quaternions,
+    [4], by the shorter way of both that mean the same rotations. Of opposite directions some way round."""
+    start, end = (np.asarray(values, np.float64) for values in (first, second))
     cosine = float(start @ end)
     if len(start) == 4 and cosine < 0:
         end, cosine = -end, -cosine
@@ -144,18 +145,18 @@ def rotation_about(axis: ArrayLike, angle_deg: float) -> Array:
 
 def _rotation(values: ArrayLike) -> tuple[Array, Array]:
     """(matrix [3, 3], unit quaternion [4]) of one of them."""
-    given = _numbers(values)
-    if given.shape == (4,):
-        length = float(np.linalg.norm(given))
+    numbers = _numbers(values)
+    if numbers.shape == (4,):
+        length = float(np.linalg.norm(numbers))
         if not 1e-12 < length < np.inf:
             raise InputError(f"rotation_wxyz: expected 4 finite numbers, not all 0, found {values!r}")
-        unit = given if abs(length - 1) < 1e-12 else given / length
+        unit = numbers if abs(length - 1) < 1e-12 else numbers / length
         return rotation_from_quaternion(unit), unit
-    is_rotation = given.shape == (3, 3) and np.abs(given @ given.T - np.eye(3)).max() < 1e-3
-    if not is_rotation or np.linalg.det(given) < 0:
+    is_rotation = numbers.shape == (3, 3) and np.abs(numbers @ numbers.T - np.eye(3)).max() < 1e-3
+    if not is_rotation or np.linalg.det(numbers) < 0:
         raise InputError(f"rotation: expected a rotation matrix [3, 3] or a quaternion [4], found {values!r}")
-    turned = not np.array_equal(given, np.eye(3))
-    return given, quaternion_from_rotation(given) if turned else np.array([1.0, 0.0, 0.0, 0.0])
+    turned = not np.array_equal(numbers, np.eye(3))
+    return numbers, quaternion_from_rotation(numbers) if turned else np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def _numbers(values: ArrayLike) -> Array:

@@ -21,43 +21,44 @@ from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
-from spacesim.splat.compose.members import Ensemble, Member, display_colours
+from spacesim.splat.compose.members import Ensemble, Member, display_colors
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.light.shadow.cast import Between, cast_between
+from spacesim.splat.light.shadow.cast import CrossShadow, cast_cross_shadows
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.render import RenderOutput, render
-from spacesim.splat.raster.supersample import supersampled
-from spacesim.splat.raster.tone import developed
+from spacesim.splat.raster.output import RenderOutput
+from spacesim.splat.raster.render import render
+from spacesim.splat.raster.supersample import render_supersampled
+from spacesim.splat.raster.tone import adjust_exposure
 from spacesim.splat.run import Prediction, Run, check_picture, stops
 
 OUTPUTS = ("rgb", "alpha", "depth", "median_depth", "normal", "visibility", "id")
-SHADOWS = ("others", "ratio", "none")
-LEAST_SHARE = (
-    0.25  #: of the pixels a metre that a light camera had in training, before a model gets another one; chosen
-)
-RATIO_EPSILON = 1e-3  #: epsilon of 4.15, for which the thesis names no number: chosen
-COVERED = 0.5  #: alpha from which on a pixel shows an object: chosen
+SHADOWS = ("trained", "others", "ratio", "none")
+MIN_SCALE_SHARE = 0.25  #: least light pixels over a model's extent as a share of the picture's size: half of training's
+RATIO_EPSILON = 1e-3  #: epsilon of 4.15, for which the thesis names no number
+COVERED = 0.5  #: alpha from which on a pixel shows an object
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """A run and where it stands. name: for messages and files"""
+class PlacedRun:
+    """A run and where it stands."""
 
     run: Run
     pose: Pose = field(default_factory=Pose)
-    name: str = ""
+    name: str = ""  #: for messages and files
 
 
 @dataclass(frozen=True)
 class ComposeConfig:
-    """shadows: of models on each other. "others": from the other models alone, which is what 4.15 estimates. "ratio":
-    4.15 itself, light from all over light from the model's own Gaussians; where a model's raw shadow of itself is
-    wrongly dark, the ratio says nothing, and what refinement has mended is dark again. "none": no such shadows."""
+    """How models of a scene are drawn together."""
 
-    shadows: str = "others"
+    #: of models on each other. "others": from the other models alone, which is what 4.15 estimates. "ratio": 4.15
+    #: itself, light from all over light from the model's own Gaussians; where a model's raw shadow of itself is wrongly
+    #: dark, the ratio says nothing, and what refinement has mended is dark again. "trained": the one of these that the
+    #: run of the model in the shadow was configured with (`ShadowConfig.between`). "none": no such shadows.
+    shadows: str = "trained"
 
     def __post_init__(self) -> None:
         if self.shadows not in SHADOWS:
@@ -66,27 +67,28 @@ class ComposeConfig:
 
 @dataclass(frozen=True, eq=False)
 class ComposedPrediction(Prediction):
-    """A view of a scene. visibility: of models without shadows of their own 1 where no other model is before the Sun;
-    id: [H, W] int32, number of the object with the largest share of the pixel, counted from 1 in the order of the
-    models; 0 where less than half of the pixel is covered"""
+    """A view of a scene. visibility: of models without shadows of their own 1 where no other model is before the
+    Sun."""
 
+    #: [H, W] int32, number of the object with the largest share of the pixel, counted from 1 in the order of the
+    #: models; 0 where less than half of the pixel is covered
     id: np.ndarray | None = None
 
 
 @dataclass
-class Drawn:
-    """A view on the device. output: alpha, depth, ... and `features`, of which `planes` says what they are: "rgb" (3,
-    premultiplied, linear where there is a `curve`), "visibility" (1, premultiplied), "id" (one a model, in the order of
-    `order`)"""
+class DrawnView:
+    """A view on the device."""
 
+    #: alpha, depth, ... and `features`, of which `planes` says what they are: "rgb" (3, premultiplied, linear where
+    #: there is a `curve`), "visibility" (1, premultiplied), "id" (one a model, in the order of `order`)
     output: RenderOutput
     planes: dict[str, list[Any]]
     order: list[int]
     curve: tuple[str, float] | None
 
-    def image(self, name: str, more: float = 0.0) -> np.ndarray:
+    def image(self, name: str, stops: float = 0.0) -> np.ndarray:
         """One of `OUTPUTS` that was asked for: rgb [H, W, 3] sRGB values over black, normal [H, W, 3], others [H, W];
-        float32, id int32. more: EV by which linear colours are exposed more than in training. Raises ValueError for
+        float32, id int32. stops: EV by which linear colours are exposed more than in training. Raises ValueError for
         what was not asked for."""
         if name not in ("rgb", "visibility", "id"):
             return self.output.image(name)
@@ -96,7 +98,7 @@ class Drawn:
         planes = [np.array(plane, dtype=np.float32).reshape(shape) for plane in self.planes[name]]
         if name == "rgb":
             rgb = np.stack(planes, axis=-1)
-            return developed(rgb, self.curve[0], more) if self.curve else rgb
+            return adjust_exposure(rgb, self.curve[0], stops) if self.curve else rgb
         alpha = self.output.image("alpha")
         if name == "visibility":
             return np.divide(planes[0], alpha, out=np.zeros_like(alpha), where=alpha > 0)
@@ -114,27 +116,29 @@ class Composition:
     run gives alone, to the bit.
     """
 
-    def __init__(self, models: Sequence[Placed], config: ComposeConfig | None = None, path: Path | None = None) -> None:
+    def __init__(
+        self, models: Sequence[PlacedRun], config: ComposeConfig | None = None, path: Path | None = None
+    ) -> None:
         if not models:
             raise InputError("models: expected at least one, found none")
         self.models, self.config, self.path = tuple(models), config or ComposeConfig(), path
-        known: dict[int, Member] = {id(model.run): Member.of(model.run) for model in self.models}
-        self._members = [known[id(model.run)] for model in self.models]
+        members: dict[int, Member] = {id(model.run): Member.of(model.run) for model in self.models}
+        self._members = [members[id(model.run)] for model in self.models]
         self._ensemble = Ensemble(sorted((m for m in self._members if m.count), key=lambda member: member.key))
-        self._kept = _Kept()
-        _tell(self.models, self._ensemble)
+        self._cache = _Cache()
+        _log_choices(self.models, self._ensemble)
 
     # ---- what a run is asked for, too ----
 
     @property
-    def gaussians(self) -> int:
+    def gaussian_count(self) -> int:
         """Number of Gaussians."""
         return self._ensemble.count
 
     @property
-    def bytes(self) -> int:
+    def model_bytes(self) -> int:
         """Size of the models' files, each counted once."""
-        return sum(run.bytes for run in {id(model.run): model.run for model in self.models}.values())
+        return sum(run.model_bytes for run in {id(model.run): model.run for model in self.models}.values())
 
     @property
     def backend(self) -> str:
@@ -151,20 +155,20 @@ class Composition:
         InputError where not all models are linear, of one tone curve and exposure, and for no such exposure."""
         curve = self._ensemble.curve
         if exposure is not None and curve is None and any(member.curve for member in self._ensemble.members):
-            raise InputError("--exposure: expected models of one tone curve and exposure, found several")
+            raise InputError("exposure: expected models of one tone curve and exposure, found several")
         return stops(curve, exposure, str(self.path or self.models[0].run.path))
 
     def predict(
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> ComposedPrediction:
         """Render one view. exposure: see `stops`. Raises InputError where the Sun matters and none is told."""
-        more = self.stops(exposure)
+        stops = self.stops(exposure)
         check_picture(camera)
         names = [name for name in OUTPUTS if name not in ("median_depth", "normal")]
         drawn = self.draw(camera, sun, [*names, *(("normal",) if normals else ())])
         visibility = drawn.image("visibility") if "visibility" in drawn.planes else None
         normal = drawn.image("normal") if normals else None
-        rgb = np.ascontiguousarray(drawn.image("rgb", more))
+        rgb = np.ascontiguousarray(drawn.image("rgb", stops))
         return ComposedPrediction(
             rgb, drawn.image("alpha"), drawn.image("depth"), visibility, normal, drawn.image("id")
         )
@@ -197,13 +201,13 @@ class Composition:
         other: Composition = object.__new__(Composition)
         other.models = tuple(replace(m, pose=pose) for m, pose in zip(self.models, poses, strict=True))
         other.config, other.path = self.config, self.path
-        other._members, other._ensemble, other._kept = self._members, self._ensemble, self._kept
+        other._members, other._ensemble, other._cache = self._members, self._ensemble, self._cache
         return other
 
     def shaded(self, config: ComposeConfig) -> "Composition":
         """The scene with other shadows between its models."""
         other = self.posed([model.pose for model in self.models])
-        other.config, other._kept = config, _Kept()
+        other.config, other._cache = config, _Cache()
         return other
 
     @property
@@ -212,7 +216,7 @@ class Composition:
         return [placed.pose.points(m.centre) for placed, m in zip(self.models, self._members, strict=True)]
 
     @property
-    def placed(self) -> list[Placed]:
+    def placed(self) -> list[PlacedRun]:
         """The models that have Gaussians, in the order in which these stand in the set."""
         return [self.models[i] for i in self._order()]
 
@@ -224,14 +228,14 @@ class Composition:
         """Model `index` where it stands, colours left out."""
         return Ensemble([self._members[index]]).placed([self.models[index].pose])
 
-    def light_between(self, sun: Sun | None) -> list[Any]:
+    def cross_visibility(self, sun: Sun | None) -> list[Any]:
         """Of each model, in the order of `placed`, the share of sunlight that the others let through, v_inter of 4.15:
         Float [N of it], or None where no other can be before the Sun."""
-        return self._between([model.pose for model in self.placed], None if sun is None else sun.direction)
+        return self._cross_visibilities([model.pose for model in self.placed], None if sun is None else sun.direction)
 
     def draw(
         self, camera: Camera, sun: Sun | None, outputs: Sequence[str] = ("rgb",), supersample: int | None = None
-    ) -> Drawn:
+    ) -> DrawnView:
         """A view on the device: of `OUTPUTS` those asked for, and alpha. Visibility is left out where no model knows
         any. supersample: places on a side of each pixel, by default as many as the models were trained with. Raises
         ValueError for another output, InputError where the Sun matters and none is told."""
@@ -241,9 +245,9 @@ class Composition:
         poses = [model.pose for model in self.placed]
         planes: dict[str, list[Any]] = {}
         if "rgb" in outputs or "visibility" in outputs:
-            colours, visibility = self._lit(poses, camera, sun)
+            colors, visibility = self._shade_members(poses, camera, sun)
             if "rgb" in outputs:
-                planes["rgb"] = colours
+                planes["rgb"] = colors
             if "visibility" in outputs and visibility is not None:
                 planes["visibility"] = [visibility]
         if "id" in outputs:
@@ -259,17 +263,17 @@ class Composition:
             antialiased=ensemble.antialiased,
         )
         linear = ensemble.curve is not None
-        output = supersampled(plain, camera, times, len(planes.get("rgb", [])), linear)
+        output = render_supersampled(plain, camera, times, len(planes.get("rgb", [])), linear)
         drawn = iter(output.features or [])
-        found = {name: [next(drawn) for _ in group] for name, group in planes.items()}
-        return Drawn(output, found, self._order(), ensemble.curve)
+        images = {name: [next(drawn) for _ in group] for name, group in planes.items()}
+        return DrawnView(output, images, self._order(), ensemble.curve)
 
     def lit_gaussians(self, camera: Camera, sun: Sun | None) -> tuple[Gaussians, list[Any]]:
         """(the set in the world, its colours seen from the camera: three Floats [N], sRGB display values), to draw it
         in another way. Raises InputError where the Sun matters and none is told."""
         poses = [self.models[i].pose for i in self._order()]
-        colours, _ = self._lit(poses, camera, sun)
-        return self._ensemble.placed(poses), display_colours(colours, self._ensemble.curve, None)
+        colors, _ = self._shade_members(poses, camera, sun)
+        return self._ensemble.placed(poses), display_colors(colors, self._ensemble.curve, None)
 
     # ---- light ----
 
@@ -283,22 +287,22 @@ class Composition:
         drawn = [i for i, member in enumerate(self._members) if member.count]
         return sorted(drawn, key=lambda i: (self._members[i].key, self.models[i].pose.key))
 
-    def _lit(self, poses: Sequence[Pose], camera: Camera, sun: Sun | None) -> tuple[list[Any], Any]:
+    def _shade_members(self, poses: Sequence[Pose], camera: Camera, sun: Sun | None) -> tuple[list[Any], Any]:
         """(colours as blended, three Floats [N], visibility Float [N] or None)."""
         if sun is None and self.relightable:
-            told = self.path or self.models[0].run.path
-            raise InputError(f"{told}: expected the Sun's direction for a scene that it changes, found none")
+            source = self.path or self.models[0].run.path
+            raise InputError(f"{source}: expected the Sun's direction for a scene that it changes, found none")
         if not poses:
             return [ad.Float([]) for _ in range(3)], None
         direction = None if sun is None else sun.direction
-        between = self._between(poses, direction)
+        between = self._cross_visibilities(poses, direction)
         members = self._ensemble.members
-        parts = [self._part(k, poses[k], camera, direction) for k in range(len(poses))]
-        parts = [_dimmed(part, share) for part, share in zip(parts, between, strict=True)]
-        whole = self._ensemble.curve
+        parts = [self._member_colors(k, poses[k], camera, direction) for k in range(len(poses))]
+        parts = [_dim(part, share) for part, share in zip(parts, between, strict=True)]
+        scene_curve = self._ensemble.curve
         pairs = zip(parts, members, strict=True)
-        colours = [display_colours(part[0], member.curve, whole) for part, member in pairs]
-        joined = self._ensemble.joined(colours)
+        colors = [display_colors(part[0], member.curve, scene_curve) for part, member in pairs]
+        joined = self._ensemble.joined(colors)
         if not self._shades and not any(member.has_shadows for member in members):
             return joined, None
         seen = [
@@ -307,45 +311,46 @@ class Composition:
         ]
         return joined, self._ensemble.joined([[plane] for plane in seen])[0]
 
-    def _part(self, k: int, pose: Pose, camera: Camera, sun: Array | None) -> tuple[list[Any], Any]:
+    def _member_colors(self, k: int, pose: Pose, camera: Camera, sun: Array | None) -> tuple[list[Any], Any]:
         """(colours, visibility or None) of member k as it is alone."""
         member = self._ensemble.members[k]
         near, towards = pose.camera_in_model(camera), None if sun is None else pose.direction_in_model(sun)
         light = _bytes(towards)
-        sunlight = self._kept.get(("sunlight", k), light, lambda: member.sunlight(towards))
+        sunlight = self._cache.get(("sunlight", k), light, lambda: member.sunlight(towards))
         key = near.world_from_camera.tobytes(), light
-        part: tuple[list[Any], Any] = self._kept.get(
+        part: tuple[list[Any], Any] = self._cache.get(
             ("light", k), key, lambda: member.shade(Pinhole.of(near), towards, sunlight)
         )
         return part
 
-    def _between(self, poses: Sequence[Pose], sun: Array | None) -> list[Any]:
+    def _cross_visibilities(self, poses: Sequence[Pose], sun: Array | None) -> list[Any]:
         """Of each member v_inter, Float [N of it], or None where no other can be before the Sun."""
         if not self._shades:
             return [None] * len(poses)
         assert sun is not None, "a scene with such shadows asks for a Sun first"
         key = (b"".join(pose.key for pose in poses), sun.tobytes(), self.config.shadows)
-        found: list[Any] = self._kept.get(
-            "between", key, lambda: [self._inter(poses, sun, k) for k in range(len(poses))]
+        visibility: list[Any] = self._cache.get(
+            "between", key, lambda: [self._compute_cross_visibility(poses, sun, k) for k in range(len(poses))]
         )
-        return found
+        return visibility
 
-    def _inter(self, poses: Sequence[Pose], sun: Array, k: int) -> Any:
+    def _compute_cross_visibility(self, poses: Sequence[Pose], sun: Array, k: int) -> Any:
         """v_inter of 4.15 for member k, in its own frame: what is seen of the Sun depends neither on where all stands
         nor on how it is turned, and softness, bias and pixels are those of its training."""
         ensemble, members = self._ensemble, self._ensemble.members
         if not any(_may_shade(members[j], poses[j], members[k], poses[k], sun) for j in range(len(poses)) if j != k):
             return None
         member, back = members[k], poses[k].inverse()
-        whole = ensemble.placed([Pose() if j == k else back.after(pose) for j, pose in enumerate(poses)])
-        direction, least = poses[k].direction_in_model(sun), LEAST_SHARE * member.shadow.size / member.extent
+        scene = ensemble.placed([Pose() if j == k else back.after(pose) for j, pose in enumerate(poses)])
+        direction, least = poses[k].direction_in_model(sun), MIN_SCALE_SHARE * member.shadow.size / member.extent
 
-        alone = self.config.shadows == "others"
-        shadow = member.received if alone else member.shadow
+        named = self.config.shadows
+        alone = (member.shadow.between if named == "trained" else named) == "others"
+        shadow = member.cross_shadow_config if alone else member.shadow
 
         def seen(casts: Any) -> Any:
-            between = Between(whole, casts, member.run.model, ensemble.own[k], ensemble.indices[k])
-            return 1 - cast_between(between, direction, shadow, member.distance, least)
+            between = CrossShadow(scene, casts, member.run.gaussians, ensemble.own[k], ensemble.indices[k])
+            return 1 - cast_cross_shadows(between, direction, shadow, member.distance, least)
 
         if alone:
             visible = seen(ensemble.others[k])
@@ -357,7 +362,7 @@ class Composition:
 
 
 @dataclass
-class _Kept:
+class _Cache:
     """What the last picture has computed and the next may use again, each with what it depends on: where only a model
     moves, the light of the others; where only the camera moves, the shadows."""
 
@@ -370,12 +375,12 @@ class _Kept:
         return self.values[name][1]
 
 
-def _dimmed(part: tuple[list[Any], Any], share: Any) -> tuple[list[Any], Any]:
+def _dim(part: tuple[list[Any], Any], share: Any) -> tuple[list[Any], Any]:
     """Colours and visibility in the shadows of others (4.16, 4.17). share: v_inter, or None where there are none"""
-    colours, visibility = part
+    colors, visibility = part
     if share is None:
         return part
-    return [colour * share for colour in colours], share if visibility is None else visibility * share
+    return [color * share for color in colors], share if visibility is None else visibility * share
 
 
 def _may_shade(caster: Member, at: Pose, receiver: Member, there: Pose, sun: Array) -> bool:
@@ -388,7 +393,7 @@ def _may_shade(caster: Member, at: Pose, receiver: Member, there: Pose, sun: Arr
     return ahead > -reach and aside < reach
 
 
-def _tell(models: Sequence[Placed], ensemble: Ensemble) -> None:
+def _log_choices(models: Sequence[PlacedRun], ensemble: Ensemble) -> None:
     """One sentence about each choice that the models leave open."""
     fixed = [model.name or str(model.run.path) for model in models if not model.run.relightable]
     if fixed:

@@ -1,5 +1,5 @@
-"""Scenes of trained runs as TOML files (docs/composition.md): reading them, line by line where they are wrong, and
-writing them."""
+"""Scenes of trained runs as TOML files (docs/reference/composed-scenes.md): reading them, line by line where they are
+wrong, and writing them."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -14,16 +14,16 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import write_bytes
 from spacesim.data.geometry import OPENCV_FROM_OPENGL, Array, look_at
 from spacesim.data.records import Camera, Sun, check_size
-from spacesim.data.structure import Rules, near, structure
+from spacesim.data.structure import Rules, did_you_mean, structure
 from spacesim.data.transforms import read_camera, read_dataset
-from spacesim.splat.compose.path import FPS, MOST_FRAMES, ORBIT_FRAMES, Keyframe, Orbit, PosedScene, View
+from spacesim.splat.compose.path import FPS, MAX_FRAMES, ORBIT_FRAMES, CameraView, Keyframe, Orbit, PosedScene
 from spacesim.splat.compose.pose import Pose, rotation_about
-from spacesim.splat.compose.scene import ComposeConfig, Composition, Placed
+from spacesim.splat.compose.scene import ComposeConfig, Composition, PlacedRun
 from spacesim.splat.run import Run, load_run
 
-FOV_DEG = 35.0  #: of a camera where nothing is said, chosen
-RESOLUTION = (512, 512)  #: pixels, chosen
-FPS_RANGE = (1e-3, 1e3)  #: pictures a second, chosen
+FOV_DEG = 35.0  #: of a camera where nothing is said
+RESOLUTION = (512, 512)  #: pixels
+FPS_RANGE = (1e-3, 1e3)  #: pictures a second
 RULES = Rules(spread=("resolution",))
 
 Vector = tuple[float, float, float]
@@ -60,9 +60,9 @@ class PoseEntry:
 
 @dataclass(frozen=True)
 class ModelEntry(PoseEntry):
-    """A table of [[models]]. run: the run's folder, relative to the file"""
+    """A table of [[models]]."""
 
-    run: str = ""
+    run: str = ""  #: the run's folder, relative to the file
     name: str = ""
 
 
@@ -135,15 +135,15 @@ class ViewEntry:
             return look_at(self.position, self.look_at, self.up)
         return None if self.transform_matrix is None else np.array(self.transform_matrix) @ OPENCV_FROM_OPENGL
 
-    def view(self, width: int) -> View | None:
+    def view(self, width: int) -> CameraView | None:
         """For an image so many pixels wide; None where no place is named."""
         focal = self.focal
         if self.fov_deg is not None:
             length = float(0.5 * width / np.tan(0.5 * np.radians(self.fov_deg)))
             focal = length, length
         if self.position is not None and self.look_at is not None:
-            return View.towards(np.array(self.position), np.array(self.look_at), self.up, focal)
-        return None if self.place is None else View(self.place, None, focal)
+            return CameraView.towards(np.array(self.position), np.array(self.look_at), self.up, focal)
+        return None if self.place is None else CameraView(self.place, None, focal)
 
 
 @dataclass(frozen=True)
@@ -181,12 +181,12 @@ class CameraEntry(ViewEntry):
 
 @dataclass(frozen=True)
 class KeyframeEntry:
-    """A table of [[keyframes]]. time: seconds;  models: poses by the models' names"""
+    """A table of [[keyframes]]."""
 
-    time: float
+    time: float  #: seconds
     sun: SunEntry | None = None
     camera: ViewEntry | None = None
-    models: Mapping[str, PoseEntry] = field(default_factory=dict)
+    models: Mapping[str, PoseEntry] = field(default_factory=dict)  #: poses by the models' names
 
 
 @dataclass(frozen=True)
@@ -204,15 +204,15 @@ class SceneEntry:
     def __post_init__(self) -> None:
         if not self.models:
             raise InputError("models: expected at least one, found none")
-        if self.frames is not None and not 1 <= self.frames <= MOST_FRAMES:
-            raise InputError(f"frames: expected 1 to {MOST_FRAMES}, found {self.frames}")
+        if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
+            raise InputError(f"frames: expected 1 to {MAX_FRAMES}, found {self.frames}")
         if not FPS_RANGE[0] <= self.fps <= FPS_RANGE[1]:
             least, most = FPS_RANGE
             raise InputError(f"fps: expected {least:g} to {most:g} pictures a second, found {self.fps}")
         ComposeConfig(self.shadows)
 
 
-def load_scene(path: Path) -> PosedScene:
+def load_scene(path: str | Path) -> PosedScene:
     """The scene that a TOML file describes, its runs loaded, each once. Raises InputError with file, line and key."""
     path = Path(path)
     document = toml.read_document(path)
@@ -220,15 +220,15 @@ def load_scene(path: Path) -> PosedScene:
     names = _names(entry.models, document)
     runs: dict[Path, Run] = {}
     models = []
-    for index, (one, name) in enumerate(zip(entry.models, names, strict=True)):
-        folder = (path.parent / one.run).resolve()
+    for index, (model, name) in enumerate(zip(entry.models, names, strict=True)):
+        folder = (path.parent / model.run).resolve()
         if folder not in runs:
-            runs[folder] = _loaded(path.parent / one.run, document, index)
-        models.append(Placed(runs[folder], one.pose(Pose()), name))
+            runs[folder] = _load_model(path.parent / model.run, document, index)
+        models.append(PlacedRun(runs[folder], model.pose(Pose()), name))
     composition = Composition(models, ComposeConfig(entry.shadows), path)
     camera = None if entry.camera is None else _camera(entry.camera, path.parent, document)
     width = camera.width if camera else RESOLUTION[0]
-    keyframes = [_keyframe(one, k, entry, models, width, document) for k, one in enumerate(entry.keyframes)]
+    keyframes = [_keyframe(keyframe, k, entry, models, width, document) for k, keyframe in enumerate(entry.keyframes)]
     orbit = entry.camera.orbit if entry.camera else None
     sun = entry.sun.sun if entry.sun else None
     return PosedScene(composition, sun, camera, keyframes, orbit, _frames(entry, document), entry.fps)
@@ -279,7 +279,7 @@ def _names(models: Sequence[ModelEntry], document: toml.Document) -> list[str]:
     return names
 
 
-def _loaded(folder: Path, document: toml.Document, index: int) -> Run:
+def _load_model(folder: Path, document: toml.Document, index: int) -> Run:
     try:
         return load_run(folder)
     except InputError as error:
@@ -288,23 +288,25 @@ def _loaded(folder: Path, document: toml.Document, index: int) -> Run:
 
 def _camera(entry: CameraEntry, folder: Path, document: toml.Document) -> Camera:
     if entry.file is not None:
-        return _told(document, "file", lambda: read_camera(folder / str(entry.file)))
+        return _read_entry(document, "file", lambda: read_camera(folder / str(entry.file)))
     if entry.data is not None:
-        frames = _told(document, "data", lambda: read_dataset(folder / str(entry.data))).frames
+        frames = _read_entry(document, "data", lambda: read_dataset(folder / str(entry.data))).frames
         if not 0 <= entry.frame < len(frames):
             label = document.label(("camera", "frame"))
             raise InputError(f"{label}: expected 0 to {len(frames) - 1}, found {entry.frame}")
         camera: Camera = frames[entry.frame].camera
         return camera
     width, height = entry.resolution or RESOLUTION
-    view = entry.view(width) or (entry.orbit.view(0) if entry.orbit else View(look_at((0.0, -5.0, 2.0), (0, 0, 0))))
+    view = entry.view(width) or (
+        entry.orbit.view(0) if entry.orbit else CameraView(look_at((0.0, -5.0, 2.0), (0, 0, 0)))
+    )
     camera = Camera.from_fov(view.world_from_camera, width, height, entry.fov_deg or FOV_DEG)
     fx, fy = entry.focal or (camera.fx, camera.fy)
     cx, cy = entry.principal or (camera.cx, camera.cy)
     return Camera(view.world_from_camera, width, height, fx, fy, cx, cy)
 
 
-def _told(document: toml.Document, key: str, read: Any) -> Any:
+def _read_entry(document: toml.Document, key: str, read: Any) -> Any:
     try:
         return read()
     except InputError as error:
@@ -312,32 +314,39 @@ def _told(document: toml.Document, key: str, read: Any) -> Any:
 
 
 def _keyframe(
-    one: KeyframeEntry, index: int, entry: SceneEntry, models: Sequence[Placed], width: int, document: toml.Document
+    keyframe: KeyframeEntry,
+    index: int,
+    entry: SceneEntry,
+    models: Sequence[PlacedRun],
+    width: int,
+    document: toml.Document,
 ) -> Keyframe:
     """width: of the scene's camera, pixels. Raises InputError, with the line, for a time that does not rise, a model
     that there is none of, a camera that cannot be."""
     at = ("keyframes", index)
-    if index > 0 and not one.time > entry.keyframes[index - 1].time:
+    if index > 0 and not keyframe.time > entry.keyframes[index - 1].time:
         before = entry.keyframes[index - 1].time
         raise InputError(
-            f"{document.label((*at, 'time'))}: expected more than the one before, {before}, found {one.time}"
+            f"{document.label((*at, 'time'))}: expected more than the one before, {before}, found {keyframe.time}"
         )
     by_name = {model.name: model for model in models}
-    for name in one.models:
+    for name in keyframe.models:
         if name not in by_name:
             label = document.label((*at, "models", name))
-            raise InputError(f"{label}: expected one of {', '.join(by_name)}, found {name!r}{near(name, by_name)}")
+            raise InputError(
+                f"{label}: expected one of {', '.join(by_name)}, found {name!r}{did_you_mean(name, by_name)}"
+            )
     view = None
-    if one.camera is not None:
+    if keyframe.camera is not None:
         label = document.label((*at, "camera"))
         if entry.camera is None or entry.camera.orbit is not None:
             found = "none" if entry.camera is None else "an orbit"
             raise InputError(f"{label}: expected a table [camera] that says the image's size, found {found}")
-        view = one.camera.view(width)
+        view = keyframe.camera.view(width)
         if view is None:
             raise InputError(f"{label}: expected position and look_at, or transform_matrix, found neither")
-    poses = {name: pose.pose(by_name[name].pose) for name, pose in one.models.items()}
-    return Keyframe(one.time, one.sun.sun if one.sun else None, view, poses)
+    poses = {name: pose.pose(by_name[name].pose) for name, pose in keyframe.models.items()}
+    return Keyframe(keyframe.time, keyframe.sun.sun if keyframe.sun else None, view, poses)
 
 
 def _frames(entry: SceneEntry, document: toml.Document) -> int:
@@ -347,9 +356,9 @@ def _frames(entry: SceneEntry, document: toml.Document) -> int:
         return entry.frames
     if entry.keyframes:
         last = entry.keyframes[-1].time
-        if last * entry.fps >= MOST_FRAMES - 0.5:
+        if last * entry.fps >= MAX_FRAMES - 0.5:
             label = document.label(("keyframes", len(entry.keyframes) - 1, "time"))
-            most = f"{MOST_FRAMES:,} pictures at {entry.fps:g} a second, or frames to say how many"
+            most = f"{MAX_FRAMES:,} pictures at {entry.fps:g} a second, or frames to say how many"
             raise InputError(f"{label}: expected a time within {most}, found {last} seconds")
         return max(0, int(last * entry.fps + 0.5)) + 1
     return ORBIT_FRAMES if entry.camera and entry.camera.orbit else 1
@@ -376,7 +385,7 @@ def _sun_values(sun: Sun) -> dict[str, Any]:
     return {"direction": sun.direction.tolist()}
 
 
-def _view_values(view: View) -> dict[str, Any]:
+def _view_values(view: CameraView) -> dict[str, Any]:
     values: dict[str, Any] = {"transform_matrix": (view.world_from_camera @ OPENCV_FROM_OPENGL).tolist()}
     position = view.world_from_camera[:3, 3]
     if view.target is not None and np.array_equal(look_at(position, view.target, view.up), view.world_from_camera):

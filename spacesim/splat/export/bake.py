@@ -1,5 +1,7 @@
 """A relightable model under one Sun as plain Gaussians with spherical harmonics, which every splat viewer draws."""
 
+from typing import Any
+
 import drjit as dr
 import numpy as np
 
@@ -8,14 +10,18 @@ from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
-from spacesim.splat.raster.tone import picture_of
+from spacesim.splat.raster.tone import tone_map
 
 VIEWS = 64  #: directions that the harmonics are fitted to, four times as many as degree 3 has terms
 
 
-def baked(gaussians: Gaussians, light: LightModel, sun: np.ndarray, degree: int = 3) -> Gaussians:
-    """The Gaussians with the colours, shadows included, that they have under a Sun in the direction `sun` [3].
+def bake(
+    gaussians: Gaussians, light: LightModel, sun: np.ndarray | None, degree: int = 3, others: Any | None = None
+) -> Gaussians:
+    """The Gaussians with the colours, shadows included, that they have under a Sun in the direction `sun` [3], or None
+    for a model that is not told.
 
+    others: Float [N], the share of sunlight that other models let through (v_inter of 4.16), or None for all of it
     Harmonics of `degree` are fitted by least squares to the colours from `VIEWS` directions around; what is sharper in
     the view than they can be, such as a glint, is smoothed. Colours are sRGB values, as in `vanilla`.
     """
@@ -27,19 +33,21 @@ def baked(gaussians: Gaussians, light: LightModel, sun: np.ndarray, degree: int 
     for view, direction in enumerate(directions):
         # A camera of parallel rays sees every Gaussian in one direction; how far it is away makes no difference.
         camera = OrthographicCamera.from_extent(look_at(-direction, np.zeros(3)), 4, 4, 1.0)
-        colours, _ = light.lit(gaussians, Orthographic.of(camera), sun, known=sunlight)
+        colors, _ = light.shade_picture(gaussians, Orthographic.of(camera), sun, sunlight=sunlight)
+        if others is not None:
+            colors = [color * others for color in colors]
         if light.config.curve:
-            colours = [picture_of(colour, light.config.curve[0]) for colour in colours]
+            colors = [tone_map(color, light.config.curve[0]) for color in colors]
         for k in range(len(fit)):
-            weight = ad.Float(np.array([fit[k, view]], dtype=np.float32))
+            weight = ad.Float([float(np.float32(fit[k, view]))])
             for channel in range(3):
-                coefficients[3 * k + channel] += weight * (colours[channel] - 0.5)
+                coefficients[3 * k + channel] += weight * (colors[channel] - 0.5)
         dr.eval(coefficients)
     drawn = gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities
     return Gaussians(*drawn, ad.ArrayXf(coefficients))
 
 
 def _harmonics(directions: np.ndarray, degree: int) -> list:
-    """Terms of `view_colours`, constant included, for directions [V, 3]."""
+    """Terms of `view_colors`, constant included, for directions [V, 3]."""
     rows = dr.sh_eval(ad.Array3f(directions.T.astype(np.float32)), degree)
     return [np.array([SH_C0]), *(np.array(row) for row in rows[1:])]

@@ -15,28 +15,28 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
 
-TRUNCATION = 2.0  #: voxels (docs/geometry.md says what was tried)
-STEP = 2.0  #: voxels; between pixels whose depths differ by more, depth is not interpolated (chosen)
+TRUNCATION = 2.0  #: voxels (docs/research/geometry.md says what was tried)
+STEP = 2.0  #: voxels; between pixels whose depths differ by more, depth is not interpolated
 BATCH = 16  #: views in one kernel
 BYTES = 32  #: a voxel takes at most, while views are fused and the surface is looked for: 23 to 30 were seen
-USED = 0.8  #: share of the free memory that a grid may take, chosen
-MOST_VOXELS = 2**31  #: what 32-bit indices reach
-MOST_SIDE = 1e15  #: voxels along a side, that they can be counted
+USED = 0.8  #: share of the free memory that a grid may take
+MAX_VOXELS = 2**31  #: what 32-bit indices reach
+MAX_SIDE = 1e15  #: voxels along a side, that they can be counted
 NEAR = 1e-6  #: metres; nearer voxels are behind the camera
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Cubic voxels, aligned with the world. origin: [3] metres, centre of the first;  voxel: their side, metres;
-    shape: (X, Y, Z) how many; fields over it are [Z, Y, X]"""
+    """Cubic voxels, aligned with the world."""
 
-    origin: Array
-    voxel: float
-    shape: tuple[int, int, int]
+    origin: Array  #: [3] metres, centre of the first
+    voxel: float  #: their side, metres
+    shape: tuple[int, int, int]  #: (X, Y, Z) how many; fields over it are [Z, Y, X]
 
     @property
     def count(self) -> int:
@@ -47,7 +47,7 @@ class Grid:
     def around(low: Array, high: Array, voxel: float, margin: float) -> "Grid":
         """Voxels of side `voxel` that hold the box from `low` to `high` [3] and `margin` metres around it."""
         low, high = np.asarray(low) - margin, np.asarray(high) + margin
-        sides = np.ceil(np.minimum((high - low) / voxel, MOST_SIDE))
+        sides = np.ceil(np.minimum((high - low) / voxel, MAX_SIDE))
         shape = np.maximum(sides, 1).astype(np.int64) + 1
         x, y, z = (int(side) for side in shape)
         return Grid(0.5 * (low + high) - 0.5 * voxel * (shape - 1), float(voxel), (x, y, z))
@@ -55,19 +55,19 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """depth: [H, W] float32, z along the optical axis of `camera`, metres; 0 where there is no surface"""
+    """A depth picture and its camera."""
 
     camera: Camera
-    depth: np.ndarray
+    depth: np.ndarray  #: [H, W] float32, z along the optical axis of `camera`, metres; 0 where there is no surface
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """distance: [Z, Y, X] float32 in [-1, 1], mean signed distance by the truncation, above 0 outside
-    observed: [Z, Y, X] bool, whether a view sees the voxel, or the surface less than the truncation before it"""
+    """A truncated signed distance on a grid."""
 
     grid: Grid
-    distance: np.ndarray
+    distance: np.ndarray  #: [Z, Y, X] float32 in [-1, 1], mean signed distance by the truncation, above 0 outside
+    #: [Z, Y, X] bool, whether a view sees the voxel, or the surface less than the truncation before it
     observed: np.ndarray
 
 
@@ -83,7 +83,7 @@ def fuse(
     """
     check_memory(grid)
     sums = dr.zeros(ad.Float, grid.count), dr.zeros(ad.Float, grid.count)
-    lattice = ad.Float(np.array([*grid.origin, grid.voxel], np.float32)), ad.UInt32(list(grid.shape))
+    lattice = upload(np.array([*grid.origin, grid.voxel])), ad.UInt32(list(grid.shape))
     limits = ad.Float([truncation * grid.voxel, STEP * grid.voxel])
     batch: list[DepthView] = []
     done = 0
@@ -98,7 +98,7 @@ def fuse(
         sums = _add(sums, _upload(batch), lattice, limits, grid.count)
         if progress:
             progress(done + len(batch))
-    total, weight = (np.array(one).reshape(grid.shape[::-1]) for one in sums)
+    total, weight = (np.array(values).reshape(grid.shape[::-1]) for values in sums)
     observed = weight > 0
     distance = np.divide(total, weight, out=np.ones_like(total), where=observed)
     return Field(grid, distance, observed)
@@ -107,7 +107,7 @@ def fuse(
 def check_memory(grid: Grid) -> None:
     """Raises InputError where the voxels of `grid` do not fit into memory, with the size that would."""
     free = backend.free_memory(int(BYTES * grid.count / USED))
-    most = MOST_VOXELS if free is None else min(MOST_VOXELS, int(USED * free / BYTES))
+    most = MAX_VOXELS if free is None else min(MAX_VOXELS, int(USED * free / BYTES))
     if grid.count > most:
         sides = "x".join(map(str, grid.shape))
         least = grid.voxel * (grid.count / most) ** (1 / 3)
@@ -119,13 +119,12 @@ def check_memory(grid: Grid) -> None:
 
 @dataclass
 class _Batch:
-    """numbers: Float [18 V], of each view camera_from_world rows (12), fx, fy, cx, cy, width, height
-    start: UInt32 [V], its first pixel in `depth`;  depth: Float;  count: UInt32, V"""
+    """Views on the device."""
 
-    numbers: Any
-    start: Any
-    depth: Any
-    count: Any
+    numbers: Any  #: Float [18 V], of each view camera_from_world rows (12), fx, fy, cx, cy, width, height
+    start: Any  #: UInt32 [V], its first pixel in `depth`
+    depth: Any  #: Float
+    count: Any  #: UInt32, V
 
 
 def _upload(views: Sequence[DepthView]) -> _Batch:
@@ -139,9 +138,9 @@ def _upload(views: Sequence[DepthView]) -> _Batch:
     start = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.uint32)
     depth = np.concatenate([np.asarray(view.depth, np.float32).ravel() for view in views])
     return _Batch(
-        ad.Float(np.asarray(numbers, np.float32)),
-        ad.UInt32(start),
-        ad.Float(np.where(np.isfinite(depth), depth, 0)),
+        upload(np.asarray(numbers)),
+        upload(start, ad.UInt32),
+        upload(np.where(np.isfinite(depth), depth, 0)),
         ad.UInt32([len(views)]),
     )
 
@@ -158,7 +157,7 @@ def _add(sums: tuple[Any, Any], batch: _Batch, lattice: tuple[Any, Any], limits:
     point = ad.Array3f(x, y, z) + voxel * cells
     last = dr.gather(ad.UInt32, batch.count, ad.UInt32(0))
 
-    def more(view: Any, _total: Any, _weight: Any) -> Any:
+    def has_more(view: Any, _total: Any, _weight: Any) -> Any:
         return view < last
 
     def look(view: Any, total: Any, weight: Any) -> tuple[Any, Any, Any]:
@@ -177,30 +176,28 @@ def _add(sums: tuple[Any, Any], batch: _Batch, lattice: tuple[Any, Any], limits:
         focal = ad.Array2f(number(12), number(13))
         pixel = ad.Array2f(column, row)
         cell = _cell(batch.depth, dr.gather(ad.UInt32, batch.start, view), width, height, pixel, inside, step)
-        ahead, slope = _ahead(cell, ad.Array2f(at.x, at.y) * scale, at.z, focal, truncation)
+        ahead, slope = _signed_distance(cell, ad.Array2f(at.x, at.y) * scale, at.z, focal, truncation)
         share = slope * dr.minimum(2 * (1 + ahead / truncation), 1)  # deep behind the surface is guessed
         share = dr.select(inside & (ahead > -truncation), share, 0)
         return view + 1, total + share * dr.minimum(dr.maximum(ahead / truncation, -1), 1), weight + share
 
     state = dr.zeros(ad.UInt32, count), *sums
-    _, total, weight = dr.while_loop(state, more, look, mode="symbolic", label="fuse")
+    _, total, weight = dr.while_loop(state, has_more, look, mode="symbolic", label="fuse")
     dr.eval(total, weight)
     return total, weight
 
 
 @dataclass
 class _Cell:
-    """What the four pixels around a place show. depth: of the surface in front, metres, 0 where none has any;
-    rise: Array2f, its change by a column and by a row; share: bilinear, of the pixels that show it, 1 for all;
-    back: depth of the others, infinite without surface"""
+    """What the four pixels around a place show."""
 
-    depth: Any
-    rise: Any
-    share: Any
-    back: Any
+    depth: Any  #: of the surface in front, metres, 0 where none has any
+    rise: Any  #: Array2f, its change by a column and by a row
+    share: Any  #: bilinear, of the pixels that show it, 1 for all
+    back: Any  #: depth of the others, infinite without surface
 
 
-def _ahead(cell: _Cell, ray: Any, z: Any, focal: Any, truncation: Any) -> tuple[Any, Any]:
+def _signed_distance(cell: _Cell, ray: Any, z: Any, focal: Any, truncation: Any) -> tuple[Any, Any]:
     """How far a voxel at depth `z` on the ray (x, y, 1) lies before the surface that a view sees, metres, and the
     weight of that.
 
@@ -211,10 +208,10 @@ def _ahead(cell: _Cell, ray: Any, z: Any, focal: Any, truncation: Any) -> tuple[
     inverse = dr.rcp(dr.select(cell.depth > 0, cell.depth, 1))
     a, b = (cell.rise[i] * focal[i] * inverse for i in range(2))
     slope = dr.rsqrt(a * a + b * b + dr.square(1 + a * ray.x + b * ray.y))
-    whole = cell.share > 1 - 1e-4
+    is_covered = cell.share > 1 - 1e-4
     across = (0.5 - cell.share) * z / focal.x
     front = (cell.depth - z) * slope
-    inner = dr.select(whole | (front >= 0) | (front <= -truncation), front, dr.maximum(front, across))
+    inner = dr.select(is_covered | (front >= 0) | (front <= -truncation), front, dr.maximum(front, across))
     beside = dr.minimum(cell.back - z, across)
     ahead = dr.select(cell.depth > 0, dr.select(cell.share >= 0.5, inner, beside), truncation)
     return ahead, slope
@@ -228,22 +225,22 @@ def _cell(depth: Any, start: Any, width: Any, height: Any, pixel: Any, inside: A
     fx, fy = left - x0, top - y0
     corner = start + ad.UInt32(y0) * stride + ad.UInt32(x0)
     right, down = dr.select(width > 1, ad.UInt32(1), 0), dr.select(height > 1, stride, 0)
-    found = [
+    depths = [
         dr.gather(ad.Float, depth, corner + offset, inside) for offset in (ad.UInt32(0), right, down, right + down)
     ]
     weights = [(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy]
-    near = [dr.select(one > 0, one, dr.inf) for one in found]
+    near: list[Any] = [dr.select(pixel_depth > 0, pixel_depth, dr.inf) for pixel_depth in depths]
     lowest = dr.minimum(dr.minimum(near[0], near[1]), dr.minimum(near[2], near[3]))
     share, mean, back = ad.Float(0), ad.Float(0), ad.Float(dr.inf)
-    for one, weight in zip(near, weights, strict=True):
-        front = one - lowest <= step
+    for pixel_depth, weight in zip(near, weights, strict=True):
+        front = pixel_depth - lowest <= step
         share += dr.select(front, weight, 0)
-        mean += dr.select(front, weight * one, 0)
-        back = dr.select(front, back, dr.minimum(back, one))
+        mean += dr.select(front, weight * pixel_depth, 0)
+        back = dr.select(front, back, dr.minimum(back, pixel_depth))
     shown = dr.isfinite(lowest)
     share = dr.select(shown, share, 0)
-    a, b, c, d = found
-    whole = share > 1 - 1e-4
+    a, b, c, d = depths
+    is_covered = share > 1 - 1e-4
     rise = ad.Array2f(dr.lerp(b - a, d - c, fy), dr.lerp(c - a, d - b, fx))
     value = dr.select(shown, dr.select(share > 1e-4, mean / dr.maximum(share, 1e-4), lowest), 0)
-    return _Cell(value, dr.select(whole, rise, 0), share, back)
+    return _Cell(value, dr.select(is_covered, rise, 0), share, back)

@@ -17,18 +17,18 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, fibonacci_sphere, look_at
 from spacesim.data.records import Camera
 from spacesim.splat.export.fusion import TRUNCATION, DepthView, Field, Grid, check_memory, fuse
-from spacesim.splat.export.sweep import resized
+from spacesim.splat.export.sweep import resize_camera
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import project
 from spacesim.splat.raster.render import blend
-from spacesim.splat.raster.surface import median_splat, picked, surface_depth
+from spacesim.splat.raster.surface import gather_or_zero, median_splat, surface_depth
 
 KINDS = ("surface", "median", "expected")
 OPAQUE = 0.5  #: alpha from which on a pixel shows a surface
-FOV_DEG, SIDE = 40.0, 256  #: of cameras that stand in for missing ones (chosen), pixels a side
-MOST_PIXELS = 512  #: of a picture's longer side; larger ones are rendered smaller (chosen)
-MOST_TRUNCATION = 100  #: voxels, chosen: the grid has as many around the object
+FOV_DEG, SIDE = 40.0, 256  #: of cameras that stand in for missing ones, pixels a side
+MAX_PIXELS = 512  #: of a picture's longer side; larger ones are rendered smaller
+MAX_TRUNCATION = 100  #: voxels: the grid has as many around the object
 OUTLIERS = 1e-3  #: share of the points seen, at each end of each axis, that does not decide how large the object is
 MARGIN = 0.1  #: of the size so found, around it, in which outliers still count
 PIECE = 1e-3  #: of the largest piece's area: smaller ones are dropped
@@ -37,15 +37,14 @@ _CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 
 
 @dataclass(frozen=True)
 class MeshConfig:
-    """voxels: along the object's size (the diagonal of its box);  voxel: their side in metres instead, or None
-    truncation: voxels;  views: at most, evenly chosen
-    depth: of a pixel: where its ray meets the Gaussian at which half of the light is gone ("surface"), that Gaussian's
-    centre ("median"), or the mean of the centres ("expected")"""
+    """How the surface of a run is made."""
 
-    voxels: int = 192
-    voxel: float | None = None
-    truncation: float = TRUNCATION
-    views: int = 64
+    voxels: int = 192  #: along the object's size (the diagonal of its box)
+    voxel: float | None = None  #: their side in metres instead, or None
+    truncation: float = TRUNCATION  #: voxels
+    views: int = 64  #: at most, evenly chosen
+    #: of a pixel: where its ray meets the Gaussian at which half of the light is gone ("surface"), that Gaussian's
+    #: centre ("median"), or the mean of the centres ("expected")
     depth: str = "surface"
 
     def __post_init__(self) -> None:
@@ -55,21 +54,20 @@ class MeshConfig:
             raise InputError(f"voxels: expected at least 2, found {self.voxels}")
         if self.views < 1:
             raise InputError(f"views: expected at least 1, found {self.views}")
-        if not 1 <= self.truncation <= MOST_TRUNCATION:
-            raise InputError(f"truncation: expected 1 to {MOST_TRUNCATION} voxels, found {self.truncation}")
+        if not 1 <= self.truncation <= MAX_TRUNCATION:
+            raise InputError(f"truncation: expected 1 to {MAX_TRUNCATION} voxels, found {self.truncation}")
         if self.depth not in KINDS:
             raise InputError(f"depth: expected {' or '.join(KINDS)}, found {self.depth!r}")
 
 
 @dataclass(frozen=True, eq=False)
 class RunMesh:
-    """vertices: [V, 3] metres, world frame;  faces: [F, 3] int64, outside is where they turn counter-clockwise
-    voxel: metres;  views: how many were fused.  No faces where no view shows a surface."""
+    """The surface of a run."""
 
-    vertices: Array
-    faces: np.ndarray
-    voxel: float
-    views: int
+    vertices: Array  #: [V, 3] metres, world frame
+    faces: np.ndarray  #: [F, 3] int64, outside is where they turn counter-clockwise
+    voxel: float  #: metres
+    views: int  #: how many were fused. No faces where no view shows a surface.
 
 
 def mesh_of(
@@ -85,7 +83,7 @@ def mesh_of(
     Raises InputError where the grid does not fit into memory.
     """
     config = config or MeshConfig()
-    chosen = chosen_views(cameras, config.views)
+    chosen = select_views(cameras, config.views)
     steps = 2 * len(chosen) + 1
 
     def report(done: int) -> None:
@@ -104,18 +102,18 @@ def mesh_of(
     grid = Grid.around(*box, voxel, (config.truncation + 1) * voxel)
     check_memory(grid)
     field = fuse(views, grid, config.truncation, progress=lambda done: report(len(views) + done))
-    vertices, faces = without_crumbs(*surface(field))
+    vertices, faces = remove_small_pieces(*surface(field))
     report(steps)
     return RunMesh(vertices, faces, voxel, len(views))
 
 
-def chosen_views(cameras: Sequence[Camera], most: int) -> list[Camera]:
+def select_views(cameras: Sequence[Camera], most: int) -> list[Camera]:
     """At most `most` of the cameras, evenly chosen among those that see something else: under several Suns many are the
-    same. As large as `MOST_PIXELS`."""
+    same. As large as `MAX_PIXELS`."""
     views = {(c.world_from_camera.tobytes(), c.width, c.height, c.fx, c.fy, c.cx, c.cy): c for c in cameras}
     different = list(views.values())
     places = np.unique(np.linspace(0, len(different) - 1, min(most, len(different))).round().astype(int))
-    return [_within(different[place], MOST_PIXELS) for place in places]
+    return [_limit_pixels(different[place], MAX_PIXELS) for place in places]
 
 
 def cameras_around(model: Gaussians, count: int) -> list[Camera]:
@@ -147,7 +145,7 @@ def depth_of(model: Gaussians, camera: Camera, kind: str = "surface", antialiase
         if kind == "surface":
             depth = surface_depth(model, splats, index, seen, model.count)
         else:
-            depth = picked(splats.depth, index)
+            depth = gather_or_zero(splats.depth, index)
     depth = dr.select((alpha >= OPAQUE) & dr.isfinite(depth) & (depth > 0), depth, 0)
     return np.array(depth, np.float32).reshape(camera.height, camera.width)
 
@@ -169,15 +167,15 @@ def surface(field: Field) -> tuple[Array, np.ndarray]:
     nx, ny, nz = grid.shape
     if min(grid.shape) < 2:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    known = np.ones((nz - 1, ny - 1, nx - 1), bool)
-    below, above = np.zeros_like(known), np.zeros_like(known)
+    is_known = np.ones((nz - 1, ny - 1, nx - 1), bool)
+    below, above = np.zeros_like(is_known), np.zeros_like(is_known)
     negative = field.distance < 0
     for x, y, z in _CORNERS:
         part = np.s_[z : z + nz - 1, y : y + ny - 1, x : x + nx - 1]
-        known &= field.observed[part]
+        is_known &= field.observed[part]
         below |= negative[part]
         above |= ~negative[part]
-    z, y, x = np.nonzero(known & below & above)
+    z, y, x = np.nonzero(is_known & below & above)
     if len(x) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     corners = np.ravel_multi_index(
@@ -191,7 +189,7 @@ def surface(field: Field) -> tuple[Array, np.ndarray]:
     return np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
 
 
-def without_crumbs(vertices: Array, faces: np.ndarray) -> tuple[Array, np.ndarray]:
+def remove_small_pieces(vertices: Array, faces: np.ndarray) -> tuple[Array, np.ndarray]:
     """The mesh without pieces whose area is below `PIECE` of the largest one's."""
     if len(faces) == 0:
         return vertices, faces
@@ -215,6 +213,6 @@ def _points(view: DepthView) -> Array:
     return np.asarray(np.stack([x, y, depth], axis=1) @ pose[:3, :3].T + pose[:3, 3], np.float64)
 
 
-def _within(camera: Camera, most: int) -> Camera:
+def _limit_pixels(camera: Camera, most: int) -> Camera:
     """The camera with at most `most` pixels on its longer side."""
-    return camera if max(camera.width, camera.height) <= most else resized(camera, most)
+    return camera if max(camera.width, camera.height) <= most else resize_camera(camera, most)

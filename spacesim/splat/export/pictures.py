@@ -14,14 +14,14 @@ LIT, SHADOWED = (222, 222, 216), (58, 64, 82)  #: sRGB colours of visibility 1 a
 
 def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
     """kind: "rgb" (PNG: straight alpha; EXR: sRGB over black), "alpha", "depth" (PNG: near is bright; EXR: metres)
-    "normal" (PNG: world x, y, z from -1 to 1 as red, green, blue; EXR: the vectors) or "shadow" (PNG: `shadow_colours`;
+    "normal" (PNG: world x, y, z from -1 to 1 as red, green, blue; EXR: the vectors) or "shadow" (PNG: `shadow_colors`;
     EXR: visibility, 1 where all of the Sun is seen).
 
     Raises InputError for another suffix than .png or .exr, and for shadows of a method without.
     """
     path, plane = Path(path), getattr(prediction, "visibility" if kind == "shadow" else kind)
     if plane is None:
-        raise InputError(f"--kind {kind}: expected a run whose method predicts shadows, found one that does not")
+        raise InputError("kind: expected another than shadow, of a run whose method predicts none, found shadow")
     if path.suffix == ".exr":
         write_exr(path, {kind: plane.astype(np.float32)})
     elif path.suffix != ".png":
@@ -33,7 +33,7 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
     elif kind == "depth":
         write_png(path, as_bytes(_near_is_bright(plane)))
     elif kind == "shadow":
-        write_png(path, as_bytes(shadow_colours(prediction)))
+        write_png(path, as_bytes(shadow_colors(prediction)))
     elif kind == "normal":
         surface = np.any(plane != 0, axis=-1, keepdims=True)
         write_png(path, as_bytes(np.where(surface, 0.5 + 0.5 * plane, 0)))
@@ -41,12 +41,12 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
         write_png(path, as_bytes(plane))
 
 
-def shadow_colours(prediction: Prediction) -> np.ndarray:
+def shadow_colors(prediction: Prediction) -> np.ndarray:
     """[H, W, 3] values in [0, 1], over black: SHADOWED where the Sun is hidden, LIT where it is seen. Raises ValueError
     for a prediction without visibility."""
     if prediction.visibility is None:
         raise ValueError("prediction: expected one with visibility, found none")
-    lit, shadowed = (np.array(colour) / 255 for colour in (LIT, SHADOWED))
+    lit, shadowed = (np.array(color) / 255 for color in (LIT, SHADOWED))
     visibility = np.clip(np.nan_to_num(prediction.visibility), 0, 1)[..., None]
     return (shadowed + visibility * (lit - shadowed)) * np.clip(prediction.alpha, 0, 1)[..., None]
 

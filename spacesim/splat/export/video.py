@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 INSTALL = "pip install 'spacesim[video]'"
-FASTEST_RATE = 10_000  #: pictures a second, chosen
-FINEST_RATE = 100_000  #: largest denominator of pictures a second, chosen: 24000/1001 is meant by 23.976023976
-QUALITY = "18"  #: x264's constant rate factor, chosen: artefacts are hard to see
+FASTEST_RATE = 10_000  #: pictures a second
+FINEST_RATE = 100_000  #: largest denominator of pictures a second: 24000/1001 is meant by 23.976023976
+QUALITY = "18"  #: x264's constant rate factor: artefacts are hard to see
 _BT709, _SRGB_TRANSFER = 1, 13  # numbers of ITU-T H.273
 
 
@@ -81,8 +81,8 @@ def yuv420_from_rgb(picture: np.ndarray) -> np.ndarray:
     red, green, blue = np.moveaxis(even.astype(np.float64) / 255, -1, 0)
     luma = 0.2126 * red + 0.7152 * green + 0.0722 * blue
     planes = [16 + 219 * luma]
-    for colour, span in ((blue, 1.8556), (red, 1.5748)):
-        chroma = 128 + 224 * (colour - luma) / span
+    for color, span in ((blue, 1.8556), (red, 1.5748)):
+        chroma = 128 + 224 * (color - luma) / span
         planes.append(0.25 * (chroma[::2, ::2] + chroma[1::2, ::2] + chroma[::2, 1::2] + chroma[1::2, 1::2]))
     packed = np.concatenate([plane.ravel() for plane in planes]).reshape(-1, even.shape[1])
     return np.rint(packed).astype(np.uint8)

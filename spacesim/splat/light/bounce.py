@@ -10,35 +10,35 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.splat.light.columns import Lanes
+from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.splat.light.field import unit_normals
 from spacesim.splat.light.mlp import sigmoid
+from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.gaussians import opacities
 from spacesim.splat.raster.records import load, packets, store
-from spacesim.splat.raster.tone import decoded, decoded_slope, encoded_slope, encoded_unclipped
+from spacesim.splat.raster.tone import decode_srgb, decode_srgb_slope, encode_srgb_slope, encode_srgb_unclipped
 
-ALBEDO = -1.0  #: logit of the albedos at the start: 0.27, chosen
-OVERLAP = 0.3  #: share of the Gaussians' areas that is surface: they overlap; chosen, albedos learn the rest
-LARGEST_AREA = 1e12  #: bound on an emitter's area, m^2: products stay finite in float32
-MOST_EMITTERS = 2**14  #: chosen
+ALBEDO = -1.0  #: logit of the albedos at the start: 0.27
+OVERLAP = 0.3  #: share of the Gaussians' areas that is surface: they overlap, albedos learn the rest
+MAX_EMITTER_AREA = 1e12  #: bound on an emitter's area, m^2: products stay finite in float32
 
 
 @dataclass
 class Scatterers:
-    """Gaussians as surfaces. features: Float, packed [F * N], in which normals stand from row `normals` and the logits
-    of albedos (RGB) from row `albedos`;  means: Array3f [3, N], metres;  log_scales: Array3f [3, N];
-    logit_opacities: [N];  sun: Array3f of width 1, unit, towards the Sun"""
+    """Gaussians as surfaces."""
 
-    features: Any
+    #: Float, packed [F * N], in which normals stand from row `normals` and the logits of albedos (RGB) from row
+    #: `albedos`
+    features: Float
     normals: int
     albedos: int
-    means: Any
-    log_scales: Any
-    logit_opacities: Any
-    sun: Any
+    means: Array3f  #: Array3f [3, N], metres
+    log_scales: Array3f  #: Array3f [3, N]
+    logit_opacities: Float  #: [N]
+    sun: Array3f  #: Array3f of width 1, unit, towards the Sun
 
 
-def irradiance(scatterers: Scatterers, emitters: int, visibility: list[Any], lanes: Lanes) -> list[Any]:
+def irradiance(scatterers: Scatterers, emitters: int, visibility: list[Float], batch: PaddedBatch) -> list[Float]:
     """Light that arrives at each Gaussian: three Floats [M] at the side to which its normal points, three at the other;
     1 where all around is as bright as a white surface under the Sun, as far as areas add up to surfaces (`OVERLAP`).
 
@@ -48,13 +48,13 @@ def irradiance(scatterers: Scatterers, emitters: int, visibility: list[Any], lan
     Sum over emitters k of rho_k v_k |n_k . s| F with F = A cos_i cos_k / (pi r^2 + A), the disc of Wallace et al.
     (1989), A its area: 2 pi s_1 s_2 opacity, its two longer axes', times N / emitters, times `OVERLAP`.
     """
-    numbers = _emitters(scatterers, emitters, visibility, lanes)
+    numbers = _emitters(scatterers, emitters, visibility, batch)
     packed = [store(values, dr.arange(ad.UInt32, emitters), emitters) for values in packets(numbers)]
     dr.eval(packed)
-    means = lanes.spread(scatterers.means)
-    normals = unit_normals(ad.Array3f(lanes.block(scatterers.features, scatterers.normals, 3)))
+    means = batch.repeat_last(scatterers.means)
+    normals = unit_normals(ad.Array3f(batch.block(scatterers.features, scatterers.normals, 3)))
 
-    def received(k: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+    def received(k: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
         x, y, z, nx, ny, nz, area, *light = load(packed, k, emitters)[:10]
         away = ad.Array3f(x, y, z) - means
         square = dr.squared_norm(away)
@@ -64,36 +64,36 @@ def irradiance(scatterers: Scatterers, emitters: int, visibility: list[Any], lan
         sides = share * dr.maximum(here, 0), share * dr.maximum(-here, 0)
         return k + 1, [dr.fma(side, light[c], sums[3 * i + c]) for i, side in enumerate(sides) for c in range(3)]
 
-    def more(k: Any, _sums: list[Any]) -> Any:
+    def has_more(k: UInt32, _sums: list[Float]) -> Bool:
         return k < emitters
 
-    start = ad.UInt32(0), [dr.zeros(ad.Float, lanes.capacity) for _ in range(6)]
-    _, sums = dr.while_loop(start, more, received, mode="symbolic", label="bounce")
+    start = ad.UInt32(0), [dr.zeros(ad.Float, batch.capacity) for _ in range(6)]
+    _, sums = dr.while_loop(start, has_more, received, mode="symbolic", label="bounce")
     return list(sums)
 
 
-def brightened(colour: Any, light: Any, linear: bool) -> Any:
+def add_irradiance(color: Float, light: Any, linear: bool) -> Float:
     """A colour with more light on it, `light` linear. linear: of the colour, which is an sRGB value else, and may get
     beyond 1 as one"""
-    return colour + light if linear else encoded_unclipped(decoded(colour) + light)
+    return color + light if linear else encode_srgb_unclipped(decode_srgb(color) + light)
 
 
-def brightened_slopes(colour: Any, light: Any, linear: bool) -> tuple[Any, Any]:
-    """d `brightened` by colour and by light."""
+def add_irradiance_slopes(color: Float, light: Any, linear: bool) -> tuple[Float, Float]:
+    """d `add_irradiance` by colour and by light."""
     if linear:
         return ad.Float(1), ad.Float(1)
-    by_light = encoded_slope(decoded(colour) + light)
-    return by_light * decoded_slope(colour), by_light
+    light_slope = encode_srgb_slope(decode_srgb(color) + light)
+    return light_slope * decode_srgb_slope(color), light_slope
 
 
-def _emitters(scatterers: Scatterers, emitters: int, visibility: list[Any], lanes: Lanes) -> list[Any]:
+def _emitters(scatterers: Scatterers, emitters: int, visibility: list[Float], batch: PaddedBatch) -> list[Float]:
     """Ten Floats [emitters]: place, normal of the lit side, area, light that it scatters a piece of area."""
-    each = ad.Float(lanes.count) / emitters
+    each = ad.Float(batch.count) / emitters
     k = ad.UInt32((ad.Float(dr.arange(ad.UInt32, emitters)) + 0.5) * each)
-    k = dr.minimum(k, lanes.count - 1)
+    k = dr.minimum(k, batch.count - 1)
 
-    def rows(first: int) -> list[Any]:
-        return [dr.gather(ad.Float, scatterers.features, (first + i) * lanes.count + k) for i in range(3)]
+    def rows(first: int) -> list[Float]:
+        return [dr.gather(ad.Float, scatterers.features, (first + i) * batch.count + k) for i in range(3)]
 
     place, log_scales = (dr.gather(ad.Array3f, of, k) for of in (scatterers.means, scatterers.log_scales))
     normal = unit_normals(ad.Array3f(rows(scatterers.normals)))
@@ -105,6 +105,6 @@ def _emitters(scatterers: Scatterers, emitters: int, visibility: list[Any], lane
     if visibility:
         seen *= dr.gather(ad.Float, visibility[0], k)
     light = [seen * sigmoid(logit) for logit in rows(scatterers.albedos)]
-    numbers = [*place, *dr.select(cosine < 0, -normal, normal), dr.minimum(area, LARGEST_AREA), *light]
+    numbers = [*place, *dr.select(cosine < 0, -normal, normal), dr.minimum(area, MAX_EMITTER_AREA), *light]
     sound = dr.isfinite(sum(numbers, ad.Float(0))) & ~dr.isnan(area)  # one that is not would reach all others
     return [dr.select(sound, number, 0) for number in numbers]

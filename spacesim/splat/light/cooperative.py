@@ -1,7 +1,7 @@
 """Networks of `mlp` for pictures: forward alone, a whole network in one kernel, by Dr.Jit's cooperative vectors.
 
 On CUDA these are OptiX's: products of half precision on tensor cores, and nothing between two layers goes to memory. On
-LLVM they compute the same more slowly. Not everywhere where CUDA is there is OptiX, so `usable` tries it.
+LLVM they compute the same more slowly. Not everywhere where CUDA is there is OptiX, so `is_usable` tries it.
 """
 
 import logging
@@ -13,16 +13,18 @@ import numpy as np
 from drjit import nn
 
 from spacesim.backend import ad, recorded, select
+from spacesim.backend.arrays import Float
+from spacesim.backend.upload import upload
 from spacesim.splat.light import mlp
-from spacesim.splat.light.columns import Lanes
 from spacesim.splat.light.mlp import MlpShape
+from spacesim.splat.light.padded_batch import PaddedBatch
 
-AGREES = 2e-3  #: difference to single precision up to which `usable` accepts a network's sigmoid
+AGREES = 2e-3  #: difference to single precision up to which `is_usable` accepts a network's sigmoid
 
 log = logging.getLogger(__name__)
 
 
-def pack(shape: MlpShape, weights: list[Any]) -> list[Any]:
+def pack(shape: MlpShape, weights: list[Float]) -> list[Any]:
     """Matrix and bias of each layer as `forward` reads them, half precision in the device's order, from weights as
     `mlp.initial_weights` orders them. What is shared stands before the other inputs."""
     parts = []
@@ -36,10 +38,10 @@ def pack(shape: MlpShape, weights: list[Any]) -> list[Any]:
     return list(views)
 
 
-def forward(shape: MlpShape, packed: list[Any], rows: list[Any], shared: Any) -> list[Any]:
+def forward(shape: MlpShape, packed: list[Any], rows: list[Float], shared: Float) -> list[Float]:
     """Outputs, Floats [M], of inputs `rows`, Floats [M] or of width 1.  packed: see `pack`;  shared: Float [shared]"""
-    told = [dr.gather(ad.Float, shared, ad.UInt32(i)) for i in range(shape.shared)]
-    value: Any = nn.CoopVec([ad.Float16(row) for row in [*told, *rows]])
+    shared_inputs = [dr.gather(ad.Float, shared, ad.UInt32(i)) for i in range(shape.shared)]
+    value: Any = nn.CoopVec([ad.Float16(row) for row in [*shared_inputs, *rows]])
     for i in range(shape.layers):
         value = nn.matvec(packed[2 * i], value, packed[2 * i + 1])
         if i < shape.layers - 1:
@@ -48,11 +50,11 @@ def forward(shape: MlpShape, packed: list[Any], rows: list[Any], shared: Any) ->
 
 
 @cache
-def usable() -> bool:
+def is_usable() -> bool:
     """Whether cooperative vectors work here and give what `mlp.forward` gives: tried once in a process, with a small
     network, in a recording."""
     try:
-        difference = _tried()
+        difference = _largest_difference()
     except Exception as error:  # whatever OptiX, driver or Dr.Jit say: pictures can be drawn without
         reason = str(error.__cause__ or error).strip().splitlines()
         log.warning("networks: no cooperative vectors on %s (%s)", select(), reason[-1] if reason else type(error))
@@ -62,16 +64,20 @@ def usable() -> bool:
     return difference < AGREES
 
 
-def _tried() -> float:
+def _largest_difference() -> float:
     """Largest difference between sigmoids of a network's outputs."""
     shape, rng, count = MlpShape(19, 5, 3, 32, 3), np.random.default_rng(0), 300
-    weights = [ad.Float(weight) for weight in mlp.initial_weights(shape, rng)]
-    shared, rows = ad.Float(rng.normal(size=5)), ad.Float(rng.normal(size=19 * count))
-    lanes = Lanes.of(count)
-    run = recorded(lambda packed, rows, shared, lanes: forward(shape, packed, lanes.block(rows, 0, 19), shared), 2)
+    weights = [upload(weight) for weight in mlp.initial_weights(shape, rng)]
+    shared, rows = upload(rng.normal(size=5)), upload(rng.normal(size=19 * count))
+    batch = PaddedBatch.of(count)
+    run = recorded(
+        lambda packed, rows, shared, batch: forward(shape, packed, batch.block(rows, 0, 19), shared),
+        limit=2,
+        elements=None,
+    )
     packed = pack(shape, weights)
-    outputs = [run(packed, rows, shared, lanes) for _ in range(2)][1]
-    exact, _ = mlp.forward(shape, weights, lanes.matrix(lanes.block(rows, 0, 19), shape.rows), shared)
-    pairs = zip(outputs, (lanes.row(exact, i) for i in range(shape.outputs)), strict=True)
+    outputs = [run(packed, rows, shared, batch) for _ in range(2)][1]
+    exact, _ = mlp.forward(shape, weights, batch.matrix(batch.block(rows, 0, 19), shape.rows), shared)
+    pairs = zip(outputs, (batch.row(exact, i) for i in range(shape.outputs)), strict=True)
     sigmoids = [[1 / (1 + np.exp(-np.array(row))) for row in pair] for pair in pairs]
     return max(float(np.abs(ours - other).max()) for ours, other in sigmoids)

@@ -1,41 +1,97 @@
 """The appearance field: colour of each Gaussian by its features, the Sun and the view (thesis 4.1, 4.2, table 4.1)."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 
 from spacesim.backend import ad
+from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, TensorXf
 from spacesim.data.errors import check_ranges
-from spacesim.splat.light.columns import Lanes
 from spacesim.splat.light.encoding import Encoding
-from spacesim.splat.light.mlp import MOST_FEATURES, MOST_LAYERS, MOST_WIDTH, MlpShape
+from spacesim.splat.light.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape
+from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.surface import shortest_axis
 
-LOBES = (8, 32, 128, 512)  #: exponents of n . h, from satin to mirror, chosen: each is the one before to the fourth
+LOBES = (8, 32, 128, 512)  #: exponents of n . h, from satin to mirror: each is the one before to the fourth
 COSINES = 4 + len(LOBES)  #: numbers that `surface_cosines` gives
-TURNED = 0.2  #: a surface with n . s of at most -TURNED is turned away from the Sun; chosen (docs/shadows.md)
+TURNED = 0.2  #: a surface with n . s of at most -TURNED is turned away from the Sun (docs/research/shadows.md)
+
+
+@dataclass(frozen=True)
+class DirectionsConfig:
+    """The field is told the directions of Sun and view, as in the thesis."""
+
+    kind: ClassVar[str] = "directions"
+
+    sun: Encoding = field(default_factory=Encoding)  #: how the Sun's direction is told
+    view: Encoding = field(default_factory=Encoding)  #: how the view's direction is told
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """Each Gaussian learns a normal, too, and the field is told the cosines of a reflectance model about it
+    (`surface_cosines`): what one side of a body has taught then serves the others, and Suns never seen. Ours.
+
+    Directions beside the cosines teach it the Suns of training by heart: by default they say nothing (one constant).
+    """
+
+    kind: ClassVar[str] = "surface"
+
+    sun: Encoding = field(default_factory=lambda: Encoding("harmonics", 0))  #: of the Sun's direction, beside cosines
+    view: Encoding = field(default_factory=lambda: Encoding("harmonics", 0))  #: of the view's direction, beside cosines
+
+
+@dataclass(frozen=True)
+class ViewAloneConfig:
+    """The field is told the view's direction alone: 4.2 without s, for pictures that do not name their Sun."""
+
+    kind: ClassVar[str] = "view"
+
+    view: Encoding = field(default_factory=Encoding)  #: how the view's direction is told
+
+
+NO_SUN = Encoding("harmonics", 0)  #: in its place: one constant, as there is no product of nothing
 
 
 @dataclass(frozen=True)
 class FieldConfig:
-    """Defaults: table 4.1. `layers` counts matrix products: 3 are two hidden layers of `width` units (the thesis says
-    "depth 3", which can mean either).
+    """Defaults: table 4.1."""
 
-    surface: each Gaussian learns a normal, too, and the field is told the cosines of a reflectance model about it
-    (`surface_cosines`): what one side of a body has taught then serves the others, and Suns never seen. Ours.
-    """
-
-    features: int = 128
-    width: int = 256
-    layers: int = 3
-    sun: Encoding = field(default_factory=Encoding)
-    view: Encoding = field(default_factory=Encoding)
-    surface: bool = False
+    features: int = 128  #: learned numbers that each Gaussian has for the network
+    width: int = 256  #: units of a hidden layer
+    layers: int = 3  #: matrix products: 3 are two hidden layers (the thesis says "depth 3", which can mean either)
+    #: what the network is told of Sun and view: their directions (thesis), cosines about a learned normal, or the view
+    #: alone, for pictures that do not name their Sun
+    inputs: DirectionsConfig | SurfaceConfig | ViewAloneConfig = field(default_factory=DirectionsConfig)
+    #: learned numbers that each training picture has for the network, 0 for none; other pictures are drawn with their
+    #: mean. NeRF-W (Martin-Brualla et al. 2021) and Splatfacto-W take 48
+    embeddings: int = 0
 
     def __post_init__(self) -> None:
-        check_ranges(self, features=(0, MOST_FEATURES), width=(1, MOST_WIDTH), layers=(1, MOST_LAYERS))
+        check_ranges(self, features=(0, MAX_FEATURES), width=(1, MAX_WIDTH), layers=(1, MAX_LAYERS))
+        check_ranges(self, embeddings=(0, MAX_FEATURES))
+
+    @property
+    def sun(self) -> Encoding:
+        """Of the Sun's direction."""
+        return NO_SUN if isinstance(self.inputs, ViewAloneConfig) else self.inputs.sun
+
+    @property
+    def view(self) -> Encoding:
+        """Of the view's direction."""
+        return self.inputs.view
+
+    @property
+    def knows_sun(self) -> bool:
+        """Whether the Sun's direction changes what the network says."""
+        return not isinstance(self.inputs, ViewAloneConfig)
+
+    @property
+    def surface(self) -> bool:
+        """Whether each Gaussian has a normal, and the network is told the cosines about it."""
+        return isinstance(self.inputs, SurfaceConfig)
 
     @property
     def stored(self) -> int:
@@ -44,75 +100,76 @@ class FieldConfig:
 
     @property
     def shape(self) -> MlpShape:
-        """The network: features, view and cosines of each Gaussian, the Sun in common, three colours out."""
+        """The network: features, view and cosines of each Gaussian, Sun and picture in common, three colours out."""
         inputs = self.features + self.view.size + COSINES * self.surface
-        return MlpShape(inputs, self.sun.size, 3, self.width, self.layers)
+        return MlpShape(inputs, self.sun.size + self.embeddings, 3, self.width, self.layers)
 
 
 @dataclass
 class FieldInputs:
-    """What the field reads of the world. features: Float, packed [F * N], `FieldConfig.stored` of them the field's;
-    means: Array3f [3, N], metres;  turns: (quaternions, log scales) of the Gaussians;  sun: Array3f of width 1, unit,
-    towards the Sun"""
+    """What the field reads of the world."""
 
-    features: Any
-    means: Any
-    turns: tuple[Any, Any]
+    features: Float  #: Float, packed [F * N], `FieldConfig.stored` of them the field's
+    means: Array3f  #: Array3f [3, N], metres
+    rotations_and_scales: tuple[Array4f, Array3f]  #: (quaternions, log scales) of the Gaussians
     camera: Projection
-    sun: Any
+    sun: Array3f  #: Array3f of width 1, unit, towards the Sun
 
 
-def field_items(config: FieldConfig, features: Any, views: list[Any], lanes: Lanes) -> Any:
+def field_items(config: FieldConfig, features: Float, views: list[Float], batch: PaddedBatch) -> TensorXf:
     """Items of the network (4.2): TensorXf [B, C, m]. features: packed;  views: of `field_views`"""
-    return lanes.matrix([*lanes.block(features, 0, config.features), *views], config.shape.rows)
+    return batch.matrix([*batch.block(features, 0, config.features), *views], config.shape.rows)
 
 
-def field_views(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> list[Any]:
+def field_views(config: FieldConfig, inputs: FieldInputs, batch: PaddedBatch) -> list[Float]:
     """What stands behind the features among the network's inputs, and changes with Sun and camera: Floats [M]."""
-    direction = inputs.camera.directions_to(lanes.spread(inputs.means))
-    rows: list[Any] = config.view(direction)
+    direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
+    rows: list[Float] = config.view(direction)
     if config.surface:
-        rows += surface_cosines(_normals(config, inputs, lanes), direction, inputs.sun)
+        rows += surface_cosines(_normals(config, inputs, batch), direction, inputs.sun)
     return rows
 
 
-def facing(config: FieldConfig, inputs: FieldInputs, views: list[Any], lanes: Lanes) -> list[Any]:
+def sun_facing(config: FieldConfig, inputs: FieldInputs, views: list[Float], batch: PaddedBatch) -> list[Float]:
     """Float [M] in [0, 1] in a list: does the side that is seen face the Sun? 1 where its learned normal or the
     Gaussian's shortest axis does, 1/2 at n . s = -TURNED / 2, as neither is exact. Nothing of a field without normals.
     views: of `field_views`"""
-    return [_faces(views[config.view.size], inputs, lanes)] if config.surface else []
+    return [_faces(views[config.view.size], inputs, batch)] if config.surface else []
 
 
-def by_normals(config: FieldConfig, inputs: FieldInputs, by_items: Any, by_facing: list[Any], lanes: Lanes) -> Any:
-    """TensorXf [B, 3, m]: gradient of the normals, from that of the network's items and, if any, of `facing`."""
-    normals = _normals(config, inputs, lanes)
+def normals_adjoint(
+    config: FieldConfig, inputs: FieldInputs, grad_items: TensorXf, grad_facing: list[Float], batch: PaddedBatch
+) -> Any:
+    """TensorXf [B, 3, m]: gradient of the normals, from that of the network's items and, if any, of `sun_facing`."""
+    normals = _normals(config, inputs, batch)
     dr.enable_grad(normals)
-    direction = inputs.camera.directions_to(lanes.spread(inputs.means))
+    direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
     cosines = surface_cosines(normals, direction, inputs.sun)
     first = config.features + config.view.size
-    along = sum((cosine * lanes.row(by_items, first + i) for i, cosine in enumerate(cosines)), ad.Float(0))
-    for gradient in by_facing:
-        along += gradient * _faces(cosines[0], inputs, lanes)
+    along = sum((cosine * batch.row(grad_items, first + i) for i, cosine in enumerate(cosines)), ad.Float(0))
+    for gradient in grad_facing:
+        along += gradient * _faces(cosines[0], inputs, batch)
     dr.backward(along)
-    return lanes.matrix(list(dr.grad(normals)))
+    return batch.matrix(list(dr.grad(normals)))
 
 
-def turned_over(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:
+def is_back_side_seen(config: FieldConfig, inputs: FieldInputs, batch: PaddedBatch) -> Bool:
     """Bool [M]: is the side seen to which the learned normal does not point?"""
-    return _points_away(_normals(config, inputs, lanes), inputs.camera.directions_to(lanes.spread(inputs.means)))
+    return _points_away(_normals(config, inputs, batch), inputs.camera.directions_to(batch.repeat_last(inputs.means)))
 
 
-def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
+def surface_cosines(normals: Array3f, direction: Array3f, sun: Array3f) -> list[Float]:
     """n . s, max(n . s, 0), n . v, n . h, and powers of the last: what a reflectance model of an isotropic surface
     depends on (Blinn 1977), [M] each. A network of few units makes no lobe as narrow as a glint out of n . h alone.
 
     normals: Array3f [3, M], of any length; the side that is seen counts, n . v >= 0;  direction: Array3f [3, M], unit,
     from the camera;  sun: Array3f, unit, towards the Sun;  h: halfway between the Sun and the viewer, v = -direction
     """
-    seen = _seen(unit_normals(normals), direction)
+    seen = _seen_side_normals(unit_normals(normals), direction)
     half = sun - direction
     half2 = dr.squared_norm(half)
-    half *= dr.select(half2 > 1e-12, dr.rsqrt(dr.maximum(half2, 1e-12)), 0)
+    per_length: Any = dr.select(half2 > 1e-12, dr.rsqrt(dr.maximum(half2, 1e-12)), 0)
+    half *= per_length
     lambert = dr.dot(seen, sun)
     halfway = dr.maximum(dr.dot(seen, half), 0)
     lobes = [dr.square(dr.square(dr.square(halfway)))]
@@ -121,29 +178,29 @@ def surface_cosines(normals: Any, direction: Any, sun: Any) -> list[Any]:
     return [lambert, dr.maximum(lambert, 0), -dr.dot(seen, direction), halfway, *lobes]
 
 
-def unit_normals(normals: Any) -> Any:
+def unit_normals(normals: Array3f) -> Array3f:
     """Array3f [3, M] of unit length; (0, 0, 1) in place of what has no direction."""
     length2 = dr.squared_norm(normals)
-    known = dr.detach(length2) > 1e-12
-    return dr.select(known, normals, ad.Array3f(0, 0, 1)) * dr.rsqrt(dr.select(known, length2, 1))
+    has_direction = dr.detach(length2) > 1e-12
+    return dr.select(has_direction, normals, ad.Array3f(0, 0, 1)) * dr.rsqrt(dr.select(has_direction, length2, 1))
 
 
-def _faces(lambert: Any, inputs: FieldInputs, lanes: Lanes) -> Any:
+def _faces(lambert: Float, inputs: FieldInputs, batch: PaddedBatch) -> Any:
     """Of n . s of the learned normals."""
-    axis = shortest_axis(*(lanes.spread(dr.detach(turn)) for turn in inputs.turns))
-    axis = _seen(axis, inputs.camera.directions_to(lanes.spread(inputs.means)))
+    axis = shortest_axis(*(batch.repeat_last(dr.detach(turn)) for turn in inputs.rotations_and_scales))
+    axis = _seen_side_normals(axis, inputs.camera.directions_to(batch.repeat_last(inputs.means)))
     return dr.clip(1 + dr.maximum(lambert, dr.dot(axis, inputs.sun)) / TURNED, 0, 1)
 
 
-def _seen(normals: Any, direction: Any) -> Any:
+def _seen_side_normals(normals: Array3f, direction: Array3f) -> Any:
     """Normals of the side that is seen. direction: from the camera"""
     return dr.select(_points_away(normals, direction), -normals, normals)
 
 
-def _points_away(normals: Any, direction: Any) -> Any:
+def _points_away(normals: Array3f, direction: Array3f) -> Bool:
     return dr.detach(dr.dot(normals, direction)) > 0
 
 
-def _normals(config: FieldConfig, inputs: FieldInputs, lanes: Lanes) -> Any:
+def _normals(config: FieldConfig, inputs: FieldInputs, batch: PaddedBatch) -> Array3f:
     """Array3f [3, M], of any length."""
-    return ad.Array3f(lanes.block(inputs.features, config.features, 3))
+    return ad.Array3f(batch.block(inputs.features, config.features, 3))

@@ -1,7 +1,7 @@
 """Small fully connected networks over N items at once: forward, and the adjoint of that by hand.
 
-Items are the columns of B matrices [rows, m] in memory (`lanes`): N = B m. What all items share, such as the direction
-of the Sun, enters the first layer as one vector: its products are made once instead of N times.
+Items are the columns of B matrices [rows, m] in memory (`PaddedBatch`): N = B m. What all items share, such as the
+direction of the Sun, enters the first layer as one vector: its products are made once instead of N times.
 """
 
 from dataclasses import dataclass
@@ -11,22 +11,22 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
-from spacesim.splat.light.columns import aligned
+from spacesim.backend.arrays import Float, TensorXf
+from spacesim.splat.light.padded_batch import round_up_rows
 
-MOST_FEATURES, MOST_WIDTH, MOST_LAYERS = 1024, 4096, 32
-"""Of a network: numbers a Gaussian, units of a layer, layers; chosen, far above any that pays."""
+MAX_FEATURES, MAX_WIDTH, MAX_LAYERS = 1024, 4096, 32
+"""Of a network: numbers a Gaussian, units of a layer, layers, far above any that pays."""
 
 
 @dataclass(frozen=True)
 class MlpShape:
-    """inputs: numbers of each item;  shared: numbers that all items have in common;  width: units of a hidden layer;
-    layers: matrix products, so `layers` - 1 hidden layers;  outputs: numbers"""
+    """Sizes of a network."""
 
-    inputs: int
-    shared: int
-    outputs: int
-    width: int
-    layers: int
+    inputs: int  #: numbers of each item
+    shared: int  #: numbers that all items have in common
+    outputs: int  #: numbers
+    width: int  #: units of a hidden layer
+    layers: int  #: matrix products, so `layers` - 1 hidden layers
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
@@ -37,7 +37,7 @@ class MlpShape:
     @property
     def rows(self) -> int:
         """Rows of a matrix of items: `inputs` and what fills them up to a size at which products are fast."""
-        return aligned(self.inputs)
+        return round_up_rows(self.inputs)
 
     @property
     def parameters(self) -> int:
@@ -45,7 +45,7 @@ class MlpShape:
         return sum(rows * columns + rows for rows, columns in self.sizes) + self.sizes[0][0] * self.shared
 
 
-def sigmoid(value: Any) -> Any:
+def sigmoid(value: Any) -> Float:
     """1 / (1 + e^-x)."""
     return dr.rcp(1 + dr.exp(-value))
 
@@ -65,7 +65,7 @@ def initial_weights(shape: MlpShape, rng: np.random.Generator, last: float = 1.0
 
 
 @dataclass
-class Known:
+class PartialLayer:
     """What the first layer makes of the first `inputs` inputs, values: TensorXf [B, width, m]: where only the others
     change from call to call, it is computed once."""
 
@@ -73,30 +73,32 @@ class Known:
     inputs: int
 
 
-def known(shape: MlpShape, weights: list[Any], items: Any, inputs: int) -> Known:
-    """Of the first `inputs` inputs, items: TensorXf [B, `aligned(inputs)`, m], 0 in the rows that fill them up."""
-    return Known(dr.matmul(_matrix(shape, weights, 0, 0, inputs), items), inputs)
+def first_layer_part(shape: MlpShape, weights: list[Float], items: TensorXf, inputs: int) -> PartialLayer:
+    """Of the first `inputs` inputs, items: TensorXf [B, `round_up_rows(inputs)`, m], 0 in the rows that fill them
+    up."""
+    return PartialLayer(dr.matmul(_matrix(shape, weights, 0, 0, inputs), items), inputs)
 
 
 def forward(
-    shape: MlpShape, weights: list[Any], items: Any, shared: Any, known: Known | None = None
-) -> tuple[Any, list[Any]]:
+    shape: MlpShape, weights: list[Float], items: TensorXf, shared: Float, first_layer: PartialLayer | None = None
+) -> tuple[TensorXf, list[Any]]:
     """(outputs [B, outputs, m], the tape that `backward` wants): ReLU between layers, nothing after the last.
 
     weights: as `initial_weights` orders them, Float each;  items: TensorXf [B, `shape.rows`, m], finite everywhere;
-    shared: Float [shared];  known: where there is some, items are the other inputs alone, and the tape is of no use
+    shared: Float [shared];  first_layer: where there is some, items are the other inputs alone, and the tape is of no
+    use
     """
-    first = known.inputs if known else 0
+    first = first_layer.inputs if first_layer else 0
     tape = [items]
-    value = items
+    value: Any = items
     for i, (rows, _) in enumerate(shape.sizes):
-        bias = ad.TensorXf(weights[2 + 2 * i], (rows, 1))
+        bias: Any = ad.TensorXf(weights[2 + 2 * i], (rows, 1))
         if i == 0:
             common = ad.TensorXf(weights[0], (rows, shape.shared))
             bias = bias + dr.matmul(common, ad.TensorXf(shared, (shape.shared, 1)))
         value = dr.matmul(_matrix(shape, weights, i, first if i == 0 else 0), value) + bias
-        if known and i == 0:
-            value += known.values
+        if first_layer and i == 0:
+            value += first_layer.values
         if i < shape.layers - 1:
             value = dr.maximum(value, 0)
             tape.append(value)
@@ -104,47 +106,57 @@ def forward(
 
 
 def backward(
-    shape: MlpShape, weights: list[Any], tape: list[Any], shared: Any, by_output: Any
-) -> tuple[list[Any], Any]:
-    """(gradients of the weights, gradient of the items [B, `shape.rows`, m]) from by_output: TensorXf [B, outputs, m].
+    shape: MlpShape, weights: list[Float], tape: list[Any], shared: Float, grad_output: TensorXf
+) -> tuple[list[Float], TensorXf]:
+    """(gradients of the weights, gradient of the items [B, `shape.rows`, m]) from grad_output: TensorXf
+    [B, outputs, m].
 
     Sums over N are sums over the columns of each matrix, all at once, then over the matrices, each in a fixed order:
     the same bits in every run.
     """
     gradients: list[Any] = [None] * len(weights)
-    by_value = by_output
+    grad_values: Any = grad_output
     for i in reversed(range(shape.layers)):
         rows, columns = shape.sizes[i]
-        by_bias = _over_matrices(dr.block_reduce(dr.ReduceOp.Add, by_value.array, by_value.shape[2]), rows)
-        products: Any = dr.matmul(by_value, tape[i], Bt=True)
-        by_matrix = _over_matrices(products.array, rows * tape[i].shape[1])
-        gradients[1 + 2 * i] = _columns(by_matrix, rows, tape[i].shape[1], columns)
-        gradients[2 + 2 * i] = by_bias
+        grad_bias = _over_matrices(dr.block_reduce(dr.ReduceOp.Add, grad_values.array, grad_values.shape[2]), rows)
+        products: Any = dr.matmul(grad_values, tape[i], Bt=True)
+        grad_matrix = _over_matrices(products.array, rows * tape[i].shape[1])
+        gradients[1 + 2 * i] = _columns(grad_matrix, rows, tape[i].shape[1], columns)
+        gradients[2 + 2 * i] = grad_bias
         if i == 0:
-            outer: Any = ad.TensorXf(by_bias, (rows, 1)) * ad.TensorXf(shared, (1, shape.shared))
+            outer: Any = ad.TensorXf(grad_bias, (rows, 1)) * ad.TensorXf(shared, (1, shape.shared))
             gradients[0] = outer.array
-        by_value = dr.matmul(_matrix(shape, weights, i), by_value, At=True)
+        grad_values = dr.matmul(_matrix(shape, weights, i), grad_values, At=True)
         if i > 0:
-            by_value = dr.select(tape[i] > 0, by_value, 0)
-    return gradients, by_value
+            grad_values = dr.select(tape[i] > 0, grad_values, 0)
+    return gradients, grad_values
 
 
-def _matrix(shape: MlpShape, weights: list[Any], i: int, first: int = 0, count: int | None = None) -> Any:
+def shared_gradient(shape: MlpShape, weights: list[Float], gradients: list[Float]) -> Float:
+    """Float [shared]: gradient of what all items share, from the gradients of the weights that `backward` gives: it
+    enters where the bias of the first layer does."""
+    rows = shape.sizes[0][0]
+    grad_bias = ad.TensorXf(gradients[2], (rows, 1))
+    by_shared: Any = dr.matmul(ad.TensorXf(weights[0], (rows, shape.shared)), grad_bias, At=True)
+    return by_shared.array
+
+
+def _matrix(shape: MlpShape, weights: list[Float], i: int, first: int = 0, count: int | None = None) -> Any:
     """TensorXf [rows, columns] of layer i, or of `count` of its columns from `first` on; that of the first layer has
     columns of 0, too, where rows fill the items up."""
     rows, columns = shape.sizes[i]
     count = columns - first if count is None else count
-    wanted = aligned(count) if i == 0 else count
-    return ad.TensorXf(_columns(weights[1 + 2 * i], rows, columns, wanted, first, count), (rows, wanted))
+    row_count = round_up_rows(count) if i == 0 else count
+    return ad.TensorXf(_columns(weights[1 + 2 * i], rows, columns, row_count, first, count), (rows, row_count))
 
 
-def _columns(matrix: Any, rows: int, stored: int, wanted: int, first: int = 0, count: int | None = None) -> Any:
+def _columns(matrix: Any, rows: int, stored: int, row_count: int, first: int = 0, count: int | None = None) -> Any:
     """Float [rows * wanted] of [rows * stored]: `count` columns from `first` on, all by default, then columns of 0."""
     count = stored if count is None else count
-    if stored == wanted == count:
+    if stored == row_count == count:
         return matrix
-    place = dr.arange(ad.UInt32, rows * wanted)
-    row, column = place // wanted, place % wanted
+    place = dr.arange(ad.UInt32, rows * row_count)
+    row, column = place // row_count, place % row_count
     return dr.gather(ad.Float, matrix, row * stored + first + column, column < count)
 
 

@@ -12,74 +12,99 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 
 from spacesim.backend import ad, select
+from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array
 from spacesim.splat.light import cooperative, mlp
 from spacesim.splat.light import shading as kernels
-from spacesim.splat.light.columns import Lanes
-from spacesim.splat.light.shading import Inputs, LightConfig, SunTerms, Tape, split
-from spacesim.splat.light.shadow.cast import Shadows, cast_shadows, cast_shadows_adaptively
+from spacesim.splat.light.config import LightConfig
+from spacesim.splat.light.padded_batch import PaddedBatch
+from spacesim.splat.light.shading import ShadingInputs, ShadingTape, SunEncoding, split_weights
+from spacesim.splat.light.shadow.cast import Shadows, cast_shadows
 from spacesim.splat.light.shadow.light_camera import SUNS, light_rows
 from spacesim.splat.raster.cameras import Projection
-from spacesim.splat.raster.gaussians import Gaussians, uploaded
+from spacesim.splat.raster.gaussians import Gaussians
 
+ANY_SUN = np.array([0.0, 0.0, 1.0])  #: stands for a Sun that is not known, in a model that is not told it
 COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed by `cooperative` where that works
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingFrame:
-    """Where a model was when it was trained, metres. centre: [3], mu_model of 4.12;  scale: the unit of length of its
-    networks;  distance: of the farthest training camera from the centre, dist_max of 4.5;  radius: of the Gaussians
-    that training started from, about the centre"""
+    """Where a model was when it was trained, metres."""
 
-    centre: Array
-    scale: float
-    distance: float
-    radius: float
+    centre: Array  #: [3], mu_model of 4.12
+    scale: float  #: the unit of length of its networks
+    distance: float  #: of the farthest training camera from the centre, dist_max of 4.5
+    radius: float  #: `robust_radius` of the Gaussians that training started from
+
+
+def robust_radius(means: Array) -> float:
+    """Metres, above 0: 99 % of the points [N, 3] lie within it of their median. Of a point cloud that has outliers, as
+    any from structure from motion has, neither the farthest point nor the mean says how large the object is."""
+    return _radius_within(_from_median(means))
+
+
+def is_near(means: Array) -> NDArray[np.bool_]:
+    """[N] bool: which of the points [N, 3] are within ten times `robust_radius` of their median, and no outliers."""
+    away = _from_median(means)
+    return away <= 10 * _radius_within(away)
+
+
+def _from_median(means: Array) -> Array:
+    """[N] metres."""
+    return np.linalg.norm(means - np.median(means, axis=0), axis=1)
+
+
+def _radius_within(away: Array) -> float:
+    return max(float(np.quantile(away, 0.99)), 1e-9)
 
 
 @dataclass
 class Sunlight:
-    """What of a Sun's light no camera changes. visibility: Float [N], what dims colours (4.17), or None of a model
-    without shadows;  bounced: of `bounce.irradiance`, Floats [N], or nothing"""
+    """What of a Sun's light no camera changes."""
 
-    visibility: Any
-    bounced: list[Any]
+    visibility: Float | None  #: Float [N], what dims colours (4.17), or None of a model without shadows
+    bounced: list[Float]  #: of `bounce.irradiance`, Floats [N], or nothing
 
 
 @dataclass
 class Shading:
-    """colours: 3 arrays [N], display values that visibility has dimmed (4.17);  visibility: Float [N] in [0, 1] as
-    pictures show it, so times `facing`, which colours do without, or None;  shadows: raw, or None;
-    inputs, lanes, tape: what `LightModel.adjoint` wants"""
+    """Colours and visibility of Gaussians, and what their adjoint needs."""
 
-    colours: list[Any]
+    colors: list[Float]  #: 3 arrays [N], display values that visibility has dimmed (4.17)
+    #: Float [N] in [0, 1] as pictures show it, so times `sun_facing`, which colours do without, or None
     visibility: Any
-    shadows: Shadows | None
-    inputs: Inputs
-    lanes: Lanes
-    tape: Tape
+    shadows: Shadows | None  #: raw, or None
+    inputs: ShadingInputs  #: what `LightModel.adjoint` wants
+    batch: PaddedBatch  #: what `LightModel.adjoint` wants
+    tape: ShadingTape  #: what `LightModel.adjoint` wants
+    picture: int | None  #: number of the training picture whose embedding the field has read; None: the mean one
 
 
 @dataclass
-class _Kept:
-    """What pictures of one model have in common. read: the arrays that it was made of;  known: what the field's first
-    layer makes of the features;  packed: the field's network for `cooperative`. One of the two."""
+class _PictureCache:
+    """What pictures of one model have in common."""
 
-    read: list[Any]
-    known: mlp.Known | None
-    packed: list[Any]
+    read: list[Any]  #: the arrays that it was made of
+    first_layer: mlp.PartialLayer | None  #: what the field's first layer makes of the features
+    packed: list[Any]  #: the field's network for `cooperative`, [] where `first_layer` serves
+    embedding: list[Float]  #: the mean one, Float [E] in a list, or nothing
 
 
 @dataclass
 class LightGradients:
-    """features: Float [F * N];  weights: as `LightModel.weights`;  geometry: of the first 11 rows of the Gaussians
-    (`Gaussians.rows`), through their shadows, or nothing where shadows count as given"""
+    """Gradients of a loss by what light depends on."""
 
-    features: Any
-    weights: list[Any]
-    geometry: list[Any]
+    features: Float  #: Float [F * N]
+    weights: list[Float]  #: as `LightModel.weights`
+    embeddings: list[Float]  #: as `LightModel.embeddings`
+    #: of the first 11 rows of the Gaussians (`Gaussians.rows`), through their shadows, or nothing where shadows count
+    #: as given
+    geometry: list[Float]
 
 
 class LightModel:
@@ -87,91 +112,117 @@ class LightModel:
 
     weights: Floats, the field's and then the refinement's, each as `mlp.initial_weights` orders them
     frame: of its training
+    embeddings: those of all training pictures, Float [V * E], in a list, or nothing where pictures have none
     """
 
-    def __init__(self, config: LightConfig, weights: list[Any], frame: TrainingFrame) -> None:
-        self.config, self.weights, self.frame = config, weights, frame
-        self._place = ad.Float([*np.asarray(frame.centre, np.float32), frame.scale])
-        self._terms = lru_cache(maxsize=SUNS)(self._sun_terms)
-        self._kept = _Kept([], None, [])
+    def __init__(
+        self, config: LightConfig, weights: list[Float], frame: TrainingFrame, embeddings: list[Float]
+    ) -> None:
+        self.config, self.weights, self.frame, self.embeddings = config, weights, frame, embeddings
+        self._training_frame = ad.Float([*np.asarray(frame.centre, np.float32), frame.scale])
+        self._encodings = lru_cache(maxsize=SUNS)(self._encode_sun)
+        self._cache = _PictureCache([], None, [], [])
 
     @staticmethod
-    def initial(config: LightConfig, frame: TrainingFrame, seed: int) -> "LightModel":
-        """Fresh networks; the refinement's last layer starts at 0, so that raw shadows are where training starts."""
+    def initial(config: LightConfig, frame: TrainingFrame, seed: int, pictures: int = 0) -> "LightModel":
+        """Fresh networks; the last layer of a refinement that corrects raw shadows starts at 0, so that these are where
+        training starts, and so do the embeddings of `pictures` training pictures."""
         rng = np.random.default_rng([seed, 4])
         weights = mlp.initial_weights(config.field.shape, rng)
         if config.refine:
-            weights += mlp.initial_weights(config.refine.shape, rng, last=0.0)
-        return LightModel(config, [ad.Float(weight) for weight in weights], frame)
+            weights += mlp.initial_weights(config.refine.shape, rng, last=0.0 if config.refine.residual else 1.0)
+        numbers = pictures * config.field.embeddings
+        embeddings = [upload(np.zeros(numbers))] if config.field.embeddings else []
+        return LightModel(config, [upload(weight) for weight in weights], frame, embeddings)
 
-    def sun_terms(self, sun: np.ndarray) -> SunTerms:
-        """What kernels read of a Sun in the direction `sun` [3], unit, world axes."""
-        terms: SunTerms = self._terms(*(float(value) for value in sun))
+    def encode_sun(self, sun: np.ndarray | None) -> SunEncoding:
+        """What kernels read of a Sun in the direction `sun` [3], unit, world axes; None where the field is not told."""
+        terms: SunEncoding = self._encodings(*(float(value) for value in (ANY_SUN if sun is None else sun)))
         return terms
 
-    def shadows(self, gaussians: Gaussians, sun: np.ndarray, adaptive: bool = False) -> Shadows | None:
-        """Raw occlusion of each Gaussian; None for a model without shadows. adaptive: several light cameras where one
-        has less than half the pixels a metre that it had of the whole model in training (f_min of algorithm 3)."""
-        config, frame = self.config.shadow, self.frame
+    def shadows(self, gaussians: Gaussians, sun: np.ndarray | None) -> Shadows | None:
+        """Raw occlusion of each Gaussian, by one light camera in training and in pictures: the refinement corrects what
+        it was trained on. None for a model without shadows."""
+        config = self.config.shadow
         if config is None:
             return None
-        if adaptive:
-            least_scale = 0.25 * config.size / frame.radius
-            return cast_shadows_adaptively(gaussians, sun, config, frame.distance, least_scale)
-        return cast_shadows(gaussians, self.sun_terms(sun).light, config, frame.distance)
+        assert sun is not None, "what casts shadows is told the Sun"
+        return cast_shadows(gaussians, self.encode_sun(sun).light_axes, config, self.frame.distance)
 
-    def shade(self, gaussians: Gaussians, camera: Projection, sun: np.ndarray, adaptive: bool = False) -> Shading:
-        """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes.
-        adaptive: see `shadows`."""
-        shadows = self.shadows(gaussians, sun, adaptive)
-        inputs = self._inputs(gaussians, camera, sun, shadows)
-        lanes = Lanes.of(gaussians.count)
-        colours, visibility, tape = kernels.shade(self.config, self.weights, inputs, lanes)
-        return Shading(colours, visibility[0] if visibility else None, shadows, inputs, lanes, tape)
-
-    def sunlight(self, gaussians: Gaussians, sun: np.ndarray, adaptive: bool = False) -> Sunlight:
-        """Visibility, and light that bounces, under one Sun, for any number of pictures. Arguments: see `shadows`."""
-        shadows = self.shadows(gaussians, sun, adaptive)
-        if shadows is None and not self.config.bounce:
-            return Sunlight(None, [])
-        lanes = Lanes.of(gaussians.count, still=True)
-        _, of_refine = split(self.config, self.weights)
-        visibility, bounced = kernels.sunlit(self.config, of_refine, self._inputs(gaussians, None, sun, shadows), lanes)
-        return Sunlight(visibility[0] if visibility else None, bounced)
-
-    def lit(
+    def shade(
         self,
         gaussians: Gaussians,
         camera: Projection,
-        sun: np.ndarray,
-        adaptive: bool = False,
-        known: Sunlight | None = None,
-    ) -> tuple[list[Any], Any]:
-        """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. known: `sunlight` of this
-        Sun, of an earlier picture. What the field's first layer makes of the features does not change with Sun or
-        camera and stays for the next picture: as many numbers for each Gaussian as the layer has units."""
-        light = self.sunlight(gaussians, sun, adaptive) if known is None else known
-        of_any_size = replace(camera, width=1, height=1)  # directions do not depend on it: one recording for all sizes
-        inputs = self._inputs(gaussians, of_any_size, sun, None)
-        lanes = Lanes.of(gaussians.count, still=True)
-        kept = self._kept_of(gaussians.features, lanes)
-        of_field, _ = split(self.config, self.weights)
-        seen = [] if light.visibility is None else [light.visibility]
-        shown = kernels.lit(self.config, of_field, inputs, lanes, kept.known, kept.packed, seen, light.bounced)
-        return shown[:3], shown[3] if seen else None
+        sun: np.ndarray | None,
+        picture: int | None = None,
+    ) -> Shading:
+        """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes; None
+        where the field is not told. picture: number of the training picture whose embedding the field reads; None: it
+        reads the mean one."""
+        shadows = self.shadows(gaussians, sun)
+        embedding = self._mean_embedding() if picture is None else self._embedding(picture)
+        inputs = self._inputs(gaussians, camera, self._told(sun, embedding), shadows)
+        batch = PaddedBatch.of(gaussians.count)
+        colors, visibility, tape = kernels.shade(self.config, self.weights, inputs, batch)
+        return Shading(colors, visibility[0] if visibility else None, shadows, inputs, batch, tape, picture)
 
-    def adjoint(self, shading: Shading, by_colour: list[Any], by_visibility: Any = None) -> "LightGradients":
+    def sunlight(self, gaussians: Gaussians, sun: np.ndarray | None) -> Sunlight:
+        """Visibility, and light that bounces, under one Sun, for any number of pictures."""
+        shadows = self.shadows(gaussians, sun)
+        if shadows is None and not self.config.bounce:
+            return Sunlight(None, [])
+        batch = PaddedBatch.of(gaussians.count, still=True)
+        _, of_refine = split_weights(self.config, self.weights)
+        inputs = self._inputs(gaussians, None, self.encode_sun(sun), shadows)
+        visibility, bounced = kernels.sunlight(self.config, of_refine, inputs, batch)
+        return Sunlight(visibility[0] if visibility else None, bounced)
+
+    def shade_picture(
+        self,
+        gaussians: Gaussians,
+        camera: Projection,
+        sun: np.ndarray | None,
+        sunlight: Sunlight | None = None,
+    ) -> tuple[list[Float], Any]:
+        """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. sunlight: `sunlight` of this
+        Sun, of an earlier picture. The embedding is the mean one. What the field's first layer makes of the features
+        does not change with Sun or camera and stays for the next picture: as many numbers for each Gaussian as the
+        layer has units."""
+        light = self.sunlight(gaussians, sun) if sunlight is None else sunlight
+        of_any_size = replace(camera, width=1, height=1)  # directions do not depend on it: one recording for all sizes
+        batch = PaddedBatch.of(gaussians.count, still=True)
+        cache = self._picture_cache(gaussians.features, batch)
+        inputs = self._inputs(gaussians, of_any_size, self._told(sun, cache.embedding), None)
+        of_field, _ = split_weights(self.config, self.weights)
+        visibility = [] if light.visibility is None else [light.visibility]
+        shown = kernels.shade_picture(
+            self.config, of_field, inputs, batch, cache.first_layer, cache.packed, visibility, light.bounced
+        )
+        return shown[:3], shown[3] if visibility else None
+
+    def adjoint(self, shading: Shading, grad_color: list[Float], grad_visibility: Any = None) -> "LightGradients":
         """From the gradients of the dimmed colours (3 arrays [N]) and, where visibility is seen on its own, of the
         visibility [N]."""
-        more = [] if by_visibility is None else [by_visibility]
-        arguments = self.config, self.weights, shading.inputs, shading.lanes, shading.tape, by_colour, more
-        by_features, by_weights, by_raw = kernels.adjoint(*arguments)
-        by_geometry = shading.shadows.adjoint(by_raw[0]) if by_raw and shading.shadows else []
-        return LightGradients(by_features, by_weights, by_geometry)
+        grad_visibilities = [] if grad_visibility is None else [grad_visibility]
+        arguments = (
+            self.config,
+            self.weights,
+            shading.inputs,
+            shading.batch,
+            shading.tape,
+            grad_color,
+            grad_visibilities,
+        )
+        grad_features, grad_weights, grad_occlusion, by_told = kernels.adjoint(*arguments)
+        grad_geometry = shading.shadows.adjoint(grad_occlusion[0]) if grad_occlusion and shading.shadows else []
+        by_embeddings = [self._embedding_gradient(gradient, shading.picture) for gradient in by_told]
+        return LightGradients(grad_features, grad_weights, by_embeddings, grad_geometry)
 
     def tensors(self) -> dict[str, np.ndarray]:
-        """For a file: the weights, and the training frame."""
+        """For a file: the weights, the embeddings [V, E] where pictures have some, and the training frame."""
         weights = {f"light.weight.{i:02d}": np.array(weight) for i, weight in enumerate(self.weights)}
+        if self.embeddings:
+            weights["light.embeddings"] = np.array(self.embeddings[0]).reshape(-1, self.config.field.embeddings)
         frame = [*self.frame.centre, self.frame.scale, self.frame.distance, self.frame.radius]
         return {**weights, "light.frame": np.array(frame, dtype=np.float64)}
 
@@ -187,33 +238,77 @@ class LightModel:
             weight = tensors[f"light.weight.{i:02d}"]
             if np.shape(weight) != (dr.width(like),):
                 raise ValueError(f"light.weight.{i:02d}: expected {dr.width(like)} numbers, found {np.shape(weight)}")
-            model.weights[i] = uploaded(weight)
+            model.weights[i] = upload(weight)
+        if size := config.field.embeddings:
+            embeddings = tensors["light.embeddings"]
+            if embeddings.ndim != 2 or embeddings.shape[1] != size or not len(embeddings):
+                raise ValueError(f"light.embeddings: expected {size} numbers a picture, found {embeddings.shape}")
+            model.embeddings = [upload(embeddings)]
         return model
 
-    def _inputs(
-        self, gaussians: Gaussians, camera: Projection | None, sun: np.ndarray, shadows: Shadows | None
-    ) -> Inputs:
-        raw = [shadows.occlusion, *shadows.info] if shadows else []
-        turns = gaussians.quaternions, gaussians.log_scales
-        logits = gaussians.logit_opacities
-        return Inputs(gaussians.features, gaussians.means, turns, logits, camera, raw, self.sun_terms(sun), self._place)
+    def _told(self, sun: np.ndarray | None, embedding: list[Float]) -> SunEncoding:
+        """`encode_sun` with an embedding in a list, or nothing."""
+        terms = self.encode_sun(sun)
+        return replace(terms, field_encoding=dr.concat([terms.field_encoding, *embedding])) if embedding else terms
 
-    def _kept_of(self, features: Any, lanes: Lanes) -> _Kept:
+    def _embedding(self, picture: int) -> list[Float]:
+        """Float [E] of a training picture in a list, or nothing."""
+        return [dr.gather(ad.Float, every, self._embedding_index(picture)) for every in self.embeddings]
+
+    def _mean_embedding(self) -> list[Float]:
+        """Float [E] in a list, or nothing."""
+        size = self.config.field.embeddings
+        return [upload(np.array(every, np.float64).reshape(-1, size).mean(axis=0)) for every in self.embeddings]
+
+    def _embedding_gradient(self, by_told: Float, picture: int | None) -> Float:
+        """Float [V * E], 0 but where the picture's embedding stands. by_told: gradient of what the field is told"""
+        assert picture is not None, "the mean embedding is not trained"
+        size, first = self.config.field.embeddings, self.config.field.sun.size
+        gradient = dr.zeros(ad.Float, dr.width(self.embeddings[0]))
+        own = dr.gather(ad.Float, by_told, first + dr.arange(ad.UInt32, size))
+        dr.scatter(gradient, own, self._embedding_index(picture))
+        return gradient
+
+    def _embedding_index(self, picture: int) -> UInt32:
+        """UInt32 [E]; its number is no constant of a kernel: others compile nothing."""
+        size = self.config.field.embeddings
+        return dr.opaque(ad.UInt32, picture * size) + dr.arange(ad.UInt32, size)
+
+    def _inputs(
+        self, gaussians: Gaussians, camera: Projection | None, sun: SunEncoding, shadows: Shadows | None
+    ) -> ShadingInputs:
+        raw_shadows = [shadows.occlusion, *shadows.info] if shadows else []
+        rotations_and_scales = gaussians.quaternions, gaussians.log_scales
+        logits = gaussians.logit_opacities
+        return ShadingInputs(
+            gaussians.features,
+            gaussians.means,
+            rotations_and_scales,
+            logits,
+            camera,
+            raw_shadows,
+            sun,
+            self._training_frame,
+        )
+
+    def _picture_cache(self, features: Float, batch: PaddedBatch) -> _PictureCache:
         """Made anew where features or weights have changed. Copies hold what was read: a number of Dr.Jit's that is in
         use is never another array's."""
-        of_field, _ = split(self.config, self.weights)
-        by_vectors = select() in COOPERATIVE and cooperative.usable()
-        read = of_field if by_vectors else [features, of_field[1]]
-        if [array.index for array in read] != [array.index for array in self._kept.read]:
-            self._kept = _Kept([], None, [])  # room for the next
+        of_field, _ = split_weights(self.config, self.weights)
+        is_cooperative = select() in COOPERATIVE and cooperative.is_usable()
+        read = [*(of_field if is_cooperative else [features, of_field[1]]), *self.embeddings]
+        if [array.index for array in read] != [array.index for array in self._cache.read]:
+            self._cache = _PictureCache([], None, [], [])  # room for the next
             field = self.config.field
-            packed = cooperative.pack(field.shape, of_field) if by_vectors else []
-            known = None if by_vectors else kernels.known_layer(field, of_field, features, lanes)
-            self._kept = _Kept([ad.Float(array) for array in read], known, packed)
-        return self._kept
+            packed = cooperative.pack(field.shape, of_field) if is_cooperative else []
+            first_layer = None if is_cooperative else kernels.first_layer_of_features(field, of_field, features, batch)
+            self._cache = _PictureCache(
+                [ad.Float(array) for array in read], first_layer, packed, self._mean_embedding()
+            )
+        return self._cache
 
-    def _sun_terms(self, *sun: float) -> SunTerms:
+    def _encode_sun(self, *sun: float) -> SunEncoding:
         refine = self.config.refine or self.config.field
-        terms = SunTerms(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun))
+        terms = SunEncoding(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun))
         dr.eval(terms)
         return terms

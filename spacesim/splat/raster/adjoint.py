@@ -14,30 +14,39 @@ from typing import Any
 
 import drjit as dr
 
-from spacesim.backend import ad, select
-from spacesim.splat.raster.bin import TileLists, TileShape
+from spacesim.backend import ad, recorded, select
+from spacesim.backend.arrays import Bool, Float, UInt32
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import (
     ALPHA_MAX,
     LOG2_E,
     POWER_MIN,
-    Blended,
+    BlendResult,
     bucket_numbers,
     exp2,
     exponents,
-    lane_offsets,
-    lane_pixels,
     load,
     packet,
     packet_sizes,
     packets,
-    pixel_in_tile,
     store,
 )
+from spacesim.splat.raster.tiles import TileLists, TileShape, lane_offsets, lane_pixels, pixel_in_tile
 
-COPIES_BYTES = 2**30  #: that threads' copies of gradient slots may take on a CPU, chosen
+COPIES_BYTES = 2**30  #: that threads' copies of gradient slots may take on a CPU
 PACKET = 4  #: lanes that run together on any CPU: Dr.Jit's packets have 4, 8 or 16, and start at a multiple
 ONE_PIXEL = TileShape(1, 1, 1)
+
+
+@dataclass
+class PlaneGradients:
+    """Gradients of a scalar with respect to what blending gave: planes [height * width] of the features, and of the
+    transmittance."""
+
+    width: int
+    height: int
+    features: list[Float]
+    transmittance: Float
 
 
 @dataclass
@@ -45,32 +54,30 @@ class SplatGradients:
     """Gradients of a scalar with respect to the splats, [N] each (depths have none), and what refinement asks for."""
 
     splats: Splats
-    features: list[Any]
+    features: list[Float]
     absolute_x: Any  #: sum over pixels of |d / d x|, per pixel of screen (Ye et al. 2024, AbsGS)
     absolute_y: Any
 
 
+@recorded
 def by_tiles(
     splats: Splats,
-    blended: Blended,
+    blended: BlendResult,
     lists: TileLists,
-    image_size: tuple[int, int],
-    feature_gradients: list[Any],
-    transmittance_gradient: Any,
+    grad_planes: PlaneGradients,
     absolute: bool,
 ) -> SplatGradients:
     """See `blend.backward`. A lane for a block of a tile's pixels."""
-    channels, shape = len(feature_gradients), lists.shape
+    channels, shape = len(grad_planes.features), lists.shape
     lane, offsets = lane_pixels(lists), lane_offsets(shape)
-    width, height = image_size
     transmittance, last, behind, gradients = [], [], [], []
     for p, (i, j) in enumerate(offsets):
-        inside = (lane.column + i < width) & (lane.row + j < height)
-        pixel, place = (lane.row + j) * width + lane.column + i, lane.place * shape.pixels + p
-        gradients.append([dr.gather(ad.Float, plane, pixel, inside) for plane in feature_gradients])
+        inside = (lane.column + i < grad_planes.width) & (lane.row + j < grad_planes.height)
+        pixel, place = (lane.row + j) * grad_planes.width + lane.column + i, lane.place * shape.pixels + p
+        gradients.append([dr.gather(ad.Float, plane, pixel, inside) for plane in grad_planes.features])
         end = dr.gather(ad.Float, blended.tile_transmittance, place)
         transmittance.append(end)
-        behind.append(end * dr.gather(ad.Float, transmittance_gradient, pixel, inside))
+        behind.append(end * dr.gather(ad.Float, grad_planes.transmittance, pixel, inside))
         last.append(dr.select(inside, dr.gather(ad.UInt32, blended.last, place), 0))
 
     sizes = packet_sizes(_numbers(channels, absolute))
@@ -78,10 +85,10 @@ def by_tiles(
     slots = [dr.zeros(ad.Float, size * lists.capacity) for size in sizes]
     records, start = blended.records, dr.gather(ad.UInt32, lists.start, lane.tile)
 
-    def remaining(k: Any, _transmittance: Any, _behind: Any) -> Any:
+    def remaining(k: UInt32, _transmittance: Any, _behind: Any) -> Bool:
         return k > start
 
-    def replay(k: Any, transmittance: list[Any], behind: list[Any]) -> Any:
+    def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> Any:
         k = k - 1
         record = load(records, k, lists.capacity)
         dx, dy = lane.x - record[0], lane.y - record[1]
@@ -90,7 +97,7 @@ def by_tiles(
         transmittance, behind = list(transmittance), list(behind)
         moments = Moments(dx, dy)
         absolute_x, absolute_y = ad.Float(0), ad.Float(0)
-        by_feature = [ad.Float(0) for _ in range(channels)]
+        grad_features = [ad.Float(0) for _ in range(channels)]
         for p, (i, j) in enumerate(offsets):
             unclamped = exp2(powers[p])
             alpha = dr.minimum(unclamped, ALPHA_MAX)
@@ -98,20 +105,20 @@ def by_tiles(
             # with T behind the pair: T before it is T / (1 - alpha), and its weight alpha T / (1 - alpha)
             ratio = dr.select(blends, alpha * dr.rcp(1 - alpha), 0)
             weight = ratio * transmittance[p]
-            along = _dot(gradients[p], record[6:])
+            along = _scalar_product(gradients[p], record[6:])
             for n, gradient in enumerate(gradients[p]):
-                by_feature[n] = dr.fma(weight, gradient, by_feature[n])
-            by_log_alpha = ratio * dr.fma(along, transmittance[p], -behind[p])
+                grad_features[n] = dr.fma(weight, gradient, grad_features[n])
+            grad_log_alpha = ratio * dr.fma(along, transmittance[p], -behind[p])
             behind[p] = dr.fma(weight, along, behind[p])
             transmittance[p] += weight
-            g = dr.select(unclamped < ALPHA_MAX, by_log_alpha, 0)
+            g = dr.select(unclamped < ALPHA_MAX, grad_log_alpha, 0)
             g_dy = moments.add(i, j, g)
             # records hold -a/2, -b, -c/2 in units of log2 e; the factor is put back with the sums below
             if absolute:
                 absolute_x += dr.abs(dr.fma(b, g_dy, 2 * a * (dx + i) * g))
                 absolute_y += dr.abs(dr.fma(2 * c, g_dy, b * (dx + i) * g))
         sums = moments.sums()
-        sums += [absolute_x, absolute_y, *by_feature] if absolute else by_feature
+        sums += [absolute_x, absolute_y, *grad_features] if absolute else grad_features
         add_to_slots(slots, sums, lists.sum_index(k), mode)
         return k, transmittance, behind
 
@@ -125,11 +132,11 @@ class Moments:
     """Sums over a lane's pixels, column by column, of g, g dx, g dy, g dx^2, g dx dy and g dy^2, with (dx, dy) from the
     splat's centre to the pixel. dx, dy: of the lane's first pixel"""
 
-    def __init__(self, dx: Any, dy: Any) -> None:
+    def __init__(self, dx: Float, dy: Float) -> None:
         self.dx, self.dy = dx, dy
-        self.columns: dict[int, list[Any]] = {}
+        self.columns: dict[int, list[Float]] = {}
 
-    def add(self, column: int, row: int, g: Any) -> Any:
+    def add(self, column: int, row: int, g: Float) -> Any:
         """A pixel's g. Returns g dy."""
         dy = self.dy + row
         g_dy = g * dy
@@ -137,7 +144,7 @@ class Moments:
         self.columns[column] = [s0 + g, s1 + g_dy, dr.fma(g_dy, dy, s2)]
         return g_dy
 
-    def sums(self) -> list[Any]:
+    def sums(self) -> list[Float]:
         """The six."""
         total = [ad.Float(0) for _ in range(6)]
         for column, (s0, s1, s2) in self.columns.items():
@@ -148,17 +155,17 @@ class Moments:
         return total
 
 
-def add_to_slots(slots: list[Any], sums: list[Any], slot: Any, mode: Any) -> None:
+def add_to_slots(slots: list[Float], sums: list[Float], slot: UInt32, mode: dr.ReduceMode) -> None:
     """Add a lane's sums to its pair's slot in each array. All lanes do: to ask each whether it has anything to add
     costs more, on a CPU and on CUDA."""
     for target, values in zip(slots, packets(sums), strict=True):
         dr.scatter_reduce(dr.ReduceOp.Add, target, packet(values), slot, mode=mode)
 
 
-def _dot(one: list[Any], other: list[Any]) -> Any:
-    """Scalar product over as many entries as `one` has."""
-    total = one[0] * other[0] if one else ad.Float(0)
-    for x, y in zip(one[1:], other[1:], strict=False):
+def _scalar_product(first: list[Float], second: list[Float]) -> Float:
+    """Scalar product over as many entries as `first` has."""
+    total = first[0] * second[0] if first else ad.Float(0)
+    for x, y in zip(first[1:], second[1:], strict=False):
         total = dr.fma(x, y, total)
     return total
 
@@ -178,38 +185,37 @@ class _Buckets:
     """Of each bucket [B]: its tile, the tile's left and top edges in pixels, and its pairs from `first` to below `end`
     of the tile, none where no lane of blending came to it."""
 
-    tile: Any
-    live: Any
-    left: Any
-    top: Any
-    first: Any
-    end: Any
+    tile: UInt32
+    live: Bool
+    left: Float
+    top: Float
+    first: UInt32
+    end: UInt32
 
 
+@recorded
 def by_buckets(
     splats: Splats,
-    blended: Blended,
+    blended: BlendResult,
     lists: TileLists,
-    image_size: tuple[int, int],
-    feature_gradients: list[Any],
-    transmittance_gradient: Any,
+    grad_planes: PlaneGradients,
     absolute: bool,
 ) -> SplatGradients:
     """See `blend.backward`. A lane for a bucket: what lies behind a pair is all that the pixel shows, less what
     has been blended up to the pair."""
-    channels, shape = len(feature_gradients), lists.shape
+    channels, shape = len(grad_planes.features), lists.shape
     pixels, bucket = shape.width * shape.height, blended.bucket
-    looks = _pixel_packets(blended, lists, image_size, feature_gradients, transmittance_gradient)
+    looks = _pixel_packets(blended, lists, grad_planes)
     tiles, bucket_count = lists.tiles_x * lists.tiles_y, bucket_numbers(lists, bucket)
     number = dr.arange(ad.UInt32, bucket_count)
     buckets = _buckets(blended, lists, number)
     records = [_record(blended, buckets, i, lists.capacity) for i in range(bucket)]
     until = dr.select(buckets.live, ad.UInt32(pixels), ad.UInt32(0))
 
-    def more(q: Any, _sums: Any) -> Any:
+    def has_more(q: UInt32, _sums: Any) -> Bool:
         return q < until
 
-    def visit(q: Any, sums: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
+    def visit(q: UInt32, sums: list[list[Float]]) -> tuple[UInt32, list[list[Float]]]:
         column, row = pixel_in_tile(q, shape)
         px, py = buckets.left + ad.Float(column) + 0.5, buckets.top + ad.Float(row) + 0.5
         total, *gradients = load(looks, buckets.tile * pixels + q, tiles * pixels)
@@ -226,7 +232,7 @@ def by_buckets(
         return q + 1, sums
 
     zeros = [[ad.Float(0) for _ in range(_numbers(channels, absolute))] for _ in range(bucket)]
-    _, sums = dr.while_loop((ad.UInt32(0), zeros), more, visit, mode="symbolic", label="buckets")
+    _, sums = dr.while_loop((ad.UInt32(0), zeros), has_more, visit, mode="symbolic", label="buckets")
     fours = _fours(channels, absolute)
     slots = dr.zeros(ad.Float, 4 * fours * lists.capacity)  # a pair's numbers side by side
     for i in range(bucket):
@@ -241,14 +247,14 @@ def by_buckets(
 
 
 def _add_pixel(
-    sums: list[Any],
-    record: list[Any],
-    centre: tuple[Any, Any],
-    gradients: list[Any],
-    state: tuple[Any, Any],
-    blends: Any,
+    sums: list[Float],
+    record: list[Float],
+    centre: tuple[Float, Float],
+    gradients: list[Float],
+    state: tuple[Float, Float],
+    blends: Bool,
     absolute: bool,
-) -> tuple[Any, Any]:
+) -> tuple[Float, Float]:
     """Add what a pixel contributes to a pair's sums, and take the pair from the pixel's state: (transmittance, gradient
     of what is behind). A state that blending did not keep has no part, since `blends` is false."""
     (px, py), (transmittance, behind), channels = centre, state, len(gradients)
@@ -262,8 +268,8 @@ def _add_pixel(
     for gradient, feature in zip(gradients, record[6 : 6 + channels], strict=True):
         along = dr.fma(gradient, feature, along)
     behind = dr.fma(-weight, along, behind)
-    by_alpha = transmittance * along - behind * dr.rcp(1 - alpha)
-    g = dr.select(blends & (unclamped < ALPHA_MAX), by_alpha * alpha, 0)  # dL / d ln alpha
+    grad_alpha = transmittance * along - behind * dr.rcp(1 - alpha)
+    g = dr.select(blends & (unclamped < ALPHA_MAX), grad_alpha * alpha, 0)  # dL / d ln alpha
     g_dx, g_dy = g * dx, g * dy
     sums[0], sums[1], sums[2] = sums[0] + g, sums[1] + g_dx, sums[2] + g_dy
     sums[3], sums[4], sums[5] = dr.fma(g_dx, dx, sums[3]), dr.fma(g_dx, dy, sums[4]), dr.fma(g_dy, dy, sums[5])
@@ -275,7 +281,7 @@ def _add_pixel(
     return transmittance - weight, behind
 
 
-def _buckets(blended: Blended, lists: TileLists, number: Any) -> _Buckets:
+def _buckets(blended: BlendResult, lists: TileLists, number: UInt32) -> _Buckets:
     tile, shape = dr.gather(ad.UInt32, blended.bucket_tile, number), lists.shape
     live = tile < lists.tiles_x * lists.tiles_y
     tile = dr.select(live, tile, 0)
@@ -286,31 +292,29 @@ def _buckets(blended: Blended, lists: TileLists, number: Any) -> _Buckets:
     return _Buckets(tile, live, ad.Float(left), ad.Float(top), first, end)
 
 
-def _record(blended: Blended, buckets: _Buckets, i: int, capacity: int) -> list[Any]:
+def _record(blended: BlendResult, buckets: _Buckets, i: int, capacity: int) -> list[Float]:
     """Of pair i of each bucket; zeros where there is none, which no pixel has blended."""
     listed = buckets.first + i < buckets.end
     return load(blended.records, buckets.first + i, capacity, listed)
 
 
 def _pixel_packets(
-    blended: Blended,
+    blended: BlendResult,
     lists: TileLists,
-    image_size: tuple[int, int],
-    feature_gradients: list[Any],
-    transmittance_gradient: Any,
-) -> list[Any]:
+    grad_planes: PlaneGradients,
+) -> list[Float]:
     """Of each pixel, tile by tile, by fours: the scalar product of all that it shows, transmittance too, with their
     gradients; and its features' gradients."""
-    (width, height), shape = image_size, lists.shape
+    shape, width, height = lists.shape, grad_planes.width, grad_planes.height
     pixels = shape.width * shape.height
     index = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * pixels)
     tile, (column, row) = index // pixels, pixel_in_tile(index % pixels, shape)
     column, row = column + (tile % lists.tiles_x) * shape.width, row + (tile // lists.tiles_x) * shape.height
     inside = (column < width) & (row < height)
     pixel = row * width + column
-    gradients = [dr.gather(ad.Float, plane, pixel, inside) for plane in feature_gradients]
+    gradients = [dr.gather(ad.Float, plane, pixel, inside) for plane in grad_planes.features]
     passed = dr.gather(ad.Float, blended.tile_transmittance, index)
-    total = passed * dr.gather(ad.Float, transmittance_gradient, pixel, inside)
+    total = passed * dr.gather(ad.Float, grad_planes.transmittance, pixel, inside)
     for gradient, plane in zip(gradients, blended.features, strict=True):
         total = dr.fma(gradient, dr.gather(ad.Float, plane, pixel, inside), total)
     values = [total, *gradients]
@@ -320,7 +324,7 @@ def _pixel_packets(
     return looks
 
 
-def reduce_mode(bytes_: int, shape: TileShape) -> Any:
+def reduce_mode(bytes_: int, shape: TileShape) -> dr.ReduceMode:
     """How a tile's lanes add to the slots, `bytes_` large. One tile alone adds to a slot: the sums depend on none of
     this.
 
@@ -335,7 +339,7 @@ def reduce_mode(bytes_: int, shape: TileShape) -> Any:
 
 
 def gather_slots(
-    slots: list[Any], splats: Splats, lists: TileLists, channels: int, absolute: bool = True
+    slots: list[Float], splats: Splats, lists: TileLists, channels: int, absolute: bool = True
 ) -> SplatGradients:
     """Add up each splat's slots, in order, and turn the sums into gradients of the splat's own numbers.
 
@@ -345,10 +349,10 @@ def gather_slots(
     position = dr.gather(ad.UInt32, lists.first_slot, splat)
     end = position + dr.gather(ad.UInt32, lists.slot_count, splat)
 
-    def remaining(position: Any, _sums: Any) -> Any:
+    def remaining(position: UInt32, _sums: Any) -> Bool:
         return position < end
 
-    def add(position: Any, sums: list[Any]) -> Any:
+    def add(position: UInt32, sums: list[Float]) -> Any:
         values = load(slots, lists.sum_of_slot(position), lists.capacity)
         return position + 1, [total + value for total, value in zip(sums, values, strict=True)]
 
@@ -356,17 +360,18 @@ def gather_slots(
     state = position, [ad.Float(0) for _ in range(numbers)]
     _, sums = dr.while_loop(state, remaining, add, mode="symbolic", label="gather slots")
     s0, sx, sy, sxx, sxy, syy, *rest = sums
-    by_splat = Splats(
+    none: Any = None
+    grad_splats = Splats(
         x=dr.fma(splats.a, sx, splats.b * sy),
         y=dr.fma(splats.b, sx, splats.c * sy),
         a=-0.5 * sxx,
         b=-sxy,
         c=-0.5 * syy,
         opacity=s0 * dr.rcp(dr.maximum(splats.opacity, 1e-30)),
-        depth=None,
+        depth=none,
     )
     absolute_x, absolute_y = [value / LOG2_E for value in rest[:2]] if absolute else (None, None)
-    by_feature = rest[2 : 2 + channels] if absolute else rest[:channels]
-    result = SplatGradients(by_splat, by_feature, absolute_x, absolute_y)
+    grad_features = rest[2 : 2 + channels] if absolute else rest[:channels]
+    result = SplatGradients(grad_splats, grad_features, absolute_x, absolute_y)
     dr.eval(result)
     return result

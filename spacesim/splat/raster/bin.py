@@ -5,7 +5,7 @@ scheduling. Pairs of tile and splat come from the box around a splat's ellipse; 
 in no list. How the lists are put in order depends on the backend, the order does not:
 
 - CUDA counts the pairs into their tiles and orders each list by itself (`sort.py`): a radix sort's many launches
-  cost more than its work (docs/performance.md), and Dr.Jit 1.5 cannot replay them.
+  cost more than its work (docs/research/speed.md), and Dr.Jit 1.5 cannot replay them.
 - LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile; both sorts are stable.
 """
 
@@ -15,19 +15,19 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, free_memory, recorded, select
+from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
 from spacesim.data.errors import WorkError
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats
-from spacesim.splat.raster.sort import ordered_lists, owners
-
-RECORDINGS = 256  #: of a function that are kept: one for each size of picture, of the lists, and of the model
+from spacesim.splat.raster.sort import ordered_lists, segment_ids
+from spacesim.splat.raster.tiles import STEPS, TileLists, TileShape, round_capacity, tile_shape
 
 DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
-LONGEST = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long
+MAX_SORTED_LENGTH = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long
 PACKET = 16  #: lanes that run together on a CPU with AVX-512; elsewhere fewer
-HANDS = 64  #: at most, chosen: no fewer than the parts into which Dr.Jit divides a launch, two a thread, as a rule
-STEPS, FEW = 8, 2  #: sizes of arrays from one power of two to the next, as a rule, and of the lists of pictures
-LONG = 2**22  #: pairs from which on lists of pictures have no more room than others, chosen: a gigabyte
-LARGEST_PAIRS = {"cuda": 0.9 * 2**30, "llvm": 0.9 * 2**29}  #: records hold four or eight numbers a pair, arrays 2^32
+MAX_SHARES = 64  #: at most: no fewer than the parts into which Dr.Jit divides a launch, two a thread, as a rule
+FEW = 2  #: sizes of the lists of pictures from one power of two to the next
+LONG = 2**22  #: pairs from which on lists of pictures have no more room than others: a gigabyte
+MAX_PAIRS = {"cuda": 0.9 * 2**30, "llvm": 0.9 * 2**29}  #: records hold four or eight numbers a pair, arrays 2^32
 PICTURE_BYTES = 200, 85  #: a pair (lists, sorting, blending), a pixel (colour, transmittance and what blending keeps of
 #: them): measured on LLVM, 90 to 210 a pair, as the rounding of arrays has it
 TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a training step, with gradients and the loss;
@@ -35,69 +35,22 @@ TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a trai
 
 
 @dataclass(frozen=True)
-class TileShape:
-    """A tile of width x height pixels is blended by `lanes` lanes; each holds `columns` columns of `rows` pixels."""
+class _Grid:
+    """The tiles of a picture: `columns` x `rows` of one shape."""
 
-    width: int
-    height: int
-    lanes: int
-    columns: int = 1
-
-    @property
-    def pixels(self) -> int:
-        """Pixels a lane."""
-        return self.width * self.height // self.lanes
-
-    @property
-    def rows(self) -> int:
-        """Pixels of a column."""
-        return self.pixels // self.columns
-
-
-def tile_shape() -> TileShape:
-    """The fastest shape measured for the backend (docs/performance.md). One tile is one warp on CUDA, a part of a
-    packet on LLVM, whose packets have 4 lanes or a multiple: a tile's gradients meet in an order that is fixed."""
-    return TileShape(8, 8, 32) if select() == "cuda" else TileShape(8, 8, 4, columns=2)
-
-
-@dataclass
-class TileLists:
-    """(tile, splat) pairs. `splat`, `slot` [P] are in blending order; `start`, `end` [T] delimit each tile.
-
-    Slots number the pairs splat by splat: those of splat i are `first_slot[i]` .. + `slot_count[i]`, [M]. Arrays have
-    room for more pairs and splats than there are, so that few sizes occur: P is `capacity`, M at least N.
-    order: the tiles in the order in which they are given to lanes [T], or None for that of their indices.
-    place: where each slot's pair stands in `splat` [P], or None: sums of pairs are then kept by slots (`sum_index`).
-    """
-
-    splat: Any
-    slot: Any
-    start: Any
-    end: Any
-    first_slot: Any
-    slot_count: Any
-    capacity: int
-    tiles_x: int
-    tiles_y: int
+    columns: int
+    rows: int
     shape: TileShape
-    order: Any = None
-    place: Any = None
 
-    def sum_index(self, k: Any, active: Any = True) -> Any:
-        """Where the sums of pair k of `splat` are kept while they are added up.
-
-        Threads of a CPU add to the pairs of their tiles, which must not share cache lines: there it is the pair's
-        place."""
-        return dr.gather(ad.UInt32, self.slot, k, active) if self.place is None else k
-
-    def sum_of_slot(self, slot: Any) -> Any:
-        """The same of a slot."""
-        return slot if self.place is None else dr.gather(ad.UInt32, self.place, slot)
+    @staticmethod
+    def of(width: int, height: int, shape: TileShape) -> "_Grid":
+        """For a picture of width x height pixels."""
+        return _Grid(-(-width // shape.width), -(-height // shape.height), shape)
 
     @property
-    def pairs(self) -> int:
-        """How many pairs the tiles list. Waits for the device."""
-        return int(dr.sum(self.end - self.start)[0])
+    def tiles(self) -> int:
+        """How many they are."""
+        return self.columns * self.rows
 
 
 @dataclass
@@ -105,12 +58,12 @@ class _Boxes:
     """Of splats [M]: boxes in tiles, how many tiles, the splats in the order in which pairs are numbered (None: that of
     their indices), and the pairs up to and including each in that order, UInt64."""
 
-    left: Any
-    top: Any
-    columns: Any
-    count: Any
-    order: Any
-    upto: Any
+    left: UInt32
+    top: UInt32
+    columns: UInt32
+    count: UInt32
+    order: UInt32 | None
+    pair_ends: UInt64
 
 
 def bin_splats(
@@ -128,26 +81,25 @@ def bin_splats(
     Between its two parts, both recorded, the host waits for the number of pairs, which says how large arrays must be.
     """
     boxes_of, lists_of = (_boxes, _count) if select() == "cuda" else (_rank, _expand)
-    shape, count = tile_shape(), dr.width(splats.x)
-    tiles = -(-width // shape.width), -(-height // shape.height)
+    grid, count = _Grid.of(width, height, tile_shape()), dr.width(splats.x)
     splats, footprints = dr.detach(splats), dr.detach(footprints)
     pairs = 0
     if count > 0:
-        capacity = room(count)
-        boxes: _Boxes = boxes_of(splats, footprints, dr.opaque(ad.UInt32, count), capacity, tiles, shape)
-        pairs = int(boxes.upto[capacity - 1])
-    _check_room(pairs, width * height, *(TRAINING_BYTES[select()] if training else PICTURE_BYTES))
+        capacity = round_capacity(count)
+        boxes: _Boxes = boxes_of(splats, footprints, dr.opaque(ad.UInt32, count), capacity, grid)
+        pairs = int(boxes.pair_ends[capacity - 1])
+    _check_memory(pairs, width * height, *(TRAINING_BYTES[select()] if training else PICTURE_BYTES))
     if pairs == 0:
-        none, of_splats = dr.zeros(ad.UInt32, tiles[0] * tiles[1]), dr.zeros(ad.UInt32, max(count, 1))
-        return TileLists(none, none, none, none, of_splats, of_splats, 0, *tiles, shape)
+        none, of_splats = dr.zeros(ad.UInt32, grid.tiles), dr.zeros(ad.UInt32, max(count, 1))
+        return TileLists(none, none, none, none, of_splats, of_splats, 0, grid.columns, grid.rows, grid.shape)
     steps = FEW if few_sizes and pairs < LONG else STEPS
-    lists: TileLists = lists_of(splats, footprints, boxes, room(pairs, steps), capacity, tiles, shape)
+    lists: TileLists = lists_of(splats, footprints, boxes, round_capacity(pairs, steps), capacity, grid)
     return lists
 
 
-def _check_room(pairs: int, pixels: int, bytes_a_pair: int, bytes_a_pixel: int) -> None:
+def _check_memory(pairs: int, pixels: int, bytes_a_pair: int, bytes_a_pixel: int) -> None:
     needed = pairs * bytes_a_pair + pixels * bytes_a_pixel
-    most = LARGEST_PAIRS[select()]
+    most = MAX_PAIRS[select()]
     if pairs > most:
         raise WorkError(f"rasterizer: {pairs:.3g} pairs of tile and splat, at most {most:.3g} can be sorted")
     free = free_memory(needed) if needed > 2**28 else None
@@ -158,31 +110,19 @@ def _check_room(pairs: int, pixels: int, bytes_a_pair: int, bytes_a_pixel: int) 
         )
 
 
-def room(count: int, steps: int = STEPS) -> int:
-    """`count` rounded up by about an eighth at most: few sizes are few recordings and, on LLVM, where the size of what
-    is scattered into is part of a kernel's text, few kernels to compile. steps: sizes from one power of two to the
-    next, itself one
-
-    Never `count` itself: a recording in which the two are one takes the size of the room from the number of splats."""
-    step = max(1024, (1 << max(0, count.bit_length() - 1)) // steps)
-    return (count // step + 1) * step
-
-
-def _trace_boxes(
-    splats: Splats, footprints: Footprints, count: Any, capacity: int, tiles: tuple[int, int], shape: TileShape
-) -> _Boxes:
+@recorded
+def _boxes(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: _Grid) -> _Boxes:
     """Boxes of `count` splats; pairs are numbered in the order of the splats' indices."""
-    left, top, columns, pairs, _ = _boxes_in_tiles(splats, footprints, count, capacity, tiles, shape)
+    left, top, columns, pairs, _ = _boxes_in_tiles(splats, footprints, count, capacity, grid)
     wide = ad.UInt64(pairs)
     dr.eval(left, top, columns, pairs, wide)
     return _Boxes(left, top, columns, pairs, None, _running_sum(wide))
 
 
-def _trace_rank(
-    splats: Splats, footprints: Footprints, count: Any, capacity: int, tiles: tuple[int, int], shape: TileShape
-) -> _Boxes:
+@recorded
+def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: _Grid) -> _Boxes:
     """Boxes of `count` splats; pairs are numbered in depth order."""
-    left, top, columns, pairs, live = _boxes_in_tiles(splats, footprints, count, capacity, tiles, shape)
+    left, top, columns, pairs, live = _boxes_in_tiles(splats, footprints, count, capacity, grid)
     # Splats that cannot be seen have no pairs, so their place does not matter.
     lane = dr.arange(ad.UInt32, capacity)
     key = dr.select(live, dr.gather(ad.UInt32, footprints.order, lane, live), ad.UInt32(0xFFFFFFFF))
@@ -192,8 +132,8 @@ def _trace_rank(
 
 
 def _boxes_in_tiles(
-    splats: Splats, footprints: Footprints, count: Any, capacity: int, tiles: tuple[int, int], shape: TileShape
-) -> tuple[Any, Any, Any, Any, Any]:
+    splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: _Grid
+) -> tuple[UInt32, UInt32, UInt32, UInt32, Bool]:
     """(left, top, columns, pairs, whether it can be seen) of each splat's box, [M] = [capacity]."""
     lane = dr.arange(ad.UInt32, capacity)
     live = lane < count
@@ -201,51 +141,54 @@ def _boxes_in_tiles(
     x, y, half_width, half_height = (
         dr.gather(ad.Float, v, lane, live) for v in (splats.x, splats.y, footprints.half_width, footprints.half_height)
     )
-    x0, x1 = _tile_range(x, half_width, shape.width, tiles[0])
-    y0, y1 = _tile_range(y, half_height, shape.height, tiles[1])
+    x0, x1 = _tile_range(x, half_width, grid.shape.width, grid.columns)
+    y0, y1 = _tile_range(y, half_height, grid.shape.height, grid.rows)
     return x0, y0, dr.maximum(x1 - x0, 1), dr.select(live, (x1 - x0) * (y1 - y0), ad.UInt32(0)), live
 
 
-def _running_sum(values: Any) -> Any:
+def _running_sum(values: UInt64) -> UInt64:
     return dr.prefix_reduce(dr.ReduceOp.Add, values, exclusive=False)
 
 
-def _trace_count(
+@recorded
+def _count(
     splats: Splats,
     footprints: Footprints,
     boxes: _Boxes,
     capacity: int,
     splat_capacity: int,
-    tiles: tuple[int, int],
-    shape: TileShape,
+    grid: _Grid,
 ) -> TileLists:
     """Lists that are ordered one by one."""
     slot = dr.arange(ad.UInt32, capacity)
-    total = ad.UInt32(dr.gather(ad.UInt64, boxes.upto, ad.UInt32(splat_capacity - 1)))
-    splat = owners(boxes.upto, dr.minimum(slot, total - 1), splat_capacity)  # beyond the last pair: that one's splat
-    before = ad.UInt32(dr.gather(ad.UInt64, boxes.upto, splat)) - dr.gather(ad.UInt32, boxes.count, splat)
-    tile = _tile_of(splats, boxes, splat, slot - before, slot < total, tiles, shape)
+    total = ad.UInt32(dr.gather(ad.UInt64, boxes.pair_ends, ad.UInt32(splat_capacity - 1)))
+    splat = segment_ids(
+        boxes.pair_ends, dr.minimum(slot, total - 1), splat_capacity
+    )  # beyond the last pair: that one's splat
+    before = ad.UInt32(dr.gather(ad.UInt64, boxes.pair_ends, splat)) - dr.gather(ad.UInt32, boxes.count, splat)
+    tile = _tile_of(splats, boxes, splat, slot - before, slot < total, grid)
     key = dr.gather(ad.UInt32, footprints.order, splat)
-    first_slot = ad.UInt32(boxes.upto) - boxes.count
+    first_slot = ad.UInt32(boxes.pair_ends) - boxes.count
     dr.eval(first_slot)
-    splat, slot, start, end = ordered_lists(tile, key, splat, tiles[0] * tiles[1], capacity)
-    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, *tiles, shape)
+    splat, slot, start, end = ordered_lists(tile, key, splat, grid.tiles, capacity)
+    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, grid.columns, grid.rows, grid.shape)
 
 
-def _trace_expand(
+@recorded
+def _expand(
     splats: Splats,
     _footprints: Footprints,
     boxes: _Boxes,
     capacity: int,
     splat_capacity: int,
-    tiles: tuple[int, int],
-    shape: TileShape,
+    grid: _Grid,
 ) -> TileLists:
     """Lists from two stable sorts."""
     # Mark each splat's first pair with its rank, then a running maximum fills in the rest.
     splat_rank = dr.arange(ad.UInt32, splat_capacity)
+    assert boxes.order is not None
     pairs_of = dr.gather(ad.UInt32, boxes.count, boxes.order)
-    first = ad.UInt32(boxes.upto) - pairs_of
+    first = ad.UInt32(boxes.pair_ends) - pairs_of
     dr.eval(first)
     rank = dr.zeros(ad.UInt32, capacity)
     dr.scatter(rank, splat_rank, first, active=pairs_of > 0)
@@ -254,61 +197,62 @@ def _trace_expand(
     dr.scatter(first_slot, first, boxes.order)
 
     slot = dr.arange(ad.UInt32, capacity)
-    total = ad.UInt32(dr.gather(ad.UInt64, boxes.upto, ad.UInt32(splat_capacity - 1)))
+    total = ad.UInt32(dr.gather(ad.UInt64, boxes.pair_ends, ad.UInt32(splat_capacity - 1)))
     splat = dr.gather(ad.UInt32, boxes.order, rank)
     within = slot - dr.gather(ad.UInt32, first, rank)
-    tile = _tile_of(splats, boxes, splat, within, slot < total, tiles, shape)
-    count = tiles[0] * tiles[1]
+    tile = _tile_of(splats, boxes, splat, within, slot < total, grid)
+    count = grid.tiles
     slot = _stable_order(tile, count.bit_length())
     tile = dr.gather(ad.UInt32, tile, slot)
     splat = dr.gather(ad.UInt32, splat, slot)
     dr.eval(tile, splat)
     start, end = _runs(tile, count, capacity)
-    order = _longest_first(end - start, shape)
+    order = _longest_first(end - start, grid.shape)
     place = dr.empty(ad.UInt32, capacity)
     dr.scatter(place, dr.arange(ad.UInt32, capacity), slot)
     dr.eval(splat, slot, start, end, first_slot, order, place)
-    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, *tiles, shape, order, place)
+    return TileLists(
+        splat, slot, start, end, first_slot, boxes.count, capacity, grid.columns, grid.rows, grid.shape, order, place
+    )
 
 
-def _longest_first(length: Any, shape: TileShape) -> Any:
-    """Tiles by the lengths [T] of their lists, longest first, then dealt to `HANDS` hands.
+def _longest_first(length: UInt32, shape: TileShape) -> UInt32:
+    """Tiles by the lengths [T] of their lists, longest first, then dealt into `MAX_SHARES` shares.
 
     Tiles that share a packet are walked together until the longest list ends: neighbours are of about one length.
-    Threads take runs of packets: each hand has long lists and short ones.
+    Threads take runs of packets: each share has long lists and short ones.
     """
     count = dr.width(length)
-    sorted_ = _stable_order(LONGEST - dr.minimum(length, LONGEST), LONGEST.bit_length())
+    sorted_ = _stable_order(MAX_SORTED_LENGTH - dr.minimum(length, MAX_SORTED_LENGTH), MAX_SORTED_LENGTH.bit_length())
     group = max(PACKET // shape.lanes, 1)
     groups = count // group
-    hands = min(HANDS, groups // 4)
-    if hands < 2:
+    shares = min(MAX_SHARES, groups // 4)
+    if shares < 2:
         return sorted_
     index = dr.arange(ad.UInt32, count)
-    dealt, within = index // group, index % group
-    few, more = divmod(groups, hands)  # the first `more` hands have one group more
-    in_first = dealt < more * (few + 1)
-    rest = dealt - more * (few + 1)
-    hand = dr.select(in_first, dealt // (few + 1), more + rest // few)
-    turn = dr.select(in_first, dealt % (few + 1), rest % few)
-    hand = dr.select((turn % 2 == 1) & (turn < few), hands - 1 - hand, hand)  # there and back, as long as all get one
-    whole = index < groups * group  # the last few tiles, with the shortest lists, stay where they are
-    return dr.gather(ad.UInt32, sorted_, dr.select(whole, (turn * hands + hand) * group + within, index))
+    packet, within = index // group, index % group
+    quotient, remainder = divmod(groups, shares)  # the first `remainder` shares have one group more
+    in_first = packet < remainder * (quotient + 1)
+    rest = packet - remainder * (quotient + 1)
+    share = dr.select(in_first, packet // (quotient + 1), remainder + rest // quotient)
+    turn = dr.select(in_first, packet % (quotient + 1), rest % quotient)
+    back = (turn % 2 == 1) & (turn < quotient)  # there and back, as long as all get one
+    share = dr.select(back, shares - 1 - share, share)
+    is_dealt = index < groups * group  # the last few tiles, with the shortest lists, stay where they are
+    return dr.gather(ad.UInt32, sorted_, dr.select(is_dealt, (turn * shares + share) * group + within, index))
 
 
-def _tile_of(
-    splats: Splats, boxes: _Boxes, splat: Any, within: Any, exists: Any, tiles: tuple[int, int], shape: TileShape
-) -> Any:
+def _tile_of(splats: Splats, boxes: _Boxes, splat: UInt32, within: UInt32, exists: Bool, grid: _Grid) -> UInt32:
     """Tile [P] of the pair `within` the box of a splat; the number of tiles where there is no such pair, or the ellipse
     misses the tile."""
     columns = dr.maximum(dr.gather(ad.UInt32, boxes.columns, splat), 1)
     column = dr.gather(ad.UInt32, boxes.left, splat) + within % columns
     row = dr.gather(ad.UInt32, boxes.top, splat) + within // columns
-    listed = exists & _touches(splats, splat, column, row, shape)
-    return dr.select(listed, row * tiles[0] + column, tiles[0] * tiles[1])
+    listed = exists & _touches(splats, splat, column, row, grid.shape)
+    return dr.select(listed, row * grid.columns + column, grid.tiles)
 
 
-def _touches(splats: Splats, splat: Any, column: Any, row: Any, shape: TileShape) -> Any:
+def _touches(splats: Splats, splat: UInt32, column: UInt32, row: UInt32, shape: TileShape) -> Bool:
     """Does the ellipse {alpha >= ALPHA_MIN} of a splat reach a pixel centre's rectangle of a tile? [P] each.
 
     Outside its centre a convex quadratic is least, over a rectangle, on an edge that faces the centre.
@@ -322,38 +266,39 @@ def _touches(splats: Splats, splat: Any, column: Any, row: Any, shape: TileShape
     on_column = dr.clip(-b * near_x * dr.rcp(c), top, bottom)  # least along the facing vertical edge
     on_row = dr.clip(-b * near_y * dr.rcp(a), left, right)
 
-    def form(dx: Any, dy: Any) -> Any:
+    def form(dx: Float, dy: Float) -> Float:
         return a * dx * dx + 2 * b * dx * dy + c * dy * dy
 
     least = dr.minimum(form(near_x, on_column), form(on_row, near_y))
     return least <= 2 * dr.log(dr.maximum(opacity / ALPHA_MIN, 1)) * (1 + 1e-4) + 1e-4
 
 
-def _stable_order(keys: Any, bits: int) -> Any:
+def _stable_order(keys: UInt32, bits: int) -> UInt32:
     """Indices that sort `keys` [N] of so many bits: a radix sort that knows how few digits there are, where dr.argsort
     goes through all 32 bits."""
     passes = -(-bits // DIGIT_BITS)
     digit_bits = -(-bits // passes)
-    order = None
+    order: Any = None
     for i in range(passes):
         digit, last = (keys >> (i * digit_bits)) & ((1 << digit_bits) - 1), i == passes - 1
         dr.eval(digit, order, None if last else keys)
-        moved = ad.UInt32(dr.detail.block_mkperm(dr.detach(digit), dr.width(keys), 1 << digit_bits))
+        plain: Any = dr.detach(digit)
+        moved = ad.UInt32(dr.detail.block_mkperm(plain, dr.width(keys), 1 << digit_bits))
         order = moved if order is None else dr.gather(ad.UInt32, order, moved)
         if not last:
             keys = dr.gather(ad.UInt32, keys, moved)
-        del digit, moved  # what is over goes: memory is short here
+        del digit, plain, moved  # what is over goes: memory is short here
     return order
 
 
-def _tile_range(center: Any, half: Any, size: int, tiles: int) -> tuple[Any, Any]:
+def _tile_range(center: Float, half: Float, size: int, tiles: int) -> tuple[UInt32, UInt32]:
     """Half-open range of tile indices that [center - half, center + half] touches, UInt32 [N] each."""
     low = dr.clip(dr.floor((center - half) / size), 0, tiles)
     high = dr.clip(dr.floor((center + half) / size) + 1, low, tiles)
     return ad.UInt32(low), ad.UInt32(high)
 
 
-def _runs(tile: Any, tiles: int, capacity: int) -> tuple[Any, Any]:
+def _runs(tile: UInt32, tiles: int, capacity: int) -> tuple[UInt32, UInt32]:
     """First and one-past-last position of each tile's run in the sorted array `tile` [capacity]; 0, 0 where it has
     none. Entries of `tiles` and above are in no tile."""
     position = dr.arange(ad.UInt32, capacity)
@@ -364,9 +309,3 @@ def _runs(tile: Any, tiles: int, capacity: int) -> tuple[Any, Any]:
     dr.scatter(start, position, tile, active=listed & ((position == 0) | (previous != tile)))
     dr.scatter(end, position + 1, tile, active=listed & ((position == capacity - 1) | (following != tile)))
     return start, end
-
-
-_boxes = recorded(_trace_boxes, RECORDINGS)
-_count = recorded(_trace_count, RECORDINGS)
-_rank = recorded(_trace_rank, RECORDINGS)
-_expand = recorded(_trace_expand, RECORDINGS)

@@ -3,7 +3,7 @@
 One lane holds a block of a tile's pixels and walks the tile's list. `forward` and `backward` are the two passes;
 `rasterize` is the differentiable operation made of them. The adjoint is by hand (`adjoint.py`): by buckets of pairs on
 CUDA, by tiles on LLVM. Buckets read what `forward` has kept of each pixel before each bucket. On an H100 to keep it
-costs a twentieth of what the adjoint gains; on a CPU it costs more than that (docs/performance.md).
+costs a twentieth of what the adjoint gains; on a CPU it costs more than that (docs/research/speed.md).
 """
 
 from functools import reduce
@@ -12,40 +12,37 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, recorded, select
-from spacesim.splat.raster.adjoint import SplatGradients, by_buckets, by_tiles
-from spacesim.splat.raster.bin import RECORDINGS, TileLists, room
+from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.splat.raster.adjoint import PlaneGradients, SplatGradients, by_buckets, by_tiles
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import (
     ALPHA_MAX,
     POWER_MIN,
     TRANSMITTANCE_MIN,
-    Blended,
+    BlendResult,
     bucket_numbers,
     exp2,
     exponents,
-    lane_pixels,
     list_records,
     load,
     store,
-    tiled_index,
 )
+from spacesim.splat.raster.tiles import TileLists, lane_pixels, round_capacity, tiled_index
 
 BUCKET = 8  #: pairs of a bucket, a power of two; 4 keep twice as much for 1 % of a step, 16 took longer on an H100
 BUCKET_TURN = 2  #: pairs a turn of the blending loop where buckets are kept: fewer turns have to ask for a new bucket
-CHECKPOINT_BYTES = 2**32  #: chosen: longer lists than these hold have their adjoint by tiles, on CUDA too
+CHECKPOINT_BYTES = 2**32  #: longer lists than these hold have their adjoint by tiles, on CUDA too
 
 
 def forward(
-    splats: Splats, features: list[Any], lists: TileLists, width: int, height: int, adjoint: bool = False
-) -> Blended:
+    splats: Splats, features: list[Float], lists: TileLists, width: int, height: int, adjoint: bool = False
+) -> BlendResult:
     """Blend `features` (C arrays [N]) over the pixels of a width x height image. Detached inputs.
 
     adjoint: keep what the backend's fastest `backward` reads; it costs memory, and can do without.
     """
-    run = _forward if width * height > 1 else trace_forward  # a recording gives a plane of one pixel another size
     bucket = _bucket(lists, len(features)) if adjoint else 0
-    blended: Blended = run(splats, features, lists, width, height, room(dr.width(splats.x)), bucket)
-    return blended
+    return blend_lists(splats, features, lists, width, height, round_capacity(dr.width(splats.x)), bucket)
 
 
 def _bucket(lists: TileLists, channels: int) -> int:
@@ -55,9 +52,10 @@ def _bucket(lists: TileLists, channels: int) -> int:
     return BUCKET if select() == "cuda" and lists.capacity > 0 and needed <= CHECKPOINT_BYTES else 0
 
 
-def trace_forward(
-    splats: Splats, features: list[Any], lists: TileLists, width: int, height: int, capacity: int, bucket: int
-) -> Blended:
+@recorded(elements=lambda _, splats, features, lists, width, height, *_rest, **_named: width * height)
+def blend_lists(
+    splats: Splats, features: list[Float], lists: TileLists, width: int, height: int, capacity: int, bucket: int
+) -> BlendResult:
     """`forward` as a part of recordings. capacity: room for the N splats;  bucket: pairs of a bucket of the adjoint, 0
     for none"""
     shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
@@ -66,14 +64,14 @@ def trace_forward(
     records = list_records(splats, features, lists, capacity)
     lane = lane_pixels(lists)
     start = dr.gather(ad.UInt32, lists.start, lane.tile)
-    kept = _Checkpoints(lists, bucket, channels, lane.place, start) if bucket else None
+    snapshots = _Checkpoints(lists, bucket, channels, lane.place, start) if bucket else None
 
-    def alive(k: Any, end: Any, transmittance: list[Any], _sums: Any, _last: Any) -> Any:
+    def alive(k: UInt32, end: UInt32, transmittance: list[Float], _sums: Any, _last: Any) -> Bool:
         return (k < end) & (reduce(dr.maximum, transmittance) > TRANSMITTANCE_MIN)
 
-    def blend(k: Any, end: Any, transmittance: list[Any], sums: list[list[Any]], last: list[Any]) -> Any:
-        if kept:
-            kept.keep(k, transmittance, sums)
+    def blend(k: UInt32, end: UInt32, transmittance: list[Float], sums: list[list[Float]], last: list[UInt32]) -> Any:
+        if snapshots:
+            snapshots.keep(k, transmittance, sums)
         transmittance, last, sums = list(transmittance), list(last), [list(pixel) for pixel in sums]
         for u in range(turn):
             listed = k + u < end if u else ad.Bool(True)
@@ -103,10 +101,10 @@ def trace_forward(
     lanes = tiles * shape.lanes
     tiled = [store([sums[p][c] for p in range(pixels)], lane.place, lanes) for c in range(channels)]
     tiled_transmittance, tiled_last = store(transmittance, lane.place, lanes), store(last, lane.place, lanes)
-    checkpoints, bucket_tile = (kept.states, kept.tile) if kept else ([], None)
+    checkpoints, bucket_tile = (snapshots.states, snapshots.tile) if snapshots else ([], None)
     dr.eval(tiled, tiled_transmittance, tiled_last, checkpoints, bucket_tile)
     pixel = tiled_index(lists, width, height)
-    return Blended(
+    return BlendResult(
         features=[dr.gather(ad.Float, plane, pixel) for plane in tiled],
         transmittance=dr.gather(ad.Float, tiled_transmittance, pixel),
         tile_transmittance=tiled_transmittance,
@@ -120,9 +118,11 @@ def trace_forward(
 
 
 class _Checkpoints:
-    """What the blending loop keeps of pixels before each bucket, see `Blended`. lane (its place), start: [T * lanes]"""
+    """What the blending loop keeps of pixels before each bucket, see `BlendResult`.
 
-    def __init__(self, lists: TileLists, bucket: int, channels: int, lane: Any, start: Any) -> None:
+    lane (its place), start: [T * lanes]"""
+
+    def __init__(self, lists: TileLists, bucket: int, channels: int, lane: UInt32, start: UInt32) -> None:
         numbers, fours = bucket_numbers(lists, bucket), -(-(1 + channels) // 4)
         pixels = lists.shape.width * lists.shape.height
         self.shape, self.bucket, self.start = lists.shape, bucket, start
@@ -131,26 +131,26 @@ class _Checkpoints:
         self.states = [dr.empty(ad.Float, 4 * numbers * pixels) for _ in range(fours)]
         self.tile = dr.full(ad.UInt32, lists.tiles_x * lists.tiles_y, numbers)
 
-    def keep(self, k: Any, transmittance: list[Any], sums: list[list[Any]]) -> None:
+    def keep(self, k: UInt32, transmittance: list[Float], sums: list[list[Float]]) -> None:
         """Before pair k, where a bucket starts there; of the pixels whose lane still walks."""
         starts = ((k - self.start) & (self.bucket - 1)) == 0
-        number, own = self.first + (k - self.start) // self.bucket, self.shape.pixels
+        number, pixels = self.first + (k - self.start) // self.bucket, self.shape.pixels
         dr.scatter(self.tile, self.tile_number, number, active=starts)  # whichever lane still walks
-        for p in range(own):
+        for p in range(pixels):
             values = [transmittance[p], *sums[p]]
             values += [ad.Float(0)] * (-len(values) % 4)
-            place = (number * self.shape.lanes + self.within) * own + p
+            place = (number * self.shape.lanes + self.within) * pixels + p
             for i, target in enumerate(self.states):
                 dr.scatter(target, ad.Array4f(values[4 * i : 4 * i + 4]), place, starts, dr.ReduceMode.NoConflicts)
 
 
 def backward(
     splats: Splats,
-    blended: Blended,
+    blended: BlendResult,
     lists: TileLists,
     image_size: tuple[int, int],
-    feature_gradients: list[Any],
-    transmittance_gradient: Any,
+    feature_gradients: list[Float],
+    transmittance_gradient: Float,
     absolute: bool = True,
 ) -> SplatGradients:
     """Adjoint of `forward`: from gradients of its planes [height * width] to gradients of the splats [N].
@@ -162,25 +162,23 @@ def backward(
     if lists.capacity == 0:
         zeros = [dr.opaque(ad.Float, 0, count) for _ in range(9 + channels)]  # no literals: they fold gradients away
         return SplatGradients(Splats(*zeros[:7]), zeros[9:], zeros[7], zeros[8])
-    run = _backward_by_buckets if blended.bucket else _backward_by_tiles
-    gradients: SplatGradients = run(
-        splats, blended, lists, image_size, feature_gradients, transmittance_gradient, absolute
-    )
-    return gradients
+    run = by_buckets if blended.bucket else by_tiles
+    grad_planes = PlaneGradients(*image_size, feature_gradients, transmittance_gradient)
+    return run(splats, blended, lists, grad_planes, absolute)
 
 
 class _Rasterize(dr.CustomOp):
     """`forward` and `backward` as one node of Dr.Jit's graph. Differentiable in reverse mode."""
 
-    def eval(self, splats: Splats, features: list[Any], lists: TileLists, width: int, height: int) -> list[Any]:
+    def eval(self, splats: Splats, features: list[Float], lists: TileLists, width: int, height: int) -> list[Float]:
         self.splats, self.lists, self.size = splats, lists, (width, height)
         self.blended = forward(splats, features, lists, width, height, adjoint=True)
         return [*self.blended.features, self.blended.transmittance]
 
     def backward(self) -> None:
         gradients: Any = self.grad_out()
-        *by_feature, by_transmittance = gradients
-        result = backward(self.splats, self.blended, self.lists, self.size, by_feature, by_transmittance, False)
+        *grad_features, grad_transmittance = gradients
+        result = backward(self.splats, self.blended, self.lists, self.size, grad_features, grad_transmittance, False)
         result.splats.depth = dr.opaque(ad.Float, 0, dr.width(self.splats.x))
         self.set_grad_in("splats", result.splats)
         self.set_grad_in("features", result.features)
@@ -189,15 +187,12 @@ class _Rasterize(dr.CustomOp):
         return "rasterize"
 
 
-def rasterize(splats: Splats, features: list[Any], lists: TileLists, width: int, height: int) -> tuple[list[Any], Any]:
+def rasterize(
+    splats: Splats, features: list[Float], lists: TileLists, width: int, height: int
+) -> tuple[list[Float], Float]:
     """Differentiable blending. Returns (C feature planes, transmittance plane), [height * width] each."""
     if not dr.grad_enabled(splats, features):
         blended = forward(splats, features, lists, width, height)
         return blended.features, blended.transmittance
-    outputs: list[Any] = dr.custom(_Rasterize, splats, features, lists, width, height)
+    outputs: list[Float] = dr.custom(_Rasterize, splats, features, lists, width, height)
     return outputs[:-1], outputs[-1]
-
-
-_forward = recorded(trace_forward, RECORDINGS)
-_backward_by_tiles = recorded(by_tiles, RECORDINGS)
-_backward_by_buckets = recorded(by_buckets, RECORDINGS)

@@ -12,31 +12,28 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
+from spacesim.backend.arrays import Array3f, Bool, Float
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
 
 NEAR = 0.01  #: metres; a perspective camera does not draw Gaussians whose centre is nearer
-LARGEST = 1e9  #: bound on lengths in metres and on footprints in pixels: their squares stay finite in float32
+MAX_MAGNITUDE = 1e9  #: bound on lengths in metres and on footprints in pixels: their squares stay finite in float32
 
 Self = TypeVar("Self", bound="Projection")
 
 
 @dataclass(frozen=True, eq=False)
 class OrthographicCamera:
-    """A camera of parallel rays along its z axis: what the Sun sees (thesis 4.3.1). No plane bounds it in depth.
+    """A camera of parallel rays along its z axis: what the Sun sees (thesis 4.3.1). No plane bounds it in depth."""
 
-    world_from_camera: [4, 4] float64, rigid, OpenCV axes, metres; z points from the Sun to the scene
-    width, height: pixels;  scale_x, scale_y: pixels per metre (thesis 4.35);  cx, cy: pixel of the axis
-    """
-
-    world_from_camera: Array
-    width: int
-    height: int
-    scale_x: float
-    scale_y: float
-    cx: float
-    cy: float
+    world_from_camera: Array  #: [4, 4] float64, rigid, OpenCV axes, metres; z points from the Sun to the scene
+    width: int  #: pixels
+    height: int  #: pixels
+    scale_x: float  #: pixels per metre (thesis 4.35)
+    scale_y: float  #: pixels per metre (thesis 4.35)
+    cx: float  #: pixel of the axis
+    cy: float  #: pixel of the axis
 
     def __post_init__(self) -> None:
         scales = (self.scale_x, self.scale_y)
@@ -59,55 +56,53 @@ class OrthographicCamera:
 
 @dataclass
 class Screen:
-    """Where points fall, and the Jacobian there: d(x, y) / d(camera axes) = diag(scale) [I | -slope].
+    """Where points fall, and the Jacobian there: d(x, y) / d(camera axes) = diag(scale) [I | -slope]."""
 
-    x, y: pixels;  scale_x, scale_y: pixels per metre;  slope_x, slope_y: of the ray, metres across a metre of depth
-    """
-
-    x: Any
-    y: Any
-    scale_x: Any
-    scale_y: Any
-    slope_x: Any
-    slope_y: Any
+    x: Float  #: pixels
+    y: Float  #: pixels
+    scale_x: Float  #: pixels per metre
+    scale_y: Float  #: pixels per metre
+    slope_x: Float  #: of the ray, metres across a metre of depth
+    slope_y: Float  #: of the ray, metres across a metre of depth
 
 
 @dataclass
 class Projection(ABC):
-    """A camera in the kernels. values: Float, first [18]: camera_from_world rows (12), pixels per unit in x and y,
-    principal point (2, pixels of the whole image), first column and row of the crop (2)."""
+    """A camera in the kernels."""
 
-    values: Any
+    #: Float, first [18]: camera_from_world rows (12), pixels per unit in x and y, principal point (2, pixels of the
+    #: whole image), first column and row of the crop (2)
+    values: Float
     width: int
     height: int
 
     @abstractmethod
-    def in_reach(self, center: Any) -> Any:
+    def in_reach(self, center: Array3f) -> Bool:
         """Bool [N]: can a Gaussian be drawn whose centre is at `center` (Array3f [3, N], camera axes, metres)?"""
 
     @abstractmethod
-    def screen(self, center: Any) -> Screen:
+    def screen(self, center: Array3f) -> Screen:
         """Projection of points in reach, Array3f [3, N] in camera axes, linearized there (thesis 2.11, 2.13)."""
 
     @abstractmethod
-    def rays_to(self, points: Any) -> Any:
+    def rays_to(self, points: Array3f) -> Array3f:
         """Array3f [3, N], world axes, not normalised: directions in which the camera sees `points` [3, N]."""
 
-    def directions_to(self, points: Any) -> Any:
+    def directions_to(self, points: Array3f) -> Array3f:
         """Array3f [3, N]: unit vectors along `rays_to`; (0, 0, 1), without gradient, where there is no direction."""
         offset = self.rays_to(points)
         length2 = dr.squared_norm(offset)
         far = dr.detach((length2 > 1e-20) & (length2 < 1e20))
         return dr.select(far, offset * dr.rsqrt(dr.select(far, length2, 1)), ad.Array3f(0, 0, 1))
 
-    def __getitem__(self, index: int) -> Any:
+    def __getitem__(self, index: int) -> Float:
         return dr.gather(ad.Float, self.values, ad.UInt32(index))
 
-    def transform(self, points: Any) -> Any:
+    def transform(self, points: Array3f) -> Array3f:
         """Array3f [3, N] world to camera axes, metres (thesis 2.10)."""
         return ad.Array3f([dr.dot(self.row(i), points) + self[4 * i + 3] for i in range(3)])
 
-    def row(self, i: int) -> Any:
+    def row(self, i: int) -> Array3f:
         """Array3f: row i of the rotation camera_from_world."""
         return ad.Array3f(self[4 * i], self[4 * i + 1], self[4 * i + 2])
 
@@ -125,7 +120,7 @@ class Projection(ABC):
         shift[16:18] = float(x), float(y)
         return replace(self, values=self.values + ad.Float(shift), width=width, height=height)
 
-    def moved(self: Self, twist: Any) -> Self:
+    def moved(self: Self, twist: Float) -> Self:
         """The camera after a small motion, differentiable at 0: what pose optimisation differentiates by.
 
         twist: Float [6], rotation vector (radians) and translation (metres) in camera axes, which take points from
@@ -146,7 +141,7 @@ class Projection(ABC):
         numbers = []
         for i in range(3):
             for j in range(4):
-                value = sum(turn[i][k] * self[4 * k + j] for k in range(3))
+                value: Any = sum(turn[i][k] * self[4 * k + j] for k in range(3))
                 numbers.append(value + translation[i] if j == 3 else value)
         rest = dr.gather(ad.Float, self.values, dr.arange(ad.UInt32, dr.width(self.values) - 12) + 12)
         return replace(self, values=dr.concat([*numbers, rest]))
@@ -167,14 +162,14 @@ class Pinhole(Projection):
         return Pinhole(values, camera.width, camera.height)
 
     @property
-    def position(self) -> Any:
+    def position(self) -> Array3f:
         """Array3f: camera centre in the world, metres."""
         return -(self.row(0) * self[3] + self.row(1) * self[7] + self.row(2) * self[11])
 
-    def in_reach(self, center: Any) -> Any:
-        return (center.z > NEAR) & (dr.max(dr.abs(center)) < LARGEST)
+    def in_reach(self, center: Array3f) -> Bool:
+        return (center.z > NEAR) & (dr.max(dr.abs(center)) < MAX_MAGNITUDE)
 
-    def screen(self, center: Any) -> Screen:
+    def screen(self, center: Array3f) -> Screen:
         inverse_z = dr.rcp(center.z)
         tan_x, tan_y = center.x * inverse_z, center.y * inverse_z
         return Screen(
@@ -186,7 +181,7 @@ class Pinhole(Projection):
             slope_y=dr.clip(tan_y, self[20], self[21]),
         )
 
-    def rays_to(self, points: Any) -> Any:
+    def rays_to(self, points: Array3f) -> Array3f:
         return points - self.position
 
 
@@ -201,10 +196,10 @@ class Orthographic(Projection):
         intrinsics = camera.scale_x, camera.scale_y, camera.cx, camera.cy
         return Orthographic(_upload(camera.camera_from_world, intrinsics, ()), camera.width, camera.height)
 
-    def in_reach(self, center: Any) -> Any:
-        return dr.max(dr.abs(center)) < LARGEST
+    def in_reach(self, center: Array3f) -> Bool:
+        return dr.max(dr.abs(center)) < MAX_MAGNITUDE
 
-    def screen(self, center: Any) -> Screen:
+    def screen(self, center: Array3f) -> Screen:
         return Screen(
             x=dr.fma(self[12], center.x, self[14]) - self[16],
             y=dr.fma(self[13], center.y, self[15]) - self[17],
@@ -214,10 +209,10 @@ class Orthographic(Projection):
             slope_y=ad.Float(0),
         )
 
-    def rays_to(self, points: Any) -> Any:
+    def rays_to(self, points: Array3f) -> Array3f:
         return self.row(2) + dr.zeros(ad.Array3f, dr.width(points))
 
 
-def _upload(camera_from_world: Array, intrinsics: tuple[float, ...], more: tuple[float, ...]) -> Any:
-    numbers = [*camera_from_world[:3].ravel().tolist(), *map(float, intrinsics), 0.0, 0.0, *map(float, more)]
+def _upload(camera_from_world: Array, intrinsics: tuple[float, ...], lengths: tuple[float, ...]) -> Float:
+    numbers = [*camera_from_world[:3].ravel().tolist(), *map(float, intrinsics), 0.0, 0.0, *map(float, lengths)]
     return ad.Float(numbers)  # no numpy array: see `backend.recorded`

@@ -12,6 +12,8 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
+from spacesim.backend.arrays import Array3f, Array4f, ArrayXf, Float, UInt32
+from spacesim.backend.upload import upload, upload_rows
 
 SH_C0 = 0.28209479177387814  #: Y_00, the constant spherical harmonic
 NAMES = ("means", "log_scales", "quaternions", "logit_opacities", "sh")
@@ -31,7 +33,13 @@ class Gaussians:
     """
 
     def __init__(
-        self, means: Any, log_scales: Any, quaternions: Any, logit_opacities: Any, sh: Any, features: Any = None
+        self,
+        means: Array3f,
+        log_scales: Array3f,
+        quaternions: Array4f,
+        logit_opacities: Float,
+        sh: ArrayXf,
+        features: Any = None,
     ) -> None:
         self.means = means
         self.log_scales = log_scales
@@ -59,18 +67,18 @@ class Gaussians:
         """{name: array} of what a Gaussian is drawn by, in a fixed order; features are not among them."""
         return {name: getattr(self, name) for name in NAMES}
 
-    def rows(self) -> list[Any]:
+    def rows(self) -> list[Float]:
         """The parameters as a list of Floats [N], row after row in the order of `ROWS`; features, if any, are the last,
         [F * N]."""
         drawn = [*self.shape_rows(), *self.sh]
         return drawn if self.features is None else [*drawn, self.features]
 
-    def shape_rows(self) -> list[Any]:
+    def shape_rows(self) -> list[Float]:
         """The first of `rows`: what places Gaussians and makes them opaque, without their looks. 11 Floats [N]."""
         return [*self.means, *self.log_scales, *self.quaternions, self.logit_opacities]
 
     @staticmethod
-    def from_rows(rows: list[Any]) -> "Gaussians":
+    def from_rows(rows: list[Float]) -> "Gaussians":
         """The inverse of `rows`; shares the arrays."""
         means, log_scales, quaternions = (rows[ROWS[name]] for name in NAMES[:3])
         sh = rows[ROWS["sh"]]
@@ -79,7 +87,7 @@ class Gaussians:
             ad.Array3f(means), ad.Array3f(log_scales), ad.Array4f(quaternions), rows[10], ad.ArrayXf(sh), features
         )
 
-    def replace(self, rows: list[Any]) -> None:
+    def replace(self, rows: list[Float]) -> None:
         """Take other parameters, `rows` of them as in `from_rows`."""
         other = Gaussians.from_rows(rows)
         for name in (*NAMES, "features"):
@@ -133,39 +141,21 @@ class Gaussians:
         rows = {name: np.asarray(arrays[name], dtype=np.float32).T for name in expected}
         harmonics = sh.reshape(count, sh.shape[1] * 3)
         return Gaussians(
-            means=ad.Array3f(rows["means"]),
-            log_scales=ad.Array3f(rows["log_scales"]),
-            quaternions=ad.Array4f(rows["quaternions"]),
-            logit_opacities=uploaded(rows["logit_opacities"]),
-            sh=ad.ArrayXf(np.ascontiguousarray(harmonics.T)) if sh.shape[1] else ad.ArrayXf([]),
-            features=None if features is None else uploaded(np.asarray(features).T.ravel()),
+            means=upload_rows(rows["means"]),
+            log_scales=upload_rows(rows["log_scales"]),
+            quaternions=ad.Array4f(*(upload(row) for row in rows["quaternions"])),
+            logit_opacities=upload(rows["logit_opacities"]),
+            sh=ad.ArrayXf([upload(row) for row in harmonics.T]) if sh.shape[1] else ad.ArrayXf([]),
+            features=None if features is None else upload(np.asarray(features).T.ravel()),
         )
 
 
-def numbers(rows: Iterable[Any]) -> np.ndarray:
+def stack_rows(rows: Iterable[Any]) -> np.ndarray:
     """[K, N] of K Floats [N]. Dr.Jit's own way compiles a kernel for each N, for it writes the rows as one array."""
     return np.stack([np.array(row) for row in rows])
 
 
-def triple(rows: np.ndarray) -> Any:
-    """Array3f [3, N] of an array [3, N]; nothing is compiled, see `numbers`."""
-    return ad.Array3f(*(uploaded(row) for row in rows))
-
-
-def uploaded(values: np.ndarray, kind: Any = None) -> Any:
-    """Float [N], or UInt32 or Bool as `kind` says, in memory of Dr.Jit's own: numpy's may lie otherwise, and each way
-    to lie is recorded anew, and compiled on LLVM."""
-    kind = ad.Float if kind is None else kind
-    values = np.ascontiguousarray(values, {ad.Float: np.float32, ad.UInt32: np.uint32, ad.Bool: bool}[kind])
-    if not len(values):
-        return kind([])
-    found = dr.opaque(kind, 0, len(values))
-    dr.scatter(found, kind(values), dr.arange(ad.UInt32, len(values)))
-    dr.eval(found)
-    return found
-
-
-def entries(row: Any, index: Any, count: int) -> Any:
+def gather_entries(row: Float, index: UInt32, count: int) -> Any:
     """Entries index [M] of a row [count], or of each of the C rows of a packed one: [C * count] to [C * M]."""
     copies, chosen = dr.width(row) // count, dr.width(index)
     if copies == 1:
@@ -175,12 +165,12 @@ def entries(row: Any, index: Any, count: int) -> Any:
     return dr.gather(type(row), row, place // new * old + dr.gather(ad.UInt32, index, place % new))
 
 
-def opacities(logit_opacities: Any) -> Any:
+def opacities(logit_opacities: Float) -> Float:
     """o = sigmoid(logit) [N], in (0, 1)."""
     return dr.rcp(1 + dr.exp(-logit_opacities))
 
 
-def principal_axes(quaternions: Any) -> list[Any]:
+def principal_axes(quaternions: Array4f) -> list[Array3f]:
     """The principal axes in world axes: three columns (Array3f [3, N]) of the rotations of quaternions Array4f [4, N].
 
     Quaternions that have no direction (0, not finite, beyond 1e12) count as no rotation and get no gradients.

@@ -10,7 +10,8 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.splat.raster.cameras import LARGEST, NEAR, Orthographic, Pinhole, Projection
+from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, UInt32
+from spacesim.splat.raster.cameras import MAX_MAGNITUDE, NEAR, Orthographic, Pinhole, Projection
 from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
 
 __all__ = ["ALPHA_MIN", "DILATION", "NEAR", "PIXEL", "Footprints", "Orthographic", "Pinhole", "Splats", "project"]
@@ -24,23 +25,23 @@ ALPHA_MIN = 1 / 255  #: fainter contributions are not blended
 class Splats:
     """Screen-space ellipses, [N] each. exponent(dx, dy) = -(a dx^2 + 2 b dx dy + c dy^2) / 2."""
 
-    x: Any  #: centre, pixels
-    y: Any
-    a: Any  #: inverse of the 2D covariance, pixels^-2
-    b: Any
-    c: Any
-    opacity: Any
-    depth: Any  #: z of the centre along the camera's axis, metres; negative behind an orthographic camera's origin
+    x: Float  #: centre, pixels
+    y: Float
+    a: Float  #: inverse of the 2D covariance, pixels^-2
+    b: Float
+    c: Float
+    opacity: Float
+    depth: Float  #: z of the centre along the camera's axis, metres; negative behind an orthographic camera's origin
 
 
 @dataclass
 class Footprints:
     """Which splats can be seen, where, and in which order. Not differentiable."""
 
-    half_width: Any  #: [N] of the box around {alpha >= ALPHA_MIN}, pixels
-    half_height: Any
-    visible: Any  #: [N] bool
-    order: Any  #: [N] UInt32 below 2^31, grows with depth; whatever its sign, and however far away the camera is
+    half_width: Float  #: [N] of the box around {alpha >= ALPHA_MIN}, pixels
+    half_height: Float
+    visible: Bool  #: [N] bool
+    order: UInt32  #: [N] UInt32 below 2^31, grows with depth; whatever its sign, and however far away the camera is
 
 
 def project(gaussians: Gaussians, camera: Projection, antialiased: Any = False) -> tuple[Splats, Footprints]:
@@ -55,9 +56,9 @@ def project(gaussians: Gaussians, camera: Projection, antialiased: Any = False) 
 
     # Parameters that arithmetic would turn into NaN are replaced, which also cuts their gradients.
     length2 = dr.squared_norm(quaternions)
-    sane = (length2 > 1e-24) & (length2 < 1e24) & (dr.abs(logits) < LARGEST)
+    sane = (length2 > 1e-24) & (length2 < 1e24) & (dr.abs(logits) < MAX_MAGNITUDE)
     for i in range(3):
-        sane &= (dr.abs(means[i]) < LARGEST) & (log_scales[i] > -60) & (log_scales[i] < 20)
+        sane &= (dr.abs(means[i]) < MAX_MAGNITUDE) & (log_scales[i] > -60) & (log_scales[i] < 20)
     sane = dr.detach(sane)
     means = dr.select(sane, means, ad.Array3f(0))
     log_scales = dr.select(sane, log_scales, ad.Array3f(0))
@@ -67,11 +68,11 @@ def project(gaussians: Gaussians, camera: Projection, antialiased: Any = False) 
 
 
 def project_ellipsoids(
-    means: Any,
-    scales: Any,
-    quaternions: Any,
-    opacity: Any,
-    sane: Any,
+    means: Array3f,
+    scales: Array3f,
+    quaternions: Array4f,
+    opacity: Float,
+    sane: Bool,
     camera: Projection,
     spread: Any,
     compensated: Any,
@@ -89,15 +90,15 @@ def project_ellipsoids(
 
     # rows m_x, m_y of J R S (2.12, 2.13)
     axes = principal_axes(quaternions)
-    rows_x: list[Any] = []
-    rows_y: list[Any] = []
+    rows_x: list[Float] = []
+    rows_y: list[Float] = []
     for i in range(3):
         axis = axes[i] * scales[i]
         forward = dr.dot(camera.row(2), axis)
         rows_x.append(screen.scale_x * (dr.dot(camera.row(0), axis) - screen.slope_x * forward))
         rows_y.append(screen.scale_y * (dr.dot(camera.row(1), axis) - screen.slope_y * forward))
     m_x, m_y = ad.Array3f(rows_x), ad.Array3f(rows_y)
-    small = dr.detach(dr.max(dr.abs(m_x)) < LARGEST) & dr.detach(dr.max(dr.abs(m_y)) < LARGEST)
+    small = dr.detach(dr.max(dr.abs(m_x)) < MAX_MAGNITUDE) & dr.detach(dr.max(dr.abs(m_y)) < MAX_MAGNITUDE)
     sane &= small
     m_x, m_y = dr.select(small, m_x, ad.Array3f(0)), dr.select(small, m_y, ad.Array3f(0))
 
@@ -108,8 +109,8 @@ def project_ellipsoids(
     xx, yy = xx + spread, yy + spread
     inverse_determinant = dr.rcp(determinant)
     if compensated is not False:
-        kept = _compensation(own_determinant * inverse_determinant)
-        opacity *= kept if compensated is True else dr.select(compensated, kept, 1)
+        compensation = _compensation(own_determinant * inverse_determinant)
+        opacity *= compensation if compensated is True else dr.select(compensated, compensation, 1)
     splats = Splats(
         x=screen.x,
         y=screen.y,
@@ -131,20 +132,21 @@ def _spread(antialiased: Any) -> Any:
     return dr.select(antialiased, ad.Float(PIXEL), DILATION)
 
 
-def _compensation(ratio: Any) -> Any:
+def _compensation(ratio: Float) -> Float:
     """sqrt(det Sigma / det(Sigma + PIXEL I)) [N]; 0 with no gradient where the splat would be invisible anyway."""
     positive = dr.detach(ratio) > 1e-10
-    return dr.select(positive, dr.sqrt(dr.select(positive, ratio, 1)), 0)
+    factor: Any = dr.select(positive, dr.sqrt(dr.select(positive, ratio, 1)), 0)
+    return factor
 
 
-def _sortable(depth: Any) -> Any:
+def _sortable(depth: Float) -> UInt32:
     """UInt32 [N] below 2^31 in the order of finite floats `depth` [N]; equal where only the last bit differs."""
     bits: Any = dr.reinterpret_array(ad.UInt32, depth)
     ordered: Any = dr.select(bits >> 31 == 0, bits | 0x80000000, ~bits)
     return ordered >> 1
 
 
-def _footprints(splats: Splats, xx: Any, yy: Any, order: Any, sane: Any, camera: Projection) -> Footprints:
+def _footprints(splats: Splats, xx: Float, yy: Float, order: UInt32, sane: Bool, camera: Projection) -> Footprints:
     """Box of the ellipse where alpha reaches ALPHA_MIN: |d|^2 = 2 ln(o / ALPHA_MIN) in units of the covariance."""
     opacity, x, y = dr.detach(splats.opacity), dr.detach(splats.x), dr.detach(splats.y)
     reach2 = 2 * dr.log(dr.maximum(opacity / ALPHA_MIN, 1))

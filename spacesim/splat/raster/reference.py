@@ -22,7 +22,7 @@ class ReferenceOutput:
     """The planes of `RenderOutput`, float64: colour [H, W, 3] over black, alpha [H, W], depth [H, W] expected depth in
     metres, median_depth [H, W], normal [H, W, 3] unit or 0, features [H, W, C]."""
 
-    colour: np.ndarray
+    color: np.ndarray
     alpha: np.ndarray
     depth: np.ndarray
     median_depth: np.ndarray
@@ -44,10 +44,11 @@ def render_reference(
     R, t = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
     centers = arrays["means"] @ R.T + t
     opacity = 1 / (1 + np.exp(-arrays["logit_opacities"]))
-    own = np.zeros((len(centers), 0)) if features is None else np.asarray(features, dtype=np.float64)
+    feature_rows = np.zeros((len(centers), 0)) if features is None else np.asarray(features, dtype=np.float64)
     directions = _directions(arrays["means"], camera)
     blended = np.concatenate(
-        [_colours(arrays["sh"], directions, sh_degree), centers[:, 2:], _normals(arrays, directions), own], axis=1
+        [_colors(arrays["sh"], directions, sh_degree), centers[:, 2:], _normals(arrays, directions), feature_rows],
+        axis=1,
     )
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
 
@@ -57,7 +58,7 @@ def render_reference(
     for i in np.argsort(centers[:, 2], kind="stable"):
         if perspective and centers[i, 2] <= 0.01:
             continue
-        (x, y), J = _linearized(centers[i], camera)
+        (x, y), J = _linearize(centers[i], camera)
         axes = rotation_from_quaternion(arrays["quaternions"][i])
         covariance = J @ R @ axes @ np.diag(np.exp(2 * arrays["log_scales"][i])) @ axes.T @ R.T @ J.T
         dilated = covariance + (PIXEL if antialiased else DILATION) * np.eye(2)
@@ -73,7 +74,7 @@ def render_reference(
         transmittance = behind
     alpha, normal = 1 - transmittance, sums[..., 4:7]
     return ReferenceOutput(
-        colour=sums[..., :3],
+        color=sums[..., :3],
         alpha=alpha,
         depth=sums[..., 3] / np.where(alpha > 0, alpha, 1),
         median_depth=median_depth,
@@ -82,7 +83,7 @@ def render_reference(
     )
 
 
-def _linearized(center: np.ndarray, camera: Camera | OrthographicCamera) -> tuple[tuple[float, float], np.ndarray]:
+def _linearize(center: np.ndarray, camera: Camera | OrthographicCamera) -> tuple[tuple[float, float], np.ndarray]:
     """((x, y) in pixels, Jacobian [2, 3] in pixels per metre) of a point [3] in camera axes."""
     x, y, z = center
     if isinstance(camera, OrthographicCamera):
@@ -104,7 +105,7 @@ def _directions(means: np.ndarray, camera: Camera | OrthographicCamera) -> np.nd
     return np.asarray(offset / np.linalg.norm(offset, axis=1, keepdims=True))
 
 
-def _colours(sh: np.ndarray, directions: np.ndarray, sh_degree: int) -> np.ndarray:
+def _colors(sh: np.ndarray, directions: np.ndarray, sh_degree: int) -> np.ndarray:
     """[N, 3] colours at least 0."""
     terms = min((sh_degree + 1) ** 2, sh.shape[1])
     basis = real_spherical_harmonics(directions, sh_degree)[:, :terms]

@@ -13,30 +13,31 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
+from spacesim.backend.arrays import Array4u, Bool, UInt32
 
 CHUNK = 64  #: entries that are compared each with each, a power of two; 128 and 256 took longer on an H100
-RUN = 4096  #: entries within which chunks are searched, a power of two; chosen: lists of pictures are shorter
+RUN = 4096  #: entries within which chunks are searched, a power of two: lists of pictures are shorter
 COMPARED = 2  #: entries compared in a turn of the loop
-LONG_LANES = 2**16  #: that share the entries of lists beyond RUN; chosen: as many as fill a large device
+LONG_LANES = 2**16  #: that share the entries of lists beyond RUN: as many as fill a large device
 
 
-def owners(upto: Any, slot: Any, count: int) -> Any:
-    """Which of `count` owners each slot [P] belongs to, where owner i has those from upto[i - 1] to upto[i]; `count`
-    for slots that nobody has."""
-    number, wide = type(upto), type(upto)(slot)
-    found, step = ad.UInt32(0), 1 << (count.bit_length() - 1)
+def segment_ids(segment_ends: Any, slot: UInt32, count: int) -> UInt32:
+    """Which of `count` segments each slot [P] belongs to, where segment i has those from segment_ends[i - 1] to
+    segment_ends[i]; `count` for slots that nobody has."""
+    number, wide = type(segment_ends), type(segment_ends)(slot)
+    segment, step = ad.UInt32(0), 1 << (count.bit_length() - 1)
     while step:
-        probe = found + step
+        probe = segment + step
         within = probe <= count
-        reached = within & (dr.gather(number, upto, probe - 1, within) <= wide)
-        found = dr.select(reached, probe, found)
+        reached = within & (dr.gather(number, segment_ends, probe - 1, within) <= wide)
+        segment = dr.select(reached, probe, segment)
         step >>= 1
-    return found
+    return segment
 
 
 def ordered_lists(
-    members: Any, keys: Any, numbers: Any, lists: int, capacity: int, runs: tuple[int, int] = (CHUNK, RUN)
-) -> tuple[Any, Any, Any, Any]:
+    members: UInt32, keys: UInt32, numbers: UInt32, lists: int, capacity: int, runs: tuple[int, int] = (CHUNK, RUN)
+) -> tuple[UInt32, UInt32, UInt32, UInt32]:
     """Entries [P] = [capacity] in lists, each ordered by key, then number: (number, entry) [P] one list after another,
     and where each list starts and ends, [lists]. Entries whose list is `lists` are in none; what stands behind the
     last list has no meaning. UInt32 all; no two entries of a list may have one key and number. Not differentiable.
@@ -45,7 +46,7 @@ def ordered_lists(
     """
     chunk_size, run_size = runs
     lengths = dr.zeros(ad.UInt32, lists)
-    place = dr.scatter_inc(lengths, members, members < lists)
+    place: Any = dr.scatter_inc(lengths, members, members < lists)
     dr.eval(place, lengths, members, numbers, keys)
     end = dr.prefix_reduce(dr.ReduceOp.Add, lengths, exclusive=False)
     start, longest = end - lengths, dr.max(lengths)
@@ -57,43 +58,45 @@ def ordered_lists(
     unordered = _packed([keys, numbers, entry, members], place, listed, capacity)
 
     live = entry < dr.gather(ad.UInt32, end, ad.UInt32(lists - 1))
-    own, first, last = _own(unordered, entry, live, start, end)
+    entry_keys, first, last = _own(unordered, entry, live, start, end)
     chunk = first + ((entry - first) & ~ad.UInt32(chunk_size - 1))
-    rank = _count_before(unordered, own, chunk, dr.minimum(chunk + chunk_size, last))
-    in_chunks = _packed(list(own), chunk + rank, live, capacity)
+    rank = _count_before(unordered, entry_keys, chunk, dr.minimum(chunk + chunk_size, last))
+    in_chunks = _packed(list(entry_keys), chunk + rank, live, capacity)
 
-    own, first, last = _own(in_chunks, entry, live, start, end)
+    entry_keys, first, last = _own(in_chunks, entry, live, start, end)
     chunk = first + ((entry - first) & ~ad.UInt32(chunk_size - 1))
     run = first + ((entry - first) & ~ad.UInt32(run_size - 1))
-    others = _search_others(in_chunks, own, chunk, run, dr.minimum(run + run_size, last), chunk_size)
+    others = _search_others(in_chunks, entry_keys, chunk, run, dr.minimum(run + run_size, last), chunk_size)
     place = dr.select(live, run + (entry - chunk) + others, entry)
     is_long = live & (last - first > run_size)
-    in_runs = _packed(list(own), place, is_long, capacity)
+    in_runs = _packed(list(entry_keys), place, is_long, capacity)
     number, source = dr.empty(ad.UInt32, capacity), dr.empty(ad.UInt32, capacity)
-    dr.scatter(number, dr.select(live, own[1], 0), place)
-    dr.scatter(source, dr.select(live, own[2], 0), place)
+    dr.scatter(number, dr.select(live, entry_keys[1], 0), place)
+    dr.scatter(source, dr.select(live, entry_keys[2], 0), place)
     dr.eval(number, source, in_runs)
     _merge_runs((number, source), in_runs, longest, start, end, run_size)
     return number, source, start, end
 
 
-def _merge_runs(targets: tuple[Any, Any], entries: Any, longest: Any, start: Any, end: Any, run_size: int) -> None:
+def _merge_runs(
+    targets: tuple[UInt32, UInt32], entries: UInt32, longest: UInt32, start: UInt32, end: UInt32, run_size: int
+) -> None:
     """Write numbers and sources of the lists longer than a run, whose runs are in order, in the order of the whole
     list. One launch, which is over at once where there are none."""
     lists = dr.width(end)
     total = dr.select(longest > run_size, dr.gather(ad.UInt32, end, ad.UInt32(lists - 1)), 0)
 
-    def remaining(entry: Any) -> Any:
+    def remaining(entry: UInt32) -> Bool:
         return entry < total
 
-    def merge(entry: Any) -> tuple[Any]:
-        here = owners(end, entry, lists)
+    def merge(entry: UInt32) -> tuple[UInt32]:
+        here = segment_ids(end, entry, lists)
         first, last = dr.gather(ad.UInt32, start, here), dr.gather(ad.UInt32, end, here)
         is_long = last - first > run_size
-        own = dr.gather(ad.Array4u, entries, entry, is_long)
+        key = dr.gather(ad.Array4u, entries, entry, is_long)
         run = first + ((entry - first) & ~ad.UInt32(run_size - 1))
-        others = _search_others(entries, own, run, first, dr.select(is_long, last, first), run_size)
-        for value, target in zip((own[1], own[2]), targets, strict=True):
+        others = _search_others(entries, key, run, first, dr.select(is_long, last, first), run_size)
+        for value, target in zip((key[1], key[2]), targets, strict=True):
             dr.scatter(target, value, first + (entry - run) + others, is_long)
         return (entry + LONG_LANES,)
 
@@ -101,7 +104,7 @@ def _merge_runs(targets: tuple[Any, Any], entries: Any, longest: Any, start: Any
     dr.eval(targets)
 
 
-def _packed(values: list[Any], index: Any, active: Any, size: int) -> Any:
+def _packed(values: list[UInt32], index: UInt32, active: Bool | bool, size: int) -> UInt32:
     """A flat array [4 size] in which the four `values` of a lane stand at its index."""
     target = dr.empty(ad.UInt32, 4 * size)
     dr.scatter(target, ad.Array4u(values), index, active=active)
@@ -109,50 +112,50 @@ def _packed(values: list[Any], index: Any, active: Any, size: int) -> Any:
     return target
 
 
-def _own(entries: Any, entry: Any, live: Any, start: Any, end: Any) -> tuple[Any, Any, Any]:
+def _own(entries: UInt32, entry: UInt32, live: Bool, start: UInt32, end: UInt32) -> tuple[Array4u, UInt32, UInt32]:
     """(key, number, source, list) of an entry, and the half-open range of its list; an empty one if it is not live."""
-    own = dr.gather(ad.Array4u, entries, entry, live)
-    return own, dr.gather(ad.UInt32, start, own[3], live), dr.gather(ad.UInt32, end, own[3], live)
+    key = dr.gather(ad.Array4u, entries, entry, live)
+    return key, dr.gather(ad.UInt32, start, key[3], live), dr.gather(ad.UInt32, end, key[3], live)
 
 
-def _before(other: Any, own: Any) -> Any:
-    return (other[0] < own[0]) | ((other[0] == own[0]) & (other[1] < own[1]))
+def _before(other_key: Array4u, key: Array4u) -> Bool:
+    return (other_key[0] < key[0]) | ((other_key[0] == key[0]) & (other_key[1] < key[1]))
 
 
-def _count_before(entries: Any, own: Any, start: Any, end: Any) -> Any:
-    """How many entries of [start, end) come before `own`."""
+def _count_before(entries: UInt32, key: Array4u, start: UInt32, end: UInt32) -> UInt32:
+    """How many entries of [start, end) come before `key`."""
 
-    def more(i: Any, _rank: Any) -> Any:
+    def has_more(i: UInt32, _rank: UInt32) -> Bool:
         return i < end
 
-    def compare(i: Any, rank: Any) -> tuple[Any, Any]:
+    def compare(i: UInt32, rank: UInt32) -> tuple[UInt32, UInt32]:
         for at in (i + u for u in range(COMPARED)):
             within = at < end
             other = dr.gather(ad.Array4u, entries, at, within)
-            rank = rank + dr.select(within & _before(other, own), ad.UInt32(1), ad.UInt32(0))
+            rank = rank + dr.select(within & _before(other, key), ad.UInt32(1), ad.UInt32(0))
         return i + COMPARED, rank
 
-    _, rank = dr.while_loop((start, ad.UInt32(0)), more, compare, mode="symbolic", label="count before")
+    _, rank = dr.while_loop((start, ad.UInt32(0)), has_more, compare, mode="symbolic", label="count before")
     return rank
 
 
-def _search_others(entries: Any, own: Any, chunk: Any, start: Any, end: Any, size: int) -> Any:
-    """How many entries of [start, end), which is in ordered chunks of `size`, come before `own`; but for the chunk that
+def _search_others(entries: UInt32, key: Array4u, chunk: UInt32, start: UInt32, end: UInt32, size: int) -> UInt32:
+    """How many entries of [start, end), which is in ordered chunks of `size`, come before `key`; but for the chunk that
     starts at `chunk`."""
 
-    def more(at: Any, _rank: Any) -> Any:
+    def has_more(at: UInt32, _rank: UInt32) -> Bool:
         return at < end
 
-    def search(at: Any, rank: Any) -> tuple[Any, Any]:
+    def search(at: UInt32, rank: UInt32) -> tuple[UInt32, UInt32]:
         here, stop = at != chunk, dr.minimum(at + size, end)
         low, step = at, size
         while step:
             probe = low + step
             within = here & (probe <= stop)
             other = dr.gather(ad.Array4u, entries, probe - 1, within)
-            low = dr.select(within & _before(other, own), probe, low)
+            low = dr.select(within & _before(other, key), probe, low)
             step >>= 1
         return at + size, rank + (low - at)
 
-    _, rank = dr.while_loop((start, ad.UInt32(0)), more, search, mode="symbolic", label="search others")
+    _, rank = dr.while_loop((start, ad.UInt32(0)), has_more, search, mode="symbolic", label="search others")
     return rank

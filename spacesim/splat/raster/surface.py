@@ -6,28 +6,18 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.splat.raster.bin import RECORDINGS, TileLists, room
+from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, UInt32
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 from spacesim.splat.raster.project import Splats
-from spacesim.splat.raster.records import (
-    ALPHA_MAX,
-    POWER_MIN,
-    exp2,
-    exponents,
-    lane_pixels,
-    list_records,
-    load,
-    packets,
-    store,
-    tiled_index,
-)
+from spacesim.splat.raster.records import ALPHA_MAX, POWER_MIN, exp2, exponents, list_records, load, packets, store
+from spacesim.splat.raster.tiles import TileLists, lane_pixels, round_capacity, tiled_index
 
 NONE = 2**32 - 1  #: in place of a splat's number
-REACH = 2.0  #: standard deviations to which a Gaussian's surface reaches (docs/geometry.md)
+REACH = 2.0  #: standard deviations to which a Gaussian's surface reaches (docs/research/geometry.md)
 
 
-def normals(gaussians: Gaussians, camera: Projection, axes: str = "world") -> Any:
+def normals(gaussians: Gaussians, camera: Projection, axes: str = "world") -> Array3f:
     """Array3f [3, N]: the shortest principal axis of each Gaussian, turned towards the camera; unit length.
 
     axes: "world", or "camera" (OpenCV's). Differentiable by the quaternions; which axis, and which way it
@@ -41,44 +31,44 @@ def normals(gaussians: Gaussians, camera: Projection, axes: str = "world") -> An
     return normal if axes == "world" else ad.Array3f([dr.dot(camera.row(i), normal) for i in range(3)])
 
 
-def shortest_axis(quaternions: Any, log_scales: Any) -> Any:
+def shortest_axis(quaternions: Array4f, log_scales: Array3f) -> Array3f:
     """Array3f [3, N], unit, of either sign; differentiable by the quaternions. Among equal scales the first counts."""
     columns, scales = principal_axes(quaternions), dr.detach(log_scales)
     first = (scales[0] <= scales[1]) & (scales[0] <= scales[2])
     return dr.select(first, columns[0], dr.select(scales[1] <= scales[2], columns[1], columns[2]))
 
 
-def unit(vector: Any) -> Any:
+def unit(vector: Array3f) -> Array3f:
     """Array3f [3, P] of unit length; 0 with no gradient where `vector` is shorter than 1e-6."""
     square = dr.squared_norm(vector)
-    known = dr.detach(square) > 1e-12
-    return dr.select(known, vector * dr.rsqrt(dr.select(known, square, 1)), 0)
+    has_direction = dr.detach(square) > 1e-12
+    return dr.select(has_direction, vector * dr.rsqrt(dr.select(has_direction, square, 1)), 0)
 
 
-def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> Any:
+def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> UInt32:
     """UInt32 [height * width]: the splat behind which less than half of the light passes; `NONE` where there is none.
 
     Walks each tile's list once more, until that is known of all pixels of a lane. Not differentiable.
     """
     if lists.capacity == 0:
         return dr.opaque(ad.UInt32, NONE, width * height)
-    walk = _walk if width * height > 1 else trace_walk  # a recording gives a plane of one pixel another size
-    return walk(dr.detach(splats), lists, width, height, room(dr.width(splats.x)))
+    return walk(dr.detach(splats), lists, width, height, round_capacity(dr.width(splats.x)))
 
 
-def trace_walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: int) -> Any:
+@recorded(elements=lambda _, splats, lists, width, height, *_rest, **_named: width * height)
+def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: int) -> UInt32:
     """`median_splat` as a part of recordings. capacity: room for the N splats"""
     records, lane, pixels = list_records(splats, [], lists, capacity), lane_pixels(lists), lists.shape.pixels
 
-    def undecided(k: Any, end: Any, transmittance: list[Any], _place: Any) -> Any:
+    def undecided(k: UInt32, end: UInt32, transmittance: list[Float], _place: Any) -> Bool:
         return (k < end) & (reduce(dr.maximum, transmittance) >= 0.5)
 
-    def pass_splat(k: Any, end: Any, transmittance: list[Any], place: list[Any]) -> Any:
+    def pass_splat(k: UInt32, end: UInt32, transmittance: list[Float], place: list[UInt32]) -> Any:
         transmittance, place = list(transmittance), list(place)
         powers = exponents(load(records, k, lists.capacity), lane.x, lane.y, lists.shape)
         for p in range(pixels):
             passing = transmittance[p] >= 0.5
-            alpha = dr.select(powers[p] >= POWER_MIN, dr.minimum(exp2(powers[p]), ALPHA_MAX), 0)
+            alpha: Any = dr.select(powers[p] >= POWER_MIN, dr.minimum(exp2(powers[p]), ALPHA_MAX), 0)
             transmittance[p] -= alpha * transmittance[p]
             place[p] = dr.select(passing & (transmittance[p] < 0.5), k, place[p])
         return k + 1, end, transmittance, place
@@ -92,19 +82,20 @@ def trace_walk(splats: Splats, lists: TileLists, width: int, height: int, capaci
     return dr.select(place != NONE, dr.gather(ad.UInt32, lists.splat, place, place != NONE), NONE)
 
 
-def picked(values: Any, index: Any) -> Any:
+def gather_or_zero(values: Float, index: UInt32) -> Float:
     """values[index], Float [P] of values [N] and index UInt32 [P]; 0 where the index is N or more. Differentiable, and
     its gradients are the same to the bit in every run: added up as integers, in which order does not matter."""
-    return dr.custom(_Pick, values, index)
+    return dr.custom(_Gather, values, index)
 
 
-def surface_depth(gaussians: Gaussians, splats: Splats, index: Any, camera: Projection, capacity: int) -> Any:
+def surface_depth(gaussians: Gaussians, splats: Splats, index: UInt32, camera: Projection, capacity: int) -> Float:
     """Float [height * width], metres: depth of the splat `index` of each pixel (UInt32 [P], as of `median_splat`) where
     the ray meets it, not at its centre; 0 where the index is `NONE`.
 
     A ray d is deepest in a Gaussian at z = d'P m / d'P d, P its inverse covariance and m its centre in camera axes.
     That is taken as linear in the pixel about the centre, as in RaDe-GS (Zhang et al. 2024), and ends `REACH` standard
-    deviations of the longest axis before and behind it. Not differentiable. capacity: room for the N splats (`room`)
+    deviations of the longest axis before and behind it. Not differentiable. capacity: room for the N splats
+    (`round_capacity`)
     """
     splats = dr.detach(splats)
     means, scales = dr.detach(gaussians.means), dr.detach(gaussians.log_scales)
@@ -125,17 +116,17 @@ def surface_depth(gaussians: Gaussians, splats: Splats, index: Any, camera: Proj
     packed = [store(values, lane, capacity) for values in packets(numbers)]
     dr.eval(packed)
 
-    known = index != NONE
-    x, y, slope_x, slope_y, depth, reach, *_ = load(packed, index, capacity, known)
+    is_hit = index != NONE
+    x, y, slope_x, slope_y, depth, reach, *_ = load(packed, index, capacity, is_hit)
     pixel = dr.arange(ad.UInt32, camera.width * camera.height)
     offset = slope_x * (x - 0.5 - ad.Float(pixel % camera.width))
     offset += slope_y * (y - 0.5 - ad.Float(pixel // camera.width))
     offset = dr.clip(offset, -reach, reach)
-    return dr.select(known, depth + dr.select(dr.isfinite(offset), offset, 0), 0)
+    return dr.select(is_hit, depth + dr.select(dr.isfinite(offset), offset, 0), 0)
 
 
-class _Pick(dr.CustomOp):
-    def eval(self, values: Any, index: Any) -> Any:
+class _Gather(dr.CustomOp):
+    def eval(self, values: Float, index: UInt32) -> Any:
         self.index, self.count = index, dr.width(values)
         return dr.gather(ad.Float, values, index, index < self.count)
 
@@ -145,13 +136,10 @@ class _Pick(dr.CustomOp):
         gradient = dr.select(dr.isfinite(gradient), gradient, 0)
         unit_of_sum = dr.maximum(dr.max(dr.abs(gradient)), 1e-300) * (dr.width(self.index) / 2.0**61)
         parts = dr.reinterpret_array(ad.UInt64, ad.Int64(dr.round(gradient / unit_of_sum)))  # CUDA adds unsigned ones
-        total = dr.zeros(ad.UInt64, self.count)
+        total: Any = dr.zeros(ad.UInt64, self.count)
         dr.scatter_reduce(dr.ReduceOp.Add, total, parts, self.index, self.index < self.count)
         total = ad.Float64(dr.reinterpret_array(ad.Int64, total))
         self.set_grad_in("values", ad.Float(total * unit_of_sum))
 
     def name(self) -> str:
         return "pick"
-
-
-_walk = recorded(trace_walk, RECORDINGS)

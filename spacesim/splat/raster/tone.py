@@ -15,24 +15,24 @@ from spacesim.data.tone import WHITES, filmic
 _LINEAR_END, _ENCODED_END = 0.0031308, 0.04045
 
 
-def picture_of(light: Any, tone: str) -> Any:
+def tone_map(light: Any, tone: str) -> Any:
     """sRGB values in [0, 1] of linear colours, shares of white, by a tone curve. Arrays of any shape."""
     if tone == "srgb":
-        return encoded(light)
+        return encode_srgb(light)
     v = WHITES[tone] * dr.clip(light, 0, 1)
-    return encoded(v * dr.fma(2.51, v, 0.03) / dr.fma(v, dr.fma(2.43, v, 0.59), 0.14))  # `filmic`
+    return encode_srgb(v * dr.fma(2.51, v, 0.03) / dr.fma(v, dr.fma(2.43, v, 0.59), 0.14))  # `filmic`
 
 
-def light_of(values: Any, tone: str) -> Any:
+def inverse_tone_map(values: Any, tone: str) -> Any:
     """The inverse: linear colours, shares of white, of sRGB values in [0, 1]."""
-    t = decoded(values)
+    t = decode_srgb(values)
     if tone == "srgb":
         return t
     a, b = 2.51 - 2.43 * t, 0.03 - 0.59 * t  # a v^2 + b v - 0.14 t = 0
     return dr.clip((dr.sqrt(dr.fma(b, b, 0.56 * a * t)) - b) / (2 * a) / WHITES[tone], 0, 1)
 
 
-def developed(light: np.ndarray, tone: str, stops: float = 0.0) -> np.ndarray:
+def adjust_exposure(light: np.ndarray, tone: str, stops: float = 0.0) -> np.ndarray:
     """sRGB values in [0, 1] of a picture of such colours, exposed by `stops` (EV) more than those trained on."""
     if tone == "srgb" and stops == 0:
         return srgb_from_linear(light)
@@ -40,30 +40,30 @@ def developed(light: np.ndarray, tone: str, stops: float = 0.0) -> np.ndarray:
     return srgb_from_linear(filmic(v) if tone == "filmic" else v)
 
 
-def encoded(linear: Any) -> Any:
+def encode_srgb(linear: Any) -> Any:
     """sRGB values in [0, 1] of linear ones, clipped to [0, 1]. Arrays of any shape."""
-    return encoded_unclipped(dr.clip(linear, 0, 1))
+    return encode_srgb_unclipped(dr.clip(linear, 0, 1))
 
 
-def encoded_unclipped(linear: Any) -> Any:
+def encode_srgb_unclipped(linear: Any) -> Any:
     """sRGB values of linear ones, 0 or more, beyond 1 by the same curve. Arrays of any shape."""
     curve = 1.055 * dr.power(dr.maximum(linear, _LINEAR_END), 1 / 2.4) - 0.055
     return dr.select(linear <= _LINEAR_END, 12.92 * linear, curve)
 
 
-def encoded_slope(linear: Any) -> Any:
-    """d `encoded_unclipped`. Arrays of any shape."""
+def encode_srgb_slope(linear: Any) -> Any:
+    """d `encode_srgb_unclipped`. Arrays of any shape."""
     curve = 1.055 / 2.4 * dr.power(dr.maximum(linear, _LINEAR_END), 1 / 2.4 - 1)
     return dr.select(linear <= _LINEAR_END, 12.92, curve)
 
 
-def decoded_slope(values: Any) -> Any:
-    """d `decoded`. Arrays of any shape."""
+def decode_srgb_slope(values: Any) -> Any:
+    """d `decode_srgb`. Arrays of any shape."""
     curve = 2.4 / 1.055 * dr.power((dr.maximum(values, _ENCODED_END) + 0.055) / 1.055, 1.4)
     return dr.select(values <= _ENCODED_END, 1 / 12.92, curve)
 
 
-def decoded(values: Any) -> Any:
+def decode_srgb(values: Any) -> Any:
     """Linear values of sRGB ones in [0, 1]. Arrays of any shape."""
     curve = dr.power((dr.maximum(values, _ENCODED_END) + 0.055) / 1.055, 2.4)
     return dr.select(values <= _ENCODED_END, values / 12.92, curve)

@@ -20,19 +20,19 @@ FORMAT = "spacesim-gaussians-1"
 
 @dataclass(frozen=True)
 class HistoryEntry:
-    """What training noted of a step. iteration: how many were finished;  loss: of the last one"""
+    """What training noted of a step."""
 
-    iteration: int
-    loss: float
+    iteration: int  #: how many were finished
+    loss: float  #: of the last one
     gaussians: int
 
 
 @dataclass(frozen=True)
 class CheckpointHeader:
-    """What a checkpoint says beside its arrays. iteration, adam_steps: finished ones"""
+    """What a checkpoint says beside its arrays."""
 
-    iteration: int
-    adam_steps: int
+    iteration: int  #: finished ones
+    adam_steps: int  #: finished ones
     history: tuple[HistoryEntry, ...]
     format: str = FORMAT
 

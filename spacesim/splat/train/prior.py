@@ -8,7 +8,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.mesh import SignedDistance, drawable, read_mesh
+from spacesim.data.mesh import SignedDistance, drawable_faces, read_mesh
 from spacesim.data.records import Camera, Dataset
 
 
@@ -19,7 +19,7 @@ class MeshPrior:
         """Of a mesh file in the world's axes, metres. Raises InputError where it holds none."""
         vertices, faces = read_mesh(path)
         single = vertices.astype(np.float32)
-        faces = drawable(single.astype(np.float64), faces)
+        faces = drawable_faces(single.astype(np.float64), faces)
         if len(faces) == 0:
             raise InputError(f"{path}: expected a mesh that single precision can tell from a point, found none")
         mi = backend.mitsuba()
@@ -33,11 +33,11 @@ class MeshPrior:
     @staticmethod
     def of(dataset: Dataset) -> "MeshPrior":
         """Of a dataset's mesh. Raises InputError where it has none, or one that is not where its pictures show it."""
-        path = dataset.root / known_mesh(dataset, "--prior mesh")
-        check_outside(SignedDistance.of(path), dataset, "--prior mesh")
+        path = dataset.root / known_mesh(dataset, "prior mesh")
+        check_outside(SignedDistance.of(path), dataset, "prior mesh")
         prior = MeshPrior(path)
         if dataset.train and not any(prior(frame.camera)[0].any() for frame in dataset.train):
-            raise InputError(f"{path}: --prior mesh expects a mesh that training cameras see, found one that none sees")
+            raise InputError(f"{path}: prior mesh expects a mesh that training cameras see, found one that none sees")
         return prior
 
     def __call__(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -50,10 +50,10 @@ class MeshPrior:
         length = np.linalg.norm(world, axis=1)
         origin = mi.Point3f(*camera.position.tolist())
         direction = mi.Vector3f(np.ascontiguousarray((world / length[:, None]).T, np.float32))
-        found = self._scene.ray_intersect(mi.Ray3f(origin, direction))
-        hit = found.is_valid()
-        normal = dr.select(dr.dot(found.n, direction) > 0, -found.n, found.n)
-        depth = np.where(np.array(hit), np.array(found.t) / length, 0).astype(np.float32)
+        hits = self._scene.ray_intersect(mi.Ray3f(origin, direction))
+        hit = hits.is_valid()
+        normal = dr.select(dr.dot(hits.n, direction) > 0, -hits.n, hits.n)
+        depth = np.where(np.array(hit), np.array(hits.t) / length, 0).astype(np.float32)
         normals = np.array(dr.select(hit, normal, 0), np.float32).T
         shape = camera.height, camera.width
         return depth.reshape(shape), np.ascontiguousarray(normals).reshape(*shape, 3)

@@ -7,122 +7,154 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.splat.raster.cameras import Pinhole
+from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Footprints, Splats, project
-from spacesim.splat.raster.render import view_colours
+from spacesim.splat.raster.render import view_colors
 from spacesim.splat.raster.supersample import pixel_means
 from spacesim.splat.raster.surface import normals
-from spacesim.splat.raster.tone import light_of, picture_of
-from spacesim.splat.train.loss import depth_loss, normal_loss, photometric_loss, visibility_loss
-from spacesim.splat.train.optimizer import adam_step
+from spacesim.splat.raster.tone import inverse_tone_map, tone_map
+from spacesim.splat.train.downscale import covered_color, truth_of_squares, valid_squares
+from spacesim.splat.train.loss.terms import depth_loss, normal_loss, photometric_loss, visibility_loss
+from spacesim.splat.train.optimizer.adam import adam_step
 from spacesim.splat.train.warm_start import foreground_loss
 
 
 def project_views(
-    rows: list[Any], camera: Pinhole, degree: int, antialiased: bool, shape: tuple[str, ...], scale: float
-) -> tuple[Splats, Footprints, dict[str, list[Any]]]:
-    """Splats, footprints and what is blended, Floats [N] by name, without gradients: "colour", none where it comes from
-    a field, and of `shape` "depth", in units of `scale` metres, and "normal"."""
+    rows: list[Float],
+    camera: Pinhole,
+    degree: int,
+    antialiased: bool,
+    shape: tuple[str, ...],
+    scale: float,
+    watched: bool = False,
+) -> tuple[Splats, Footprints, dict[str, list[Float]], Float | None]:
+    """Splats, footprints, what is blended, Floats [N] by name, without gradients: "color", none where it comes from a
+    field, and of `shape` "depth", in units of `scale` metres, and "normal"; and, if `watched`, `screen_radii`."""
     gaussians = Gaussians.from_rows(rows)
     splats, footprints = project(gaussians, camera, antialiased)
-    colour = [] if gaussians.features is not None else list(view_colours(gaussians, camera, degree))
-    return splats, footprints, {"colour": colour, **shape_values(gaussians, splats, camera, shape, scale)}
+    color = [] if gaussians.features is not None else list(view_colors(gaussians, camera, degree))
+    values = {"color": color, **shape_values(gaussians, splats, camera, shape, scale)}
+    return splats, footprints, values, screen_radii(gaussians, splats, camera) if watched else None
+
+
+def screen_radii(gaussians: Gaussians, splats: Splats, camera: Pinhole) -> Float:
+    """Float [N], whole pixels: three standard deviations along the longer axis on the screen (rho of thesis 5.4), 0 for
+    what is out of the picture. A Gaussian counts as seen where this is above 0, however faint it is: the `radii` of
+    gsplat 1.4. What the rasterizer skips is another matter (`Footprints.visible`)."""
+    product = splats.a * splats.c
+    determinant = dr.rcp(dr.maximum(product - dr.square(splats.b), 1e-7 * product))  # needles cancel
+    xx, yy, xy = splats.c * determinant, splats.a * determinant, -splats.b * determinant
+    longest = 0.5 * (xx + yy) + dr.sqrt(dr.square(0.5 * (xx - yy)) + dr.square(xy))
+    radius = dr.ceil(3 * dr.sqrt(longest))
+    seen = camera.in_reach(camera.transform(gaussians.means)) & (radius < MAX_MAGNITUDE)
+    seen &= (splats.x + radius > 0) & (splats.x - radius < camera.width)
+    seen &= (splats.y + radius > 0) & (splats.y - radius < camera.height)
+    return dr.select(seen, radius, 0)
 
 
 def shape_values(
     gaussians: Gaussians, splats: Splats, camera: Pinhole, shape: Iterable[str], scale: float
-) -> dict[str, list[Any]]:
+) -> dict[str, list[Float]]:
     """What is blended for the sake of the shape, see `project_views`, of the names in `shape`."""
-    found = {}
+    values = {}
     if "depth" in shape:
-        found["depth"] = [splats.depth / scale]
+        values["depth"] = [splats.depth / scale]
     if "normal" in shape:
-        found["normal"] = list(normals(gaussians, camera))
-    return found
+        values["normal"] = list(normals(gaussians, camera))
+    return values
 
 
 @dataclass
-class Target:
-    """What a picture is compared with. rgba: UInt32 [H * W];  background: Float [3];  valid: Bool [H * W] or of width 1
-    truth: Floats [H * W] by name, see `View`, and "foreground": Bool [H * W] and its weight, Float"""
+class TargetImage:
+    """What a picture is compared with."""
 
-    rgba: Any
-    background: Any
-    valid: Any
+    rgba: UInt32  #: UInt32 [H * W]
+    background: Float  #: Float [3]
+    valid: Bool  #: Bool [H * W] or of width 1
+    #: Floats [H * W] by name, see `TrainingView`, and "foreground": Bool [H * W] and its weight, Float
     truth: dict[str, list[Any]]
 
 
 @dataclass(frozen=True)
-class LossConfig:
-    """Weights of the terms;  scale: metres, the unit of depth;  tone: curve of colours that are blended, with the
-    background, in linear light, or None;  supersample: places on a side of each pixel, see `pixel_means`"""
+class LossSettings:
+    """Weights of the terms."""
 
     ssim: float
     visibility: float
     depth: float
     normal: float
-    scale: float
-    tone: str | None
-    supersample: int = 1
+    scale: float  #: metres, the unit of depth
+    tone: str | None  #: curve of colours that are blended, with the background, in linear light, or None
+    supersample: int = 1  #: places on a side of each pixel, see `pixel_means`
+    downscale: int = 1  #: pixels of the target on a side of each pixel that is compared
 
 
 def picture_loss(
-    planes: dict[str, list[Any]], transmittance: Any, target: Target, size: tuple[int, int], config: LossConfig
-) -> tuple[Any, dict[str, list[Any]], Any]:
+    planes: dict[str, list[Float]],
+    transmittance: Float,
+    target: TargetImage,
+    size: tuple[int, int],
+    config: LossSettings,
+) -> tuple[Float, dict[str, list[Float]], Float]:
     """Loss of a picture over the target's background, and its gradients by its planes (by name) and transmittance.
-    size: width and height of the target, pixels"""
-    channels = [ad.Float((target.rgba >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24)]
+    size: width and height of the target, pixels, before it is downscaled"""
+    times = config.downscale
+    covered, alpha = covered_color(target.rgba, size, times, config.tone, light=config.supersample > 1)
+    valid, truths = valid_squares(target.valid, size, times), truth_of_squares(target.truth, size, times)
+    size = size[0] // times, size[1] // times
     below = ad.Array3f([dr.gather(ad.Float, target.background, ad.UInt32(c)) for c in range(3)])
-    straight = ad.Array3f(channels[:3])
     if config.tone:
-        straight, below = light_of(straight, config.tone), light_of(below, config.tone)
-    truth = straight * channels[3] + (1 - channels[3]) * below
+        below = inverse_tone_map(below, config.tone)
+    truth = covered + (1 - alpha) * below
     planes = {name: [ad.Float(plane) for plane in group] for name, group in planes.items()}
     transmittance = ad.Float(transmittance)
     dr.enable_grad(planes, transmittance)
-    drawn, places = planes, transmittance
+    inputs, input_transmittance = planes, transmittance
     if config.supersample > 1:
         planes, transmittance = pixel_means(planes, transmittance, size, config.supersample, config.tone is not None)
-    picture = dr.select(target.valid, ad.Array3f(planes["colour"]) + transmittance * below, truth)
+    picture = dr.select(valid, ad.Array3f(planes["color"]) + transmittance * below, truth)
     if config.tone:
-        picture, truth = picture_of(picture, config.tone), picture_of(truth, config.tone)
+        picture, truth = tone_map(picture, config.tone), tone_map(truth, config.tone)
     loss = photometric_loss(picture, truth, *size, ssim_weight=config.ssim)
-    known, valid = target.truth, target.valid
     if "visibility" in planes:
-        loss += config.visibility * visibility_loss(planes["visibility"][0], known["visibility"][0], valid)
+        loss += config.visibility * visibility_loss(planes["visibility"][0], truths["visibility"][0], valid)
     if "depth" in planes:
-        depth = known["depth"][0] / config.scale
+        depth = truths["depth"][0] / config.scale
         loss += config.depth * depth_loss(planes["depth"][0], transmittance, depth, valid)
     if "normal" in planes:
-        normal = ad.Array3f(planes["normal"]), transmittance, ad.Array3f(known["normal"])
+        normal = ad.Array3f(planes["normal"]), transmittance, ad.Array3f(truths["normal"])
         loss += config.normal * normal_loss(*normal, valid)
-    if "foreground" in known:
-        mask, weight = known["foreground"]
+    if "foreground" in truths:
+        mask, weight = truths["foreground"]
         loss += weight * foreground_loss(transmittance, mask)
     dr.backward(loss)
-    by_plane = {name: [dr.grad(plane) for plane in group] for name, group in drawn.items()}
-    return dr.detach(loss), by_plane, dr.grad(places)
+    grad_planes = {name: [dr.grad(plane) for plane in group] for name, group in inputs.items()}
+    return dr.detach(loss), grad_planes, dr.grad(input_transmittance)
 
 
-def on_screen(absolute: tuple[Any, Any], half: tuple[Any, Any], sizes: Any) -> tuple[Any, Any]:
-    """What refinement watches, [N] each: the norm of the absolute gradient by half a picture, and the larger radius as
-    a share of the picture's longer side. absolute: by x and y, a pixel;  half: width and height of the box, pixels;
+def on_screen(absolute: tuple[Float, Float], radii: Float, sizes: Float) -> tuple[Float, Float, Bool]:
+    """What refinement watches, [N] each: the norm of the absolute gradient by half a picture, the radius as a share of
+    the picture's longer side, and who is in the picture. absolute: by x and y, a pixel;  radii: of `screen_radii`;
     sizes: Float [3], half the picture's width and height, its longer side"""
     half_width, half_height, longer = (dr.gather(ad.Float, sizes, ad.UInt32(i)) for i in range(3))
     gradient = dr.sqrt(dr.square(absolute[0] * half_width) + dr.square(absolute[1] * half_height))
-    return gradient, dr.maximum(*half) / longer
+    return gradient, radii / longer, radii > 0
 
 
 def update_light(
-    weights: list[Any], moments: tuple[list[Any], list[Any]], gradients: list[list[Any]], factors: Any
-) -> tuple[list[Any], list[Any], list[Any]]:
-    """An Adam step of the networks by their mean gradient. factors: Float [3], two corrections and the step size."""
-    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(3)]
+    weights: list[Float], moments: tuple[list[Float], list[Float]], gradients: list[list[Float]], factors: Float
+) -> tuple[list[Float], list[Float], list[Float]]:
+    """An Adam step of the networks by their mean gradient, and of the pictures' embeddings, which stand behind their
+    weights. factors: Float [3] or, with embeddings, [4]: two corrections, the networks' step size, the embeddings'"""
+    count = dr.width(factors)
+    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(count)]
+    rates = [numbers[2]] * (len(weights) - count + 3) + numbers[3:]
     means = [mean(list(of_views)) for of_views in zip(*gradients, strict=True)]
-    return adam_step(weights, means, moments, [numbers[2]] * len(weights), (numbers[0], numbers[1]))
+    return adam_step(weights, means, moments, rates, (numbers[0], numbers[1]))
 
 
-def mean(values: list[Any]) -> Any:
+def mean(values: list[Float]) -> Float:
     """Of some views' gradients."""
     return values[0] if len(values) == 1 else sum(values[1:], values[0]) / len(values)

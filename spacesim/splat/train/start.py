@@ -4,17 +4,20 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
+from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.mesh import read_mesh
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_points
 from spacesim.splat.raster.cameras import NEAR
-from spacesim.splat.raster.gaussians import SH_C0, Gaussians, uploaded
+from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 
 OPACITY = 0.1  #: of every Gaussian at the start (Kerbl et al. 2023)
-NEIGHBOURS = 12  #: points that a normal is estimated from, chosen
-COARSE = 0.05  #: pixels, chosen: steps of 0.1 cost 0.4 dB of 26.6, those of 1 pixel 1.9 dB (boxsat, 96 pixels)
-FEATURES = 0.3  #: standard deviation of the features at the start, chosen
+NEIGHBOURS = 12  #: points that a normal is estimated from
+COARSE = 0.05  #: pixels: steps of 0.1 cost 0.4 dB of 26.6, those of 1 pixel 1.9 dB (boxsat, 96 pixels)
+FEATURES = 0.3  #: standard deviation of the features at the start
+SPLATFACTO_CUBE = 10  #: scene scales, side of the cube that its random start fills (`random_scale`)
 
 
 def initial_gaussians(
@@ -25,6 +28,7 @@ def initial_gaussians(
     seed: int,
     features: int = 0,
     box: float | None = None,
+    like_splatfacto: bool = False,
 ) -> Gaussians:
     """At most `count` Gaussians: isotropic, as wide as the mean distance to their three nearest neighbours.
 
@@ -32,21 +36,25 @@ def initial_gaussians(
     init: "mesh" samples the ground-truth mesh evenly, "points" takes the dataset's points, "random" fills the cube
     around the scene; None takes points, else the mesh, else random
     box: side of that cube in sizes of the object; None: within the cameras
+    like_splatfacto: turned at random, and "random" without a box fills `SPLATFACTO_CUBE` in colours of 0.5 to 0.78
     Raises InputError where `init` is not to be had.
     """
     rng = np.random.default_rng([seed, 0])
     if init is None:
         init = "points" if dataset.ply_file_path else "mesh" if dataset.mesh_path else "random"
     if init == "points":
-        means, colours = _from_points(dataset, count, rng)
+        means, colors = _from_points(dataset, count, rng)
     elif init == "mesh":
-        means, colours = _from_mesh(dataset, count, rng)
+        means, colors = _from_mesh(dataset, count, rng)
     else:
-        means, colours = _at_random(dataset, count, rng, box)
-    gaussians = gaussians_at(means, colours, -1 if features else sh_degree)
+        means, colors = _at_random(dataset, count, rng, box, like_splatfacto)
+    gaussians = gaussians_at(means, colors, -1 if features else sh_degree)
     if features:
         values = FEATURES * rng.standard_normal((features, gaussians.count))
-        gaussians.features = uploaded(values.ravel())
+        gaussians.features = upload(values.ravel())
+    if like_splatfacto:
+        turned = rng.standard_normal((4, gaussians.count))
+        gaussians.quaternions = ad.Array4f(*map(upload, turned / np.linalg.norm(turned, axis=0)))
     return gaussians
 
 
@@ -70,11 +78,11 @@ def spacing(means: np.ndarray) -> np.ndarray:
     return np.maximum(distances.mean(axis=1), 1e-6)
 
 
-def gaussians_at(means: np.ndarray, colours: np.ndarray, sh_degree: int) -> Gaussians:
+def gaussians_at(means: np.ndarray, colors: np.ndarray, sh_degree: int) -> Gaussians:
     """Gaussians at means [N, 3] metres with sRGB colours [N, 3] in [0, 1]; sh_degree -1: without harmonics."""
     count = len(means)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
-    sh[:, :1] = ((colours - 0.5) / SH_C0)[:, None]
+    sh[:, :1] = ((colors - 0.5) / SH_C0)[:, None]
     return Gaussians.from_numpy(
         {
             "means": means,
@@ -92,7 +100,7 @@ def scene_scale(dataset: Dataset) -> float:
     return float(max(np.abs(centers - centers.mean(axis=0)).max(), 1e-6)) if len(centers) > 1 else 1.0
 
 
-def small_remark(dataset: Dataset) -> str:
+def scale_warning(dataset: Dataset) -> str:
     """A sentence where the cameras stand so near to each other and to what they look at that little of it can be drawn,
     as with poses in kilometres; "" where they do not."""
     distance = nearest_camera(dataset, focus_point(dataset))
@@ -104,7 +112,7 @@ def small_remark(dataset: Dataset) -> str:
     )
 
 
-def far_remark(dataset: Dataset) -> str:
+def distance_warning(dataset: Dataset) -> str:
     """A sentence where what the cameras look at is so far from the origin that single precision shows in pictures, as
     with the coordinates of an orbit; "" where it is not."""
     focus = focus_point(dataset)
@@ -122,32 +130,36 @@ def far_remark(dataset: Dataset) -> str:
 
 def _from_points(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     if dataset.ply_file_path is None:
-        raise InputError(f"{dataset.root}: --init points expects ply_file_path in transforms.json, found none")
-    points, colours = read_points(dataset.root / dataset.ply_file_path)
+        raise InputError(f"{dataset.root}: init points expects ply_file_path in transforms.json, found none")
+    points, colors = read_points(dataset.root / dataset.ply_file_path)
     if len(points) > count:
         chosen = np.sort(rng.choice(len(points), count, replace=False))
-        points, colours = points[chosen], colours[chosen]
-    return points.astype(np.float64), colours / 255.0
+        points, colors = points[chosen], colors[chosen]
+    return points.astype(np.float64), colors / 255.0
 
 
 def _from_mesh(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     if dataset.mesh_path is None or not (dataset.root / dataset.mesh_path).exists():
-        raise InputError(f"{dataset.root}: --init mesh expects a mesh.ply, found none")
+        raise InputError(f"{dataset.root}: init mesh expects a mesh.ply, found none")
     mesh = trimesh.Trimesh(*read_mesh(dataset.root / dataset.mesh_path), process=False)
     points, _ = trimesh.sample.sample_surface(mesh, count, seed=rng)
     return np.asarray(points), np.full((count, 3), 0.5)
 
 
 def _at_random(
-    dataset: Dataset, count: int, rng: np.random.Generator, box: float | None
+    dataset: Dataset, count: int, rng: np.random.Generator, box: float | None, like_splatfacto: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Uniform in a cube about the point that the cameras look at: as wide as the nearest camera is far, or `box` times
-    as wide as the object."""
+    as wide as the object. Like splatfacto: about the mean of the cameras, and its constant harmonics are 0 to 1."""
     center = focus_point(dataset)
     half = 0.5 * nearest_camera(dataset, center)
     if box is not None:
         half = 0.5 * box * object_size(dataset)
-    return center + rng.uniform(-half, half, (count, 3)), rng.uniform(0, 1, (count, 3))
+    elif like_splatfacto:
+        center = np.mean([frame.camera.position for frame in dataset.train], axis=0)
+        half = 0.5 * SPLATFACTO_CUBE * scene_scale(dataset)
+    means, colors = center + rng.uniform(-half, half, (count, 3)), rng.uniform(0, 1, (count, 3))
+    return means, 0.5 + SH_C0 * colors if like_splatfacto else colors
 
 
 def object_size(dataset: Dataset) -> float:
@@ -158,7 +170,7 @@ def object_size(dataset: Dataset) -> float:
     elif dataset.ply_file_path is not None:
         points = read_points(dataset.root / dataset.ply_file_path)[0]
     else:
-        raise InputError(f"{dataset.root}: --init-box expects a mesh or points that tell the object's size, found none")
+        raise InputError(f"{dataset.root}: init_box expects a mesh or points that tell the object's size, found none")
     return float(np.ptp(points, axis=0).max())
 
 

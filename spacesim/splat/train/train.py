@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 
 import spacesim
-from spacesim import backend, ending
+from spacesim import backend, interrupts
 from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, read_json, remove_leftovers, write_json
 from spacesim.data.identity import training_digest
-from spacesim.data.lock import locked
+from spacesim.data.lock import lock_folder
 from spacesim.data.records import Dataset
-from spacesim.data.tone import development
+from spacesim.data.tone import tone_and_exposure
 from spacesim.splat.run import Run, load_run, read_config
 from spacesim.splat.train.checkpoint import write_tensors
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.start import far_remark, small_remark
-from spacesim.splat.train.trainer import Progress, Trainer
+from spacesim.splat.train.start import distance_warning, scale_warning
+from spacesim.splat.train.trainer import Trainer, TrainingProgress
 
 KEEP_CHECKPOINTS = 2
 
@@ -37,7 +37,7 @@ def train(
     out: Path,
     config: TrainConfig,
     resume: bool = False,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
+    on_progress: Callable[[TrainingProgress], None] = lambda progress: None,
     command: Sequence[str] = (),
 ) -> Run:
     """Train and write RUN (see `spacesim.splat.run`). With `resume`, go on from the newest checkpoint, with the
@@ -46,7 +46,7 @@ def train(
     Ctrl-C on the command line leaves a checkpoint of the step that it came in. Raises InputError where `out` holds a
     run and `resume` is not asked for, or one of another configuration, or where another training is at work in it.
     """
-    out, config = Path(out), _with_development(config, dataset)
+    out, config = Path(out), _with_tone_and_exposure(config, dataset)
     described = {**config.to_json(), "data": _identity(dataset)}
     _check_folder(out, described, resume)
     if (out / "model.safetensors").exists():
@@ -54,9 +54,9 @@ def train(
     if config.warm_start is not None and (remark := config.warm_start.remark(config.iterations)):
         log.warning(remark)
     trainer = Trainer(dataset, config)
-    for remark in filter(None, (small_remark(dataset), far_remark(dataset))):
+    for remark in filter(None, (scale_warning(dataset), distance_warning(dataset))):
         log.warning(remark)
-    with locked(out):
+    with lock_folder(out):
         _check_folder(out, described, resume)  # again: another training may have come and gone
         remove_leftovers(out)
         write_json(out / "config.json", described)
@@ -64,13 +64,15 @@ def train(
     return load_run(out)
 
 
-def _train(trainer: Trainer, out: Path, on_progress: Callable[[Progress], None], command: Sequence[str]) -> None:
+def _train(
+    trainer: Trainer, out: Path, on_progress: Callable[[TrainingProgress], None], command: Sequence[str]
+) -> None:
     """From the newest checkpoint in `out` to the end, and write the run."""
     newest = max(_checkpoints(out), default=None)
     if newest is not None:
         trainer.restore(newest)
         log.info("resumed at iteration %d from %s", trainer.iteration, newest)
-    seconds = _Seconds(out, trainer)
+    seconds = _TrainingClock(out, trainer)
 
     def checkpoint() -> None:
         trainer.save(out / "checkpoints" / f"step_{trainer.iteration:08d}.safetensors")
@@ -78,8 +80,8 @@ def _train(trainer: Trainer, out: Path, on_progress: Callable[[Progress], None],
         for old in _checkpoints(out)[:-KEEP_CHECKPOINTS]:
             old.unlink(missing_ok=True)
 
-    with ending.postponed() as asked_to_stop:  # the writing, too: the last steps may have no checkpoint yet
-        trainer.run(on_progress, checkpoint, asked_to_stop)
+    with interrupts.defer_interrupts() as should_stop:  # the writing, too: the last steps may have no checkpoint yet
+        trainer.run(on_progress, checkpoint, should_stop)
         _write(trainer, out, seconds.total(), command)
 
 
@@ -107,24 +109,26 @@ def _check_folder(out: Path, described: dict[str, Any], resume: bool) -> None:
     if (out / "config.json").exists():
         if _checkpoints(out) or (out / "model.safetensors").exists():  # else nothing is there that could be lost
             _check_resumable(out, described, resume)
-    elif holds_files(out) or (out.exists() and not out.is_dir()):
+    elif out.exists() and not out.is_dir():
+        raise InputError(f"{out}: expected an empty or new folder for the run, found no folder")
+    elif holds_files(out):
         raise InputError(f"{out}: expected an empty or new folder for the run, found other files in it")
 
 
-def _with_development(config: TrainConfig, dataset: Dataset) -> TrainConfig:
+def _with_tone_and_exposure(config: TrainConfig, dataset: Dataset) -> TrainConfig:
     """Linear colours have the tone curve and the exposure of the dataset's pictures, where they were given none."""
     light = config.light
     if light is None or not light.linear:
         return config
-    tone, exposure = development(dataset.scene) or ("srgb", 0.0)
+    tone, exposure = tone_and_exposure(dataset.scene) or ("srgb", 0.0)
     light = replace(light, tone=light.tone or tone, exposure=exposure if light.exposure is None else light.exposure)
     return replace(config, light=light)
 
 
 def versions() -> dict[str, str]:
     """Versions of what the numbers depend on."""
-    found = {"spacesim": spacesim.__version__, "drjit": version("drjit"), "numpy": np.__version__}
-    return {**found, "python": platform.python_version()}
+    packages = {"spacesim": spacesim.__version__, "drjit": version("drjit"), "numpy": np.__version__}
+    return {**packages, "python": platform.python_version()}
 
 
 def device() -> str:
@@ -148,14 +152,14 @@ def _identity(dataset: Dataset) -> dict[str, Any]:
 
 def _check_resumable(out: Path, described: dict[str, Any], resume: bool) -> None:
     if not resume:
-        raise InputError(f"{out}: holds a run already; pass --resume to complete it, or name another folder")
+        raise InputError(f"resume: expected with {out}, which holds a run already, or a new folder, found neither")
     config, data = read_config(out / "config.json")
     data["path"] = described["data"]["path"]  # it may have moved
-    known = {**config.to_json(), "data": data}  # what an older version did not write is as by default
-    difference = _first_difference(known, described)
+    current = {**config.to_json(), "data": data}  # what an older version did not write is as by default
+    difference = _first_difference(current, described)
     if difference is not None:
         key, old, new = difference
-        raise InputError(f"{out}: was started with {key} {old!r}, --resume asks for {new!r}")
+        raise InputError(f"{out}: was started with {key} {old!r}, expected the same to resume it, found {new!r}")
 
 
 def _first_difference(old: dict[str, Any], new: dict[str, Any], within: str = "") -> tuple[str, Any, Any] | None:
@@ -164,9 +168,9 @@ def _first_difference(old: dict[str, Any], new: dict[str, Any], within: str = ""
     for key, value in new.items():
         was = old.get(key)
         if isinstance(was, dict) and isinstance(value, dict):
-            found = _first_difference(was, value, f"{within}{key}.")
-            if found is not None:
-                return found
+            difference = _first_difference(was, value, f"{within}{key}.")
+            if difference is not None:
+                return difference
         elif was != value:
             return f"{within}{key}", was, value
     return None
@@ -194,15 +198,15 @@ def _read_seconds(path: Path) -> dict[str, float]:
         return {}
 
 
-class _Seconds:
+class _TrainingClock:
     """Wall-clock time of training and the part of it that refinement took, kept across interruptions beside the
     checkpoints."""
 
     def __init__(self, out: Path, trainer: Trainer) -> None:
         self.path, self.trainer = out / "checkpoints" / "seconds.json", trainer
-        known = _read_seconds(self.path)
-        self.before, self.start = known.get(str(trainer.iteration), 0.0), time.monotonic()
-        trainer.refinement_seconds = known.get("refinement", 0.0) if self.before else 0.0
+        seconds = _read_seconds(self.path)
+        self.before, self.start = seconds.get(str(trainer.iteration), 0.0), time.monotonic()
+        trainer.refinement_seconds = seconds.get("refinement", 0.0) if self.before else 0.0
 
     def total(self) -> float:
         return self.before + time.monotonic() - self.start

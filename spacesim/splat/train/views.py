@@ -9,32 +9,31 @@ from typing import Any
 import numpy as np
 
 from spacesim.backend import ad, free_memory, main_memory
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
-from spacesim.splat.raster.gaussians import uploaded
 
 log = logging.getLogger(__name__)
 
-CACHE_BYTES = 6 * 2**30  #: of decoded pictures, at most, chosen
-DEVICE_BYTES = 2 * 2**30  #: of pictures that stay on the device, at most, chosen: 512 of 1024 x 1024
-SHARES = 4, 8  #: a fourth and an eighth of the memory that is free are not exceeded, chosen
+CACHE_BYTES = 6 * 2**30  #: of decoded pictures, at most
+DEVICE_BYTES = 2 * 2**30  #: of pictures that stay on the device, at most: 512 of 1024 x 1024
+SHARES = 4, 8  #: a fourth and an eighth of the memory that is free are not exceeded
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """rgba: [H * W] uint32, 8 bits a channel, red lowest; valid: [H * W] bool, or None where all pixels count;
-    opaque: the picture has no transparency, so that what is behind the object is part of it;
-    truth: {name: planes [H * W] float32} of what is asked for: "visibility", path-traced, below 0 where there is no
-    surface; "depth", along the optical axis, metres, 0 where there is none; "normal", 3 planes, world axes."""
+class TrainingView:
+    """A training picture in main memory."""
 
     index: int
     camera: Camera
     sun: np.ndarray | None
-    rgba: np.ndarray
-    valid: np.ndarray | None
-    opaque: bool
+    rgba: np.ndarray  #: [H * W] uint32, 8 bits a channel, red lowest
+    valid: np.ndarray | None  #: [H * W] bool, or None where all pixels count
+    opaque: bool  #: the picture has no transparency, so that what is behind the object is part of it
+    #: {name: planes [H * W] float32} of what is asked for: "visibility", path-traced, below 0 where there is no
+    #: surface; "depth", along the optical axis, metres, 0 where there is none; "normal", 3 planes, world axes
     truth: dict[str, list[np.ndarray]]
 
 
@@ -66,34 +65,34 @@ class TrainingViews:
         self._order = lru_cache(maxsize=1)(self._shuffle)
         in_memory, on_device = kept_bytes()
         self._cached = lru_cache(maxsize=max(1, in_memory // largest))(self._load)
-        self._uploaded = lru_cache(maxsize=max(1, on_device // largest))(self._upload)
+        self._device_cache = lru_cache(maxsize=max(1, on_device // largest))(self._upload)
 
     def __len__(self) -> int:
         return len(self.dataset.train)
 
-    def __getitem__(self, index: int) -> View:
+    def __getitem__(self, index: int) -> TrainingView:
         return self._cached(index)
 
-    def at_step(self, step: int) -> View:
+    def at_step(self, step: int) -> TrainingView:
         """The view of a step: every epoch visits all views once, in an order that (seed, epoch) decides."""
         epoch, place = divmod(step, len(self))
         return self[int(self._order(epoch)[place])]
 
-    def pixels(self, view: View) -> tuple[Any, Any, dict[str, list[Any]]]:
+    def pixels(self, view: TrainingView) -> tuple[Any, Any, dict[str, list[Any]]]:
         """(rgba UInt32 [H * W], valid Bool [H * W] or of width 1, truth as Floats [H * W]) of a view."""
-        pixels: tuple[Any, Any, dict[str, list[Any]]] = self._uploaded(view.index)
+        pixels: tuple[Any, Any, dict[str, list[Any]]] = self._device_cache(view.index)
         return pixels
 
     def _upload(self, index: int) -> tuple[Any, Any, dict[str, list[Any]]]:
         view = self[index]
-        valid = ad.Bool(True) if view.valid is None else uploaded(view.valid, ad.Bool)
-        truth = {name: [uploaded(plane) for plane in planes] for name, planes in view.truth.items()}
-        return uploaded(view.rgba, ad.UInt32), valid, truth
+        valid = ad.Bool(True) if view.valid is None else upload(view.valid, ad.Bool)
+        truth = {name: [upload(plane) for plane in planes] for name, planes in view.truth.items()}
+        return upload(view.rgba, ad.UInt32), valid, truth
 
     def _shuffle(self, epoch: int) -> np.ndarray:
         return np.random.default_rng([self.seed, 1, epoch]).permutation(len(self))
 
-    def _load(self, index: int) -> View:
+    def _load(self, index: int) -> TrainingView:
         frame = self.dataset.train[index]
         image = load_image(self.dataset, frame)
         rgba = np.concatenate([image.rgb, image.alpha[..., None]], axis=-1)
@@ -104,7 +103,7 @@ class TrainingViews:
             log.warning("%s: no pixel of it counts, by its mask or by its lens distortion", frame.file_path)
         sun = None if frame.sun is None else frame.sun.direction
         opaque = bool((image.alpha == 1).all())
-        return View(index, frame.camera, sun, bytes_.view("<u4").ravel(), valid, opaque, self._planes(frame))
+        return TrainingView(index, frame.camera, sun, bytes_.view("<u4").ravel(), valid, opaque, self._planes(frame))
 
     def _planes(self, frame: Frame) -> dict[str, list[np.ndarray]]:
         """What is asked for of a frame's truth, or of the surface as its camera sees it."""
@@ -121,16 +120,16 @@ class TrainingViews:
         else:
             return {}
         planes |= {"depth": depth[..., None], "normal": normal}
-        wanted = {name: np.moveaxis(planes[name], -1, 0).astype(np.float32) for name in self.truth}
-        return {name: [np.ascontiguousarray(plane).ravel() for plane in group] for name, group in wanted.items()}
+        planes_first = {name: np.moveaxis(planes[name], -1, 0).astype(np.float32) for name in self.truth}
+        return {name: [np.ascontiguousarray(plane).ravel() for plane in group] for name, group in planes_first.items()}
 
 
 def kept_bytes() -> tuple[int, int]:
     """How many bytes of pictures are kept in main memory, and on the device."""
     free = main_memory(), free_memory()
     most, device = (
-        largest if one is None else min(largest, one // share)
-        for largest, one, share in zip((CACHE_BYTES, DEVICE_BYTES), free, SHARES, strict=True)
+        largest if a_view is None else min(largest, a_view // share)
+        for largest, a_view, share in zip((CACHE_BYTES, DEVICE_BYTES), free, SHARES, strict=True)
     )
     return most, device
 
@@ -140,8 +139,8 @@ def _check_known(dataset: Dataset, suns: bool, traced: Sequence[str]) -> None:
     for frame in dataset.train:
         if suns and frame.sun is None:
             raise InputError(
-                f"{dataset.root}: expected sun_direction in every training frame, for methods of light, "
-                f"found none in {frame.file_path}"
+                f"{dataset.root}: expected sun_direction in every training frame, or the method relight with "
+                f"light.field.inputs=view, which is told none, found none in {frame.file_path}"
             )
         if traced and frame.gt_path is None:
             raise InputError(

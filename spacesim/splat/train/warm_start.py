@@ -4,68 +4,65 @@ towards what the training pictures show, before refinement begins to prune.
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import drjit as dr
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from spacesim.backend import ad, recorded
+from spacesim.backend.arrays import Array3f, Bool, Float
+from spacesim.backend.upload import upload, upload_rows
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.images import luminance
-from spacesim.splat.raster.bin import RECORDINGS
 from spacesim.splat.raster.cameras import NEAR, Pinhole
-from spacesim.splat.raster.gaussians import Gaussians, numbers, triple, uploaded
-from spacesim.splat.train.densify import raise_opacities
-from spacesim.splat.train.optimizer import Adam
+from spacesim.splat.raster.gaussians import Gaussians, stack_rows
+from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.start import spacing
-from spacesim.splat.train.strategies.strategy import MOST_SIZE, MOST_STEPS
-from spacesim.splat.train.views import DEVICE_BYTES, TrainingViews, View
+from spacesim.splat.train.strategies.densify import raise_opacities
+from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD
+from spacesim.splat.train.views import DEVICE_BYTES, TrainingView, TrainingViews
 
 
 @dataclass(frozen=True)
 class WarmStartConfig:
-    """Steps count from the start of training."""
+    """Gaussians that start anywhere are pulled to what pictures show. Steps count from the start of training."""
 
     steps: int = 2_000  #: table 5.7, T_ws: full strength, no refinement
-    decay: int = 2_000  #: table 5.7, T_decay
-    weight: float = 0.5  #: table 5.7, lambda_ws
-    luminance: float = 0.03  #: table 5.7, tau_fg, of pictures without transparency
+    decay: int = 2_000  #: table 5.7, T_decay: steps in which it fades
+    weight: float = 0.5  #: table 5.7, lambda_ws, of the foreground loss
+    alpha_mask: bool = True  #: the foreground of pictures with transparency is their alpha; false: 5.24 of all
+    luminance: float = 0.03  #: table 5.7, tau_fg: brighter is foreground, over black
     dilation: int = 3  #: table 5.7, pixels, of masks by luminance; a mask by alpha is known exactly
-    projection_weight: float = 0.4  #: table 5.7, lambda_proj
+    projection_weight: float = 0.4  #: table 5.7, lambda_proj, of the pull towards the foreground beside it
     downsampling: int = 4  #: table 5.7, of the distance image
-    reach: float = 0.125  #: rho of 5.26
-    travel: float = 1.0  #: of the radius of the start, how far a Gaussian can move during `steps` at least, chosen
-    rescue: float = 0.5  #: table 5.7, alpha_rescue
-    rescue_every: int = 100  #: steps, chosen; a Gaussian that no view of them had in its picture is unseen
+    reach: float = 0.125  #: rho of 5.26: the distance that counts 1, a share of the picture's smaller side
+    travel: float = 1.0  #: of the radius of the start, how far a Gaussian can move during `steps`; 0: as without
+    rescue: float = 0.5  #: table 5.7, alpha_rescue: how far the unseen move towards the visible cloud
+    rescue_every: int = 100  #: steps; a Gaussian that no view of them had in its picture is unseen
     least_seen: int = 16  #: Gaussians that make a visible cloud, chosen as table 5.3's least supported cloud
-    gather: bool = True  #: beyond the nearest camera is unseen, too, chosen
-    spacing: float = 1.0  #: widest a Gaussian is after a rescue, in mean distances to its three nearest, chosen; 0: any
-    revive: float = 0.1  #: opacity to which fainter ones are raised at each rescue, chosen: that of the start; 0: none
+    gather: bool = True  #: beyond the nearest camera is unseen, too
+    spacing: float = 1.0  #: widest a Gaussian is after a rescue, in mean distances to its three nearest; 0: any
+    revive: float = 0.1  #: opacity to which fainter ones are raised at each rescue: that of the start; 0: none
     conservative: int = 1_000  #: table 5.7, steps after `steps` with a lower opacity threshold
     opacity_scale: float = 0.5  #: table 5.7, of that threshold
 
     def __post_init__(self) -> None:
-        counts = self.steps, self.decay, self.conservative, self.dilation
-        if min(counts) < 0 or min(self.downsampling, self.rescue_every) < 1:
-            raise InputError(f"--warm-start: expected numbers of steps and pixels, found {self}")
-        if not (
-            0 <= self.rescue <= 1
-            and self.reach > 0
-            and min(self.weight, self.projection_weight, self.travel, self.spacing) >= 0
-        ):
-            raise InputError(f"--warm-start: expected weights of 0 or more and a rescue of 0 to 1, found {self}")
-        check_ranges(self, steps=(0, MOST_STEPS), decay=(0, MOST_STEPS), conservative=(0, MOST_STEPS))
-        check_ranges(self, weight=(0, MOST_SIZE), projection_weight=(0, MOST_SIZE), reach=(0, MOST_SIZE))
-        check_ranges(self, travel=(0, MOST_SIZE), spacing=(0, MOST_SIZE), dilation=(0, 1000), downsampling=(1, 1000))
-        check_ranges(self, luminance=(0, 1), revive=(0, 1), opacity_scale=(0, 1), rescue_every=(1, MOST_STEPS))
+        if not self.reach > 0:
+            raise InputError(f"reach: expected a number above 0, found {self.reach}")
+        check_ranges(self, rescue=(0, 1), least_seen=(0, MAX_STEPS))
+        check_ranges(self, steps=(0, MAX_STEPS), decay=(0, MAX_STEPS), conservative=(0, MAX_STEPS))
+        check_ranges(self, weight=(0, MAX_THRESHOLD), projection_weight=(0, MAX_THRESHOLD), reach=(0, MAX_THRESHOLD))
+        check_ranges(
+            self, travel=(0, MAX_THRESHOLD), spacing=(0, MAX_THRESHOLD), dilation=(0, 1000), downsampling=(1, 1000)
+        )
+        check_ranges(self, luminance=(0, 1), revive=(0, 1), opacity_scale=(0, 1), rescue_every=(1, MAX_STEPS))
 
     def remark(self, iterations: int) -> str:
         """A sentence where training is over before the attraction is; "" where it is not."""
         if iterations > self.steps + self.decay:
             return ""
         return (
-            f"--warm-start: gathers Gaussians for {self.steps} iterations and fades over {self.decay} more, expected a "
+            f"warm_start: gathers Gaussians for {self.steps} iterations and fades over {self.decay} more, expected a "
             f"training of more than {self.steps + self.decay}, better of several times as many, found {iterations}: "
             "what is gathered is hardly trained"
         )
@@ -90,12 +87,13 @@ class WarmStartConfig:
         return self.opacity_scale if step < self.steps + self.conservative else 1.0
 
 
-def foreground(view: View, config: WarmStartConfig) -> np.ndarray:
-    """[H, W] bool: where the picture shows the object. By alpha; of a picture without transparency by luminance,
-    dilated (5.23, 5.24). Pixels that are to be ignored show nothing."""
+def foreground(view: TrainingView, config: WarmStartConfig) -> np.ndarray:
+    """[H, W] bool: where the picture shows the object. By alpha; of a picture without transparency, or of all without
+    `alpha_mask`, by luminance over black, dilated (5.23, 5.24). Pixels that are to be ignored show nothing."""
     bytes_ = view.rgba.view(np.uint8).reshape(view.camera.height, view.camera.width, 4)
-    if view.opaque:
-        mask = luminance(bytes_[..., :3] / np.float32(255)) > config.luminance
+    if view.opaque or not config.alpha_mask:
+        straight, alpha = bytes_[..., :3] / np.float32(255), bytes_[..., 3:] / np.float32(255)
+        mask = luminance(straight * alpha) > config.luminance
         if config.dilation and mask.any():
             mask = binary_dilation(mask, disc(config.dilation))
     else:
@@ -125,11 +123,11 @@ def distance_image(mask: np.ndarray, config: WarmStartConfig) -> np.ndarray:
 
 @dataclass
 class Attraction:
-    """Of one view. mask: Bool [H * W];  image: Float [h * w], the distance image;  size: its (width, height)"""
+    """Of one view."""
 
-    mask: Any
-    image: Any
-    size: tuple[int, int]
+    mask: Bool  #: Bool [H * W]
+    image: Float  #: Float [h * w], the distance image
+    size: tuple[int, int]  #: its (width, height)
 
 
 class WarmStart:
@@ -151,16 +149,20 @@ class WarmStart:
         """Whether refinement waits, and the unseen are rescued, at step number `step`, the first of which is 0."""
         return step < self.config.steps
 
-    def attraction(self, view: View) -> Attraction:
+    def attraction(self, view: TrainingView) -> Attraction:
         """What pulls in a view; nothing does where it shows no foreground."""
-        found: Attraction = self._cached(view.index)
-        return found
+        attraction: Attraction = self._cached(view.index)
+        return attraction
 
-    def pull(self, rows: list[Any], camera: Pinhole, found: Attraction, step: int) -> list[Any]:
+    def attraction_gradients(
+        self, rows: list[Float], camera: Pinhole, attraction: Attraction, step: int
+    ) -> list[Float]:
         """Gradients of the projected foreground loss by the means, as it counts at `step`: 3 Floats [N]. Counts who is
         in the picture while refinement waits. rows: of the Gaussians, the first 3 count"""
         numbers = ad.Float([self.config.strength(step) * self.config.projection_weight])
-        gradients, framed = _pull(rows[:3], camera, found.image, found.size, self.config.downsampling, numbers)
+        gradients, framed = _pull(
+            rows[:3], camera, attraction.image, attraction.size, self.config.downsampling, numbers
+        )
         if self.active(step):
             self.state["framed"] = self.state["framed"] + framed
             dr.eval(self.state)
@@ -172,7 +174,7 @@ class WarmStart:
         config = self.config
         if step > config.steps or step % config.rescue_every:
             return
-        means = numbers(gaussians.means).astype(np.float64)
+        means = stack_rows(gaussians.means).astype(np.float64)
         means[:, ~np.isfinite(means).all(axis=0)] = self.centre[:, None]
         unseen = np.array(self.state["framed"]) == 0
         if config.gather:
@@ -182,20 +184,22 @@ class WarmStart:
             enough = (~unseen).sum() >= config.least_seen
             target = means[:, ~unseen].mean(axis=1) if enough else self.centre
             means[:, unseen] += config.rescue * (target[:, None] - means[:, unseen])
-            gaussians.means = triple(means)
+            gaussians.means = upload_rows(means)
         if config.spacing > 0:
             widest = np.log(config.spacing * spacing(means.T))
-            gaussians.log_scales = triple(np.minimum(numbers(gaussians.log_scales), widest))
+            gaussians.log_scales = upload_rows(np.minimum(stack_rows(gaussians.log_scales), widest))
         if config.revive > 0:
             raise_opacities(gaussians, optimizer, config.revive)
 
     def _attraction(self, index: int) -> Attraction:
         mask = foreground(self.views[index], self.config)
         image = distance_image(mask, self.config)
-        return Attraction(uploaded(mask.ravel(), ad.Bool), uploaded(image.ravel()), (image.shape[1], image.shape[0]))
+        return Attraction(upload(mask.ravel(), ad.Bool), upload(image.ravel()), (image.shape[1], image.shape[0]))
 
 
-def projected_loss(means: Any, camera: Pinhole, image: Any, size: tuple[int, int], step: int) -> tuple[Any, Any]:
+def projected_loss(
+    means: Array3f, camera: Pinhole, image: Float, size: tuple[int, int], step: int
+) -> tuple[Float, Bool]:
     """(loss of width 1, Bool [N]: centre in the picture) of 5.27: the mean of the distance image, bilinearly sampled
     where each centre falls, over those that are in front of the camera and in the picture. Differentiable by `means`
     (Array3f [3, N]). The square root of the square is the value itself: distances are not negative.
@@ -208,11 +212,12 @@ def projected_loss(means: Any, camera: Pinhole, image: Any, size: tuple[int, int
     x, y = screen.x, screen.y
     framed = ahead & dr.detach((x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
     value = dr.select(framed, bilinear(image, size, x / step - 0.5, y / step - 0.5), 0)
-    count = dr.maximum(dr.sum(dr.select(framed, ad.Float(1), 0)), 1)
+    ones = dr.select(framed, ad.Float(1), 0)
+    count = dr.maximum(dr.sum(ones), 1)
     return dr.sum(value) / count, framed
 
 
-def bilinear(image: Any, size: tuple[int, int], u: Any, v: Any) -> Any:
+def bilinear(image: Float, size: tuple[int, int], u: Float, v: Float) -> Float:
     """[N] of an image Float [h * w] at columns u and rows v, whose whole numbers are the centres of its pixels; linear
     beyond the outermost. Differentiable by u and v."""
     width, height = size
@@ -226,9 +231,10 @@ def bilinear(image: Any, size: tuple[int, int], u: Any, v: Any) -> Any:
     return dr.lerp(upper, lower, fy)
 
 
-def _trace_pull(
-    rows: list[Any], camera: Pinhole, image: Any, size: tuple[int, int], step: int, numbers: Any
-) -> tuple[list[Any], Any]:
+@recorded
+def _pull(
+    rows: list[Float], camera: Pinhole, image: Float, size: tuple[int, int], step: int, numbers: Float
+) -> tuple[list[Float], Float]:
     """(gradients by the 3 rows, Float [N]: 1 where the centre is in the picture). numbers: Float [1], the weight"""
     rows = [ad.Float(row) for row in rows]
     dr.enable_grad(rows)
@@ -237,10 +243,7 @@ def _trace_pull(
     return [dr.grad(row) for row in rows], dr.select(framed, ad.Float(1), 0)
 
 
-def foreground_loss(transmittance: Any, mask: Any) -> Any:
+def foreground_loss(transmittance: Float, mask: Bool) -> Float:
     """5.25: mean of (1 - A)^2 over the foreground. transmittance: Float [H * W], 1 - A;  mask: Bool [H * W]"""
-    count = dr.sum(dr.select(mask, ad.Float(1), 0))
-    return dr.sum(dr.select(mask, dr.square(transmittance), 0)) / dr.maximum(count, 1)
-
-
-_pull = recorded(_trace_pull, RECORDINGS)
+    ones, missing = dr.select(mask, ad.Float(1), 0), dr.select(mask, dr.square(transmittance), 0)
+    return dr.sum(missing) / dr.maximum(dr.sum(ones), 1)

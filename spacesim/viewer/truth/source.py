@@ -9,13 +9,20 @@ from typing import Any
 from spacesim.data.errors import InputError
 from spacesim.data.records import Dataset
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.run import Run
-from spacesim.viewer.frames import sides
+from spacesim.splat.run import Predictor
+from spacesim.viewer.drawing.frames import picture_size
 from spacesim.viewer.session import Session
-from spacesim.viewer.state import Look, Stand, View
-from spacesim.viewer.truth.scene import composed_scene, models_of, parted, places_among, posed_objects, recorded_scene
-from spacesim.viewer.truth.tracer import Answer, Request
-from spacesim.viewer.truth.truth import SIDE, Truth, TruthDesk, frame_at, stored_truth
+from spacesim.viewer.state import DisplaySettings, SceneState, ViewerCamera
+from spacesim.viewer.truth.scene import (
+    compose_scene,
+    load_recorded_scene,
+    match_objects,
+    model_of_objects,
+    pose_objects,
+    split_scene,
+)
+from spacesim.viewer.truth.tracer import TraceRequest, TraceResult
+from spacesim.viewer.truth.truth import SIDE, TraceQueue, Truth, matching_frame, stored_truth
 
 
 class TruthService:
@@ -25,54 +32,56 @@ class TruthService:
     truth where its scene is the one that is shown, or None;  start: which a dataset that tells no scene shows
     """
 
-    def __init__(self, data: Sequence[Path | None], dataset: Dataset | None, start: Stand) -> None:
+    def __init__(self, data: Sequence[Path | None], dataset: Dataset | None, start: SceneState) -> None:
         self._data, self._dataset, self._start = data, dataset, start
         self._scenes: list[Any] | str | None = None
         self._whole: Any = None  # the dataset's own scene
         self._lock = threading.Lock()
-        self._desk = TruthDesk(self._answered)
+        self._queue = TraceQueue(self._on_trace_result)
 
-    def truth(self, session: Session, view: View, stand: Stand, look: Look) -> Truth | int | str:
+    def request_truth(
+        self, session: Session, view: ViewerCamera, state: SceneState, settings: DisplaySettings
+    ) -> Truth | int | str:
         """See `TruthSource`."""
-        models = self._models(stand)
+        models = self._models(state)
         if self._dataset is not None and models is not None:
-            number = frame_at(self._dataset, view, stand)
-            stored = None if number is None else stored_truth(self._dataset, number, look.mode, models)
+            number = matching_frame(self._dataset, view, state)
+            stored = None if number is None else stored_truth(self._dataset, number, settings.mode, models)
             if stored is not None:
                 return stored
-        if stand.sun is None:
+        if state.sun is None:
             return "the Sun's direction is not known"
-        scenes = self._recorded()
+        scenes = self._recorded_scenes()
         if isinstance(scenes, str):
             return scenes
         try:
-            scene = composed_scene(scenes, stand.poses)
+            scene = compose_scene(scenes, state.poses)
         except InputError as error:
             return str(error)
-        camera = view.camera(*sides(view, min(SIDE, look.side)))
-        request = Request(0, scene, camera, stand.sun, look.samples, look.mode, models_of(scenes))
-        return self._desk.ask(session, request)
+        camera = view.camera(*picture_size(view, min(SIDE, settings.side)))
+        request = TraceRequest(0, scene, camera, state.sun, settings.samples, settings.mode, model_of_objects(scenes))
+        return self._queue.ask(session, request)
 
-    def no_truth(self, session: Session) -> None:
+    def cancel_truth(self, session: Session) -> None:
         """See `TruthSource`."""
-        self._desk.cancel(session)
+        self._queue.cancel(session)
 
     def stop(self) -> None:
         """End the process that traces."""
-        self._desk.stop()
+        self._queue.stop()
 
-    def _models(self, stand: Stand) -> list[int] | None:
+    def _models(self, state: SceneState) -> list[int] | None:
         """Of each object of the dataset the number of the model that it is part of, where the models stand as the
         objects do, else None. Where scenes are not known: an empty list where they stand as at the start, or, of one
         model, where it was trained."""
-        scenes = self._recorded()
+        scenes = self._recorded_scenes()
         if not isinstance(scenes, str) and self._whole is not None:
-            places = places_among(posed_objects(scenes, stand.poses), self._whole.objects)
-            return None if places is None else [models_of(scenes)[place] for place in places]
+            places = match_objects(pose_objects(scenes, state.poses), self._whole.objects)
+            return None if places is None else [model_of_objects(scenes)[place] for place in places]
         start = self._start.poses if len(self._start.poses) > 1 else (Pose(),)
-        return [] if [pose.key for pose in stand.poses] == [pose.key for pose in start] else None
+        return [] if [pose.key for pose in state.poses] == [pose.key for pose in start] else None
 
-    def _recorded(self) -> list[Any] | str:
+    def _recorded_scenes(self) -> list[Any] | str:
         """The scenes of the models' data, or why they are not known; looked up once."""
         with self._lock:
             if self._scenes is None:
@@ -87,21 +96,23 @@ class TruthService:
     def _parts(self) -> list[Any] | None:
         """The scenes of several models by the dataset's own, which shows all of them as they stand at the start."""
         several = self._whole is not None and len(self._data) > 1
-        return parted(self._whole, self._start.poses) if several else None
+        return split_scene(self._whole, self._start.poses) if several else None
 
     def _scene(self, path: Path | None) -> Any:
         if path is None:
             others = "them" if len(self._data) == 1 else "data of the whole scene, an object for each model,"
-            raise InputError(f"the data that a model was trained on are not where they were; name {others} with --data")
-        return recorded_scene(path)
+            raise InputError(
+                f"the data that a model was trained on are not where they were; name {others} when the viewer starts"
+            )
+        return load_recorded_scene(path)
 
     @staticmethod
-    def _answered(session: Hashable, answer: Answer) -> None:
+    def _on_trace_result(session: Hashable, answer: TraceResult) -> None:
         assert isinstance(session, Session)
-        session.answer(answer)
+        session.on_trace_result(answer)
 
 
-def data_of(run: Run) -> Path | None:
+def dataset_folder(run: Predictor) -> Path | None:
     """The folder of the dataset that a run was trained on, if it is there."""
     path = Path(str(run.config.get("data", {}).get("path", "")))
     folder = path if path.is_dir() else path.parent

@@ -1,6 +1,6 @@
 """A process that path-traces the truth: the viewer's own draws meanwhile (Dr.Jit is not shared between threads).
 
-It is started with a socket (see `truth`), gets `Request`s, and answers each with an `Answer` after
+It is started with a socket (see `truth`), gets `TraceRequest`s, and answers each with a `TraceResult` after
 every few samples a pixel; a newer request, or None, ends the one before. Where the viewer has gone, it ends.
 """
 
@@ -14,37 +14,35 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.records import Camera, Sun
-from spacesim.data.tone import displayed
-from spacesim.scenes.generation.workers import linked, select_backend
-from spacesim.viewer.paint import Planes
+from spacesim.data.tone import display_values
+from spacesim.scenes.generation.workers import connect_to_parent, select_backend
+from spacesim.viewer.drawing.paint import Planes
 
-PASS = 4  #: samples a pixel between two answers, chosen
+PASS = 4  #: samples a pixel between two answers
 NICENESS = 10  #: less urgent than the viewer's own pictures
 
 
 @dataclass(frozen=True, eq=False)
-class Request:
-    """What to trace. number: given back with answers;  scene: a `SceneConfig`;  samples: a pixel;  mode: whose planes:
-    "colour" asks for paths, the others for labels;  models: see `numbered`"""
+class TraceRequest:
+    """What to trace."""
 
-    number: int
-    scene: Any
+    number: int  #: given back with answers
+    scene: Any  #: a `SceneConfig`
     camera: Camera
     sun: Sun
-    samples: int
-    mode: str
-    models: Sequence[int] = ()
+    samples: int  #: a pixel
+    mode: str  #: whose planes: "colour" asks for paths, the others for labels
+    models: Sequence[int] = ()  #: see `model_ids`
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """planes: of all samples so far, None where `error` says in a sentence why there are none;  samples: a pixel, so
-    far;  done: nothing more comes"""
+class TraceResult:
+    """A path-traced picture, or why there is none."""
 
     number: int
-    planes: Planes | None
-    samples: int
-    done: bool
+    planes: Planes | None  #: of all samples so far, None where `error` says in a sentence why there are none
+    samples: int  #: a pixel, so far
+    done: bool  #: nothing more comes
     error: str = ""
 
 
@@ -55,13 +53,13 @@ class Tracer:
         self._scene: Any = None
         self._renderer: Any = None
 
-    def answers(self, request: Request) -> Iterator[Answer]:
+    def answers(self, request: TraceRequest) -> Iterator[TraceResult]:
         """One answer after another, each of more samples than the one before."""
         renderer = self._loaded(request.scene)
         camera, sun, config = request.camera, request.sun, request.scene.camera
         if request.mode not in ("colour", "ellipsoids", "accumulation"):
             labels = renderer.labels(camera, sun)
-            yield Answer(request.number, _label_planes(labels, request.models), 1, True)
+            yield TraceResult(request.number, _label_planes(labels, request.models), 1, True)
             return
         total, weight, done = 0.0, 0.0, 0
         while done < request.samples:
@@ -69,7 +67,7 @@ class Tracer:
             total, weight, done = total + radiance.astype(np.float64), weight + alpha.astype(np.float64), done + PASS
             share = PASS / done
             planes = _picture(np.asarray(total) * share, np.asarray(weight) * share, config)
-            yield Answer(request.number, planes, done, done >= request.samples)
+            yield TraceResult(request.number, planes, done, done >= request.samples)
 
     def _loaded(self, scene: Any) -> Any:
         if self._renderer is None or scene != self._scene:
@@ -84,14 +82,14 @@ class Tracer:
 def _picture(radiance: np.ndarray, alpha: np.ndarray, config: Any) -> Planes:
     """As the data's pictures are, over black, without a sensor's noise. config: a `CameraConfig`"""
     if config.sensor is not None:  # which records what is over black
-        rgb = displayed(config.exposure * radiance, config.tone)
+        rgb = display_values(config.exposure * radiance, config.tone)
     else:
         straight = radiance / np.where(alpha > 0, alpha, 1)[..., None]
-        rgb = displayed(config.exposure * straight, config.tone) * alpha[..., None]
+        rgb = display_values(config.exposure * straight, config.tone) * alpha[..., None]
     return Planes(alpha.astype(np.float32), rgb=rgb.astype(np.float32))
 
 
-def numbered(objects: np.ndarray, models: Sequence[int]) -> np.ndarray:
+def model_ids(objects: np.ndarray, models: Sequence[int]) -> np.ndarray:
     """Numbers of objects [H, W] as those of the models that they are part of. models: of each object the number of its
     model, from 1; nothing where they are the same"""
     return np.array([0, *models], objects.dtype).take(objects, mode="clip") if models else objects
@@ -104,13 +102,13 @@ def _label_planes(labels: dict[str, np.ndarray], models: Sequence[int]) -> Plane
         depth=labels["depth"],
         visibility=labels["sun_visibility"],
         normal=labels["normal"],
-        object_id=numbered(labels["object_id"], models),
+        object_id=model_ids(labels["object_id"], models),
     )
 
 
 def _work(connection: Connection) -> None:
     """What the process does."""
-    inbox, tell = linked(connection)
+    inbox, tell = connect_to_parent(connection)
     name, threads = inbox.get()
     with suppress(OSError, AttributeError):
         os.nice(NICENESS)
@@ -132,7 +130,7 @@ def _work(connection: Connection) -> None:
                     break
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            tell(Answer(request.number, None, 0, True, reason))
+            tell(TraceResult(request.number, None, 0, True, reason))
 
 
 def main(socket: int) -> None:

@@ -22,12 +22,12 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
-from spacesim.viewer.paint import Bytes, Planes
-from spacesim.viewer.state import Stand, View
-from spacesim.viewer.truth.tracer import Answer, Request, numbered
+from spacesim.viewer.drawing.paint import Bytes, Planes
+from spacesim.viewer.state import SceneState, ViewerCamera
+from spacesim.viewer.truth.tracer import TraceRequest, TraceResult, model_ids
 
-SIDE = 512  #: pixels of the longer side of what is path-traced, at most; chosen
-SAME_DIRECTION = 1e-4  #: radians between two Suns or two axes that count as one, chosen
+SIDE = 512  #: pixels of the longer side of what is path-traced, at most
+SAME_DIRECTION = 1e-4  #: radians between two Suns or two axes that count as one
 PATIENCE = 2.0  #: seconds in which the process has gone that is told to go
 _START = "import sys; from spacesim.viewer.truth import tracer; tracer.main(int(sys.argv[1]))"
 _ROOT = str(Path(__file__).parents[3])
@@ -37,14 +37,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """planes: what is true;  camera: of these planes;  source: what they are, in words"""
+    """The truth of a view."""
 
-    planes: Planes
-    camera: Camera
-    source: str
+    planes: Planes  #: what is true
+    camera: Camera  #: of these planes
+    source: str  #: what they are, in words
 
 
-def frame_at(dataset: Dataset, view: View, stand: Stand) -> int | None:
+def matching_frame(dataset: Dataset, view: ViewerCamera, state: SceneState) -> int | None:
     """Number of the dataset's frame that a view stands at, under its Sun; None for none."""
     pose = view.world_from_camera
     for number, frame in enumerate(dataset.frames):
@@ -54,17 +54,17 @@ def frame_at(dataset: Dataset, view: View, stand: Stand) -> int | None:
             continue
         if np.abs(pose[:3, :3] - other[:3, :3]).max() > 10 * SAME_DIRECTION:
             continue
-        if frame.sun is None or stand.sun is None or _near(frame.sun.direction, stand.sun.direction):
+        if frame.sun is None or state.sun is None or _near(frame.sun.direction, state.sun.direction):
             return number
     return None
 
 
-def _near(one: np.ndarray, other: np.ndarray) -> bool:
-    return float(np.linalg.norm(one - other)) < SAME_DIRECTION
+def _near(first: np.ndarray, second: np.ndarray) -> bool:
+    return float(np.linalg.norm(first - second)) < SAME_DIRECTION
 
 
 def stored_truth(dataset: Dataset, number: int, mode: str, models: Sequence[int] = ()) -> Truth | None:
-    """What the dataset holds of a frame for a mode; None where it does not. models: see `numbered`"""
+    """What the dataset holds of a frame for a mode; None where it does not. models: see `model_ids`"""
     frame = dataset.frames[number]
     source = f"the dataset's frame {number}"
     try:
@@ -86,11 +86,11 @@ def _labels(dataset: Dataset, frame: Frame, models: Sequence[int]) -> Planes:
         depth=truth.depth,
         visibility=truth.sun_visibility,
         normal=truth.normal,
-        object_id=numbered(truth.object_id, models),
+        object_id=model_ids(truth.object_id, models),
     )
 
 
-def fitted(picture: Bytes, source: Camera, target: Camera, smooth: bool = True) -> tuple[Bytes, NDArray[np.bool_]]:
+def resample(picture: Bytes, source: Camera, target: Camera, smooth: bool = True) -> tuple[Bytes, NDArray[np.bool_]]:
     """(picture [H, W, 3], where it is known [H, W]) as camera `target` sees what `picture` [h, w, 3] shows, which
     camera `source` took at the same place in the same direction. smooth: colours may be mixed"""
     size = (picture.shape[1] / source.width, picture.shape[0] / source.height)
@@ -106,23 +106,23 @@ def fitted(picture: Bytes, source: Camera, target: Camera, smooth: bool = True) 
     return np.asarray(image), within_y[:, None] & within_x[None, :]
 
 
-class TruthDesk:
+class TraceQueue:
     """Takes requests of clients to the process that traces, one after another; a client's newest counts.
 
     deliver: told (client, answer), on a thread of its own
     """
 
-    def __init__(self, deliver: Callable[[Hashable, Answer], None]) -> None:
+    def __init__(self, deliver: Callable[[Hashable, TraceResult], None]) -> None:
         self._deliver = deliver
-        self._waiting: OrderedDict[Hashable, Request] = OrderedDict()
-        self._running: tuple[Hashable, Request] | None = None
+        self._waiting: OrderedDict[Hashable, TraceRequest] = OrderedDict()
+        self._running: tuple[Hashable, TraceRequest] | None = None
         self._lock = threading.RLock()
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
         self._count = 0
         self._stopped = False
 
-    def ask(self, client: Hashable, request: Request) -> int:
+    def ask(self, client: Hashable, request: TraceRequest) -> int:
         """Trace for a client, instead of what it asked for before. Returns the number that answers bear."""
         with self._lock:
             self._count += 1
@@ -169,7 +169,7 @@ class TruthDesk:
         self._send(request)
         return True
 
-    def _send(self, request: Request | None) -> None:
+    def _send(self, request: TraceRequest | None) -> None:
         if self._connection is not None:
             with suppress(OSError, ValueError):  # where it is dead, the listener says so
                 self._connection.send(request)
@@ -214,6 +214,6 @@ class TruthDesk:
         code = process.wait()
         if running is not None:
             reason = f"the process that traces ended (code {code})"
-            self._deliver(running[0], Answer(running[1].number, None, 0, True, reason))
+            self._deliver(running[0], TraceResult(running[1].number, None, 0, True, reason))
         with self._lock:
             self._pump()

@@ -94,7 +94,13 @@ def test_empty_mask_is_none(pictures):
 
 def test_equal_pictures(pictures):
     _, truth = pictures
-    assert [metric(truth, truth) for metric in METRICS] == [0, 0, None, pytest.approx(1), 0]
+    assert [metric(truth, truth) for metric in METRICS] == [0, 0, 100, pytest.approx(1), 0]
+
+
+@pytest.mark.parametrize(("error", "decibels"), [(1e-4, 80), (1.01e-5, 99.913573), (0.99e-5, 100), (1e-9, 100)])
+def test_psnr_ends_at_a_hundred(error, decibels):
+    truth = np.full((6, 7, 3), 0.25)
+    assert image.psnr(truth + error, truth) == pytest.approx(decibels, abs=1e-6)
 
 
 def test_picture_smaller_than_the_window_has_no_ssim():

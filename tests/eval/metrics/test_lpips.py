@@ -120,7 +120,7 @@ def test_no_weights_is_none_and_a_sentence(monkeypatch, tmp_path):
     location, sentence = lpips.find_weights()
     assert location is None
     assert "alex.pth" in sentence
-    assert "--lpips-weights" in sentence
+    assert "lpips_weights" in sentence
     assert lpips.load()[0] is None
 
 
@@ -132,7 +132,7 @@ def test_no_torch_is_none_and_a_sentence(monkeypatch, single_file):
 
 
 def test_named_weights_must_be_there(tmp_path):
-    with pytest.raises(InputError, match=r"--lpips-weights .*found no alexnet"):
+    with pytest.raises(InputError, match=r"lpips_weights: .*found no alexnet"):
         lpips.find_weights(tmp_path)
 
 

@@ -14,6 +14,7 @@ from PIL import Image
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
 from spacesim.eval.evaluate import evaluate
+from spacesim.eval.labels import IMAGE, LOWER, Metric
 from spacesim.eval.metrics.shadow import KINDS
 from spacesim.eval.report import charts
 from spacesim.eval.report.write import write_report
@@ -103,6 +104,15 @@ def test_numbers_are_there(folder):
         assert note in text
 
 
+def test_map_of_the_training_cameras(folder, lit, tmp_path):
+    """Of the run that was trained on one frame; runs with the same map show it once; without training frames, none."""
+    assert not (folder / "camera_density.png").exists()
+    assert "Training cameras" not in page_of(folder).text
+    page = page_of(lit, another(lit, "again", lambda metrics: metrics.update(run="runs/again")))
+    assert "Training cameras" in page.text
+    assert [alt for alt in page.values("img", "alt") if "density" in alt] == ["Camera density, fake, again"]
+
+
 @pytest.fixture
 def lit(relightable, tmp_path, monkeypatch):
     """An EVAL folder of a run that predicts visibility, under a known Sun and one never seen."""
@@ -141,6 +151,16 @@ def test_known_and_unseen_suns_have_tables_of_their_own(lit):
             pooled = f" pooled {value['pooled']:.4f}" if group == "shadow_mask" else ""
             assert cells[label] == f"{value['mean']:.4f} ± {value['std']:.4f}{pooled}"
     assert found["Suns never seen in training: 2 views, 1 Sun"][1][2] == "0.4321 ± 0.0123"
+
+
+def test_a_metric_that_is_appended_takes_the_place_of_none(lit, monkeypatch):
+    """In the cards and in the tables by Suns, which show FLIP where no run has LPIPS."""
+    before = page_of(lit)
+    assert any("FLIP" in part for part in before.text)
+    new = Metric("new", "Appended", "", LOWER, 4, "A metric of a later version.")
+    for module in ("write", "tables"):
+        monkeypatch.setattr(f"spacesim.eval.report.{module}.IMAGE", (*IMAGE, new))
+    assert page_of(lit).text == before.text
 
 
 def test_errors_by_grazing_angle_are_there(lit):

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.store import FrameWriter, read_points, verify_dataset
+from spacesim.data.store import FrameWriter, find_unreadable_files, read_points
 from spacesim.scenes import build, generate, read_scene
+from spacesim.scenes.cameras.sensor import SensorConfig
 from spacesim.scenes.generation.generate import estimate
-from spacesim.scenes.sensor import SensorConfig
 
 SMALL = {"views": 4, "test_views": 2, "resolution": (24, 24), "spp": 4, "points": 300}
 
@@ -35,7 +35,7 @@ def made(tmp_path_factory) -> Path:
 
 
 def test_dataset_is_whole(made):
-    assert verify_dataset(made) == []
+    assert find_unreadable_files(made) == []
     files = set(contents(made))
     top = {"transforms.json", "scene.json", "mesh.ply", "points.ply", "contact_sheet.png", "camera_density.png"}
     top |= {"SHA256SUMS"}
@@ -63,7 +63,7 @@ def test_scene_json_holds_what_renders_it_again(made):
     assert [part["id"] for part in scene["parts"]] == list(range(1, len(scene["parts"]) + 1))
 
 
-def test_points_lie_on_the_surface_and_have_its_colours(made):
+def test_points_lie_on_the_surface_and_have_its_colors(made):
     points, colors = read_points(made / "points.ply")
     mesh = build(boxsat()).mesh
     assert points.shape == (300, 3)
@@ -99,12 +99,12 @@ def test_resume_gives_the_same_bytes(made, tmp_path):
 def test_a_damaged_file_is_not_whole(made, tmp_path, victim, damage):
     root = tmp_path / "data"
     shutil.copytree(made, root)
-    assert FrameWriter(root).has("train_00001")
+    assert FrameWriter(root).has_frame("train_00001")
     whole = (root / victim).read_bytes()
     # a power cut can leave the size without the bytes: zeros in the last block
     bad = {"cut": whole[:-1], "empty": b"", "zeros": bytes(len(whole)), "longer": whole + b"\0"}
     (root / victim).write_bytes(bad[damage])
-    assert not FrameWriter(root).has("train_00001")
+    assert not FrameWriter(root).has_frame("train_00001")
     generate(boxsat(), root, resume=True)
     assert (root / victim).read_bytes() == whole
 
@@ -112,7 +112,7 @@ def test_a_damaged_file_is_not_whole(made, tmp_path, victim, damage):
 def test_the_headers_of_a_large_exr_are_found_beyond_the_first_block(tmp_path):
     """Tall pictures have chunk tables longer than the block that is read first."""
     from spacesim.data.images import write_exr
-    from spacesim.data.integrity import is_whole
+    from spacesim.data.integrity.whole import is_whole
 
     path = tmp_path / "tall.exr"
     write_exr(path, dict.fromkeys(("depth", "alpha"), np.zeros((16 * 10_000, 1), np.float32)))
@@ -137,7 +137,7 @@ def test_killed_run_is_completed(tmp_path):
         os.kill(process.pid, signal.SIGKILL)
         process.communicate()
     assert not (root / "transforms.json").exists()
-    assert verify_dataset(root) != []
+    assert find_unreadable_files(root) != []
     generate(config, root, resume=True)
     generate(config, tmp_path / "whole")
     assert contents(root) == contents(tmp_path / "whole")
@@ -199,7 +199,7 @@ def test_bad_scene_folder_and_camera_are_refused(made, tmp_path):
     with pytest.raises(InputError, match="workers: expected at least 1, found 0"):
         generate(boxsat(), tmp_path / "b", workers=0)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(InputError, match="--resume"):
+    with pytest.raises(InputError, match="resume: expected"):
         generate(boxsat(), made)
     with pytest.raises(InputError, match="'spp' differs"):
         generate(boxsat(spp=5), made, resume=True)

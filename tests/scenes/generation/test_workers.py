@@ -15,8 +15,8 @@ import pytest
 from spacesim.data.errors import InputError, WorkError
 from spacesim.scenes import generate, read_scene
 from spacesim.scenes.generation import workers
-from spacesim.scenes.generation.frames import FrameMaker, Job, Shot, writing_threads
-from spacesim.scenes.generation.generate import _Sweep
+from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, writing_threads
+from spacesim.scenes.generation.generate import _DatasetPlan
 from spacesim.scenes.generation.workers import make_in_processes
 
 OPTIONS = {"views": 60, "test_views": 0, "resolution": (24, 24), "spp": 4, "points": 100}
@@ -36,9 +36,9 @@ def whole(tmp_path_factory) -> dict[str, bytes]:
 
 
 @pytest.fixture
-def job(tmp_path) -> tuple[Job, list[Shot]]:
-    sweep = _Sweep(read_scene("boxsat", **{**OPTIONS, "views": 6}))
-    return replace(sweep.job, root=tmp_path), sweep.shots
+def job(tmp_path) -> tuple[Job, list[FrameSpec]]:
+    sweep = _DatasetPlan(read_scene("boxsat", **{**OPTIONS, "views": 6}))
+    return replace(sweep.job, root=tmp_path), sweep.specs
 
 
 def workers_of(parent: int) -> list[int]:
@@ -110,25 +110,25 @@ def test_workers_end_with_their_parent_and_resume_completes(whole, tmp_path, end
 
 
 def test_frames_that_kill_every_process_end_in_a_sentence(job, monkeypatch):
-    work, shots = job
+    work, specs = job
     monkeypatch.setattr("spacesim.scenes.generation.workers.sys.executable", "/bin/false")
-    with pytest.raises(WorkError, match=r"train_00000 to train_00000: 3 processes ended .* code 1.* --workers"):
-        list(make_in_processes(work, shots, 1))
+    with pytest.raises(WorkError, match=r"train_00000 to train_00000: 3 processes ended .* code 1.* fewer workers"):
+        list(make_in_processes(work, specs, 1))
 
 
 def test_an_error_in_a_worker_is_told_as_it_is(job, tmp_path):
-    work, shots = job
+    work, specs = job
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(InputError, match=r"file/data/.*cannot be written"):
-        list(make_in_processes(replace(work, root=tmp_path / "file/data"), shots, 2))
+        list(make_in_processes(replace(work, root=tmp_path / "file/data"), specs, 2))
 
 
 def test_frames_that_are_whole_are_not_rendered_again(job, monkeypatch):
-    work, shots = job
+    work, specs = job
     maker = FrameMaker(work)
-    assert list(maker.make(shots)) == [shot.name for shot in shots]
+    assert list(maker.make(specs)) == [spec.name for spec in specs]
     monkeypatch.setattr(maker, "_renderer", None)
-    assert list(maker.make(shots)) == [shot.name for shot in shots]
+    assert list(maker.make(specs)) == [spec.name for spec in specs]
 
 
 class _Obliging:
@@ -137,8 +137,8 @@ class _Obliging:
     def __init__(self) -> None:
         self.answers: list[str | None] = [None]
 
-    def send(self, shots: list[Shot]) -> None:
-        self.answers += [*(shot.name for shot in shots), None]
+    def send(self, specs: list[FrameSpec]) -> None:
+        self.answers += [*(spec.name for spec in specs), None]
 
     def recv(self) -> str | None:
         return self.answers.pop(0)
@@ -147,7 +147,7 @@ class _Obliging:
 @pytest.mark.parametrize("count", [2, 3, 5])
 def test_several_processes_may_ask_at_once_when_few_tasks_are_left(job, monkeypatch, count):
     def start(_job: Job, task: Any, *_: int) -> workers._Worker:
-        return workers._Worker(None, _Obliging(), task, [task.shots])
+        return workers._Worker(None, _Obliging(), task, [task.specs])
 
     def all_that_spoke(connections: list[_Obliging]) -> list[_Obliging]:
         spoke = [connection for connection in connections if connection.answers]
@@ -157,8 +157,8 @@ def test_several_processes_may_ask_at_once_when_few_tasks_are_left(job, monkeypa
     monkeypatch.setattr(workers, "_start", start)
     monkeypatch.setattr(workers, "_stop", lambda _workers: None)
     monkeypatch.setattr(workers, "wait", all_that_spoke)
-    work, shots = job
-    assert sorted(make_in_processes(work, shots, count)) == sorted(shot.name for shot in shots)
+    work, specs = job
+    assert sorted(make_in_processes(work, specs, count)) == sorted(spec.name for spec in specs)
 
 
 def test_threads_are_shared_among_processes(monkeypatch):

@@ -12,9 +12,9 @@ import spacesim  # noqa: F401
 from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb
+from spacesim.scenes.lights.sun import SOLAR_IRRADIANCE
 from spacesim.scenes.materials import spectra, textures
 from spacesim.scenes.materials import table as m
-from spacesim.scenes.sun import SOLAR_IRRADIANCE
 
 NAMES = m.material_names()
 SPECTRAL = [name for name in NAMES if m.material(name).reflectance]
@@ -45,9 +45,9 @@ def radiance(scene: Any, origins: np.ndarray, directions: np.ndarray, max_depth:
     sampler.seed(seed, len(origins))
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 100})
     ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T)))
-    colour, _, _ = integrator.sample(scene, sampler, ray)
-    dr.eval(colour)
-    return colour.numpy().T
+    color, _, _ = integrator.sample(scene, sampler, ray)
+    dr.eval(color)
+    return color.numpy().T
 
 
 def rectangle(material: m.Material, to_world: Any) -> dict[str, Any]:
@@ -88,7 +88,7 @@ def test_white_furnace(angle_deg):
         tolerance = (0.16 if name.endswith("mli") else 0.07) if angle_deg else 0.015  # tilted facets lose more
         np.testing.assert_allclose(seen[name], m.material(name).albedo, rtol=tolerance, atol=0.003, err_msg=name)
     for name in ("white-paint", "carbon-fibre", "kapton", "glass"):  # a diffuse base and its coat's Fresnel
-        coat = ((m.preset(name).ior - 1) / (m.preset(name).ior + 1)) ** 2
+        coat = ((m.material_preset(name).ior - 1) / (m.material_preset(name).ior + 1)) ** 2
         if not angle_deg:
             np.testing.assert_allclose(seen[name], coat + np.array(m.material(name).albedo), atol=0.015, err_msg=name)
 
@@ -158,7 +158,7 @@ def spectral_and_rgb() -> dict[str, np.ndarray]:
     spectral = np.zeros((2, len(names), 3))
     for k in range(0, len(GRID), 3):  # three wavelengths a render, one in each channel
         values = [spectra.reflectance_at(m.material(name).reflectance, GRID[k : k + 3]) for name in names]
-        found = groove([m.customised(f"at {k}", n, albedo=tuple(v)) for n, v in zip(names, values, strict=True)])
+        found = groove([m.customise(f"at {k}", n, albedo=tuple(v)) for n, v in zip(names, values, strict=True)])
         spectral += np.einsum("bmk,kc->bmc", np.stack(found), weights[k : k + 3])
     rgb = np.stack(groove([m.material(name) for name in names]))
     return {name: np.stack([spectral[:, i], rgb[:, i]], axis=1) for i, name in enumerate(names)}
@@ -172,7 +172,7 @@ def difference(pair: np.ndarray) -> float:
 
 
 SATURATED = {"gold-mli": (0.10, 0.125), "kapton": (0.05, 0.06)}
-"""Where two bounces differ by more than 3 %, as docs/materials.md says: within these bounds."""
+"""Where two bounces differ by more than 3 %, as docs/reference/models-and-materials.md says: within these bounds."""
 
 
 @pytest.mark.parametrize("name", SPECTRAL)
@@ -188,7 +188,7 @@ def test_rgb_rendering_agrees_with_spectral_rendering(name, spectral_and_rgb):
 @pytest.mark.parametrize("name", SPECTRAL)
 def test_albedo_and_absorptance_follow_from_the_spectrum(name):
     """Of a coated surface the spectrum is the base's below its coat, which reflects ((n - 1) / (n + 1))^2 more."""
-    row = m.preset(name)
+    row = m.material_preset(name)
     np.testing.assert_allclose(spectra.albedo_rgb(row.spectrum), row.albedo, atol=1e-3)
     coat = ((row.ior - 1) / (row.ior + 1)) ** 2 if row.ior else 0.0
     wavelengths, values = np.array(row.spectrum).T
@@ -260,15 +260,15 @@ def test_cells_show_a_grid():
 
 
 def test_customised_presets():
-    red = m.customised("wing", "white-paint", albedo=(0.5, 0.1, 0.1), roughness=0.2)
+    red = m.customise("wing", "white-paint", albedo=(0.5, 0.1, 0.1), roughness=0.2)
     assert red.name == "wing"
     assert red.albedo == (0.5, 0.1, 0.1)
     assert red.bsdf["roughness"] == pytest.approx(0.2**0.5)
     assert red.reflectance == ()
     assert "albedo, roughness" in red.source
-    assert m.customised("same", "gold-mli").bsdf == m.material("gold-mli").bsdf
-    assert m.customised("large", "gold-mli", tile=2.0).tile == 2.0
-    white = m.customised("white cells", "solar-cell", albedo=(0.5, 0.5, 0.5))
+    assert m.customise("same", "gold-mli").bsdf == m.material("gold-mli").bsdf
+    assert m.customise("large", "gold-mli", tile=2.0).tile == 2.0
+    white = m.customise("white cells", "solar-cell", albedo=(0.5, 0.5, 0.5))
     assert white.albedo[0] > 0.4
     for bad, message in (
         ({"albedo": (1.2, 0, 0)}, "material x: albedo: expected numbers from 0 to 1, found 1.2, 0, 0"),
@@ -278,7 +278,19 @@ def test_customised_presets():
         ({"albedo": (0.5, 0.91, 0.5)}, "material x: albedo: expected at most 0.9 for white-paint, .*, found 0.91"),
     ):
         with pytest.raises(InputError, match=message):
-            m.customised("x", "white-paint", **bad)
+            m.customise("x", "white-paint", **bad)
+
+
+def test_a_row_of_another_kind_is_refused(monkeypatch, tmp_path):
+    """A mistyped kind would else be Lambertian; and the table's own coats are no whiter than what is checked above."""
+    rows = [m.material_preset(name) for name in m.material_names()]
+    assert max(max(row.albedo) for row in rows if row.kind == "coated") <= m.WHITEST
+    table = tmp_path / "materials.toml"
+    table.write_text('[foil]\nkind = "metall"\nsource = "chosen"\nalbedo = [0.5, 0.5, 0.5]\nroughness = 0.2\n')
+    monkeypatch.setattr(m, "TABLE", table)
+    message = "materials.toml: foil: kind: expected one of diffuse, coated, metal, found 'metall'"
+    with pytest.raises(InputError, match=message):
+        m._table.__wrapped__()
 
 
 def test_principled_multiplies_images_by_factors():

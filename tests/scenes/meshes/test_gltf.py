@@ -13,6 +13,7 @@ from PIL import Image
 
 from spacesim import backend
 from spacesim.backend import memory
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb
 from spacesim.scenes.materials.table import principled
@@ -410,8 +411,8 @@ def reflected(bsdf: dict) -> np.ndarray:
     rng = np.random.default_rng(0).random((3, count * each)).astype(np.float32)
     hit = mi.SurfaceInteraction3f()
     hit.t, hit.n, hit.sh_frame = mi.Float(1.0), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
-    hit.wi = mi.Vector3f(mi.Float(np.sqrt(1 - cosine**2)), 0, mi.Float(cosine))
-    weight = loaded.sample(mi.BSDFContext(), hit, mi.Float(rng[0]), mi.Point2f(mi.Float(rng[1]), mi.Float(rng[2])))[1]
+    hit.wi = mi.Vector3f(upload(np.sqrt(1 - cosine**2)), 0, upload(cosine))
+    weight = loaded.sample(mi.BSDFContext(), hit, upload(rng[0]), mi.Point2f(upload(rng[1]), upload(rng[2])))[1]
     return np.array(weight)[0].reshape(count, each).mean(axis=1)
 
 

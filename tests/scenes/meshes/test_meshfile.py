@@ -215,13 +215,13 @@ def test_sides_and_materials_of_a_scene_file(tmp_path, caplog):
     assert {"cells", "paint"} <= set(re.split(r"\W+", said.split("base colours")[1].split("\n")[0]))
     some, said = built(f"mesh = 'sat.obj'\nmaterials = {{ '{names[0]}' = 'kapton' }}")
     assert (some[0].name, some[1].name) == ("kapton", both[1].name)
-    judged = said.split("base colours")[1].split("\n")[0]
-    assert both[1].name.split("/")[1] in judged
-    assert both[0].name.split("/")[1] not in judged
+    evaluated = said.split("base colours")[1].split("\n")[0]
+    assert both[1].name.split("/")[1] in evaluated
+    assert both[0].name.split("/")[1] not in evaluated
     assert "base colours" not in built("mesh = 'sat.obj'\nmaterials = { '*' = 'kapton' }")[1]
 
 
-def test_colours_of_a_ply_become_their_mean(tmp_path):
+def test_colors_of_a_ply_become_their_mean(tmp_path):
     mesh = box()
     mesh.visual.vertex_colors = np.array([[255, 0, 100, 255], [255, 255, 100, 255]] * 4, dtype=np.uint8)
     craft, report = read_mesh(saved(mesh, tmp_path / "painted.ply"))
@@ -301,7 +301,7 @@ def test_latin_1_is_read_as_well_as_utf_8(tmp_path):
         ("newmtl cells\nKd 1 0 0\nmap_Kd words.png\nnewmtl paint\nKd 0 0 1\n", "decoded"),
     ],
 )
-def test_obj_without_its_texture_keeps_the_colour_and_says_so(tmp_path, mtl, said):
+def test_obj_without_its_texture_keeps_the_color_and_says_so(tmp_path, mtl, said):
     (tmp_path / "sat").mkdir()
     (tmp_path / "sat" / "words.png").write_text("no picture")
     Image.new("RGB", (2, 2)).save(tmp_path / "secret.png")

@@ -7,36 +7,37 @@ import drjit as dr
 import numpy as np
 from splats import random_splats
 
-from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
+from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.encoding import Encoding
-from spacesim.splat.light.field import FieldConfig
+from spacesim.splat.light.field import DirectionsConfig, FieldConfig, SurfaceConfig
 from spacesim.splat.light.model import LightModel, TrainingFrame
-from spacesim.splat.light.shading import LightConfig
-from spacesim.splat.light.shadow.cast import ShadowConfig
+from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig
 from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.light.shadow.refine import RefineConfig
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 
-FIELD = FieldConfig(features=5, width=12, layers=3, sun=Encoding("harmonics", 2), view=Encoding("harmonics", 2))
+TOLD = {"sun": Encoding("harmonics", 2), "view": Encoding("harmonics", 2)}
+FIELD = FieldConfig(features=5, width=12, layers=3, inputs=DirectionsConfig(**TOLD))
 REFINE = RefineConfig(features=3, width=8, sun=Encoding("harmonics", 1))
-MAP = ShadowConfig("mapping", 64, refine=REFINE)
+MAP = ShadowConfig(MappingConfig(), 64, refine=REFINE)
 CONFIGS = {
     "relight": LightConfig(FIELD),
     "map": LightConfig(FIELD, MAP),
-    "splat": LightConfig(FIELD, ShadowConfig("splatting", 64, refine=REFINE)),
+    "splat": LightConfig(FIELD, ShadowConfig(SplattingConfig(), 64, refine=REFINE)),
     "linear": LightConfig(FIELD, MAP, linear=True),
     "surface": LightConfig(  # shadows as in `fast`
-        replace(FIELD, features=7, surface=True),
-        replace(MAP, bias=5.0, grazing="both", size=96, mapping=MappingConfig("median")),
+        replace(FIELD, features=7, inputs=SurfaceConfig(**TOLD)),
+        replace(MAP, bias=5.0, grazing="both", size=96, method=MappingConfig("median")),
     ),
-    "bounce": LightConfig(replace(FIELD, features=7, surface=True), replace(MAP, size=96), bounce=20),
+    "bounce": LightConfig(replace(FIELD, features=7, inputs=SurfaceConfig(**TOLD)), replace(MAP, size=96), bounce=20),
     "park": LightConfig(
         FIELD,
         ShadowConfig(
-            "splatting", 64, bias=0.0, refine=replace(REFINE, positions="world", positional=2, bias_info=False)
+            SplattingConfig(), 64, bias=0.0, refine=replace(REFINE, positions="world", positional=2, bias_info=False)
         ),
     ),
 }
@@ -52,7 +53,7 @@ def made_run(method: str, seed: int = 0, count: int = 80, degree: int = 2, antia
     light_config, rng = CONFIGS[method], np.random.default_rng(seed)
     arrays |= {"sh": np.zeros((count, 0, 3)), "features": rng.normal(size=(count, light_config.features))}
     light = LightModel.initial(light_config, TrainingFrame(np.array([0.1, 0.0, -0.1]), 1.5, 4.0, 1.0), seed)
-    light.weights = [ad.Float(np.array(w) + 0.3 * rng.normal(size=dr.width(w))) for w in light.weights]
+    light.weights = [upload(np.array(w) + 0.3 * rng.normal(size=dr.width(w))) for w in light.weights]
     return Run(Path(f"runs/{method}{seed}"), config, {}, Gaussians.from_numpy(arrays), 1000, light)
 
 

@@ -12,19 +12,19 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose import (
+    CameraView,
     ComposeConfig,
     Composition,
     Keyframe,
     Orbit,
-    Placed,
+    PlacedRun,
     Pose,
     PosedScene,
-    View,
     load_scene,
     save_scene,
     scenefile,
 )
-from spacesim.splat.compose.path import Track, view_between
+from spacesim.splat.compose.path import Track, interpolate_view
 from spacesim.splat.compose.pose import rotation_about
 from spacesim.splat.run import Run
 
@@ -45,7 +45,7 @@ def runs(monkeypatch):
             raise InputError(f"{path}: expected a run of `spacesim train`, found no config.json in it")
         if name not in made:
             run = RUNS[name]()
-            made[name] = Run(Path(path), run.config, run.training, run.model, run.bytes, run.light)
+            made[name] = Run(Path(path), run.config, run.training, run.gaussians, run.model_bytes, run.light)
         return made[name]
 
     monkeypatch.setattr(scenefile, "load_run", load)
@@ -74,7 +74,7 @@ def test_a_whole_scene(tmp_path):
     assert scene.camera.fx == pytest.approx(20 / np.tan(np.radians(30)))
     np.testing.assert_allclose(scene.camera.world_from_camera, look_at([4, 0, 1], [0, 0, 0]))
     assert (scene.frames, scene.fps) == (1, 24)
-    shot = scene.shot(0)
+    shot = scene.frame(0)
     assert shot.camera is scene.camera
     assert shot.composition.predict(shot.camera, shot.sun).rgb.shape == (32, 40, 3)
 
@@ -92,7 +92,7 @@ def test_cameras_of_other_kinds(tmp_path, small_dataset):
     )
     assert scene.frames == 120
     for k, azimuth in ((0, 0.0), (60, -90.0)):
-        place = scene.shot(k).camera
+        place = scene.frame(k).camera
         offset = place.position - [0, 0, 1]
         expected = 5 * Sun.from_angles(azimuth, 20).direction
         np.testing.assert_allclose(offset, expected, atol=1e-9)
@@ -111,13 +111,13 @@ def test_keyframes(tmp_path):
         "[[keyframes]]\ntime = 1.5\n[keyframes.sun]\nazimuth_deg = 90\nelevation_deg = 0\n",
     )
     assert scene.frames == 37  # 1.5 s at 24 a second, both ends
-    half = scene.shot(12)
+    half = scene.frame(12)
     old = half.composition.models[1].pose
     np.testing.assert_allclose(old.translation, [1, 0, 0])
     np.testing.assert_allclose(old.rotation, rotation_about([0, 0, 1], 45), atol=1e-12)
     assert old.scale == pytest.approx(2)
     np.testing.assert_allclose(half.sun.angles, (0, 0), atol=1e-9)
-    np.testing.assert_allclose(scene.shot(24).sun.angles, (45, 0), atol=1e-9)
+    np.testing.assert_allclose(scene.frame(24).sun.angles, (45, 0), atol=1e-9)
     np.testing.assert_allclose(half.camera.position, [8, 0, 1])  # the only keyframe with a camera
     assert half.composition.models[0].pose.translation.tolist() == [0, 0, 0]
     assert scene.posed_at(1.0).models[1].pose.scale == pytest.approx(4)
@@ -128,9 +128,9 @@ def test_keyframes(tmp_path):
 def test_keyframes_zoom_as_the_camera_is_resized():
     """A field of view is one of the picture, however many pixels it has; between none and one it changes evenly."""
     camera = Camera.from_fov(look_at([5, 0, 0], [0, 0, 0]), 64, 48, 40)
-    near = View(camera.world_from_camera, None, (4 * camera.fx, 4 * camera.fy))
-    keys = [Keyframe(0.0, view=View(camera.world_from_camera)), Keyframe(1.0, view=near)]
-    scene = PosedScene(Composition([Placed(made_run("vanilla", 0), name="one")]), None, camera, keys)
+    near = CameraView(camera.world_from_camera, None, (4 * camera.fx, 4 * camera.fy))
+    keys = [Keyframe(0.0, view=CameraView(camera.world_from_camera)), Keyframe(1.0, view=near)]
+    scene = PosedScene(Composition([PlacedRun(made_run("vanilla", 0), name="one")]), None, camera, keys)
     small = scene.seen_by(Camera.from_fov(camera.world_from_camera, 16, 12, 40))
     for time, zoom in ((0.0, 1), (0.5, 2), (1.0, 4)):
         assert scene.at(time).camera.fx == pytest.approx(zoom * camera.fx)
@@ -138,28 +138,32 @@ def test_keyframes_zoom_as_the_camera_is_resized():
 
 
 def test_a_camera_between_two_keeps_its_target_in_the_middle():
-    one = View(look_at([4, 0, 0], [0, 0, 0]), np.zeros(3), (100, 100))
-    other = View(look_at([0, 4, 2], [0, 0, 1]), np.array([0, 0, 1.0]), (400, 400))
-    middle = view_between(one, other, 0.5)
+    one = CameraView(look_at([4, 0, 0], [0, 0, 0]), np.zeros(3), (100, 100))
+    other = CameraView(look_at([0, 4, 2], [0, 0, 1]), np.array([0, 0, 1.0]), (400, 400))
+    middle = interpolate_view(one, other, 0.5)
     np.testing.assert_allclose(middle.world_from_camera, look_at([2, 2, 1], [0, 0, 0.5]))
     assert middle.focal == pytest.approx((200, 200))
-    free = view_between(View(one.world_from_camera), other, 0.5)
+    free = interpolate_view(CameraView(one.world_from_camera), other, 0.5)
     np.testing.assert_allclose(free.world_from_camera[:3, 3], [2, 2, 1])
     assert np.linalg.det(free.world_from_camera[:3, :3]) == pytest.approx(1)
     for share, end in ((0.0, one), (1.0, other)):
-        np.testing.assert_allclose(view_between(one, other, share).world_from_camera, end.world_from_camera, atol=1e-12)
+        np.testing.assert_allclose(
+            interpolate_view(one, other, share).world_from_camera, end.world_from_camera, atol=1e-12
+        )
 
 
 def test_a_camera_between_two_keeps_its_target_where_other_things_are_up():
-    one = View.towards(np.array([4.0, 0, 0]), np.zeros(3), [0.0, 0, 2])
-    other = View.towards(np.array([0.0, 4, 2]), np.array([0.0, 0, 1]), [1.0, 0, 0])
+    one = CameraView.towards(np.array([4.0, 0, 0]), np.zeros(3), [0.0, 0, 2])
+    other = CameraView.towards(np.array([0.0, 4, 2]), np.array([0.0, 0, 1]), [1.0, 0, 0])
     for share in (0.25, 0.5, 0.75):
-        middle = view_between(one, other, share)
+        middle = interpolate_view(one, other, share)
         angle = 0.5 * np.pi * share  # from z to x, evenly
         expected = look_at([4 - 4 * share, 4 * share, 2 * share], [0, 0, share], [np.sin(angle), 0, np.cos(angle)])
         np.testing.assert_allclose(middle.world_from_camera, expected, atol=1e-12)
     for share, end in ((0.0, one), (1.0, other)):
-        np.testing.assert_allclose(view_between(one, other, share).world_from_camera, end.world_from_camera, atol=1e-12)
+        np.testing.assert_allclose(
+            interpolate_view(one, other, share).world_from_camera, end.world_from_camera, atol=1e-12
+        )
 
 
 def test_what_is_up_stands_in_the_file(tmp_path):
@@ -168,12 +172,12 @@ def test_what_is_up_stands_in_the_file(tmp_path):
         "[[keyframes]]\ntime = 1\ncamera = {position = [0, 4, 2], look_at = [0, 0, 1], up = [2, 0, 0]}\n"
     )
     scene = read(tmp_path, f"{HEAD}{SUN}{EYE}{keys}")
-    half = scene.shot(12).camera
+    half = scene.frame(12).camera
     np.testing.assert_allclose(half.world_from_camera, look_at([2, 2, 1], [0, 0, 0.5], [1, 0, 1]), atol=1e-12)
     save_scene(tmp_path / "saved.toml", scene)
     loaded = load_scene(tmp_path / "saved.toml")
     for k in (0, 5, 12, 24):
-        assert np.array_equal(loaded.shot(k).camera.world_from_camera, scene.shot(k).camera.world_from_camera)
+        assert np.array_equal(loaded.frame(k).camera.world_from_camera, scene.frame(k).camera.world_from_camera)
 
 
 def test_a_track_is_exact_at_its_keys():
@@ -185,13 +189,17 @@ def test_a_track_is_exact_at_its_keys():
 def whole_scene(tmp_path: Path) -> PosedScene:
     run = tmp_path / "runs"
     models = [
-        Placed(scenefile.load_run(run / "map"), Pose(rotation_about([1, 2, 3], 50), [0.1, 0.2, 0.3], 1.1), "first one"),
-        Placed(scenefile.load_run(run / "disc"), Pose([0.1, 0.7, -0.3, 0.2], [0.0, 0.4, 1.3], 0.7), "b.c"),
+        PlacedRun(
+            scenefile.load_run(run / "map"), Pose(rotation_about([1, 2, 3], 50), [0.1, 0.2, 0.3], 1.1), "first one"
+        ),
+        PlacedRun(scenefile.load_run(run / "disc"), Pose([0.1, 0.7, -0.3, 0.2], [0.0, 0.4, 1.3], 0.7), "b.c"),
     ]
     camera = Camera(seen_from([3, 1, 0.5]).world_from_camera, 33, 21, 40.25, 41.5, 16.1, 10.7)
     keys = [
-        Keyframe(0.0, Sun.from_angles(40, 30), View(camera.world_from_camera), {"b.c": models[1].pose}),
-        Keyframe(1 / 3, Sun(np.array([0.3, 0.2, 0.4])), View(look_at([0, 3, 0.2], [0, 0, 0]), np.zeros(3), (50.5, 51))),
+        Keyframe(0.0, Sun.from_angles(40, 30), CameraView(camera.world_from_camera), {"b.c": models[1].pose}),
+        Keyframe(
+            1 / 3, Sun(np.array([0.3, 0.2, 0.4])), CameraView(look_at([0, 3, 0.2], [0, 0, 0]), np.zeros(3), (50.5, 51))
+        ),
     ]
     composition = Composition(models, ComposeConfig("ratio"))
     return PosedScene(composition, Sun.from_angles(41.5, -12.25), camera, keys, None, 5, 12.5)
@@ -205,7 +213,7 @@ def test_a_saved_scene_gives_the_same_pictures_to_the_bit(tmp_path):
     assert 'run = "runs/map"' in (tmp_path / "saved.toml").read_text()
     assert (loaded.frames, loaded.fps, loaded.composition.config) == (5, 12.5, ComposeConfig("ratio"))
     for index in range(5):
-        one, other = scene.shot(index), loaded.shot(index)
+        one, other = scene.frame(index), loaded.frame(index)
         a, b = (shot.composition.predict(shot.camera, shot.sun) for shot in (one, other))
         for name in ("rgb", "depth", "visibility", "id"):
             assert np.array_equal(getattr(a, name), getattr(b, name)), (index, name)
@@ -221,14 +229,14 @@ def test_a_saved_orbit_and_a_scene_without_camera_and_sun(tmp_path):
         save_scene(tmp_path / "still.toml", still)
         assert load_scene(tmp_path / "still.toml").frames == 1
     for index in (0, 3):
-        pair = orbit.shot(index).camera, loaded.shot(index).camera
+        pair = orbit.frame(index).camera, loaded.frame(index).camera
         assert np.array_equal(*(camera.world_from_camera for camera in pair))
         assert pair[0].cx == pair[1].cx
     save_scene(tmp_path / "bare.toml", PosedScene(scene.composition))
     bare = load_scene(tmp_path / "bare.toml")
     assert (bare.camera, bare.sun) == (None, None)
     with pytest.raises(InputError, match=r"bare.toml: expected a camera"):
-        bare.shot(0)
+        bare.frame(0)
 
 
 @pytest.mark.parametrize(

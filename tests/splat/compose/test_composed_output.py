@@ -11,9 +11,9 @@ from posed import made_run, seen_from
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb, read_exr, read_png
-from spacesim.data.lock import locked
+from spacesim.data.lock import lock_folder
 from spacesim.data.records import Sun
-from spacesim.splat.compose import Composition, Keyframe, Placed, Pose, PosedScene
+from spacesim.splat.compose import Composition, Keyframe, PlacedRun, Pose, PosedScene
 from spacesim.splat.compose import output as module
 from spacesim.splat.compose.output import compose
 from spacesim.splat.export.video import encoder
@@ -24,7 +24,7 @@ SUN = Sun.from_angles(40, 35)
 
 def scene(frames: int = 3, away: float = 1.0, last: float = 0.2, methods=("map", "vanilla")) -> PosedScene:
     models = [
-        Placed(made_run(method, k), Pose(translation=[k * away, 0, 0]), f"m{k}") for k, method in enumerate(methods)
+        PlacedRun(made_run(method, k), Pose(translation=[k * away, 0, 0]), f"m{k}") for k, method in enumerate(methods)
     ]
     keys = [
         Keyframe(0.0, poses={"m0": models[0].pose}),
@@ -47,7 +47,7 @@ def test_frames_hold_what_the_scene_predicts(tmp_path):
     assert (done.frames, done.rendered) == (3, 3)
     assert told == [(1, 3), (2, 3), (3, 3)]
     for index in range(3):
-        shot, name = scene().shot(index), f"{index:04d}"
+        shot, name = scene().frame(index), f"{index:04d}"
         seen = shot.composition.predict(shot.camera, shot.sun)
         picture = read_png(tmp_path / f"out/rgb/{name}.png").astype(float) / 255
         np.testing.assert_allclose(picture[..., 3], seen.alpha, atol=0.5 / 255 + 1e-6)
@@ -83,7 +83,7 @@ def test_only_what_is_missing_or_changed_is_rendered(tmp_path, monkeypatch):
 
 def test_pictures_of_linear_models_are_exposed_as_asked_for(tmp_path):
     linear = scene(1, methods=("linear", "linear"))
-    shot = linear.shot(0)
+    shot = linear.frame(0)
     once, doubled = (shot.composition.predict(shot.camera, SUN, exposure=ev).rgb for ev in (None, 1.0))
     np.testing.assert_allclose(linear_from_srgb(doubled), np.minimum(2 * linear_from_srgb(once), 1), atol=1e-4)
     compose(linear, tmp_path / "out")
@@ -91,8 +91,8 @@ def test_pictures_of_linear_models_are_exposed_as_asked_for(tmp_path):
     assert compose(linear, tmp_path / "out", exposure=1.0).rendered == 1
     assert compose(linear, tmp_path / "out", exposure=1.0).rendered == 0
     assert read_png(tmp_path / "out/rgb/0000.png")[..., :3].mean() > 1.1 * before[..., :3].mean()
-    for methods, named in ((("map",), "--linear"), (("linear", "map"), "of one tone curve")):
-        with pytest.raises(InputError, match=f"--exposure: expected .*{named}"):
+    for methods, named in ((("map",), "linear light"), (("linear", "map"), "of one tone curve")):
+        with pytest.raises(InputError, match=f"exposure: expected .*{named}"):
             compose(scene(1, methods=methods), tmp_path / "none", exposure=1.0)
     with pytest.raises(InputError, match="-40 to 40 EV"):
         compose(linear, tmp_path / "none", exposure=float("inf"))
@@ -164,7 +164,7 @@ def test_what_cannot_be_rendered_is_refused_before_the_work(tmp_path):
         compose(one, tmp_path / "b")
     with pytest.raises(InputError, match=r"notes\.txt"):
         compose(one, tmp_path / "b/notes.txt")
-    with locked(tmp_path / "c"), pytest.raises(InputError, match=r"no other run at work"):
+    with lock_folder(tmp_path / "c"), pytest.raises(InputError, match=r"no other run at work"):
         compose(one, tmp_path / "c")
 
 
@@ -194,7 +194,7 @@ def test_the_command(spacesim, scene_file, tmp_path):
     config = tmp_path / "runs/tiny/config.json"
     config.write_text(json.dumps({**json.loads(config.read_text()), "antialiased": True}))
     done = spacesim("compose", scene_file, "--out", tmp_path / "out", "--size", 20, "--ply", tmp_path / "pair.ply")
-    assert any(line.startswith("second: the run is --antialiased") for line in done.errors)
+    assert any(line.startswith("second: the run is antialiased") for line in done.errors)
 
 
 def test_the_command_refuses(spacesim, scene_file, tmp_path):

@@ -8,14 +8,14 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.splat.compose.pose import (
-    FARTHEST,
-    LARGEST,
-    SMALLEST,
+    MAX_COORDINATE,
+    MAX_SCALE,
+    MIN_SCALE,
     Pose,
-    between,
+    interpolate_pose,
+    interpolate_rotation,
     rotation_about,
     slerp,
-    turned_between,
 )
 
 
@@ -49,11 +49,15 @@ def test_a_camera_in_the_model_sees_the_same_pixels():
 
 
 def test_a_model_seen_from_another_may_be_beyond_the_bounds_of_poses():
-    small, far = Pose(scale=SMALLEST), Pose(translation=np.array([0, 0, FARTHEST]), scale=LARGEST)
+    small, far = Pose(scale=MIN_SCALE), Pose(translation=np.array([0, 0, MAX_COORDINATE]), scale=MAX_SCALE)
     seen = small.inverse().after(far)
-    np.testing.assert_allclose(seen.translation, [0, 0, FARTHEST / SMALLEST])
-    assert seen.scale == pytest.approx(LARGEST / SMALLEST)
-    for outside in ({"scale": SMALLEST / 2}, {"scale": 2 * LARGEST}, {"translation": np.full(3, 2 * FARTHEST)}):
+    np.testing.assert_allclose(seen.translation, [0, 0, MAX_COORDINATE / MIN_SCALE])
+    assert seen.scale == pytest.approx(MAX_SCALE / MIN_SCALE)
+    for outside in (
+        {"scale": MIN_SCALE / 2},
+        {"scale": 2 * MAX_SCALE},
+        {"translation": np.full(3, 2 * MAX_COORDINATE)},
+    ):
         with pytest.raises(InputError):
             Pose(**outside)
 
@@ -69,13 +73,15 @@ def test_no_pose_changes_no_bit():
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.5, 0.9, 1.0])
 def test_between_two_poses(share):
     one, other = random_pose(3), random_pose(4)
-    found = between(one, other, share)
+    found = interpolate_pose(one, other, share)
     expected = Slerp([0, 1], Rotation.from_matrix([one.rotation, other.rotation]))(share)
     np.testing.assert_allclose(found.rotation, expected.as_matrix(), atol=1e-9)
     np.testing.assert_allclose(found.translation, (1 - share) * one.translation + share * other.translation)
     assert np.log(found.scale) == pytest.approx((1 - share) * np.log(one.scale) + share * np.log(other.scale))
     if share in (0.0, 1.0):
-        assert np.array_equal(turned_between(one.rotation, other.rotation, share), (one, other)[int(share)].rotation)
+        assert np.array_equal(
+            interpolate_rotation(one.rotation, other.rotation, share), (one, other)[int(share)].rotation
+        )
 
 
 def test_great_circles():

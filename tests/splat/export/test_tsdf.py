@@ -13,7 +13,7 @@ from spacesim.data.records import Camera
 from spacesim.data.store import load_truth, read_dataset
 from spacesim.splat.export import fusion
 from spacesim.splat.export.fusion import DepthView, Field, Grid, fuse
-from spacesim.splat.export.mesh import MeshConfig, bounds, cameras_around, chosen_views, depth_of, mesh_of, surface
+from spacesim.splat.export.mesh import MeshConfig, bounds, cameras_around, depth_of, mesh_of, select_views, surface
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.start import gaussians_at
 
@@ -253,12 +253,12 @@ def test_no_gaussians_and_one():
 
 def test_views_are_even_and_of_different_places():
     all_of_them = cameras(30, side=1024)
-    chosen = chosen_views([*all_of_them, *all_of_them], 10)
+    chosen = select_views([*all_of_them, *all_of_them], 10)
     assert len(chosen) == 10
     assert len({camera.world_from_camera.tobytes() for camera in chosen}) == 10
     assert {camera.width for camera in chosen} == {512}
     near = [replace(camera, fx=9 * camera.fx, fy=9 * camera.fy) for camera in all_of_them]
-    assert len(chosen_views([*all_of_them, *near], 60)) == 60  # one lens does not stand for another
+    assert len(select_views([*all_of_them, *near], 60)) == 60  # one lens does not stand for another
 
 
 def test_cameras_around_see_all_of_the_model():

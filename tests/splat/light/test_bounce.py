@@ -1,4 +1,4 @@
-"""One bounce of light, against what is known of two surfaces. The formula has its float64 twin in test_light.py."""
+"""One bounce of light, against the known case of two surfaces. Its float64 reference is in test_light.py."""
 
 from dataclasses import replace
 
@@ -10,11 +10,11 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.splat.light.bounce import OVERLAP
+from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.encoding import Encoding
-from spacesim.splat.light.field import FieldConfig
+from spacesim.splat.light.field import FieldConfig, SurfaceConfig
 from spacesim.splat.light.model import LightModel, TrainingFrame
-from spacesim.splat.light.shading import LightConfig
-from spacesim.splat.light.shadow.cast import ShadowConfig
+from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.config import PRESETS, preset
@@ -22,7 +22,7 @@ from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 
 NONE = Encoding("harmonics", 0)
-FIELD = FieldConfig(features=2, width=4, layers=2, sun=NONE, view=NONE, surface=True)
+FIELD = FieldConfig(features=2, width=4, layers=2, inputs=SurfaceConfig())
 GLOW = LightConfig(FIELD, bounce=4000)
 SIDE = 40  #: Gaussians on a side of a square wall
 
@@ -104,7 +104,7 @@ def test_light_goes_with_the_cosine_of_the_sun_and_a_sample_is_as_bright_as_all(
 
 def test_what_lies_in_shadow_scatters_nothing():
     """A roof over the wall: what stands beside it sees the wall's light go out."""
-    shadow = ShadowConfig("splatting", 128, refine=None)
+    shadow = ShadowConfig(SplattingConfig(), 128, refine=None)
     spacing = 2.0 / SIDE
     roof = np.column_stack([square(1.5 * spacing), np.full(SIDE * SIDE, 2.0)])
     black = discs(roof, np.tile([0.0, 0, 1], (len(roof), 1)), 1.5 * spacing, 0.001)
@@ -146,7 +146,7 @@ def test_a_picture_is_brighter_by_what_arrives_at_the_side_that_is_seen():
     for height, side in ((3.0, 0), (0.4, 1)):
         camera = Pinhole.of(Camera(look_at([0.01, 0, height], [0, 0, 0.7]), 8, 8, 8, 8, 4, 4))
         bare = replace_features(splats, count)
-        before, after = plain.lit(bare, camera, up)[0], glowing.lit(splats, camera, up)[0]
+        before, after = plain.shade_picture(bare, camera, up)[0], glowing.shade_picture(splats, camera, up)[0]
         for c in range(3):
             more = numbers(after[c])[-1] - numbers(before[c])[-1]
             assert more == pytest.approx(0.5 * numbers(bounced[3 * side + c])[-1], abs=1e-5)
@@ -202,14 +202,14 @@ def test_training_learns_albedos_and_repeats_to_the_bit(small_lit_dataset, tmp_p
     assert config.light.bounce > 0
     runs = [train(small_lit_dataset, tmp_path / name, config) for name in ("one", "two")]
     assert len({(run.path / "model.safetensors").read_bytes() for run in runs}) == 1
-    albedos = runs[0].model.to_numpy()["features"][:, config.light.albedos :]
+    albedos = runs[0].gaussians.to_numpy()["features"][:, config.light.albedos :]
     assert albedos.shape[1] == 3
     start = Trainer(small_lit_dataset, config).gaussians.to_numpy()["features"][:, config.light.albedos :]
     assert np.ptp(start) == 0
     assert np.ptp(albedos) > 0.05
-    frame, arrays = small_lit_dataset.test[0], runs[0].model.to_numpy()
+    frame, arrays = small_lit_dataset.test[0], runs[0].gaussians.to_numpy()
     arrays["features"][:, config.light.albedos :] = -30  # black
-    black = replace(runs[0], model=Gaussians.from_numpy(arrays)).predict(frame.camera, frame.sun)
+    black = replace(runs[0], gaussians=Gaussians.from_numpy(arrays)).predict(frame.camera, frame.sun)
     lit = runs[0].predict(frame.camera, frame.sun)
     assert np.isfinite(lit.rgb).all()
     assert (lit.rgb >= black.rgb - 1e-6).all()
@@ -240,8 +240,8 @@ def test_presets_bounce_where_shadows_are_known(name):
 
 
 def test_impossible_bounces_are_named():
-    with pytest.raises(InputError, match="--bounce: expected --field surface"):
+    with pytest.raises(InputError, match=r"bounce: expected 0 or field\.inputs surface"):
         LightConfig(FieldConfig(), bounce=10)
     for bounce in (-1, 2**14 + 1):
-        with pytest.raises(InputError, match=f"--bounce: expected 0 to 16384, found {bounce}"):
+        with pytest.raises(InputError, match=f"bounce: expected 0 to 16384, found {bounce}"):
             LightConfig(FIELD, bounce=bounce)

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from spacesim.backend import ad, recorded
+from spacesim.backend.upload import upload
 from spacesim.splat.light import cooperative, mlp
-from spacesim.splat.light.columns import CHUNK, Lanes, aligned
 from spacesim.splat.light.mlp import MlpShape
+from spacesim.splat.light.padded_batch import CHUNK, PaddedBatch, round_up_rows
 
 SHAPES = {
     "filled up": MlpShape(5, 3, 2, 12, 3),
@@ -27,7 +28,7 @@ def columns(tensor, count: int) -> np.ndarray:
     return array.transpose(1, 0, 2).reshape(array.shape[1], -1)[:, :count]
 
 
-def twin(shape, weights, items, shared, by_output):
+def twin(shape, weights, items, shared, grad_output):
     """(outputs [outputs, N], gradients of the weights, of the items [inputs, N]) in float64."""
     matrices = [weight.reshape(size) for weight, size in zip(weights[1::2], shape.sizes, strict=True)]
     biases = [bias[:, None] for bias in weights[2::2]]
@@ -36,16 +37,16 @@ def twin(shape, weights, items, shared, by_output):
     for i, (matrix, bias) in enumerate(zip(matrices, biases, strict=True)):
         value = matrix @ values[-1] + bias
         values.append(value if i == shape.layers - 1 else np.maximum(value, 0))
-    gradients, by_value = [np.zeros(0)] * len(weights), by_output
+    gradients, grad_values = [np.zeros(0)] * len(weights), grad_output
     for i in reversed(range(shape.layers)):
-        gradients[1 + 2 * i] = (by_value @ values[i].T).ravel()
-        gradients[2 + 2 * i] = by_value.sum(axis=1)
+        gradients[1 + 2 * i] = (grad_values @ values[i].T).ravel()
+        gradients[2 + 2 * i] = grad_values.sum(axis=1)
         if i == 0:
-            gradients[0] = np.outer(by_value.sum(axis=1), shared).ravel()
-        by_value = matrices[i].T @ by_value
+            gradients[0] = np.outer(grad_values.sum(axis=1), shared).ravel()
+        grad_values = matrices[i].T @ grad_values
         if i > 0:
-            by_value = by_value * (values[i] > 0)
-    return values[-1], gradients, by_value
+            grad_values = grad_values * (values[i] > 0)
+    return values[-1], gradients, grad_values
 
 
 class Case:
@@ -57,35 +58,35 @@ class Case:
         self.weights = mlp.initial_weights(shape, rng)
         self.shared = rng.normal(size=shape.shared).astype(np.float32)
         self.items = rng.normal(size=(shape.inputs, count)).astype(np.float32)
-        self.by_output = rng.normal(size=(shape.outputs, count)).astype(np.float32)
+        self.grad_output = rng.normal(size=(shape.outputs, count)).astype(np.float32)
 
     def device(self) -> list:
         """Weights, items, shared, gradients: as the networks read them."""
-        floats = [[ad.Float(v) for v in values] for values in (self.weights, self.items, self.by_output)]
-        return [floats[0], floats[1], ad.Float(self.shared), floats[2], Lanes.of(self.count)]
+        floats = [[upload(v) for v in values] for values in (self.weights, self.items, self.grad_output)]
+        return [floats[0], floats[1], upload(self.shared), floats[2], PaddedBatch.of(self.count)]
 
     def exact(self):
         doubles = [np.float64(weight) for weight in self.weights]
-        return twin(self.shape, doubles, *map(np.float64, (self.items, self.shared, self.by_output)))
+        return twin(self.shape, doubles, *map(np.float64, (self.items, self.shared, self.grad_output)))
 
 
-def passes(shape, weights, rows, shared, by_rows, lanes):
-    items = lanes.matrix([lanes.padded(row) for row in rows], shape.rows)
+def passes(shape, weights, rows, shared, grad_rows, batch):
+    items = batch.matrix([batch.pad_zeros(row) for row in rows], shape.rows)
     output, tape = mlp.forward(shape, weights, items, shared)
-    by_output = lanes.matrix([lanes.padded(row) for row in by_rows])
-    gradients, by_items = mlp.backward(shape, weights, tape, shared, by_output)
-    return output, gradients, by_items
+    grad_output = batch.matrix([batch.pad_zeros(row) for row in grad_rows])
+    gradients, grad_items = mlp.backward(shape, weights, tape, shared, grad_output)
+    return output, gradients, grad_items
 
 
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("name", SHAPES)
 def test_networks_and_their_adjoint_match_float64(name, count):
     case = Case(SHAPES[name], count)
-    output, gradients, by_items = passes(case.shape, *case.device())
+    output, gradients, grad_items = passes(case.shape, *case.device())
     exact, exact_gradients, exact_by_items = case.exact()
     assert output.shape[1:] == (case.shape.outputs, CHUNK)
     np.testing.assert_allclose(columns(output, count), exact, atol=2e-6)
-    np.testing.assert_allclose(columns(by_items, count)[: case.shape.inputs], exact_by_items, atol=5e-6)
+    np.testing.assert_allclose(columns(grad_items, count)[: case.shape.inputs], exact_by_items, atol=5e-6)
     assert len(gradients) == len(case.weights)
     for one, other, weight in zip(gradients, exact_gradients, case.weights, strict=True):
         assert dr.width(one) == len(weight)
@@ -94,7 +95,7 @@ def test_networks_and_their_adjoint_match_float64(name, count):
 
 def test_recorded_passes_repeat_to_the_bit_and_serve_other_sizes():
     shape = SHAPES["filled up"]
-    record = recorded(passes, 16)
+    record = recorded(passes, limit=16)
     for count in (700, 900, CHUNK + 1, 5000, 700):  # the first three have room for as many
         case = Case(shape, count)
         output, gradients, _ = record(shape, *case.device())
@@ -108,10 +109,10 @@ def test_recorded_passes_repeat_to_the_bit_and_serve_other_sizes():
 
 
 def test_recordings_are_as_wide_as_the_columns_whatever_they_read():
-    record = recorded(lambda packed, lanes: lanes.matrix(lanes.block(packed, 4, 2)), 16)
+    record = recorded(lambda packed, batch: batch.matrix(batch.block(packed, 4, 2)), limit=16)
     for count in (512, 1000, 300):  # 512: the packed rows are a multiple of the columns, and more than the matrix
         packed = np.random.default_rng(count).normal(size=(38, count)).astype(np.float32)
-        found = record(ad.Float(packed.ravel()), Lanes.of(count))
+        found = record(upload(packed.ravel()), PaddedBatch.of(count))
         np.testing.assert_array_equal(columns(found, count), packed[4:6])
         np.testing.assert_array_equal(columns(found, 1024)[:, count:], np.repeat(packed[4:6, -1:], 1024 - count, 1))
 
@@ -119,20 +120,20 @@ def test_recordings_are_as_wide_as_the_columns_whatever_they_read():
 @pytest.mark.parametrize("first", [1, 4, 7])
 def test_a_network_that_knows_first_inputs_says_the_same(first):
     case = Case(MlpShape(9, 3, 2, 12, 3), CHUNK + 1)
-    weights, rows, shared, _, lanes = case.device()
-    rows = [lanes.padded(row) for row in rows]
-    known = mlp.known(case.shape, weights, lanes.matrix(rows[:first], aligned(first)), first)
-    output, _ = mlp.forward(case.shape, weights, lanes.matrix(rows[first:], aligned(9 - first)), shared, known)
+    weights, rows, shared, _, batch = case.device()
+    rows = [batch.pad_zeros(row) for row in rows]
+    known = mlp.first_layer_part(case.shape, weights, batch.matrix(rows[:first], round_up_rows(first)), first)
+    output, _ = mlp.forward(case.shape, weights, batch.matrix(rows[first:], round_up_rows(9 - first)), shared, known)
     np.testing.assert_allclose(columns(output, case.count), case.exact()[0], atol=2e-6)
 
 
 def test_columns_beyond_the_gaussians_change_nothing():
     shape, count = SHAPES["as it is"], 1500
     case = Case(shape, count)
-    weights, rows, shared, by_rows, lanes = case.device()
-    _, gradients, _ = passes(shape, weights, rows, shared, by_rows, lanes)
-    wide = [ad.Float(np.append(row, np.full(9, 7e3))) for row in case.items]  # beyond N: never read
-    _, same, _ = passes(shape, weights, wide, shared, by_rows, lanes)
+    weights, rows, shared, grad_rows, batch = case.device()
+    _, gradients, _ = passes(shape, weights, rows, shared, grad_rows, batch)
+    wide = [upload(np.append(row, np.full(9, 7e3))) for row in case.items]  # beyond N: never read
+    _, same, _ = passes(shape, weights, wide, shared, grad_rows, batch)
     for one, other in zip(gradients, same, strict=True):
         np.testing.assert_array_equal(numbers(one), numbers(other))
 
@@ -140,10 +141,10 @@ def test_columns_beyond_the_gaussians_change_nothing():
 @pytest.mark.parametrize("still", [False, True])
 @pytest.mark.parametrize("count", [1, CHUNK - 1, CHUNK, 31622, 100_000])
 def test_columns_are_more_than_the_gaussians_and_whole_chunks(count, still):
-    lanes = Lanes.of(count, still)
-    assert numbers(lanes.count) == count
-    assert count < lanes.capacity <= (count + CHUNK if still else 9 / 8 * count + 1024)
-    assert lanes.capacity % CHUNK == 0
+    batch = PaddedBatch.of(count, still)
+    assert numbers(batch.count) == count
+    assert count < batch.capacity <= (count + CHUNK if still else 9 / 8 * count + 1024)
+    assert batch.capacity % CHUNK == 0
 
 
 def test_weights_have_the_size_that_the_shape_says():
@@ -156,30 +157,30 @@ def test_weights_have_the_size_that_the_shape_says():
 
 @pytest.mark.parametrize("count", COUNTS)
 def test_rows_come_back_from_matrices(count):
-    rng, lanes = np.random.default_rng(1), Lanes.of(count)
+    rng, batch = np.random.default_rng(1), PaddedBatch.of(count)
     packed = rng.normal(size=(6, count)).astype(np.float32)
-    like = ad.Float(np.zeros(count))
-    one = lanes.matrix([*lanes.block(ad.Float(packed.ravel()), 1, 3), ad.Float(2)], aligned(5))
-    assert one.shape == (lanes.capacity // CHUNK, 8, CHUNK)
+    like = upload(np.zeros(count))
+    one = batch.matrix([*batch.block(upload(packed.ravel()), 1, 3), ad.Float(2)], round_up_rows(5))
+    assert one.shape == (batch.capacity // CHUNK, 8, CHUNK)
     np.testing.assert_array_equal(columns(one, count)[:3], packed[1:4])
     np.testing.assert_array_equal(columns(one, count)[3:], np.repeat([[2.0], [0], [0], [0], [0]], count, axis=1))
-    rows = [lanes.row(one, i) for i in (2, 0)]
+    rows = [batch.row(one, i) for i in (2, 0)]
     dr.eval(rows)
-    for row, i in zip(lanes.narrowed(rows, like), (3, 1), strict=True):
+    for row, i in zip(batch.unpad(rows, like), (3, 1), strict=True):
         np.testing.assert_array_equal(numbers(row), packed[i])
-    other = lanes.matrix([lanes.spread(ad.Float(packed[5]))])
-    back = lanes.packed([(one, 1, 2), (other, 0, 1)], ad.Float(np.zeros(3 * count)))
+    other = batch.matrix([batch.repeat_last(ad.Float(packed[5]))])
+    back = batch.pack([(one, 1, 2), (other, 0, 1)], upload(np.zeros(3 * count)))
     np.testing.assert_array_equal(numbers(back).reshape(3, count), packed[[2, 3, 5]])
 
 
-def test_cooperative_vectors_give_the_same_colours():
-    assert cooperative.usable()
+def test_cooperative_vectors_give_the_same_colors():
+    assert cooperative.is_usable()
     shape, count = MlpShape(57, 25, 3, 64, 3), 700
-    record = recorded(cooperative.forward, 4)
+    record = recorded(cooperative.forward, limit=4, elements=None)
     for seed in range(2):  # the second with other weights, by the recording of the first
         case = Case(shape, count + seed)
-        weights, rows, shared, _, lanes = case.device()
-        found = record(shape, cooperative.pack(shape, weights), [lanes.spread(row) for row in rows], shared)
+        weights, rows, shared, _, batch = case.device()
+        found = record(shape, cooperative.pack(shape, weights), [batch.repeat_last(row) for row in rows], shared)
         exact, *_ = case.exact()
         for row, other in zip(found, exact, strict=True):
             np.testing.assert_allclose(
@@ -196,8 +197,8 @@ def test_cooperative_vectors_that_fail_or_lie_are_not_used(monkeypatch, caplog):
         (lambda: 0.1, "wrong by 0.1"),
         (lambda: float("nan"), "wrong by nan"),
     ):
-        monkeypatch.setattr(cooperative, "_tried", tried)
-        cooperative.usable.cache_clear()
-        assert not cooperative.usable()
+        monkeypatch.setattr(cooperative, "_largest_difference", tried)
+        cooperative.is_usable.cache_clear()
+        assert not cooperative.is_usable()
         assert told in caplog.records[-1].getMessage()
-    cooperative.usable.cache_clear()
+    cooperative.is_usable.cache_clear()

@@ -8,12 +8,14 @@ import pytest
 from splats import random_splats
 
 from spacesim.backend import ad, recordings, select
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
-from spacesim.splat.raster import bin as tiles
+from spacesim.splat.raster import bin as binning
+from spacesim.splat.raster import tiles
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
-from spacesim.splat.raster.sort import ordered_lists, owners
+from spacesim.splat.raster.sort import ordered_lists, segment_ids
 
 WAYS = ("cuda", "llvm")
 
@@ -27,7 +29,8 @@ def way(request, monkeypatch):
 def use(name, monkeypatch):
     if name == "llvm" and select() == "cuda":
         pytest.skip("Dr.Jit cannot replay its sort on CUDA")
-    monkeypatch.setattr(tiles, "select", lambda: name)
+    for module in (binning, tiles):
+        monkeypatch.setattr(module, "select", lambda: name)
 
 
 def projected(count: int, width: int, height: int, seed: int = 0) -> tuple[Splats, Footprints]:
@@ -65,7 +68,7 @@ def expected(splats: Splats, footprints: Footprints, width: int, height: int, sh
 @pytest.mark.parametrize(("count", "size"), [(1, (16, 8)), (40, (50, 30)), (700, (90, 61)), (3000, (16, 8))])
 def test_tiles_list_who_reaches_them_in_order(way, count, size):
     splats, footprints = projected(count, *size)
-    lists = tiles.bin_splats(splats, footprints, *size)
+    lists = binning.bin_splats(splats, footprints, *size)
     certain, possible = expected(splats, footprints, *size, lists.shape)
     ours = listed(lists)
     assert sum(map(len, certain)) > 0
@@ -78,7 +81,7 @@ def test_tiles_list_who_reaches_them_in_order(way, count, size):
 def test_slots_are_the_splats_own(way):
     """Each listed pair has a slot of its own among its splat's."""
     splats, footprints = projected(900, 70, 50)
-    lists = tiles.bin_splats(splats, footprints, 70, 50)
+    lists = binning.bin_splats(splats, footprints, 70, 50)
     start, end = np.array(lists.start), np.array(lists.end)
     entries = np.concatenate([np.arange(s, e) for s, e in zip(start, end, strict=True)])
     splat, slot = np.array(lists.splat)[entries], np.array(lists.slot)[entries]
@@ -87,19 +90,19 @@ def test_slots_are_the_splats_own(way):
     assert (slot < first + count).all()
     assert len(np.unique(slot)) == len(slot)
     assert slot.max() < lists.capacity
-    kept = np.array(lists.sum_index(ad.UInt32(entries.astype(np.uint32))))
-    np.testing.assert_array_equal(np.array(lists.sum_of_slot(ad.UInt32(slot))), kept)
+    kept = np.array(lists.sum_index(upload(entries.astype(np.uint32), ad.UInt32)))
+    np.testing.assert_array_equal(np.array(lists.sum_of_slot(upload(slot, ad.UInt32))), kept)
     assert len(np.unique(kept)) == len(kept)
 
 
 @pytest.mark.parametrize(("count", "size"), [(2000, (64, 64)), (500, (33, 90)), (9000, (8, 8))])
 def test_both_ways_list_the_same(count, size, monkeypatch):
     splats, footprints = projected(count, *size)
-    monkeypatch.setattr(tiles, "tile_shape", lambda: tiles.TileShape(16, 8, 16))
+    monkeypatch.setattr(binning, "tile_shape", lambda: tiles.TileShape(16, 8, 16))
     found = []
     for name in WAYS:
         use(name, monkeypatch)
-        found.append(listed(tiles.bin_splats(splats, footprints, *size)))
+        found.append(listed(binning.bin_splats(splats, footprints, *size)))
     assert found[0] == found[1]
     assert sum(map(len, found[0])) > count / 2
 
@@ -107,9 +110,9 @@ def test_both_ways_list_the_same(count, size, monkeypatch):
 def test_equal_depths_are_in_index_order(way):
     """What shadow splatting relies on: of two events at one depth the first comes first."""
     splats, footprints = projected(600, 48, 48)
-    footprints.order = ad.UInt32(np.random.default_rng(0).integers(3, 6, 600).astype(np.uint32))
+    footprints.order = upload(np.random.default_rng(0).integers(3, 6, 600).astype(np.uint32), ad.UInt32)
     order = np.array(footprints.order)
-    lists = listed(tiles.bin_splats(splats, footprints, 48, 48))
+    lists = listed(binning.bin_splats(splats, footprints, 48, 48))
     assert max(map(len, lists)) > 30
     for own in lists:
         assert own == sorted(own, key=lambda splat: (order[splat], splat))
@@ -121,7 +124,7 @@ def test_recordings_serve_other_numbers_of_splats_and_pairs(way):
     found = {}
     for count in counts:
         splats, footprints = projected(count, 64, 40, seed=count)
-        lists = tiles.bin_splats(splats, footprints, 64, 40)
+        lists = binning.bin_splats(splats, footprints, 64, 40)
         certain, possible = expected(splats, footprints, 64, 40, lists.shape)
         found[count] = listed(lists)
         for own, inner, outer in zip(found[count], certain, possible, strict=True):
@@ -129,14 +132,14 @@ def test_recordings_serve_other_numbers_of_splats_and_pairs(way):
             assert own == [splat for splat in outer if splat in set(own)]
     before = recordings()
     for count in counts:
-        assert listed(tiles.bin_splats(*projected(count, 64, 40, seed=count), 64, 40)) == found[count]
+        assert listed(binning.bin_splats(*projected(count, 64, 40, seed=count), 64, 40)) == found[count]
     assert recordings() == before
 
 
 def test_nobody_seen_is_no_list(way):
     splats, footprints = projected(50, 32, 32)
     hidden = dataclasses.replace(footprints, visible=dr.zeros(ad.Bool, 50))
-    lists = tiles.bin_splats(splats, hidden, 32, 32)
+    lists = binning.bin_splats(splats, hidden, 32, 32)
     assert lists.pairs == 0
     assert lists.capacity == 0
 
@@ -153,7 +156,7 @@ def test_lists_of_any_length_are_ordered(lengths, runs):
     rng.shuffle(members)
     size = len(members)
     keys, numbers = rng.integers(0, 9, size), rng.permutation(size)
-    arrays = (ad.UInt32(values.astype(np.uint32)) for values in (members, keys, numbers))
+    arrays = (upload(values.astype(np.uint32), ad.UInt32) for values in (members, keys, numbers))
     number, source, start, end = (np.array(v) for v in ordered_lists(*arrays, len(lengths), size, runs))
     np.testing.assert_array_equal(end - start, lengths)
     for i, (s, e) in enumerate(zip(start, end, strict=True)):
@@ -165,8 +168,8 @@ def test_lists_of_any_length_are_ordered(lengths, runs):
 
 def test_owners_of_slots():
     counts = np.array([0, 3, 0, 0, 5, 1, 0])
-    upto = ad.UInt64(np.cumsum(counts).astype(np.uint64))
-    found = np.array(owners(upto, dr.arange(ad.UInt32, 11), len(counts)))
+    upto = upload(np.cumsum(counts).astype(np.uint64), ad.UInt64)
+    found = np.array(segment_ids(upto, dr.arange(ad.UInt32, 11), len(counts)))
     np.testing.assert_array_equal(found, [*np.repeat(np.arange(7), counts), 7, 7])
 
 
@@ -177,10 +180,10 @@ def test_tiles_are_dealt_longest_first(lengths):
     """Each tile once; those that share a packet have lists of about one length; runs of tiles have long and short."""
     lengths = np.random.default_rng(0).permutation(lengths)
     shape = tiles.TileShape(8, 8, 4, 2)
-    order = np.array(tiles._longest_first(ad.UInt32(lengths.astype(np.uint32)), shape))
+    order = np.array(binning._longest_first(upload(lengths.astype(np.uint32), ad.UInt32), shape))
     assert sorted(order.tolist()) == list(range(len(lengths)))
-    dealt = np.minimum(lengths, tiles.LONGEST)[order]
-    ranks = np.sort(np.minimum(lengths, tiles.LONGEST))[::-1]
+    dealt = np.minimum(lengths, binning.MAX_SORTED_LENGTH)[order]
+    ranks = np.sort(np.minimum(lengths, binning.MAX_SORTED_LENGTH))[::-1]
     packets = dealt[: len(dealt) // 4 * 4].reshape(-1, 4)
     assert sorted(map(tuple, packets)) == sorted(map(tuple, ranks[: len(dealt) // 4 * 4].reshape(-1, 4)))
     if len(lengths) >= 300:

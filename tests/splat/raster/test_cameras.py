@@ -1,4 +1,4 @@
-"""Perspective and orthographic cameras: pictures and gradients against the float64 twin, poses, crops, far and near."""
+"""Perspective, orthographic cameras: pictures, gradients against the float64 reference, poses, crops, far and near."""
 
 from dataclasses import replace
 
@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from splats import random_splats
 
 from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
@@ -20,7 +21,7 @@ from spacesim.splat.raster.render import render
 
 KINDS = ("perspective", "orthographic")
 POSE = look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0])
-PLANES = ("colour", "alpha", "depth", "normal", "features")
+PLANES = ("color", "alpha", "depth", "normal", "features")
 
 
 def record(kind: str, width: int = 40, height: int = 28, pose=POSE) -> Camera | OrthographicCamera:
@@ -29,7 +30,7 @@ def record(kind: str, width: int = 40, height: int = 28, pose=POSE) -> Camera | 
     return OrthographicCamera(pose, width, height, 0.55 * width, 0.6 * width, 0.52 * width, 0.47 * height)
 
 
-def upload(view: Camera | OrthographicCamera) -> Pinhole | Orthographic:
+def device_camera(view: Camera | OrthographicCamera) -> Pinhole | Orthographic:
     return Pinhole.of(view) if isinstance(view, Camera) else Orthographic.of(view)
 
 
@@ -70,15 +71,15 @@ def twin_loss(arrays, view, features, **options) -> float:
 def our_loss(gaussians, camera, features, **options):
     outputs = [name for name in PLANES if name != "features"]
     output = render(gaussians, camera, outputs=outputs, features=features, **options)
-    planes = [*output.colour, output.alpha, output.depth, *output.normal, *output.features]
+    planes = [*output.color, output.alpha, output.depth, *output.normal, *output.features]
     loss = ad.Float(0)
     for weight, plane in zip(weights(camera.width * camera.height), planes, strict=True):
-        loss += dr.sum(ad.Float(weight.astype(np.float32)) * plane)
+        loss += dr.sum(upload(weight.astype(np.float32)) * plane)
     return loss
 
 
 def columns_of(features: np.ndarray) -> list:
-    return [ad.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in features.T]
+    return [upload(np.ascontiguousarray(column, dtype=np.float32)) for column in features.T]
 
 
 def slope(function, values: np.ndarray, step: float = 1e-5) -> np.ndarray:
@@ -109,13 +110,13 @@ def test_picture_matches_the_twin(kind, antialiased, count, size):
     twin = render_reference(arrays, view, features=features, antialiased=antialiased)
     ours = render(
         Gaussians.from_numpy(arrays),
-        upload(view),
-        outputs=("colour", "depth", "normal"),
+        device_camera(view),
+        outputs=("color", "depth", "normal"),
         features=columns_of(features),
         antialiased=antialiased,
     )
     assert twin.alpha.max() > 0.1
-    for name in ("colour", "alpha", "features"):
+    for name in ("color", "alpha", "features"):
         np.testing.assert_allclose(ours.image(name), getattr(twin, name), atol=1e-5, err_msg=name)
     solid = twin.alpha > 0.05  # below, depth and normal divide by next to nothing
     np.testing.assert_allclose(ours.image("depth")[solid], twin.depth[solid], atol=1e-5)
@@ -129,7 +130,7 @@ def test_splats_beyond_the_border_match_the_twin(kind):
     arrays, view = random_splats(40, seed=31, degree=0), record(kind, 36, 20)
     arrays["means"] *= 2.5
     arrays["log_scales"] += 1.2
-    twin, ours = render_reference(arrays, view), picture(arrays, upload(view), ("colour", "alpha"))
+    twin, ours = render_reference(arrays, view), picture(arrays, device_camera(view), ("color", "alpha"))
     for name, plane in ours.items():
         np.testing.assert_allclose(plane, getattr(twin, name), atol=1e-5, err_msg=name)
 
@@ -140,7 +141,7 @@ def test_gradients_of_every_parameter_match_central_differences(kind, antialiase
     arrays, view, features = wide_splats(), record(kind, 16, 12), own_features(5)
     gaussians, channels = Gaussians.from_numpy(arrays), columns_of(features)
     dr.enable_grad(*gaussians.parameters().values(), *channels)
-    dr.backward(our_loss(gaussians, upload(view), channels, antialiased=antialiased))
+    dr.backward(our_loss(gaussians, device_camera(view), channels, antialiased=antialiased))
     for name in NAMES:
         ours = np.array(dr.grad(getattr(gaussians, name))).T.reshape(arrays[name].shape)
 
@@ -159,16 +160,16 @@ def test_gradients_of_small_orthographic_splats(antialiased):
     arrays, view = random_splats(14, seed=41, degree=1), record("orthographic", 20, 14)
     gaussians = Gaussians.from_numpy(arrays)
     dr.enable_grad(*gaussians.parameters().values())
-    output = render(gaussians, upload(view), outputs=("colour",), antialiased=antialiased)
+    output = render(gaussians, device_camera(view), outputs=("color",), antialiased=antialiased)
     weight = np.random.default_rng(5).normal(size=(14, 20, 4))
-    planes = [*output.colour, output.alpha]
-    columns = [ad.Float(weight[..., c].ravel().astype(np.float32)) for c in range(4)]
+    planes = [*output.color, output.alpha]
+    columns = [upload(weight[..., c].ravel().astype(np.float32)) for c in range(4)]
     dr.backward(sum((dr.sum(w * plane) for w, plane in zip(columns, planes, strict=True)), ad.Float(0)))
     for name in NAMES:
 
         def loss(values, name=name):
             twin = render_reference({**arrays, name: values}, view, antialiased=antialiased)
-            return float((weight[..., :3] * twin.colour).sum() + (weight[..., 3] * twin.alpha).sum())
+            return float((weight[..., :3] * twin.color).sum() + (weight[..., 3] * twin.alpha).sum())
 
         ours = np.array(dr.grad(getattr(gaussians, name))).T.reshape(arrays[name].shape)
         expected = slope(loss, arrays[name], 1e-7)
@@ -179,9 +180,9 @@ def test_gradients_of_small_orthographic_splats(antialiased):
 @pytest.mark.parametrize("kind", KINDS)
 def test_pose_gradients_match_central_differences(kind, start):
     arrays, view, features = wide_splats(), record(kind, 16, 12), own_features(5)
-    twist = ad.Float(start.astype(np.float32))
+    twist = upload(start.astype(np.float32))
     dr.enable_grad(twist)
-    camera = upload(view).moved(twist)
+    camera = device_camera(view).moved(twist)
     dr.backward(our_loss(Gaussians.from_numpy(arrays), camera, columns_of(features)))
 
     def loss(values):
@@ -195,7 +196,7 @@ def test_pose_gradients_match_central_differences(kind, start):
     assert_close(np.array(dr.grad(twist)), slope(loss, start), "twist")
 
 
-def picture(arrays, camera, names=("colour", "alpha", "depth"), **options) -> dict[str, np.ndarray]:
+def picture(arrays, camera, names=("color", "alpha", "depth"), **options) -> dict[str, np.ndarray]:
     output = render(Gaussians.from_numpy(arrays), camera, outputs=names, **options)
     return {name: output.image(name) for name in names}
 
@@ -260,7 +261,7 @@ def test_rigid_motion_of_scene_and_camera_changes_nothing(kind):
         "quaternions": turned.as_quat()[:, [3, 0, 1, 2]],
     }
     moved_view = replace(view, world_from_camera=motion @ view.world_from_camera)
-    first, second = picture(arrays, upload(view)), picture(moved, upload(moved_view))
+    first, second = picture(arrays, device_camera(view)), picture(moved, device_camera(moved_view))
     solid = first["alpha"] > 0.01
     for name, plane in first.items():
         np.testing.assert_allclose(plane[solid], second[name][solid], atol=3e-5, err_msg=name)
@@ -268,10 +269,10 @@ def test_rigid_motion_of_scene_and_camera_changes_nothing(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_crop_is_the_part_of_the_whole_picture(kind):
-    arrays, camera = random_splats(3000, seed=12, degree=1), upload(record(kind, 150, 110))
+    arrays, camera = random_splats(3000, seed=12, degree=1), device_camera(record(kind, 150, 110))
     arrays["log_scales"][:20] = -0.5  # wide ones, linearized outside of every crop
     arrays["means"] *= 2.5
-    names = ("colour", "alpha", "depth", "median_depth", "normal")
+    names = ("color", "alpha", "depth", "median_depth", "normal")
     whole = picture(arrays, camera, names)
     for x, y, width, height in ((0, 0, 150, 110), (0, 0, 37, 21), (51, 33, 64, 48), (113, 89, 37, 21), (77, 50, 1, 1)):
         part = picture(arrays, camera.cropped(x, y, width, height), names)
@@ -283,7 +284,7 @@ def test_crop_is_the_part_of_the_whole_picture(kind):
 
 
 def test_crops_of_crops_add_up():
-    arrays, camera = random_splats(300, seed=13, degree=0), upload(record("perspective", 90, 70))
+    arrays, camera = random_splats(300, seed=13, degree=0), device_camera(record("perspective", 90, 70))
     once = picture(arrays, camera.cropped(30, 25, 20, 15))
     twice = picture(arrays, camera.cropped(10, 20, 60, 40).cropped(20, 5, 20, 15))
     for name, plane in once.items():
@@ -300,16 +301,16 @@ def test_moved_is_the_rigid_motion(kind, vector):
     twist = [*vector, 0.4, -0.2, 0.7]
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = Rotation.from_rotvec(vector).as_matrix(), twist[3:]
-    camera = upload(view).moved(ad.Float(np.array(twist, dtype=np.float32)))
+    camera = device_camera(view).moved(upload(np.array(twist, dtype=np.float32)))
     expected = (motion @ view.camera_from_world)[:3].ravel()
     np.testing.assert_allclose(np.array(camera.values)[:12], expected, atol=1e-6)
-    np.testing.assert_array_equal(np.array(camera.values)[12:], np.array(upload(view).values)[12:])
+    np.testing.assert_array_equal(np.array(camera.values)[12:], np.array(device_camera(view).values)[12:])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_of_focal_length_and_principal_point(kind):
     arrays, view, features = wide_splats(), record(kind, 16, 12), own_features(5)
-    camera = upload(view)
+    camera = device_camera(view)
     dr.enable_grad(camera.values)
     dr.backward(our_loss(Gaussians.from_numpy(arrays), camera, columns_of(features)))
     names = ["fx", "fy"] if kind == "perspective" else ["scale_x", "scale_y"]
@@ -325,10 +326,10 @@ def test_gradients_of_focal_length_and_principal_point(kind):
 def test_another_camera_compiles_nothing():
     gaussians = Gaussians.from_numpy(random_splats(50))
     for kind in KINDS:
-        dr.eval(project(gaussians, upload(record(kind))))
+        dr.eval(project(gaussians, device_camera(record(kind))))
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            dr.eval(project(gaussians, upload(record(kind, pose=look_at([-1.5, 2.0, 0.9], [0.1, 0.0, 0.0])))))
+            dr.eval(project(gaussians, device_camera(record(kind, pose=look_at([-1.5, 2.0, 0.9], [0.1, 0.0, 0.0])))))
             kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
         assert kernels
         assert all(kernel["cache_hit"] for kernel in kernels)
@@ -339,7 +340,7 @@ def test_another_camera_compiles_nothing():
 def test_cameras_beyond_reach_show_nothing(kind, place):
     pose = look_at([2.5, 0.8, 0.6], [0, 0, 0])
     pose[:3, 3] = place
-    found = picture(random_splats(40), upload(record(kind, pose=pose)))
+    found = picture(random_splats(40), device_camera(record(kind, pose=pose)))
     for plane in found.values():
         assert np.isfinite(plane).all()
         assert not plane.any()

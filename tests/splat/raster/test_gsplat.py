@@ -22,5 +22,5 @@ def test_picture_and_gradients_match_gsplat(monkeypatch):
     from against_gsplat import compare_pictures
 
     found = compare_pictures(1_000, 256)
-    assert max(found["colour"], found["alpha"], found["depth"]) < 2e-3
+    assert max(found["color"], found["alpha"], found["depth"]) < 2e-3
     assert max(value for name, value in found.items() if name.startswith("gradient")) < 1e-3

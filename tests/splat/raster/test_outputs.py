@@ -6,14 +6,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.output import OUTPUTS
 from spacesim.splat.raster.project import project
 from spacesim.splat.raster.reference import render_reference
-from spacesim.splat.raster.render import CHANNELS, OUTPUTS, render
-from spacesim.splat.raster.surface import normals, picked, unit
+from spacesim.splat.raster.render import FEATURES_PER_PASS, render
+from spacesim.splat.raster.surface import gather_or_zero, normals, unit
 
 POSE = look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0])
 
@@ -29,7 +31,7 @@ def orthographic(width: int = 40, height: int = 28) -> OrthographicCamera:
 VIEWS = [perspective, orthographic]
 
 
-def upload(view):
+def device_camera(view):
     return Pinhole.of(view) if isinstance(view, Camera) else Orthographic.of(view)
 
 
@@ -62,7 +64,9 @@ def test_median_depth_matches_the_twin(view):
     for count, seed in ((1, 2), (60, 3), (400, 4)):
         arrays, camera = random_splats(count, seed), view()
         arrays["logit_opacities"] += 2.0
-        ours = render(Gaussians.from_numpy(arrays), upload(camera), outputs=("median_depth",)).image("median_depth")
+        ours = render(Gaussians.from_numpy(arrays), device_camera(camera), outputs=("median_depth",)).image(
+            "median_depth"
+        )
         twin = render_reference(arrays, camera).median_depth
         assert (twin > 0).mean() > 0.01
         np.testing.assert_allclose(ours, twin, rtol=1e-6)
@@ -88,9 +92,9 @@ def test_median_depth_gradient_goes_to_the_chosen_gaussian():
     arrays["logit_opacities"] += 3.0
     gaussians = Gaussians.from_numpy(arrays)
     dr.enable_grad(gaussians.means)
-    output = render(gaussians, upload(camera), outputs=("median_depth",))
+    output = render(gaussians, device_camera(camera), outputs=("median_depth",))
     weights = np.random.default_rng(1).normal(size=40 * 28).astype(np.float32)
-    dr.backward(dr.sum(ad.Float(weights) * output.median_depth))
+    dr.backward(dr.sum(upload(weights) * output.median_depth))
     slope = np.array(dr.grad(gaussians.means)).T
     twin = render_reference(arrays, camera).median_depth.ravel()
     depths = arrays["means"] @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
@@ -106,11 +110,11 @@ def test_picking_is_a_gather_and_adds_up_in_no_order():
     gradient = (rng.normal(size=200_000) * 10.0 ** rng.integers(-6, 6, 200_000)).astype(np.float32)
     found = []
     for order in (np.arange(200_000), rng.permutation(200_000)):
-        source = ad.Float(values)
+        source = upload(values)
         dr.enable_grad(source)
-        out = picked(source, ad.UInt32(index[order]))
+        out = gather_or_zero(source, upload(index[order], ad.UInt32))
         np.testing.assert_array_equal(np.array(out), np.append(values, 0)[index[order]])
-        dr.backward(dr.sum(out * ad.Float(gradient[order])))
+        dr.backward(dr.sum(out * upload(gradient[order])))
         found.append(np.array(dr.grad(source)))
     np.testing.assert_array_equal(found[0], found[1])
     expected = np.bincount(index, gradient.astype(np.float64), 301)[:300]
@@ -122,7 +126,7 @@ def test_picking_is_a_gather_and_adds_up_in_no_order():
 def test_normals_of_a_sphere_point_outwards(view, axes):
     outward = fibonacci_sphere(3000)
     arrays, camera = surfels(0.5 * outward, outward, 0.02), view(64, 64)
-    uploaded = upload(camera)
+    uploaded = device_camera(camera)
     gaussians = Gaussians.from_numpy(arrays)
     output = render(gaussians, uploaded, outputs=("normal",), features=normals(gaussians, uploaded, axes))
     found = (
@@ -160,27 +164,27 @@ def test_normals_of_a_sphere_point_outwards(view, axes):
 def test_normals_of_quaternions_without_direction_are_finite():
     arrays = random_splats(4)
     arrays["quaternions"][:3] = [[0, 0, 0, 0], [np.nan, 0, 0, 1], [1e30, 0, 0, 0]]
-    found = np.array(normals(Gaussians.from_numpy(arrays), upload(perspective())))
+    found = np.array(normals(Gaussians.from_numpy(arrays), device_camera(perspective())))
     np.testing.assert_allclose(np.linalg.norm(found, axis=0), 1, atol=1e-6)
 
 
 def test_normal_axes_by_name_only():
     gaussians = Gaussians.from_numpy(random_splats(3))
     with pytest.raises(ValueError, match='axes: expected "world" or "camera"'):
-        normals(gaussians, upload(perspective()), "eye")
+        normals(gaussians, device_camera(perspective()), "eye")
 
 
-@pytest.mark.parametrize("channels", [0, 1, CHANNELS, CHANNELS + 1, 3 * CHANNELS + 2])
+@pytest.mark.parametrize("channels", [0, 1, FEATURES_PER_PASS, FEATURES_PER_PASS + 1, 3 * FEATURES_PER_PASS + 2])
 def test_any_number_of_channels(channels):
     """Each is the same picture as alone; the picture's gradient is that of the twin's linear map, the weights."""
-    arrays, camera = random_splats(120, 8), upload(perspective())
+    arrays, camera = random_splats(120, 8), device_camera(perspective())
     gaussians = Gaussians.from_numpy(arrays)
     values = np.random.default_rng(2).normal(size=(channels, 120)).astype(np.float32)
-    features = [ad.Float(row) for row in values]
+    features = [upload(row) for row in values]
     dr.enable_grad(features)
     output = render(gaussians, camera, outputs=("alpha",), features=features)
     assert output.image("features").shape == (28, 40, channels)
-    assert output.colour is None
+    assert output.color is None
     assert output.depth is None
     twin = render_reference(arrays, perspective(), features=values.T)
     np.testing.assert_allclose(output.image("features"), twin.features, atol=1e-5)
@@ -193,36 +197,36 @@ def test_any_number_of_channels(channels):
 
 
 def test_splat_gradients_do_not_depend_on_how_channels_are_grouped():
-    arrays, camera = random_splats(120, 8), upload(perspective())
-    values = np.random.default_rng(2).normal(size=(CHANNELS + 3, 120)).astype(np.float32)
+    arrays, camera = random_splats(120, 8), device_camera(perspective())
+    values = np.random.default_rng(2).normal(size=(FEATURES_PER_PASS + 3, 120)).astype(np.float32)
 
     def slope(groups):
         gaussians = Gaussians.from_numpy(arrays)
         dr.enable_grad(gaussians.means)
         loss = ad.Float(0)
         for group in groups:
-            output = render(gaussians, camera, outputs=("alpha",), features=[ad.Float(values[i]) for i in group])
+            output = render(gaussians, camera, outputs=("alpha",), features=[upload(values[i]) for i in group])
             loss += sum((dr.sum((1 + i) * plane) for i, plane in zip(group, output.features, strict=True)), ad.Float(0))
         dr.backward(loss)
         return np.array(dr.grad(gaussians.means))
 
-    together, alone = slope([range(CHANNELS + 3)]), slope([[i] for i in range(CHANNELS + 3)])
+    together, alone = slope([range(FEATURES_PER_PASS + 3)]), slope([[i] for i in range(FEATURES_PER_PASS + 3)])
     np.testing.assert_allclose(together, alone, rtol=1e-3, atol=1e-4 * np.abs(alone).max())
 
 
 def test_features_as_an_array_and_features_that_are_not_finite():
-    arrays, camera = random_splats(30, 4), upload(perspective())
+    arrays, camera = random_splats(30, 4), device_camera(perspective())
     gaussians = Gaussians.from_numpy(arrays)
     values = np.random.default_rng(3).normal(size=(4, 30)).astype(np.float32)
-    plain = render(gaussians, camera, features=[ad.Float(row) for row in values]).image("features")
+    plain = render(gaussians, camera, features=[upload(row) for row in values]).image("features")
     np.testing.assert_array_equal(render(gaussians, camera, features=ad.ArrayXf(values)).image("features"), plain)
     hostile = values.copy()
     hostile[0, 3], hostile[1, 5], hostile[2, 7] = np.nan, np.inf, -np.inf
     zeroed = np.where(np.isfinite(hostile), hostile, 0)
-    features = [ad.Float(row) for row in hostile]
+    features = [upload(row) for row in hostile]
     dr.enable_grad(features)
     output = render(gaussians, camera, features=features)
-    expected = render(gaussians, camera, features=[ad.Float(row) for row in zeroed])
+    expected = render(gaussians, camera, features=[upload(row) for row in zeroed])
     np.testing.assert_array_equal(output.image("features"), expected.image("features"))
     dr.backward(sum((dr.sum(plane) for plane in output.features), ad.Float(0)))
     for feature in features:
@@ -230,13 +234,20 @@ def test_features_as_an_array_and_features_that_are_not_finite():
 
 
 def test_wrong_requests_are_told():
-    gaussians, camera = Gaussians.from_numpy(random_splats(30)), upload(perspective())
-    with pytest.raises(ValueError, match=r"outputs: expected some of colour, alpha, .* found 'color'"):
-        render(gaussians, camera, outputs=("color",))
+    gaussians, camera = Gaussians.from_numpy(random_splats(30)), device_camera(perspective())
+    with pytest.raises(ValueError, match=r"outputs: expected some of color, alpha, .* found 'shade'"):
+        render(gaussians, camera, outputs=("shade",))
     with pytest.raises(ValueError, match="features: expected arrays of 30, found one of 29"):
         render(gaussians, camera, features=[dr.zeros(ad.Float, 30), dr.zeros(ad.Float, 29)])
     with pytest.raises(ValueError, match=r"name: expected one of the outputs asked for .* found 'normal'"):
         render(gaussians, camera).image("normal")
+    output = render(gaussians, camera, outputs=("alpha",), features=[dr.zeros(ad.Float, 30)])
+    with pytest.raises(ValueError, match=r"name: .* asked for \(alpha, features\), found 'depth'"):
+        output.image("depth")
+    with pytest.raises(ValueError, match="outputs: expected color and depth for to_numpy, found no color"):
+        output.to_numpy()
+    with pytest.raises(ValueError, match="outputs: expected color for over, found none"):
+        output.over(0)
 
 
 @pytest.mark.parametrize("view", VIEWS)
@@ -246,7 +257,7 @@ def test_zooming_out_keeps_the_mean_of_the_antialiased_picture(view):
     change = {}
     for antialiased in (False, True):
         means = [
-            render(gaussians, upload(view(size, size)), antialiased=antialiased).image("colour").mean()
+            render(gaussians, device_camera(view(size, size)), antialiased=antialiased).image("color").mean()
             for size in (256, 32)
         ]
         change[antialiased] = abs(means[1] / means[0] - 1)
@@ -273,7 +284,7 @@ def test_compensation_is_the_ratio_of_areas():
 @pytest.mark.parametrize("view", VIEWS)
 def test_no_gaussians_give_every_output(view):
     empty = Gaussians.from_numpy({name: value[:0] for name, value in random_splats(3).items()})
-    output = render(empty, upload(view()), outputs=OUTPUTS, features=[ad.Float(), ad.Float()])
+    output = render(empty, device_camera(view()), outputs=OUTPUTS, features=[ad.Float(), ad.Float()])
     for name in (*OUTPUTS, "features"):
         assert not output.image(name).any()
     assert output.image("features").shape == (28, 40, 2)
@@ -285,10 +296,10 @@ def test_hostile_values_stay_finite_in_every_output(name, value):
     arrays = random_splats(30, 4)
     arrays[name][7] = value
     for view, antialiased in ((perspective, True), (orthographic, False), (orthographic, True)):
-        gaussians, camera = Gaussians.from_numpy(arrays), upload(view(16, 12))
+        gaussians, camera = Gaussians.from_numpy(arrays), device_camera(view(16, 12))
         dr.enable_grad(*gaussians.parameters().values(), camera.values)
         output = render(gaussians, camera, outputs=OUTPUTS, antialiased=antialiased)
-        planes = [*output.colour, output.alpha, output.depth, output.median_depth, *output.normal]
+        planes = [*output.color, output.alpha, output.depth, output.median_depth, *output.normal]
         dr.backward(sum((dr.sum(plane) for plane in planes), ad.Float(0)))
         for plane in (*planes, *map(dr.grad, (*gaussians.parameters().values(), camera.values))):
             assert np.isfinite(np.array(plane)).all()
@@ -297,11 +308,11 @@ def test_hostile_values_stay_finite_in_every_output(name, value):
 @pytest.mark.parametrize("view", VIEWS)
 def test_same_input_same_bits(view):
     def run():
-        gaussians, camera = Gaussians.from_numpy(random_splats(4000, 2)), upload(view(120, 90))
+        gaussians, camera = Gaussians.from_numpy(random_splats(4000, 2)), device_camera(view(120, 90))
         twist = dr.zeros(ad.Float, 6)
         dr.enable_grad(*gaussians.parameters().values(), twist)
         output = render(gaussians, camera.moved(twist), outputs=OUTPUTS, antialiased=True)
-        planes = [*output.colour, output.alpha, output.depth, output.median_depth, *output.normal]
+        planes = [*output.color, output.alpha, output.depth, output.median_depth, *output.normal]
         dr.backward(sum((dr.sum(dr.square(plane)) for plane in planes), ad.Float(0)))
         return [np.array(plane) for plane in (*planes, *map(dr.grad, (*gaussians.parameters().values(), twist)))]
 
@@ -313,7 +324,9 @@ def test_same_input_same_bits(view):
 @pytest.mark.parametrize(("count", "size"), [(10, 16), (200_000, 128), (2_000, 2048)])
 def test_sizes_and_numbers(view, count, size):
     arrays = random_splats(count, 1, scales=(-6.0, -4.5))
-    output = render(Gaussians.from_numpy(arrays), upload(view(size, size)), outputs=("alpha", "depth", "median_depth"))
+    output = render(
+        Gaussians.from_numpy(arrays), device_camera(view(size, size)), outputs=("alpha", "depth", "median_depth")
+    )
     alpha, depth, median = (output.image(name) for name in ("alpha", "depth", "median_depth"))
     assert alpha.shape == (size, size)
     assert 0 < alpha.max() <= 1
@@ -328,14 +341,14 @@ def test_sizes_and_numbers(view, count, size):
 def test_one_giant_over_all_tiles_and_a_crowd_on_one_pixel(view):
     giant = random_splats(1, 1)
     giant["log_scales"][:], giant["logit_opacities"][:], giant["means"][:] = 6.0, 2.0, 0.0
-    output = render(Gaussians.from_numpy(giant), upload(view(500, 300)), outputs=("alpha", "median_depth"))
+    output = render(Gaussians.from_numpy(giant), device_camera(view(500, 300)), outputs=("alpha", "median_depth"))
     np.testing.assert_allclose(output.image("alpha"), 1 / (1 + np.exp(-2.0)), rtol=1e-3)
     np.testing.assert_allclose(output.image("median_depth"), np.linalg.norm(POSE[:3, 3]), rtol=1e-5)
 
     crowd = random_splats(10_000, 6)
     crowd["means"][:] *= 1e-6
     crowd["log_scales"][:], crowd["logit_opacities"][:] = -9.0, -5.0
-    output = render(Gaussians.from_numpy(crowd), upload(view(16, 16)), outputs=("alpha", "median_depth"))
+    output = render(Gaussians.from_numpy(crowd), device_camera(view(16, 16)), outputs=("alpha", "median_depth"))
     twin = render_reference(crowd, view(16, 16), 0)
     np.testing.assert_allclose(output.image("alpha"), twin.alpha, atol=2e-5)
     np.testing.assert_allclose(output.image("median_depth"), twin.median_depth, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""The Dr.Jit rasterizer against its float64 twin: pictures, gradients, symmetries, hostile input."""
+"""The Dr.Jit rasterizer against its float64 reference: pictures, gradients, symmetries, hostile input."""
 
 from functools import cache
 
@@ -8,12 +8,13 @@ import pytest
 from splats import random_splats
 
 from spacesim.backend import ad, select
+from spacesim.backend.upload import upload
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import look_at, quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
-from spacesim.splat.raster import bin as tiles
+from spacesim.splat.raster import bin as binning
 from spacesim.splat.raster import blend as rasterize
-from spacesim.splat.raster import records
+from spacesim.splat.raster import records, tiles
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
 from spacesim.splat.raster.project import Pinhole, project
 from spacesim.splat.raster.reference import real_spherical_harmonics, render_reference
@@ -30,7 +31,8 @@ def way(request, monkeypatch):
     if request.param != select():
         if select() == "cuda":
             pytest.skip("Dr.Jit cannot replay its sort on CUDA")
-        monkeypatch.setattr(tiles, "select", lambda: "cuda")
+        for module in (binning, tiles):
+            monkeypatch.setattr(module, "select", lambda: "cuda")
         monkeypatch.setattr(rasterize, "select", lambda: "cuda")
 
 
@@ -57,7 +59,7 @@ def picture(arrays: dict[str, np.ndarray], view: Camera) -> dict[str, np.ndarray
     output = render(Gaussians.from_numpy(arrays), Pinhole.of(view))
     shape = (view.height, view.width)
     return {
-        "colour": np.array(output.colour).T.reshape(*shape, 3),
+        "color": np.array(output.color).T.reshape(*shape, 3),
         "alpha": np.array(output.alpha).reshape(shape),
         "depth": np.array(output.depth).reshape(shape),
     }
@@ -74,10 +76,10 @@ def gradients(arrays: dict[str, np.ndarray], view: Camera) -> dict[str, np.ndarr
     for parameter in gaussians.parameters().values():
         dr.enable_grad(parameter)
     output = render(gaussians, Pinhole.of(view))
-    planes = [*output.colour, output.alpha, output.depth * output.alpha]
+    planes = [*output.color, output.alpha, output.depth * output.alpha]
     loss = ad.Float(0)
     for weight, plane in zip(loss_weights(view), planes, strict=True):
-        loss += dr.sum(ad.Float(weight.astype(np.float32)) * plane)
+        loss += dr.sum(upload(weight.astype(np.float32)) * plane)
     dr.backward(loss)
     result = {name: np.array(dr.grad(value)).T for name, value in gaussians.parameters().items()}
     result["sh"] = result["sh"].reshape(len(arrays["means"]), -1, 3)
@@ -86,7 +88,7 @@ def gradients(arrays: dict[str, np.ndarray], view: Camera) -> dict[str, np.ndarr
 
 def reference_loss(arrays: dict[str, np.ndarray], view: Camera) -> float:
     output = render_reference(arrays, view)
-    planes = [*np.moveaxis(output.colour, -1, 0), output.alpha, output.depth * output.alpha]
+    planes = [*np.moveaxis(output.color, -1, 0), output.alpha, output.depth * output.alpha]
     return float(sum((w * p.ravel()).sum() for w, p in zip(loss_weights(view), planes, strict=True)))
 
 
@@ -111,7 +113,7 @@ def test_picture_matches_the_twin(count, size):
     arrays, view = random_splats(count, seed=count), camera(*size)
     ours, twin = picture(arrays, view), render_reference(arrays, view)
     assert twin.alpha.max() > 0.1
-    np.testing.assert_allclose(ours["colour"], twin.colour, atol=1e-5)
+    np.testing.assert_allclose(ours["color"], twin.color, atol=1e-5)
     np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=1e-5)
     solid = twin.alpha > 0.01  # below, depth divides by next to nothing
     np.testing.assert_allclose(ours["depth"][solid], twin.depth[solid], atol=2e-5)
@@ -185,7 +187,7 @@ def test_no_splats_at_all():
     view = camera()
     empty = {name: value[:0] for name, value in random_splats(3).items()}
     output = picture(empty, view)
-    assert not output["colour"].any()
+    assert not output["color"].any()
     assert not output["alpha"].any()
 
 
@@ -210,7 +212,7 @@ def test_hostile_values_stay_finite_and_alone(name, value):
         assert np.isfinite(gradient).all()
     if not np.isfinite(value) and name != "sh":  # such a splat is not drawn, and the others are as without it
         others = picture({key: np.delete(array, 7, axis=0) for key, array in arrays.items()}, view)
-        np.testing.assert_array_equal(output["colour"], others["colour"])
+        np.testing.assert_array_equal(output["color"], others["color"])
 
 
 def test_extremes_of_size_and_number():
@@ -239,20 +241,20 @@ def test_recordings_serve_models_of_any_size():
     for count in (1000, 40, 1020, 7, 1, 961, 1000):
         arrays = random_splats(count, seed=count, degree=0)
         ours, twin = picture(arrays, view), render_reference(arrays, view)
-        np.testing.assert_allclose(ours["colour"], twin.colour, atol=2e-5)
+        np.testing.assert_allclose(ours["color"], twin.color, atol=2e-5)
         np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=2e-5)
 
 
 def test_pictures_have_lists_of_few_sizes():
     """Two from one power of two to the next; a model that is seen from all over then has few recordings."""
     counts = range(2**13, 2**17, 61)
-    sizes = {tiles.room(count, tiles.FEW) for count in counts}
+    sizes = {tiles.round_capacity(count, binning.FEW) for count in counts}
     assert len(sizes) <= 9
-    assert len({tiles.room(count) for count in counts}) > 30
-    assert all(count < tiles.room(count, tiles.FEW) <= 1.5 * count + 1 for count in counts)
+    assert len({tiles.round_capacity(count) for count in counts}) > 30
+    assert all(count < tiles.round_capacity(count, binning.FEW) <= 1.5 * count + 1 for count in counts)
     arrays = random_splats(600, seed=5, degree=0)
     splats, footprints = project(Gaussians.from_numpy(arrays), Pinhole.of(camera(64, 48)))
-    few, many = (tiles.bin_splats(splats, footprints, 64, 48, few_sizes=flag) for flag in (True, False))
+    few, many = (binning.bin_splats(splats, footprints, 64, 48, few_sizes=flag) for flag in (True, False))
     assert few.pairs == many.pairs > 100
     for name in ("start", "end"):
         assert np.array_equal(np.array(getattr(few, name)), np.array(getattr(many, name)))
@@ -262,7 +264,7 @@ def test_pictures_have_lists_of_few_sizes():
 @pytest.mark.parametrize("first", [1024, 2048])
 def test_a_recording_of_as_many_splats_as_its_room_holds_serves_fewer(first):
     """Where count and room were one, a replay would take the room's size from the next, smaller number of splats."""
-    assert all(tiles.room(count) > count for count in (*range(1, 5000), 2**20, 2**20 - 1))
+    assert all(tiles.round_capacity(count) > count for count in (*range(1, 5000), 2**20, 2**20 - 1))
     for count in (first, first - 300):
         arrays = {**random_splats(count), "logit_opacities": np.full(count, -1.0)}
         twin = render_reference(arrays, camera())
@@ -272,7 +274,7 @@ def test_a_recording_of_as_many_splats_as_its_room_holds_serves_fewer(first):
 @pytest.mark.parametrize(("count", "sentence"), [(20_000, "GB are free"), (150_000, "can be sorted")])
 def test_more_pairs_than_memory_holds_are_a_sentence(count, sentence, monkeypatch):
     """Splats that cover all tiles of a large picture."""
-    monkeypatch.setattr(tiles, "free_memory", lambda _: 10**9)
+    monkeypatch.setattr(binning, "free_memory", lambda _: 10**9)
     arrays = random_splats(count, degree=0)
     arrays["log_scales"][:] = 3.0
     arrays["logit_opacities"][:] = 5.0
@@ -282,7 +284,7 @@ def test_more_pairs_than_memory_holds_are_a_sentence(count, sentence, monkeypatc
 
 def test_a_picture_larger_than_memory_is_a_sentence(monkeypatch):
     """Also of a single splat, and of none in sight."""
-    monkeypatch.setattr(tiles, "free_memory", lambda _: 10**9)
+    monkeypatch.setattr(binning, "free_memory", lambda _: 10**9)
     arrays, view = random_splats(1), camera(4096, 4096)
     with pytest.raises(WorkError, match=r"on 1.68e\+07 pixels need about 1.43 GB of memory, 1 GB are free"):
         render(Gaussians.from_numpy(arrays), Pinhole.of(view))
@@ -292,14 +294,14 @@ def test_a_picture_larger_than_memory_is_a_sentence(monkeypatch):
 
 
 def test_a_training_step_needs_more_than_a_picture(monkeypatch, small_dataset):
-    monkeypatch.setattr(tiles, "free_memory", lambda _: 2 * 10**9)
+    monkeypatch.setattr(binning, "free_memory", lambda _: 2 * 10**9)
     view = camera(4096, 4096)
     splats, footprints = project(Gaussians.from_numpy(random_splats(1)), Pinhole.of(view))
-    assert tiles.bin_splats(splats, footprints, 4096, 4096).pairs > 0
-    needed = {"cuda": "2.7", "llvm": "4.71"}[tiles.select()]
+    assert binning.bin_splats(splats, footprints, 4096, 4096).pairs > 0
+    needed = {"cuda": "2.7", "llvm": "4.71"}[binning.select()]
     with pytest.raises(WorkError, match=rf"need about {needed} GB of memory, 2 GB are free"):
-        tiles.bin_splats(splats, footprints, 4096, 4096, training=True)
-    monkeypatch.setattr(tiles, "TRAINING_BYTES", dict.fromkeys(("cuda", "llvm"), (0, 10**7)))
+        binning.bin_splats(splats, footprints, 4096, 4096, training=True)
+    monkeypatch.setattr(binning, "TRAINING_BYTES", dict.fromkeys(("cuda", "llvm"), (0, 10**7)))
     with pytest.raises(WorkError, match="2 GB are free"):
         Trainer(small_dataset, TrainConfig()).step()
 
@@ -308,19 +310,20 @@ def test_a_training_step_needs_more_than_a_picture(monkeypatch, small_dataset):
 def test_pictures_of_few_pixels(size):
     arrays, view = random_splats(60, seed=4, degree=0), camera(*size)
     ours, twin = picture(arrays, view), render_reference(arrays, view)
-    np.testing.assert_allclose(ours["colour"], twin.colour, atol=2e-5)
+    np.testing.assert_allclose(ours["color"], twin.color, atol=2e-5)
     np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=2e-5)
 
 
 def adjoints(arrays, view, channels: int, absolute: bool, monkeypatch) -> list[np.ndarray]:
     """Gradients [N] of weighted sums of `channels` planes: by buckets, then by tiles, with CUDA's tiles."""
-    monkeypatch.setattr(tiles, "select", lambda: "cuda")
+    for module in (binning, tiles):
+        monkeypatch.setattr(module, "select", lambda: "cuda")
     monkeypatch.setattr(rasterize, "select", lambda: "cuda")
     splats, footprints = project(Gaussians.from_numpy(arrays), Pinhole.of(view))
     rng, size = np.random.default_rng(4), (view.width, view.height)
-    features = [ad.Float(row) for row in rng.normal(size=(channels, len(arrays["means"]))).astype(np.float32)]
-    weights = [ad.Float(row) for row in rng.normal(size=(channels + 1, view.width * view.height)).astype(np.float32)]
-    lists = tiles.bin_splats(splats, footprints, *size)
+    features = [upload(row) for row in rng.normal(size=(channels, len(arrays["means"]))).astype(np.float32)]
+    weights = [upload(row) for row in rng.normal(size=(channels + 1, view.width * view.height)).astype(np.float32)]
+    lists = binning.bin_splats(splats, footprints, *size)
     found = []
     for limit in (rasterize.CHECKPOINT_BYTES, 0):
         monkeypatch.setattr(rasterize, "CHECKPOINT_BYTES", limit)
@@ -385,10 +388,10 @@ SHAPES = [(8, 8, 4, 2), (8, 8, 4, 4), (8, 8, 2, 4), (8, 8, 1, 8), (16, 8, 16, 1)
 @pytest.mark.parametrize("shape", SHAPES[:1] + SHAPES[3:6])
 def test_any_tile_shape_blends_the_same(shape, monkeypatch):
     """Lanes that hold columns or blocks, tiles that share a packet or fill it: pictures and gradients by the twin."""
-    monkeypatch.setattr(tiles, "tile_shape", lambda: tiles.TileShape(*shape))
+    monkeypatch.setattr(binning, "tile_shape", lambda: tiles.TileShape(*shape))
     arrays, view = random_splats(25, seed=11, degree=1), camera(24, 17)
     ours, twin = picture(arrays, view), render_reference(arrays, view)
-    np.testing.assert_allclose(ours["colour"], twin.colour, atol=1e-5)
+    np.testing.assert_allclose(ours["color"], twin.color, atol=1e-5)
     np.testing.assert_allclose(ours["alpha"], twin.alpha, atol=1e-5)
     slope, expected = gradients(arrays, view), differences()
     for name in NAMES:
@@ -402,25 +405,25 @@ def test_lanes_hold_each_pixel_of_a_picture_once(shape):
     shape, (width, height) = tiles.TileShape(*shape), (37, 21)
     across, down = -(-width // shape.width), -(-height // shape.height)
     none, order = ad.UInt32(0), np.random.default_rng(0).permutation(across * down)
-    lists = tiles.TileLists(*[none] * 6, 0, across, down, shape, ad.UInt32(order.astype(np.uint32)))
-    lane = records.lane_pixels(lists)
+    lists = tiles.TileLists(*[none] * 6, 0, across, down, shape, upload(order.astype(np.uint32), ad.UInt32))
+    lane = tiles.lane_pixels(lists)
     found = {}
-    for p, (i, j) in enumerate(records.lane_offsets(shape)):
+    for p, (i, j) in enumerate(tiles.lane_offsets(shape)):
         column, row, place = (np.array(v) for v in (lane.column + i, lane.row + j, lane.place * shape.pixels + p))
         found |= {(x, y): n for x, y, n in zip(column.tolist(), row.tolist(), place.tolist(), strict=True)}
-        inside = records.pixel_in_tile(lane.place * shape.pixels % (shape.width * shape.height) + p, shape)
+        inside = tiles.pixel_in_tile(lane.place * shape.pixels % (shape.width * shape.height) + p, shape)
         np.testing.assert_array_equal(np.array(inside[0]), column % shape.width)
         np.testing.assert_array_equal(np.array(inside[1]), row % shape.height)
     pixels = across * down * shape.width * shape.height
     assert sorted(found.values()) == list(range(pixels))
-    index = np.array(records.tiled_index(lists, width, height)).reshape(height, width)
+    index = np.array(tiles.tiled_index(lists, width, height)).reshape(height, width)
     assert all(found[x, y] == index[y, x] for y in range(height) for x in range(width))
 
 
 def test_powers_of_two():
     """Within two units in the last place where splats are blended, and nowhere far off."""
     power = np.linspace(-126, 1, 300_001).astype(np.float32)
-    error = np.array(records.exp2(ad.Float(power))).astype(np.float64) / np.exp2(power.astype(np.float64)) - 1
+    error = np.array(records.exp2(upload(power))).astype(np.float64) / np.exp2(power.astype(np.float64)) - 1
     assert np.abs(error[power >= records.POWER_MIN]).max() < 2.4e-7
     assert np.abs(error).max() < 1e-6
     np.testing.assert_array_equal(np.array(records.exp2(ad.Float([0.0, -1.0, -7.0]))), [1.0, 0.5, 2.0**-7])

@@ -8,18 +8,20 @@ import pytest
 from splats import light_of, random_splats, srgb_of
 
 from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.data.records import Camera
-from spacesim.splat.compose.scene import Composition, Placed
+from spacesim.splat.compose.scene import Composition, PlacedRun
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.render import OUTPUTS, render
-from spacesim.splat.raster.supersample import finer, pixel_means, supersampled
-from spacesim.splat.raster.tone import developed
+from spacesim.splat.raster.output import OUTPUTS
+from spacesim.splat.raster.render import render
+from spacesim.splat.raster.supersample import pixel_means, render_supersampled, upsampled_camera
+from spacesim.splat.raster.tone import adjust_exposure
 from spacesim.splat.train.config import TrainConfig, preset
-from spacesim.splat.train.stages import LossConfig, Target, picture_loss
+from spacesim.splat.train.stages import LossSettings, TargetImage, picture_loss
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 from spacesim.splat.train.warm_start import WarmStart, WarmStartConfig
@@ -38,9 +40,9 @@ def boxes(plane: np.ndarray, times: int) -> np.ndarray:
     return plane.reshape(height, times, width, times, *plane.shape[2:]).mean(axis=(1, 3))
 
 
-def mean_light(colour: np.ndarray, alpha: np.ndarray, times: int) -> np.ndarray:
+def mean_light(color: np.ndarray, alpha: np.ndarray, times: int) -> np.ndarray:
     """Premultiplied sRGB values [h, w, 3], beyond 1 too: the light of straight colours, averaged with the alphas."""
-    straight = np.divide(colour, alpha[..., None], out=np.zeros_like(colour), where=alpha[..., None] > 0)
+    straight = np.divide(color, alpha[..., None], out=np.zeros_like(color), where=alpha[..., None] > 0)
     whole = boxes(alpha, times)[..., None]
     light = boxes(alpha[..., None] * light_of(straight), times)
     return whole * srgb_of(np.divide(light, whole, out=np.zeros_like(light), where=whole > 0))
@@ -58,12 +60,12 @@ def planes(times: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarra
 @pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("times", [2, 3])
 def test_pixels_are_the_mean_light_of_their_places(times, linear):
-    colour, alpha, other = planes(times)
-    groups = {"colour": [ad.Float(c.ravel()) for c in np.moveaxis(colour, -1, 0)], "depth": [ad.Float(other.ravel())]}
-    found, passed = pixel_means(groups, ad.Float(1 - alpha.ravel()), (WIDTH, HEIGHT), times, linear)
+    color, alpha, other = planes(times)
+    groups = {"color": [upload(c.ravel()) for c in np.moveaxis(color, -1, 0)], "depth": [upload(other.ravel())]}
+    found, passed = pixel_means(groups, upload(1 - alpha.ravel()), (WIDTH, HEIGHT), times, linear)
     shape = HEIGHT, WIDTH
-    expected = boxes(colour, times) if linear else mean_light(colour, alpha, times)
-    drawn = np.stack([numbers(plane).reshape(shape) for plane in found["colour"]], axis=-1)
+    expected = boxes(color, times) if linear else mean_light(color, alpha, times)
+    drawn = np.stack([numbers(plane).reshape(shape) for plane in found["color"]], axis=-1)
     np.testing.assert_allclose(drawn, expected, atol=2e-6)
     np.testing.assert_allclose(numbers(found["depth"][0]).reshape(shape), boxes(other, times), atol=1e-6)
     np.testing.assert_allclose(1 - numbers(passed).reshape(shape), boxes(alpha, times), atol=1e-6)
@@ -71,33 +73,33 @@ def test_pixels_are_the_mean_light_of_their_places(times, linear):
 
 def test_half_of_a_white_pixel_in_shadow_has_half_of_its_light():
     white = [ad.Float([1, 0, 1, 0]) for _ in range(3)]
-    found, passed = pixel_means({"colour": white}, ad.Float([0, 0, 0, 0]), (1, 1), 2, linear=False)
-    assert numbers(found["colour"][0]) == pytest.approx(srgb_from_linear(np.array([0.5])), abs=1e-6)
+    found, passed = pixel_means({"color": white}, ad.Float([0, 0, 0, 0]), (1, 1), 2, linear=False)
+    assert numbers(found["color"][0]) == pytest.approx(srgb_from_linear(np.array([0.5])), abs=1e-6)
     assert numbers(passed) == 0
 
 
 @pytest.mark.parametrize("linear", [False, True])
 def test_gradients_are_those_of_the_mean_light(linear):
-    colour, alpha, _ = planes(2, seed=3)
-    alpha, colour = np.maximum(alpha, 0.05), np.maximum(colour, 0.01)
+    color, alpha, _ = planes(2, seed=3)
+    alpha, color = np.maximum(alpha, 0.05), np.maximum(color, 0.01)
     rng = np.random.default_rng(4)
-    by_colour, by_passed = rng.normal(size=(3, HEIGHT * WIDTH)), rng.normal(size=HEIGHT * WIDTH)
+    grad_color, grad_passed = rng.normal(size=(3, HEIGHT * WIDTH)), rng.normal(size=HEIGHT * WIDTH)
 
-    def loss(colour: np.ndarray, alpha: np.ndarray) -> float:
-        pixels = boxes(colour, 2) if linear else mean_light(colour, alpha, 2)
-        along = (np.moveaxis(pixels, -1, 0).reshape(3, -1) * by_colour).sum()
-        return float(along + ((1 - boxes(alpha, 2)).ravel() * by_passed).sum())
+    def loss(color: np.ndarray, alpha: np.ndarray) -> float:
+        pixels = boxes(color, 2) if linear else mean_light(color, alpha, 2)
+        along = (np.moveaxis(pixels, -1, 0).reshape(3, -1) * grad_color).sum()
+        return float(along + ((1 - boxes(alpha, 2)).ravel() * grad_passed).sum())
 
-    given = [ad.Float(c.ravel()) for c in np.moveaxis(colour, -1, 0)]
-    passed = ad.Float(1 - alpha.ravel())
+    given = [upload(c.ravel()) for c in np.moveaxis(color, -1, 0)]
+    passed = upload(1 - alpha.ravel())
     dr.enable_grad(given, passed)
-    found, whole = pixel_means({"colour": given}, passed, (WIDTH, HEIGHT), 2, linear)
-    parts = [dr.sum(p * ad.Float(g)) for p, g in zip(found["colour"], by_colour, strict=True)]
-    dr.backward(sum(parts, dr.sum(whole * ad.Float(by_passed))))
+    found, whole = pixel_means({"color": given}, passed, (WIDTH, HEIGHT), 2, linear)
+    parts = [dr.sum(p * upload(g)) for p, g in zip(found["color"], grad_color, strict=True)]
+    dr.backward(sum(parts, dr.sum(whole * upload(grad_passed))))
     for _ in range(4):
-        steps = rng.normal(size=colour.shape), rng.normal(size=alpha.shape)
+        steps = rng.normal(size=color.shape), rng.normal(size=alpha.shape)
         h = 1e-6
-        ends = [loss(colour + sign * h * steps[0], alpha + sign * h * steps[1]) for sign in (1, -1)]
+        ends = [loss(color + sign * h * steps[0], alpha + sign * h * steps[1]) for sign in (1, -1)]
         slope = sum(numbers(dr.grad(g)) @ steps[0][..., c].ravel() for c, g in enumerate(given))
         slope -= numbers(dr.grad(passed)) @ steps[1].ravel()
         assert slope == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=2e-3, abs=2e-3)
@@ -106,19 +108,19 @@ def test_gradients_are_those_of_the_mean_light(linear):
 @pytest.mark.parametrize("times", [1, 2, 3])
 def test_a_supersampled_picture_is_made_of_a_wider_one(times):
     splats = Gaussians.from_numpy(random_splats(60, seed=1))
-    features = [ad.Float(np.random.default_rng(2).uniform(size=60).astype(np.float32)) for _ in range(2)]
+    features = [upload(np.random.default_rng(2).uniform(size=60).astype(np.float32)) for _ in range(2)]
 
     def draw(camera):
         return render(splats, camera, outputs=OUTPUTS, features=features, antialiased=True)
 
-    wide, found = draw(Pinhole.of(finer(EYE, times))), supersampled(draw, EYE, times)
+    wide, found = draw(Pinhole.of(upsampled_camera(EYE, times))), render_supersampled(draw, EYE, times)
     assert (found.width, found.height) == (EYE.width, EYE.height)
     alpha = numbers(wide.image("alpha"))
     whole = boxes(alpha, times)
     np.testing.assert_allclose(found.image("alpha"), whole, atol=1e-6)
     np.testing.assert_allclose(found.image("features"), boxes(numbers(wide.image("features")), times), atol=1e-6)
-    expected = mean_light(numbers(wide.image("colour")), alpha, times) if times > 1 else wide.image("colour")
-    np.testing.assert_allclose(found.image("colour"), expected, atol=5e-6)
+    expected = mean_light(numbers(wide.image("color")), alpha, times) if times > 1 else wide.image("color")
+    np.testing.assert_allclose(found.image("color"), expected, atol=5e-6)
     depth = boxes(numbers(wide.image("depth")) * alpha, times) / np.maximum(whole, 1e-9)
     np.testing.assert_allclose(found.image("depth"), depth, rtol=1e-5, atol=1e-6)
     length = np.linalg.norm(found.image("normal"), axis=-1)
@@ -132,17 +134,17 @@ def test_a_supersampled_picture_is_made_of_a_wider_one(times):
 def test_one_pixel_is_drawn_like_any_other():
     splats = Gaussians.from_numpy(random_splats(60, seed=1))
     camera = Camera(EYE.world_from_camera, 1, 1, 3.0, 3.0, 0.5, 0.5)
-    found = supersampled(lambda seen: render(splats, seen), camera, 2)
-    assert found.image("colour").shape == (1, 1, 3)
-    wide = render(splats, Pinhole.of(finer(camera, 2)))
-    expected = mean_light(numbers(wide.image("colour")), numbers(wide.image("alpha")), 2)
-    np.testing.assert_allclose(found.image("colour"), expected, atol=2e-6)
+    found = render_supersampled(lambda seen: render(splats, seen), camera, 2)
+    assert found.image("color").shape == (1, 1, 3)
+    wide = render(splats, Pinhole.of(upsampled_camera(camera, 2)))
+    expected = mean_light(numbers(wide.image("color")), numbers(wide.image("alpha")), 2)
+    np.testing.assert_allclose(found.image("color"), expected, atol=2e-6)
 
 
 def test_the_finer_camera_sees_the_same():
     point = np.array([0.3, 0.2, -0.1, 1])
     for times in (2, 4):
-        seen = finer(EYE, times)
+        seen = upsampled_camera(EYE, times)
         places = []
         for camera in (EYE, seen):
             x, y, z, _ = camera.camera_from_world @ point
@@ -162,12 +164,12 @@ def test_a_run_and_a_scene_of_it_draw_the_same(small_lit_dataset, tmp_path, meth
     frame = small_lit_dataset.test[0]
     alone = run.predict(frame.camera, frame.sun, normals=True)
     single = replace(run, config={**run.config, "supersample": 1})
-    wide = single.predict(finer(frame.camera, 2), frame.sun)
+    wide = single.predict(upsampled_camera(frame.camera, 2), frame.sun)
     expected = mean_light(numbers(wide.rgb), numbers(wide.alpha), 2)
     if linear:  # what is blended is light over black
         expected = srgb_from_linear(boxes(linear_from_srgb(numbers(wide.rgb)), 2))
     np.testing.assert_allclose(alone.rgb, expected, atol=5e-6)
-    scene = Composition([Placed(run)])
+    scene = Composition([PlacedRun(run)])
     assert scene.supersample == 2
     composed = scene.predict(frame.camera, frame.sun, normals=True)
     for name in ("rgb", "alpha", "depth", "visibility", "normal"):
@@ -177,7 +179,7 @@ def test_a_run_and_a_scene_of_it_draw_the_same(small_lit_dataset, tmp_path, meth
         if name != "visibility" or name in drawn.planes:
             assert np.isfinite(drawn.image(name)).all()
             assert drawn.image(name).shape == (frame.camera.height, frame.camera.width)
-    with_both = Composition([Placed(run), Placed(single)])
+    with_both = Composition([PlacedRun(run), PlacedRun(single)])
     assert with_both.contents[0] != with_both.contents[1], "a picture depends on it"
 
 
@@ -192,7 +194,7 @@ def test_supersampled_training_repeats_to_the_bit_and_resumes(small_lit_dataset,
     resumed.restore(tmp_path / "one/checkpoints/step_00000008.safetensors")
     while resumed.iteration < config.iterations:
         resumed.step()
-    for name, values in runs[0].model.to_numpy().items():
+    for name, values in runs[0].gaussians.to_numpy().items():
         np.testing.assert_array_equal(resumed.gaussians.to_numpy()[name], values, err_msg=name)
 
 
@@ -200,15 +202,15 @@ def test_supersampled_training_repeats_to_the_bit_and_resumes(small_lit_dataset,
 def test_training_compares_the_mean_light(tone):
     """An empty picture half lit: its loss by the mean of light, or of what is light already."""
     half = np.tile([1.0, 0.0], 2 * WIDTH * HEIGHT)
-    groups = {"colour": [ad.Float(half) for _ in range(3)]}
+    groups = {"color": [upload(half) for _ in range(3)]}
     light = {None: srgb_from_linear(np.array(0.5)), "srgb": srgb_from_linear(np.array(0.5))}
-    light["filmic"] = developed(np.array(0.5), "filmic")
+    light["filmic"] = adjust_exposure(np.array(0.5), "filmic")
     for level, same in ((float(light[tone]), True), (0.5, tone == "filmic" and abs(float(light[tone]) - 0.5) < 0.01)):
         byte = round(255 * level)
-        rgba = ad.UInt32(np.full(WIDTH * HEIGHT, byte * 0x10101 + (255 << 24), np.uint32))
-        target = Target(rgba, ad.Float([0, 0, 0]), ad.Bool(True), {})
-        config = LossConfig(0.0, 0.0, 0.0, 0.0, 1.0, tone, 2)
-        loss, _, _ = picture_loss(groups, ad.Float(1 - np.ones_like(half)), target, (WIDTH, HEIGHT), config)
+        rgba = upload(np.full(WIDTH * HEIGHT, byte * 0x10101 + (255 << 24), np.uint32), ad.UInt32)
+        target = TargetImage(rgba, ad.Float([0, 0, 0]), ad.Bool(True), {})
+        config = LossSettings(0.0, 0.0, 0.0, 0.0, 1.0, tone, 2)
+        loss, _, _ = picture_loss(groups, upload(1 - np.ones_like(half)), target, (WIDTH, HEIGHT), config)
         assert (numbers(loss)[0] < 0.004) == same
 
 
@@ -219,7 +221,7 @@ def test_refinement_watches_the_same_gradients_and_sizes(small_dataset, monkeypa
         config = replace(preset("demo"), init_count=200, supersample=times, antialiased=True)
         trainer = Trainer(small_dataset, config)
         seen = []
-        monkeypatch.setattr(trainer.strategy, "watches", lambda _step: True)
+        monkeypatch.setattr(trainer.strategy, "observes_step", lambda _step: True)
         monkeypatch.setattr(trainer.strategy, "observe", lambda *given, seen=seen: seen.append(given))
         trainer.step()
         gradient, radius, visible = (np.array(values) for values in seen[0])
@@ -230,13 +232,13 @@ def test_refinement_watches_the_same_gradients_and_sizes(small_dataset, monkeypa
 def test_the_warm_start_reads_its_masks_in_the_pixels_of_the_view(small_dataset, monkeypatch):
     config = replace(preset("demo"), init_count=60, supersample=2)
     config = replace(config, warm_start=WarmStartConfig(steps=6, decay=6, conservative=3))
-    trainer, sizes, pull = Trainer(small_dataset, config), [], WarmStart.pull
+    trainer, sizes, pull = Trainer(small_dataset, config), [], WarmStart.attraction_gradients
 
     def watched(self, rows, camera, *rest):
         sizes.append((camera.width, camera.height))
         return pull(self, rows, camera, *rest)
 
-    monkeypatch.setattr(WarmStart, "pull", watched)
+    monkeypatch.setattr(WarmStart, "attraction_gradients", watched)
     trainer.step()
     camera = small_dataset.train[0].camera
     assert sizes == [(camera.width, camera.height)]
@@ -249,16 +251,18 @@ def test_fine_light_is_drawn_finely():
         assert config.refinement.split_screen_size < preset("fast", method).refinement.split_screen_size
         assert preset("fast", method).supersample == preset("thesis", method).supersample == 1
     assert preset("fine").supersample == 1
-    assert preset("fine", "shadow-map").light.shadow.mapping.filter == "variance"
+    assert preset("fine", "shadow-map").light.shadow.method.filter == "variance"
 
 
 def test_pictures_too_large_to_draw_are_named():
     vast = Camera(EYE.world_from_camera, 8000, 8000, 8000, 8000, 4000, 4000)
-    with pytest.raises(InputError, match=r"--supersample 2: expected pictures of at most 33554432 pixels, found 8000x"):
-        finer(vast, 2)
+    with pytest.raises(
+        InputError, match=r"supersample: expected pictures of at most 33554432 pixels .*2 times as wide, found 8000x"
+    ):
+        upsampled_camera(vast, 2)
 
 
 def test_it_is_a_number_of_places():
     for times in (0, 5):
-        with pytest.raises(InputError, match=f"--supersample: expected 1 to 4, found {times}"):
+        with pytest.raises(InputError, match=f"supersample: expected 1 to 4, found {times}"):
             TrainConfig(supersample=times)

@@ -15,25 +15,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spacesim.backend import ad, recorded
+from spacesim.backend.arrays import Float
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array
 from spacesim.splat.light.shadow.light_camera import (
     MARGIN,
-    NARROWEST,
+    MIN_EXTENT_SHARE,
     SUPPORT,
-    drawable,
+    drawable_mask,
     fit_camera,
     light_axes,
     light_rows,
 )
-from spacesim.splat.raster.bin import RECORDINGS
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 
-MEANINGFUL_GAP = 0.05  #: of a cluster's extent: a narrower gap between supports is no place to split at, chosen
-MOST_CAMERAS = 8  #: K of algorithm 3, chosen: the thesis does not say
-WIDEST = 0.5  #: of an image, see `assign`, chosen
-STRAYS = 1e-3  #: share of the Gaussians that the one camera of a compact set may leave out, chosen
-LEAST_EXTENT = 1e-6  #: metres that an image covers at least, chosen: a point has no extent
+MEANINGFUL_GAP = 0.05  #: of a cluster's extent: a narrower gap between supports is no place to split at
+MAX_CAMERAS = 8  #: K of algorithm 3: the thesis does not say
+MAX_SUPPORT_SHARE = 0.5  #: of an image, see `assign_cameras`
+STRAYS = 1e-3  #: share of the Gaussians that the one camera of a compact set may leave out
+MIN_EXTENT = 1e-6  #: metres that an image covers at least: a point has no extent
 ROUNDING = 1e-9  #: by which a scale may seem to fall short of the least one
 
 Indices = NDArray[np.intp]
@@ -46,13 +47,14 @@ def occlusion_in_clusters(
     size: int,
     least_scale: float,
     occlude: Occlude,
-    most: int = MOST_CAMERAS,
-) -> Any:
+    most: int = MAX_CAMERAS,
+    crop: bool = True,
+) -> Float:
     """Float [N] in [0, 1], detached: the raw occlusion of each Gaussian, seen at enough pixels a metre.
 
     direction: [3], from the scene towards the Sun;  size: pixels of each side of a light image;  least_scale: f_min of
     algorithm 3, pixels a metre;  occlude: (gaussians, camera) -> Float [N], `occlusion_by_mapping` for one;  most:
-    cameras at most, K of algorithm 3
+    cameras at most, K of algorithm 3;  crop: of the one camera of a compact set, see `fit_camera`
 
     A set that fits one image, but for a share of `STRAYS` beyond it, has the one camera of `fit_camera`, as in
     training, which is tried first: whether it suffices is four numbers that are there by then. Else the largest cluster
@@ -63,31 +65,30 @@ def occlusion_in_clusters(
     _check(size, least_scale, most)
     if gaussians.count == 0:
         return dr.zeros(ad.Float, 0)
-    camera, coverage = _fitted(_shapes(gaussians), light_rows(direction), size)
+    camera, coverage = _fitted(_shapes(gaussians), light_rows(direction), size, crop)
     occlusion = occlude(gaussians, camera)
-    if _suffices(coverage, least_scale):
+    if _is_one_camera_enough(coverage, least_scale):
         return occlusion
     axes = light_axes(direction)
-    cameras, receivers = assign(light_supports(gaussians, direction), axes, size, least_scale, most)
+    cameras, receivers = assign_cameras(light_supports(gaussians, direction), axes, size, least_scale, most)
     camera_of = np.zeros(gaussians.count, np.uint32)
     for k, members in enumerate(receivers):
         camera_of[members] = k
-    chosen, occlusion = ad.UInt32(camera_of), None
+    chosen, occlusion = upload(camera_of, ad.UInt32), None
     for k, record in enumerate(cameras):
-        found = occlude(gaussians, Orthographic.of(record))
+        seen = occlude(gaussians, Orthographic.of(record))
         served = chosen == dr.opaque(ad.UInt32, k)
-        occlusion = found if occlusion is None else dr.select(served, found, occlusion)
+        occlusion = seen if occlusion is None else dr.select(served, seen, occlusion)
         dr.eval(occlusion)
     return occlusion
 
 
 @dataclass(frozen=True, eq=False)
 class Supports:
-    """Gaussians in light space; NaN where one cannot be drawn. positions: [N, 3] metres, R_l^T mu (4.29, t_l being the
-    world's origin);  radii: [N, 2] metres, three standard deviations across the light (4.31)."""
+    """Gaussians in light space; NaN where one cannot be drawn."""
 
-    positions: Array
-    radii: Array
+    positions: Array  #: [N, 3] metres, R_l^T mu (4.29, t_l being the world's origin)
+    radii: Array  #: [N, 2] metres, three standard deviations across the light (4.31)
 
 
 def light_supports(gaussians: Gaussians, direction: ArrayLike) -> Supports:
@@ -98,16 +99,16 @@ def light_supports(gaussians: Gaussians, direction: ArrayLike) -> Supports:
     return Supports(means @ light_axes(direction), radii)
 
 
-def assign(
-    supports: Supports, axes: Array, size: int, least_scale: float, most: int = MOST_CAMERAS
+def assign_cameras(
+    supports: Supports, axes: Array, size: int, least_scale: float, most: int = MAX_CAMERAS
 ) -> tuple[list[OrthographicCamera], list[Indices]]:
     """(cameras, indices of the Gaussians that each serves), the primary one first; every Gaussian that can be drawn is
     served by one camera (4.3.5). Arguments as in `occlusion_in_clusters`.
 
-    A support wider than `WIDEST` of an image at `least_scale` counts as that wide: a veil over the whole model would
-    else have it cut to pieces, none of which is any smaller.
+    A support wider than `MAX_SUPPORT_SHARE` of an image at `least_scale` counts as that wide: a veil over the whole
+    model would else have it cut to pieces, none of which is any smaller.
     """
-    widest = 0.5 * WIDEST * _footprint(size, least_scale)
+    widest = 0.5 * MAX_SUPPORT_SHARE * _footprint(size, least_scale)
     supports = Supports(supports.positions, np.minimum(supports.radii, widest))
     centres, radii = supports.positions[:, :2], supports.radii
     left = clusters(centres, radii, size, least_scale, most)
@@ -128,7 +129,7 @@ def assign(
 
 
 def clusters(
-    centres: ArrayLike, radii: ArrayLike, size: int, least_scale: float, most: int = MOST_CAMERAS
+    centres: ArrayLike, radii: ArrayLike, size: int, least_scale: float, most: int = MAX_CAMERAS
 ) -> list[Indices]:
     """Algorithm 3, lines 5 to 19: parts of a set that each fit an image of size x size pixels at `least_scale` pixels a
     metre, or `most` parts of which some do not. Arrays of indices, ascending; the largest part (most members) first.
@@ -151,8 +152,8 @@ def clusters(
             fitting.append(members)
         else:
             waiting += _split(members, centres, radii, axis=int(extent.argmax()))
-    found = sorted(waiting + fitting, key=lambda members: _rank(members, centres, radii))
-    return [np.sort(members) for members in found]
+    ordered = sorted(waiting + fitting, key=lambda members: _rank(members, centres, radii))
+    return [np.sort(members) for members in ordered]
 
 
 def light_cameras(supports: Supports, groups: Sequence[Indices], axes: Array, size: int) -> list[OrthographicCamera]:
@@ -165,7 +166,7 @@ def light_cameras(supports: Supports, groups: Sequence[Indices], axes: Array, si
     for members in groups:
         low, high = _bounds(members, supports.positions[:, :2], supports.radii)
         extent = high - low
-        scale = (size - 2 * MARGIN) / np.maximum(extent, max(NARROWEST * extent.max(), LEAST_EXTENT))
+        scale = (size - 2 * MARGIN) / np.maximum(extent, max(MIN_EXTENT_SHARE * extent.max(), MIN_EXTENT))
         pose = np.eye(4)
         pose[:3, :3] = axes
         pose[:3, 3] = axes @ [*(0.5 * (low + high)), supports.positions[members, 2].mean()]
@@ -203,35 +204,38 @@ def _shapes(gaussians: Gaussians) -> tuple[Any, ...]:
     return tuple(dr.detach(getattr(gaussians, name)) for name in names)
 
 
-def _suffices(coverage: Any, least_scale: float) -> bool:
+def _is_one_camera_enough(coverage: Float, least_scale: float) -> bool:
     """Does one camera cover the Gaussians, but for `STRAYS`, at `least_scale`? Waits for the device."""
     scale_x, scale_y, covered, drawn = np.array(coverage, dtype=np.float64)
     return bool(drawn == 0 or (min(scale_x, scale_y) >= least_scale and drawn - covered <= STRAYS * drawn))
 
 
-def _trace_fitted(shapes: tuple[Any, ...], light: Any, size: int) -> tuple[Orthographic, Any]:
+@recorded
+def _fitted(shapes: tuple[Any, ...], light: Float, size: int, crop: bool) -> tuple[Orthographic, Float]:
     """(the one camera of a compact set, Float [4]: its pixels a metre in x and y, how many Gaussians have their centre
     in its image, how many can be drawn). Counts are exact to 2^24."""
     means, log_scales, quaternions, logits = shapes
-    camera = fit_camera(Gaussians(means, log_scales, quaternions, logits, ad.ArrayXf([])), light, size)
-    drawn = drawable(*shapes)
+    camera = fit_camera(Gaussians(means, log_scales, quaternions, logits, ad.ArrayXf([])), light, size, crop)
+    drawn = drawable_mask(*shapes)
     screen = camera.screen(camera.transform(dr.select(drawn, means, ad.Array3f(0))))
     inside = drawn & (screen.x >= 0) & (screen.x <= size) & (screen.y >= 0) & (screen.y <= size)
-    counts = [dr.sum(dr.select(mask, ad.Float(1), 0)) for mask in (inside, drawn)]
+    ones = [dr.select(mask, ad.Float(1), 0) for mask in (inside, drawn)]
+    counts = [dr.sum(ones_of) for ones_of in ones]
     return camera, dr.concat([camera[12], camera[13], *counts])
 
 
-def _trace_radii(shapes: tuple[Any, ...], light: Any) -> list[Any]:
+@recorded
+def _radii(shapes: tuple[Any, ...], light: Float) -> list[Float]:
     """Three standard deviations along the light frame's x and y, [N] metres each (4.30, 4.31); NaN where a
     Gaussian cannot be drawn."""
     _, log_scales, quaternions, _ = shapes
-    drawn = drawable(*shapes)
+    drawn = drawable_mask(*shapes)
     scales = dr.exp(dr.select(drawn, log_scales, ad.Array3f(0)))
-    own = [axis * scales[a] for a, axis in enumerate(principal_axes(quaternions))]
+    scaled_axes = [axis * scales[a] for a, axis in enumerate(principal_axes(quaternions))]
     radii = []
     for i in range(2):
         across = ad.Array3f([dr.gather(ad.Float, light, ad.UInt32(3 * i + j)) for j in range(3)])
-        radius = SUPPORT * dr.norm(ad.Array3f([dr.dot(across, axis) for axis in own]))
+        radius = SUPPORT * dr.norm(ad.Array3f([dr.dot(across, axis) for axis in scaled_axes]))
         radii.append(dr.select(drawn, radius, dr.nan))
     return radii
 
@@ -247,7 +251,3 @@ def _check(size: int, least_scale: float, most: int) -> None:
             raise ValueError(f"{name}: expected at least {least}, found {value}")
     if not (np.isfinite(least_scale) and least_scale > 0):
         raise ValueError(f"least_scale: expected a positive number of pixels a metre, found {least_scale}")
-
-
-_fitted = recorded(_trace_fitted, RECORDINGS)
-_radii = recorded(_trace_radii, RECORDINGS)

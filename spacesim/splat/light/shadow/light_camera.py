@@ -12,18 +12,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from spacesim.backend import ad
+from spacesim.backend.arrays import Array3f, Array4f, Bool, Float
 from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
-from spacesim.splat.raster.cameras import LARGEST, Orthographic
+from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic
 from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
 from spacesim.splat.raster.project import ALPHA_MIN
 
 SUPPORT = 3.0  #: standard deviations of a single Gaussian that its light camera holds (thesis 4.31)
-REACH = 4.0  #: standard deviations of the whole, on either side of its mean, that a light camera holds at most; chosen
-MARGIN = 1.0  #: pixels left free along each border; chosen
-UPRIGHT = 1e-10  #: radians off the vertical that are rounding of angles; chosen
-SUNS = 4096  #: whose axes and encodings are kept, chosen
-NARROWEST = 1e-3  #: least extent of the image, as a share of its larger one; chosen
+REACH = 4.0  #: standard deviations of the whole, on either side of its mean, that a light camera holds at most
+MARGIN = 1.0  #: pixels left free along each border
+UPRIGHT = 1e-10  #: radians off the vertical that are rounding of angles
+SUNS = 4096  #: whose axes and encodings are kept
+MIN_EXTENT_SHARE = 1e-3  #: least extent of the image, as a share of its larger one
 
 
 def light_axes(direction: ArrayLike) -> Array:
@@ -43,7 +44,7 @@ def light_axes(direction: ArrayLike) -> Array:
     return np.stack([np.array(right), np.array(down), np.array([-x, -y, -z])], axis=1)
 
 
-def light_rows(direction: ArrayLike) -> Any:
+def light_rows(direction: ArrayLike) -> Float:
     """`light_axes` for the kernels: Float [9], the light camera's x, y and z axes one after another. Kept for the next
     picture under this Sun."""
     return _rows(*np.asarray(direction, dtype=np.float64).tolist())
@@ -54,27 +55,25 @@ def _rows(*direction: float) -> Any:
     return ad.Float(light_axes(direction).T.ravel().tolist())
 
 
-def towards_sun(light: Any) -> Any:
+def towards_sun(light: Float) -> Array3f:
     """s: Array3f of width 1, from the scene towards the Sun, of `light_rows`."""
     return -_axis(light, 2)
 
 
-def fit_camera(gaussians: Gaussians, light: Any, size: int) -> Orthographic:
+def fit_camera(gaussians: Gaussians, light: Float, size: int, crop: bool = True) -> Orthographic:
     """The light camera of size x size pixels that holds the Gaussians' 3 sigma supports (thesis 4.29 to 4.35).
 
     light: Float [9] of `light_rows`. Pixels need not be square (4.35). The image's bounds are those of the supports,
-    but at most `REACH` standard deviations of the whole (the spread of the means and of the Gaussians themselves) to
-    either side of the mean, so that a stray Gaussian does not cost the others their resolution; depth counts from
-    the plane through that mean. Only Gaussians that can be drawn count; of none, the image is a metre wide about the
-    world's origin. Nothing waits for the device, and the function may be part of a recording. Detached.
+    with `crop` at most `REACH` standard deviations of the whole (the spread of the means and of the Gaussians
+    themselves) to either side of the mean, so that a stray Gaussian does not cost the others their resolution; depth
+    counts from the plane through that mean. Only Gaussians that can be drawn count; of none, the image is a metre wide
+    about the world's origin. Nothing waits for the device, and the function may be part of a recording. Detached.
     """
     if gaussians.count == 0:
         return _camera(light, ad.Array3f(0), [(ad.Float(-0.5), ad.Float(0.5))] * 2, size)
-    means, log_scales, quaternions, logits = (
-        dr.detach(value)
-        for value in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
-    )
-    drawn = drawable(means, log_scales, quaternions, logits)
+    means, log_scales = dr.detach(gaussians.means), dr.detach(gaussians.log_scales)
+    quaternions, logits = dr.detach(gaussians.quaternions), dr.detach(gaussians.logit_opacities)
+    drawn = drawable_mask(means, log_scales, quaternions, logits)
     means, log_scales = dr.select(drawn, means, ad.Array3f(0)), dr.select(drawn, log_scales, ad.Array3f(0))
     counted = dr.select(drawn, ad.Float(1), 0)
     dr.eval(means, counted)  # here and below: one kernel for what several reductions read
@@ -87,42 +86,47 @@ def fit_camera(gaussians: Gaussians, light: Any, size: int) -> Orthographic:
         across = dr.dot(axis, offset)
         spread2 = dr.squared_norm(ad.Array3f([dr.dot(axis, columns[k]) * scales[k] for k in range(3)]))  # 4.30
         support = SUPPORT * dr.sqrt(spread2)  # 4.31
-        low, high = dr.select(drawn, across - support, LARGEST), dr.select(drawn, across + support, -LARGEST)
+        low, high = (
+            dr.select(drawn, across - support, MAX_MAGNITUDE),
+            dr.select(drawn, across + support, -MAX_MAGNITUDE),
+        )
         extents.append((low, high, counted * dr.fma(across, across, spread2)))
     dr.eval(extents)
     bounds = []
     for low, high, square in extents:
-        limit = REACH * dr.sqrt(dr.sum(square) * share)
-        lowest, highest = dr.maximum(dr.min(low), -limit), dr.minimum(dr.max(high), limit)  # 4.32
+        lowest, highest = dr.min(low), dr.max(high)  # 4.32
+        if crop:
+            limit = REACH * dr.sqrt(dr.sum(square) * share)
+            lowest, highest = dr.maximum(lowest, -limit), dr.minimum(highest, limit)
         some = lowest < highest
         bounds.append((dr.select(some, lowest, -0.5), dr.select(some, highest, 0.5)))
     return _camera(light, middle, bounds, size)
 
 
-def _axis(light: Any, i: int) -> Any:
+def _axis(light: Float, i: int) -> Array3f:
     """Array3f of width 1: axis i of `light_rows`."""
     return ad.Array3f([dr.gather(ad.Float, light, ad.UInt32(3 * i + j)) for j in range(3)])
 
 
-def drawable(means: Any, log_scales: Any, quaternions: Any, logits: Any) -> Any:
+def drawable_mask(means: Array3f, log_scales: Array3f, quaternions: Array4f, logits: Float) -> Bool:
     """Bool [N]: the Gaussians that `project` would draw if the image were large enough."""
     length2 = dr.squared_norm(quaternions)
-    drawn = (length2 > 1e-24) & (length2 < 1e24) & (dr.abs(logits) < LARGEST)
+    drawn = (length2 > 1e-24) & (length2 < 1e24) & (dr.abs(logits) < MAX_MAGNITUDE)
     for i in range(3):
-        drawn &= (dr.abs(means[i]) < LARGEST) & (log_scales[i] > -60) & (log_scales[i] < 20)
+        drawn &= (dr.abs(means[i]) < MAX_MAGNITUDE) & (log_scales[i] > -60) & (log_scales[i] < 20)
     return drawn & (opacities(dr.select(drawn, logits, 0)) >= ALPHA_MIN)
 
 
-def _camera(light: Any, middle: Any, bounds: list[tuple[Any, Any]], size: int) -> Orthographic:
+def _camera(light: Float, middle: Array3f, bounds: list[tuple[Any, Any]], size: int) -> Orthographic:
     """Camera whose depths count from `middle` (Array3f, world) and whose image spans `bounds` (low, high in x and y,
     metres from there) and the margin (thesis 4.33 to 4.35)."""
     if size < 4:
         raise ValueError(f"size: expected at least 4 pixels, found {size}")
     extents = [high - low for low, high in bounds]
-    least = dr.maximum(NARROWEST * dr.maximum(*extents), 1e-6)
+    least = dr.maximum(MIN_EXTENT_SHARE * dr.maximum(*extents), 1e-6)
     scales = [(size - 2 * MARGIN) * dr.rcp(dr.maximum(extent, least)) for extent in extents]
     principal = [0.5 * size - scale * 0.5 * (low + high) for scale, (low, high) in zip(scales, bounds, strict=True)]
-    numbers: list[Any] = []
+    numbers: list[Float] = []
     for i in range(3):
         axis = _axis(light, i)
         numbers += [*axis, -dr.dot(axis, middle)]

@@ -102,8 +102,8 @@ def _median(
     x, y = (columns - camera.cx) / camera.scale_x, (rows - camera.cy) / camera.scale_y
     surface, behind, nearest = np.zeros(x.shape), np.ones(x.shape), np.argsort(places[:, 2], kind="stable")
     for i in nearest:
-        one = {name: np.asarray(values)[i : i + 1] for name, values in gaussians.items()}
-        alpha = render_reference(one, camera, sh_degree=0, antialiased=config.antialiased).alpha
+        gaussian = {name: np.asarray(values)[i : i + 1] for name, values in gaussians.items()}
+        alpha = render_reference(gaussian, camera, sh_degree=0, antialiased=config.antialiased).alpha
         slope = np.linalg.solve(spreads[i][:2, :2], spreads[i][:2, 2])
         reach = 2 * np.exp(np.asarray(gaussians["log_scales"])[i].max())
         offset = (x - places[i, 0]) * slope[0] + (y - places[i, 1]) * slope[1]

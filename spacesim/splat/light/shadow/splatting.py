@@ -14,65 +14,67 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, recorded
+from spacesim.backend.arrays import Array2f, Array3f, Bool, Float, UInt32
 from spacesim.data.errors import WorkError
 from spacesim.splat.raster.adjoint import Moments, add_to_slots, gather_slots, reduce_mode
-from spacesim.splat.raster.bin import RECORDINGS, TileLists, bin_splats, room
-from spacesim.splat.raster.cameras import LARGEST, Orthographic
+from spacesim.splat.raster.bin import bin_splats
+from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats, _sortable, project
 from spacesim.splat.raster.records import (
     ALPHA_MAX,
     POWER_MIN,
     TRANSMITTANCE_MIN,
-    LanePixels,
     exp2,
     exponents,
-    lane_offsets,
-    lane_pixels,
     list_records,
     load,
     packet_sizes,
     store,
 )
+from spacesim.splat.raster.tiles import LanePixels, TileLists, lane_offsets, lane_pixels, round_capacity
 
-BETA_MIN = 0.05  #: a receiver's footprint ends there: 95 % of its weight on 54 % of the area of a cut at 1/255; chosen
-_RECEIVER = ALPHA_MIN / BETA_MIN  # opacity with which a receiver stands in the lists
+BETA_MIN = 0.05  #: a receiver's footprint ends there: 95 % of its weight on 54 % of the area of a cut at 1/255
+LEAST_BETA = 0.004  #: least end of a footprint: 99.6 % of its weight; the lists hold nothing below 1/255
 
 
 def occlusion_by_splatting(
     gaussians: Gaussians,
     camera: Orthographic,
-    bias: Any,
-    points: Any = None,
+    bias: Float,
+    points: Array3f | None = None,
     antialiased: bool = False,
-    receives: Any = None,
-) -> Any:
+    receives: Bool | None = None,
+    beta_min: float = BETA_MIN,
+) -> Float:
     """Float [N] in [0, 1], detached: the share of sunlight that is blocked before it reaches each Gaussian.
 
     For receiver i, the mean over the pixels of its footprint of 1 - T_i, weighted by beta_i (4.7, 4.9, 4.10), with T_i
     the product of 1 - alpha_j over the blockers with z_i - z_j - b_i > 0 (4.8, 4.28). alpha_j is cut off as in pictures
-    (docs/rasterizer.md), beta_i below `BETA_MIN`. beta has no opacity in it: faint Gaussians have an occlusion too.
+    (docs/explanation/method.md), beta_i below `beta_min`. beta has no opacity in it: faint Gaussians have one, too.
 
     camera: looks from the Sun at the scene
     bias: Float [N] metres, of each receiver, or one for all; below 0, from 1e9 on or not a number counts as 0
-    points: Array3f [3, N], world, metres: where each Gaussian is tested, if not at its centre (`bias.lifted`)
+    points: Array3f [3, N], world, metres: where each Gaussian is tested, if not at its centre (`bias.offset_receivers`)
     antialiased: blockers thinner than a pixel of the light image fade, see `project`
     receives: Bool [N]: who is asked about, all by default; the others block, and have 0
+    beta_min: where a receiver's footprint ends, `LEAST_BETA` to below 1
     0 for what cannot be projected and where no pixel of a footprint is inside of the image. Raises ValueError for a
     bias of another length, WorkError where memory is short.
     """
     rows = [dr.detach(row) for row in gaussians.shape_rows()]
-    return differentiable_occlusion(Gaussians.from_rows(rows), camera, bias, points, antialiased, receives)
+    return differentiable_occlusion(Gaussians.from_rows(rows), camera, bias, points, antialiased, receives, beta_min)
 
 
 def differentiable_occlusion(
     gaussians: Gaussians,
     camera: Orthographic,
-    bias: Any,
-    points: Any = None,
+    bias: Float,
+    points: Array3f | None = None,
     antialiased: bool = False,
-    receives: Any = None,
-) -> Any:
+    receives: Bool | None = None,
+    beta_min: float = BETA_MIN,
+) -> Float:
     """`occlusion_by_splatting` with gradients (reverse mode) by means, log scales, quaternions and opacities, of the
     blockers' alpha and the receivers' beta. Who is before whom, the bias, and by how much `points` are off the centres
     are taken as given."""
@@ -84,8 +86,9 @@ def differentiable_occlusion(
     bias = dr.detach(bias) + dr.zeros(ad.Float, count)
     dr.make_opaque(bias)
     rows, away = gaussians.shape_rows(), None if points is None else dr.detach(points) - dr.detach(gaussians.means)
-    prepare = _trace_prepare if dr.grad_enabled(rows) else _prepare
-    blockers, receivers, blocker_boxes, receiver_boxes = prepare(rows, away, camera, bias, antialiased, receives)
+    opacity = ALPHA_MIN / beta_min  # of a receiver in the lists
+    prepared = _prepare(rows, away, camera, bias, antialiased, receives, opacity)
+    blockers, receivers, blocker_boxes, receiver_boxes = prepared
     size = camera.width, camera.height
     try:
         return dr.custom(_Occlusion, blockers, receivers, blocker_boxes, receiver_boxes, size)
@@ -93,41 +96,49 @@ def differentiable_occlusion(
         raise error.__cause__ if isinstance(error.__cause__, WorkError) else error from None
 
 
-def _trace_prepare(
-    rows: list[Any], away: Any, camera: Orthographic, bias: Any, antialiased: bool, receives: Any
+@recorded
+def _prepare(
+    rows: list[Float],
+    away: Array3f | None,
+    camera: Orthographic,
+    bias: Float,
+    antialiased: bool,
+    receives: Bool | None,
+    opacity: float,
 ) -> tuple[Splats, Splats, Footprints, Footprints]:
     """(splats of the blockers, of the receivers, footprints of both), [N], of the Gaussians with these `_rows`.
 
-    away: Array3f [3, N], metres, from the centres to where the receivers are, or None. Their opacity is such that the
-    cut at ALPHA_MIN falls where beta is BETA_MIN.
+    away: Array3f [3, N], metres, from the centres to where the receivers are, or None;  opacity: theirs, such that the
+    cut at ALPHA_MIN falls where their footprints end
     """
     blockers, blocker_boxes = project(Gaussians.from_rows(rows), camera, antialiased)
     means, shape, logit = ad.Array3f(rows[:3]), rows[3:10], rows[10]
     blocker_boxes.order = _sortable(_depth(means, camera))
     if away is not None:
         means += away
-    logit = dr.detach(dr.select(dr.abs(logit) < LARGEST, dr.log(ad.Float(_RECEIVER / (1 - _RECEIVER))), logit))
+    logit = dr.detach(dr.select(dr.abs(logit) < MAX_MAGNITUDE, dr.log(ad.Float(opacity / (1 - opacity))), logit))
     receivers, receiver_boxes = project(Gaussians.from_rows([*means, *shape, logit]), camera)
     if receives is not None:
         receiver_boxes.visible &= receives
-    bias = dr.select((bias > 0) & (bias < LARGEST), bias, 0)
+    bias = dr.select((bias > 0) & (bias < MAX_MAGNITUDE), bias, 0)
     receiver_boxes.order = _sortable(_depth(means, camera) - bias)
     return blockers, receivers, blocker_boxes, receiver_boxes
 
 
-def _depth(means: Any, camera: Orthographic) -> Any:
+def _depth(means: Array3f, camera: Orthographic) -> Float:
     """Light depths [N], metres, without the camera's own distance, for sorting: detached, finite, 0 of one sign."""
     means = dr.detach(means)
-    depth = dr.dot(camera.row(2), dr.select(dr.max(dr.abs(means)) < LARGEST, means, ad.Array3f(0)))
+    depth = dr.dot(camera.row(2), dr.select(dr.max(dr.abs(means)) < MAX_MAGNITUDE, means, ad.Array3f(0)))
     return dr.select(depth == 0, 0, depth)
 
 
-def _trace_events(
+@recorded
+def _events(
     blockers: Splats,
     receivers: Splats,
     blocker_boxes: Footprints,
     receiver_boxes: Footprints,
-    count: Any,
+    count: UInt32,
     capacity: int,
 ) -> tuple[Splats, Footprints]:
     """Events [2 capacity]: receivers, then blockers, of `count` Gaussians; the rest are invisible.
@@ -153,35 +164,36 @@ def _trace_events(
 
 
 @dataclass
-class _Walked:
+class _WalkResult:
     """What `_walk` leaves behind. occlusion, weight (sum of beta): [capacity]
 
     Tile-major, for the adjoint: transmittance and one past the last blocker of each pixel [T * lanes * rows]; the
-    events' records in list order, see `records.Blended`.
+    events' records in list order, see `records.BlendResult`.
     """
 
-    occlusion: Any
-    weight: Any
-    transmittance: Any
-    last: Any
-    records: list[Any]
+    occlusion: Float
+    weight: Float
+    transmittance: Float
+    last: UInt32
+    records: list[Float]
 
 
-def _trace_walk(events: Splats, lists: TileLists, image_size: tuple[Any, Any], capacity: int) -> _Walked:
+@recorded
+def _walk(events: Splats, lists: TileLists, image_size: tuple[UInt32, UInt32], capacity: int) -> _WalkResult:
     """What each receiver has lost; one lane holds a block of a tile's pixels."""
     shape, pixels = lists.shape, lists.shape.pixels
     receives = dr.select(dr.arange(ad.UInt32, 2 * capacity) < capacity, ad.Float(1), ad.Float(0))
-    records = list_records(events, [receives], lists, room(2 * capacity))
+    records = list_records(events, [receives], lists, round_capacity(2 * capacity))
     lanes, lane = lists.tiles_x * lists.tiles_y * shape.lanes, lane_pixels(lists)
     inside = [_inside(lane, offset, image_size) for offset in lane_offsets(shape)]
     slots = dr.zeros(ad.Float, 2 * lists.capacity)
     mode = reduce_mode(8 * lists.capacity, shape)
     end = dr.gather(ad.UInt32, lists.end, lane.tile)
 
-    def remaining(k: Any, _transmittance: Any, _last: Any) -> Any:
+    def remaining(k: UInt32, _transmittance: Any, _last: Any) -> Bool:
         return k < end
 
-    def take(k: Any, transmittance: list[Any], last: list[Any]) -> Any:
+    def take(k: UInt32, transmittance: list[Float], last: list[UInt32]) -> Any:
         record = load(records, k, lists.capacity)
         powers = exponents(record, lane.x, lane.y, shape)
         receiver = record[6] > 0
@@ -211,24 +223,24 @@ def _trace_walk(events: Splats, lists: TileLists, image_size: tuple[Any, Any], c
     lost, weight = _sum_slots(slots, lists, capacity)
     seen = weight > 0
     occlusion = dr.select(seen, dr.clip(lost / dr.select(seen, weight, 1), 0, 1), 0)
-    return _Walked(occlusion, weight, transmittance, last, records)
+    return _WalkResult(occlusion, weight, transmittance, last, records)
 
 
-def _inside(lane: LanePixels, offset: tuple[int, int], image_size: tuple[Any, Any]) -> Any:
+def _inside(lane: LanePixels, offset: tuple[int, int], image_size: tuple[UInt32, UInt32]) -> Bool:
     """Is the lane's pixel at an offset from its first one of the picture's?"""
     return (lane.column + offset[0] < image_size[0]) & (lane.row + offset[1] < image_size[1])
 
 
-def _sum_slots(slots: Any, lists: TileLists, capacity: int) -> Any:
+def _sum_slots(slots: Float, lists: TileLists, capacity: int) -> Array2f:
     """Array2f [capacity]: the sums over each receiver's slots, in order."""
     index = dr.arange(ad.UInt32, capacity)
     position = dr.gather(ad.UInt32, lists.first_slot, index)
     end = position + dr.gather(ad.UInt32, lists.slot_count, index)
 
-    def remaining(position: Any, _total: Any) -> Any:
+    def remaining(position: UInt32, _total: Any) -> Bool:
         return position < end
 
-    def add(position: Any, total: Any) -> Any:
+    def add(position: UInt32, total: Any) -> Any:
         return position + 1, total + dr.gather(ad.Array2f, slots, lists.sum_of_slot(position))
 
     state = position, ad.Array2f(0)
@@ -236,8 +248,9 @@ def _sum_slots(slots: Any, lists: TileLists, capacity: int) -> Any:
     return total
 
 
-def _trace_replay(
-    events: Splats, walked: _Walked, lists: TileLists, image_size: tuple[Any, Any], gradient: Any
+@recorded
+def _replay(
+    events: Splats, walked: _WalkResult, lists: TileLists, image_size: tuple[UInt32, UInt32], gradient: Float
 ) -> Splats:
     """Adjoint of `_walk`: from gradients of the occlusions [capacity] to gradients of the events.
 
@@ -255,10 +268,10 @@ def _trace_replay(
     mode = reduce_mode(32 * lists.capacity, shape)
     start = dr.gather(ad.UInt32, lists.start, lane.tile)
 
-    def remaining(k: Any, _transmittance: Any, _behind: Any) -> Any:
+    def remaining(k: UInt32, _transmittance: Any, _behind: Any) -> Bool:
         return k > start
 
-    def replay(k: Any, transmittance: list[Any], behind: list[Any]) -> Any:
+    def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> Any:
         k = k - 1
         record = load(walked.records, k, lists.capacity)
         powers = exponents(record, lane.x, lane.y, shape)
@@ -275,11 +288,12 @@ def _trace_replay(
             receives, blocks = reached & receiver & inside[p], reached & ~receiver & (k < last[p])
             weight = dr.select(receives, alpha * share, 0)
             inverse = dr.rcp(1 - dr.select(blocks, alpha, 0))
-            by_beta = weight * (1 - transmittance[p] - occlusion)  # dL / d ln beta
-            by_alpha = dr.select(blocks & (unclamped < ALPHA_MAX), behind[p] * inverse * alpha, 0)  # dL / d ln alpha
+            grad_log_beta = weight * (1 - transmittance[p] - occlusion)  # dL / d ln beta
+            # dL / d ln alpha
+            grad_log_alpha = dr.select(blocks & (unclamped < ALPHA_MAX), behind[p] * inverse * alpha, 0)
             behind[p] = dr.fma(weight, transmittance[p], behind[p])
             transmittance[p] *= inverse
-            moments.add(*offset, by_beta + by_alpha)
+            moments.add(*offset, grad_log_beta + grad_log_alpha)
         add_to_slots(slots, moments.sums(), lists.sum_index(k), mode)
         return k, transmittance, behind
 
@@ -306,7 +320,7 @@ class _Occlusion(dr.CustomOp):
         self.count = dr.width(blockers.x)
         splats = dr.detach(blockers), dr.detach(receivers)
         count = dr.opaque(ad.UInt32, self.count)
-        self.capacity = room(self.count)
+        self.capacity = round_capacity(self.count)
         self.events, boxes = _events(*splats, blocker_boxes, receiver_boxes, count, self.capacity)
         self.lists = bin_splats(self.events, boxes, *image_size)
         if self.lists.capacity == 0:
@@ -317,23 +331,24 @@ class _Occlusion(dr.CustomOp):
     def backward(self) -> None:
         index, capacity = dr.arange(ad.UInt32, self.count), self.capacity
         none = dr.opaque(ad.Float, 0, self.count)
-        by_event = Splats(*[dr.opaque(ad.Float, 0, 2 * capacity)] * 7)
+        grad_events = Splats(*[dr.opaque(ad.Float, 0, 2 * capacity)] * 7)
         if self.lists.capacity > 0:
             receiver = dr.arange(ad.UInt32, capacity)
             padded = dr.gather(ad.Float, self.grad_out(), receiver, receiver < dr.opaque(ad.UInt32, self.count))
-            by_event = _replay(self.events, self.walked, self.lists, self.size, padded)
+            grad_events = _replay(self.events, self.walked, self.lists, self.size, padded)
         for name, first in (("receivers", 0), ("blockers", capacity)):
             x, y, a, b, c, opacity = (
                 dr.gather(ad.Float, value, index + first)
-                for value in (by_event.x, by_event.y, by_event.a, by_event.b, by_event.c, by_event.opacity)
+                for value in (
+                    grad_events.x,
+                    grad_events.y,
+                    grad_events.a,
+                    grad_events.b,
+                    grad_events.c,
+                    grad_events.opacity,
+                )
             )
             self.set_grad_in(name, Splats(x, y, a, b, c, opacity, none))
 
     def name(self) -> str:
         return "occlusion by splatting"
-
-
-_prepare = recorded(_trace_prepare, RECORDINGS)
-_events = recorded(_trace_events, RECORDINGS)
-_walk = recorded(_trace_walk, RECORDINGS)
-_replay = recorded(_trace_replay, RECORDINGS)

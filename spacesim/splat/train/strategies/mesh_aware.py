@@ -6,38 +6,42 @@ it was away from it.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
+from spacesim.backend.arrays import Bool, Float
 from spacesim.data.errors import InputError, WorkError, check_ranges
 from spacesim.data.mesh import SignedDistance
-from spacesim.splat.raster.gaussians import Gaussians, numbers
-from spacesim.splat.train.strategies.control import DefaultStrategyConfig, DensityControl, Survey, chosen_parents
-from spacesim.splat.train.strategies.strategy import MOST_SIZE, MOST_STEPS
+from spacesim.splat.raster.gaussians import Gaussians, stack_rows
+from spacesim.splat.train.strategies.control import DensityControl, GaussianStatistics, RefinementConfig, select_parents
+from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD
 
 KNOWN = ("known", "known_x", "known_y", "known_z")
 
 
 @dataclass(frozen=True)
 class MeshAwareConfig:
-    """Lengths are fractions of the scene's scale."""
+    """A mesh says where Gaussians may be. Lengths are fractions of the scene's scale."""
+
+    kind: ClassVar[str] = "mesh-aware"
 
     cull_every: int = 2_500  #: table 5.2, iterations between two prunings of the exterior
     exterior_margin: float = 1e-4  #: table 5.2, tau_out: farther outside is the exterior
     interior_margin: float = 0.05  #: table 5.2, tau_in: deeper inside is the interior
     boundary_ease: float = 0.3  #: table 5.2, lambda_b, factor of the growth threshold between both margins
-    min_gaussians: int = 20_000  #: table 5.2
+    min_gaussians: int = 20_000  #: where fewer are left, some are copied (table 5.2)
     protect_interior: bool = True  #: from weak pruning, as what is near the surface
 
     def __post_init__(self) -> None:
-        if self.cull_every < 1 or self.min_gaussians < 0 or min(self.exterior_margin, self.interior_margin) < 0:
-            raise InputError(f"mesh-aware strategy: expected margins and counts of 0 or more, found {self}")
         if not 0 < self.boundary_ease <= 1:
-            raise InputError(f"mesh-aware strategy: expected boundary_ease in (0, 1], found {self.boundary_ease}")
-        check_ranges(self, exterior_margin=(0, MOST_SIZE), interior_margin=(0, MOST_SIZE), cull_every=(1, MOST_STEPS))
+            raise InputError(f"boundary_ease: expected a number in (0, 1], found {self.boundary_ease}")
+        check_ranges(
+            self, exterior_margin=(0, MAX_THRESHOLD), interior_margin=(0, MAX_THRESHOLD), cull_every=(1, MAX_STEPS)
+        )
+        check_ranges(self, min_gaussians=(0, MAX_STEPS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +77,7 @@ class MeshAwareStrategy(DensityControl):
 
     def __init__(
         self,
-        config: DefaultStrategyConfig,
+        config: RefinementConfig,
         mesh_aware: MeshAwareConfig,
         surface: SignedDistance,
         scene_scale: float,
@@ -82,69 +86,71 @@ class MeshAwareStrategy(DensityControl):
         super().__init__(config, scene_scale, count, kept=("views", *KNOWN))
         self.mesh_aware, self.surface = mesh_aware, surface
 
-    def _accumulate(self, state: dict[str, Any], gradient: Any, radius: Any, visible: Any) -> None:
+    def _accumulate(self, state: dict[str, Float], gradient: Float, radius: Float, visible: Bool) -> None:
         state["views"] = state["views"] + dr.select(visible, ad.Float(1), 0)
 
-    def _thresholds(self, gaussians: Gaussians, survey: Survey) -> np.ndarray:
+    def _thresholds(self, gaussians: Gaussians, statistics: GaussianStatistics) -> np.ndarray:
         """5.6."""
         ease, usual = self.mesh_aware.boundary_ease, self.config.grow_gradient
-        open_ = (survey.gradient > ease * usual) & (survey.gradient <= usual)
-        boundary = self._regions(gaussians, survey, open_)[1].boundary & open_
+        open_ = (statistics.gradient > ease * usual) & (statistics.gradient <= usual)
+        boundary = self._regions(gaussians, statistics, open_)[1].boundary & open_
         return np.where(boundary, ease * usual, usual)
 
-    def _expendable(self, gaussians: Gaussians, survey: Survey, weak: np.ndarray) -> np.ndarray:
+    def _prunable(self, gaussians: Gaussians, statistics: GaussianStatistics, weak: np.ndarray) -> np.ndarray:
         """The second term of 5.5."""
-        where = self._regions(gaussians, survey, weak)[1]
+        where = self._regions(gaussians, statistics, weak)[1]
         return weak & (where.exterior if self.mesh_aware.protect_interior else ~where.boundary)
 
     def _outside_is_due(self, step: int) -> bool:
         every = self.mesh_aware.cull_every
         return step // every != (step - self.config.refine_every) // every
 
-    def _outside(self, gaussians: Gaussians, survey: Survey) -> np.ndarray:
+    def _outside(self, gaussians: Gaussians, statistics: GaussianStatistics) -> np.ndarray:
         """5.3."""
-        outside = self._regions(gaussians, survey, np.ones(gaussians.count, bool))[1].exterior
+        outside = self._regions(gaussians, statistics, np.ones(gaussians.count, bool))[1].exterior
         if outside.all():
             raise WorkError(
-                "training: --strategy mesh-aware would prune every Gaussian, none is within the mesh; "
+                "training: the strategy mesh-aware would prune every Gaussian, none is within the mesh; "
                 "is mesh.ply in the place and scale of the pictures?"
             )
         return outside
 
     def _parents(
-        self, gaussians: Gaussians, survey: Survey, remove: np.ndarray, rng: np.random.Generator
+        self, gaussians: Gaussians, statistics: GaussianStatistics, remove: np.ndarray, rng: np.random.Generator
     ) -> np.ndarray:
         """5.7 to 5.9, from the interior and the boundary layer."""
         missing = min(self.mesh_aware.min_gaussians, self.config.max_gaussians) - int((~remove).sum())
         if missing <= 0:
             return np.zeros(0, np.int64)
-        distance, where = self._regions(gaussians, survey, ~remove)
-        score = backfill_score(survey.opacity, distance, survey.kept["views"], where)
-        return chosen_parents(score, ~(remove | where.exterior), missing, rng)
+        distance, where = self._regions(gaussians, statistics, ~remove)
+        score = backfill_score(statistics.opacity, distance, statistics.kept["views"], where)
+        return select_parents(score, ~(remove | where.exterior), missing, rng)
 
-    def _regions(self, gaussians: Gaussians, survey: Survey, asked: np.ndarray) -> tuple[np.ndarray, Regions]:
+    def _regions(
+        self, gaussians: Gaussians, statistics: GaussianStatistics, index: np.ndarray
+    ) -> tuple[np.ndarray, Regions]:
         """(signed distance [N] metres, regions); those that are not asked for, [N] bool, have distance 0."""
         margins = [self.scene_scale * m for m in (self.mesh_aware.exterior_margin, self.mesh_aware.interior_margin)]
-        distance, means = np.zeros(gaussians.count), numbers(gaussians.means).T.astype(np.float64)
+        distance, means = np.zeros(gaussians.count), stack_rows(gaussians.means).T.astype(np.float64)
         finite = np.isfinite(means).all(axis=1)
         distance[~finite] = np.inf
-        asked = asked & finite
-        if asked.any():
-            distance[asked] = self._signed(means, survey.kept, asked, min(margins))
+        index = index & finite
+        if index.any():
+            distance[index] = self._signed(means, statistics.kept, index, min(margins))
         return distance, regions(distance, *margins)
 
-    def _signed(self, means: np.ndarray, kept: dict[str, np.ndarray], asked: np.ndarray, near: float) -> np.ndarray:
+    def _signed(self, means: np.ndarray, kept: dict[str, np.ndarray], index: np.ndarray, near: float) -> np.ndarray:
         """Signed distances of those asked for, metres; nearer than `near` they count as inside: the regions are the
         same. means [N, 3]; kept: the state, [N] each, which is brought up to date."""
-        points = means[asked]
-        known, *place = (kept[name][asked].astype(np.float64) for name in KNOWN)
+        points = means[index]
+        last_distance, *place = (kept[name][index].astype(np.float64) for name in KNOWN)
         distance = self.surface.unsigned(points)
         moved = np.linalg.norm(points - np.stack(place, axis=1), axis=1)
-        stale = (moved >= np.abs(known)) & (distance > near)
-        outside = known > 0
+        stale = (moved >= np.abs(last_distance)) & (distance > near)
+        outside = last_distance > 0
         outside[stale] = ~self.surface.inside(points[stale])
         signed = np.where(outside & (distance > near), distance, -distance)
-        fresh = np.flatnonzero(asked)[stale]
+        fresh = np.flatnonzero(index)[stale]
         for name, values in zip(KNOWN, (signed, *points.T), strict=True):
             kept[name][fresh] = values[stale]
         return signed

@@ -1,4 +1,4 @@
-"""Prints the tables of a flat plate in docs/shadows.md: python tests/splat/light/shadow/acne.py     a minute
+"""Prints the tables of a flat plate in docs/research/shadows.md: python tests/splat/light/shadow/acne.py     a minute
 
 Acne is the share of a bare plate's discs that count as shadowed (mapping), and their mean occlusion (splatting, which
 darkens by degrees), in percent; recession, how far the shadow of a screen that stands on it has withdrawn from its
@@ -22,7 +22,7 @@ def main() -> None:
         ways = {name: way(name, method) for name in (*BIASES, "fast")}
         if method == "mapping":
             ways["fine"] = way("fine", method)  # splatting's are alike
-            ways["lifted, variance"] = replace(ways["lifted"], mapping=MappingConfig("variance"))
+            ways["lifted, variance"] = replace(ways["lifted"], method=MappingConfig("variance"))
         print(f"\n| {method}: Sun [°] | {' | '.join(ways)} |")
         for elevation in ELEVATIONS:
             print(f"| {elevation} | {' | '.join(cell(elevation, config) for config in ways.values())} |", flush=True)
@@ -32,7 +32,7 @@ def cell(elevation: float, config: ShadowConfig) -> str:
     mean, share = acne(elevation, config, COUNT)
     found = (math.nan, math.nan) if elevation > 80 else screen_shadow(elevation, config, COUNT)
     lengths = ["–" if math.isnan(metres) else f"{1000 * metres:.0f}" for metres in found]
-    return " · ".join([f"{100 * (share if config.method == 'mapping' else mean):.1f}", *lengths])
+    return " · ".join([f"{100 * (share if config.method.kind == 'mapping' else mean):.1f}", *lengths])
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Prints docs/shadows.md's tables of shadows on a trained model.
+"""Prints docs/research/shadows.md's tables of shadows on a trained model.
 
 python tests/splat/light/shadow/against_truth.py RUN DATA
 
-RUN: a trained run (`spacesim train`), DATA: a dataset of the same object under many Suns, of which those are judged
-that no training frame has, if there are such. Visibility is drawn, and judged where the model is there (alpha above
+RUN: a trained run (`spacesim train`), DATA: a dataset of the same object under many Suns, of which those are evaluated
+that no training frame has, if there are such. Visibility is drawn, and evaluated where the model is there (alpha above
 1/2); at least one half is lit. First raw shadows of many kinds; then, of a run with shadows, its own refined ones, and
 these as pictures show them, without what faces away (`--own`: these alone).
 """
@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_SELF_CAST, load_truth, read_dataset
 from spacesim.eval.suns import known_suns
-from spacesim.splat.light.shadow.cast import ShadowConfig, cast_shadows
+from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig, cast_shadows
 from spacesim.splat.light.shadow.light_camera import light_rows
 from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.raster.gaussians import Gaussians
@@ -36,20 +36,23 @@ Visibility = Callable[[Frame], Any]
 """Of each Gaussian in a frame, Float [N]."""
 
 
+METHODS = {"mapping": MappingConfig, "splatting": SplattingConfig}
+
+
 def ways(size: int) -> dict[str, ShadowConfig]:
     """Shadows by name."""
     found: dict[str, ShadowConfig] = {}
     for method in ("mapping", "splatting"):
         for bias, grazing in ((0.0, "none"), (3.0, "none"), (10.0, "none"), (30.0, "none"), (10.0, "bias")):
             what = {"none": "", "bias": ", grazing bias"}[grazing]
-            found[f"{method}, λ = {bias:g}{what}"] = ShadowConfig(method, size, bias, grazing)
+            found[f"{method}, λ = {bias:g}{what}"] = ShadowConfig(METHODS[method](), size, bias, grazing)
         for bias, grazing in ((5.0, "lift"), (10.0, "lift"), (5.0, "both")):
             what = {"lift": "lifted", "both": "lifted, grazing bias"}[grazing]
-            found[f"{method}, λ = {bias:g}, {what}"] = ShadowConfig(method, size, bias, grazing)
+            found[f"{method}, λ = {bias:g}, {what}"] = ShadowConfig(METHODS[method](), size, bias, grazing)
         if method == "mapping":
             for name in ("percentage-closer", "variance", "median"):
                 reading = MappingConfig(name)
-                found[f"{method}, λ = 5, lifted, {name}"] = ShadowConfig(method, size, 5.0, "lift", mapping=reading)
+                found[f"{method}, λ = 5, lifted, {name}"] = ShadowConfig(reading, size, 5.0, "lift")
     for method, kind in (("mapping", "shadow-map"), ("splatting", "shadow-splat")):
         light = preset("fast", kind).light
         assert light is not None
@@ -67,13 +70,13 @@ def main() -> None:
     options = parser.parse_args()
     run, dataset = load_run(options.run), read_dataset(options.data)
     frames = unseen(dataset)
-    print(f"{run.model.count} Gaussians, {len(frames)} frames")
+    print(f"{run.gaussians.count} Gaussians, {len(frames)} frames")
     grazing = " | ".join(f"{low}–{high}°" for low, high in itertools.pairwise(EDGES))
     classes = "lit, but dark | cast, but lit | attached, but lit | all of the model"
     print(f"| shadows | error | balanced | {classes} | dark at {grazing} |")
-    raw = () if options.own else raw_shadows(run.model, dataset, options.size)
+    raw = () if options.own else raw_shadows(run.gaussians, dataset, options.size)
     for name, visibility in itertools.chain(raw, own_shadows(run)):
-        shares = judged(run.model, dataset, frames, visibility)
+        shares = judged(run.gaussians, dataset, frames, visibility)
         print(f"| {name} | {' | '.join(f'{100 * share:.1f}' for share in shares)} |", flush=True)
 
 
@@ -95,8 +98,8 @@ def own_shadows(run: Run) -> Iterator[tuple[str, Visibility]]:
     light = run.light
     if light is None or light.config.shadow is None:
         return
-    yield "refined", lambda frame: light.sunlight(run.model, frame.sun.direction, adaptive=True).visibility
-    yield "shown", lambda frame: light.lit(run.model, Pinhole.of(frame.camera), frame.sun.direction, adaptive=True)[1]
+    yield "refined", lambda frame: light.sunlight(run.gaussians, frame.sun.direction).visibility
+    yield "shown", lambda frame: light.shade_picture(run.gaussians, Pinhole.of(frame.camera), frame.sun.direction)[1]
 
 
 def unseen(dataset: Dataset) -> list[Frame]:
@@ -116,7 +119,7 @@ def judged(gaussians: Gaussians, dataset: Dataset, frames: Sequence[Frame], visi
     counts, attached = np.zeros((len(EDGES) - 1, 4)), np.zeros(2)
     for frame in frames:
         truth = load_truth(dataset, frame)
-        seen = render(gaussians, Pinhole.of(frame.camera), outputs=("alpha",), features=[ad.Float(visibility(frame))])
+        seen = render(gaussians, Pinhole.of(frame.camera), outputs=("alpha",), features=[upload(visibility(frame))])
         alpha = seen.image("alpha")
         bright = seen.image("features")[..., 0] >= 0.5 * alpha
         lit = (truth.shadow == SHADOW_LIT) & (alpha > 0.5)

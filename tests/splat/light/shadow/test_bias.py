@@ -1,13 +1,13 @@
-"""Receiver-depth bias against closed forms and the float64 twin."""
+"""Receiver-depth bias against closed forms and the float64 reference."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from splats import random_splats
 
-from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import fibonacci_sphere, look_at, quaternion_from_rotation
-from spacesim.splat.light.shadow.bias import grazing_bias, lifted, receiver_bias
+from spacesim.splat.light.shadow.bias import grazing_bias, offset_receivers, receiver_bias
 from spacesim.splat.light.shadow.light_camera import fit_camera, light_rows, towards_sun
 from spacesim.splat.light.shadow.reference import reference_bias
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
@@ -71,7 +71,7 @@ def test_turns_with_the_scene():
 def test_lifted_by_hand(sun):
     """Along the disc's normal, to the Sun's side; a ball has no normal and stays."""
     arrays = {name: np.concatenate([disc()[name], disc(flatness=1.0)[name]]) for name in disc()}
-    points = np.array(lifted(Gaussians.from_numpy(arrays), towards_sun(light_rows(sun)), 3.0, 0.25)).T
+    points = np.array(offset_receivers(Gaussians.from_numpy(arrays), towards_sun(light_rows(sun)), 3.0, 0.25)).T
     height = 0.99 * (3 * 0.002 + 0.25 * 0.2)
     assert points[0] == pytest.approx([0, 0, np.sign(sun[2]) * height], abs=1e-6)
     assert points[1] == pytest.approx([0, 0, 0], abs=1e-6)
@@ -108,7 +108,7 @@ def test_grazing_bias_is_the_depth_that_a_footprint_spans():
 
 def test_no_bias_is_below_its_floor():
     bias = receiver_bias(Gaussians.from_numpy(random_splats(9)), towards_sun(light_rows([0, 0, 1])))
-    floor = ad.Float(np.linspace(0, 1, 9))
+    floor = upload(np.linspace(0, 1, 9))
     raised = bias.at_least(floor)
     assert np.array(raised.bias) == pytest.approx(np.maximum(np.array(bias.bias), np.linspace(0, 1, 9)))
     assert raised.thickness is bias.thickness
@@ -129,4 +129,4 @@ def test_hostile_gaussians_get_none():
     gaussians = Gaussians.from_numpy(arrays)
     camera = fit_camera(gaussians, light_rows([0, 0, 1]), 16)
     assert np.all(np.isfinite(np.array(grazing_bias(gaussians, camera))))
-    assert np.all(np.isfinite(np.array(lifted(gaussians, towards_sun(light_rows([0, 0, 1]))))))
+    assert np.all(np.isfinite(np.array(offset_receivers(gaussians, towards_sun(light_rows([0, 0, 1]))))))

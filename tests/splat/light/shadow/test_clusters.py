@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import direction_from_angles, rotation_from_quaternion
 from spacesim.splat.light.shadow.bias import receiver_bias
 from spacesim.splat.light.shadow.clusters import (
     Supports,
-    assign,
+    assign_cameras,
     clusters,
     light_cameras,
     light_supports,
@@ -62,7 +62,7 @@ class Recorder:
 
     def __call__(self, gaussians, camera):
         self.tried.append(camera)
-        return ad.Float(np.full(gaussians.count, len(self.cameras), np.float32))
+        return upload(np.full(gaussians.count, len(self.cameras), np.float32))
 
 
 def screen(camera, means):
@@ -231,11 +231,11 @@ def test_who_is_covered_by_the_primary_image_needs_no_other():
     radii[15, 0] = 2  # at 7.5, so that the primary image begins at 5.5
     supports = Supports(np.column_stack([centres, np.zeros(31)]), radii)
     assert parts(clusters(centres, radii, SIZE, least_scale=10)) == [list(range(15, 31)), list(range(15))]
-    cameras, receivers = assign(supports, np.eye(3), SIZE, least_scale=10)
+    cameras, receivers = assign_cameras(supports, np.eye(3), SIZE, least_scale=10)
     assert parts(receivers) == [list(range(11, 31)), list(range(11))]
     assert [camera.scale_x for camera in cameras] == pytest.approx([100 / 9.5, 100 / 5])  # the second of the rest alone
     # An image below the wanted scale, which the budget has forced, serves its own cluster only.
-    cameras, receivers = assign(supports, np.eye(3), SIZE, least_scale=12, most=2)
+    cameras, receivers = assign_cameras(supports, np.eye(3), SIZE, least_scale=12, most=2)
     assert parts(receivers) == [list(range(15, 31)), list(range(15))]
 
 
@@ -244,7 +244,7 @@ def test_a_veil_over_the_model_does_not_cut_it_to_pieces():
     radii[100] = 50
     supports = Supports(np.column_stack([centres, np.zeros(200)]), radii)
     assert len(clusters(centres, radii, SIZE, least_scale=10)) == 8
-    cameras, receivers = assign(supports, np.eye(3), SIZE, least_scale=10)
+    cameras, receivers = assign_cameras(supports, np.eye(3), SIZE, least_scale=10)
     assert len(cameras) == 1
     assert len(receivers[0]) == 200
 
@@ -266,6 +266,9 @@ def test_a_few_strays_cost_nothing_and_many_do():
     recorder = Recorder()
     occlusion_in_clusters(Gaussians.from_numpy(join(blob(2000, (0, 0, 0)), far)), SUN, SIZE, 10.0, recorder)
     assert len(recorder.cameras) == 1
+    few, recorder = Gaussians.from_numpy(join(blob(2000, (0, 0, 0)), far)), Recorder()
+    occlusion_in_clusters(few, SUN, SIZE, 10.0, recorder, crop=False)  # 4.32 leaves none out
+    assert len(recorder.cameras) == 2
     far = blob(20, (60, -30, 10))
     occlusion_in_clusters(
         Gaussians.from_numpy(join(blob(2000, (0, 0, 0)), far)), SUN, SIZE, 10.0, recorder := Recorder()
@@ -312,7 +315,7 @@ def test_a_blocker_far_towards_the_sun_is_in_the_picture():
     def occlude(gaussians, camera):
         splats, footprints = project(gaussians, camera)
         seen.append((np.array(footprints.visible), np.array(splats.depth)))
-        return ad.Float(np.zeros(gaussians.count, np.float32))
+        return upload(np.zeros(gaussians.count, np.float32))
 
     occlusion_in_clusters(gaussians, SUN, SIZE, 30.0, occlude)
     _of_all, _first, (visible, depth) = seen

@@ -1,4 +1,4 @@
-"""Shadow mapping: hand-placed blockers, the float64 twin, walls under every Sun, hostile input, repeatability."""
+"""Shadow mapping: hand-placed blockers, the float64 reference, walls under every Sun, hostile input, repeatability."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from splats import random_splats
 from walls import BIASES, SHIPPED, acne, plate, plate_occlusion, screen_shadow, way
 
-from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at, quaternion_from_rotation
 from spacesim.splat.light.shadow import mapping
@@ -54,7 +54,7 @@ def from_above(size=64, metres=2.0):
 
 def occlusion(arrays, camera, bias=None, softness=SOFTNESS, config=None):
     bias = np.zeros(len(arrays["means"])) if bias is None else bias
-    found = occlusion_by_mapping(Gaussians.from_numpy(arrays), camera, ad.Float(bias), softness, config)
+    found = occlusion_by_mapping(Gaussians.from_numpy(arrays), camera, upload(bias), softness, config)
     return np.array(found)
 
 
@@ -167,7 +167,7 @@ def test_the_same_to_the_bit(name):
     results = []
     for gaussians in (*sets, sets[0]):
         camera = fit_camera(gaussians, light_rows([1, -2, 0.5]), 100)
-        found = occlusion_by_mapping(gaussians, camera, ad.Float(np.full(3000, 0.01)), 1e-5, CONFIGS[name])
+        found = occlusion_by_mapping(gaussians, camera, upload(np.full(3000, 0.01)), 1e-5, CONFIGS[name])
         results.append(np.array(found))
     assert np.array_equal(results[0], results[1])
     assert np.array_equal(results[0], results[2])
@@ -272,7 +272,7 @@ def test_models_of_any_size(name, most, monkeypatch):
         ]
 
     recorded = found()
-    monkeypatch.setattr(mapping, "_tested", mapping._trace_tested)
+    monkeypatch.setattr(mapping, "_tested", mapping._tested.traced)
     for one, other in zip(recorded, found(), strict=True):
         np.testing.assert_array_equal(one, other)
     assert 0.05 < recorded[0].mean() < most
@@ -348,7 +348,7 @@ def test_a_face_along_the_light_stays_finite():
         ({"filter": "soft"}, "filter: expected one of bilinear, percentage-closer, variance, median, found 'soft'"),
         ({"radius": 0.2}, "radius: expected 0.5 to 16 pixels, found 0.2"),
         ({"widest": 99}, "widest: expected 0.5 to 16 pixels, found 99"),
-        ({"sun_radius_deg": -1}, "--sun-radius: expected 0 to 45 degrees, found -1"),
+        ({"sun_radius_deg": -1}, "sun_radius_deg: expected 0 to 45 degrees, found -1"),
         ({"bleeding": 1.0}, "bleeding: expected a share from 0 to below 1, found 1.0"),
     ],
 )

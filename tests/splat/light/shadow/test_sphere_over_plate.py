@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array, direction_from_angles, fibonacci_sphere
-from spacesim.splat.light.shadow.cast import ShadowConfig, cast_shadows
+from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig, cast_shadows
 from spacesim.splat.light.shadow.light_camera import fit_camera, light_axes, light_rows
 from spacesim.splat.light.shadow.mapping import FILTERS, MappingConfig, occlusion_by_mapping
 from spacesim.splat.light.shadow.splatting import occlusion_by_splatting
@@ -22,7 +22,7 @@ SPACING, WIDE, THIN = 0.03, 0.02, 5e-4  # of the discs, and their standard devia
 SIZE = 192  # pixels of the light image
 DISTANCE = 5.0  # of the farthest camera, metres, on which the softness depends
 ELEVATIONS = (5, 15, 30, 60, 90)
-BLEEDS = {5: 0.3, 15: 0.06}  # light that a variance filter lets through to the sphere's back (docs/shadows.md)
+BLEEDS = {5: 0.3, 15: 0.06}  # light that a variance filter lets through to the sphere's back (docs/research/shadows.md)
 SLOPE = 4.0  # pixels of the light image over which the plate's own depth must not count: footprints of two Gaussians
 
 
@@ -73,7 +73,7 @@ def wide(method: str, arrays: dict[str, np.ndarray], sun: Array) -> tuple[np.nda
     gaussians = Gaussians.from_numpy(arrays)
     camera = fit_camera(gaussians, light_rows(sun), SIZE)
     pixels = np.array(camera.values)[12:14]
-    bias = ad.Float(np.full(gaussians.count, 0.01 + SLOPE / pixels.min() * np.hypot(*sun[:2]) / sun[2], np.float32))
+    bias = upload(np.full(gaussians.count, 0.01 + SLOPE / pixels.min() * np.hypot(*sun[:2]) / sun[2], np.float32))
     if method in FILTERS:
         occlusion = occlusion_by_mapping(gaussians, camera, bias, 1e-3, MappingConfig(filter=method))
     else:
@@ -132,7 +132,7 @@ def test_as_shipped_the_shadow_ends_where_the_umbra_does(preset_name, method, mo
     check(arrays, ball, sun, (visibility, scale), most, least)
     towards = (arrays["means"][:ball] - [0, 0, HEIGHT]) @ sun / RADIUS
     assert visibility[:ball][towards > 0.2].mean() > 0.95  # the sphere does not darken its own sunlit side
-    bleeds = method == "shadow-map" and light.shadow.mapping.filter == "variance"
+    bleeds = method == "shadow-map" and light.shadow.method.filter == "variance"
     lit = BLEEDS.get(elevation, 0.03) if bleeds else 0.001 if method == "shadow-map" else 0.1
     assert visibility[:ball][towards < -0.2].mean() < lit
 
@@ -141,7 +141,7 @@ def test_the_thesis_leaves_the_plate_dark_at_five_degrees():
     """What the shipped bias is for."""
     sun = direction_from_angles(30, 5)
     arrays, ball = scene(sun, 5)
-    for method in ("mapping", "splatting"):
+    for method in (MappingConfig(), SplattingConfig()):
         visibility, scale = occlude(ShadowConfig(method), arrays, sun)
         beyond, _ = beyond_umbra(arrays["means"][ball:], sun, scale)
         assert visibility[ball:][beyond > 4].mean() < 0.5, method

@@ -1,4 +1,4 @@
-"""Shadow splatting against its float64 twin, closed forms on hand-placed Gaussians, symmetries, hostile input."""
+"""Shadow splatting against its float64 reference, closed forms on hand-placed Gaussians, symmetries, hostile input."""
 
 import drjit as dr
 import numpy as np
@@ -8,10 +8,11 @@ from splats import random_splats
 from walls import acne, screen_shadow, way
 
 from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import look_at
 from spacesim.splat.light.shadow.bias import receiver_bias
 from spacesim.splat.light.shadow.reference_splatting import occlusion_reference
-from spacesim.splat.light.shadow.splatting import BETA_MIN, differentiable_occlusion, occlusion_by_splatting
+from spacesim.splat.light.shadow.splatting import BETA_MIN, LEAST_BETA, differentiable_occlusion, occlusion_by_splatting
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians
 
@@ -19,6 +20,7 @@ PARAMETERS = ("means", "log_scales", "quaternions", "logit_opacities")
 POSE = look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0])
 DOWN = np.diag([1.0, -1.0, -1.0, 1.0])  # the light looks along -z
 PIXELS = 10.0  # a metre, of `overhead`
+STEP = 1e-6  # of central differences
 
 
 def light(width: int = 40, height: int = 28, pose=POSE) -> OrthographicCamera:
@@ -30,11 +32,11 @@ def overhead(width: int = 64, height: int = 64) -> OrthographicCamera:
     return OrthographicCamera(DOWN, width, height, PIXELS, PIXELS, width / 2, height / 2)
 
 
-def occlusion(arrays, camera, bias=0.0, antialiased=False, points=None) -> np.ndarray:
-    numbers = ad.Float(np.broadcast_to(np.float32(bias), len(arrays["means"])).copy())
+def occlusion(arrays, camera, bias=0.0, antialiased=False, points=None, beta_min=BETA_MIN) -> np.ndarray:
+    numbers = upload(np.broadcast_to(np.float32(bias), len(arrays["means"])).copy())
     points = None if points is None else ad.Array3f(points.T.astype(np.float32))
-    result = occlusion_by_splatting(Gaussians.from_numpy(arrays), Orthographic.of(camera), numbers, points, antialiased)
-    return np.array(result)
+    given = Gaussians.from_numpy(arrays), Orthographic.of(camera), numbers, points, antialiased
+    return np.array(occlusion_by_splatting(*given, beta_min=beta_min))
 
 
 def placed(means, scales=0.1, opacities=0.999999) -> dict[str, np.ndarray]:
@@ -70,6 +72,14 @@ def test_occlusion_matches_the_twin(count, size, antialiased):
     twin = occlusion_reference(arrays, view, bias, BETA_MIN, antialiased)
     assert count < 60 or (twin.max() > 0.5 and (twin > 0).mean() > 0.5)
     np.testing.assert_allclose(occlusion(arrays, view, bias, antialiased), twin, atol=2e-6)
+
+
+@pytest.mark.parametrize("end", [LEAST_BETA, 0.3])
+def test_a_footprint_ends_where_it_is_told_to(end):
+    arrays, view = random_splats(60, seed=2), light()
+    ours, twin = occlusion(arrays, view, beta_min=end), occlusion_reference(arrays, view, np.zeros(60), end)
+    np.testing.assert_allclose(ours, twin, atol=2e-6)
+    assert np.abs(ours - occlusion(arrays, view)).max() > 0.01
 
 
 def test_receivers_elsewhere_match_the_twin():
@@ -287,15 +297,16 @@ def test_one_bias_serves_all_and_another_length_does_not():
         occlusion_by_splatting(gaussians, camera, ad.Float(0, 0, 0))
 
 
-def gradients(arrays, view, bias, antialiased=False, away=0.0) -> list[np.ndarray]:
+def gradients(arrays, view, bias, antialiased=False, away=0.0, beta_min=BETA_MIN) -> list[np.ndarray]:
     """[occlusion, gradients of sum(weights x occlusion) by each of `PARAMETERS`, N first]; receivers `away` m in x."""
     gaussians = Gaussians.from_numpy(arrays)
     for name in PARAMETERS:
         dr.enable_grad(getattr(gaussians, name))
-    bias = ad.Float(np.asarray(bias, dtype=np.float32))
+    bias = upload(np.asarray(bias, dtype=np.float32))
     points = gaussians.means + ad.Array3f(away, 0, 0) if away else None
-    occluded = differentiable_occlusion(gaussians, Orthographic.of(view), bias, points, antialiased)
-    dr.backward(dr.sum(occluded * ad.Float(weights(len(bias)).astype(np.float32))))
+    given = gaussians, Orthographic.of(view), bias, points, antialiased
+    occluded = differentiable_occlusion(*given, beta_min=beta_min)
+    dr.backward(dr.sum(occluded * upload(weights(len(bias)).astype(np.float32))))
     return [np.array(dr.detach(occluded)), *(np.array(dr.grad(getattr(gaussians, name))).T for name in PARAMETERS)]
 
 
@@ -303,12 +314,12 @@ def weights(count: int) -> np.ndarray:
     return np.random.default_rng(3).normal(size=count)
 
 
-def differences(arrays, view, bias, antialiased: bool, away: float, step: float = 1e-6) -> list[np.ndarray]:
+def differences(arrays, view, bias, antialiased: bool, away: float, beta_min: float) -> list[np.ndarray]:
     """Central differences of the twin."""
 
     def loss(moved: dict[str, np.ndarray]) -> float:
         points = moved["means"] + [away, 0, 0]
-        return float(weights(len(bias)) @ occlusion_reference(moved, view, bias, BETA_MIN, antialiased, points))
+        return float(weights(len(bias)) @ occlusion_reference(moved, view, bias, beta_min, antialiased, points))
 
     slopes = []
     for name in PARAMETERS:
@@ -316,20 +327,23 @@ def differences(arrays, view, bias, antialiased: bool, away: float, step: float 
         slope = np.empty_like(values)
         for index in np.ndindex(values.shape):
             shift = np.zeros_like(values)
-            shift[index] = step
-            slope[index] = (loss({**arrays, name: values + shift}) - loss({**arrays, name: values - shift})) / (
-                2 * step
-            )
+            shift[index] = STEP
+            both = [loss({**arrays, name: values + sign * shift}) for sign in (1, -1)]
+            slope[index] = (both[0] - both[1]) / (2 * STEP)
         slopes.append(slope)
     return slopes
 
 
-@pytest.mark.parametrize(("antialiased", "away"), [(False, 0.0), (True, 0.0), (False, 0.1)])
-def test_gradients_match_central_differences(antialiased, away):
+@pytest.mark.parametrize(
+    ("antialiased", "away", "beta_min"),
+    [(False, 0.0, BETA_MIN), (True, 0.0, BETA_MIN), (False, 0.1, BETA_MIN), (False, 0.0, LEAST_BETA)],
+)
+def test_gradients_match_central_differences(antialiased, away, beta_min):
     arrays, view = random_splats(20, seed=1), light(24, 17)
     bias = np.random.default_rng(1).uniform(0, 0.05, 20)
-    _, *ours = gradients(arrays, view, bias, antialiased, away)
-    for name, slope, twin in zip(PARAMETERS, ours, differences(arrays, view, bias, antialiased, away), strict=True):
+    _, *ours = gradients(arrays, view, bias, antialiased, away, beta_min)
+    twins = differences(arrays, view, bias, antialiased, away, beta_min)
+    for name, slope, twin in zip(PARAMETERS, ours, twins, strict=True):
         error = np.linalg.norm(slope - twin) / np.linalg.norm(twin)
         assert error < 1e-4, (name, error)
 

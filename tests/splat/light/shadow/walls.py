@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from spacesim.splat.light.shadow.cast import ShadowConfig, cast_shadows
+from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig, cast_shadows
 from spacesim.splat.light.shadow.light_camera import light_rows
 from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.raster.gaussians import Gaussians
@@ -12,6 +12,7 @@ from spacesim.splat.train.config import preset
 
 SCREEN = 0.25  #: metres, height
 DISTANCE = 5.0  #: metres, of the farthest camera, on which the softness depends
+METHODS = {"mapping": MappingConfig, "splatting": SplattingConfig}
 SHIPPED = {"mapping": "shadow-map", "splatting": "shadow-splat"}  #: methods of `spacesim train`
 #: what is done against acne, beside the thesis's way to read the light's picture
 BIASES = {
@@ -27,7 +28,7 @@ def way(name: str, method: str = "mapping", size: int = 512) -> ShadowConfig:
     """Of BIASES, or of a preset: `fast`, as `demo`, or `fine`."""
     if name not in BIASES:
         return replace(preset(name, SHIPPED[method]).light.shadow, size=size)
-    return ShadowConfig(method, size, mapping=MappingConfig(), **BIASES[name])
+    return ShadowConfig(METHODS[method](), size, **BIASES[name])
 
 
 def sheet(corner, along, across, count: int, rng: np.random.Generator, width: float) -> dict[str, np.ndarray]:

@@ -1,0 +1,260 @@
+"""Makes the pages of docs/reference that are read off the code: api, options, scene-fields, materials and
+command-line.
+
+mkdocs calls `on_files` (a hook of mkdocs.yml): the pages are made while the site is built and lie in no folder.
+
+    python docs/generate.py [FOLDER]     prints their names, or writes them into FOLDER to look at
+"""
+
+import ast
+import contextlib
+import inspect
+import io
+import os
+import re
+import sys
+import textwrap
+from collections.abc import Iterable, Iterator
+from dataclasses import is_dataclass, replace
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+from unittest.mock import patch
+
+WIDTH = 100  #: characters of a line of help and of a signature
+
+
+def pages() -> dict[str, str]:
+    """{path under docs: Markdown} of all generated pages."""
+    return {
+        "reference/api.md": api_page(),
+        "reference/options.md": options_page(),
+        "reference/scene-fields.md": scene_page(),
+        "reference/materials.md": materials_page(),
+        "reference/command-line.md": command_page(),
+    }
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """The hook: the pages join those of the folder."""
+    from mkdocs.structure.files import File
+
+    for path, text in pages().items():
+        files.append(File.generated(config, path, content=text))
+    return files
+
+
+def api_page() -> str:
+    """Every public name with its signature and docstring."""
+    import spacesim as ss
+    from spacesim.torch import rasterization
+
+    parts = [
+        "# API",
+        f"Generated from the docstrings of spacesim {ss.__version__}. `import spacesim as ss` gives the names below; "
+        "nothing heavy is loaded before one is used. Equation numbers are explained in "
+        "[equations](../explanation/equations.md).",
+        "## Functions",
+        *(function_entry(f"ss.{name}", getattr(ss, name)) for name in functions(ss)),
+        "## Records",
+        *(class_entry(f"ss.{name}", getattr(ss, name)) for name in classes(ss)),
+        "## Errors",
+        *(f"### ss.{name}\n\n{block(inspect.getdoc(getattr(ss, name)) or '')}" for name in errors(ss)),
+        "## Torch",
+        function_entry("spacesim.torch.rasterization", rasterization),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def functions(module: Any) -> list[str]:
+    return [name for name in module.__all__ if inspect.isfunction(getattr(module, name))]
+
+
+def errors(module: Any) -> list[str]:
+    return [name for name in module.__all__ if is_error(getattr(module, name))]
+
+
+def classes(module: Any) -> list[str]:
+    return [name for name in module.__all__ if inspect.isclass(getattr(module, name)) and name not in errors(module)]
+
+
+def is_error(thing: Any) -> bool:
+    return inspect.isclass(thing) and issubclass(thing, Exception)
+
+
+def block(text: str, language: str = "text") -> str:
+    return f"```{language}\n{text.strip()}\n```"
+
+
+def function_entry(title: str, function: Any) -> str:
+    name = title.rsplit(".", 1)[-1]
+    return f"### {title}\n\n{block(signature(function, name), 'python')}\n\n{block(inspect.getdoc(function) or '')}"
+
+
+def class_entry(title: str, cls: Any) -> str:
+    """A class: its fields as they stand in the code, and what can be asked of it."""
+    parts = [f"### {title}", block(inspect.getdoc(cls) or "")]
+    if fields := list(field_lines(cls)):
+        parts.append(block("\n".join(fields), "python"))
+    for name, member in members(cls):
+        own, said = f"{title.removeprefix('ss.')}.{name}", inspect.getdoc(member) or ""
+        if inspect.isfunction(member):
+            parts.append(f"{block(signature(member, own), 'python')}\n\n{block(said)}")
+        else:
+            parts.append(f"`{own}`\n\n{block(said)}")
+    return "\n\n".join(parts)
+
+
+def field_lines(cls: type) -> Iterator[str]:
+    """Fields as they stand in the code, with the values of constants in the place of their names."""
+    source = textwrap.dedent(inspect.getsource(cls))
+    lines = source.splitlines()
+    definition = ast.parse(source).body[0]
+    assert isinstance(definition, ast.ClassDef)
+    for statement in definition.body:
+        if isinstance(statement, ast.AnnAssign) and not ast.unparse(statement.target).startswith("_"):
+            assert statement.end_lineno is not None
+            text = textwrap.dedent("\n".join(lines[statement.lineno - 1 : statement.end_lineno]))
+            if isinstance(statement.value, ast.Name):
+                assert isinstance(statement.target, ast.Name)
+                default = getattr(cls, statement.target.id)
+                shown = f"{default:.6g}" if isinstance(default, float) else repr(default)
+                text = text.replace(f"= {statement.value.id}", f"= {shown}")
+            yield text
+
+
+def members(cls: type) -> Iterator[tuple[str, Any]]:
+    """(name, function) of the public methods and properties that have a docstring."""
+    for name, member in vars(cls).items():
+        function = getattr(member, "fget", None) or getattr(member, "__func__", None) or getattr(member, "func", member)
+        if not name.startswith("_") and inspect.isfunction(function) and function.__doc__:
+            yield name, function if not isinstance(member, property) else member
+
+
+def signature(function: Any, name: str) -> str:
+    """As it is written in the code, without `self`."""
+    definition = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
+    assert isinstance(definition, ast.FunctionDef)
+    arguments = definition.args
+    if arguments.args and arguments.args[0].arg in ("self", "cls"):
+        arguments.args = arguments.args[1:]
+    parts = [re.sub(r"^([^=]*: [^=]*)=", r"\1 = ", part) for part in split(ast.unparse(arguments))]
+    end = f" -> {ast.unparse(definition.returns)}".replace("'", "") if definition.returns else ""
+    line = f"{name}({', '.join(parts)}){end}"
+    return line if len(line) <= WIDTH else f"{name}(\n    " + ",\n    ".join(parts) + f",\n){end}"
+
+
+def split(arguments: str) -> list[str]:
+    """At the commas that stand in no brackets."""
+    parts, depth = [""], 0
+    for character in arguments:
+        depth += (character in "([{") - (character in ")]}")
+        if character == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return [part.strip() for part in parts if part.strip()]
+
+
+def options_page() -> str:
+    """Every field of a training's configuration."""
+    from spacesim.cli.fields import reference
+
+    lead = (
+        "Every field of `TrainConfig` and of the records in it, with the defaults of the records. `--set KEY=VALUE` "
+        "takes each; `spacesim train --fields` lists them with what preset, method and strategy give them. The presets "
+        "are files in `spacesim/assets/presets/`."
+    )
+    return f"# Options of a training\n\n{lead}\n\n{reference().strip()}\n"
+
+
+def scene_page() -> str:
+    """Every table of a scene file: the record that it becomes, its fields and their defaults."""
+    import spacesim as ss
+    from spacesim.data.structure import keys_of
+    from spacesim.scenes.scenefile import RULES
+
+    records = {name: record_in(hint) for name, hint in get_type_hints(ss.SceneConfig).items()}
+    example = ss.read_scene("boxsat")
+    kinds = {replace(example, rig=cls()).to_json()["rig"]["kind"]: cls for cls in records["rig"].__subclasses__()}
+    tables: dict[str, type] = {
+        "The scene": ss.SceneConfig,
+        "[[objects]]": records["objects"],
+        "[materials.NAME]": records["materials"],
+        "[sun]": records["sun"],
+        "[earth]": records["earth"],
+        "[rig]": records["rig"],
+        **{f'[rig] kind = "{kind}"': cls for kind, cls in kinds.items()},
+        "[camera]": records["camera"],
+        "[camera.sensor]": record_in(get_type_hints(records["camera"])["sensor"]),
+        "[quality]": records["quality"],
+    }
+    parts = [
+        "# Fields of scene files",
+        "Generated from the records that a [scene file](scene-files.md) becomes. A default of None means that leaving "
+        "the key out is the only way to have none. Lengths are metres.",
+        *(f"## {title}\n\n{record_entry(cls, keys_of(cls, RULES))}" for title, cls in tables.items()),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def record_in(hint: Any) -> Any:
+    """The record of `tuple[Record, ...]`, `Record | None` and their like."""
+    return hint if is_dataclass(hint) else next(filter(None, map(record_in, get_args(hint))), None)
+
+
+def record_entry(cls: type, keys: Iterable[str]) -> str:
+    """A record: its docstring, and those of its fields that are keys of a file."""
+    known = set(keys)
+    lines = [line for line in field_lines(cls) if line.partition(":")[0] in known]
+    return f"{block(inspect.getdoc(cls) or '')}\n\n{block(chr(10).join(lines), 'python')}"
+
+
+def materials_page() -> str:
+    """Every row of assets/materials.toml."""
+    from spacesim.data.toml import parse
+
+    path = Path(__file__).parents[1] / "spacesim" / "assets" / "materials.toml"
+    rows = ["| Material | Kind | Albedo R, G, B | GGX α | Absorptance | From |", "|---|---|---|---|---|---|"]
+    for name, values in parse(path.read_text(encoding="utf-8"), path.name).values.items():
+        albedo = ", ".join(f"{channel:.3f}" for channel in values.get("albedo", []))
+        kind = f"{values['kind']}, n = {values['ior']}" if "ior" in values else values["kind"]
+        cells = f"`{name}`", kind, albedo, values.get("roughness", ""), values.get("absorptance", ""), values["source"]
+        rows.append(f"| {' | '.join(' '.join(str(cell).split()) for cell in cells)} |")
+    lead = (
+        "Generated from `spacesim/assets/materials.toml`. Albedo is linear camera RGB, of coated surfaces that of the "
+        "base as seen through the coat; the absorptance is over 300 to 2500 nm. Table 11.3: Fortescue, Swinerd "
+        "and Stark, *Spacecraft Systems Engineering*, 4th edition, 2011; Rakic: Appl. Opt. 34, 4755 (1995)."
+    )
+    return f"# Table of materials\n\n{lead}\n\n{chr(10).join(rows)}\n"
+
+
+def command_page() -> str:
+    """The help of every command."""
+    overview = help_of()
+    names = re.findall(r"^    ([a-z]+) ", overview, re.MULTILINE)
+    parts = [
+        "# Command line",
+        "The help of every command. Exit codes: 0 done, 1 the work failed, 2 bad usage or bad input: one sentence "
+        "names the file or option, what was expected and what was found.",
+        block(overview),
+        *(f"## spacesim {name}\n\n{block(help_of(name))}" for name in names),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def help_of(*words: str) -> str:
+    from spacesim.cli import main
+
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit), patch.dict(os.environ, COLUMNS=str(WIDTH)):
+        main([*words, "--help"])
+    return said.getvalue()
+
+
+if __name__ == "__main__":
+    for path, text in pages().items():
+        print(f"{path}: {len(text.split())} words")
+        if len(sys.argv) > 1:
+            place = Path(sys.argv[1]) / path
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_text(text, encoding="utf-8")

@@ -1,0 +1,25 @@
+"""Names of Dr.Jit's array types for annotations: `Float` is `ad.Float` of whichever backend runs.
+
+A type checker and an editor read Dr.Jit's own stubs, in which `dr.gather(ad.Float, ...)` is a `Float` and a comparison
+a `Bool`. At run time the names stand for anything, and neither Dr.Jit nor a backend is loaded for them.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from drjit.auto.ad import (
+        Array2f,
+        Array3f,
+        Array4f,
+        Array4u,
+        ArrayXf,
+        Bool,
+        Float,
+        TensorXf,
+        UInt32,
+        UInt64,
+    )
+else:
+    Array2f = Array3f = Array4f = Array4u = ArrayXf = Bool = Float = TensorXf = UInt32 = UInt64 = Any
+
+__all__ = ["Array2f", "Array3f", "Array4f", "Array4u", "ArrayXf", "Bool", "Float", "TensorXf", "UInt32", "UInt64"]

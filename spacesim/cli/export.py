@@ -1,0 +1,122 @@
+"""`spacesim export`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from spacesim import backend, interrupts
+from spacesim.cli.parser import Parser, angles
+from spacesim.cli.printing import KNOWS_ONE_LIGHT, WANTS_FILTER
+from spacesim.data.errors import InputError, WorkError
+
+SUMMARY, NEEDS_BACKEND = "a run or a dataset as files for other tools", False
+
+
+def add_options(parser: Parser, arguments: Sequence[str]) -> None:
+    parser.add_argument("path", type=Path, metavar="RUN|DATA")
+    parser.add_argument("--backend", choices=backend.NAMES, default="auto", help="default: CUDA, else LLVM")
+    form = parser.add_mutually_exclusive_group(required=True)
+    form.add_argument("--ply", type=Path, metavar="FILE", help="Gaussians: INRIA layout, the dataset's frame and scale")
+    form.add_argument("--mesh", type=Path, metavar="FILE", help="the surface of a run: .ply, .obj, .glb or .stl")
+    form.add_argument("--speedplus", type=Path, metavar="DIR", help="a dataset's images and poses as SPEED+ has them")
+    form.add_argument("--bop", type=Path, metavar="DIR", help="a dataset's images, depth, masks, poses, models for BOP")
+    parser.add_argument("--sun", type=angles, metavar="AZ,EL", help="for --ply of a relightable run: whose colours")
+    parser.add_argument("--object", metavar="K", help="for SPEED+: whose poses, by number or name (the first)")
+    parser.add_argument("--data", type=Path, metavar="DATA", help="for --mesh: the dataset, where it has moved")
+    parser.add_argument("--views", type=int, metavar="N", help="for --mesh: how many are fused, at most (64)")
+    parser.add_argument("--voxel", type=float, metavar="M", help="for --mesh: metres (1/192 of the object's size)")
+    parser.add_argument("--truncation", type=float, metavar="N", help="for --mesh: voxels behind the surface (2)")
+
+
+def run(options: argparse.Namespace) -> None:
+    if options.object is not None and options.speedplus is None:
+        raise InputError("object: expected with --speedplus, found without it")
+    if options.sun is not None and options.ply is None:
+        raise InputError("sun: expected with --ply, found without it")
+    for name in ("data", "views", "voxel", "truncation"):
+        if getattr(options, name) is not None and options.mesh is None:
+            raise InputError(f"{name}: expected with --mesh, found without it")
+    if options.speedplus is not None:
+        _export_speedplus(options)
+    elif options.bop is not None:
+        _export_bop(options)
+    elif options.mesh is not None:
+        _export_mesh(options)
+    else:
+        _export_ply(options)
+
+
+def _export_ply(options: argparse.Namespace) -> None:
+    from spacesim.data.records import Sun
+    from spacesim.splat.export.bake import bake
+    from spacesim.splat.export.ply import write_ply
+    from spacesim.splat.run import load_run
+
+    backend.select(options.backend)
+    run = load_run(options.path)
+    model = run.gaussians
+    if options.sun is None and run.relightable:
+        raise InputError("sun: expected AZ,EL, under which a relightable run is to be exported, found none")
+    if options.sun is not None and not run.relightable:
+        print(KNOWS_ONE_LIGHT, file=sys.stderr)
+    if run.light is not None:
+        model = bake(model, run.light, Sun.from_angles(*options.sun).direction if options.sun else None)
+    write_ply(model, options.ply)
+    if run.antialiased:
+        print(WANTS_FILTER, file=sys.stderr)
+    interrupts.print_output(f"{options.ply}: {run.gaussian_count} Gaussians")
+
+
+def _export_mesh(options: argparse.Namespace) -> None:
+    from spacesim.data.mesh import mesh_suffix, write_mesh
+    from spacesim.data.store import read_dataset
+    from spacesim.progress import show_progress
+    from spacesim.splat.export.mesh import MeshConfig, cameras_around, mesh_of
+    from spacesim.splat.run import load_run
+
+    mesh_suffix(options.mesh)
+    settings = {"voxel": options.voxel, "truncation": options.truncation, "views": options.views}
+    config = MeshConfig(**{name: value for name, value in settings.items() if value is not None})
+    backend.select(options.backend)
+    run = load_run(options.path)
+    data = options.data or Path(run.config["data"]["path"])
+    if options.data or data.exists():
+        cameras = [frame.camera for frame in read_dataset(data).train]
+    else:
+        print(f"{data}: is gone; {config.views} cameras around the model take the place of its views", file=sys.stderr)
+        cameras = cameras_around(run.gaussians, config.views)
+    with show_progress("export", "steps") as report:
+        surface = mesh_of(run.gaussians, cameras, config, run.antialiased, report)
+    if len(surface.faces) == 0:
+        raise WorkError(f"{options.path}: no view of the run shows an opaque surface, so there is no mesh to write")
+    write_mesh(options.mesh, surface.vertices, surface.faces)
+    interrupts.print_output(
+        f"{options.mesh}: {len(surface.faces)} faces from {surface.views} views, voxels of {surface.voxel:.4g} m"
+    )
+
+
+def _export_speedplus(options: argparse.Namespace) -> None:
+    from spacesim.data.exporters import write_speedplus
+    from spacesim.data.store import read_dataset
+    from spacesim.progress import show_progress
+
+    dataset = read_dataset(options.path)
+    with show_progress("export", "frames") as report:
+        target = write_speedplus(dataset, options.speedplus, options.object, report)
+    interrupts.print_output(f"{options.speedplus}: {len(dataset.frames)} images with the pose of {target.name}")
+
+
+def _export_bop(options: argparse.Namespace) -> None:
+    from spacesim.data.exporters import write_bop
+    from spacesim.data.store import read_dataset
+    from spacesim.progress import show_progress
+    from spacesim.scenes.silhouette import silhouette_finder
+
+    backend.select(options.backend)
+    dataset = read_dataset(options.path)
+    with show_progress("export", "frames") as report:
+        targets = write_bop(dataset, options.bop, silhouette_finder, report)
+    interrupts.print_output(
+        f"{options.bop}: {len(dataset.frames)} images with the poses of {', '.join(t.name for t in targets)}"
+    )

@@ -1,0 +1,91 @@
+"""What commands have in common: how wrong options are told, types of arguments, from where a run is seen."""
+
+import argparse
+import math
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from spacesim import interrupts
+from spacesim.data.errors import InputError
+from spacesim.data.structure import did_you_mean
+
+if TYPE_CHECKING:
+    from spacesim.data.records import Camera, Sun
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong with the usage in one sentence, and takes "-40,10" for an argument, not for an option."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._negative_number_matcher = re.compile(r"^-\.?\d")
+
+    def flags(self) -> dict[str, str]:
+        """{name of an option's value: the option}."""
+        return {action.dest: action.option_strings[-1] for action in self._actions if action.option_strings}
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """argparse itself would not say that its help could not be written."""
+        if file is sys.stdout:
+            interrupts.print_output(message, end="")
+        else:
+            super()._print_message(message, file)
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            words = ", ".join(map(str, action.choices))
+            raise argparse.ArgumentError(
+                action, f"expected one of {words}, found {value!r}{did_you_mean(value, map(str, action.choices))}"
+            )
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def angles(text: str) -> tuple[float, float]:
+    """(azimuth, elevation), degrees, of "AZ,EL"."""
+    try:
+        azimuth, elevation = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected AZ,EL in degrees, found {text!r}") from None
+    if not (math.isfinite(azimuth) and -90 <= elevation <= 90):
+        raise argparse.ArgumentTypeError(f"expected a finite azimuth and an elevation up to 90, found {text!r}")
+    return azimuth, elevation
+
+
+def resolution(text: str) -> int | tuple[int, int]:
+    """Pixels of each side, or (width, height) of "WIDTHxHEIGHT"."""
+    sides = text.lower().split("x")
+    if not all(side.isascii() and side.lstrip("-").isdigit() for side in sides) or len(sides) > 2:
+        raise argparse.ArgumentTypeError(f"expected pixels of each side, or WIDTHxHEIGHT, found {text!r}")
+    return (int(sides[0]), int(sides[1])) if len(sides) == 2 else int(sides[0])
+
+
+def add_view(parser: Parser) -> None:
+    """The options that say from where a run is seen."""
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--camera", type=Path, metavar="FILE", help="JSON with transform_matrix, w, h, fl_x, ...")
+    where.add_argument("--frame", type=int, metavar="K", help="frame K of the dataset, training frames first (0)")
+    parser.add_argument("--data", type=Path, metavar="DATA", help="the dataset, where it has moved since training")
+
+
+def view_of(options: argparse.Namespace, config: dict[str, Any]) -> "tuple[Camera, Sun | None]":
+    """The camera that the options of `add_view` name, and the Sun of a frame. config: a run's config.json"""
+    from spacesim.data.transforms import read_camera, read_dataset
+
+    if options.camera:
+        return read_camera(options.camera), None
+    frames = read_dataset(options.data or _data_of(config)).frames
+    index = options.frame or 0
+    if not 0 <= index < len(frames):
+        raise InputError(f"frame: expected 0 to {len(frames) - 1}, found {index}")
+    return frames[index].camera, frames[index].sun
+
+
+def _data_of(config: dict[str, Any]) -> Path:
+    path = Path(config["data"]["path"])
+    if not path.exists():
+        raise InputError(f"{path}: expected the data that the run was trained on, found nothing; name it with --data")
+    return path

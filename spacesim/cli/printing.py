@@ -1,0 +1,47 @@
+"""What several commands print."""
+
+from functools import partial
+from typing import Any
+
+from spacesim import interrupts
+
+KNOWS_ONE_LIGHT = "the run knows the light that it was trained under only; --sun changes nothing"
+WANTS_FILTER = "the run is antialiased: viewers without Mip-Splatting's 2D filter draw thin splats wider"
+
+
+def print_headline(metrics: dict[str, Any]) -> None:
+    """PSNR, SSIM and shadow errors in a line each."""
+    show = partial(_mean, metrics)
+    interrupts.print_output(f"silhouette: PSNR {show('image', 'psnr', 2)} dB, SSIM {show('image', 'ssim', 4)}", end="")
+    interrupts.print_output(f", FLIP {show('image', 'flip', 4)}; full frame: PSNR {show('image_full', 'psnr', 2)} dB")
+    interrupts.print_output(
+        f"shadows: BER {show('shadow', 'ber', 4)}, boundary MAE {show('shadow', 'boundary_mae', 4)}"
+    )
+    if metrics.get("shadow_mask"):
+        share, balanced = show("shadow_mask", "error_rate", 4), show("shadow_mask", "balanced_error_rate", 4)
+        pooled = metrics["shadow_mask"]["error_rate"]
+        pooled_words = "" if pooled is None else f" ({pooled['pooled']:.4f} over the pixels of all frames)"
+        interrupts.print_output(f"shadow masks: error rate {share}{pooled_words}, balanced {balanced}")
+    if metrics.get("known_suns") and metrics.get("unseen_suns"):
+        known_psnr, unseen_psnr = (_mean(metrics[part], "image", "psnr", 2) for part in ("known_suns", "unseen_suns"))
+        interrupts.print_output(
+            f"silhouette PSNR: {known_psnr} dB under known Suns, {unseen_psnr} dB under Suns never seen"
+        )
+    if (metrics.get("geometry") or {}).get("chamfer") is not None:
+        interrupts.print_output(_shape_words(metrics["geometry"]))
+    for note in metrics.get("notes", []):
+        interrupts.print_output(f"note: {note}")
+
+
+def _shape_words(geometry: dict[str, Any]) -> str:
+    """The headline of metrics.json's "geometry"."""
+    near, overlap = geometry["precision_recall"], geometry["iou"]
+    words = f"shape: Chamfer {geometry['chamfer']:.3g} m2, Hausdorff-99 {geometry['hausdorff99']:.3g} m"
+    words += f", IoU {'null' if overlap is None else f'{overlap:.4f}'}, F {near['f']:.4f} at {near['distance']:.3g} m"
+    floating = (geometry["floaters"] or {}).get("outside")
+    return words if floating is None else f"{words}, floaters {100 * floating:.2f} %"
+
+
+def _mean(metrics: dict[str, Any], group: str, name: str, digits: int) -> str:
+    value = ((metrics.get(group) or {}).get(name) or {}).get("mean")
+    return "null" if value is None else f"{value:.{digits}f}"

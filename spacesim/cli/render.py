@@ -1,0 +1,41 @@
+"""`spacesim render`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from spacesim import interrupts
+from spacesim.cli.parser import Parser, add_view, angles, view_of
+from spacesim.cli.printing import KNOWS_ONE_LIGHT
+from spacesim.data.errors import InputError
+
+SUMMARY, NEEDS_BACKEND = "one picture of a run", True
+KINDS = ("rgb", "depth", "alpha", "normal", "shadow")
+
+
+def add_options(parser: Parser, arguments: Sequence[str]) -> None:
+    parser.add_argument("path", type=Path, metavar="RUN")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.png|.exr")
+    add_view(parser)
+    parser.add_argument("--sun", type=angles, metavar="AZ,EL", help="degrees; a vanilla run knows one light only")
+    parser.add_argument("--kind", choices=KINDS, default="rgb")
+    parser.add_argument("--exposure", type=float, metavar="EV", help="of a run in linear light (that of its pictures)")
+
+
+def run(options: argparse.Namespace) -> None:
+    from spacesim.data.records import Sun
+    from spacesim.splat.export.pictures import write_picture
+    from spacesim.splat.run import load_run
+
+    run = load_run(options.path)
+    sun = Sun.from_angles(*options.sun) if options.sun else None
+    if sun is not None and not run.relightable:
+        print(KNOWS_ONE_LIGHT, file=sys.stderr)
+    camera, sun_of_frame = view_of(options, run.config)
+    sun = sun or sun_of_frame
+    if sun is None and run.relightable:
+        raise InputError("sun: expected AZ,EL for a run that can be relit and a camera without a Sun, found none")
+    seen = run.predict(camera, sun, normals=options.kind == "normal", exposure=options.exposure)
+    write_picture(seen, options.kind, options.out)
+    interrupts.print_output(options.out)

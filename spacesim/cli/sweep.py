@@ -1,0 +1,42 @@
+"""`spacesim sweep`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from spacesim import interrupts
+from spacesim.cli.parser import Parser, add_view, resolution, view_of
+
+SUMMARY, NEEDS_BACKEND = "the Sun goes round a run: a contact sheet and a video", True
+
+
+def add_options(parser: Parser, arguments: Sequence[str]) -> None:
+    parser.add_argument("path", type=Path, metavar="RUN")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    add_view(parser)
+    path = parser.add_mutually_exclusive_group()
+    path.add_argument("--elevation", type=float, metavar="DEG", help="the Sun goes round at this elevation (30)")
+    path.add_argument("--azimuth", type=float, metavar="DEG", help="the Sun rises at this azimuth and goes overhead")
+    parser.add_argument("--frames", type=int, metavar="N", help="Suns, evenly around the circle (72)")
+    parser.add_argument("--kind", choices=("rgb", "shadow"), default="rgb")
+    parser.add_argument("--exposure", type=float, metavar="EV", help="of a run in linear light (that of its pictures)")
+    parser.add_argument("--size", type=resolution, metavar="PX", help="pixels of the longer side, or WIDTHxHEIGHT")
+    parser.add_argument("--keep-frames", action="store_true", help="write every picture into DIR/frames, too")
+
+
+def run(options: argparse.Namespace) -> None:
+    from spacesim.progress import show_progress
+    from spacesim.splat.export.sweep import FRAMES, resize_camera, suns_around, sweep
+    from spacesim.splat.run import load_run
+
+    suns = suns_around(FRAMES if options.frames is None else options.frames, options.elevation, options.azimuth)
+    run = load_run(options.path)
+    camera, _ = view_of(options, run.config)
+    if options.size is not None:
+        camera = resize_camera(camera, options.size)
+    with show_progress("sweep", "frames") as report:
+        done = sweep(run, camera, suns, options.out, options.kind, options.keep_frames, report, options.exposure)
+    if done.note is not None:
+        print(done.note, file=sys.stderr)
+    interrupts.print_output(" ".join(str(path) for path in (done.sheet, done.video) if path is not None))

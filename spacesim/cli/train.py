@@ -1,0 +1,126 @@
+"""`spacesim train`. Its options stand for fields of TrainConfig, whose comments say what they mean."""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from spacesim import interrupts
+from spacesim.cli.parser import Parser
+from spacesim.data.errors import InputError
+
+SUMMARY, NEEDS_BACKEND = "reconstruct a dataset with Gaussian splatting", True
+OPTIONS = {
+    "--method": ("method", "NAME"),
+    "--strategy": ("strategy", "NAME"),
+    "--preset": ("preset", "NAME"),
+    "--iterations": ("iterations", "N"),
+    "--seed": ("seed", "N"),
+    "--init": ("init", "NAME"),
+    "--init-count": ("init_count", "N"),
+    "--max-gaussians": ("refinement.max_gaussians", "N"),
+}
+"""Options with a value: the field that each sets, and what stands for its value. Every other field is for --set."""
+
+_NAMES = ("method", "strategy", "preset")  #: of a configuration: `preset` makes it, with all its defaults
+
+
+def add_options(parser: Parser, arguments: Sequence[str]) -> None:
+    from spacesim.cli.fields import fields_of
+    from spacesim.splat.train.config import TrainConfig
+
+    lists = "--fields" in arguments
+    meanings = {field.key: field for field in fields_of(TrainConfig(preset="fast"))}
+    parser.usage = "spacesim train DATA --out RUN [options]"
+    parser.formatter_class = _help
+    parser.epilog = "Which method, strategy and preset to take: docs/how-to/choose.md"
+    parser.add_argument("data", type=Path, nargs="?" if lists else None, metavar="DATA", help="folder of the dataset")
+    parser.add_argument("--out", type=Path, required=not lists, metavar="RUN", help="folder that the run is written to")
+    for option, (key, value) in OPTIONS.items():
+        field = meanings[key]
+        words = field.type.removesuffix(" | none").replace(" | ", ", ") if value == "NAME" else field.meaning
+        default = field.default if key in _NAMES else None
+        kind = int if value == "N" else str
+        shown = field.default if key in (*_NAMES, "seed") else "what the data has" if key == "init" else "of the preset"
+        text = f"{words} (default: {shown})"
+        parser.add_argument(option, type=kind, default=default, metavar=value, help=text)
+    parser.add_argument("--warm-start", action="store_true", help=meanings["warm_start"].meaning.partition(";")[0])
+    parser.add_argument("--resume", action="store_true", help="go on from the newest checkpoint")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="any field: refinement.max_gaussians=60000; repeatable",
+    )
+    parser.add_argument("--fields", action="store_true", help="list every field with its default under these options")
+
+
+def option_of(field: str, options: argparse.Namespace) -> str | None:
+    """The option that sets a field, by the field's dotted name."""
+    from spacesim.splat.train.config import TrainConfig
+
+    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | {"warm_start": "--warm-start"}
+    typed = {text.partition("=")[0].partition(".")[0].strip() for text in options.set}  # of which some are no fields
+    is_field = field.partition(".")[0] in typed | set(TrainConfig.__dataclass_fields__)
+    return options_by_key.get(field) or (f"--set {field}" if is_field else None)
+
+
+def run(options: argparse.Namespace) -> None:
+    from spacesim.cli.fields import listing
+    from spacesim.data.store import read_dataset
+    from spacesim.progress import report_training, show_progress
+    from spacesim.splat.train.config import preset, warm_start, with_options, with_settings
+    from spacesim.splat.train.train import train
+
+    config = preset(options.preset, options.method, options.strategy)
+    if options.warm_start:
+        config = replace(config, warm_start=warm_start(options.preset))
+    config = with_options(config, iterations=options.iterations)
+    settings = {key: getattr(options, option[2:].replace("-", "_")) for option, (key, _) in OPTIONS.items()}
+    chosen = {key: value for key, value in settings.items() if value is not None and key not in _NAMES}
+    try:
+        config = with_settings(config, chosen | dict(map(parse_setting, options.set)))
+    except InputError as error:
+        raise InputError(f"{error}{_advice(str(error))}") from None
+    if options.fields:
+        interrupts.print_output(listing(config))
+        return
+    dataset = read_dataset(options.data)
+    with show_progress("train", "iterations") as report:
+        done = train(dataset, options.out, config, options.resume, report_training(report), options.arguments)
+    history = done.training["history"]
+    interrupts.print_output(
+        f"{options.out}: {done.gaussian_count} Gaussians after {config.iterations} iterations in "
+        f"{done.training['seconds']:.0f} s on {done.training['backend']}, final loss {history[-1]['loss']:.4f}"
+    )
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """(key, value) of "KEY=VALUE"; the value is one of TOML, or a bare word. Raises InputError for another text."""
+    from spacesim.data.toml import parse
+
+    key, equals, value = (part.strip() for part in text.partition("="))
+    if not (key and equals and value):
+        raise InputError(f"set: expected KEY=VALUE, found {text!r}")
+    if key in ("method", "preset"):
+        raise InputError(f"set: expected --{key}, which sets all that goes with it, found {text!r}")
+    try:
+        values = parse(f"value = {value}", "--set").values
+    except InputError:
+        return key, value
+    return key, values["value"] if set(values) == {"value"} else value
+
+
+def _advice(sentence: str) -> str:
+    """What helps against an error of `with_settings`, "light.bounce: expected ..., found ...", if anything does."""
+    field, _, rest = sentence.partition(": ")
+    if rest.startswith(("expected light to be there", "expected light.shadow to be there")):
+        return "; try --method shadow-map"
+    is_unknown = f"found {field.rpartition('.')[2]!r}" in rest
+    return "; see spacesim train --fields" if is_unknown and "did you mean" not in rest else ""
+
+
+def _help(prog: str) -> argparse.HelpFormatter:
+    return argparse.HelpFormatter(prog, max_help_position=28)

@@ -1,0 +1,135 @@
+"""One frame evaluated: the pictures to compare, its metrics, what is written of it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from spacesim.data.errors import InputError, WorkError
+from spacesim.data.geometry import Array
+from spacesim.data.images import load_image, luminance, read_png, write_png
+from spacesim.data.records import Dataset, Frame, Truth
+from spacesim.data.store import SHADOW_NONE, SHADOW_SELF_CAST, load_truth
+from spacesim.eval import pictures
+from spacesim.eval.metrics import grazing, image, lpips, shadow
+from spacesim.eval.metrics.image import Mask
+
+if TYPE_CHECKING:
+    from spacesim.splat.run import Prediction
+
+
+@dataclass(frozen=True, eq=False)
+class FrameImages:
+    """A frame's pictures."""
+
+    prediction: np.ndarray  #: [H, W, 3] sRGB values in [0, 1] over black, black where not valid
+    truth: np.ndarray  #: as `prediction`
+    silhouette: Mask  #: [H, W] bool, the object's among them
+    valid: Mask  #: [H, W] bool, pixels that are not to be ignored
+
+
+@dataclass(frozen=True, eq=False)
+class FrameLight:
+    """What is known of a frame's light."""
+
+    truth: Truth | None  #: None where the dataset has none
+    #: [H, W] predicted share of the solar disc that is seen, None where the method predicts none
+    visibility: np.ndarray | None
+    alpha: np.ndarray  #: [H, W] predicted
+
+
+def frame_images(dataset: Dataset, frame: Frame, prediction: "Prediction") -> tuple[FrameImages, str]:
+    """The pictures to compare, and where the silhouette is from: "truth", "alpha" or "frame".
+
+    Raises WorkError where the prediction is not finite, InputError where the dataset is broken.
+    """
+    predicted = (prediction.rgb, prediction.alpha, prediction.visibility)
+    if not all(np.all(np.isfinite(plane)) for plane in predicted if plane is not None):
+        raise WorkError(f"{frame.file_path}: the prediction has values that are not finite; train the run again")
+    loaded = load_image(dataset, frame)
+    if frame.silhouette_path is not None and not any(frame.distortion):
+        silhouette, source = read_png(dataset.root / frame.silhouette_path) > 0, "truth"
+        if silhouette.shape != loaded.alpha.shape:
+            raise InputError(
+                f"{dataset.root / frame.silhouette_path}: expected {loaded.alpha.shape} pixels, "
+                f"found {silhouette.shape}"
+            )
+    else:
+        silhouette = loaded.alpha >= 0.5
+        source = "frame" if np.all(loaded.alpha == 1) else "alpha"
+    shown = np.where(loaded.valid[..., None], np.clip(prediction.rgb, 0, 1), np.float32(0)), loaded.over(np.zeros(3))
+    return FrameImages(*shown, silhouette & loaded.valid, loaded.valid), source
+
+
+def frame_light(dataset: Dataset, frame: Frame, prediction: "Prediction") -> FrameLight:
+    """Raises InputError where the truth that the dataset names is missing or broken."""
+    truth = None if frame.gt_path is None else load_truth(dataset, frame)
+    return FrameLight(truth, prediction.visibility, prediction.alpha)
+
+
+def image_groups(view: FrameImages, network: lpips.Lpips | None) -> dict[str, shadow.Metrics]:
+    """The frame's values of the groups that compare pictures."""
+    inside = image.interior(view.valid.shape)
+    levels = luminance(view.prediction), luminance(view.truth)
+    return {
+        "image": _image_metrics(view, view.silhouette, view.silhouette, network),
+        "image_full": _image_metrics(view, view.valid, view.valid & inside, network),
+        "shadow": shadow.luminance_metrics(*levels, view.silhouette),
+        "shadow_full": shadow.luminance_metrics(*levels, view.valid),
+    }
+
+
+def visibility_groups(light: FrameLight, view: FrameImages) -> dict[str, shadow.Metrics | None]:
+    """The frame's values of the groups about predicted visibility; None where either side is missing, and for a kind of
+    shadow that the frame does not show."""
+    if light.visibility is None or light.truth is None:
+        return {"shadow_mask": None, **dict.fromkeys(shadow.KINDS)}
+    pair = light.visibility, light.truth.sun_visibility
+    sees_the_sun_or_a_caster = light.truth.shadow >= SHADOW_SELF_CAST
+    return {
+        "shadow_mask": shadow.visibility_metrics(*pair, view.valid & sees_the_sun_or_a_caster),
+        **{kind: shadow.kind_metrics(*pair, light.truth.shadow, kind, view.valid) for kind in shadow.KINDS},
+    }
+
+
+def tally_grazing(light: FrameLight, view: FrameImages) -> Array | None:
+    """Sums of the frame by grazing angle; None without truth."""
+    if light.truth is None:
+        return None
+    levels = luminance(view.prediction), luminance(view.truth)
+    return grazing.tally(light.truth, *levels, light.visibility, view.valid)
+
+
+def write_pictures(folder: Path, view: FrameImages, light: FrameLight) -> None:
+    """Five pictures, and three more where visibility is predicted and known."""
+    dark, truly_dark = (shadow.is_shadowed(luminance(p)) for p in (view.prediction, view.truth))
+    images = {
+        "truth": pictures.as_bytes(view.truth),
+        "prediction": pictures.as_bytes(view.prediction),
+        "error": pictures.error_picture(view.prediction, view.truth, view.valid),
+        "shadow_truth": pictures.shadow_picture(truly_dark, truly_dark, view.silhouette),
+        "shadow_prediction": pictures.shadow_picture(dark, truly_dark, view.silhouette),
+    }
+    if light.visibility is not None and light.truth is not None:
+        classes = light.truth.shadow
+        mask = view.valid & (classes != SHADOW_NONE)
+        images["mask_truth"] = pictures.kinds_picture(classes, mask)
+        images["mask_prediction"] = pictures.mask_picture(light.visibility < 0.5, classes, mask)
+        images["visibility"] = pictures.visibility_picture(light.visibility, light.alpha)
+    for name, picture in images.items():
+        write_png(folder / f"{name}.png", picture)
+
+
+def _image_metrics(view: FrameImages, mask: Mask, windows: Mask, network: lpips.Lpips | None) -> shadow.Metrics:
+    """Metrics over `mask`; SSIM over `windows`, the centres of its windows."""
+    pair = view.prediction, view.truth
+    crops = [image.crop_to_mask(picture, mask) for picture in pair] if network and mask.any() else []
+    return {
+        "psnr": image.psnr(*pair, mask),
+        "ssim": image.ssim(*pair, windows),
+        "lpips": network(*crops) if network and crops else None,
+        "mae": image.mae(*pair, mask),
+        "rmse": image.rmse(*pair, mask),
+        "flip": image.flip(*pair, mask),
+    }

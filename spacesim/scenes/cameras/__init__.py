@@ -1,0 +1,1 @@
+"""Where frames are taken from, and the lens and the sensor that take them."""

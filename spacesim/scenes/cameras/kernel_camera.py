@@ -1,0 +1,89 @@
+"""A camera as inputs of kernels, in the coordinates that Mitsuba works in."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from spacesim import backend
+from spacesim.data.geometry import Array
+from spacesim.data.images import undistort_points
+from spacesim.data.records import Camera
+from spacesim.scenes.lights.emitters import kernel_input
+
+RADIUS = 100.0
+"""Of the bounding sphere in Mitsuba's coordinates. Mitsuba starts rays 9e-5 (1 + |p|) from the surface point p, so at
+this size 9e-5 of the radius, and hardly less at a larger one."""
+
+RECORDINGS = 64
+"""Of a kernel that are kept: one for each size of picture and, of shadow rays, for each power of two of points."""
+
+
+@dataclass(frozen=True)
+class Units:
+    """Mitsuba's coordinates: metres from `centre` [3], times `scale`. Single precision holds the differences between
+    points of the scene, wherever it stands and however large it is."""
+
+    centre: Array
+    scale: float
+
+    @classmethod
+    def of(cls, bounding_sphere: tuple[Array, float]) -> "Units":
+        """Those in which the sphere (centre, radius), metres, lies at the origin and has RADIUS."""
+        centre, radius = bounding_sphere
+        return cls(centre, RADIUS / radius)
+
+    def points(self, positions: Array) -> Array:
+        """Positions [N, 3] in metres in these coordinates."""
+        return (positions - self.centre) * self.scale
+
+
+@dataclass(frozen=True)
+class KernelCamera:
+    """A camera: another pose or focal length reuses what was recorded.
+
+    Rays start on a plane before the scene, `near` along the axis from the camera: from a camera far away single
+    precision would miss by more than a pixel.
+    """
+
+    width: int
+    height: int
+    right: Any
+    down: Any
+    forward: Any
+    start: Any  #: where the axis meets that plane
+    near: Any
+    metre: Any  #: of the unit of length
+    focal: Any
+    centre: Any
+
+    @classmethod
+    def of(cls, camera: Camera, units: Units) -> "KernelCamera":
+        """`camera` as seen in `units`."""
+        axes, position = camera.world_from_camera[:3, :3].T, camera.world_from_camera[:3, 3]
+        origin = units.points(position)
+        near = max(0.0, -float(origin @ axes[2]) - 1.1 * RADIUS)
+        right, down, forward, start = (kernel_input(x) for x in (*axes, origin + near * axes[2]))
+        lengths = kernel_input(near), kernel_input(1 / units.scale)
+        focal, centre = ([kernel_input(x) for x in pair] for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
+        return cls(camera.width, camera.height, right, down, forward, start, *lengths, focal, centre)
+
+    def rays(self, pixel: Any, offset: Any, distortion: Sequence[float]) -> tuple[Any, Any]:
+        """Rays through pixels (index row by row), each at an `offset` in [0, 1)^2 from the pixel's upper left; and how
+        far from the camera they start."""
+        mi = backend.mitsuba()
+        x = (mi.Float(pixel % self.width) + offset.x - self.centre[0]) / self.focal[0]
+        y = (mi.Float(pixel // self.width) + offset.y - self.centre[1]) / self.focal[1]
+        if distortion:
+            x, y = undistort_points(x, y, distortion)
+        aside = x * self.right + y * self.down
+        length = dr.sqrt(1 + x * x + y * y)
+        start = mi.Point3f(self.start + self.near * aside)
+        return mi.RayDifferential3f(mi.Ray3f(start, (aside + self.forward) / length)), self.near * length
+
+
+def record_on_cuda(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, recorded once and replayed on CUDA. On LLVM it is traced anew, which takes 5 % of a frame there:
+    whatever Embree scene or numpy array somebody lets go of in the middle of a recording would end the process."""
+    return backend.recorded(function, limit=RECORDINGS, elements=None) if backend.select() == "cuda" else function

@@ -1,0 +1,1 @@
+"""What shines: the Sun, and the Earth that it lights."""

@@ -1,0 +1,64 @@
+"""How light becomes colour: the configuration of a relightable model."""
+
+from dataclasses import dataclass, field
+
+from spacesim.data.errors import InputError
+from spacesim.data.structure import check_choices
+from spacesim.data.tone import Tone
+from spacesim.splat.light.field import FieldConfig
+from spacesim.splat.light.shadow.cast import ShadowConfig
+from spacesim.splat.light.shadow.refine import RefineConfig
+
+MAX_EMITTERS = 2**14  #: of one bounce
+MAX_EXPOSURE = 40  #: of an exposure, as large as a scene's camera can have
+
+
+@dataclass(frozen=True)
+class LightConfig:
+    """How light becomes colour."""
+
+    field: FieldConfig = field(default_factory=FieldConfig)  #: the network that gives colours
+    shadow: ShadowConfig | None = None  #: how shadows are cast; none leaves them to the field (the method `relight`)
+    bounce: int = 0  #: so many of the Gaussians scatter sunlight onto all (`bounce.irradiance`), 0 for none
+    #: colours are linear, shares of what is white, and blended as such, and pictures go through the tone curve
+    #: afterwards; else they are sRGB values, as in the thesis (section 7.2 asks for the former)
+    linear: bool = False
+    #: the curve of linear colours; none: the dataset's own, which `train` fills in, else srgb
+    tone: Tone | None = None
+    #: EV of the pictures trained on, of linear colours; none: the dataset's own, which `train` fills in, else 0
+    exposure: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.bounce <= MAX_EMITTERS:
+            raise InputError(f"bounce: expected 0 to {MAX_EMITTERS}, found {self.bounce}")
+        if self.bounce and not self.field.surface:
+            found = "a field that is told directions"
+            raise InputError(f"bounce: expected 0 or field.inputs surface, whose normals it needs, found {found}")
+        if self.shadow and not self.field.knows_sun:
+            raise InputError("field: expected inputs that tell of the Sun, which casts shadows, found view")
+        for name in ("tone", "exposure"):
+            if getattr(self, name) is not None and not self.linear:
+                raise InputError(f"{name}: expected linear colours (linear = true), found sRGB values")
+        check_choices(self)
+        if self.exposure is not None and not abs(self.exposure) <= MAX_EXPOSURE:
+            raise InputError(f"exposure: expected -{MAX_EXPOSURE} to {MAX_EXPOSURE} EV, found {self.exposure}")
+
+    @property
+    def curve(self) -> tuple[str, float] | None:
+        """Tone curve and exposure (EV) of linear colours, None of others."""
+        return (self.tone or "srgb", self.exposure or 0.0) if self.linear else None
+
+    @property
+    def refine(self) -> RefineConfig | None:
+        """The refinement of shadows, if there is one."""
+        return self.shadow.refine if self.shadow else None
+
+    @property
+    def features(self) -> int:
+        """F: numbers that each Gaussian has for the field, then for the refinement of shadows, then of its albedo."""
+        return self.albedos + 3 * (self.bounce > 0)
+
+    @property
+    def albedos(self) -> int:
+        """Which of these numbers are the logits of the albedo (RGB) that one bounce needs: this and the next two."""
+        return self.field.stored + (self.refine.features if self.refine else 0)

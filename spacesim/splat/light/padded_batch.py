@@ -1,0 +1,96 @@
+"""Gaussians as columns of the matrices that networks read and write, in few sizes."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from spacesim.backend import ad
+from spacesim.backend.arrays import Float, TensorXf, UInt32
+from spacesim.splat.raster.tiles import round_capacity
+
+CHUNK = 512  #: columns of a chunk, of which `round_capacity` is a multiple: 100,000 Gaussians fill a GPU
+ALIGNED = 4  #: rows of matrices are a multiple of it
+
+
+@dataclass
+class PaddedBatch:
+    """N Gaussians in `capacity` columns M >= N: matrices come in few sizes, and each is recorded once.
+
+    The columns of a matrix of C rows lie in B = M / m chunks of m = `CHUNK`, each a matrix of its own: TensorXf [B, C,
+    m]. A sum over all columns is then B short ones, made at once, and one over these (`mlp.backward`).
+
+    Arrays [N] are gathered into columns first, and all is computed there: to gather what was computed takes a kernel
+    for each. In a recording the size of a kernel follows that of an array that it reads, first of one that it does
+    not read by index: where that is `count`, it is as many times as wide as it was, so M; elsewhere hence `like`.
+    """
+
+    count: UInt32  #: UInt32 of width 1, N
+    capacity: int
+
+    @staticmethod
+    def of(count: int, still: bool = False) -> "PaddedBatch":
+        """For N = `count` Gaussians, at least one. still: of a model that stays as large as it is, with less room."""
+        return PaddedBatch(
+            dr.opaque(ad.UInt32, count), (count // CHUNK + 1) * CHUNK if still else round_capacity(count)
+        )
+
+    def repeat_last(self, values: Any) -> Any:
+        """[N] to [M], an array or nested ones; the last is repeated."""
+        return dr.gather(type(values), values, dr.minimum(self._column(), self.count - 1))
+
+    def pad_zeros(self, row: Float) -> Float:
+        """[N] to [M], 0 beyond N."""
+        lane = self._column()
+        return dr.gather(ad.Float, row, lane, lane < self.count)
+
+    def block(self, packed: Float, first: int, rows: int) -> list[Float]:
+        """Some rows of a packed array [C * N], [M] each."""
+        lane = dr.minimum(self._column(), self.count - 1)
+        return [dr.gather(ad.Float, packed, (first + i) * self.count + lane) for i in range(rows)]
+
+    def matrix(self, rows: list[Float], height: int | None = None) -> TensorXf:
+        """TensorXf [B, C, m] of rows [M], or one number for all, in one kernel. height: C, the rows that are missing
+        are 0; by default as many as there are."""
+        height = len(rows) if height is None else height
+        numbers = dr.empty(ad.Float, height * self.capacity)
+        for i in range(height):
+            row = rows[i] if i < len(rows) else ad.Float(0)
+            dr.scatter(numbers, row, self._matrix_index(self._column(), i, height), mode=dr.ReduceMode.Permute)
+        return ad.TensorXf(numbers, (self.capacity // CHUNK, height, CHUNK))
+
+    def row(self, columns: TensorXf, i: int) -> Float:
+        """Row i [M] of a TensorXf [B, C, m]."""
+        return dr.gather(ad.Float, columns.array, self._matrix_index(self._column(), i, columns.shape[1]))
+
+    def unpad(self, rows: list[Float], like: Float) -> list[Float]:
+        """Rows [M], evaluated, to [N]. like: any array [N]."""
+        lane = dr.arange(ad.UInt32, dr.width(like))
+        is_real = lane < self.count
+        return [dr.select(is_real, dr.gather(ad.Float, row, lane), like) for row in rows]
+
+    def pack(self, parts: list[tuple[Any, int, int]], like: Float) -> Float:
+        """Float [C * N], packed, of parts (TensorXf [B, R, m], first row, rows), one under another. like: an array."""
+        place = dr.arange(ad.UInt32, dr.width(like))
+        row, lane = place // self.count, place % self.count
+        result, before = like, 0
+        for columns, first, rows in parts:
+            mine = (row >= before) & (row < before + rows)
+            index = self._matrix_index(lane, row - before + first, columns.shape[1])
+            result = dr.select(mine, dr.gather(ad.Float, columns.array, index, mine), result)
+            before += rows
+        return result
+
+    def _column(self) -> UInt32:
+        return dr.arange(ad.UInt32, self.capacity)
+
+    @staticmethod
+    def _matrix_index(lane: UInt32, row: UInt32 | int, height: int) -> UInt32:
+        """Where a matrix of `height` rows has this row of this column."""
+        return ((lane // CHUNK) * height + row) * CHUNK + lane % CHUNK
+
+
+def round_up_rows(rows: int) -> int:
+    """`rows` rounded up to what matrix products are fast at: Dr.Jit 1.5 reads four numbers at once on CUDA where rows
+    of memory allow it, and works in tiles of 64 x 64 instead of 8 x 8."""
+    return -(-rows // ALIGNED) * ALIGNED

@@ -1,0 +1,136 @@
+"""Tiles of a picture: their shape, the lists of the splats that each blends, and which pixels a lane holds."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+
+from spacesim.backend import ad, select
+from spacesim.backend.arrays import Bool, Float, UInt32
+
+STEPS = 8  #: sizes of arrays from one power of two to the next, as a rule
+
+
+@dataclass(frozen=True)
+class TileShape:
+    """A tile of width x height pixels is blended by `lanes` lanes; each holds `columns` columns of `rows` pixels."""
+
+    width: int
+    height: int
+    lanes: int
+    columns: int = 1
+
+    @property
+    def pixels(self) -> int:
+        """Pixels a lane."""
+        return self.width * self.height // self.lanes
+
+    @property
+    def rows(self) -> int:
+        """Pixels of a column."""
+        return self.pixels // self.columns
+
+
+def tile_shape() -> TileShape:
+    """The fastest shape measured for the backend (docs/research/speed.md). One tile is one warp on CUDA, a part of a
+    packet on LLVM, whose packets have 4 lanes or a multiple: a tile's gradients meet in an order that is fixed."""
+    return TileShape(8, 8, 32) if select() == "cuda" else TileShape(8, 8, 4, columns=2)
+
+
+@dataclass
+class TileLists:
+    """(tile, splat) pairs. `splat`, `slot` [P] are in blending order; `start`, `end` [T] delimit each tile.
+
+    Slots number the pairs splat by splat: those of splat i are `first_slot[i]` .. + `slot_count[i]`, [M]. Arrays
+    have room for more pairs and splats than there are, so that few sizes occur: P is `capacity`, M at least N.
+    """
+
+    splat: UInt32
+    slot: UInt32
+    start: UInt32
+    end: UInt32
+    first_slot: UInt32
+    slot_count: UInt32
+    capacity: int
+    tiles_x: int
+    tiles_y: int
+    shape: TileShape
+    #: the tiles in the order in which they are given to lanes [T], or None for that of their indices
+    order: UInt32 | None = None
+    #: where each slot's pair stands in `splat` [P], or None: sums of pairs are then kept by slots (`sum_index`)
+    place: UInt32 | None = None
+
+    def sum_index(self, k: UInt32, active: Bool | bool = True) -> UInt32:
+        """Where the sums of pair k of `splat` are kept while they are added up.
+
+        Threads of a CPU add to the pairs of their tiles, which must not share cache lines: there it is the pair's
+        place."""
+        return dr.gather(ad.UInt32, self.slot, k, active) if self.place is None else k
+
+    def sum_of_slot(self, slot: UInt32) -> UInt32:
+        """The same of a slot."""
+        return slot if self.place is None else dr.gather(ad.UInt32, self.place, slot)
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs the tiles list. Waits for the device."""
+        return int(dr.sum(self.end - self.start)[0])
+
+
+def round_capacity(count: int, steps: int = STEPS) -> int:
+    """`count` rounded up by about an eighth at most: few sizes are few recordings and, on LLVM, where the size of what
+    is scattered into is part of a kernel's text, few kernels to compile. steps: sizes from one power of two to the
+    next, itself one
+
+    Never `count` itself: a recording in which the two are one takes the size of the room from the number of splats."""
+    step = max(1024, (1 << max(0, count.bit_length() - 1)) // steps)
+    return (count // step + 1) * step
+
+
+@dataclass
+class LanePixels:
+    """Of each lane: its tile, its place in tile-major order, and its first pixel: centre (x, y), and indices."""
+
+    tile: UInt32
+    place: UInt32
+    x: Float
+    y: Float
+    column: UInt32
+    row: UInt32
+
+
+def lane_pixels(lists: TileLists) -> LanePixels:
+    """Of all lanes [T * lanes], in the order in which tiles are given to lanes."""
+    shape = lists.shape
+    lane = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * shape.lanes)
+    tile, within = lane // shape.lanes, lane % shape.lanes
+    if lists.order is not None:
+        tile = dr.gather(ad.UInt32, lists.order, tile)
+    across = shape.width // shape.columns
+    column = (tile % lists.tiles_x) * shape.width + (within % across) * shape.columns
+    row = (tile // lists.tiles_x) * shape.height + (within // across) * shape.rows
+    return LanePixels(tile, tile * shape.lanes + within, ad.Float(column) + 0.5, ad.Float(row) + 0.5, column, row)
+
+
+def lane_offsets(shape: TileShape) -> list[tuple[int, int]]:
+    """(column, row) of a lane's pixels from its first: column by column."""
+    return [(i, j) for i in range(shape.columns) for j in range(shape.rows)]
+
+
+def pixel_in_tile(number: UInt32, shape: TileShape) -> tuple[UInt32, UInt32]:
+    """(column, row) in its tile of a tile's pixel by its number in tile-major order."""
+    lane, pixel, across = number // shape.pixels, number % shape.pixels, shape.width // shape.columns
+    if shape.columns == 1:
+        return lane % across, (lane // across) * shape.rows + pixel
+    column, row = (lane % across) * shape.columns, (lane // across) * shape.rows
+    return column + pixel // shape.rows, row + pixel % shape.rows
+
+
+def tiled_index(lists: TileLists, width: int, height: int) -> UInt32:
+    """Position in tile-major order of each pixel of the image, UInt32 [height * width]."""
+    shape = lists.shape
+    pixel = dr.arange(ad.UInt32, width * height)
+    x, y = pixel % width, pixel // width
+    tile = (y // shape.height) * lists.tiles_x + x // shape.width
+    column, row = x % shape.width, y % shape.height
+    within = column // shape.columns + (row // shape.rows) * (shape.width // shape.columns)
+    return (tile * shape.lanes + within) * shape.pixels + (column % shape.columns) * shape.rows + row % shape.rows

@@ -1,0 +1,74 @@
+"""What training minimises: L1 and structural dissimilarity (thesis 2.8), on planes of pixels."""
+
+from typing import Any
+
+import drjit as dr
+
+from spacesim.backend.arrays import Array3f, Bool, Float
+from spacesim.splat.raster.gaussians import Gaussians, opacities
+from spacesim.splat.train.loss.ssim import ssim
+
+ROUND = 1e-4  #: of a Gaussian's mean scale
+
+
+def photometric_loss(prediction: Any, target: Any, width: int, height: int, ssim_weight: float = 0.2) -> Float:
+    """(1 - w) mean |p - t| + w (1 - SSIM(p, t)), thesis 2.8 with D-SSIM = 1 - SSIM as gsplat takes it.
+
+    prediction, target: Array3f [3, height * width];  returns a Float of width 1.
+    """
+    pixels = 3 * width * height
+    l1 = dr.sum(dr.sum(dr.abs(prediction - target))) / pixels
+    if ssim_weight == 0:
+        return l1
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(prediction, target, width, height))
+
+
+def visibility_loss(prediction: Any, truth: Any, valid: Bool) -> Float:
+    """Mean |blended visibility - path-traced visibility| over the object's pixels, planes [height * width], as a share
+    of all pixels. truth: below 0 where there is no surface;  valid: Bool, pixels that count."""
+    counts = valid & (truth >= 0)
+    return dr.sum(dr.select(counts, dr.abs(prediction - truth), 0)) / dr.width(truth)
+
+
+def depth_loss(blended: Any, transmittance: Float, truth: Any, valid: Bool) -> Float:
+    """Mean |sum_i w_i (z_i - z)| over the surface's pixels, as a share of all pixels: the expected depth's error, times
+    alpha. blended: plane of sum_i w_i z_i;  truth: plane of z, 0 where there is no surface;  both in one unit"""
+    counts = valid & (truth > 0)
+    error = dr.abs(blended - (1 - transmittance) * truth)
+    return dr.sum(dr.select(counts, error, 0)) / dr.width(truth)
+
+
+def normal_loss(blended: Any, transmittance: Float, truth: Any, valid: Bool) -> Float:
+    """Mean of sum_i w_i (1 - n_i . n) over the surface's pixels, as a share of all pixels (Huang et al. 2024, 2DGS,
+    with the true normal). blended: Array3f of sum_i w_i n_i;  truth: Array3f, unit, 0 where there is no surface"""
+    counts = valid & (dr.squared_norm(truth) > 0.25)
+    error = 1 - transmittance - dr.dot(blended, truth)
+    return dr.sum(dr.select(counts, error, 0)) / dr.width(truth)
+
+
+def penalty(name: str, gaussians: Gaussians) -> Float:
+    """[N] what a named penalty on Gaussians adds up; lengths in metres. The weight of the sum is the caller's.
+
+    "isotropy": see `anisotropy`;  "opacity" and "scale": opacity, and mean scale (Kheradmand et al. 2024);
+    "flatten": the shortest scale, so that Gaussians become discs (Chen et al. 2023, NeuSG)."""
+    scales = dr.exp(gaussians.log_scales)
+    if name == "isotropy":
+        return anisotropy(gaussians.log_scales)
+    if name == "opacity":
+        return opacities(gaussians.logit_opacities)
+    if name == "scale":
+        return dr.sum(scales) / 3
+    if name == "flatten":
+        first = dr.detach((scales[0] <= scales[1]) & (scales[0] <= scales[2]))
+        return dr.select(first, scales[0], dr.select(dr.detach(scales[1] <= scales[2]), scales[1], scales[2]))
+    raise ValueError(f"name: expected isotropy, opacity, scale or flatten, found {name!r}")
+
+
+def anisotropy(log_scales: Array3f) -> Float:
+    """[N] metres: mean distance of a Gaussian's three scales, Array3f [3, N], from their mean (Matsuki et al. 2024,
+    section 3.3.3; the weight of the sum is the caller's). Within `ROUND` of the mean a scale counts as the mean: else
+    the last bit of a round Gaussian would decide the sign of its gradient."""
+    scales = dr.exp(log_scales)
+    mean = dr.sum(scales) / 3  # dr.mean puts N into the kernel: a replay rounded by another N
+    distances = [dr.abs(scales[i] - mean) for i in range(3)]
+    return sum((dr.select(d > ROUND * mean, d, 0) for d in distances), type(mean)(0)) / 3

@@ -1,0 +1,36 @@
+"""config.json of runs that were trained before the configuration had alternatives: in today's layout."""
+
+from collections.abc import Mapping
+from typing import Any
+
+ALIASES = {"park": "baseline-park"}  #: words that methods had: today's
+_STRATEGIES = ("mesh-aware", "support-aware", "mcmc")
+
+
+def in_this_layout(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a TrainConfig, plain values; those in today's layout stay as they are, and so does what is neither:
+    whoever reads it says what is wrong."""
+    values = dict(values)
+    if isinstance(method := values.get("method"), str):
+        values["method"] = ALIASES.get(method, method)
+    strategies = {name: values.pop(name.replace("-", "_"), {}) for name in _STRATEGIES}
+    if isinstance(kind := values.get("strategy"), str) and isinstance(table := strategies.get(kind, {}), Mapping):
+        values["strategy"] = {"kind": kind, **table}
+    if isinstance(light := values.get("light"), Mapping):
+        values["light"] = _light(dict(light))
+    return values
+
+
+def _light(light: dict[str, Any]) -> dict[str, Any]:
+    field, shadow = light.get("field"), light.get("shadow")
+    if isinstance(field, Mapping) and isinstance(field.get("surface"), bool):
+        field = dict(field)
+        kind = "surface" if field.pop("surface") else "directions"
+        field["inputs"] = {"kind": kind, **{name: field.pop(name) for name in ("sun", "view") if name in field}}
+        light["field"] = field
+    if isinstance(shadow, Mapping) and isinstance(method := shadow.get("method"), str):
+        shadow = dict(shadow)
+        mapping, gradients = shadow.pop("mapping", {}), shadow.pop("gradients", False)
+        settings = mapping if method == "mapping" and isinstance(mapping, Mapping) else {"gradients": gradients}
+        light["shadow"] = {**shadow, "method": {"kind": method, **settings}}
+    return light

@@ -1,0 +1,153 @@
+"""Adam (Kingma & Ba 2015) over rows of parameters, whose moments follow when Gaussians come and go."""
+
+from collections.abc import Sequence
+
+import drjit as dr
+import numpy as np
+
+from spacesim.backend import ad
+from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.upload import upload
+from spacesim.splat.raster.gaussians import ROWS, gather_entries
+from spacesim.splat.train.optimizer.packing import (
+    PackedArray,
+    load,
+    pack_numpy,
+    plan_packing,
+    release,
+    store,
+    unpack_numpy,
+    zeros,
+)
+
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+OWN = ROWS["sh"].start  #: rows of place, shape and opacity; harmonics or features come behind
+CONSTANT = 3  #: rows of the constant harmonic, which are moved with them
+PART = 15  #: rows of harmonics that are moved at once: five coefficients
+
+
+class Adam:
+    """Moments of the rows of Gaussians (`Gaussians.rows`), part by part, those of a part in few arrays (`packing`).
+
+    slices: the rows of each part; features, a packed row, are none
+    layouts, arrays: how the moments of each part lie, and where;  features: their two moments [F * N], or none
+    """
+
+    def __init__(self, rows: list[Float]) -> None:
+        self.steps = 0
+        self.slices, count = parts(len(rows)), dr.width(rows[0])
+        self.arrays: list[list[Float]] = []
+        self.layouts: list[tuple[PackedArray, ...]] = []
+        self._lay_out(count)
+        self.arrays = [zeros(layout) for layout in self.layouts]
+        self.features = [dr.opaque(ad.Float, 0, dr.width(row)) for row in 2 * rows[self.slices[-1].stop :]]
+
+    def corrections(self) -> tuple[float, float]:
+        """Count a step; the factors that make the moments unbiased estimates."""
+        self.steps += 1
+        return _corrections(self.steps)
+
+    def select(self, index: UInt32, fresh: Bool) -> None:
+        """Entry i of each moment becomes entry index[i], or zero where `fresh[i]`. index, fresh: [M]."""
+        before, count, chosen = self.layouts, self.count, dr.width(index)
+        self._lay_out(chosen)
+        for number, (old, new) in enumerate(zip(before, self.layouts, strict=True)):
+            pairs = load(self.arrays[number], old, index)
+            first, second = ([dr.select(fresh, 0, moment) for moment in moments] for moments in pairs)
+            arrays = store(first, second, new)
+            dr.eval(arrays)
+            self.arrays[number] = arrays  # part by part, so that old ones go as new ones come
+            del pairs, first, second, arrays
+            release(count, chosen)
+        size = dr.opaque(ad.UInt32, chosen)  # as a literal each size would be compiled
+        for number, moment in enumerate(self.features):
+            copies = dr.width(moment) // count
+            forget = dr.gather(ad.Bool, fresh, dr.arange(ad.UInt32, copies * chosen) % size)
+            self.features[number] = dr.select(forget, 0, gather_entries(moment, index, count))
+        dr.eval(self.features)
+
+    def forget(self, row: int) -> None:
+        """Set the moments of a row to zero."""
+        number = next(i for i, rows in enumerate(self.slices) if rows.start <= row < rows.stop)
+        within, layout = row - self.slices[number].start, self.layouts[number]
+        first, second = load(self.arrays[number], layout, dr.arange(ad.UInt32, self.count))
+        first[within], second[within] = ad.Float(0), ad.Float(0)
+        self.arrays[number] = store(first, second, layout)
+        dr.eval(self.arrays[number])
+
+    def moments(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The first and the second moment of each row, float32 [N], and of the features [F * N]."""
+        first, second = list[np.ndarray](), list[np.ndarray]()
+        for arrays, layout in zip(self.arrays, self.layouts, strict=True):
+            first_moments, second_moments = unpack_numpy(arrays, layout, self.count)
+            first, second = first + first_moments, second + second_moments
+        features = [np.array(moment) for moment in self.features]
+        return first + features[:1], second + features[1:]
+
+    def put(self, first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> None:
+        """The inverse of `moments`."""
+        for number, (rows, layout) in enumerate(zip(self.slices, self.layouts, strict=True)):
+            self.arrays[number] = pack_numpy(first[rows], second[rows], layout)
+        last = self.slices[-1].stop
+        self.features = [upload(moment) for moment in (*first[last:], *second[last:])]
+
+    def _lay_out(self, count: int) -> None:
+        self.count = count
+        self.layouts = [plan_packing(rows.stop - rows.start, count) for rows in self.slices]
+
+
+class NetworkAdam:
+    """Moments of the weights of networks, arrays of any lengths."""
+
+    def __init__(self, weights: list[Float]) -> None:
+        self.first = [dr.zeros(ad.Float, dr.width(weight)) for weight in weights]
+        self.second = [dr.zeros(ad.Float, dr.width(weight)) for weight in weights]
+        self.steps = 0
+
+    def corrections(self) -> tuple[float, float]:
+        """See `Adam.corrections`."""
+        self.steps += 1
+        return _corrections(self.steps)
+
+    def moments(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The first and the second moment of each array."""
+        return [np.array(moment) for moment in self.first], [np.array(moment) for moment in self.second]
+
+    def put(self, first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> None:
+        """The inverse of `moments`."""
+        self.first, self.second = [upload(moment) for moment in first], [upload(moment) for moment in second]
+
+
+def parts(rows: int) -> list[slice]:
+    """Rows that are moved at once, of so many (`Gaussians.rows`) without features: those of place, shape and opacity
+    with the constant harmonic, where there are harmonics, then `PART` each."""
+    drawn = rows - (rows % 3 == 0)  # 11, and harmonics come in threes
+    first = min(OWN + CONSTANT, drawn)
+    return [slice(0, first), *(slice(start, min(start + PART, drawn)) for start in range(first, drawn, PART))]
+
+
+def adam_step(
+    rows: list[Float],
+    gradients: list[Float],
+    moments: tuple[list[Float], list[Float]],
+    rates: list[Float],
+    corrections: tuple[Float, Float],
+) -> tuple[list[Float], list[Float], list[Float]]:
+    """(rows, first, second) after a step; pure, so that it can be recorded once and replayed. rates: a row each.
+
+    Gradients below EPSILON count as 0. They are round-off, and their squares are denormal numbers, which Dr.Jit's
+    worker threads flush to zero and the main thread does not: Adam would make the number of threads visible.
+    """
+    moved, first, second = [], [], []
+    for row, gradient, m, v, rate in zip(rows, gradients, *moments, rates, strict=True):
+        gradient = dr.select(dr.abs(gradient) < EPSILON, 0, gradient)
+        m = BETA1 * m + (1 - BETA1) * gradient
+        v = BETA2 * v + (1 - BETA2) * gradient * gradient
+        moved.append(row - rate * (corrections[0] * m) / (dr.sqrt(corrections[1] * v) + EPSILON))
+        first.append(m)
+        second.append(v)
+    return moved, first, second
+
+
+def _corrections(steps: int) -> tuple[float, float]:
+    return 1 / (1 - BETA1**steps), 1 / (1 - BETA2**steps)

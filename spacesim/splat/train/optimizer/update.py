@@ -1,0 +1,194 @@
+"""Adam steps of a model's parameters from what some views have taught of its splats, in parts.
+
+A part (`adam.parts`) is a few rows and a recorded function. The rows and moments that it replaces go at once: a
+step holds all of them once, and only those of a part twice (docs/research/memory.md). Many rows in one kernel were also
+slower on a CPU.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+
+from spacesim.backend import ad, recorded
+from spacesim.backend.arrays import Float
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.gaussians import SH_C0, Gaussians
+from spacesim.splat.raster.project import Splats, project
+from spacesim.splat.raster.render import harmonics, is_unclamped
+from spacesim.splat.train.loss.terms import penalty
+from spacesim.splat.train.optimizer.adam import OWN, Adam, adam_step
+from spacesim.splat.train.optimizer.packing import PackedArray, load, store
+from spacesim.splat.train.stages import mean, shape_values
+
+Packed = tuple[list[Any], tuple[PackedArray, ...]]  #: moments of a part and how they lie, see `packing`
+
+
+@dataclass
+class ViewGradients:
+    """Gradients of a scalar by what one view shows: by its splats and by what was blended, by name, see
+    `stages.project_views`."""
+
+    camera: Pinhole
+    grad_splats: Splats
+    grad_values: dict[str, list[Float]]
+    grad_features: Any = None  #: Float [F * N], of a method of light
+    grad_rows: list[Float] = field(default_factory=list)  #: of the first rows, beside what the splats give them
+
+
+class Update:
+    """Moves all parameters by the mean gradient of some views.
+
+    antialiased: see `project`;  scale: metres, the unit of depth
+    """
+
+    def __init__(self, antialiased: bool, scale: float) -> None:
+        self.antialiased, self.scale = antialiased, scale
+        self._own, self._features = recorded(_move_own), recorded(_move_features)
+        self._harmonics = recorded(_move_harmonics)
+
+    def __call__(
+        self,
+        gaussians: Gaussians,
+        optimizer: Adam,
+        degree: int,
+        views: list[ViewGradients],
+        factors: Float,
+        penalties: Mapping[str, Any],
+    ) -> None:
+        """Replace the parameters and their moments, part by part.
+
+        views: emptied on the way, so that gradients go once they are read
+        factors: Float [2 + R], Adam's two corrections and the step size of each row;  penalties: weights by name.
+        Harmonics of no degree up to `degree` have never had a gradient: they stay as they are.
+        """
+        assert optimizer.count == gaussians.count, "moments of other Gaussians"
+        how = degree, factors, penalties, self.antialiased, self.scale
+        rows = [ad.Float(row) for row in gaussians.rows()]  # a row taken from an array keeps all of that array
+        means, packed = rows[:3], (optimizer.arrays[0], optimizer.layouts[0])
+        cameras, grad_features = [view.camera for view in views], [view.grad_features for view in views]
+        of_own = [_without_features(view) for view in views]
+        views.clear()
+        grad_sums, *moved = self._own(rows, optimizer.slices[0].stop, packed, of_own, *how)
+        del packed, of_own
+        _replace(gaussians, optimizer, rows, 0, *moved)
+        if gaussians.features is not None:
+            rows[-1], optimizer.features = self._features(rows[-1], optimizer.features, grad_features, factors)
+            gaussians.replace(rows)
+            return
+        for number, part in enumerate(optimizer.slices[1:], 1):
+            first = (part.start - OWN) // 3
+            if first >= (degree + 1) ** 2:
+                break
+            packed = optimizer.arrays[number], optimizer.layouts[number]
+            step = self._harmonics(rows[part], packed, first, degree, means, cameras, grad_sums, factors)
+            del packed
+            _replace(gaussians, optimizer, rows, number, *step)
+
+
+def _without_features(view: ViewGradients) -> tuple[Pinhole, Splats, dict[str, list[Float]], list[Float]]:
+    return view.camera, view.grad_splats, view.grad_values, view.grad_rows
+
+
+def _replace(
+    gaussians: Gaussians, optimizer: Adam, rows: list[Float], number: int, moved: list[Float], moments: list[Float]
+) -> None:
+    """Put a part's new rows and moments in the place of the old ones, which nobody holds any longer."""
+    rows[optimizer.slices[number]], optimizer.arrays[number] = moved, moments
+    gaussians.replace(rows)
+
+
+def _move_own(
+    rows: list[Float],
+    count: int,
+    packed: Packed,
+    views: list[tuple[Pinhole, Splats, dict[str, list[Float]], list[Float]]],
+    degree: int,
+    factors: Float,
+    penalties: Mapping[str, Any],
+    antialiased: bool,
+    scale: float,
+) -> tuple[list[list[Float]], list[Float], list[Float]]:
+    """A step of the first `count` rows. rows: all of them.
+
+    Also, of each view, the gradients of the sums of harmonics: 3 Floats [N], none where colours come from a field.
+    """
+    shape_rows = [ad.Float(row) for row in rows[:OWN]]
+    dr.enable_grad(shape_rows)
+    gaussians = Gaussians.from_rows([*shape_rows, *rows[OWN:]])
+    along: Any = ad.Float(0)
+    grad_sums: list[list[Float]] = []
+    for camera, grad_splats, grad_values, grad_rows in views:
+        splats, _ = project(gaussians, camera, antialiased)
+        for name in ("opacity", "x", "y", "a", "b", "c"):
+            along += getattr(splats, name) * getattr(grad_splats, name)
+        for row, gradient in zip(shape_rows, grad_rows, strict=False):
+            along += row * gradient
+        for name, group in shape_values(gaussians, splats, camera, grad_values, scale).items():
+            for value, gradient in zip(group, grad_values[name], strict=True):
+                along += value * gradient
+        grad_sums.append([])
+        if gaussians.features is None:
+            sums = harmonics(gaussians, camera, degree)
+            for total, gradient in zip(sums, grad_values["color"], strict=True):
+                grad_sums[-1].append(dr.select(is_unclamped(total), gradient, 0))
+                along += total * grad_sums[-1][-1]
+    for name, weight in penalties.items():
+        along += len(views) * weight * penalty(name, gaussians)
+    dr.backward(along if len(views) == 1 else along / len(views))
+    grad_rows = [dr.grad(row) for row in shape_rows]
+    grad_rows += [mean([SH_C0 * grad_sum[c] for grad_sum in grad_sums]) for c in range(count - OWN)]
+    moved, moments = _step([*dr.detach(shape_rows), *rows[OWN:count]], grad_rows, packed, factors, 0)
+    dr.eval(grad_sums, moved, moments)
+    return grad_sums, moved, moments
+
+
+def _move_harmonics(
+    rows: list[Float],
+    packed: Packed,
+    first: int,
+    degree: int,
+    means: list[Float],
+    cameras: list[Pinhole],
+    grad_sums: list[list[Float]],
+    factors: Float,
+) -> tuple[list[Float], list[Float]]:
+    """A step of the coefficients from number `first` on. means: those of which `grad_sums` are the gradients."""
+    grad_rows: list[list[Float]] = [[] for _ in rows]
+    for camera, grad_sum in zip(cameras, grad_sums, strict=True):
+        basis = dr.sh_eval(camera.directions_to(ad.Array3f(means)), degree)
+        for i in range(len(rows)):
+            k = first + i // 3
+            grad_rows[i].append(basis[k] * grad_sum[i % 3] if k < len(basis) else ad.Float(0))
+    moved, moments = _step(rows, [mean(gradients) for gradients in grad_rows], packed, factors, OWN + 3 * first)
+    dr.eval(moved, moments)
+    return moved, moments
+
+
+def _move_features(
+    row: Any, moments: list[Float], grad_features: list[Float], factors: Float
+) -> tuple[Float, list[Float]]:
+    """A step of the features, one packed row."""
+    first, second = moments
+    corrections, rates = _numbers(factors, OWN, 1)
+    moved, [first], [second] = adam_step([row], [mean(grad_features)], ([first], [second]), rates, corrections)
+    return moved[0], [first, second]
+
+
+def _step(
+    rows: list[Float], grad_rows: list[Float], packed: Packed, factors: Float, first: int
+) -> tuple[list[Float], list[Float]]:
+    """(rows, moments) after a step of Adam over rows from number `first` on."""
+    arrays, layout = packed
+    moments = load(arrays, layout, dr.arange(ad.UInt32, dr.width(rows[0])))
+    corrections, rates = _numbers(factors, first, len(rows))
+    moved, first_moments, second_moments = adam_step(rows, grad_rows, moments, rates, corrections)
+    return moved, store(first_moments, second_moments, layout)
+
+
+def _numbers(factors: Float, first: int, count: int) -> tuple[tuple[Any, Any], list[Float]]:
+    """Adam's two corrections, and the step sizes of `count` rows from number `first` on."""
+    indices = 0, 1, *range(2 + first, 2 + first + count)
+    first_correction, second_correction, *rates = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in indices]
+    return (first_correction, second_correction), rates

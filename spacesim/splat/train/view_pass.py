@@ -1,0 +1,181 @@
+"""One view of a training step: forward from Gaussians to a picture, its loss, and backward to gradients of Gaussians.
+
+Stages of fixed shape (project, loss) are recorded once and replayed without tracing; binning and blending, whose lists
+change length from step to step, stand between them.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from spacesim.backend import ad, recorded
+from spacesim.data.records import Camera
+from spacesim.splat.light.model import LightModel, Shading
+from spacesim.splat.raster.adjoint import SplatGradients
+from spacesim.splat.raster.bin import bin_splats
+from spacesim.splat.raster.blend import backward, forward
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Pinhole, Splats
+from spacesim.splat.raster.records import BlendResult
+from spacesim.splat.raster.supersample import upsampled_camera
+from spacesim.splat.raster.tiles import TileLists
+from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.downscale import downscaled_camera
+from spacesim.splat.train.optimizer.update import ViewGradients
+from spacesim.splat.train.stages import LossSettings, TargetImage, on_screen, picture_loss, project_views
+from spacesim.splat.train.views import TrainingView
+
+
+@dataclass
+class BlendTape:
+    """What blending a view leaves behind for its way back."""
+
+    splats: Splats
+    lists: TileLists
+    blended: BlendResult
+
+
+@dataclass
+class RenderedView:
+    """A view that was drawn."""
+
+    camera: Pinhole  #: with as many pixels as are blended
+    downscale: int  #: pixels of the view on a side of each pixel that is compared
+    radii: Any  #: of `screen_radii`, or None where refinement does not watch
+    channels: dict[str, int]  #: how many planes each name has
+    shading: Shading | None  #: its light, of a method of light
+    tape: BlendTape | None  #: until the way back has read it
+
+    def take_tape(self) -> BlendTape:
+        """What blending left behind, which is not held any longer: memory is shortest here."""
+        assert self.tape is not None, "a view goes back once"
+        tape, self.tape = self.tape, None
+        return tape
+
+
+@dataclass(frozen=True, eq=False)
+class ViewLoss:
+    """The loss of a view, and its gradients."""
+
+    value: Any  #: Float of width 1
+    grad_planes: list[Any]  #: gradients by the blended planes, in their order
+    grad_transmittance: Any  #: plane
+
+
+@dataclass
+class ViewResult:
+    """What a step has learned from one view: for the Gaussians, and for the networks."""
+
+    gradients: ViewGradients | None
+    loss: Any
+    by_networks: Any = None  #: by their weights, then by the pictures' embeddings
+
+    def take_gradients(self) -> ViewGradients:
+        """The gradients, which are not held any longer."""
+        assert self.gradients is not None, "gradients are read once"
+        gradients, self.gradients = self.gradients, None
+        return gradients
+
+
+class ViewPass:
+    """Forward and backward of views, one after another. scale: of the scene, metres, the unit of depth"""
+
+    def __init__(self, config: TrainConfig, scale: float) -> None:
+        self.config, self.scale = config, scale
+        terms = LossSettings(
+            config.ssim_weight,
+            config.visibility_weight,
+            config.depth_weight,
+            config.normal_weight,
+            scale,
+            config.light.curve[0] if config.light and config.light.curve else None,
+            config.supersample,
+        )
+        factors = [2**power for power in range(config.num_downscales + 1)]
+        self._loss_settings = {downscale: replace(terms, downscale=downscale) for downscale in factors}
+        self._project = recorded(project_views)
+        self._loss = recorded(picture_loss)
+        self._on_screen = recorded(on_screen)
+
+    def forward(
+        self,
+        gaussians: Gaussians,
+        rows: list[Any],
+        light: LightModel | None,
+        view: TrainingView,
+        degree: int,
+        downscale: int,
+        watched: bool,
+    ) -> RenderedView:
+        """Draw a view. rows: `gaussians.rows()`;  light: of a method of light;  degree: of the harmonics;  downscale:
+        see `RenderedView`;  watched: whether refinement wants to know of it"""
+        config = self.config
+        camera = Pinhole.of(upsampled_camera(downscaled_camera(view.camera, downscale), config.supersample))
+        splats, footprints, values, radii = self._project(
+            rows, camera, degree, config.antialiased, config.shape_terms, self.scale, watched
+        )
+        shading = light.shade(gaussians, camera, view.sun, picture=view.index) if light else None
+        if shading:
+            values["color"] = shading.colors
+            if config.visibility_weight > 0:
+                values["visibility"] = [shading.visibility]
+        lists = bin_splats(splats, footprints, camera.width, camera.height, training=True)
+        planes = [value for group in values.values() for value in group]
+        blended = forward(splats, planes, lists, camera.width, camera.height, adjoint=True)
+        channels = {name: len(group) for name, group in values.items()}
+        return RenderedView(camera, downscale, radii, channels, shading, BlendTape(splats, lists, blended))
+
+    def loss(self, drawn: RenderedView, target: TargetImage, camera: Camera) -> ViewLoss:
+        """Compare a view that was drawn. camera: of the target"""
+        assert drawn.tape is not None, "a view is compared before it goes back"
+        blended = drawn.tape.blended
+        planes, size = _group_by_name(blended.features, drawn.channels), (camera.width, camera.height)
+        terms = self._loss_settings[drawn.downscale]
+        value, grad_planes, grad_transmittance = self._loss(planes, blended.transmittance, target, size, terms)
+        return ViewLoss(value, [plane for group in grad_planes.values() for plane in group], grad_transmittance)
+
+    def backward(self, drawn: RenderedView, loss: ViewLoss, absolute: bool) -> SplatGradients:
+        """Gradients of the loss by splats and by what was blended. absolute: also what `watched` reads"""
+        tape, size = drawn.take_tape(), (drawn.camera.width, drawn.camera.height)
+        return backward(
+            tape.splats, tape.blended, tape.lists, size, loss.grad_planes, loss.grad_transmittance, absolute=absolute
+        )
+
+    def watched(self, drawn: RenderedView, grad_splats: SplatGradients) -> tuple[Any, Any, Any]:
+        """What refinement watches of a view, see `on_screen`."""
+        width, height = drawn.camera.width, drawn.camera.height
+        sizes = ad.Float([0.5 * width, 0.5 * height, max(width, height)])
+        gradient, radius, seen = self._on_screen((grad_splats.absolute_x, grad_splats.absolute_y), drawn.radii, sizes)
+        return gradient, radius, seen
+
+    def to_gradients(
+        self,
+        drawn: RenderedView,
+        loss: ViewLoss,
+        grad_splats: SplatGradients,
+        light: LightModel | None,
+        grad_rows: list[Any],
+    ) -> ViewResult:
+        """What the view teaches, back through its light. grad_rows: gradients of the Gaussians' first rows that come
+        from elsewhere, none at all or some"""
+        grad_values = _group_by_name(grad_splats.features, drawn.channels)
+        if drawn.shading is None or light is None:
+            return ViewResult(
+                ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_rows=grad_rows), loss.value
+            )
+        grad_visibility = grad_values.pop("visibility", [None])[0]
+        grad_light = light.adjoint(drawn.shading, grad_values.pop("color"), grad_visibility)
+        grad_rows = _sum_rows(grad_light.geometry, grad_rows)
+        gradients = ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_light.features, grad_rows)
+        return ViewResult(gradients, loss.value, [*grad_light.weights, *grad_light.embeddings])
+
+
+def _group_by_name(values: list[Any], counts: dict[str, int]) -> dict[str, list[Any]]:
+    """So many of the values, one after another, under each name."""
+    rest = iter(values)
+    return {name: [next(rest) for _ in range(count)] for name, count in counts.items()}
+
+
+def _sum_rows(first: list[Any], second: list[Any]) -> list[Any]:
+    """Rows added up, those that only one has as they are."""
+    longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
+    return [row + addend for row, addend in zip(longer, shorter, strict=False)] + longer[len(shorter) :]

@@ -1,0 +1,182 @@
+"""gsplat's `rasterization` over Dr.Jit's kernels: for torch, on CUDA and on any CPU, without a compiler.
+
+    from spacesim.torch import rasterization
+
+It takes the arguments of gsplat 1.5.3's function of that name (V. Ye et al., "gsplat: An open-source library for
+Gaussian splatting", 2025), in their order, and returns what it returns; what is not supported ends in one sentence.
+Tensors on a CUDA device run on CUDA, others on the CPU, one of the two in a process. On a CPU torch's threads wait by
+spinning and take cores from the kernels: `torch.set_num_threads(1)`.
+"""
+
+from typing import Any
+
+try:
+    import torch
+    from torch import Tensor
+except ImportError:
+    raise ImportError("spacesim.torch: expected torch, found none; type: pip install torch") from None
+
+from spacesim import backend
+from spacesim.torch import arguments
+from spacesim.torch.autograd import DEPTH, OPACITY, Blend, Drawing, Project, pack
+
+Results = tuple[Tensor, Tensor, dict[str, Any]]
+
+MIN_ALPHA = 1e-10  #: by which "ED" divides at least, as gsplat
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    rolling_shutter: Any = None,
+    viewmats_rs: Tensor | None = None,
+) -> Results:
+    """Render N Gaussians with C cameras, differentiable by every tensor that requires gradients.
+
+    means: [N, 3] metres;  quats: [N, 4] (w, x, y, z), of any length;  scales: [N, 3] standard deviations, metres
+    opacities: [N] in [0, 1]
+    colors: [N, K, 3] or [C, N, K, 3] harmonics where `sh_degree` is given, else [N, D] or [C, N, D] of any D
+    viewmats: [C, 4, 4] world to camera, OpenCV axes;  Ks: [C, 3, 3] pinhole intrinsics, pixels (of an "ortho" camera
+        pixels per metre)
+    near_plane, far_plane: metres;  radius_clip: pixels, splats no larger are not drawn
+    eps2d: pixels^2 added to the screen-space covariance;  rasterize_mode: "classic", or "antialiased": what that adds
+        to a splat's area is taken from its opacity
+    backgrounds: [C, D] or None;  render_mode: "RGB", "D" (summed depth), "ED" (expected depth), "RGB+D", "RGB+ED"
+    absgrad: means2d gets the attribute `absgrad`, of its shape, in the backward pass
+    packed: how the dictionary lies, see below; pictures and time are the same but for a few indices
+    tile_size, channel_chunk, segmented: taken and without effect
+
+    Returns (pictures [C, H, W, D], depth last; alphas [C, H, W, 1]; a dictionary). In the dictionary are means2d
+    [..., 2] (pixels, which `retain_grad` works on), conics [..., 3], opacities [...], depths [...] and radii [..., 2]
+    int32: with packed=True of the splats that are drawn, camera by camera, whose batch_ids, camera_ids and gaussian_ids
+    are int64 [M]; with packed=False [C, N, ...], radii 0 of what is not drawn, and None for the ids. Further width,
+    height, n_cameras, n_batches, tile_size, tile_width and tile_height.
+
+    Raises ValueError for shapes that do not fit, for tensors on several devices, for a second device in one process and
+    for what is not supported, BackendError where the device's backend cannot run. Without torch, importing this module
+    raises ImportError.
+    """
+    arguments.check_unsupported(
+        {
+            "sparse_grad": sparse_grad,
+            "distributed": distributed,
+            "covars": covars,
+            "with_ut": with_ut,
+            "with_eval3d": with_eval3d,
+            "radial_coeffs": radial_coeffs,
+            "tangential_coeffs": tangential_coeffs,
+            "thin_prism_coeffs": thin_prism_coeffs,
+            "ftheta_coeffs": ftheta_coeffs,
+            "viewmats_rs": viewmats_rs,
+            "rolling_shutter": rolling_shutter,
+        }
+    )
+    arguments.check_choice("render_mode", render_mode, arguments.RENDER_MODES)
+    arguments.check_choice("rasterize_mode", rasterize_mode, arguments.RASTERIZE_MODES)
+    arguments.check_choice("camera_model", camera_model, arguments.CAMERA_MODELS)
+    count, cameras = arguments.check_shapes(means, quats, scales, opacities, viewmats, Ks, width, height)
+    arguments.check_colors(colors, backgrounds, sh_degree, render_mode, means, cameras)
+    backend.select("cuda" if means.is_cuda else "llvm")
+    settings = arguments.raster_settings(
+        width=width,
+        height=height,
+        near=near_plane,
+        far=far_plane,
+        radius_clip=radius_clip,
+        eps2d=eps2d,
+        antialiased=rasterize_mode == "antialiased",
+        ortho=camera_model == "ortho",
+        degree=sh_degree,
+    )
+    colored, harmonic = "RGB" in render_mode, sh_degree is not None
+    float32 = torch.float32
+    colors = colors.to(float32)
+    means2d, table, radii, projected = Project.apply(
+        means.to(float32),
+        quats.to(float32),
+        scales.to(float32),
+        opacities.to(float32),
+        colors if harmonic else None,
+        viewmats.to(float32),
+        Ks.to(float32),
+        settings,
+    )
+    visible, camera_ids, gaussian_ids = None, None, None
+    if packed:
+        visible = radii[..., 0].flatten().nonzero()[:, 0]
+        camera_ids, gaussian_ids = visible // count, visible % count
+        means2d = pack(means2d, visible)
+    drawing = Drawing(
+        projected=projected,
+        width=width,
+        height=height,
+        harmonic=colored and harmonic,
+        depth="D" in render_mode,
+        visible=visible,
+        target=means2d if absgrad else None,
+    )
+    pictures, alphas = Blend.apply(means2d, table, colors if colored and not harmonic else None, drawing)
+    pictures = _finish_picture(pictures, alphas, backgrounds, render_mode)
+    own = pack(table, visible)
+    meta = {
+        "batch_ids": None if gaussian_ids is None else torch.zeros_like(gaussian_ids),
+        "camera_ids": camera_ids,
+        "gaussian_ids": gaussian_ids,
+        "radii": pack(radii, visible),
+        "means2d": means2d,
+        "depths": own[..., DEPTH],
+        "conics": own[..., :3],
+        "opacities": own[..., OPACITY],
+        "tile_width": -(-width // tile_size),
+        "tile_height": -(-height // tile_size),
+        "width": width,
+        "height": height,
+        "tile_size": tile_size,
+        "n_batches": 1,
+        "n_cameras": cameras,
+    }
+    return pictures, alphas, meta
+
+
+def _finish_picture(picture: Tensor, alpha: Tensor, backgrounds: Tensor | None, render_mode: str) -> Tensor:
+    """Over the background, expected depth last where that is asked for."""
+    color, depth = (picture[..., :-1], picture[..., -1:]) if "D" in render_mode else (picture, None)
+    if backgrounds is not None and color.shape[-1]:
+        color = color + (1 - alpha) * backgrounds[:, None, None, :]
+    if depth is None:
+        return color
+    depth = depth / alpha.clamp(min=MIN_ALPHA) if "ED" in render_mode else depth
+    return torch.cat([color, depth], dim=-1)
+
+
+__all__ = ["rasterization"]

@@ -1,0 +1,122 @@
+"""What `rasterization` takes: checks with one sentence each, and what of a call is no tensor."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from torch import Tensor
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
+CAMERA_MODELS = ("pinhole", "ortho")
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """What of a call is no tensor."""
+
+    width: int  #: pixels
+    height: int
+    near: float  #: metres
+    far: float
+    radius_clip: float  #: pixels; splats no larger are not drawn
+    eps2d: float  #: pixels^2 added to the screen-space covariance
+    antialiased: bool  #: what that adds to a splat's area is taken from its opacity
+    ortho: bool  #: orthographic cameras, not pinhole cameras
+    degree: int | None  #: of the harmonics; None where colours are given
+
+
+@lru_cache(maxsize=256)
+def raster_settings(
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    radius_clip: float,
+    eps2d: float,
+    antialiased: bool,
+    ortho: bool,
+    degree: int | None,
+) -> RasterSettings:
+    """`RasterSettings`, one object for the same values: recorded calls know it by identity."""
+    return RasterSettings(width, height, near, far, radius_clip, eps2d, antialiased, ortho, degree)
+
+
+def check_unsupported(arguments: Mapping[str, Any]) -> None:
+    """Raises ValueError for the first argument that asks for something: each is False or None where it does not."""
+    for name, value in arguments.items():
+        if name == "rolling_shutter":
+            asked = value is not None and getattr(value, "name", "GLOBAL") != "GLOBAL"
+        else:
+            asked = value is not None and not (isinstance(value, int) and not value)
+        if asked:
+            raise ValueError(f"{name}: not supported by spacesim.torch.rasterization, leave it out")
+
+
+def check_choice(name: str, found: str, known: Sequence[str]) -> None:
+    """Raises ValueError where `found` is not one of `known`."""
+    if found not in known:
+        raise ValueError(f"{name}: expected one of {', '.join(known)}, found {found!r}")
+
+
+def check_shapes(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+) -> tuple[int, int]:
+    """(N, C). Raises ValueError naming the argument that does not fit."""
+    for name, matrices, size in (("viewmats", viewmats, 4), ("Ks", Ks, 3)):
+        if matrices.dim() == 2:
+            raise ValueError(f"{name}: expected [C, {size}, {size}], found {list(matrices.shape)}; add [None]")
+    count, cameras, device = len(means), len(viewmats), means.device
+    expected = (
+        ("means", means, (count, 3)),
+        ("quats", quats, (count, 4)),
+        ("scales", scales, (count, 3)),
+        ("opacities", opacities, (count,)),
+        ("viewmats", viewmats, (cameras, 4, 4)),
+        ("Ks", Ks, (cameras, 3, 3)),
+    )
+    for name, tensor, shape in expected:
+        if tensor.shape != shape:
+            suffix = "; batches are not supported" if tensor.dim() > len(shape) else ""
+            raise ValueError(f"{name}: expected {list(shape)}, found {list(tensor.shape)}{suffix}")
+        check_device(name, tensor, device)
+    if count < 1 or cameras < 1 or width < 1 or height < 1:
+        raise ValueError(f"means, viewmats: expected at least one each and a picture, found {count} and {cameras}")
+    return count, cameras
+
+
+def check_device(name: str, tensor: Tensor, device: Any) -> None:
+    """Raises ValueError for a tensor elsewhere."""
+    if tensor.device != device:
+        raise ValueError(f"{name}: expected a tensor on {device}, found one on {tensor.device}")
+
+
+def check_colors(
+    colors: Tensor, backgrounds: Tensor | None, sh_degree: int | None, render_mode: str, means: Tensor, cameras: int
+) -> None:
+    """Raises ValueError where colours do not fit the harmonics, the Gaussians or the background."""
+    count, shape = len(means), tuple(colors.shape)
+    check_device("colors", colors, means.device)
+    if backgrounds is not None:
+        check_device("backgrounds", backgrounds, means.device)
+    if sh_degree is None:
+        if shape[:-1] not in ((count,), (cameras, count)):
+            raise ValueError(f"colors: expected [{count}, D] or [{cameras}, {count}, D], found {list(shape)}")
+    else:
+        if not 0 <= sh_degree <= 3:
+            raise ValueError(f"sh_degree: expected 0 to 3, found {sh_degree}")
+        if shape[:-2] not in ((count,), (cameras, count)) or shape[-1] != 3 or shape[-2] < (sh_degree + 1) ** 2:
+            raise ValueError(f"colors: expected harmonics [{count}, K, 3] of degree {sh_degree}, found {list(shape)}")
+    channels = 3 if sh_degree is not None else shape[-1]
+    if backgrounds is not None and tuple(backgrounds.shape) != (cameras, channels):
+        raise ValueError(f"backgrounds: expected [{cameras}, {channels}], found {list(backgrounds.shape)}")
+    if render_mode == "D" and shape[-1] == 0:
+        raise ValueError("colors: expected at least one channel, found none")

@@ -1,0 +1,65 @@
+"""Tensors to Dr.Jit's arrays and back, without a copy where memory allows."""
+
+from typing import Any
+
+import drjit as dr
+import torch
+from torch import Tensor
+
+from spacesim.backend import ad
+
+ALIGNED = 64  #: bytes to a multiple of which torch allocates
+WIDEST = 16  #: numbers of a row that a kernel stores at once
+
+
+def to_floats(tensor: Tensor) -> Any:
+    """A tensor of float32 as one flat Float, without a copy where it is contiguous and aligned as torch allocates:
+    elsewhere a kernel on LLVM could read beyond its last page, see `spacesim.backend.upload`."""
+    flat = tensor.detach().reshape(-1)
+    return ad.Float(flat if flat.is_cuda or flat.data_ptr() % ALIGNED == 0 else flat.clone())
+
+
+def column(flat: Any, index: int, size: int, count: int) -> Any:
+    """Column `index` of a flat array [count * size], in memory of Dr.Jit's own: what torch has may lie otherwise, and
+    each way to lie is recorded anew."""
+    rows = dr.arange(ad.UInt32, count)
+    return dr.gather(ad.Float, flat, rows * size + index, mode=dr.ReduceMode.Permute)
+
+
+def columns(tensor: Tensor) -> list[Any]:
+    """The columns of a tensor [count, size], Floats; not evaluated."""
+    flat, size = to_floats(tensor), tensor.shape[-1]
+    return [column(flat, i, size, len(tensor)) for i in range(size)]
+
+
+def rows(values: list[Any], size: int, count: int, room: int | None = None) -> Any:
+    """A flat array [room * size] whose first `count` rows are `values` (at least one column, at most `size`) side by
+    side; what is missing of a row is 0. One kernel writes it, in packets of at most WIDEST numbers that divide a row;
+    `dr.concat` would launch one for each column.
+
+    room: `count` by default; in a recording a number that is an argument of it, by `round_capacity`: what a recording
+    allocates stays as large as it was when it was recorded"""
+    kind = type(values[0])
+    packet = next(width for width in (WIDEST, 8, 4, 2, 1) if size % width == 0)
+    packets = size // packet
+    whole = len(values) + packet > size  # packets that hold a value are all that there are
+    length = size * (count if room is None else room)
+    target = dr.empty(kind, length) if whole else dr.zeros(kind, length)
+    place = dr.arange(ad.UInt32, count) * packets
+    values = [*values, *[kind(0)] * (-len(values) % packet)]
+    for first in range(0, len(values), packet):
+        own = values[first : first + packet]
+        stored = (ad.ArrayXi if kind is ad.Int32 else ad.ArrayXf)(own) if packet > 1 else own[0]
+        dr.scatter(target, stored, place + first // packet, mode=dr.ReduceMode.Permute)
+    return target
+
+
+def to_table(flat: Any, count: int, size: int) -> Tensor:
+    """The first `count` rows of a flat array of at least as many rows of `size`: a tensor [count, size]."""
+    return to_tensor(flat).as_strided((count, size), (size, 1))
+
+
+def to_tensor(flat: Any) -> Tensor:
+    """A flat array as a tensor that shares its memory."""
+    tensor: Tensor = torch.from_dlpack(dr.detach(flat))
+    return tensor

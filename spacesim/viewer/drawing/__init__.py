@@ -1,0 +1,1 @@
+"""From a scene to pictures, on the one thread that draws."""

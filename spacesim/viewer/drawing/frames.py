@@ -1,0 +1,105 @@
+"""From what a client looks at to a picture: nothing here knows of servers or threads."""
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from spacesim.data.errors import InputError
+from spacesim.data.records import Camera
+from spacesim.viewer.drawing.paint import NEEDED, Bytes, Planes, depth_range, paint
+from spacesim.viewer.drawing.scene_renderer import SceneRenderer
+from spacesim.viewer.state import DisplaySettings, SceneState, ViewerCamera
+
+BUDGET = 1 / 15  #: seconds that a frame may take while the view moves: 15 frames a second
+SHARES = (1.0, 0.75, 0.5, 0.375, 0.25)  #: of the full resolution, while the view moves
+STEP = 16  #: sides of pictures are multiples of this many pixels
+STAIR = 128  #: and the longer one, in full resolution, of this many: few sizes occur, each of which compiles kernels
+WARM = 3  #: frames of a size that compile kernels and tell nothing of its speed
+MIN_SIDE = 64  #: pixels of a side
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A picture for a client."""
+
+    picture: Bytes  #: [H, W, 3]
+    planes: Planes | None  #: what it was painted from, or None
+    seconds: float  #: that it took
+    share: float  #: of the full resolution
+    depths: tuple[float, float] | None  #: ends of the colour map in metres, or None
+    note: str = ""  #: a sentence for the user, or ""
+
+
+def picture_size(view: ViewerCamera, most: int, share: float = 1.0) -> tuple[int, int]:
+    """(width, height) of the picture of a view, pixels: the window's shape and, in full resolution, its size rounded up
+    to a STAIR, but at most `most` on the longer side; `share` of that. Pixels are not quite square then, and the camera
+    knows that."""
+    longer = max(view.width, view.height)
+    scale = share * min(STAIR * -(-longer // STAIR), most) / longer
+    width, height = (max(MIN_SIDE, STEP * round(scale * side / STEP)) for side in (view.width, view.height))
+    return width, height
+
+
+def draw_frame(
+    renderer: SceneRenderer, state: SceneState, view: ViewerCamera, settings: DisplaySettings, share: float = 1.0
+) -> Frame:
+    """The picture of a view in the look's mode, without the truth; black, and a note that says why, of a scene that
+    cannot be drawn."""
+    start = time.perf_counter()
+    camera = view.camera(*picture_size(view, settings.side, share))
+    try:
+        planes, picture, depths, note = draw_mode(renderer, state, camera, settings.mode)
+    except InputError as error:
+        planes = Planes(np.zeros((camera.height, camera.width)))
+        picture, depths, note = _black(camera), None, f"no picture: {error}"
+    return Frame(picture, planes, time.perf_counter() - start, share, depths, note)
+
+
+def draw_mode(
+    renderer: SceneRenderer, state: SceneState, camera: Camera, mode: str
+) -> tuple[Planes, Bytes, tuple[float, float] | None, str]:
+    """(planes, picture, depths, note) of a camera in a mode; black, and a note that says why, where there is nothing of
+    the mode to see."""
+    planes = renderer.draw(state, camera, mode)
+    depths = depth_range(planes) if mode == "depth" else None
+    picture = paint(planes, mode, depths)
+    if picture is not None:
+        return planes, picture, depths, ""
+    note = f"no {mode} to be seen: {renderer.why_missing(NEEDED[mode])}"
+    return planes, _black(camera), None, note
+
+
+def _black(camera: Camera) -> Bytes:
+    return np.zeros((camera.height, camera.width, 3), np.uint8)
+
+
+@dataclass
+class ResolutionControl:
+    """Which share of the full resolution a moving view is drawn at, so that a frame takes BUDGET at most.
+
+    One step down after a frame that took longer; one up where the larger picture, with that many more pixels, would
+    still take 70 % of BUDGET at most. Frames of a size new to the kernels do not count.
+    """
+
+    level: int = 0
+    _seen: dict[tuple[int, int], int] = field(default_factory=dict)
+
+    @property
+    def share(self) -> float:
+        """Of the full resolution."""
+        return SHARES[self.level]
+
+    def record_time(self, share: float, size: tuple[int, int], seconds: float) -> None:
+        """Told that a frame of `size` at `share` took so long."""
+        if len(self._seen) > 256:
+            self._seen.clear()
+        self._seen[size] = self._seen.get(size, 0) + 1
+        if self._seen[size] <= WARM or share != self.share:
+            return
+        if seconds > BUDGET:
+            self.level = min(self.level + 1, len(SHARES) - 1)
+        elif self.level > 0:
+            larger = SHARES[self.level - 1]
+            if seconds * (larger / share) ** 2 < 0.7 * BUDGET:
+                self.level -= 1

@@ -1,0 +1,107 @@
+"""The models that are shown, and their planes under any camera, Sun and poses.
+
+Only the render thread draws: a recorded call holds Dr.Jit's lock while it runs Python, so that another thread that asks
+Dr.Jit for anything at all, be it the length of an array, would wait for it for ever, and keep Python from going on. All
+that others ask of a `SceneRenderer` is therefore found out when it is made.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spacesim.data.geometry import Array
+from spacesim.data.records import Camera
+from spacesim.splat.compose import Composition
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.viewer.drawing.ellipsoids import draw_ellipsoids
+from spacesim.viewer.drawing.paint import NEEDED, Planes
+from spacesim.viewer.state import SceneState
+
+MIN_RADIUS = 1e-6  #: metres of a model, where all its Gaussians are in one place
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What handles and cameras need of a model."""
+
+    name: str  #: unlike the others'
+    centre: Array  #: [3] and radius of its Gaussians, its own frame, metres
+    radius: float
+
+
+class SceneRenderer:
+    """A composed scene to be drawn. composition: with the poses that the viewer starts with
+
+    gaussians: how many there are;  relightable: whether the Sun changes the picture;  backend: that draws
+    """
+
+    def __init__(self, composition: Composition) -> None:
+        self.composition = composition
+        self.gaussian_count = composition.gaussian_count
+        self.relightable = composition.relightable
+        self.backend = composition.backend
+        names = _unique_names([placed.name or placed.run.path.resolve().name for placed in composition.models])
+        self.models = tuple(
+            Model(name, *_bounds(placed.run.gaussians.to_numpy()))
+            for name, placed in zip(names, composition.models, strict=True)
+        )
+
+    def bounds(self, state: SceneState) -> tuple[Array, float]:
+        """(centre [3], radius) of a sphere about all models, world, metres."""
+        spheres = [
+            (pose.points(model.centre), pose.scale * model.radius)
+            for model, pose in zip(self.models, state.poses, strict=True)
+        ]
+        low = np.min([centre - radius for centre, radius in spheres], axis=0)
+        high = np.max([centre + radius for centre, radius in spheres], axis=0)
+        centre = spheres[0][0] if len(spheres) == 1 else 0.5 * (low + high)
+        return centre, max(float(np.linalg.norm(at - centre) + radius) for at, radius in spheres)
+
+    def draw(self, state: SceneState, camera: Camera, mode: str) -> Planes:
+        """The planes that a mode needs, and alpha. Raises InputError where the Sun matters and none is told."""
+        scene = self.composition.posed(state.poses)
+        if mode == "ellipsoids":
+            gaussians, colors = scene.lit_gaussians(camera, state.sun)
+            blended = draw_ellipsoids(gaussians, colors, Pinhole.of(camera))
+            shape = camera.height, camera.width
+            rgb = np.stack([np.array(plane).reshape(shape) for plane in blended.planes], axis=-1)
+            return Planes(1 - np.array(blended.transmittance).reshape(shape), rgb=rgb)
+        outputs = {"rgb": "rgb", "depth": "depth", "visibility": "visibility", "normal": "normal", "object_id": "id"}
+        name = NEEDED[mode]
+        drawn = scene.draw(camera, state.sun, [outputs[name]] if name in outputs else [], supersample=1)
+        alpha = drawn.image("alpha")
+        if name not in outputs or (name == "visibility" and "visibility" not in drawn.planes):
+            return Planes(alpha)
+        return Planes(alpha, **{name: drawn.image(outputs[name])})
+
+    def why_missing(self, plane: str) -> str:
+        """Why a plane cannot be had, in words."""
+        if plane == "visibility":
+            return "no model here predicts shadows (the methods shadow-map, shadow-splat and baseline-park do)"
+        return f"no model here predicts {plane}"
+
+
+def _bounds(arrays: dict[str, np.ndarray]) -> tuple[Array, float]:
+    """(centre [3], radius) of the Gaussians but for the farthest 1 %, metres."""
+    means = arrays["means"].astype(np.float64)
+    means = means[np.isfinite(means).all(axis=1)]
+    if not len(means):
+        return np.zeros(3), 1.0
+    centre = np.median(means, axis=0)
+    away = np.linalg.norm(means - centre, axis=1)
+    central = means[away <= np.percentile(away, 99)]
+    centre = 0.5 * (central.min(axis=0) + central.max(axis=0))
+    radius = float(np.linalg.norm(central - centre, axis=1).max())
+    return centre, max(radius, MIN_RADIUS)
+
+
+def _unique_names(names: Sequence[str]) -> list[str]:
+    """The names, numbered from 2 where they occur again."""
+    result: list[str] = []
+    for name in names:
+        number, unique = 2, name
+        while unique in result:
+            unique, number = f"{name} {number}", number + 1
+        result.append(unique)
+    return result

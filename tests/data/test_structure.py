@@ -1,0 +1,86 @@
+"""Plain values to records and back: words, alternatives, and how what is wrong is named."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+import pytest
+
+from spacesim.data.errors import InputError
+from spacesim.data.structure import Rules, check_choices, plain, structure
+from spacesim.data.toml import Document
+
+
+@dataclass(frozen=True)
+class Disc:
+    kind: ClassVar[str] = "disc"
+    radius: float = 1.0
+
+
+@dataclass(frozen=True)
+class Box:
+    kind: ClassVar[str] = "box"
+    sides: tuple[float, float] = (1.0, 2.0)
+
+
+@dataclass(frozen=True)
+class Tag:
+    kind: str = "label"
+
+
+@dataclass(frozen=True)
+class Part:
+    shape: Disc | Box = field(default_factory=Disc)
+    lid: Disc | Box | None = None
+    colour: Literal["red", "blue"] = "red"
+    finish: Literal["matt"] | None = None
+    tag: Tag = field(default_factory=Tag)
+
+    def __post_init__(self) -> None:
+        check_choices(self)
+
+
+def read(values, **rules):
+    return structure(Part, Document("part.toml", values, {}), Rules(**rules))
+
+
+@pytest.mark.parametrize(
+    "part", [Part(), Part(Box((3.0, 4.0)), Disc(2.0), "blue", "matt", Tag("other")), Part(lid=Box())]
+)
+def test_there_and_back(part):
+    assert read(plain(part)) == part
+
+
+def test_an_alternative_is_chosen_by_its_name():
+    assert plain(Part())["shape"] == {"kind": "disc", "radius": 1.0}
+    assert plain(Tag()) == {"kind": "label"}  # a field like any other
+    assert read({"shape": "box"}) == Part(Box())
+    assert read({"shape": {"kind": "box", "sides": [5, 6]}, "lid": None}) == Part(Box((5.0, 6.0)))
+    assert read({"shape": {"radius": 3}}) == Part(Disc(3.0))  # the first one
+    assert read({"lid": "none", "finish": "none"}, none="none") == Part()
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"shape": "bax"}, "shape: expected one of disc, box, found 'bax'; did you mean box?"),
+        ({"shape": {"kind": "ball"}}, r"shape\.kind: expected one of disc, box, found 'ball'"),
+        ({"shape": {"kind": 3}}, r"shape\.kind: expected one of disc, box, found 3"),
+        ({"shape": 3}, "shape: expected a table, found 3"),
+        ({"shape": {"sides": [1, 2]}}, r"shape\.sides: expected one of kind, radius, found 'sides'; kind box knows it"),
+        ({"shape": None}, "shape: expected a table, found none"),
+        ({"lid": "none"}, "lid: expected one of disc, box, found 'none'"),
+        ({"colour": "rad"}, "colour: expected one of red, blue, found 'rad'; did you mean red?"),
+        ({"colour": ["red"]}, "colour: expected one of red, blue, found"),
+        ({"finish": "shiny"}, "finish: expected one of matt, found 'shiny'"),
+    ],
+)
+def test_what_is_wrong_is_named(values, said):
+    with pytest.raises(InputError, match=f"part.toml: {said}"):
+        read(values)
+
+
+def test_words_are_checked_however_a_record_is_made():
+    with pytest.raises(InputError, match="colour: expected one of red, blue, found 'green'"):
+        Part(colour="green")
+    with pytest.raises(InputError, match="finish: expected one of matt, found 'wet'"):
+        Part(finish="wet")

@@ -1,0 +1,70 @@
+"""A run and a composed scene are asked for the same things, in the same words."""
+
+import inspect
+
+import numpy as np
+import pytest
+from splats import random_splats
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import look_at
+from spacesim.data.records import Camera, Sun
+from spacesim.splat.compose import ComposedRun, Composition, PlacedRun, Pose, load_predictor
+from spacesim.splat.compose.run import PlacedPart
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.run import Part, Predictor, Run
+
+CAMERA = Camera.from_fov(look_at((0, -4, 0), (0, 0, 0)), 24, 16, 40)
+SUN = Sun.from_angles(45, 30)
+
+
+def words_of(function) -> list[tuple]:
+    """Names, kinds, defaults and annotations of what a method is asked with."""
+    return [(p.name, p.kind, p.default, p.annotation) for p in inspect.signature(function).parameters.values()]
+
+
+@pytest.fixture
+def run(tmp_path) -> Run:
+    model = Gaussians.from_numpy(random_splats(40))
+    return Run(tmp_path / "run", {"method": "vanilla"}, {}, model, 1000)
+
+
+@pytest.fixture
+def scene(run, tmp_path) -> ComposedRun:
+    models = [PlacedRun(run, name="left"), PlacedRun(run, Pose(translation=[2.0, 0, 0]), "right")]
+    return ComposedRun(Composition(models), tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize("kind", [Run, ComposedRun, Composition])
+def test_predict_is_asked_in_the_same_words(kind):
+    assert words_of(kind.predict) == words_of(Predictor.predict)
+
+
+@pytest.mark.parametrize(("kind", "protocol"), [(Run, Predictor), (ComposedRun, Predictor), (PlacedPart, Part)])
+def test_all_that_is_asked_for_is_there(kind, protocol):
+    asked = {name for name in vars(protocol) if not name.startswith("_")}
+    assert len(asked) > 3
+    assert asked <= {*dir(kind), *kind.__dataclass_fields__}
+
+
+def test_a_run_has_no_parts_and_a_scene_those_of_its_models(run, scene):
+    assert run.parts == ()
+    left, right = scene.parts
+    assert (left.name, right.name) == ("left", "right")
+    assert isinstance(right.gaussians, Gaussians)
+    assert np.allclose(right.centre - left.centre, [2, 0, 0])
+    assert np.allclose(np.array(right.gaussians.means) - np.array(left.gaussians.means), [[2], [0], [0]], atol=1e-6)
+    assert right.antialiased is run.antialiased
+
+
+def test_both_refuse_an_exposure_of_srgb_values(run, scene):
+    for predictor in (run, scene):
+        with pytest.raises(InputError, match="exposure"):
+            predictor.predict(CAMERA, SUN, exposure=1.0)
+        assert predictor.predict(CAMERA, SUN, exposure=None).rgb.shape == (16, 24, 3)
+
+
+def test_a_scene_file_is_a_predictor_by_its_suffix(tmp_path):
+    for name in ("none.toml", "none"):
+        with pytest.raises(InputError, match=name):
+            load_predictor(tmp_path / name)

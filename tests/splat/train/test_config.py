@@ -1,0 +1,226 @@
+"""Presets as they have always been, settings by name, and what older runs wrote."""
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import spacesim as ss
+from spacesim.data.errors import InputError
+from spacesim.splat.light.field import DirectionsConfig
+from spacesim.splat.light.shadow.cast import SplattingConfig
+from spacesim.splat.train.config import (
+    METHODS,
+    PRESETS,
+    STRATEGIES,
+    TrainConfig,
+    preset,
+    shortened,
+    warm_start,
+    with_options,
+    with_settings,
+)
+from spacesim.splat.train.strategies.factory import make_strategy
+from spacesim.splat.train.strategies.mcmc import McmcConfig
+from spacesim.splat.train.train import train
+
+OLD = json.loads((Path(__file__).parent / "configs_before_unions.json").read_text(encoding="utf-8"))
+"""{preset, method and strategy: its config.json} as it was written while all strategies stood side by side."""
+DIGESTS = {
+    "demo": "eeb61bdd1a0168be",
+    "fast": "2a224f8b33903fcb",
+    "fine": "ff490bc27995f71b",
+    "thesis": "66c8b5518eecfb22",
+}
+"""Of all methods and strategies of a preset: a change here changes trained models."""
+
+
+def thesis_as_it_was(config: TrainConfig) -> TrainConfig:
+    """What that run of `thesis` has, and the preset has not."""
+    shadow = {"method": {"beta_min": 0.05}, "crop": True, "between": "others", "refine": {"residual": True}}
+    return replace(
+        with_settings(config, {"light.shadow": shadow}),
+        splatfacto_start=False,
+        means_steps=None,
+        random_behind_opaque=False,
+        num_downscales=0,
+        isotropy_weight=0.01,
+        refinement=replace(config.refinement, screen_size_stop=150_000),
+    )
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_what_they_were(name):
+    every = [preset(name, method, strategy).to_json() for method in METHODS for strategy in STRATEGIES]
+    text = json.dumps([*every, replace(preset(name), warm_start=warm_start(name)).to_json()], sort_keys=True)
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == DIGESTS[name]
+
+
+@pytest.mark.parametrize("name", OLD)
+def test_a_configuration_of_an_older_run_is_the_same_one(name):
+    config = TrainConfig.from_json({**OLD[name], "data": {}})
+    expected = preset(*name.split())
+    assert config == (thesis_as_it_was(expected) if name.startswith("thesis") else expected)
+    assert TrainConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
+
+
+@pytest.mark.parametrize("method", ["shadow-map", "shadow-splat", "baseline-park"])
+def test_the_thesis_has_the_light_of_its_text(method):
+    shadow = preset("thesis", method).light.shadow
+    assert (shadow.crop, shadow.between, shadow.grazing) == (False, "ratio", "none")  # 4.32, 4.15, 4.26
+    assert not shadow.refine.residual  # 4.13
+    if method == "shadow-map":
+        assert (shadow.method.filter, shadow.method.antialiased) == ("bilinear", False)  # 4.4, 4.5
+    else:
+        assert (shadow.method.beta_min, shadow.method.gradients) == (0.004, False)  # 4.10
+    assert shadow.bias == (0 if method == "baseline-park" else 10)  # table 4.3
+    ours = preset("fine", method).light.shadow
+    assert (ours.crop, ours.between, ours.refine.residual) == (True, "others", True)
+
+
+def test_an_older_run_is_resumed(small_lit_dataset, tmp_path):
+    config = replace(preset("demo", "shadow-map", "mesh-aware"), iterations=2, init_count=40)
+    run = train(small_lit_dataset, tmp_path / "run", config)
+    path = run.path / "config.json"
+    data = json.loads(path.read_text())["data"]
+    path.write_text(json.dumps({**OLD["demo shadow-map mesh-aware"], "iterations": 2, "init_count": 40, "data": data}))
+    assert train(small_lit_dataset, tmp_path / "run", config, resume=True).gaussian_count == run.gaussian_count
+    other = with_settings(config, {"strategy.cull_every": 77})
+    with pytest.raises(InputError, match=r"strategy\.cull_every 500, .* found 77"):
+        train(small_lit_dataset, tmp_path / "run", other, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("strategy", "mesh-awful", "strategy.kind: expected one of default, mesh-aware"),
+        ("mesh_aware", {"cull_evry": 3}, "strategy.cull_evry: expected one of kind, cull_every"),
+        (
+            "light",
+            {"shadow": {"method": "mapping", "mapping": {"filter": 3}}},
+            "light.shadow.method.filter: expected one",
+        ),
+        ("light", [], "light: expected a table"),
+        ("method", 3, "method: expected one of vanilla"),
+    ],
+)
+def test_what_is_broken_in_an_older_one_is_named(key, value, said):
+    with pytest.raises(InputError, match=f"config.json: {said}"):
+        TrainConfig.from_json({**OLD["demo shadow-map mesh-aware"], key: value})
+
+
+def test_settings_do_not_depend_on_their_order():
+    config = preset("fast", "shadow-map")
+    settings = {
+        "light.tone": "filmic",
+        "light.linear": True,
+        "strategy.growth": 0.5,
+        "strategy": "mcmc",
+        "light.field.inputs.view.degree": 2,
+        "light.field.inputs": "directions",
+        "light.bounce": 0,
+        "light.shadow.refine": "none",
+        "light.shadow.grazing": "none",
+    }
+    made = with_settings(config, settings)
+    assert made == with_settings(config, dict(reversed(settings.items())))
+    assert made.light.tone == "filmic"
+    assert made.strategy == McmcConfig(growth=0.5)
+    assert made.light.field.inputs == DirectionsConfig(view=replace(DirectionsConfig().view, degree=2))
+    assert (made.light.shadow.refine, made.light.shadow.grazing) == (None, "none")
+    assert with_settings(config, {}) == config
+
+
+def test_an_alternative_that_is_there_keeps_what_it_has():
+    config = preset("fast", "shadow-map")
+    assert with_settings(config, {"light.shadow.method": "mapping"}) == config
+    bilinear = with_settings(config, {"light.shadow.method": {"filter": "bilinear"}}).light.shadow.method
+    assert bilinear == replace(config.light.shadow.method, filter="bilinear")
+    splat = replace(config, method="shadow-splat", light=preset("fast", "shadow-splat").light)
+    moving = with_settings(splat, {"light.shadow.method": {"kind": "splatting", "gradients": True}})
+    assert moving.light.shadow.method == SplattingConfig(gradients=True)
+
+
+def test_light_is_that_of_the_method():
+    for method in METHODS[1:]:
+        light = preset("fast", method).light
+        for other in METHODS:
+            if other == method or {other, method} == {"shadow-splat", "baseline-park"}:
+                assert replace(preset("fast", other), light=light).light == light
+            else:
+                with pytest.raises(InputError, match=f"light: expected .* the method {other}'s, found"):
+                    replace(preset("fast", other), light=light)
+
+
+def test_the_old_word_for_the_baseline_is_known_everywhere(tiny_data, tmp_path):
+    assert preset("fast", "park") == preset("fast", "baseline-park")
+    small = {"iterations": 1, "init_count": 40, "settings": {"light.shadow.size": 16}}
+    run = ss.train(tiny_data, tmp_path / "run", preset="demo", method="park", **small)
+    assert run.config["method"] == "baseline-park"
+    assert run.config["light"]["shadow"]["size"] == 16
+    with pytest.raises(InputError, match=r"light\.shadow\.sise: expected one of method, size, .* mean size"):
+        ss.train(tiny_data, tmp_path / "other", method="park", settings={"light.shadow.sise": 16})
+
+
+@pytest.mark.parametrize("names", [{"preset": "junk"}, {"method": "relight"}, {"strategy": "mcmc"}])
+def test_a_configuration_takes_no_names_beside_it(tmp_path, names):
+    ((name, word),) = names.items()
+    with pytest.raises(InputError, match=f"{name}: expected none beside a configuration, found '{word}'"):
+        ss.train(tmp_path / "nothing", tmp_path / "run", preset("fast"), **names)
+
+
+def test_settings_are_checked_before_the_dataset_is_read(tmp_path):
+    with pytest.raises(InputError, match=r"^sede: expected"):
+        ss.train(tmp_path / "nothing", tmp_path / "run", settings={"sede": 1})
+    with pytest.raises(InputError, match=r"^iterations: expected at least 1, found 0"):
+        ss.train(tmp_path / "nothing", tmp_path / "run", iterations=0)
+
+
+def test_a_shorter_training_shortens_its_schedule():
+    """A tenth of `fast`, whose last refinement comes long before the end; a longer one goes on after it."""
+    config = replace(preset("fast", strategy="support-aware"), warm_start=warm_start("fast"))
+    short, before = shortened(config, 700), config.refinement
+    after = short.refinement
+    assert (short.iterations, short.sh_every) == (700, config.sh_every // 10)
+    assert (after.refine_start, after.pause_after_reset, after.refine_stop) == (50, 100, 500)
+    names = ("refine_every", "reset_every", "screen_size_stop", "max_gaussians")
+    assert [getattr(after, name) for name in names] == [getattr(before, name) for name in names]
+    assert short.strategy == replace(config.strategy, warm_up=50, backfill_start=100)
+    assert (short.warm_start.steps, short.warm_start.decay, short.warm_start.conservative) == (100, 100, 50)
+    assert shortened(config, 14_000) == replace(config, iterations=14_000)
+    assert with_options(config, iterations=700) == short
+    assert shortened(config, 1).sh_every == 1
+
+
+@pytest.mark.parametrize(("name", "shortest"), [("demo", 300), ("fast", 300), ("fine", 1000), ("thesis", 300)])
+def test_short_trainings_refine_and_then_go_on(name, shortest):
+    """At every length some refinement happens, and its last fifth is for what that leaves."""
+    for iterations in range(shortest, 3000, 50):
+        refinement = shortened(preset(name), iterations).refinement
+        steps = [step for step in range(0, iterations + 1, 50) if refinement.refines_at(step)]
+        assert steps
+        assert max(steps) <= 0.8 * iterations
+
+
+def test_refinement_that_would_outlast_the_training_ends_before(small_dataset):
+    for iterations, stop in ((20_000, 15_000), (150_000, 112_500), (160_000, 150_000)):
+        config = with_settings(preset("thesis"), {"iterations": iterations})
+        assert make_strategy(config, small_dataset, 1.0, 1).config.refine_stop == stop
+
+
+def test_beginnings_take_up_to_a_twentieth_of_a_short_training():
+    """A tenth of `thesis` has its last refinement in its place, and table 5.1's beginnings as they are."""
+    thesis = shortened(preset("thesis", strategy="mesh-aware"), 20_000)
+    assert (thesis.refinement.refine_start, thesis.refinement.refine_stop) == (500, 15_000)
+    assert (thesis.refinement.pause_after_reset, thesis.refinement.screen_size_stop) == (1_000, 4_000)
+    assert (thesis.sh_every, thesis.strategy.cull_every) == (1_000, 1_000)
+
+
+def test_the_command_line_and_python_shorten_alike(spacesim, tiny_data, tmp_path):
+    done = spacesim("train", tiny_data, "--out", tmp_path / "run", "--preset", "demo", "--iterations", "30")
+    assert done.code == 0, done.errors
+    by_api = ss.train(tiny_data, tmp_path / "api", preset="demo", iterations=30)
+    for run in (ss.load_run(tmp_path / "run"), by_api):
+        assert run.config["refinement"]["refine_stop"] == 20

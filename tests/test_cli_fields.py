@@ -1,0 +1,60 @@
+"""The list of fields is read off the records: nothing in it is said a second time, and nothing is left out."""
+
+import re
+from dataclasses import dataclass, fields
+
+import pytest
+
+from spacesim.cli.fields import fields_of, meanings, reference
+from spacesim.cli.train import OPTIONS
+from spacesim.splat.train.config import METHODS, STRATEGIES, TrainConfig, preset, warm_start
+from spacesim.splat.train.strategies.support_aware import SupportAwareConfig
+
+
+@dataclass(frozen=True)
+class Said:
+    """A record with comments in every way."""
+
+    behind: int = 1  #: behind it
+    bare: str = "#: in a text, no comment"
+    #: above it, on
+    #: two lines
+    above: float = 2.0
+    spread: tuple[int, int] = (
+        1,  # not this
+        2,
+    )  #: behind its end
+    both: int = 3  #: and this
+    # no meaning
+
+
+def test_comments_are_found_wherever_they_stand():
+    assert meanings(Said) == {
+        "behind": "behind it",
+        "bare": "",
+        "above": "above it, on two lines",
+        "spread": "behind its end",
+        "both": "and this",
+    }
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_every_field_has_a_meaning(method, strategy):
+    config = preset("fine", method, strategy)
+    found = list(fields_of(config))
+    assert [field.key for field in found if not field.meaning] == []
+    assert {f.name for f in fields(TrainConfig)} <= {field.key for field in found}
+    assert {key for key, _ in OPTIONS.values()} <= {field.key for field in found}
+
+
+def test_the_reference_has_a_table_for_each_record():
+    shown = reference()
+    assert shown.count("\n## ") + 1 == len(re.findall(r"^## (\w+)$", shown, re.MULTILINE)) == 18
+    row = r"| `bias` | number | `10` | strength lambda_b of the receiver-depth bias (4.26), 0 for none |"
+    assert row in shown
+    assert r"| `init` | mesh \| points \| random \| none | `none` |" in shown
+    assert "`light.shadow.method` (`splatting`)" in shown
+    own = shown.split("## SupportAwareConfig\n")[1].split("\n## ")[0]
+    assert re.findall(r"^\| `(\w+)`", own, re.MULTILINE) == [f.name for f in fields(SupportAwareConfig)]
+    assert f"| `steps` | whole number | `{warm_start('thesis').steps}` |" in shown
