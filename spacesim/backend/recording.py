@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache, update_wrapper
 from typing import Any, Generic, ParamSpec, TypeVar, overload
-from weakref import WeakSet
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -15,7 +14,7 @@ RECORDINGS = 256  #: of a function that are kept: one for each size of picture, 
 _PLAIN = frozenset((int, float, bool, str, type(None)))
 _EQUAL_TO_INTEGERS = frozenset((float, bool))  # 1, 1.0 and True are one key of a dictionary, 0.0 and -0.0 too
 MAX_KEYS = 2**14  # that are remembered of what is not an array
-_recorded: WeakSet[Any] = WeakSet()
+_made = 0  # recordings, ever
 _constants: dict[int, tuple[Any, Any]] = {}  # frozen dataclasses without arrays, by `id`: what `_split` told of them
 _leaves: set[type] = set()  # types of arguments that Dr.Jit is left to look into
 
@@ -71,7 +70,7 @@ class Recorded(Generic[P, R]):
     long to walk through these, knows an argument that occurs twice in a call by identity, and takes f(1, 2, 1) for
     f(1, 2, 2): it gets a flat list of the arrays and one text for all the rest. No array may stand in two places. What
     Dr.Jit's LLVM backend makes of a numpy array is numpy's own memory, whose kernels and recordings differ by whether
-    it happens to begin at a multiple of 64 bytes: make arguments of lists, or copy them (`gaussians.upload`).
+    it happens to begin at a multiple of 64 bytes: make arguments of lists, or copy them (`backend.upload`).
     Python's garbage collector waits during a call: arrays that it frees in the middle of a recording end the process.
 
     traced: the function itself, without a recording
@@ -87,13 +86,14 @@ class Recorded(Generic[P, R]):
         now = self._now = _Arguments()
 
         def replay(_: str, arrays: list[Any]) -> Any:
+            global _made
+            _made += 1
             rest = iter(arrays)
             return function(*_joined(now.arguments, rest), **_joined(now.named, rest))
 
         # who looks around for hours makes more recordings than are kept, and need not hear of it
         self._frozen = dr.freeze(replay, limit=limit, warn_after=2**31 - 1)
         self._has_gradients, self._flag, self._scope = dr.grad_enabled, dr.flag, dr.JitFlag.FreezingScope
-        _recorded.add(self._frozen)
 
     def __call__(self, *arguments: P.args, **named: P.kwargs) -> R:
         if self._flag(self._scope):
@@ -225,5 +225,5 @@ def _names(kind: Any) -> tuple[str, ...] | None:
 
 
 def recordings() -> int:
-    """How many recordings the functions of `recorded` that are alive have made: once warm, it stands still."""
-    return sum(frozen.n_recordings for frozen in _recorded)
+    """How many recordings the functions of `recorded` have made: once warm, it stands still."""
+    return _made
