@@ -1,0 +1,158 @@
+"""What every importer ends with: frames from elsewhere, written as a dataset."""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from spacesim.data.errors import InputError
+from spacesim.data.files import (
+    MAX_LIST_BYTES,
+    flush_disks,
+    holds_files,
+    json_bytes,
+    read_bytes,
+    read_json,
+    remove_leftovers,
+    write_bytes,
+    write_json,
+)
+from spacesim.data.images import write_png
+from spacesim.data.integrity.manifest import write_manifest
+from spacesim.data.lock import lock_folder
+from spacesim.data.records import Camera, Dataset, Sun
+from spacesim.data.store import write_points
+from spacesim.data.transforms import dataset_of, read_dataset
+
+SOURCE = "import.json"  #: of a dataset: where it comes from and what was asked for; written first
+Picture = Path | Callable[[], np.ndarray]
+"""A file, copied as it is, or what makes pixels when they are written: uint8 [H, W], [H, W, 3] or [H, W, 4]."""
+Progress = Callable[[int, int, str], None]
+"""Called with how many pictures are written, of how many, and the name of the last."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedFrame:
+    """A view from elsewhere."""
+
+    name: str  #: relative path without suffix, below images/: each once
+    picture: Picture  #: as `camera` and `distortion` say; with alpha where it is known to be empty around the object
+    camera: Camera
+    distortion: tuple[float, ...] = ()  #: as of `Frame`
+    sun: Sun | None = None
+    silhouette: Picture | None = None  #: 255 object, 0 none: a pixel without is empty
+    mask: Picture | None = None  #: 255 counts, 0: ignore this pixel, nothing is known of it
+    keys: Mapping[str, Any] = field(default_factory=dict)  #: that transforms.json has of the frame besides
+
+
+def write_dataset(
+    out: str | Path,
+    train: Sequence[ImportedFrame],
+    test: Sequence[ImportedFrame],
+    source: Mapping[str, Any],
+    points: tuple[np.ndarray, np.ndarray] | None = None,
+    files: Mapping[str, bytes] | None = None,
+    progress: Progress | None = None,
+) -> Dataset:
+    """Write frames from elsewhere into the folder `out` as a dataset, transforms.json last; returns it as read back.
+
+    train, test: where there are none to test with, every 8th frame is held out (`data.transforms`)
+    source: what import.json says: the kind of import, from where, its options
+    points: (positions [N, 3] metres, colours [N, 3] uint8) to start training from
+    files: others by their names in `out`: pictures of the cameras, reports
+    Where an earlier import of the same source was interrupted, it is begun anew in its folder. Raises InputError where
+    `out` holds anything else, where a picture cannot be read, and where no frame is left.
+    """
+    out, files, source = Path(out), dict(files or {}), json.loads(json_bytes(dict(source)))
+    frames = [*train, *test]
+    if not train:
+        raise InputError(f"{source.get('source', out)}: expected frames to train on, found none")
+    with lock_folder(out):
+        _claim(out, source)
+        paths = [SOURCE]
+        entries = []
+        for number, frame in enumerate(frames, start=1):
+            entry = _entry(frame)
+            entries.append(entry)
+            paths += [_write(out, frame.picture, entry["file_path"])]
+            for key in ("silhouette", "mask"):
+                picture = getattr(frame, key)
+                if picture is not None:
+                    paths.append(_write(out, picture, entry[f"{key}_path"]))
+            if progress is not None:
+                progress(number, len(frames), frame.name)
+        meta: dict[str, Any] = {"camera_model": "OPENCV", "frames": entries}
+        if test:
+            meta |= {
+                f"{split}_filenames": [_entry(frame)["file_path"] for frame in group]
+                for split, group in (("train", train), ("test", test))
+            }
+        if points is not None and len(points[0]):
+            write_points(out / "points.ply", *points)
+            meta["ply_file_path"] = "points.ply"
+            paths.append("points.ply")
+        for name, content in files.items():
+            write_bytes(out / name, content)
+            paths.append(name)
+        path, content = out / "transforms.json", json_bytes(meta)
+        dataset_of(path, meta)  # what reads it has no complaint
+        write_manifest(out, paths, {path.name: hashlib.sha256(content).hexdigest()})
+        flush_disks()
+        write_bytes(path, content)
+    return read_dataset(out)
+
+
+def _claim(out: Path, source: Mapping[str, Any]) -> None:
+    """Write import.json into a new folder, or into that of an import that has not ended."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: expected a folder to write to, found a file")
+    path = out / SOURCE
+    if path.is_file() and not (out / "transforms.json").exists():
+        if read_json(path, MAX_LIST_BYTES) != source:
+            raise InputError(f"{out}: expected a new or empty folder, found an unfinished import of something else")
+        remove_leftovers(out)
+    elif holds_files(out):
+        raise InputError(f"{out}: expected a new or empty folder, found files in it")
+    else:
+        write_json(path, dict(source))
+
+
+def _entry(frame: ImportedFrame) -> dict[str, Any]:
+    """Of transforms.json."""
+    camera, suffix = frame.camera, frame.picture.suffix.lower() if isinstance(frame.picture, Path) else ".png"
+    entry: dict[str, Any] = {
+        "file_path": f"images/{frame.name}{suffix}",
+        "transform_matrix": camera.opengl.tolist(),
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+    }
+    entry |= dict(zip(("k1", "k2", "p1", "p2", "k3"), frame.distortion, strict=False))
+    if frame.sun is not None:
+        azimuth, elevation = frame.sun.angles
+        entry |= {"sun_direction": frame.sun.direction.tolist()}
+        entry |= {"sun_azimuth_deg": azimuth, "sun_elevation_deg": elevation}
+    for key in ("silhouette", "mask"):
+        picture = getattr(frame, key)
+        if picture is not None:
+            of_picture = picture.suffix.lower() if isinstance(picture, Path) else ".png"
+            entry[f"{key}_path"] = f"{key}/{frame.name}{of_picture}"
+    return entry | dict(frame.keys)
+
+
+def _write(out: Path, picture: Picture, name: str) -> str:
+    """Write a picture below `out` under the name of transforms.json, which is returned."""
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        raise InputError(f"{name}: expected a name below the dataset's folder, found another")
+    if isinstance(picture, Path):
+        write_bytes(out / name, read_bytes(picture, "a picture"), durable=False)
+    else:
+        write_png(out / name, picture(), durable=False)
+    return name
