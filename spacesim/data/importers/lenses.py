@@ -1,7 +1,7 @@
 """COLMAP's camera models: where a lens images a direction, and what a pinhole camera sees of its pictures.
 
-Parameters are those of https://colmap.github.io/cameras.html, in its order. (x, y, 1) is a direction in the camera's axes
-(OpenCV's), and the picture is at a distance of one focal length.
+Parameters are those of https://colmap.github.io/cameras.html, in its order. (x, y, 1) is a direction in the axes of the
+camera (OpenCV's).
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from spacesim.data.images import Resampling, distort_points
 _AZIMUTHS, _STEPS = 64, 2048  # rays and steps along each, on which a lens is followed outwards
 _SMALL = 1e-12
 
-Mapping = Callable[[Array, Array, Sequence[float]], tuple[Array, Array]]
+Projection = Callable[[Array, Array, Sequence[float]], tuple[Array, Array]]
 """(x, y, parameters but focal lengths and principal point) of directions (x, y, 1) to where they are imaged."""
 
 
@@ -115,7 +115,7 @@ class LensModel:
     name: str
     focal_lengths: int  #: 1, or 2: fx, fy
     others: int  #: further parameters
-    mapping: Mapping
+    mapping: Projection
 
 
 LENS_MODELS: dict[int, LensModel] = {
