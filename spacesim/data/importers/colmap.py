@@ -121,7 +121,7 @@ def _find_pictures(
     else:
         where = given or places[0]
         raise InputError(
-            f"{where}: expected the pictures of {folder} ({images[0].name}), found none; name their folder with images"
+            f"{where}: expected the pictures of {folder} ({images[0].name}), found none; name their folder (images)"
         )
     if len(found) < len(images):
         first = next(image.name for image in images if image.name not in found)

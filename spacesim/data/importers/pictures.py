@@ -75,16 +75,17 @@ class FrameMaker:
         """uint8, with the file's channels."""
         pixels = read_png(view.path)
         values = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
-        shape = values.shape[:2]
-        alpha = values[..., 3] if values.shape[2] == 4 else np.ones(shape, np.float32)
-        if values.shape[2] == 4 and view.mask is not None and self.masked == "empty":
+        source = self._resampling(view.lens) if view.lens.distortion is None else None
+        if values.shape[2] < 4:
+            shown = values if source is None else source.linear(values)
+            return np.rint(255 * shown[..., 0] if shown.shape[2] == 1 else 255 * shown).astype(np.uint8)
+        alpha = values[..., 3]
+        if view.mask is not None and self.masked == "empty":
             alpha = alpha * read_mask(view.mask, view.lens.width, view.lens.height)
-        image = Image(np.broadcast_to(values[..., :3], (*shape, 3)), alpha, np.ones(shape, bool))
-        if view.lens.distortion is None:
-            image = resample(image, self._resampling(view.lens))
-        rgb = image.rgb[..., 0] if values.shape[2] == 1 else image.rgb
-        planes = np.concatenate([rgb, image.alpha[..., None]], axis=-1) if values.shape[2] == 4 else rgb
-        return np.rint(255 * planes).astype(np.uint8)
+        image = Image(values[..., :3], alpha, np.ones(alpha.shape, bool))
+        if source is not None:
+            image = resample(image, source)
+        return np.rint(255 * np.concatenate([image.rgb, image.alpha[..., None]], axis=-1)).astype(np.uint8)
 
     def _silhouette(self, view: View) -> np.ndarray:
         """255 object, 0 none."""
