@@ -5,7 +5,7 @@ from typing import Any
 
 from spacesim.data.errors import InputError
 from spacesim.data.importers import colmap, nerfstudio
-from spacesim.data.importers.importer import Importer
+from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.writing import Progress
 from spacesim.data.records import Dataset
 from spacesim.data.structure import did_you_mean
@@ -16,6 +16,8 @@ KINDS: dict[str, Importer] = {
     "colmap": colmap.COLMAP,
 }
 """By their names on the command line."""
+
+_TYPES: dict[Any, Any] = {float: (float, int), int: int, str: str, bool: bool, Path: Path}
 
 
 def import_dataset(
@@ -29,11 +31,23 @@ def import_dataset(
         raise InputError(f"kind: expected one of {', '.join(KINDS)}, found {kind!r}{did_you_mean(kind, KINDS)}")
     importer = KINDS[kind]
     known = {option.name: option for option in importer.options}
-    for name, value in options.items():
+    for name in options:
         if name not in known:
             names = f"one of {', '.join(known)}" if known else "none"
             raise InputError(f"{name}: expected options of {kind}, {names}, found another{did_you_mean(name, known)}")
-        choices = known[name].choices
-        if choices and value not in choices:
-            raise InputError(f"{name}: expected one of {', '.join(choices)}, found {value!r}")
-    return importer.function(Path(src), Path(out), progress=progress, **options)
+    given = {name: _value(known[name], value) for name, value in options.items() if value is not None}
+    return importer.function(Path(src), Path(out), progress=progress, **given)
+
+
+def _value(option: Option, value: Any) -> Any:
+    """Of an option, which may be text as on the command line. Raises InputError for one of another type."""
+    wanted = _TYPES.get(option.type, object)
+    try:
+        read = option.type(value) if isinstance(value, str) and option.type is not bool else value
+    except (TypeError, ValueError):
+        read = None
+    if read is None or not isinstance(read, wanted) or (isinstance(read, bool) and option.type is not bool):
+        raise InputError(f"{option.name}: expected {option.value or 'True or False'}, found {value!r}")
+    if option.choices and read not in option.choices:
+        raise InputError(f"{option.name}: expected one of {', '.join(option.choices)}, found {value!r}")
+    return read

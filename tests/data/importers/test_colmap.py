@@ -223,7 +223,7 @@ def test_masked_pixels_are_empty(tmp_path, ending, size, mode):
 
 def test_masked_pixels_are_unknown(tmp_path):
     write_masks(tmp_path / "masks", [f"view {k}.png" for k in range(5)])
-    dataset = imported(project(tmp_path / "src"), tmp_path / "out", masks=tmp_path / "masks", masked="unknown")
+    dataset = imported(project(tmp_path / "src"), tmp_path / "out", masks=str(tmp_path / "masks"), masked="unknown")
     for frame in dataset.frames:
         image = ss.load_image(dataset, frame)
         np.testing.assert_array_equal(image.valid, np.repeat([[True] * 8 + [False] * 8], 12, axis=0))

@@ -252,8 +252,12 @@ def test_wrong_kinds_and_options(tmp_path, caplog):
         ss.import_dataset("nerf", root, tmp_path / "out")
     with pytest.raises(InputError, match="depth_unit: expected metres above 0, found -1"):
         ss.import_dataset("nerfstudio", root, tmp_path / "out", depth_unit=-1.0)
+    for wrong in ("deep", [1], True):
+        with pytest.raises(InputError, match="depth_unit: expected M, found"):
+            ss.import_dataset("nerfstudio", root, tmp_path / "out", depth_unit=wrong)
     with pytest.raises(InputError, match=r"expected a folder with transforms_train\.json, found none"):
         ss.import_dataset("blender", root, tmp_path / "out")
+    assert len(ss.import_dataset("nerfstudio", str(root), str(tmp_path / "out"), depth_unit="0.01").frames) == 2
 
 
 def test_training_takes_what_was_imported(spacesim, tmp_path):
