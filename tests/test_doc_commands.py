@@ -37,7 +37,7 @@ HAS_VISER = importlib.util.find_spec("viser") is not None
 
 VALUES = {  # what stands in a command for a value
     **{"N": "2", "PX": "24", "K": "1", "NAME": "boxsat", "FILE": "boxsat", "AZ,EL": "40,25", "NAME=RUN": "none=RUN"},
-    **{"KEY=VALUE": "seed=3"},
+    **{"KEY=VALUE": "seed=3", "KIND": "nerfstudio", "SRC": "DATA"},
     **{"GAUSSIANSxPIXELS,...": "300x32", "GAUSSIANSxPIXELS": "300x32", "PATH": "opensplat"},
 }
 FILES = {"DATA", "RUN", "RUNS", "EVAL", "DIR", "OUT", "PAIR", "BOXSAT", "URL"}
@@ -265,6 +265,8 @@ def test_usages_are_expanded():
 def test_options_that_sentences_name_exist(monkeypatch, capsys):
     names = re.findall(r"^    ([a-z]+)\b", call("--help").output, re.MULTILINE)
     helps = [call(name, "--help").output for name in names]
+    kinds = re.findall(r"^    ([a-z]+)\b", call("import", "--help").output, re.MULTILINE)
+    helps += [call("import", kind, "--help").output for kind in kinds]
     for script in sorted({command.program for command in EVERY} - {"spacesim"}):
         if takes_arguments(script) and can_be_read(script):
             with pytest.raises(SystemExit):
