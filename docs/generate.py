@@ -231,15 +231,23 @@ def materials_page() -> str:
 def command_page() -> str:
     """The help of every command."""
     overview = help_of()
-    names = re.findall(r"^    ([a-z]+) ", overview, re.MULTILINE)
+    names = [(name,) for name in commands_in(overview)]
+    kinds = [("import", kind) for kind in commands_in(help_of("import"))]
+    at = names.index(("import",)) + 1
+    names[at:at] = kinds
     parts = [
         "# Command line",
         "The help of every command. Exit codes: 0 done, 1 the work failed, 2 bad usage or bad input: one sentence "
         "names the file or option, what was expected and what was found.",
         block(overview),
-        *(f"## spacesim {name}\n\n{block(help_of(name))}" for name in names),
+        *(f"## spacesim {' '.join(name)}\n\n{block(help_of(*name))}" for name in names),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def commands_in(text: str) -> list[str]:
+    """Names of the commands that a help lists."""
+    return re.findall(r"^    ([a-z]+)\b", text, re.MULTILINE)
 
 
 def help_of(*words: str) -> str:

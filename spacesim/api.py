@@ -52,6 +52,7 @@ __all__ = [
     "compose",
     "evaluate",
     "generate",
+    "import_dataset",
     "load_image",
     "load_run",
     "load_scene",
@@ -93,6 +94,24 @@ def generate(
     elif options:
         raise InputError(f"{next(iter(options))}: expected no options beside a scene that has been read, found one")
     return _generate(scene, Path(out), resume, progress, workers)
+
+
+def import_dataset(
+    kind: str, src: str | Path, out: str | Path, *, progress: ProgressCallback | None = None, **options: Any
+) -> Dataset:
+    """Write pictures from elsewhere as a dataset into the folder `out` (docs/reference/dataset.md#data-from-elsewhere).
+
+    kind: "nerfstudio", "blender", ...: those of `spacesim import --help`
+    src: the folder or file that they lie in
+    options: of the kind, as `spacesim import KIND --help` has them, with underscores: masks="masks"
+    progress: called with (pictures written, pictures in all, name of the last)
+
+    Where an earlier import of the same source was interrupted, it begins anew. Raises InputError for a kind, a source
+    or an option that cannot be, and for a folder that holds anything else.
+    """
+    from spacesim.data.importers.kinds import import_dataset as run_import
+
+    return run_import(kind, src, out, progress, **options)
 
 
 def train(

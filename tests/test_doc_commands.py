@@ -265,6 +265,8 @@ def test_usages_are_expanded():
 def test_options_that_sentences_name_exist(monkeypatch, capsys):
     names = re.findall(r"^    ([a-z]+)\b", call("--help").output, re.MULTILINE)
     helps = [call(name, "--help").output for name in names]
+    kinds = re.findall(r"^    ([a-z]+)\b", call("import", "--help").output, re.MULTILINE)
+    helps += [call("import", kind, "--help").output for kind in kinds]
     for script in sorted({command.program for command in EVERY} - {"spacesim"}):
         if takes_arguments(script) and can_be_read(script):
             with pytest.raises(SystemExit):

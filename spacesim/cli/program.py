@@ -16,6 +16,7 @@ from types import ModuleType
 from spacesim import __version__, backend
 from spacesim.cli import compose, demo, doctor, export, generate, render, report, reproduce, sweep, train, verify, view
 from spacesim.cli import eval as evaluate
+from spacesim.cli import import_ as import_command
 from spacesim.cli.parser import Parser
 from spacesim.data.errors import InputError, WorkError
 
@@ -23,6 +24,7 @@ COMMANDS: dict[str, ModuleType] = {
     "doctor": doctor,
     "demo": demo,
     "generate": generate,
+    "import": import_command,
     "train": train,
     "eval": evaluate,
     "report": report,
