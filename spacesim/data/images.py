@@ -201,7 +201,11 @@ def undistort(image: Image, camera: Camera, distortion: tuple[float, ...]) -> Im
     distortion: see `distort_points`. Colours are weighted by alpha, so that none bleeds in from where alpha is 0.
     Pixels that are not valid are opaque black.
     """
-    source = Undistortion(camera, distortion)
+    return resample(image, Undistortion(camera, distortion))
+
+
+def resample(image: Image, source: "Resampling") -> Image:
+    """`image` in the pixels of `source`, as `undistort`."""
     alpha = source.linear(image.alpha)
     weighted = source.linear(image.rgb * image.alpha[..., None])
     rgb = np.clip(weighted / np.where(alpha > 0, alpha, 1)[..., None], 0, 1)
@@ -214,22 +218,14 @@ def _without_ignored(rgb: np.ndarray, alpha: np.ndarray, valid: np.ndarray) -> t
     return np.where(valid[..., None], rgb, np.float32(0)), np.where(valid, alpha, np.float32(1))
 
 
-class Undistortion:
-    """Pictures of a lens, resampled to what the pinhole `camera` sees. inside: [H, W] bool, where the lens sees it.
+class Resampling:
+    """Pictures resampled to another camera's pixels. inside: [H, W] bool of the new one, where the old one has any.
 
-    distortion: see `distort_points`.
+    columns, rows: [H, W] where each new pixel lies in the old picture, 0 at the centre of its first pixel
     """
 
-    def __init__(self, camera: Camera, distortion: tuple[float, ...]) -> None:
-        x = (np.arange(camera.width) + 0.5 - camera.cx)[None, :] / camera.fx
-        y = (np.arange(camera.height) + 0.5 - camera.cy)[:, None] / camera.fy
-        u, v = distort_points(x, y, distortion)
-        self._columns, self._rows = u * camera.fx + camera.cx - 0.5, v * camera.fy + camera.cy - 0.5
-        self.inside = (self._columns >= -0.5) & (self._columns <= camera.width - 0.5)
-        self.inside &= (self._rows >= -0.5) & (self._rows <= camera.height - 0.5)
-        k1, k2, _, _, k3 = distortion
-        r2 = x * x + y * y
-        self.inside &= 1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) > 0  # past this the model folds back on itself
+    def __init__(self, columns: np.ndarray, rows: np.ndarray, inside: np.ndarray) -> None:
+        self._columns, self._rows, self.inside = columns, rows, inside
 
     def linear(self, picture: np.ndarray) -> np.ndarray:
         """`picture` [H, W] or [H, W, C] resampled bilinearly, float32; 0 outside."""
@@ -241,11 +237,30 @@ class Undistortion:
 
     def nearest(self, labels: np.ndarray) -> np.ndarray:
         """The nearest pixels' values of `labels` [H, W] or [H, W, C], none averaged, of the same type; 0 outside."""
-        height, width = self.inside.shape
+        height, width = labels.shape[:2]
         rows = np.rint(np.where(self.inside, self._rows, 0)).astype(np.intp).clip(0, height - 1)
         columns = np.rint(np.where(self.inside, self._columns, 0)).astype(np.intp).clip(0, width - 1)
         inside = self.inside if labels.ndim == 2 else self.inside[..., None]
         return np.where(inside, labels[rows, columns], np.zeros((), labels.dtype))
+
+
+class Undistortion(Resampling):
+    """Pictures of a lens, resampled to what the pinhole `camera` sees. inside: where the lens sees it.
+
+    distortion: see `distort_points`.
+    """
+
+    def __init__(self, camera: Camera, distortion: tuple[float, ...]) -> None:
+        x = (np.arange(camera.width) + 0.5 - camera.cx)[None, :] / camera.fx
+        y = (np.arange(camera.height) + 0.5 - camera.cy)[:, None] / camera.fy
+        u, v = distort_points(x, y, distortion)
+        columns, rows = u * camera.fx + camera.cx - 0.5, v * camera.fy + camera.cy - 0.5
+        inside = (columns >= -0.5) & (columns <= camera.width - 0.5)
+        inside &= (rows >= -0.5) & (rows <= camera.height - 0.5)
+        k1, k2, _, _, k3 = distortion
+        r2 = x * x + y * y
+        inside &= 1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) > 0  # past this the model folds back on itself
+        super().__init__(columns, rows, inside)
 
 
 def distort_points(x: Any, y: Any, distortion: Sequence[Any]) -> tuple[Any, Any]:

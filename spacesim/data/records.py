@@ -184,6 +184,9 @@ class Dataset:
     ply_file_path: str | None = None  #: points to start from
     mesh_path: str | None = None  #: the ground-truth mesh, world frame, metres
     scene: Mapping[str, Any] = field(default_factory=dict)  #: scene.json, {} for data from elsewhere
+    missing: tuple[
+        str, ...
+    ] = ()  #: images that transforms.json names and that are not there: their frames are left out
 
     @property
     def frames(self) -> tuple[Frame, ...]:

@@ -283,7 +283,7 @@ def find_unreadable_files(path: Path) -> list[str]:
         dataset = read_dataset(path)
     except InputError as error:
         return [str(error)]
-    problems: list[str] = []
+    problems = [f"{dataset.root / name}: expected an image file, found none" for name in dataset.missing]
 
     def check(load: Any, *arguments: Any) -> None:
         try:

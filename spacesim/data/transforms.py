@@ -6,8 +6,11 @@ Blender's pair transforms_train.json and transforms_test.json is taken too. Pose
 1. those of `test_filenames`, else of `val_filenames`, where transforms.json has such lists;
 2. else those in a folder named test, else val, where there is a folder named train beside it;
 3. else every 8th frame, beginning with the first, in the order of their file paths.
+
+Frames whose image is not there are left out, with a warning that counts them.
 """
 
+import logging
 import math
 from collections.abc import Mapping
 from itertools import pairwise
@@ -28,38 +31,67 @@ _HOLD_OUT = 8
 _SPLITS = ("train", "val", "test")
 
 Json = Mapping[str, Any]
+_log = logging.getLogger(__name__)
 
 
 def read_dataset(path: str | Path) -> Dataset:
     """The dataset in a folder, or of the transforms.json named.
 
     Raises InputError, naming the file, where it is no such dataset: nothing there, an unfinished `generate`,
-    malformed JSON, no frames, a missing image, a pose or a camera that cannot be, or a camera model with no
+    malformed JSON, no frames, none with an image, a pose or a camera that cannot be, or a camera model with no
     pinhole equivalent. Files of truth are only looked for when they are loaded.
     """
     path = Path(path)
     root = path if path.is_dir() else path.parent
     source = root / "transforms.json" if path.is_dir() else path
     if source.is_file() and source.name != "transforms_train.json":
-        return dataset_of(source, _read_object(source))
+        return dataset_of(source, read_object(source))
     if (root / "transforms_train.json").is_file():
-        meta, train, test = _read_blender(root)
-    else:
-        raise InputError(_say_what_is_missing(path, root))
-    return _dataset(source, meta, train, test)
+        return dataset_of_pair(root, *read_pair(root))
+    raise InputError(_say_what_is_missing(path, root))
 
 
 def dataset_of(path: Path, meta: Json) -> Dataset:
     """The dataset whose transforms.json, at `path`, says or will say `meta`. Raises InputError as `read_dataset`."""
-    return _dataset(path, meta, *_split(path, meta, _read_frames(path, meta)))
+    frames, missing = _read_frames(path, meta)
+    _warn_of_missing(path, missing, len(frames))
+    return _dataset(path, meta, *_split(path, meta, frames, missing), missing)
 
 
-def _dataset(path: Path, meta: Json, train: tuple[Frame, ...], test: tuple[Frame, ...]) -> Dataset:
+def read_pair(root: Path) -> tuple[Json, tuple[str, Json] | None]:
+    """(content of transforms_train.json, (name, content) of transforms_test.json, else of transforms_val.json) of a
+    folder laid out as Blender's scenes are."""
+    held_out = next((p for p in (root / "transforms_test.json", root / "transforms_val.json") if p.is_file()), None)
+    of_test = (held_out.name, read_object(held_out)) if held_out else None
+    return read_object(root / "transforms_train.json"), of_test
+
+
+def dataset_of_pair(root: Path, meta: Json, held_out: tuple[str, Json] | None) -> Dataset:
+    """The dataset of what `read_pair` returns. Raises InputError as `read_dataset`."""
+    source = root / "transforms_train.json"
+    train, missing = _read_frames(source, meta)
+    test, missing_test = _read_frames(root / held_out[0], held_out[1]) if held_out else ((), ())
+    _warn_of_missing(source, missing + missing_test, len(train) + len(test))
+    return _dataset(source, meta, train, test, missing + missing_test)
+
+
+def _warn_of_missing(source: Path, missing: tuple[str, ...], found: int) -> None:
+    if missing:
+        count = len(missing) + found
+        _log.warning(
+            "%s: %d of %d frames have no image and are left out, %s first", source, len(missing), count, missing[0][:200]
+        )
+
+
+def _dataset(
+    path: Path, meta: Json, train: tuple[Frame, ...], test: tuple[Frame, ...], missing: tuple[str, ...]
+) -> Dataset:
     if not train:
         raise InputError(f"{path}: expected frames to train on, found none")
     root = path.parent
-    scene = _read_object(root / "scene.json") if (root / "scene.json").exists() else {}
-    return Dataset(root, train, test, _path(path, meta, "ply_file_path"), _path(path, meta, "mesh_path"), scene)
+    scene = read_object(root / "scene.json") if (root / "scene.json").exists() else {}
+    points, mesh = (_path(path, meta, key) for key in ("ply_file_path", "mesh_path"))
+    return Dataset(root, train, test, points, mesh, scene, missing)
 
 
 def read_camera(path: Path) -> Camera:
@@ -68,7 +100,7 @@ def read_camera(path: Path) -> Camera:
     A whole transforms.json is taken too: its first frame counts. Raises InputError where a key is missing or
     broken.
     """
-    values = dict(_read_object(path))
+    values = dict(read_object(path))
     frames = values.pop("frames", None)
     if isinstance(frames, list) and frames and isinstance(frames[0], dict):
         values |= frames[0]
@@ -89,45 +121,47 @@ def _say_what_is_missing(path: Path, root: Path) -> str:
     return f"{path}: expected a dataset folder with a transforms.json, found none in it"
 
 
-def _read_blender(root: Path) -> tuple[Json, tuple[Frame, ...], tuple[Frame, ...]]:
-    """(content of transforms_train.json, train, test) of a folder laid out as Blender's scenes are."""
-    source = root / "transforms_train.json"
-    meta = _read_object(source)
-    held_out = next((p for p in (root / "transforms_test.json", root / "transforms_val.json") if p.is_file()), None)
-    test = _read_frames(held_out, _read_object(held_out)) if held_out else ()
-    return meta, _read_frames(source, meta), test
-
-
-def _read_object(path: Path) -> Json:
+def read_object(path: Path) -> Json:
+    """The JSON object in a file. Raises InputError for anything else."""
     value = read_json(path, MAX_LIST_BYTES)
     if not isinstance(value, dict):
         raise InputError(f"{path}: expected a JSON object, found {type(value).__name__}")
     return value
 
 
-def _read_frames(source: Path, meta: Json) -> tuple[Frame, ...]:
-    """All frames in the order of their file paths."""
+def _read_frames(source: Path, meta: Json) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
+    """(all frames with an image, paths of the images that are not there), each in the order of their file paths."""
     entries = meta.get("frames")
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{source}: expected a list of frames, found {'none' if not entries else 'another value'}")
-    frames = sorted((_read_frame(source, meta, entry) for entry in entries), key=lambda frame: frame.file_path)
-    for first, second in pairwise(frames):
-        if first.file_path == second.file_path:
-            raise InputError(f"{source}: expected each image once, found {first.file_path} twice")
-    return tuple(frames)
+    named = sorted(((image_path(source, entry), entry) for entry in entries), key=lambda pair: pair[0])
+    for (first, _), (second, _) in pairwise(named):
+        if first == second:
+            raise InputError(f"{source}: expected each image once, found {first} twice")
+    there = [is_file(source.parent / path) for path, _ in named]
+    if not any(there):
+        path = named[0][0]
+        raise InputError(f"{source}: frame {path}: expected an image file, found none, nor one of any other frame")
+    frames = [
+        _read_frame(source, meta, entry, path) for (path, entry), it_is in zip(named, there, strict=True) if it_is
+    ]
+    return tuple(frames), tuple(path for (path, _), it_is in zip(named, there, strict=True) if not it_is)
 
 
-def _read_frame(source: Path, meta: Json, entry: Json) -> Frame:
+def image_path(source: Path, entry: Json) -> str:
+    """Of a frame, relative to the folder of `source`."""
     file_path = _path(source, entry, "file_path")
     if file_path is None:
         raise InputError(f"{source}: expected file_path in every frame, found a frame without")
-    if not _is_file(source.parent / file_path) and _is_file(source.parent / f"{file_path}.png"):
+    if not is_file(source.parent / file_path) and is_file(source.parent / f"{file_path}.png"):
         file_path += ".png"  # Blender's files leave the suffix out
+    return file_path
+
+
+def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
     image = source.parent / file_path
     values = _without_nulls({**meta, **entry})
     try:
-        if not _is_file(image):
-            raise InputError("expected an image file, found none")
         camera, distortion, sun = _read_camera(values, image), _read_distortion(values), _read_sun(values)
     except InputError as error:
         raise InputError(f"{source}: frame {file_path}: {error}") from None
@@ -195,11 +229,13 @@ def _read_sun(values: Json) -> Sun | None:
     return None
 
 
-def _split(source: Path, meta: Json, frames: tuple[Frame, ...]) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
-    """(train, test) of `frames` by the rules above."""
+def _split(
+    source: Path, meta: Json, frames: tuple[Frame, ...], missing: tuple[str, ...]
+) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+    """(train, test) of `frames` by the rules above. missing: paths of frames that are left out"""
     paths = [frame.file_path for frame in frames]
     lists = {key: meta.get(f"{key}_filenames") for key in _SPLITS}
-    listed = {key: _listed(source, names, paths) for key, names in lists.items() if names is not None}
+    listed = {key: _listed(source, names, paths, missing) for key, names in lists.items() if names is not None}
     folders = {key: {path for path in paths if key in PurePosixPath(path).parts[:-1]} for key in _SPLITS}
     if listed:
         test = listed.get("test", listed.get("val"))
@@ -216,19 +252,21 @@ def _split(source: Path, meta: Json, frames: tuple[Frame, ...]) -> tuple[tuple[F
     return tuple(f for f in frames if f.file_path in train), tuple(f for f in frames if f.file_path in test)
 
 
-def _listed(source: Path, names: Any, paths: list[str]) -> set[str]:
-    """The file paths of a list such as `train_filenames`, each of which must be one of a frame."""
+def _listed(source: Path, names: Any, paths: list[str], missing: tuple[str, ...]) -> set[str]:
+    """The file paths of a list such as `train_filenames`, each of which must be one of a frame, without those that are
+    missing."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{source}: expected lists of file paths as train_filenames and the like")
     listed = {f"{PurePosixPath(name)}" for name in names}
-    listed = {name if name in paths else f"{name}.png" for name in listed}
+    listed = {name if name in paths else f"{name}.png" for name in listed.difference(missing)}
     unknown = sorted(listed.difference(paths))
     if unknown:
         raise InputError(f"{source}: expected a frame for each name in its lists, found none for {unknown[0]}")
     return listed
 
 
-def _is_file(path: Path) -> bool:
+def is_file(path: Path) -> bool:
+    """There is a file of this name, which may be one that no file can have."""
     try:
         return path.is_file()
     except (OSError, ValueError):  # a name that is too long, or has a null in it

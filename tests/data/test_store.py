@@ -317,6 +317,8 @@ def test_verify_tells_all_that_is_wrong(root):
         assert name in problem
         assert "\n" not in problem
     (root / "images/train_00000.png").unlink()
+    assert "images/train_00000.png: expected an image file, found none" in find_unreadable_files(root)[0]
+    (root / "transforms.json").write_text("{}")
     assert len(find_unreadable_files(root)) == 1  # not even to be read
 
 

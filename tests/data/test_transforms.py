@@ -8,6 +8,7 @@ from PIL import Image as PillowImage
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
+from spacesim.data.store import find_unreadable_files
 from spacesim.data.transforms import read_dataset
 
 POSE = [[1, 0, 0, 0.5], [0, 0, -1, -4], [0, 1, 0, 1], [0, 0, 0, 1]]
@@ -48,6 +49,23 @@ def test_camera_and_pose(tmp_path):
 def test_the_json_itself_may_be_named(tmp_path):
     write_folder(tmp_path, ["images/a.png", "images/b.png"], name="cameras.json")
     assert names_of(read_dataset(tmp_path / "cameras.json").frames) == ["images/b.png", "images/a.png"]
+
+
+def test_frames_without_an_image_are_left_out_with_one_warning(tmp_path, caplog):
+    names = [f"images/{k}.png" for k in range(6)]
+    write_folder(tmp_path, names, train_filenames=names[:5], test_filenames=names[5:])
+    for k in (1, 4):
+        (tmp_path / names[k]).unlink()
+    dataset = read_dataset(tmp_path)
+    assert names_of(dataset.train) == ["images/0.png", "images/2.png", "images/3.png"]
+    assert names_of(dataset.test) == ["images/5.png"]
+    assert dataset.missing == ("images/1.png", "images/4.png")
+    (record,) = caplog.records
+    path = tmp_path / "transforms.json"
+    assert record.getMessage() == f"{path}: 2 of 6 frames have no image and are left out, images/1.png first"
+    assert [problem.split(":")[0] for problem in find_unreadable_files(tmp_path)] == [
+        str(tmp_path / name) for name in dataset.missing
+    ]
 
 
 def test_intrinsics_of_the_frame_win(tmp_path):
@@ -161,8 +179,8 @@ NAN_POSE = [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (lambda m: m["frames"][0].pop("file_path"), "file_path"),
         (lambda m: m["frames"][0].update(file_path=7), "file path as file_path, found 7"),
         (
-            lambda m: m["frames"][0].update(file_path="images/absent.png"),
-            "absent.png: expected an image file",
+            lambda m: [frame.update(file_path=f"images/absent{k}.png") for k, frame in enumerate(m["frames"])],
+            "absent0.png: expected an image file, found none, nor one of any other frame",
         ),
         (lambda m: m["frames"].append(m["frames"][0]), "images/a.png twice"),
         (set_pose(NAN_POSE), "images/a.png: expected a transform_matrix of 4x4 finite"),
@@ -184,7 +202,7 @@ NAN_POSE = [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (lambda m: m.update(w=10**400), "expected a finite number as w"),
         (lambda m: m["frames"][0]["transform_matrix"][0].__setitem__(0, 10**400), "transform_matrix"),
         (lambda m: (m.pop("fl_x"), m.pop("fl_y"), m.update(camera_angle_x=0)), "camera_angle_x, found 0"),
-        (lambda m: m["frames"][0].update(file_path="x" * 5000), "expected an image file"),
+        (lambda m: m.update(frames=[{**m["frames"][0], "file_path": "x" * 5000}]), "expected an image file"),
         (lambda m: m.update(train_filenames=["images/z.png"]), "none for images/z.png"),
         (lambda m: m.update(train_filenames="images/a.png"), "lists of file paths"),
         (lambda m: m.update(test_filenames=["images/a.png", "images/b.png"]), "frames to train on"),
