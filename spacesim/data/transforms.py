@@ -79,7 +79,11 @@ def _warn_of_missing(source: Path, missing: tuple[str, ...], found: int) -> None
     if missing:
         count = len(missing) + found
         _log.warning(
-            "%s: %d of %d frames have no image and are left out, %s first", source, len(missing), count, missing[0][:200]
+            "%s: %d of %d frames have no image and are left out, %s first",
+            source,
+            len(missing),
+            count,
+            missing[0][:200],
         )
 
 
