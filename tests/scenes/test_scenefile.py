@@ -149,7 +149,8 @@ def test_dumped_values_are_read_back():
 
 
 def test_built_in_scenes():
-    assert set(BUILT_IN_SCENES) == {"boxsat", "boxsat-pair", "telescope", "cubesat", "upper-stage", "small-body"}
+    crafts = {"boxsat", "boxsat-pair", "telescope", "cubesat", "upper-stage", "small-body"}
+    assert set(BUILT_IN_SCENES) == {*crafts, "speedplus"}
     assert read_scene("boxsat") == SceneConfig("boxsat", (ObjectConfig(spacecraft="boxsat"),))
     assert [one.position for one in read_scene("boxsat-pair").objects] == [(0, 0, 0), (-3, -3, -3)]
     telescope = read_scene("telescope")
