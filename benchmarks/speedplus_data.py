@@ -47,7 +47,7 @@ class SpeedplusData:
 
 
 def make(folder: Path, frames: int = 600, height: int = 300, seed: int = 0, spp: int = 64) -> SpeedplusData:
-    """The datasets in `folder`, made as far as they are not there. frames: to train on; height: pixels, 1200 at most."""
+    """The datasets in `folder`, made as far as they are not there. frames: to train on; height: pixels, to 1200."""
     folder, size = Path(folder), (round(1.6 * height), height)
     scene = {"views": frames, "test_views": max(frames // 8, 1), "resolution": size, "spp": spp, "test_spp": spp}
     made = read_dataset(common.generated("speedplus", folder / "made", seed=seed, **scene))

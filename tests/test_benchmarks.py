@@ -575,7 +575,7 @@ def test_data_like_speedplus_have_no_suns_but_those_that_are_told(command, place
         assert frame.sun is None
         assert frame.silhouette_path is None
         assert frame.file_path == told.file_path
-        np.testing.assert_array_equal(told.sun.direction, truth.sun.direction)
+        np.testing.assert_allclose(told.sun.direction, truth.sun.direction, atol=1e-15)
         np.testing.assert_allclose(frame.camera.world_from_camera, truth.camera.world_from_camera, atol=1e-12)
         np.testing.assert_array_equal(frame.camera.world_from_camera, told.camera.world_from_camera)
         assert (load_image(made.data, frame).alpha == 1).all()
