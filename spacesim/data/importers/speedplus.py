@@ -12,7 +12,7 @@ world is the frame of the body. Labels stay with their frames in transforms.json
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -26,7 +26,8 @@ from spacesim.data.files import MAX_LIST_BYTES, read_json
 from spacesim.data.geometry import Array, rotation_from_quaternion
 from spacesim.data.images import image_size, read_png
 from spacesim.data.importers.importer import Importer, Option
-from spacesim.data.importers.writing import ImportedFrame, Picture, Progress, write_dataset
+from spacesim.data.importers.masks import MASK_OPTIONS, MASKED, MaskFolder, read_mask
+from spacesim.data.importers.writing import ImportedFrame, Progress, write_dataset
 from spacesim.data.records import Camera, Dataset
 
 DOMAINS = ("synthetic", "lightbox", "sunlamp")
@@ -86,6 +87,8 @@ def import_speedplus(
     count: int | None = None,
     scale: float = 1.0,
     seed: int = 0,
+    masks: Path | None = None,
+    masked: str = "empty",
     progress: Progress | None = None,
 ) -> Dataset:
     """Import one domain of SPEED+, or SPEED's labelled synthetic pictures.
@@ -93,6 +96,7 @@ def import_speedplus(
     domain: "synthetic", whose validation pictures become the test split, "lightbox" or "sunlamp", of which every 8th
     is held out; max_distance: metres to the body, farther ones are left out; count: frames in all, one drawn by `seed`
     from each of as many equal pieces of the lists; scale: of the pictures' size, by the means over areas.
+    masks: a folder of them, without it the domain's own folder `masks`, if there is one; masked: one of `MASKED`.
     Frames without a picture are skipped, with one warning. Raises InputError for labels or a camera that are missing or
     broken, pictures of another size than the camera's, and where no frame is left.
     """
@@ -100,6 +104,7 @@ def import_speedplus(
     expect(max_distance is None or max_distance > 0, "max_distance", "metres above 0", max_distance)
     expect(count is None or count >= 2, "count", "at least 2 frames", count)
     expect(0 < scale <= 1, "scale", "a fraction above 0, up to 1", scale)
+    expect(masked in MASKED, "masked", f"one of {', '.join(MASKED)}", masked)
     expect(seed >= 0, "seed", "at least 0", seed)
     pictures, lists = _lists(src, domain)
     intrinsics = _read_camera(src, lists[0])
@@ -118,8 +123,13 @@ def import_speedplus(
     if count is not None:
         splits = _subsets(splits, count, seed)
     size = max(1, round(scale * intrinsics.width)), max(1, round(scale * intrinsics.height))
-    train, test = ([_frame(one, pictures, intrinsics, size) for one in labels] for labels in [*splits, []][:2])
+    folder = masks or pictures.parent / "masks"
+    names = [one.filename for labels in splits for one in labels]
+    found_masks = MaskFolder(folder).find_all(names) if masks or folder.is_dir() else {}
+    maker = _FrameMaker(pictures, intrinsics, size, found_masks, masked)
+    train, test = (list(map(maker.frame, labels)) for labels in [*splits, []][:2])
     options = {"domain": domain, "max_distance": max_distance, "count": count, "scale": scale, "seed": seed}
+    options |= {"masks": None if masks is None else str(masks), "masked": masked}
     return write_dataset(out, train, test, {"kind": "speedplus", "source": str(src), **options}, progress=progress)
 
 
@@ -217,20 +227,34 @@ def _draw(labels: list[_Label], count: int, random: np.random.Generator) -> list
     return [labels[i] for i in np.minimum(places.astype(np.int64), len(labels) - 1)]
 
 
-def _frame(label: _Label, pictures: Path, intrinsics: _Intrinsics, size: tuple[int, int]) -> ImportedFrame:
-    full = intrinsics.width, intrinsics.height
-    path, stem = pictures / label.filename, PurePosixPath(label.filename).with_suffix("")
-    found = image_size(path)
-    if found != full:
-        expected = f"{full[0]}x{full[1]} pixels as camera.json says"
-        raise InputError(f"{path}: expected {expected}, found {found[0]}x{found[1]}")
-    picture: Picture = path if size == full else partial(_resized, path, size)
-    masks = pictures.parent / "masks"
-    mask = next((one for s in (path.suffix, ".png", ".jpg") if (one := masks / f"{stem}{s}").is_file()), None)
-    silhouette: Callable[[], np.ndarray] | None = None if mask is None else partial(_silhouette, mask, full, size)
-    keys = {"q_vbs2tango_true": label.quaternion, "r_Vo2To_vbs_true": label.position}
-    camera = intrinsics.camera(label.world_from_camera, size)
-    return ImportedFrame(str(stem), picture, camera, intrinsics.distortion, silhouette=silhouette, keys=keys)
+@dataclass(frozen=True, eq=False)
+class _FrameMaker:
+    """What all frames share."""
+
+    pictures: Path  #: their folder
+    intrinsics: _Intrinsics
+    size: tuple[int, int]  #: (width, height) that pictures get
+    masks: Mapping[str, Path]  #: of file names
+    masked: str
+
+    def frame(self, label: _Label) -> ImportedFrame:
+        """Pictures are read when it is written. Raises InputError for a picture of another size than the camera's."""
+        path, full = self.pictures / label.filename, (self.intrinsics.width, self.intrinsics.height)
+        found = image_size(path)
+        if found != full:
+            expected = f"{full[0]}x{full[1]} pixels as camera.json says"
+            raise InputError(f"{path}: expected {expected}, found {found[0]}x{found[1]}")
+        mask = self.masks.get(label.filename)
+        made = None if mask is None else partial(_resized_mask, mask, full, self.size)
+        return ImportedFrame(
+            name=PurePosixPath(label.filename).with_suffix("").as_posix(),
+            picture=path if self.size == full else partial(_resized, path, self.size),
+            camera=self.intrinsics.camera(label.world_from_camera, self.size),
+            distortion=self.intrinsics.distortion,
+            silhouette=made if self.masked == "empty" else None,
+            mask=made if self.masked == "unknown" else None,
+            keys={"q_vbs2tango_true": label.quaternion, "r_Vo2To_vbs_true": label.position},
+        )
 
 
 def _resized(path: Path, size: tuple[int, int]) -> np.ndarray:
@@ -241,14 +265,10 @@ def _resized(path: Path, size: tuple[int, int]) -> np.ndarray:
     return np.asarray(PillowImage.fromarray(pixels[..., :3] if pixels.ndim == 3 else pixels).resize(size, _BOX))
 
 
-def _silhouette(path: Path, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
-    """[h, w] uint8, 255 where most of a pixel is brighter than half of what is brightest: JPEG rings about edges."""
-    pixels = read_png(path)
-    grey = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=-1)
-    if grey.shape != full[::-1]:
-        raise InputError(f"{path}: expected {full[0]}x{full[1]} pixels, found {grey.shape[1]}x{grey.shape[0]}")
-    mask = np.where(2 * grey.astype(np.int64) > grey.max(), 255, 0).astype(np.uint8)
-    return np.where(np.asarray(PillowImage.fromarray(mask).resize(size, _BOX)) > 127, 255, 0).astype(np.uint8)
+def _resized_mask(path: Path, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
+    """[h, w] uint8, 255 where most of a pixel is white."""
+    white = np.where(read_mask(path, *full), 255, 0).astype(np.uint8)
+    return np.where(np.asarray(PillowImage.fromarray(white).resize(size, _BOX)) > 127, 255, 0).astype(np.uint8)
 
 
 SPEEDPLUS = Importer(
@@ -261,5 +281,6 @@ SPEEDPLUS = Importer(
         Option("count", int, "N", "so many frames, evenly spread (all)"),
         Option("scale", float, "X", "size of the pictures, a fraction (1)"),
         Option("seed", int, "N", "draws the frames of --count (0)"),
+        *MASK_OPTIONS,
     ),
 )

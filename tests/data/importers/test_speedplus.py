@@ -154,13 +154,22 @@ def test_masks_are_silhouettes(published, tmp_path):
     shape = np.zeros(SIZE[::-1], np.uint8)
     shape[8:20, 10:30] = 255
     PillowImage.fromarray(shape).save(masks / "img000000.jpg", quality=60)  # which rings
-    PillowImage.fromarray(shape // 255).save(masks / "img000001.png")  # 0 and 1
+    PillowImage.fromarray(shape).save(masks / "img000001.png")
     for scale in (1.0, 0.5):
         data = import_speedplus(published, tmp_path / f"{scale}", scale=scale)
         step = round(1 / scale)
         for frame in data.train[:2]:
             np.testing.assert_array_equal(read_png(data.root / frame.silhouette_path), shape[::step, ::step])
         assert data.train[2].silhouette_path is None
+    ignored = import_speedplus(published, tmp_path / "ignored", masked="unknown")
+    assert ignored.train[0].silhouette_path is None
+    np.testing.assert_array_equal(read_png(ignored.root / ignored.train[1].mask_path), shape)
+    elsewhere = tmp_path / "by-hand"
+    elsewhere.mkdir()
+    PillowImage.fromarray(255 - shape).save(elsewhere / "img000001.png")
+    data = import_speedplus(published, tmp_path / "other", masks=elsewhere)
+    np.testing.assert_array_equal(read_png(data.root / data.train[1].silhouette_path), 255 - shape)
+    assert data.train[0].silhouette_path is None
 
 
 def test_missing_pictures_are_skipped_with_one_warning(published, tmp_path, caplog):
