@@ -14,6 +14,7 @@ from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.scene import Scene
 
 TRIES = 64  #: to have sunlit ground behind the objects
+SUN_UP = 0.2  #: sine of the Sun's elevation there, at least: lower, the ground is dim beside the objects
 _GOLDEN = 0.5 * (math.sqrt(5) - 1)
 _WHEN, _WHERE, _SKY, _GLOBE = range(100, 104)  # streams of random numbers
 
@@ -53,7 +54,7 @@ class Background:
             direction = _within_cone(random, towards, math.cos(earth.angular_radius))
             place = Placement(direction, earth.distance, np.eye(3))
             normal = place.normal_behind(towards)
-            if normal is not None and normal @ sun.direction > 0:
+            if normal is not None and normal @ sun.direction > SUN_UP:
                 break
         return Placement(direction, earth.distance, _turn(random))
 

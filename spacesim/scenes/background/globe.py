@@ -112,6 +112,7 @@ class Globe:
         day = dr.maximum(mu_s, 0)
         slant_s = dr.rcp(dr.sqrt(day * day + (2 / CHORD) ** 2))
         width = dr.maximum(reach, 0) * pixel * dr.rsqrt(dr.maximum(mu_v, 0.02))
+        width = dr.select((cover > 0) & (day > 0), width, dr.inf)  # noise is not looked at elsewhere, and ends at once
         point = mi.Point3f(*(dr.dot(axis, normal) for axis in axes))
         through = dr.exp(-tau * (slant_s + slant_v))
         ground = albedo(point, width, seed) * (day / math.pi) * dr.sqrt(through)
@@ -133,25 +134,24 @@ def albedo(point: Any, width: Any, seed: Any) -> Any:
     mi = backend.mitsuba()
     latitude = dr.abs(point.z)  # its sine
     warp = octaves(point, seed, 3, 1.7, 0.5, width)
-    shape = octaves(point + 0.35 * warp, seed + 1, 12, 1.15, 0.57, width)
-    land = _smoothstep(shape.x, 0.055, 0.07)
-    relief, wet = shape.y, shape.z
-
-    dry = dr.exp(-dr.square((latitude - 0.40) / 0.17)) + 0.55 * wet - 0.15
-    plants = _mix(FOREST, STEPPE, _smoothstep(dry, 0.15, 0.45))
-    soil = _mix(plants, DESERT, _smoothstep(dry, 0.45, 0.85)) * (1 + 0.45 * dr.clip(relief, -1, 1))
-    surface = dr.lerp(mi.Color3f(*OCEAN), soil, land)
-    cold = latitude + 0.06 * wet + 0.05 * land
-    surface = _mix(surface, ICE, _smoothstep(cold, 0.955, 0.985))
-
     flow = mi.Point3f(point.x, point.y, 1.4 * point.z)  # clouds are longer from west to east
     swirl = octaves(flow, seed + 2, 3, 2.6, 0.55, width)
+    fine = octaves(flow + 0.02 * swirl, seed + 4, 11, 23.0, 0.68, width)  # cells of 280 km and less
+
+    shape = octaves(point + 0.35 * warp, seed + 1, 12, 1.15, 0.57, width)
+    land = _smoothstep(shape.x, 0.055, 0.07)
+    relief, wet = shape.y + 0.5 * fine.y, shape.z + 0.35 * fine.z
+    dry = dr.exp(-dr.square((latitude - 0.40) / 0.17)) + 0.55 * wet - 0.15
+    plants = _mix(FOREST, STEPPE, _smoothstep(dry, 0.15, 0.45))
+    soil = _mix(plants, DESERT, _smoothstep(dry, 0.45, 0.85)) * (1 + 0.5 * dr.clip(relief, -1, 1))
+    surface = dr.lerp(mi.Color3f(*OCEAN), soil, land)
+    surface = _mix(surface, ICE, _smoothstep(latitude + 0.06 * wet + 0.05 * land, 0.955, 0.985))
+
     cloud = octaves(flow + 0.11 * swirl, seed + 3, 14, 3.7, 0.64, width)
     wetness = 0.10 * dr.cos(3 * math.pi * latitude) + 0.30 * warp.z  # belts at the equator and at 42 degrees
     sheets = 0.9 * _smoothstep(cloud.x + wetness, -0.15, 0.75)
-    heaps = octaves(flow + 0.02 * swirl, seed + 4, 11, 23.0, 0.68, width).x  # cells of 280 km and less
-    scattered = _smoothstep(heaps + 0.9 * (cloud.y + wetness), 0.05, 0.85)
-    return _mix(surface, CLOUD, 1 - (1 - sheets) * (1 - scattered))
+    heaps = _smoothstep(fine.x + 0.9 * (cloud.y + wetness), 0.05, 0.85)
+    return _mix(surface, CLOUD, 1 - (1 - sheets) * (1 - heaps))
 
 
 def _mix(first: Any, second: Any, share: Any) -> Any:

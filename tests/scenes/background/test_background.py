@@ -144,17 +144,22 @@ def test_the_earth_is_behind_its_share_of_frames(share):
     scene = build(boxsat())
     background = Background(BackgroundConfig(share=share, stars=False), scene, (), seed=4)
     random = np.random.default_rng(0)
-    seen = []
+    seen, lit = [], 0
     for index in range(200):
         place = 9 * random.normal(size=3)
         camera = Camera.look_at(place, scene.bounding_sphere[0], 16, 16, 20.0)
-        placed = background.placement(camera, Sun(random.normal(size=3)), index)
+        sun = Sun(random.normal(size=3))
+        placed = background.placement(camera, sun, index)
         seen.append(placed is not None)
         if placed is not None:  # the middle of the objects stands before the ground
             towards = scene.bounding_sphere[0] - place
-            assert placed.normal_behind(towards / np.linalg.norm(towards)) is not None
+            normal = placed.normal_behind(towards / np.linalg.norm(towards))
+            assert normal is not None
+            assert np.linalg.norm(normal) == pytest.approx(1)
+            lit += normal @ sun.direction > 0.2
     assert abs(sum(seen) - 200 * share) <= 2
     assert abs(sum(seen[60:120]) - 60 * share) <= 2
+    assert lit >= 0.75 * sum(seen)  # where the Sun is ahead of the camera there is no such ground
 
 
 def test_a_fixed_earth_stands_where_the_scene_says():
