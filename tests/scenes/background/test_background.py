@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny import call
 
 from spacesim import backend
 from spacesim.backend.upload import upload
@@ -270,3 +271,11 @@ def test_scene_json_keeps_the_background(made):
         "share": 1.0,
         "star_gain": 1e5,
     }
+
+
+def test_the_command_line_says_it(tmp_path):
+    small = ("--views", 1, "--test-views", 0, "--resolution", 16, "--spp", 1)
+    done = call("generate", "boxsat", "--out", tmp_path / "data", "--background", "earth", *small)
+    assert done.code == 0, done.errors
+    assert read_png(tmp_path / "data/images/train_00000.png").shape == (16, 16, 3)
+    assert call("generate", "boxsat", "--print", "--background", "moon").is_refusal("--background", "earth, stars")
