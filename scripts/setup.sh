@@ -119,6 +119,8 @@ if [ "$WANTED" = test ]; then
         say "ray cannot be had here; the test that needs it is skipped"
     install --no-build-isolation -e '.[video]' 2>/dev/null ||
         say "PyAV cannot be had here; the tests that need it (videos) are skipped"
+    install --no-build-isolation -e '.[sfm]' 2>/dev/null ||
+        say "pycolmap cannot be had here; the tests that need it (structure from motion) are skipped"
     install --no-build-isolation -e '.[viewer]' 2>/dev/null ||
         say "viser cannot be had here; the tests that need it (the viewer) are skipped"
     install --no-build-isolation -e '.[docs]' 2>/dev/null ||

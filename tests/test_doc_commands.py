@@ -37,7 +37,7 @@ HAS_VISER = importlib.util.find_spec("viser") is not None
 
 VALUES = {  # what stands in a command for a value
     **{"N": "2", "PX": "24", "K": "1", "NAME": "boxsat", "FILE": "boxsat", "AZ,EL": "40,25", "NAME=RUN": "none=RUN"},
-    **{"KEY=VALUE": "seed=3"},
+    **{"KEY=VALUE": "seed=3", "KIND": "nerfstudio", "SRC": "DATA"},
     **{"GAUSSIANSxPIXELS,...": "300x32", "GAUSSIANSxPIXELS": "300x32", "PATH": "opensplat"},
 }
 FILES = {"DATA", "RUN", "RUNS", "EVAL", "DIR", "OUT", "PAIR", "BOXSAT", "URL"}

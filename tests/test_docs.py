@@ -160,7 +160,20 @@ def test_the_reference_has_rasterization():
 def test_the_reference_has_every_field_and_command():
     options, commands = (generated()[f"reference/{name}.md"] for name in ("options", "command-line"))
     assert [f.name for f in fields(ss.TrainConfig) if f.name not in options] == []
-    for name in ("generate", "train", "eval", "report", "render", "sweep", "view", "compose", "verify", "export"):
+    for name in (
+        "generate",
+        "import",
+        "import colmap",
+        "train",
+        "eval",
+        "report",
+        "render",
+        "sweep",
+        "view",
+        "compose",
+        "verify",
+        "export",
+    ):
         assert f"## spacesim {name}\n" in commands
     assert "--iterations" in commands
     rows = re.findall(

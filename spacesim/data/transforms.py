@@ -177,9 +177,10 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
 
 
 def _read_camera(values: Json, image: Path) -> Camera:
-    model = values.get("camera_model", "OPENCV")
+    model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else values.get("camera_model", "OPENCV")
     if model not in _PERSPECTIVE:
-        raise InputError(f"expected a camera_model among {', '.join(_PERSPECTIVE)}, found {model}")
+        help_ = "; spacesim import nerfstudio undistorts it" if model == "OPENCV_FISHEYE" else ""
+        raise InputError(f"expected a camera_model among {', '.join(_PERSPECTIVE)}, found {model}{help_}")
     if "w" in values and "h" in values:
         width, height = round(_number(values, "w")), round(_number(values, "h"))
     else:

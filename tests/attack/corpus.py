@@ -4,6 +4,7 @@ import json
 import os
 import random
 import shutil
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -156,6 +157,23 @@ KINDS = (
                "eval run --data data --out {out} --no-geometry", "export data --speedplus {out}"),
     ),
     Kind(
+        "COLMAP", tuple(f"colmap/sparse/0/{part}.bin" for part in ("cameras", "images", "points3D")),
+        (m.of_bytes, m.of_bytes, m.of_floats, m.other_file),
+        _words("import colmap colmap --out {out}", "import colmap colmap --out {out} --masks colmap/masks"),
+    ),
+    Kind(
+        "COLMAP as text", tuple(f"colmap/text/{part}.txt" for part in ("cameras", "images", "points3D")),
+        (m.of_words, m.of_words, m.of_bytes, m.other_file),
+        _words("import colmap colmap/text --out {out} --images colmap/images"),
+    ),
+    Kind(
+        "imported",
+        ("nerfstudio/transforms.json", "nerfstudio/depth.npy", "colmap/images/a.png", "colmap/masks/b.png"),
+        (m.of_json, m.of_json, m.of_png, m.of_bytes, m.other_file),
+        _words("import nerfstudio nerfstudio --out {out}", "import colmap colmap --out {out} --masks colmap/masks",
+               "import nerfstudio nerfstudio --out {out} --masked empty"),
+    ),
+    Kind(
         "EXR", ("data/gt/test_00000.exr", "data/gt/train_00001.exr"), (m.of_bytes, m.of_floats, m.other_file),
         _words("verify data", "eval run --data data --out {out} --no-geometry",
                f"{_TRAIN} --set depth_weight=0.1", f"{_TRAIN} --method shadow-map --set visibility_weight=0.1"),
@@ -226,6 +244,8 @@ _LINES = (
     ("export run --mesh {out}.ply", ("--views", "--voxel", "--truncation", "--sun", "--data", "--mesh")),
     ("export data --speedplus {out}", ("--object", "--bop", "--sun")),
     ("verify data", ("--debug", "data", "--data")),
+    ("import colmap colmap --out {out}", ("--images", "--masks", "--masked", "--out", "nerfstudio", "--depth-unit")),
+    ("import nerfstudio nerfstudio --out {out}", ("--masked", "--depth-unit", "--masks", "blender", "--debug")),
     ("doctor", ("--json", "--debug", "x")),
 )  # fmt: skip
 
@@ -282,6 +302,8 @@ def build(root: Path) -> Path:
     (root / "camera.json").write_text(json.dumps(camera))
     _call("compose", root / "composed.toml", "--out", root / "composed")
     _write_other(root / "other", meta)
+    _write_colmap(root / "colmap")
+    _write_nerfstudio(root / "nerfstudio", camera)
     return root
 
 
@@ -298,6 +320,54 @@ def _write_other(root: Path, meta: dict[str, object]) -> None:
     ]
     intrinsics = {key: meta[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
     (root / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
+
+
+def _write_colmap(root: Path) -> None:
+    """A model, binary and with a lens that is undistorted, and text; its pictures and masks."""
+    points, poses = (
+        [(3, 0.1, 0.2, 0.3), (5, -0.4, 0.5, 0.6)],
+        [(1.0, 0.0, 0.1 * k, 0.0, 0.1, 0.2, 3.0) for k in range(3)],
+    )
+    names, focal, middle = ["a.png", "b.png", "c.png"], 20.0, SIDE / 2
+    for folder in ("sparse/0", "text", "images", "masks"):
+        (root / folder).mkdir(parents=True)
+    for name in names:
+        pixels = np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 3), np.uint8)
+        Image.fromarray(pixels).save(root / "images" / name)
+        Image.fromarray(pixels[..., 0]).save(root / "masks" / name)
+    cameras = struct.pack("<Qii2Q8d", 1, 1, 5, SIDE, SIDE, focal, focal, middle, middle, 0.05, -0.01, 0.0, 0.0)
+    images, cloud = struct.pack("<Q", len(names)), struct.pack("<Q", len(points))
+    texts = ["# Images"]
+    for number, (name, pose) in enumerate(zip(names, poses, strict=True), start=1):
+        images += struct.pack("<I7dI", number, *pose, 1) + name.encode() + b"\0" + struct.pack("<Q", len(points))
+        images += b"".join(struct.pack("<ddQ", 1.0, 2.0, point[0]) for point in points)
+        texts.append(f"{number} {' '.join(map(str, pose))} 1 {name}")
+        texts.append(" ".join(f"1.0 2.0 {point[0]}" for point in points))
+    for number, *place in points:
+        cloud += struct.pack("<Q3d3BdQ", number, *place, 9, 8, 7, 0.5, 2) + struct.pack("<4I", 1, 0, 2, 0)
+    for part, content in (("cameras", cameras), ("images", images), ("points3D", cloud)):
+        (root / f"sparse/0/{part}.bin").write_bytes(content)
+    (root / "text/cameras.txt").write_text(f"# Cameras\n1 OPENCV {SIDE} {SIDE} 20 21 8 8 0.1 0.02 0.001 0.002\n")
+    (root / "text/images.txt").write_text("\n".join(texts) + "\n")
+    lines = [f"{number} {x} {y} {z} 9 8 7 0.5 1 0 2 0" for number, x, y, z in points]
+    (root / "text/points3D.txt").write_text("# Points\n" + "\n".join(lines) + "\n")
+
+
+def _write_nerfstudio(root: Path, camera: dict[str, object]) -> None:
+    """A folder with what only its importer reads: a fisheye lens, depth in a unit, masks."""
+    root.mkdir()
+    pixels = np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 3), np.uint8)
+    for name in ("a.png", "b.png", "mask.png"):
+        Image.fromarray(pixels).save(root / name)
+    np.save(root / "depth.npy", np.ones((SIDE, SIDE), np.float32))
+    shared = {"mask_path": "mask.png", "depth_file_path": "depth.npy"}
+    frames = [
+        {"file_path": name, "transform_matrix": camera["transform_matrix"], **shared} for name in ("a.png", "b.png")
+    ]
+    lens = {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": -0.01, "depth_unit_scale_factor": 0.002}
+    meta = {**camera, **lens, "frames": frames}
+    del meta["transform_matrix"]
+    (root / "transforms.json").write_text(json.dumps(meta))
 
 
 def _call(*arguments: object) -> None:

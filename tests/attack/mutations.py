@@ -234,6 +234,23 @@ def of_floats(rng: random.Random, data: bytes) -> bytes:
     return bytes(found)
 
 
+def of_words(rng: random.Random, data: bytes) -> bytes:
+    """Words of a text as others, gone, doubled, or lines that are."""
+    lines = [line.split(" ") for line in data.decode().split("\n")]
+    for _ in range(rng.choice((1, 1, 2, 5))):
+        line = rng.randrange(len(lines))
+        kind, at = rng.randrange(6), rng.randrange(len(lines[line]) or 1)
+        if kind < 3 and lines[line]:
+            lines[line][at] = str(hostile(rng))
+        elif kind == 3:
+            del lines[line][at : at + 1]
+        elif kind == 4:
+            lines[line].insert(at, rng.choice(("0", "-1", "nan", "a b", "#")))
+        else:
+            lines.insert(line, [] if rng.random() < 0.3 else list(rng.choice(lines)))
+    return "\n".join(map(" ".join, lines)).encode("utf-8", "surrogatepass")
+
+
 def of_safetensors(rng: random.Random, data: bytes) -> bytes:
     """The JSON of a safetensors file: shapes, types, names, its metadata, what lies within that."""
     size = struct.unpack_from("<Q", data)[0]

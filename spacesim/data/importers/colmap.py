@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.images import image_size
 from spacesim.data.importers.colmap_model import (
     ColmapImage,
     ColmapModel,
@@ -17,9 +16,8 @@ from spacesim.data.importers.colmap_model import (
     read_model,
 )
 from spacesim.data.importers.importer import Importer, Option
-from spacesim.data.importers.lenses import Lens
 from spacesim.data.importers.masks import MASK_OPTIONS, MaskFolder
-from spacesim.data.importers.pictures import FrameMaker, View
+from spacesim.data.importers.pictures import FrameMaker, View, fitted
 from spacesim.data.importers.writing import Progress, frame_names, write_dataset
 from spacesim.data.records import Dataset
 from spacesim.data.transforms import is_file
@@ -59,7 +57,7 @@ def import_colmap(
     frames = []
     for name, image in zip(frame_names([image.name for image in used]), used, strict=True):
         path = paths[image.name]
-        lens = _fitted(model.cameras[image.camera], path)
+        lens = fitted(model.cameras[image.camera], path)
         frames.append(maker.frame(View(name, path, image.world_from_camera, lens, found_masks.get(image.name))))
     source = {
         "kind": "colmap",
@@ -123,7 +121,7 @@ def _find_pictures(
     else:
         where = given or places[0]
         raise InputError(
-            f"{where}: expected the pictures of {folder} ({images[0].name}), found none; name their folder with images"
+            f"{where}: expected the pictures of {folder} ({images[0].name}), found none; name their folder (images)"
         )
     if len(found) < len(images):
         first = next(image.name for image in images if image.name not in found)
@@ -133,17 +131,6 @@ def _find_pictures(
             place, lacking, len(images), first[:200],
         )  # fmt: skip
     return found
-
-
-def _fitted(lens: Lens, path: Path) -> Lens:
-    """The lens before a picture that may be a fraction of the camera's size, whose sides were rounded."""
-    width, height = image_size(path)
-    if (width, height) == (lens.width, lens.height):
-        return lens
-    if abs(width - lens.width * height / lens.height) > 1 and abs(height - lens.height * width / lens.width) > 1:
-        expected = f"{lens.width}x{lens.height} pixels as its camera says, or a multiple or fraction"
-        raise InputError(f"{path}: expected {expected}, found {width}x{height}")
-    return lens.scaled(width, height)
 
 
 def _start_points(

@@ -224,7 +224,9 @@ class Lens:
         x, y = np.meshgrid(columns, rows)
         u, v = self.project(x, y)
         inside = (u >= 0) & (u <= self.width) & (v >= 0) & (v <= self.height)
-        inside &= np.hypot(x, y) < self._reach(float(np.hypot(x, y).max()))
+        reach = self._reach(float(np.hypot(x, y).max()))
+        if np.isfinite(reach):
+            inside &= np.hypot(x, y) < reach
         return Resampling(np.where(inside, u - 0.5, 0), np.where(inside, v - 0.5, 0), inside)
 
     def _reach(self, farthest: float) -> float:

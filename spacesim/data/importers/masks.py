@@ -63,7 +63,8 @@ class MaskFolder:
 
 def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     """[H, W] bool, True where the mask is white: its alpha where it has one that is not 1 everywhere, else its
-    brightest channel, from one half on. One of the same shape but another size is scaled, by the nearest pixel.
+    brightest channel, from one half on, or from 1 on where no pixel has more. One of the same shape but another size is
+    scaled, by the nearest pixel.
 
     Raises InputError where it is no picture or of another shape.
     """
@@ -71,7 +72,7 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     values = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=-1)
     if pixels.ndim == 3 and pixels.shape[2] == 4 and pixels[..., 3].min() < 255:
         values = pixels[..., 3]  # a picture that has been cut out
-    white = values >= (np.iinfo(values.dtype).max + 1) // 2
+    white = values >= (1 if values.max() == 1 else (np.iinfo(values.dtype).max + 1) // 2)
     found_height, found_width = white.shape
     if (found_width, found_height) == (width, height):
         return white

@@ -1,7 +1,8 @@
 """Pictures of a lens and their masks as frames: copied where our cameras can say the lens, else resampled."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
-from spacesim.data.images import Resampling, has_alpha, read_png, resample
+from spacesim.data.images import Resampling, has_alpha, image_size, read_png, resample
 from spacesim.data.importers.lenses import Lens
 from spacesim.data.importers.masks import read_mask
 from spacesim.data.importers.writing import ImportedFrame
@@ -30,7 +31,7 @@ class View:
     mask: Path | None = None  #: white = object, or = known, as the frames' maker says
     sun: Sun | None = None
     silhouette: Path | None = None  #: other than 0 = object, of the picture's size
-    depth: Path | None = None  #: 16 bits, millimetres, of the picture's size
+    depth: Callable[[], np.ndarray] | None = None  #: makes uint16 [H, W], millimetres along the optical axis
 
 
 @dataclass
@@ -59,7 +60,6 @@ class FrameMaker:
         unknown = (view.mask is not None and not empty) or (resampled and not self._sees_all(lens))
         in_file = view.mask is not None and empty and not cut_out
         silhouette = (lambda: self._silhouette(view)) if in_file or (resampled and view.silhouette) else view.silhouette
-        depth = (lambda: self._labels(view, _read_labels(view.depth))) if resampled and view.depth else view.depth
         return ImportedFrame(
             name=view.name,
             picture=(lambda: self._picture(view)) if resampled or cut_out else view.path,
@@ -68,23 +68,24 @@ class FrameMaker:
             sun=view.sun,
             silhouette=silhouette,
             mask=(lambda: self._known(view)) if unknown else None,
-            depth=depth,
+            depth=None if view.depth is None else partial(self._depth, view.depth, view),
         )
 
     def _picture(self, view: View) -> np.ndarray:
         """uint8, with the file's channels."""
         pixels = read_png(view.path)
         values = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
-        shape = values.shape[:2]
-        alpha = values[..., 3] if values.shape[2] == 4 else np.ones(shape, np.float32)
-        if values.shape[2] == 4 and view.mask is not None and self.masked == "empty":
+        source = self._resampling(view.lens) if view.lens.distortion is None else None
+        if values.shape[2] < 4:
+            shown = values if source is None else source.linear(values)
+            return np.rint(255 * shown[..., 0] if shown.shape[2] == 1 else 255 * shown).astype(np.uint8)
+        alpha = values[..., 3]
+        if view.mask is not None and self.masked == "empty":
             alpha = alpha * read_mask(view.mask, view.lens.width, view.lens.height)
-        image = Image(np.broadcast_to(values[..., :3], (*shape, 3)), alpha, np.ones(shape, bool))
-        if view.lens.distortion is None:
-            image = resample(image, self._resampling(view.lens))
-        rgb = image.rgb[..., 0] if values.shape[2] == 1 else image.rgb
-        planes = np.concatenate([rgb, image.alpha[..., None]], axis=-1) if values.shape[2] == 4 else rgb
-        return np.rint(255 * planes).astype(np.uint8)
+        image = Image(values[..., :3], alpha, np.ones(alpha.shape, bool))
+        if source is not None:
+            image = resample(image, source)
+        return np.rint(255 * np.concatenate([image.rgb, image.alpha[..., None]], axis=-1)).astype(np.uint8)
 
     def _silhouette(self, view: View) -> np.ndarray:
         """255 object, 0 none."""
@@ -104,8 +105,23 @@ class FrameMaker:
             known = source.inside & (source.linear(known.astype(np.float32)) > 0.999)  # no unknown pixel takes part
         return np.where(known, 255, 0).astype(np.uint8)
 
+    def _depth(self, read: Callable[[], np.ndarray], view: View) -> np.ndarray:
+        return self._labels(view, read())
+
     def _labels(self, view: View, labels: np.ndarray) -> np.ndarray:
         return self._resampling(view.lens).nearest(labels) if view.lens.distortion is None else labels
+
+
+def fitted(lens: Lens, path: Path) -> Lens:
+    """The lens before a picture, which may have a fraction of the camera's size, its sides rounded. Raises InputError
+    for one of another shape."""
+    width, height = image_size(path)
+    if (width, height) == (lens.width, lens.height):
+        return lens
+    if abs(width - lens.width * height / lens.height) > 1 and abs(height - lens.height * width / lens.width) > 1:
+        expected = f"{lens.width}x{lens.height} pixels as its camera says, or a multiple or fraction"
+        raise InputError(f"{path}: expected {expected}, found {width}x{height}")
+    return lens.scaled(width, height)
 
 
 def _undistortion(lens: Lens) -> Resampling:

@@ -121,8 +121,12 @@ def frame_names(paths: Sequence[str]) -> list[str]:
         parts = path.parts[1:] if path.parts[0] == "images" and len(path.parts) > 1 else path.parts
         stems.append(PurePosixPath(*parts).with_suffix("").as_posix())
     counts = Counter(stems)
-    ends = [PurePosixPath(path).suffix[1:] for path in paths]
-    return [stem if counts[stem] == 1 else f"{stem}_{end}" for stem, end in zip(stems, ends, strict=True)]
+    ended = [f"{PurePosixPath(path).with_suffix('')}_{PurePosixPath(path).suffix[1:]}" for path in paths]
+    names = [
+        stem if counts[stem] == 1 else f"{stem}_{end.rpartition('_')[2]}"
+        for stem, end in zip(stems, ended, strict=True)
+    ]
+    return names if len(set(names)) == len(names) else ended
 
 
 def _claim(out: Path, source: Mapping[str, Any]) -> None:

@@ -295,3 +295,19 @@ def test_the_command(spacesim, tmp_path):
     assert "spacesim: --masks: expected a folder" in refused.errors[0]
     refused = spacesim("import", "colmap", root, "--out", tmp_path / "new", "--masked", "half")
     assert (refused.code, "expected one of empty, unknown" in "".join(refused.errors)) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("mode", "color"), [("L", 77), ("RGB", (10, 20, 30)), ("RGBA", (10, 20, 30, 128)), ("I;16", 20_000)]
+)
+def test_pictures_of_every_kind_go_through_a_lens(tmp_path, mode, color):
+    root = project(tmp_path / "src", ring(2, cameras={1: ("FISHEYE", 64, 48, (60.0, 60.0, 32.0, 24.0))}), size=(64, 48))
+    for path in (root / "images").iterdir():
+        Image.new(mode, (64, 48), color).save(path)
+    dataset = imported(root, tmp_path / "out")
+    frame = dataset.frames[0]
+    image = ss.load_image(dataset, frame)
+    channels = np.atleast_1d(color) / (65535 if mode == "I;16" else 255)
+    np.testing.assert_allclose(image.rgb[5, 7], np.broadcast_to(channels[:3], 3), atol=0.5 / 255)
+    assert image.alpha[5, 7] == pytest.approx(128 / 255 if mode == "RGBA" else 1)
+    assert Image.open(tmp_path / "out" / frame.file_path).mode == ("L" if mode == "I;16" else mode)

@@ -212,5 +212,5 @@ def test_wrong_options_end_in_one_sentence(tmp_path, options, sentence):
 
 def test_masks_of_another_shape_end_in_one_sentence(tmp_path):
     write_masks(tmp_path / "masks", [f"view {k}.png" for k in range(5)], (12, 16))
-    with pytest.raises(InputError, match="view 0.png: expected 16x12 pixels, or a multiple or fraction"):
+    with pytest.raises(InputError, match=r"view 0\.png: expected 16x12 pixels, or a multiple or fraction"):
         imported(project(tmp_path / "src"), tmp_path / "out", masks=tmp_path / "masks")
