@@ -139,7 +139,7 @@ def albedo(point: Any, width: Any, seed: Any) -> Any:
     fine = octaves(flow + 0.02 * swirl, seed + 4, 11, 23.0, 0.68, width)  # cells of 280 km and less
 
     shape = octaves(point + 0.35 * warp, seed + 1, 12, 1.15, 0.57, width)
-    land = _smoothstep(shape.x, 0.055, 0.07)
+    land = _smoothstep(shape.x, 0.1, 0.115)
     relief, wet = shape.y + 0.5 * fine.y, shape.z + 0.35 * fine.z
     dry = dr.exp(-dr.square((latitude - 0.40) / 0.17)) + 0.55 * wet - 0.15
     plants = _mix(FOREST, STEPPE, _smoothstep(dry, 0.15, 0.45))
@@ -149,7 +149,7 @@ def albedo(point: Any, width: Any, seed: Any) -> Any:
 
     cloud = octaves(flow + 0.11 * swirl, seed + 3, 14, 3.7, 0.64, width)
     wetness = 0.10 * dr.cos(3 * math.pi * latitude) + 0.30 * warp.z  # belts at the equator and at 42 degrees
-    sheets = 0.9 * _smoothstep(cloud.x + wetness, -0.15, 0.75)
+    sheets = 0.9 * _smoothstep(cloud.x + wetness, -0.23, 0.8)
     heaps = _smoothstep(fine.x + 0.9 * (cloud.y + wetness), 0.05, 0.85)
     return _mix(surface, CLOUD, 1 - (1 - sheets) * (1 - heaps))
 

@@ -18,6 +18,7 @@ from spacesim.data.records import Camera, Sun
 from spacesim.data.store import find_unreadable_files, load_truth, read_dataset
 from spacesim.data.tone import as_bytes, display_values
 from spacesim.scenes import build, generate, read_scene
+from spacesim.scenes.background import globe as globe_module
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.background.draw import Background
 from spacesim.scenes.background.globe import Globe, Placement, albedo
@@ -211,15 +212,28 @@ def test_the_terminator_is_where_the_sun_sets(globe):
 
 
 @pytest.mark.parametrize("seed", [3, 77])
-def test_the_globe_has_land_and_a_mean_albedo_like_the_earths(seed):
+def test_the_globe_has_land_clouds_and_a_mean_albedo_like_the_earths(seed, monkeypatch):
     mi = backend.mitsuba()
     points = fibonacci_sphere(20_000)
-    values = albedo(mi.Point3f(*map(upload, points.T.astype(np.float32))), mi.Float(0.002), mi.UInt32(seed)).numpy()
+    where = mi.Point3f(*map(upload, points.T.astype(np.float32)))
+    values = albedo(where, mi.Float(0.002), mi.UInt32(seed)).numpy()
     assert values.min() > 0
     assert values.max() < 1
-    assert 0.22 < values.mean() < 0.34  # 0.29 with the air's own light, which is not in this
+    assert 0.25 < values.mean() < 0.33  # the Earth's is 0.29
     poles = np.abs(points[:, 2]) > 0.985
     assert values[:, poles].mean() > 0.7
+
+    def share(name: str) -> np.ndarray:
+        """[N] of what is seen at each point."""
+        for other in ("OCEAN", "FOREST", "STEPPE", "DESERT", "ICE", "CLOUD"):
+            monkeypatch.setattr(globe_module, other, (float(other == name),) * 3)
+        return albedo(where, mi.Float(0.002), mi.UInt32(seed)).numpy()[0]
+
+    clouds = share("CLOUD")
+    assert np.mean(clouds > 0.1) == pytest.approx(0.67, abs=0.06)
+    clear = clouds < 0.9
+    water = ((share("OCEAN") + share("ICE")) / (1 - clouds))[clear].mean()
+    assert 1 - water == pytest.approx(0.29, abs=0.08)
 
 
 def test_stars_follow_the_law_of_counts():
