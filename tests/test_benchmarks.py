@@ -560,3 +560,38 @@ def test_attack_tells_what_was_tried_and_held(place, command):
     assert tried["the viewer"] > 10
     assert tried == {"damaged inputs, command lines": 8, "kills and signals": 1, "flipped bits": 2, "the viewer": ANY}
     assert all(row["held"] == row["tried"] for row in found["rows"])
+
+
+@smallest("speedplus_data.py --out data --frames 4 --height 30 --spp 2 --backend llvm --json")
+def test_data_like_speedplus_have_no_suns_but_those_that_are_told(command, place):
+    import speedplus_data
+
+    report = json.loads(call(command))
+    assert (report["frames"], report["size"]) == (5, [48, 30])
+    made = speedplus_data.make(place / "data", 4, 30, spp=2)  # all there
+    assert made.data.scene == {}
+    assert len({tuple(frame.sun.direction) for frame in made.made.frames}) == 5
+    for truth, frame, told in zip(made.made.frames, made.data.frames, made.told.frames, strict=True):
+        assert frame.sun is None
+        assert frame.silhouette_path is None
+        assert frame.file_path == told.file_path
+        np.testing.assert_allclose(told.sun.direction, truth.sun.direction, atol=1e-15)
+        np.testing.assert_allclose(frame.camera.world_from_camera, truth.camera.world_from_camera, atol=1e-12)
+        np.testing.assert_array_equal(frame.camera.world_from_camera, told.camera.world_from_camera)
+        assert (load_image(made.data, frame).alpha == 1).all()
+        assert load_image(made.told, told).alpha.min() == 0
+
+
+def test_noise_like_speedpluss_is_that_of_the_full_size_averaged():
+    """A grey of 0.5 keeps its mean; black, where half of the noise is cut off, shows sigma / sqrt(2 pi)."""
+    import speedplus_data
+
+    sigma = 255 * np.sqrt(speedplus_data.VARIANCE)
+    grey, black = (np.full((150, 240), value, np.uint8) for value in (128, 0))
+    noisy = speedplus_data.degraded(grey, (0, 1)).astype(np.float64)
+    assert noisy.mean() == pytest.approx(128, abs=0.1)
+    assert noisy.std() == pytest.approx(np.hypot(sigma / 8, np.sqrt(1 / 12)), rel=0.03)
+    assert speedplus_data.degraded(black, (0, 1)).mean() == pytest.approx(sigma / np.sqrt(2 * np.pi), abs=0.15)
+    np.testing.assert_array_equal(noisy, speedplus_data.degraded(grey, (0, 1)))
+    full = speedplus_data.degraded(np.full((1200, 1920), 128, np.uint8), (0, 1))
+    assert full.std() == pytest.approx(sigma, rel=0.02)

@@ -11,7 +11,7 @@ from spacesim.data.errors import InputError
 SUMMARY, NEEDS_BACKEND = "path-trace a dataset with its truth", False
 _SCENE_OPTIONS = (
     *("suns", "views", "test_suns", "test_views", "known_test_views", "shared_test_views", "sun", "distance"),
-    *("resolution", "exposure", "spp", "test_spp", "seed", "units", "up"),
+    *("resolution", "exposure", "spp", "test_spp", "seed", "units", "up", "background"),
 )
 
 
@@ -37,6 +37,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument("--resolution", type=resolution, metavar="PX", help="pixels of each side, or WIDTHxHEIGHT")
     parser.add_argument("--fov", type=float, metavar="DEG", help="angle that the image's width covers")
     parser.add_argument("--exposure", type=float, metavar="X", help="display value of a radiance of 1 W/m2/sr")
+    parser.add_argument("--background", metavar="WHAT", help="draw earth, stars or earth,stars behind the objects")
     parser.add_argument("--spp", type=int, metavar="N", help="samples a pixel")
     parser.add_argument("--test-spp", type=int, metavar="N", help="of test views (four times as many)")
     parser.add_argument("--seed", type=int, metavar="N")

@@ -155,6 +155,7 @@ class Truth:
     sun_cosine: np.ndarray  #: [H, W] n . s
     shadow: np.ndarray  #: [H, W] uint8 class: see `spacesim.data.store.SHADOW_*`
     radiance_earth: np.ndarray | None = None  #: [H, W, 3] the Earth's part of `radiance`, where there is an Earth
+    radiance_background: np.ndarray | None = None  #: [H, W, 3] of what was drawn behind the objects, as if alone
 
 
 @dataclass(frozen=True, eq=False)

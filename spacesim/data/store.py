@@ -63,8 +63,8 @@ _FILES = {
     "gt": ".exr",  # written last
 }
 _LABELS = ("object_id", "part_id", "shadow")
-_OPTIONAL = ("radiance_earth",)
-_FILTERED = ("radiance", "alpha", "radiance_earth")
+_OPTIONAL = ("radiance_earth", "radiance_background")
+_FILTERED = ("radiance", "alpha", *_OPTIONAL)
 RAW_MONOCHROME, RAW_COLOR = ("",), ("_r", "_g", "_b")  #: suffixes of the files in raw/
 _DEPTH_UNIT = 1e-3  # metres a step of depth/*.png: Nerfstudio's default depth_unit_scale_factor
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError, expect
+from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.rig import FibonacciRig, RigConfig, kinds_with, rig_kind
 from spacesim.scenes.lights.earth import EarthConfig
@@ -26,7 +27,11 @@ MAX_COORDINATE = 1e9
 """Metres of a position in each coordinate (the Moon is at 3.8e8)."""
 
 
-_UNLESS_ASKED_FOR = ("known_test_views", "shared_test_views")  # in scene.json: datasets without them stay as they were
+_UNLESS_ASKED_FOR = (
+    "known_test_views",
+    "shared_test_views",
+    "max_phase_deg",
+)  # in scene.json: datasets without them stay as they were
 
 MAX_SEED = 2**63 - 1
 """Largest whole number that every TOML reader knows."""
@@ -115,6 +120,7 @@ class SceneConfig:
     materials: Mapping[str, MaterialConfig] = field(default_factory=dict)
     sun: SunConfig = field(default_factory=SunConfig)
     earth: EarthConfig | None = None
+    background: BackgroundConfig | None = None  #: drawn behind the objects; none: pictures have alpha
     rig: RigConfig = field(default_factory=FibonacciRig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     quality: QualityConfig = field(default_factory=QualityConfig)
@@ -124,24 +130,31 @@ class SceneConfig:
         expect(bool(self.name), "name", "a name", self.name)
         if not self.objects:
             raise InputError("objects: expected at least one object, found none")
+        if self.background is not None and self.background.placement == "fixed" and self.earth is None:
+            raise InputError("background: expected an [earth] in the scene for placement fixed, found none")
         expect(0 <= self.seed <= MAX_SEED, "seed", f"0 to {MAX_SEED}", self.seed)
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values, without the folder: a dataset does not depend on where its scene file lay."""
         values = {key: value for key, value in asdict(replace(self, folder=None)).items() if key != "folder"}
         rig = {key: value for key, value in values["rig"].items() if value or key not in _UNLESS_ASKED_FOR}
+        if self.background is None:
+            del values["background"]
         return {**values, "rig": {"kind": rig_kind(self.rig), **rig}}
 
 
 def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
     """`scene` with its name or seed, or fields of its rig, camera or quality changed by name; None changes nothing.
     `resolution` may be one number, of a square. `sun` takes the place of the rig's own arrangement, whatever the number
-    of its Suns, and `suns` alone that of `sun`.
+    of its Suns, and `suns` alone that of `sun`. `background` is a `BackgroundConfig` or the words of one.
 
     Raises InputError for a name that this scene's rig does not know, or a value out of range.
     """
     changes: dict[str, dict[str, Any]] = {"": {}, "rig": {}, "camera": {}, "quality": {}}
-    owners = {part: {f.name for f in fields(getattr(scene, part))} if part else {"name", "seed"} for part in changes}
+    owners = {
+        part: {f.name for f in fields(getattr(scene, part))} if part else {"name", "seed", "background"}
+        for part in changes
+    }
     for name, value in options.items():
         part = next((part for part, names in owners.items() if name in names), None)
         if part is None:
@@ -154,6 +167,8 @@ def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
         rig.setdefault("suns", len(rig["sun"]))
     elif "suns" in rig:
         rig["sun"] = ()
+    if isinstance(changes[""].get("background"), str):
+        changes[""]["background"] = BackgroundConfig.of(changes[""]["background"])
     parts = {part: replace(getattr(scene, part), **changed) for part, changed in changes.items() if part}
     return replace(scene, **changes[""], **parts)
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from spacesim.data.errors import InputError, expect
-from spacesim.data.geometry import Array, fibonacci_sphere, look_at, rotation_from_quaternion
+from spacesim.data.geometry import Array, fibonacci_sphere, look_at, normalize, rotation_from_quaternion
 from spacesim.data.records import Camera, Sun
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.orbit import ORBIT_NORMAL, WORLD_FROM_LVLH, ellipse, mean_motion, star_direction
@@ -197,12 +197,19 @@ class RandomRig(RigConfig):
     #: the image
     cropped: bool = False
     random_suns: bool = False  #: every frame has its own Sun, from anywhere
+    #: greatest angle between Sun and camera as the target sees them, where Suns are random; none: any. At 180 the Sun
+    #: stands behind the target, and nothing that is seen is lit
+    max_phase_deg: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         _expect_metres(near=self.near, far=self.far, sigma=self.sigma)
         if self.near is not None and self.far is not None:
             expect(self.near <= self.far, "far", f"at least near, {self.near:g} m", self.far)
+        if self.max_phase_deg is not None:
+            expected = "an angle from 1 to 180 degrees, beside random_suns"
+            fits = self.random_suns and 1 <= self.max_phase_deg <= 180
+            expect(fits, "max_phase_deg", expected, self.max_phase_deg)
         expect(not (self.random_suns and self.sun), "random_suns", "false where sun names the Suns", True)
         if self.random_suns and (self.suns, self.test_suns) != (1, 0):
             found = f"{self.suns} suns and {self.test_suns} test_suns"
@@ -217,11 +224,20 @@ class RandomRig(RigConfig):
             for k in range(count):
                 random = np.random.default_rng([seed, *stream, k])
                 pose = self._pose(random, target, camera, (near, far))
-                view_sun = Sun(random.normal(size=3)) if self.random_suns else sun
+                view_sun = self._random_sun(random, pose, target) if self.random_suns else sun
                 views.append(PlannedView(camera.at(pose), view_sun))
             return views
 
         return self.all_views(self.sun_directions(seed), some)
+
+    def _random_sun(self, random: np.random.Generator, pose: Array, target: TargetSphere) -> Sun:
+        """The first of Suns drawn from anywhere that is near enough to the camera's side."""
+        towards = normalize(pose[:3, 3] - target.centre)
+        least = -1.0 if self.max_phase_deg is None else math.cos(math.radians(self.max_phase_deg))
+        while True:
+            sun = Sun(random.normal(size=3))
+            if sun.direction @ towards >= least:
+                return sun
 
     def _pose(
         self, random: np.random.Generator, target: TargetSphere, camera: CameraConfig, depths: Array | tuple

@@ -6,13 +6,15 @@ import platform
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
 import spacesim
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, FrameWriter
+from spacesim.scenes.background.config import BackgroundConfig
+from spacesim.scenes.background.draw import Background
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.exposure import record_image
 from spacesim.scenes.config import QualityConfig
@@ -22,8 +24,8 @@ from spacesim.scenes.scene import Scene
 MAX_THREADS = 16
 IN_FLIGHT = 1 << 30
 """Bytes that frames which wait for a thread may hold: 57 frames of 512 x 512."""
-BYTES_A_PIXEL = 72
-"""Of a frame's truth: 18 numbers, float32."""
+BYTES_A_PIXEL = 84
+"""Of a frame's truth: 21 numbers, float32."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,7 @@ class Job:
     seed: int
     root: Path  #: the dataset's folder
     threads: int  #: that encode, a process
+    background: BackgroundConfig | None = None
 
     @property
     def writer(self) -> FrameWriter:
@@ -86,6 +89,9 @@ class FrameMaker:
         self._job = job
         self._writer = job.writer
         self._renderer = renderer or Renderer(job.scene, quality.spp, quality.max_depth, job.camera.distortion)
+        self._background = None
+        if job.background is not None:
+            self._background = Background(job.background, job.scene, job.camera.distortion, job.seed)
         pixels = math.prod(job.camera.resolution)
         self._most = max(1, min(job.threads + 1, IN_FLIGHT // (BYTES_A_PIXEL * pixels)))
 
@@ -104,6 +110,9 @@ class FrameMaker:
                     while waiting and (waiting[0].done() or len(waiting) >= self._most):
                         yield waiting.popleft().result()
                     truth = self._renderer.render(spec.camera, spec.sun, (self._job.seed, spec.index), spec.spp)
+                    if self._background is not None:
+                        behind = self._background.radiance(spec.camera, spec.sun, spec.index)
+                        truth = replace(truth, radiance_background=behind)
                     waiting.append(pool.submit(self._write, spec, truth))
                 while waiting:
                     yield waiting.popleft().result()
@@ -111,6 +120,7 @@ class FrameMaker:
                 pool.shutdown(cancel_futures=True)
 
     def _write(self, spec: FrameSpec, truth: Truth) -> str:
-        recording = record_image(truth.radiance, truth.alpha, self._job.camera, (self._job.seed, spec.index))
+        seed, behind = (self._job.seed, spec.index), truth.radiance_background
+        recording = record_image(truth.radiance, truth.alpha, self._job.camera, seed, behind)
         self._writer.write_frame(spec.name, truth, recording.image, recording.raw)
         return spec.name

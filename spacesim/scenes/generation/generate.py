@@ -147,7 +147,8 @@ class _DatasetPlan:
             (quality.resolved_test_spp, *planned) for planned in self.test
         ]
         self.specs = [FrameSpec(i, name, view.camera, view.sun, spp) for i, (spp, name, view) in enumerate(views)]
-        self.job = Job(self.scene, config.camera, quality, config.seed, Path(), writing_threads(1))
+        threads = writing_threads(1)
+        self.job = Job(self.scene, config.camera, quality, config.seed, Path(), threads, config.background)
         inside = self.renderer.inside(np.stack([spec.camera.position for spec in self.specs]))
         if inside.any():
             name = self.specs[int(inside.argmax())].name

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import fibonacci_sphere
+from spacesim.data.geometry import fibonacci_sphere, normalize
 from spacesim.scenes import build, read_scene
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.orbit import mean_motion
@@ -265,6 +265,28 @@ def test_random_suns_are_everywhere():
     assert len(np.unique(sun_directions(test), axis=0)) == 3
 
 
+def test_random_suns_stay_on_the_cameras_side():
+    rig = RandomRig(views=400, test_views=100, random_suns=True, max_phase_deg=70.0)
+    train, test = plan(rig, TARGET, CAMERA, 2)
+    towards = normalize(positions(train + test) - TARGET.centre)
+    cosines = np.einsum("ni,ni->n", towards, sun_directions(train + test))
+    assert cosines.min() >= np.cos(np.radians(70)) - 1e-12
+    shares = (1 - cosines) / (1 - np.cos(np.radians(70)))  # uniform over the cap
+    np.testing.assert_allclose(np.quantile(shares, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.08)
+    known = {tuple(sun) for sun in sun_directions(train)}
+    assert known.isdisjoint(tuple(sun) for sun in sun_directions(test))
+    unlimited = plan(RandomRig(views=9, random_suns=True), TARGET, CAMERA, 2)[0]
+    whole = plan(RandomRig(views=9, random_suns=True, max_phase_deg=180.0), TARGET, CAMERA, 2)[0]
+    np.testing.assert_array_equal(sun_directions(unlimited), sun_directions(whole))
+
+
+def test_a_lattice_of_suns_with_a_view_each():
+    """--suns 20 --views 1: every picture, of testing too, has a Sun of its own."""
+    train, test = plan(RandomRig(suns=20, views=1, test_suns=4, test_views=1), TARGET, CAMERA, 2)
+    assert (len(train), len(test)) == (20, 4)
+    assert len(np.unique(np.concatenate([sun_directions(train), sun_directions(test)]), axis=0)) == 24
+
+
 @pytest.mark.parametrize(
     ("axis", "away", "up"),
     [
@@ -349,6 +371,8 @@ def test_scenes_say_their_rig(tmp_path):
         (RandomRig, {"near": -1.0}, "near: expected metres from 1e-09 to 1e\\+12, found -1.0"),
         (RandomRig, {"near": 9.0, "far": 5.0}, "far: expected at least near, 9 m, found 5.0"),
         (RandomRig, {"random_suns": True, "suns": 3}, "random_suns: expected 1 suns .* found 3 suns and 0 test_suns$"),
+        (RandomRig, {"max_phase_deg": 90.0}, "max_phase_deg: expected .* beside random_suns, found 90.0"),
+        (RandomRig, {"random_suns": True, "max_phase_deg": 0.0}, "max_phase_deg: expected an angle from 1 to 180"),
         (RandomRig, {"random_suns": True, "sun": ((1.0, 2.0),)}, "random_suns: expected false where sun"),
         (ApproachRig, {"axis": "x"}, "axis: expected one of v-bar, -v-bar, r-bar, -r-bar, found 'x'"),
         (ApproachRig, {"start": 5.0, "end": 5.0}, "end: expected less than start, 5 m, found 5.0"),

@@ -1,0 +1,286 @@
+"""SPEED+ (T. H. Park et al., "SPEED+: Next-generation dataset for spacecraft pose estimation across domain gap", 2022)
+and SPEED (M. Kisantal et al., "Satellite pose estimation challenge", 2020) as datasets of ours.
+
+    SRC/camera.json                              Nu Nv cameraMatrix distCoeffs, or fx fy ppx ppy ccx ccy
+    SRC/synthetic/{train,validation}.json        [{filename, q_vbs2tango_true, r_Vo2To_vbs_true}, ...]
+    SRC/{lightbox,sunlamp}/test.json
+    SRC/DOMAIN/images/FILENAME                   and SRC/DOMAIN/masks/FILENAME where somebody has made them
+    SRC/train.json, SRC/images/train/FILENAME    SPEED's, whose quaternion is q_vbs2tango
+
+A point p of the body is at R(q) p + r in the camera: q is scalar-first, r in metres, the axes OpenCV's. The dataset's
+world is the frame of the body. Labels stay with their frames in transforms.json, as they were written.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from PIL import Image as PillowImage
+
+from spacesim.data.errors import InputError, expect
+from spacesim.data.files import MAX_LIST_BYTES, read_json
+from spacesim.data.geometry import Array, rotation_from_quaternion
+from spacesim.data.images import image_size, read_png
+from spacesim.data.importers.importer import Importer, Option
+from spacesim.data.importers.masks import MASK_OPTIONS, MASKED, MaskFolder, read_mask
+from spacesim.data.importers.writing import ImportedFrame, Progress, write_dataset
+from spacesim.data.records import Camera, Dataset
+
+DOMAINS = ("synthetic", "lightbox", "sunlamp")
+SPEED_CAMERA = {"Nu": 1920, "Nv": 1200, "ppx": 5.86e-6, "ppy": 5.86e-6, "fx": 0.0176, "fy": 0.0176}
+"""Of SPEED, where no camera.json is beside it: that of ESA's speed-utils."""
+
+_TURNS, _PLACES = ("q_vbs2tango_true", "q_vbs2tango"), ("r_Vo2To_vbs_true", "r_Vo2To_vbs")
+_UNIT = 1e-3  #: how far from 1 the length of a quaternion may be
+_FARTHEST = 1e9  #: metres
+_BOX = PillowImage.Resampling.BOX
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class _Label:
+    """The pose of a picture."""
+
+    filename: str  #: below the folder of pictures
+    quaternion: list[float]  #: (w, x, y, z), as written
+    position: list[float]  #: of the body in the camera, metres, as written
+
+    @property
+    def world_from_camera(self) -> Array:
+        """[4, 4] in the body's frame: the transpose of the quaternion's rotation, and -R^T r."""
+        turn, place = rotation_from_quaternion(self.quaternion), self.position
+        pose = np.eye(4)
+        pose[:3, :3] = turn.T
+        pose[:3, 3] = -(place[0] * turn[0] + place[1] * turn[1] + place[2] * turn[2])  # to the bit, whatever the BLAS
+        return pose
+
+
+@dataclass(frozen=True, eq=False)
+class _Intrinsics:
+    """What camera.json says."""
+
+    width: int
+    height: int
+    fx: float  #: pixels
+    fy: float  #: pixels
+    cx: float  #: pixels
+    cy: float  #: pixels
+    distortion: tuple[float, ...]  #: Brown-Conrady k1, k2, p1, p2, k3, () none
+
+    def camera(self, pose: Array, size: tuple[int, int]) -> Camera:
+        """At a pose, with pictures resized to (width, height)."""
+        u, v = size[0] / self.width, size[1] / self.height
+        return Camera(pose, *size, u * self.fx, v * self.fy, u * self.cx, v * self.cy)
+
+
+def import_speedplus(
+    src: Path,
+    out: Path,
+    *,
+    domain: str = "synthetic",
+    max_distance: float | None = None,
+    count: int | None = None,
+    scale: float = 1.0,
+    seed: int = 0,
+    masks: Path | None = None,
+    masked: str = "empty",
+    progress: Progress | None = None,
+) -> Dataset:
+    """Import one domain of SPEED+, or SPEED's labelled synthetic pictures.
+
+    domain: "synthetic", whose validation pictures become the test split, "lightbox" or "sunlamp", of which every 8th
+    is held out; max_distance: metres to the body, farther ones are left out; count: frames in all, one drawn by `seed`
+    from each of as many equal pieces of the lists; scale: of the pictures' size, by the means over areas.
+    masks: a folder of them, without it the domain's own folder `masks`, if there is one; masked: one of `MASKED`.
+    Frames without a picture are skipped, with one warning. Raises InputError for labels or a camera that are missing or
+    broken, pictures of another size than the camera's, and where no frame is left.
+    """
+    expect(domain in DOMAINS, "domain", f"one of {', '.join(DOMAINS)}", domain)
+    expect(max_distance is None or max_distance > 0, "max_distance", "metres above 0", max_distance)
+    expect(count is None or count >= 2, "count", "at least 2 frames", count)
+    expect(0 < scale <= 1, "scale", "a fraction above 0, up to 1", scale)
+    expect(masked in MASKED, "masked", f"one of {', '.join(MASKED)}", masked)
+    expect(seed >= 0, "seed", "at least 0", seed)
+    pictures, lists = _lists(src, domain)
+    intrinsics = _read_camera(src, lists[0])
+    splits = [_read_labels(path) for path in lists]
+    found = sum(map(len, splits))
+    if max_distance is not None:
+        splits = [[one for one in labels if np.linalg.norm(one.position) <= max_distance] for labels in splits]
+    near = sum(map(len, splits))
+    splits = [[one for one in labels if (pictures / one.filename).is_file()] for labels in splits]
+    there = sum(map(len, splits))
+    if not splits[0]:
+        within = "" if max_distance is None else f" within {max_distance:g} m"
+        raise InputError(f"{lists[0]}: expected pictures{within} in {pictures}, found none of {found} labels")
+    if there < near:
+        _log.warning("%s: %d of %d pictures are missing, their frames are skipped", pictures, near - there, near)
+    if count is not None:
+        splits = _subsets(splits, count, seed)
+    size = max(1, round(scale * intrinsics.width)), max(1, round(scale * intrinsics.height))
+    folder = masks or pictures.parent / "masks"
+    names = [one.filename for labels in splits for one in labels]
+    found_masks = MaskFolder(folder).find_all(names) if masks or folder.is_dir() else {}
+    maker = _FrameMaker(pictures, intrinsics, size, found_masks, masked)
+    train, test = (list(map(maker.frame, labels)) for labels in [*splits, []][:2])
+    options = {"domain": domain, "max_distance": max_distance, "count": count, "scale": scale, "seed": seed}
+    options |= {"masks": None if masks is None else str(masks), "masked": masked}
+    return write_dataset(out, train, test, {"kind": "speedplus", "source": str(src), **options}, progress=progress)
+
+
+def _lists(src: Path, domain: str) -> tuple[Path, list[Path]]:
+    """The folder of pictures, and the lists of labels: of training, and of testing where there is one."""
+    if domain == "synthetic" and (src / "train.json").is_file() and not (src / domain).is_dir():
+        return src / "images/train", [src / "train.json"]
+    folder = src / domain
+    if not folder.is_dir():
+        raise InputError(
+            f"{src}: expected a folder of SPEED+ with {domain}/ or of SPEED with train.json, found neither"
+        )
+    names = ("train.json", "validation.json") if domain == "synthetic" else ("test.json",)
+    lists = [folder / name for name in names]
+    return folder / "images", [path for path in lists if path == lists[0] or path.is_file()]
+
+
+def _read_camera(src: Path, labels: Path) -> _Intrinsics:
+    path = src / "camera.json"
+    of_speed = labels.parent == src and not path.is_file()
+    values = SPEED_CAMERA if of_speed else read_json(path)
+    try:
+        width, height = int(values["Nu"]), int(values["Nv"])
+        if "cameraMatrix" in values:
+            matrix = np.array(values["cameraMatrix"], np.float64).reshape(3, 3)
+            (fx, _, cx), (_, fy, cy) = matrix[:2].tolist()
+        else:
+            fx, fy = (float(values[f"f{axis}"]) / float(values[f"pp{axis}"]) for axis in "xy")
+            cx, cy = float(values.get("ccx", 0.5 * width)), float(values.get("ccy", 0.5 * height))
+        lens = [float(value) for value in np.ravel(values.get("distCoeffs", ()))]
+        distortion = tuple([*lens, *[0.0] * (5 - len(lens))]) if any(lens) else ()
+        if len(distortion) > 5 or not np.isfinite([fx, fy, cx, cy, *distortion]).all():
+            raise ValueError
+        Camera(np.eye(4), width, height, fx, fy, cx, cy)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError, AttributeError):
+        expected = "Nu, Nv, cameraMatrix (or fx, fy, ppx, ppy) and at most five distCoeffs"
+        raise InputError(f"{path}: expected {expected}, found other values") from None
+    return _Intrinsics(width, height, fx, fy, cx, cy, distortion)
+
+
+def _read_labels(path: Path) -> list[_Label]:
+    """In the order of their file names."""
+    entries = read_json(path, MAX_LIST_BYTES)
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{path}: expected a list of labels, found another value")
+    return sorted((_read_label(path, entry) for entry in entries), key=lambda label: label.filename)
+
+
+def _read_label(path: Path, entry: dict[str, Any]) -> _Label:
+    name = entry.get("filename")
+    parts = PurePosixPath(name).parts if isinstance(name, str) else ()
+    if not parts or "\0" in str(name) or ".." in parts or PurePosixPath(str(name)).is_absolute():
+        raise InputError(f"{path}: expected a file name below the folder of pictures as filename, found {name!r}")
+    try:
+        quaternion = _numbers(entry, _TURNS, 4)
+        position = _numbers(entry, _PLACES, 3)
+        length = float(np.linalg.norm(quaternion))
+        if abs(length - 1) > _UNIT:
+            raise InputError(f"expected a quaternion of length 1, found one of length {length:.4g}")
+        if max(map(abs, position)) > _FARTHEST:
+            raise InputError(f"expected a position within {_FARTHEST:g} m, found {position}")
+    except InputError as error:
+        raise InputError(f"{path}: {name}: {error}") from None
+    return _Label(str(name), quaternion, position)
+
+
+def _numbers(entry: dict[str, Any], keys: Sequence[str], count: int) -> list[float]:
+    """The finite numbers under the first of `keys` that is there."""
+    value = next((entry[key] for key in keys if key in entry), None)
+    try:
+        numbers = np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.empty(0)
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise InputError(f"expected {count} finite numbers as {' or '.join(keys)}, found {value!r}"[:300])
+    return numbers.tolist()
+
+
+def _subsets(splits: list[list[_Label]], count: int, seed: int) -> list[list[_Label]]:
+    """`count` of all, shared out as the splits are long, at least one of each that has any."""
+    total = sum(map(len, splits))
+    tested = sum(map(len, splits[1:]))
+    of_test = min(max(round(count * tested / total), 1), tested, count - 1) if tested else 0
+    random = np.random.default_rng(seed)
+    return [_draw(labels, want, random) for labels, want in zip(splits, (count - of_test, of_test), strict=False)]
+
+
+def _draw(labels: list[_Label], count: int, random: np.random.Generator) -> list[_Label]:
+    """One from each of `count` equal pieces; all where there are no more."""
+    if count >= len(labels):
+        return labels
+    places = (np.arange(count) + random.random(count)) * len(labels) / count
+    return [labels[i] for i in np.minimum(places.astype(np.int64), len(labels) - 1)]
+
+
+@dataclass(frozen=True, eq=False)
+class _FrameMaker:
+    """What all frames share."""
+
+    pictures: Path  #: their folder
+    intrinsics: _Intrinsics
+    size: tuple[int, int]  #: (width, height) that pictures get
+    masks: Mapping[str, Path]  #: of file names
+    masked: str
+
+    def frame(self, label: _Label) -> ImportedFrame:
+        """Pictures are read when it is written. Raises InputError for a picture of another size than the camera's."""
+        path, full = self.pictures / label.filename, (self.intrinsics.width, self.intrinsics.height)
+        found = image_size(path)
+        if found != full:
+            expected = f"{full[0]}x{full[1]} pixels as camera.json says"
+            raise InputError(f"{path}: expected {expected}, found {found[0]}x{found[1]}")
+        mask = self.masks.get(label.filename)
+        made = None if mask is None else partial(_resized_mask, mask, full, self.size)
+        return ImportedFrame(
+            name=PurePosixPath(label.filename).with_suffix("").as_posix(),
+            picture=path if self.size == full else partial(_resized, path, self.size),
+            camera=self.intrinsics.camera(label.world_from_camera, self.size),
+            distortion=self.intrinsics.distortion,
+            silhouette=made if self.masked == "empty" else None,
+            mask=made if self.masked == "unknown" else None,
+            keys={"q_vbs2tango_true": label.quaternion, "r_Vo2To_vbs_true": label.position},
+        )
+
+
+def _resized(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """[h, w] or [h, w, 3] uint8: means over the areas of the pixels of `size` (width, height)."""
+    pixels = read_png(path)
+    if pixels.dtype != np.uint8:
+        raise InputError(f"{path}: expected a picture of 8 bits, found one of 16")
+    return np.asarray(PillowImage.fromarray(pixels[..., :3] if pixels.ndim == 3 else pixels).resize(size, _BOX))
+
+
+def _resized_mask(path: Path, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
+    """[h, w] uint8, 255 where most of a pixel is white."""
+    white = np.where(read_mask(path, *full), 255, 0).astype(np.uint8)
+    return np.where(np.asarray(PillowImage.fromarray(white).resize(size, _BOX)) > 127, 255, 0).astype(np.uint8)
+
+
+SPEEDPLUS = Importer(
+    import_speedplus,
+    "SPEED+ or SPEED: poses of a spacecraft, no Sun",
+    "folder with camera.json",
+    (
+        Option("domain", str, "NAME", "synthetic (default), lightbox or sunlamp", DOMAINS),
+        Option("max_distance", float, "M", "leave out what is farther than so many metres (all)"),
+        Option("count", int, "N", "so many frames, evenly spread (all)"),
+        Option("scale", float, "X", "size of the pictures, a fraction (1)"),
+        Option("seed", int, "N", "draws the frames of --count (0)"),
+        *MASK_OPTIONS,
+    ),
+)

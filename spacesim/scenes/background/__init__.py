@@ -1,0 +1,1 @@
+"""What pictures show behind the objects: the Earth, stars."""
