@@ -264,12 +264,20 @@ class Run:
         return Rendering(self, camera, direction, exposure)
 
     def predict(
-        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
+        self,
+        camera: Camera,
+        sun: Sun | None = None,
+        normals: bool = False,
+        exposure: float | None = None,
+        embedding: np.ndarray | None = None,
     ) -> Prediction:
-        """Render one view. A run that is not `relightable` knows one light: `sun` changes nothing. Where training
-        pictures have embeddings, every view is drawn with their mean. exposure: EV, of a model whose colours are
-        linear; by default that of its training pictures. Raises InputError where a relightable run is not told the Sun,
-        and for an exposure of a model whose colours are sRGB values."""
+        """Render one view. A run that is not `relightable` knows one light: `sun` changes nothing. exposure: EV, of a
+        model whose colours are linear; by default that of its training pictures;  embedding: [E] of the view, where
+        training pictures have some; by default their mean. Raises InputError where a relightable run is not told the
+        Sun, for an exposure of a model whose colours are sRGB values, and for an embedding that it does not have."""
+        size = self.light.config.field.embeddings if self.light else 0
+        if embedding is not None and np.shape(embedding) != (size,):
+            raise InputError(f"embedding: expected {size} numbers for {self.path}, found {np.shape(embedding)}")
         stops_more = stops(self.curve, exposure, str(self.path))
         check_picture(camera)
         names = ("alpha", "depth", *(("normal",) if normals else ()))
@@ -282,7 +290,15 @@ class Run:
                 f"{self.path}: expected the Sun's direction for a run of {self.config['method']}, found none"
             )
         towards = None if sun is None else sun.direction
-        lit = partial(draw_lit, self.gaussians, self.light, sun=towards, outputs=names, antialiased=self.antialiased)
+        lit = partial(
+            draw_lit,
+            self.gaussians,
+            self.light,
+            sun=towards,
+            outputs=names,
+            antialiased=self.antialiased,
+            embedding=embedding if size else None,
+        )
         output = render_supersampled(lit, camera, self.supersample, colors=3, linear=self.curve is not None)
         drawn, alpha = output.image("features"), output.image("alpha")
         visible = np.zeros_like(alpha)
@@ -318,11 +334,12 @@ def draw_lit(
     sun: np.ndarray | None,
     outputs: Sequence[str] = (),
     antialiased: bool = False,
+    embedding: np.ndarray | None = None,
 ) -> RenderOutput:
     """A relit and shadowed frame on the device. features: colour (3 planes), then, of a model with shadows, visibility,
     all premultiplied. sun: [3], unit, towards the Sun, None of a model that is not told;  outputs, antialiased: see
-    `render`"""
-    colors, visibility = light.shade_picture(gaussians, camera, sun)
+    `render`;  embedding: of the picture, see `LightModel.shade_picture`"""
+    colors, visibility = light.shade_picture(gaussians, camera, sun, embedding=embedding)
     visibilities = [] if visibility is None else [visibility]
     return render(gaussians, camera, outputs=outputs, features=[*colors, *visibilities], antialiased=antialiased)
 

@@ -291,7 +291,9 @@ def test_data_without_alpha_is_judged_whole(make_run, dataset, tmp_path):
         write_png(path, np.ascontiguousarray(read_png(path)[..., :3]))
     metrics = evaluate(make_run(shifted), elsewhere(dataset, silhouette_path=None), tmp_path / "eval")
     assert metrics["image"]["mae"] == metrics["image_full"]["mae"]
-    assert any("the silhouette is the whole frame" in note for note in metrics["notes"])
+    assert metrics["image"] == metrics["image_full"]
+    assert metrics["image_region"] == "frame"
+    assert any("image is over whole pictures" in note for note in metrics["notes"])
 
 
 def test_ignored_pixels_do_not_count(make_run, dataset, tmp_path):
