@@ -1,6 +1,7 @@
 """What a run does not know of a picture, fitted on one half of the object in it and judged on the other half, and the
 other way round: every pixel is judged by numbers that were fitted without it."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +34,7 @@ def predict_by_halves(run: "Predictor", dataset: Dataset, frame: Frame, unknowns
     target = frame_target(dataset, frame)
     columns = np.nonzero(target.silhouette)[1]
     start = PictureLight(frame.sun)
-    middle = int(np.median(columns)) if len(columns) else 0
+    middle = math.ceil(np.median(columns)) if len(columns) else 0
     is_left = np.broadcast_to(np.arange(target.silhouette.shape[1]) < middle, target.silhouette.shape)
     masks = [target.silhouette & is_left, target.silhouette & ~is_left]
     if not all(mask.any() for mask in masks):

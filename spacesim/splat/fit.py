@@ -6,7 +6,7 @@ each from what those before it have found.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -16,10 +16,11 @@ from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose.aligned import AlignedRun
 from spacesim.splat.run import Prediction, Predictor, Run
 
+SATURATED = 254.5 / 255  #: sRGB value from which on a pixel says only that it is bright
 SIDE = 128  #: pixels of the longer side, at most, of the picture that embeddings are fitted on
 VARIANCE, MAX_AXES = 0.99, 16  #: share of the training embeddings' variance that is searched, and its axes at most
 STEP = 0.1  #: standard deviations along an axis, of a finite difference
-ITERATIONS, HALVINGS = 3, 4  #: Gauss-Newton steps, and how often each is halved until it helps
+ITERATIONS, HALVINGS = 4, 4  #: Gauss-Newton steps, and how often each is halved until it helps
 ENOUGH = 1e-3  #: a step that lowers the cost by less than this share is the last
 CORRELATED = 16  #: pixels that count as one observation against the prior: errors of neighbours are alike
 
@@ -74,8 +75,10 @@ def find_unknowns(run: Predictor, gain: bool = False) -> tuple[Unknown, ...]:
 
 def draw(run: Predictor, camera: Camera, light: PictureLight) -> Prediction:
     """A view with a light. Its colours are clipped to [0, 1] where there is a gain."""
-    told: dict[str, Any] = {} if light.embedding is None else {"embedding": light.embedding}
-    drawn = run.predict(camera, light.sun, **told)
+    if light.embedding is not None:
+        assert isinstance(run, Run | AlignedRun), "other runs have none"
+        run = run.with_embedding(light.embedding)
+    drawn = run.predict(camera, light.sun)
     return drawn if light.gain == 1 else replace(drawn, rgb=srgb_from_linear(light.gain * linear_from_srgb(drawn.rgb)))
 
 
@@ -94,7 +97,7 @@ class GainFit:
         lights = []
         for mask, light in zip(masks, start, strict=True):
             drawn = linear_from_srgb(draw(run, picture.camera, light).rgb).astype(np.float64)
-            counted = mask & (picture.rgb.max(axis=2) < 1)
+            counted = mask & (picture.rgb.max(axis=2) < SATURATED)
             squares = float(np.square(drawn[counted]).sum())
             factor = float((drawn[counted] * truth[counted]).sum()) / squares if squares > 0 else 1.0
             lights.append(replace(light, gain=light.gain * factor))

@@ -212,6 +212,9 @@ class Run:
     gaussians: Gaussians
     model_bytes: int  #: size of the model's file
     light: LightModel | None = None  #: None of a method without light
+    embedding: np.ndarray | None = (
+        None  #: [E] of every view, None: the mean of the training pictures', if they have any
+    )
 
     @property
     def gaussian_count(self) -> int:
@@ -263,21 +266,21 @@ class Run:
             raise InputError(f"sun: expected its direction for a run of {self.config['method']}, found none")
         return Rendering(self, camera, direction, exposure)
 
-    def predict(
-        self,
-        camera: Camera,
-        sun: Sun | None = None,
-        normals: bool = False,
-        exposure: float | None = None,
-        embedding: np.ndarray | None = None,
-    ) -> Prediction:
-        """Render one view. A run that is not `relightable` knows one light: `sun` changes nothing. exposure: EV, of a
-        model whose colours are linear; by default that of its training pictures;  embedding: [E] of the view, where
-        training pictures have some; by default their mean. Raises InputError where a relightable run is not told the
-        Sun, for an exposure of a model whose colours are sRGB values, and for an embedding that it does not have."""
+    def with_embedding(self, embedding: np.ndarray) -> "Run":
+        """The run with every view drawn with `embedding` [E] in place of the mean of the training pictures'. Raises
+        InputError where these have none, or of another length."""
         size = self.light.config.field.embeddings if self.light else 0
-        if embedding is not None and np.shape(embedding) != (size,):
+        if not size or np.shape(embedding) != (size,):
             raise InputError(f"embedding: expected {size} numbers for {self.path}, found {np.shape(embedding)}")
+        return replace(self, embedding=embedding)
+
+    def predict(
+        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
+    ) -> Prediction:
+        """Render one view. A run that is not `relightable` knows one light: `sun` changes nothing. Where training
+        pictures have embeddings, every view is drawn with their mean, but see `with_embedding`. exposure: EV, of a
+        model whose colours are linear; by default that of its training pictures. Raises InputError where a relightable
+        run is not told the Sun, and for an exposure of a model whose colours are sRGB values."""
         stops_more = stops(self.curve, exposure, str(self.path))
         check_picture(camera)
         names = ("alpha", "depth", *(("normal",) if normals else ()))
@@ -297,7 +300,7 @@ class Run:
             sun=towards,
             outputs=names,
             antialiased=self.antialiased,
-            embedding=embedding if size else None,
+            embedding=self.embedding,
         )
         output = render_supersampled(lit, camera, self.supersample, colors=3, linear=self.curve is not None)
         drawn, alpha = output.image("features"), output.image("alpha")

@@ -71,18 +71,17 @@ class AlignedRun:
         """None: it was trained as one."""
         return ()
 
+    def with_embedding(self, embedding: np.ndarray) -> "AlignedRun":
+        """See `Run.with_embedding`."""
+        return replace(self, run=self.run.with_embedding(embedding))
+
     def predict(
-        self,
-        camera: Camera,
-        sun: Sun | None = None,
-        normals: bool = False,
-        exposure: float | None = None,
-        embedding: np.ndarray | None = None,
+        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> Prediction:
         """As `Run.predict`, of a camera and a Sun in the world."""
         near = self.pose.camera_in_model(camera)
         towards = None if sun is None else Sun(self.pose.direction_in_model(sun.direction))
-        drawn = self.run.predict(near, towards, normals, exposure, embedding)
+        drawn = self.run.predict(near, towards, normals, exposure)
         normal = None if drawn.normal is None else drawn.normal @ self.pose.rotation.T.astype(np.float32)
         return replace(drawn, depth=drawn.depth * np.float32(self.pose.scale), normal=normal)
 
