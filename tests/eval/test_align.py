@@ -6,12 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from splats import random_splats
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at, rotation_from_quaternion
+from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame, Sun
 from spacesim.eval.align import align, match_frames, moved_dataset, residuals, similarity
-from spacesim.splat.compose import Pose
+from spacesim.eval.evaluate import EvaluateConfig, evaluate
+from spacesim.eval.report.write import write_report
+from spacesim.splat.compose import ComposedRun, Composition, PlacedRun, Pose
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.run import Run
 
 POSE = Pose(rotation_from_quaternion([0.3, -0.5, 0.7, 0.2]), [4.0, -1.0, 2.5], 0.37)  # truth from reconstruction
 INSIDE = Pose().after(POSE).inverse()
@@ -40,10 +46,10 @@ def reconstruction(truth: Dataset, root: Path, noise: float = 0.0) -> Dataset:
     rng = np.random.default_rng(1)
     frames = []
     for frame in truth.train:
+        sun = None if frame.sun is None else Sun(INSIDE.rotation @ frame.sun.direction)
         off = np.eye(4)
         off[:3, 3] = noise * rng.normal(size=3)
         shaken = replace(frame.camera, world_from_camera=off @ frame.camera.world_from_camera)
-        sun = Sun(INSIDE.rotation @ frame.sun.direction)
         frames.append(replace(frame, camera=moved(shaken, INSIDE), sun=sun))
     return Dataset(root, tuple(frames), ())
 
@@ -137,3 +143,43 @@ def test_frames_of_a_video_are_counted(truth, tmp_path):
     matches, words = match_frames(own, truth)
     assert [true.file_path for _, true in matches] == [truth.frames[k].file_path for k in (7, 1, 19)]
     assert words == "source_index in transforms.json"
+
+
+@pytest.fixture
+def drawn(tmp_path) -> tuple[Run, Dataset, Dataset]:
+    """A run, pictures of it in the truth's world, and its own dataset, in its own."""
+    model = random_splats(80)
+    run = Run(tmp_path / "run", {"method": "vanilla"}, {}, Gaussians.from_numpy(model), 1000)
+    centre = POSE.points([0, 0, 0])
+    cameras = [Camera.from_fov(look_at(centre + 1.5 * way, centre), 48, 48, 40) for way in fibonacci_sphere(9)]
+    frames = []
+    for k, camera in enumerate(cameras):
+        view = run.predict(moved(camera, INSIDE))
+        straight = np.clip(view.rgb, 0, 1) / np.maximum(view.alpha, 1e-3)[..., None]
+        pixels = np.rint(255 * np.clip(np.dstack([straight, view.alpha]), 0, 1)).astype(np.uint8)
+        frames.append(Frame(f"images/v_{k}.png", camera))
+        write_png(tmp_path / "truth" / frames[-1].file_path, pixels)
+    truth = Dataset(tmp_path / "truth", tuple(frames[:6]), tuple(frames[6:]))
+    return run, truth, reconstruction(replace(truth, train=tuple(frames[:6])), tmp_path / "own")
+
+
+def test_an_aligned_run_is_evaluated_in_the_truths_world(drawn, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "nowhere"))
+    run, truth, own = drawn
+    metrics = evaluate(run, truth, tmp_path / "eval", EvaluateConfig(align=own))
+    assert metrics["image"]["psnr"]["mean"] > 40
+    assert metrics["alignment"]["cameras"] == 6
+    assert metrics["alignment"]["scale"] == pytest.approx(0.37)
+    assert metrics["notes"][0].startswith("The run was moved into the axes and scale of the data by 6 of 6 cameras")
+    write_report([tmp_path / "eval"], tmp_path / "report.html")
+    assert "Moved into the axes and scale of the data by 6 of 6" in (tmp_path / "report.html").read_text()
+    plain = evaluate(run, truth, tmp_path / "plain")
+    assert plain["alignment"] is None
+    assert plain["image"]["psnr"]["mean"] < 20
+
+
+def test_a_scene_is_not_aligned(drawn, tmp_path):
+    run, truth, own = drawn
+    scene = ComposedRun(Composition([PlacedRun(run)]), tmp_path / "scene.toml")
+    with pytest.raises(InputError, match=r"align: expected a run, found .*scene\.toml"):
+        evaluate(scene, truth, tmp_path / "eval", EvaluateConfig(align=own))

@@ -113,7 +113,7 @@ def test_saturated_pixels_do_not_tell_the_gain(run):
     shown = linear_from_srgb(np.clip(run.predict(CAMERA).rgb, 0, 1))
     factor = 1.5 / float(shown.max())
     bright = srgb_from_linear(factor * shown)
-    assert (bright == 1).any()
+    assert bright.max() > 0.999
     (light,) = GainFit().fit(run, Picture(bright, CAMERA), [np.ones_like(LEFT)], [PictureLight()])
     assert light.gain == pytest.approx(factor, rel=1e-4)
 
