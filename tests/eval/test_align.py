@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splats import random_splats
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at, rotation_from_quaternion
@@ -148,7 +147,14 @@ def test_frames_of_a_video_are_counted(truth, tmp_path):
 @pytest.fixture
 def drawn(tmp_path) -> tuple[Run, Dataset, Dataset]:
     """A run, pictures of it in the truth's world, and its own dataset, in its own."""
-    model = random_splats(80)
+    rng = np.random.default_rng(0)
+    model = {
+        "means": rng.uniform(-0.5, 0.5, (60, 3)),
+        "log_scales": rng.uniform(-2.6, -1.8, (60, 3)),
+        "quaternions": rng.normal(size=(60, 4)),
+        "logit_opacities": rng.uniform(1, 4, 60),
+        "sh": rng.uniform(-1, 1.5, (60, 1, 3)),
+    }
     run = Run(tmp_path / "run", {"method": "vanilla"}, {}, Gaussians.from_numpy(model), 1000)
     centre = POSE.points([0, 0, 0])
     cameras = [Camera.from_fov(look_at(centre + 1.5 * way, centre), 48, 48, 40) for way in fibonacci_sphere(9)]
