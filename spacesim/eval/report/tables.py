@@ -30,7 +30,7 @@ _OBJECT_TABLES: tuple[tuple[str, str, tuple[Metric, ...]], ...] = (
 
 
 def results(runs: Sequence[Evaluation]) -> str:
-    """HTML of every group's table with what its metrics mean; groups that no run has are left out."""
+    """HTML of every group's table with what its metrics mean; groups and metrics that no run has are left out."""
     parts = []
     whole = all(run.whole_pictures for run in runs)
     titles = {group: _sentence_case(where) for group, (where, _) in GROUPS.items()}
@@ -39,7 +39,11 @@ def results(runs: Sequence[Evaluation]) -> str:
     for caption, metrics, groups, described in _TABLES:
         shown = groups[:1] if whole else groups  # "image_full" is "image" there
         present = [group for group in shown if any(run.metrics.get(group) is not None for run in runs)]
-        if not present:
+        metrics, described = (
+            tuple(m for m in some if any(run.mean(group, m.key) is not None for run in runs for group in present))
+            for some in (metrics, described)
+        )
+        if not metrics:
             continue
         head = ["", *(_heading(metric) for metric in metrics)]
         columns = {group: [(group, metric) for metric in metrics] for group in present}

@@ -75,7 +75,7 @@ def _sections(runs: Sequence[Evaluation]) -> list[str]:
             "over lit and cast-shadow pixels, of the frames that show enough of these. Half of the solar disc or "
             "more is lit.",
         ),
-        section("Results", results(runs), "Mean ± population standard deviation over the frames."),
+        _section("Results", results(runs), "Mean ± population standard deviation over the frames."),
         _section(
             "Object by object",
             by_object(runs),
@@ -109,8 +109,8 @@ def _sections(runs: Sequence[Evaluation]) -> list[str]:
         _section(
             "Training cameras",
             _camera_density(runs),
-            "From where the training cameras look at the object, in views per steradian: of sides that none has seen a "
-            "run knows nothing.",
+            f"From where the training cameras look at {'what they show' if not over else 'the object'}, in views per "
+            "steradian: of sides that none has seen a run knows nothing.",
         ),
         _training(runs),
         section("How it was made", _making(runs)),
