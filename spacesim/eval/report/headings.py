@@ -20,7 +20,7 @@ def common_header(groups: Sequence[Sequence[Evaluation]], scenes: str) -> str:
     lead = f"{count} reconstructions, evaluated on {len(groups)} sets of frames. Numbers on different frames cannot be "
     lead += "compared: each set has a part of this page to itself."
     rows = [
-        [_data_name(number, group), "".join(f"<span>{run.label}</span> " for run in group)]
+        [f"{number}. {_data_name(group)}", "".join(f"<span>{run.label}</span> " for run in group)]
         for number, group in enumerate(groups, start=1)
     ]
     return (
@@ -33,15 +33,15 @@ def common_header(groups: Sequence[Sequence[Evaluation]], scenes: str) -> str:
 def data_header(number: int, runs: Sequence[Evaluation]) -> str:
     """Where the part about one set of frames begins."""
     return (
-        f'<div class="data" id="data-{number}"><p class="eyebrow">Part {number}</p><h1>{_data_name(number, runs)}</h1>'
+        f'<div class="data" id="data-{number}"><p class="eyebrow">Part {number}</p><h1>{_data_name(runs)}</h1>'
         f'<p class="lead">{escape(_about(runs))}</p></div>'
     )
 
 
-def _data_name(number: int, runs: Sequence[Evaluation]) -> str:
+def _data_name(runs: Sequence[Evaluation]) -> str:
     """HTML."""
     data = runs[0].metrics
-    return f"{number}. {escape(runs[0].scene)} <small>{escape(data['data'])}, {escape(data['split'])}</small>"
+    return f"{escape(runs[0].scene)} <small>{escape(data['split'])} frames of {escape(data['data'])}</small>"
 
 
 def _about(runs: Sequence[Evaluation]) -> str:
@@ -54,7 +54,8 @@ def _about(runs: Sequence[Evaluation]) -> str:
     facts = [f"{width} × {height} pixels"]
     if suns := data["suns"]:
         unseen = (metrics.get("unseen_suns") or {}).get("suns", 0)
-        never = f", {unseen} of them never seen in training" if unseen else ""
+        share = "" if unseen == suns else f"{unseen} of them "
+        never = f", {share}never seen in training" if unseen else ""
         facts.append(("one Sun" if suns == 1 else f"{suns} Suns") + never)
     elif data.get("truth") is False:
         facts.append("no Sun is named")

@@ -70,6 +70,7 @@ tbody th { font-weight: 400; }
 small.fitted { color: var(--muted); font-style: italic; margin-left: 0.4rem; }
 .data { margin-top: 5rem; padding-top: 1.6rem; border-top: 4px double var(--line); }
 .data h1 { font-size: clamp(1.6rem, 3.5vw, 2.2rem); }
+.data h1 small { font: 1rem var(--sans); color: var(--muted); margin-left: 0.5rem; letter-spacing: 0; }
 .data + section, .contents + section { margin-top: 2rem; }
 tr.group th { color: var(--muted); font-size: 0.86rem; padding-top: 1rem; }
 .best { font-weight: 700; }
