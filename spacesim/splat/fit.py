@@ -22,7 +22,6 @@ VARIANCE, MAX_AXES = 0.99, 16  #: share of the training embeddings' variance tha
 STEP = 0.1  #: standard deviations along an axis, of a finite difference
 ITERATIONS, HALVINGS = 4, 4  #: Gauss-Newton steps, and how often each is halved until it helps
 ENOUGH = 1e-3  #: a step that lowers the cost by less than this share is the last
-CORRELATED = 16  #: pixels that count as one observation against the prior: errors of neighbours are alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +194,10 @@ class _Reduced:
 
 def _most_likely(small: _Reduced, light: PictureLight, weights: Array, first: tuple[Array, Array]) -> Array:
     """[K] numbers that minimise the weighted squared error over the noise, whose variance is what is left of errors,
-    plus |numbers|^2. weights: [P];  first: `linearised` at 0"""
+    plus |numbers|^2. weights: [P];  first: `linearised` at 0
+
+    Pixels count as independent: with a prior 16 times as strong, pictures under Suns that training had not seen came
+    out 0.7 dB worse on the half not fitted (boxsat, 96 x 96, 9 views)."""
     numbers = np.zeros(len(first[1]))
     if not weights.sum() > 0:
         return numbers
@@ -208,7 +210,7 @@ def _most_likely(small: _Reduced, light: PictureLight, weights: Array, first: tu
         if iteration:
             picture, slopes = small.linearised(light, numbers)
         error = squares(picture)
-        noise = CORRELATED * max(error / (3 * float(weights.sum())), 1e-8)
+        noise = max(error / (3 * float(weights.sum())), 1e-8)
         weighted = slopes * weights[:, None]
         slope = np.einsum("kpc,pc->k", weighted, small.truth - picture) / noise - numbers
         curvature = np.einsum("kpc,jpc->kj", weighted, slopes) / noise + np.eye(len(numbers))

@@ -321,6 +321,23 @@ def test_ignored_pixels_do_not_count(make_run, dataset, tmp_path):
         assert metrics[f"shadow{group}"]["sharpness_ratio"]["mean"] == pytest.approx(1)
 
 
+def test_ignored_pixels_count_in_no_group(make_run, dataset, tmp_path):
+    """Whatever is predicted there, of colour and visibility, and with a gain that is fitted."""
+    rows = np.arange(SIZE)[:, None] * np.ones(SIZE)
+    write_png(dataset.root / "mask.png", np.where(rows < 25, 255, 0).astype(np.uint8))
+    masked = elsewhere(dataset, mask_path="mask.png")
+    found = []
+    for ignored in (0.0, 1.0):
+        run = make_run(
+            lambda rgb, ignored=ignored: np.where(rows[..., None] < 25, 0.8 * rgb, ignored).astype(np.float32),
+            visibility=np.where(rows < 25, rows / 25, ignored),
+        )
+        metrics = evaluate(run, masked, tmp_path / "eval", EvaluateConfig(fit_gain=True))
+        found.append({name: metrics[name] for name in (*GROUPS, "by_grazing_angle", "frames")})
+    assert found[0] == found[1]
+    assert found[0]["shadow_mask"]["error_rate"]["count"] == 4
+
+
 def test_frame_that_shows_nothing(make_run, dataset, tmp_path):
     frame = dataset.test[1]
     for path in (frame.file_path, frame.silhouette_path):

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.records import Camera, Frame, Sun
+from spacesim.splat.compose.members import Ensemble, Member
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.compose.scene import Composition, PlacedRun
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Prediction, Run
 
@@ -39,7 +39,8 @@ class AlignedRun:
     @cached_property
     def gaussians(self) -> Gaussians:
         """Its Gaussians in the world, colours left out."""
-        return Composition([PlacedRun(self.run, self.pose)]).in_world()
+        member = Member.of(self.run)
+        return Ensemble([member] if member.count else []).placed([self.pose])
 
     @property
     def gaussian_count(self) -> int:
