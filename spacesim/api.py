@@ -173,6 +173,8 @@ def evaluate(
     split: str = "test",
     lpips_weights: str | Path | None = None,
     geometry: bool = True,
+    fit_gain: bool = False,
+    align: str | Path | Dataset | None = None,
     progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
     """Evaluate a run against a dataset; write metrics.json, report.html and the frames' pictures into the folder `out`.
@@ -180,6 +182,8 @@ def evaluate(
     run: a folder, a scene file, or what `train` or `load_run` returns;  split: "test", "train" or "all"
     lpips_weights: a file or folder of AlexNet and linear weights, without which LPIPS is null
     geometry: evaluate the shape, too
+    fit_gain: fit the exposure of each picture on one half of it, judge it on the other
+    align: the dataset in whose axes and scale the run is, where those of `data` are others: their cameras are matched
     progress: called with (frames done, frames in all, file of the next) before each frame and at the end
 
     Returns what metrics.json holds (docs/reference/metrics.md): scores["image"]["psnr"]["mean"] in dB, and so on; None
@@ -190,7 +194,8 @@ def evaluate(
     from spacesim.eval.evaluate import evaluate as evaluate_run
 
     weights = None if lpips_weights is None else Path(lpips_weights)
-    config = EvaluateConfig(split, weights)
+    own = align if align is None or isinstance(align, Dataset) else read_dataset(Path(align))
+    config = EvaluateConfig(split, weights, fit_gain=fit_gain, align=own)
     loaded = load_predictor(Path(run)) if isinstance(run, str | Path) else run
     dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
     config = config if geometry else replace(config, geometry=None)

@@ -24,6 +24,15 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--no-geometry", action="store_true", help="do not evaluate the shape (docs/how-to/geometry.md)"
     )
+    parser.add_argument(
+        "--fit-gain", action="store_true", help="fit each picture's exposure on one half of it, judge it on the other"
+    )
+    parser.add_argument(
+        "--align",
+        type=Path,
+        metavar="DATA",
+        help="the dataset that the run is in the axes and scale of, where --data has others: match their cameras",
+    )
     parser.add_argument("--json", action="store_true", help="print metrics.json alone")
 
 
@@ -34,7 +43,8 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.progress import show_progress
     from spacesim.splat.compose import load_predictor
 
-    config = EvaluateConfig(options.split, options.lpips_weights)
+    own = None if options.align is None else read_dataset(options.align)
+    config = EvaluateConfig(options.split, options.lpips_weights, fit_gain=options.fit_gain, align=own)
     if options.no_geometry:
         config = replace(config, geometry=None)
     evaluated, dataset = load_predictor(options.path), read_dataset(options.data)

@@ -12,11 +12,14 @@ WANTS_FILTER = "the run is antialiased: viewers without Mip-Splatting's 2D filte
 def print_headline(metrics: dict[str, Any]) -> None:
     """PSNR, SSIM and shadow errors in a line each."""
     show = partial(_mean, metrics)
-    interrupts.print_output(f"silhouette: PSNR {show('image', 'psnr', 2)} dB, SSIM {show('image', 'ssim', 4)}", end="")
-    interrupts.print_output(f", FLIP {show('image', 'flip', 4)}; full frame: PSNR {show('image_full', 'psnr', 2)} dB")
-    interrupts.print_output(
-        f"shadows: BER {show('shadow', 'ber', 4)}, boundary MAE {show('shadow', 'boundary_mae', 4)}"
-    )
+    whole = metrics.get("image_region") == "frame"
+    numbers = f"PSNR {show('image', 'psnr', 2)} dB, SSIM {show('image', 'ssim', 4)}, FLIP {show('image', 'flip', 4)}"
+    full = "" if whole else f"; full frame: PSNR {show('image_full', 'psnr', 2)} dB"
+    interrupts.print_output(f"{'whole pictures' if whole else 'silhouette'}: {numbers}{full}")
+    if metrics.get("shadow"):
+        interrupts.print_output(
+            f"shadows: BER {show('shadow', 'ber', 4)}, boundary MAE {show('shadow', 'boundary_mae', 4)}"
+        )
     if metrics.get("shadow_mask"):
         share, balanced = show("shadow_mask", "error_rate", 4), show("shadow_mask", "balanced_error_rate", 4)
         pooled = metrics["shadow_mask"]["error_rate"]
@@ -24,9 +27,7 @@ def print_headline(metrics: dict[str, Any]) -> None:
         interrupts.print_output(f"shadow masks: error rate {share}{pooled_words}, balanced {balanced}")
     if metrics.get("known_suns") and metrics.get("unseen_suns"):
         known_psnr, unseen_psnr = (_mean(metrics[part], "image", "psnr", 2) for part in ("known_suns", "unseen_suns"))
-        interrupts.print_output(
-            f"silhouette PSNR: {known_psnr} dB under known Suns, {unseen_psnr} dB under Suns never seen"
-        )
+        interrupts.print_output(f"PSNR: {known_psnr} dB under known Suns, {unseen_psnr} dB under Suns never seen")
     if (metrics.get("geometry") or {}).get("chamfer") is not None:
         interrupts.print_output(_shape_words(metrics["geometry"]))
     for note in metrics.get("notes", []):

@@ -12,12 +12,14 @@ MAX_NAME_LENGTH = 100  #: characters of a frame's name; file systems take 255 by
 
 
 def training_digest(dataset: Dataset) -> str:
-    """Of the training frames: names and sizes of the files, poses, intrinsics, lenses, Suns. Raises OSError where a
-    picture is missing."""
-    identity = [
-        (f.file_path, (dataset.root / f.file_path).stat().st_size, _numbers(f), f.sun and f.sun.angles)
-        for f in dataset.train
-    ]
+    """`frames_digest` of the training frames."""
+    return frames_digest(dataset.root, dataset.train)
+
+
+def frames_digest(root: Path, frames: Sequence[Frame]) -> str:
+    """Of frames: names and sizes of the files, poses, intrinsics, lenses, Suns. root: their dataset's. Raises OSError
+    where a picture is missing."""
+    identity = [(f.file_path, (root / f.file_path).stat().st_size, _numbers(f), f.sun and f.sun.angles) for f in frames]
     return hashlib.sha256(repr(identity).encode()).hexdigest()[:16]
 
 

@@ -20,26 +20,32 @@ from spacesim.data import density
 from spacesim.data.errors import InputError
 from spacesim.data.files import write_json
 from spacesim.data.geometry import Array
-from spacesim.data.identity import frame_names
+from spacesim.data.identity import frame_names, frames_digest
 from spacesim.data.records import Dataset, Frame
+from spacesim.eval.align import align
+from spacesim.eval.fit import predict_by_halves
 from spacesim.eval.frame_metrics import (
     frame_images,
     frame_light,
     image_groups,
+    is_photograph,
     tally_grazing,
     visibility_groups,
     write_pictures,
 )
-from spacesim.eval.labels import GROUPS
+from spacesim.eval.labels import GROUPS, SHADOW
 from spacesim.eval.metrics import grazing, lpips, shadow
 from spacesim.eval.metrics.geometry import GeometryConfig, ShapeResult, compare_geometry
-from spacesim.eval.notes import MODELS_OF_A_SCENE, explain, explain_light, explain_objects
+from spacesim.eval.notes import MODELS_OF_A_SCENE, explain, explain_fit, explain_light, explain_objects
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
 from spacesim.eval.objects import compare_object_shapes, object_groups, object_names, swapped_order
 from spacesim.eval.relight import write_sweep
 from spacesim.eval.schema import SCHEMA
 from spacesim.eval.shape import write_shapes
 from spacesim.eval.suns import count_suns, known_suns, rounded_angles, training_frames
+from spacesim.splat.compose.aligned import AlignedRun, moved_frame
+from spacesim.splat.fit import Unknown, find_unknowns
+from spacesim.splat.run import Run
 
 if TYPE_CHECKING:
     from spacesim.splat.run import Predictor
@@ -57,6 +63,9 @@ class EvaluateConfig:
     lpips_weights: Path | None = None  #: see `lpips.find_weights`
     #: how the shape is evaluated, None: not at all
     geometry: GeometryConfig | None = field(default_factory=GeometryConfig)
+    fit_gain: bool = False  #: one factor on each picture's linear values is fitted by halves (`eval.fit`)
+    #: the dataset in whose axes and scale the run is, where these are not those of the evaluated one (`eval.align`)
+    align: Dataset | None = None
 
     def __post_init__(self) -> None:
         if self.split not in ("test", "train", "all"):
@@ -72,6 +81,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate every frame of the split and return what EVAL/metrics.json, written last, then holds.
 
+    What a run does not know of a picture (`splat.fit.find_unknowns`) is fitted on one half of it and judged on the
+    other.
     progress: called with (frames done, frames in all, the next one's file) before each frame and at the end.
     Raises InputError where there is no frame to evaluate or the dataset is broken, WorkError where a prediction is not
     finite.
@@ -80,23 +91,34 @@ def evaluate(
     frames = {"test": dataset.test, "train": dataset.train, "all": dataset.frames}[config.split]
     if not frames:
         raise InputError(f"{dataset.root}: expected frames in the split {config.split}, found none")
+    alignment = align(config.align, dataset) if config.align else None
+    if alignment:
+        if not isinstance(run, Run):
+            raise InputError(f"align: expected a run, found {run.path}, a scene, which says itself where models stand")
+        run = AlignedRun(run, alignment.pose)
+    unknowns = find_unknowns(run, config.fit_gain)
     dark = next((frame for frame in frames if frame.sun is None), None)
-    if dark is not None and run.relightable:
+    if dark is not None and run.relightable and not any(unknown.name == "sun" for unknown in unknowns):
         raise InputError(
             f"{dataset.root}: expected the Sun of every frame for a relightable run, {dark.file_path} has none"
         )
     network, lpips_sentence = lpips.load(config.lpips_weights)
     _prepare(out)
-    run.predict(frames[0].camera, frames[0].sun)  # compiles the kernels
+    if dark is None or not run.relightable:
+        run.predict(frames[0].camera, frames[0].sun)  # compiles the kernels
     models = [part.name for part in run.parts] or None  # of a composed scene, which was not trained on this dataset
-    trained, untold = training_frames(run.config, dataset) if models is None else ((), MODELS_OF_A_SCENE)
+    own = config.align or dataset
+    trained, untold = training_frames(run.config, own) if models is None else ((), MODELS_OF_A_SCENE)
+    if alignment:
+        trained = [moved_frame(frame, alignment.pose) for frame in trained]
     objects = object_names(dataset, models or ())
     knows_sun = known_suns(frames, trained)
     results: list[FrameResult] = []
     for name, frame, has_known_sun in zip(frame_names(frames), frames, knows_sun, strict=True):
         if progress:
             progress(len(results), len(frames), frame.file_path)
-        results.append(_evaluate_frame(run, dataset, frame, has_known_sun, network, out / "frames" / name, objects))
+        folder = out / "frames" / name
+        results.append(_evaluate_frame(run, dataset, frame, has_known_sun, network, folder, objects, unknowns))
     no_map = _write_camera_density(dataset, trained, out)
     sweep, no_sweep = write_sweep(run, dataset, frames, trained, out)
     if progress:
@@ -117,6 +139,9 @@ def evaluate(
             "render_ms": 1e3 * statistics.median(result.seconds for result in results),
             "backend": run.backend,
         },
+        "image_region": "frame" if all(result.source == "frame" for result in results) else "silhouette",
+        "fitted": [{"name": unknown.name, "how": unknown.how} for unknown in unknowns] or None,
+        "alignment": alignment.to_json() if alignment else None,
         **_summaries(results),
         "geometry": shape.values,
         "objects": _by_object(results, objects, shapes),
@@ -124,6 +149,8 @@ def evaluate(
         "unseen_suns": _sun_group([result for result in results if result.has_known_sun is False]),
         "relight": sweep,
         "notes": [
+            *([alignment.note] if alignment else []),
+            *explain_fit(unknowns, records),
             *([shape.note] if shape.note else []),
             *([no_map] if no_map else []),
             *explain(records, [result.source for result in results], None if network else lpips_sentence, method),
@@ -186,21 +213,32 @@ def _evaluate_frame(
     network: lpips.Lpips | None,
     folder: Path,
     objects: Mapping[int, str],
+    unknowns: Sequence[Unknown],
 ) -> FrameResult:
-    """Predict a frame, evaluate it and each of its `objects`, write its pictures into `folder`."""
-    start = time.perf_counter()
-    prediction = run.predict(frame.camera, frame.sun)
-    seconds = time.perf_counter() - start
+    """Predict a frame, what is not known of it fitted by halves, evaluate it and each of its `objects`, write its
+    pictures into `folder`."""
+    fitted = None
+    if unknowns:
+        fit = predict_by_halves(run, dataset, frame, unknowns)
+        prediction, seconds, fitted = fit.prediction, fit.seconds, fit.record
+    else:
+        start = time.perf_counter()
+        prediction = run.predict(frame.camera, frame.sun)
+        seconds = time.perf_counter() - start
     view, source = frame_images(dataset, frame, prediction)
     light = frame_light(dataset, frame, prediction)
-    write_pictures(folder, view, light)
-    named = {
+    photograph = is_photograph(frame, source)
+    write_pictures(folder, view, light, photograph)
+    named: dict[str, Any] = {
         "file_path": frame.file_path,
         "name": folder.name,
         "sun": rounded_angles(frame),
         "known_sun": has_known_sun,
     }
-    record: dict[str, Any] = named | image_groups(view, network) | visibility_groups(light, view)
+    if unknowns:
+        named["fitted"] = fitted
+    groups = image_groups(view, network, source, photograph)
+    record: dict[str, Any] = named | groups | visibility_groups(light, view)
     if objects:
         record["objects"] = object_groups(dataset, frame, objects, view, light, network)
     return FrameResult(frame, record, source, has_known_sun, tally_grazing(light, view), seconds)
@@ -267,6 +305,8 @@ def summary(records: Iterable[Mapping[str, float | None] | None]) -> dict[str, A
 def _describe(dataset: Dataset, frames: Sequence[Frame]) -> dict[str, Any]:
     """What the report says about the data: its size, and from scene.json how it was made."""
     return {
+        "digest": _digest(dataset, frames),
+        "truth": any(frame.gt_path is not None for frame in frames),
         "frames": len(frames),
         "train_frames": len(dataset.train),
         "suns": count_suns(frames),
@@ -275,10 +315,18 @@ def _describe(dataset: Dataset, frames: Sequence[Frame]) -> dict[str, Any]:
     }
 
 
+def _digest(dataset: Dataset, frames: Sequence[Frame]) -> str | None:
+    """By which reports know that runs were evaluated on the same frames; None where their files do not say."""
+    try:
+        return frames_digest(dataset.root, frames)
+    except OSError:
+        return None
+
+
 def _flatten(record: dict[str, Any]) -> dict[str, Any]:
     """A frame as the contract has it: values over the silhouette beside the name, others in their groups."""
     rest = {key: value for key, value in record.items() if key not in ("image", "shadow")}
-    return {**rest, **record["image"], **record["shadow"]}
+    return {**rest, **record["image"], **(record["shadow"] or dict.fromkeys(metric.key for metric in SHADOW))}
 
 
 def _versions() -> dict[str, str]:

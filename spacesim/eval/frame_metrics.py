@@ -9,7 +9,7 @@ import numpy as np
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import Array
 from spacesim.data.images import load_image, luminance, read_png, write_png
-from spacesim.data.records import Dataset, Frame, Truth
+from spacesim.data.records import Dataset, Frame, Image, Truth
 from spacesim.data.store import SHADOW_NONE, SHADOW_SELF_CAST, load_truth
 from spacesim.eval import pictures
 from spacesim.eval.metrics import grazing, image, lpips, shadow
@@ -39,14 +39,17 @@ class FrameLight:
     alpha: np.ndarray  #: [H, W] predicted
 
 
-def frame_images(dataset: Dataset, frame: Frame, prediction: "Prediction") -> tuple[FrameImages, str]:
-    """The pictures to compare, and where the silhouette is from: "truth", "alpha" or "frame".
+@dataclass(frozen=True, eq=False)
+class FrameTarget:
+    """What a frame is compared with."""
 
-    Raises WorkError where the prediction is not finite, InputError where the dataset is broken.
-    """
-    predicted = (prediction.rgb, prediction.alpha, prediction.visibility)
-    if not all(np.all(np.isfinite(plane)) for plane in predicted if plane is not None):
-        raise WorkError(f"{frame.file_path}: the prediction has values that are not finite; train the run again")
+    image: Image
+    silhouette: Mask  #: [H, W] bool, the object's pixels among the valid ones; all of them where it is not known
+    source: str  #: where the silhouette is from: "truth", "alpha", or "frame" where it is not known
+
+
+def frame_target(dataset: Dataset, frame: Frame) -> FrameTarget:
+    """Raises InputError where the dataset is broken."""
     loaded = load_image(dataset, frame)
     if frame.silhouette_path is not None and not any(frame.distortion):
         silhouette, source = read_png(dataset.root / frame.silhouette_path) > 0, "truth"
@@ -58,8 +61,21 @@ def frame_images(dataset: Dataset, frame: Frame, prediction: "Prediction") -> tu
     else:
         silhouette = loaded.alpha >= 0.5
         source = "frame" if np.all(loaded.alpha == 1) else "alpha"
-    shown = np.where(loaded.valid[..., None], np.clip(prediction.rgb, 0, 1), np.float32(0)), loaded.over(np.zeros(3))
-    return FrameImages(*shown, silhouette & loaded.valid, loaded.valid), source
+    return FrameTarget(loaded, silhouette & loaded.valid, source)
+
+
+def frame_images(dataset: Dataset, frame: Frame, prediction: "Prediction") -> tuple[FrameImages, str]:
+    """The pictures to compare, and where the silhouette is from, see `FrameTarget`.
+
+    Raises WorkError where the prediction is not finite, InputError where the dataset is broken.
+    """
+    predicted = (prediction.rgb, prediction.alpha, prediction.visibility)
+    if not all(np.all(np.isfinite(plane)) for plane in predicted if plane is not None):
+        raise WorkError(f"{frame.file_path}: the prediction has values that are not finite; train the run again")
+    target = frame_target(dataset, frame)
+    valid = target.image.valid
+    shown = np.where(valid[..., None], np.clip(prediction.rgb, 0, 1), np.float32(0)), target.image.over(np.zeros(3))
+    return FrameImages(*shown, target.silhouette, valid), target.source
 
 
 def frame_light(dataset: Dataset, frame: Frame, prediction: "Prediction") -> FrameLight:
@@ -68,13 +84,26 @@ def frame_light(dataset: Dataset, frame: Frame, prediction: "Prediction") -> Fra
     return FrameLight(truth, prediction.visibility, prediction.alpha)
 
 
-def image_groups(view: FrameImages, network: lpips.Lpips | None) -> dict[str, shadow.Metrics]:
-    """The frame's values of the groups that compare pictures."""
+def is_photograph(frame: Frame, source: str) -> bool:
+    """Whether a frame shows neither what is object nor where the Sun is: then darkness says nothing of shadow. source:
+    of its silhouette"""
+    return source == "frame" and frame.sun is None and frame.gt_path is None
+
+
+def image_groups(
+    view: FrameImages, network: lpips.Lpips | None, source: str = "truth", photograph: bool = False
+) -> dict[str, shadow.Metrics | None]:
+    """The frame's values of the groups that compare pictures. Where the silhouette's `source` is "frame", "image" is
+    "image_full". photograph: see `is_photograph`"""
     inside = image.interior(view.valid.shape)
     levels = luminance(view.prediction), luminance(view.truth)
+    full = _image_metrics(view, view.valid, view.valid & inside, network)
+    over = full if source == "frame" else _image_metrics(view, view.silhouette, view.silhouette, network)
+    if photograph:
+        return {"image": over, "image_full": full, "shadow": None, "shadow_full": None}
     return {
-        "image": _image_metrics(view, view.silhouette, view.silhouette, network),
-        "image_full": _image_metrics(view, view.valid, view.valid & inside, network),
+        "image": over,
+        "image_full": full,
         "shadow": shadow.luminance_metrics(*levels, view.silhouette),
         "shadow_full": shadow.luminance_metrics(*levels, view.valid),
     }
@@ -101,16 +130,17 @@ def tally_grazing(light: FrameLight, view: FrameImages) -> Array | None:
     return grazing.tally(light.truth, *levels, light.visibility, view.valid)
 
 
-def write_pictures(folder: Path, view: FrameImages, light: FrameLight) -> None:
-    """Five pictures, and three more where visibility is predicted and known."""
-    dark, truly_dark = (shadow.is_shadowed(luminance(p)) for p in (view.prediction, view.truth))
+def write_pictures(folder: Path, view: FrameImages, light: FrameLight, photograph: bool = False) -> None:
+    """Three pictures, two of dark pixels but of photographs, three more where visibility is predicted and known."""
     images = {
         "truth": pictures.as_bytes(view.truth),
         "prediction": pictures.as_bytes(view.prediction),
         "error": pictures.error_picture(view.prediction, view.truth, view.valid),
-        "shadow_truth": pictures.shadow_picture(truly_dark, truly_dark, view.silhouette),
-        "shadow_prediction": pictures.shadow_picture(dark, truly_dark, view.silhouette),
     }
+    if not photograph:
+        dark, truly_dark = (shadow.is_shadowed(luminance(p)) for p in (view.prediction, view.truth))
+        images["shadow_truth"] = pictures.shadow_picture(truly_dark, truly_dark, view.silhouette)
+        images["shadow_prediction"] = pictures.shadow_picture(dark, truly_dark, view.silhouette)
     if light.visibility is not None and light.truth is not None:
         classes = light.truth.shadow
         mask = view.valid & (classes != SHADOW_NONE)

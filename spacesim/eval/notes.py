@@ -4,9 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from spacesim.eval.labels import GROUPS
+from spacesim.splat.fit import Unknown
 
 MODELS_OF_A_SCENE = "the models of a scene were trained on other data"
 
+WHOLE_PICTURES = "image is over whole pictures, as image_full: no silhouette is known, nor alpha."
 _STAND_INS = {
     "alpha": "the silhouette is where the image's alpha is at least one half",
     "frame": "the silhouette is the whole frame, as the data has neither silhouette nor alpha",
@@ -22,10 +24,18 @@ def explain(records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips:
     notes = []
     if no_lpips:
         notes.append(f"LPIPS is null; {no_lpips}.")
-    if all(record["shadow_mask"] is None for record in records):
+    photographs = sum(record["shadow"] is None for record in records)
+    if photographs:
+        notes.append(
+            f"shadow and shadow_full are null{'' if photographs == total else f' in {photographs} of {total} frames'}: "
+            f"the pictures say neither what is object nor where the Sun is, so dark pixels say nothing of shadow."
+        )
+    if photographs < total and all(record["shadow_mask"] is None for record in records):
         notes.append(f"Visibility is null: {method} predicts none, or the data has no path-traced one.")
+    if sources.count("frame") == total:
+        notes.append(WHOLE_PICTURES)
     for source, sentence in _STAND_INS.items():
-        if count := sources.count(source):
+        if (count := sources.count(source)) and not (source == "frame" and count == total):
             notes.append(f"In {count} of {total} frames {sentence}.")
     unseen = sum(not _shows_object(record) for record in records)
     if unseen:
@@ -33,6 +43,20 @@ def explain(records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips:
     for group in GROUPS:
         notes += _explain_group(records, group, bool(no_lpips))
     return notes + _explain_kinds(records)
+
+
+def explain_fit(unknowns: Sequence[Unknown], records: Sequence[dict[str, Any]]) -> list[str]:
+    """Sentences about what was fitted to the pictures."""
+    if not unknowns:
+        return []
+    what = "; ".join(f"{unknown.name} ({unknown.how})" for unknown in unknowns)
+    notes = [
+        f"Fitted to each evaluated picture: {what}. On the left half of the object in it, judged on the right half, "
+        "and the other way round: no pixel is judged by numbers that were fitted on it."
+    ]
+    if missing := sum(record["fitted"] is None for record in records):
+        notes.append(f"In {missing} of {len(records)} frames nothing was fitted: a half shows no object.")
+    return notes
 
 
 def explain_light(

@@ -130,7 +130,7 @@ class FrameRecord:
     sun: tuple[float, float] | None  #: azimuth and elevation, degrees
     psnr: float | None
     image_full: Values
-    shadow_full: Values
+    shadow_full: Values | None
     shadow_mask: Values | None
     known_sun: bool | None = None
     ssim: float | None = None
@@ -142,6 +142,7 @@ class FrameRecord:
     bias: float | None = None
     boundary_mae: float | None = None
     sharpness_ratio: float | None = None
+    fitted: Mapping[str, Any] | None = None  #: what was fitted to it, of a run with `Metrics.fitted`
 
     def __post_init__(self) -> None:
         if Path(self.name).name != self.name:
@@ -170,6 +171,25 @@ class RelightSweep:
 
 
 @dataclass(frozen=True)
+class FittedNumbers:
+    """What was fitted to each picture, on one half of it to judge the other."""
+
+    name: str
+    how: str  #: in words
+
+
+@dataclass(frozen=True)
+class AlignmentFacts:
+    """How a run was brought into the axes and scale of the data."""
+
+    cameras: int  #: that match
+    inliers: int  #: of these, that it is fitted to
+    rms: float  #: metres, between the positions of these
+    rms_over_distance: float
+    scale: float
+
+
+@dataclass(frozen=True)
 class ModelFacts:
     """Size and speed of a model."""
 
@@ -190,6 +210,8 @@ class DatasetFacts:
     train_frames: int
     suns: int
     resolution: tuple[int, int]  #: width and height of the first frame, pixels
+    digest: str | None = None  #: of the evaluated frames
+    truth: bool | None = None  #: whether it was path-traced
     scene: str | None = None
     config: Mapping[str, Any] | None = None
     versions: Mapping[str, Any] | None = None
@@ -243,6 +265,9 @@ class Metrics(Groups):
     unseen_suns: SunGroups | None = None
     by_grazing_angle: tuple[GrazingBin, ...] | None = None
     relight: RelightSweep | None = None
+    image_region: str = "silhouette"  #: what `image` is over: "silhouette", or "frame" where none is known
+    fitted: tuple[FittedNumbers, ...] | None = None
+    alignment: AlignmentFacts | None = None
 
     def __post_init__(self) -> None:
         if self.schema != SCHEMA:
@@ -254,6 +279,6 @@ class Metrics(Groups):
 RULES = Rules(
     open=(
         *(Summary, Groups, GrazingBin, NearShares, Floaters, Geometry, ObjectRecord, FrameRecord, RelitView),
-        *(RelightSweep, ModelFacts, DatasetFacts, TrainingStep, TrainingFacts),
+        *(FittedNumbers, AlignmentFacts, RelightSweep, ModelFacts, DatasetFacts, TrainingStep, TrainingFacts),
     )
 )

@@ -212,6 +212,9 @@ class Run:
     gaussians: Gaussians
     model_bytes: int  #: size of the model's file
     light: LightModel | None = None  #: None of a method without light
+    embedding: np.ndarray | None = (
+        None  #: [E] of every view, None: the mean of the training pictures', if they have any
+    )
 
     @property
     def gaussian_count(self) -> int:
@@ -263,13 +266,21 @@ class Run:
             raise InputError(f"sun: expected its direction for a run of {self.config['method']}, found none")
         return Rendering(self, camera, direction, exposure)
 
+    def with_embedding(self, embedding: np.ndarray) -> "Run":
+        """The run with every view drawn with `embedding` [E] in place of the mean of the training pictures'. Raises
+        InputError where these have none, or of another length."""
+        size = self.light.config.field.embeddings if self.light else 0
+        if not size or np.shape(embedding) != (size,):
+            raise InputError(f"embedding: expected {size} numbers for {self.path}, found {np.shape(embedding)}")
+        return replace(self, embedding=embedding)
+
     def predict(
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> Prediction:
         """Render one view. A run that is not `relightable` knows one light: `sun` changes nothing. Where training
-        pictures have embeddings, every view is drawn with their mean. exposure: EV, of a model whose colours are
-        linear; by default that of its training pictures. Raises InputError where a relightable run is not told the Sun,
-        and for an exposure of a model whose colours are sRGB values."""
+        pictures have embeddings, every view is drawn with their mean, but see `with_embedding`. exposure: EV, of a
+        model whose colours are linear; by default that of its training pictures. Raises InputError where a relightable
+        run is not told the Sun, and for an exposure of a model whose colours are sRGB values."""
         stops_more = stops(self.curve, exposure, str(self.path))
         check_picture(camera)
         names = ("alpha", "depth", *(("normal",) if normals else ()))
@@ -282,7 +293,15 @@ class Run:
                 f"{self.path}: expected the Sun's direction for a run of {self.config['method']}, found none"
             )
         towards = None if sun is None else sun.direction
-        lit = partial(draw_lit, self.gaussians, self.light, sun=towards, outputs=names, antialiased=self.antialiased)
+        lit = partial(
+            draw_lit,
+            self.gaussians,
+            self.light,
+            sun=towards,
+            outputs=names,
+            antialiased=self.antialiased,
+            embedding=self.embedding,
+        )
         output = render_supersampled(lit, camera, self.supersample, colors=3, linear=self.curve is not None)
         drawn, alpha = output.image("features"), output.image("alpha")
         visible = np.zeros_like(alpha)
@@ -318,11 +337,12 @@ def draw_lit(
     sun: np.ndarray | None,
     outputs: Sequence[str] = (),
     antialiased: bool = False,
+    embedding: np.ndarray | None = None,
 ) -> RenderOutput:
     """A relit and shadowed frame on the device. features: colour (3 planes), then, of a model with shadows, visibility,
     all premultiplied. sun: [3], unit, towards the Sun, None of a model that is not told;  outputs, antialiased: see
-    `render`"""
-    colors, visibility = light.shade_picture(gaussians, camera, sun)
+    `render`;  embedding: of the picture, see `LightModel.shade_picture`"""
+    colors, visibility = light.shade_picture(gaussians, camera, sun, embedding=embedding)
     visibilities = [] if visibility is None else [visibility]
     return render(gaussians, camera, outputs=outputs, features=[*colors, *visibilities], antialiased=antialiased)
 

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ import pytest
 from spacesim.data.images import load_image, write_exr, write_png
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
 from spacesim.data.store import SHADOW_LIT, SHADOW_SELF_CAST
+from spacesim.splat.run import Prediction
 
 SIZE = 40
 SUNS = ((30.0, 20.0), (200.0, -10.0))
@@ -92,7 +92,7 @@ class FakeRun:
         frame = next(frame for frame in self.dataset.test if frame.camera is camera)
         rgb = load_image(self.dataset, frame).over(np.zeros(3))
         alpha = np.ones(rgb.shape[:2], np.float32)
-        return SimpleNamespace(rgb=self.change(rgb), alpha=alpha, depth=alpha, visibility=self.visibility)
+        return Prediction(rgb=self.change(rgb), alpha=alpha, depth=alpha, visibility=self.visibility)
 
 
 @dataclass
@@ -106,7 +106,7 @@ class RelightableRun(FakeRun):
     def predict(self, camera, sun):
         rgb, inside = sphere(sun.angles)
         columns = np.arange(SIZE) >= self.edge
-        return SimpleNamespace(
+        return Prediction(
             rgb=self.change(rgb),
             alpha=inside.astype(np.float32),
             depth=inside,

@@ -10,12 +10,21 @@ import pytest
 from spacesim.data.density import write_camera_density
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import look_at
-from spacesim.data.images import load_image, luminance, read_png, write_png
+from spacesim.data.images import (
+    linear_from_srgb,
+    load_image,
+    luminance,
+    read_png,
+    srgb_from_linear,
+    write_png,
+)
 from spacesim.data.records import Camera, Frame
 from spacesim.eval import pictures
 from spacesim.eval.evaluate import EvaluateConfig, evaluate, frame_names, summary
 from spacesim.eval.labels import GROUPS
 from spacesim.eval.metrics import image, lpips, shadow
+
+SIZE = 40
 
 
 @pytest.fixture(autouse=True)
@@ -291,7 +300,9 @@ def test_data_without_alpha_is_judged_whole(make_run, dataset, tmp_path):
         write_png(path, np.ascontiguousarray(read_png(path)[..., :3]))
     metrics = evaluate(make_run(shifted), elsewhere(dataset, silhouette_path=None), tmp_path / "eval")
     assert metrics["image"]["mae"] == metrics["image_full"]["mae"]
-    assert any("the silhouette is the whole frame" in note for note in metrics["notes"])
+    assert metrics["image"] == metrics["image_full"]
+    assert metrics["image_region"] == "frame"
+    assert any("image is over whole pictures" in note for note in metrics["notes"])
 
 
 def test_ignored_pixels_do_not_count(make_run, dataset, tmp_path):
@@ -308,6 +319,23 @@ def test_ignored_pixels_do_not_count(make_run, dataset, tmp_path):
     for group in ("", "_full"):  # windows and slopes beside the mask read none of them either
         assert metrics[f"image{group}"]["ssim"]["mean"] == pytest.approx(1)
         assert metrics[f"shadow{group}"]["sharpness_ratio"]["mean"] == pytest.approx(1)
+
+
+def test_ignored_pixels_count_in_no_group(make_run, dataset, tmp_path):
+    """Whatever is predicted there, of colour and visibility, and with a gain that is fitted."""
+    rows = np.arange(SIZE)[:, None] * np.ones(SIZE)
+    write_png(dataset.root / "mask.png", np.where(rows < 25, 255, 0).astype(np.uint8))
+    masked = elsewhere(dataset, mask_path="mask.png")
+    found = []
+    for ignored in (0.0, 1.0):
+        run = make_run(
+            lambda rgb, ignored=ignored: np.where(rows[..., None] < 25, 0.8 * rgb, ignored).astype(np.float32),
+            visibility=np.where(rows < 25, rows / 25, ignored),
+        )
+        metrics = evaluate(run, masked, tmp_path / "eval", EvaluateConfig(fit_gain=True))
+        found.append({name: metrics[name] for name in (*GROUPS, "by_grazing_angle", "frames")})
+    assert found[0] == found[1]
+    assert found[0]["shadow_mask"]["error_rate"]["count"] == 4
 
 
 def test_frame_that_shows_nothing(make_run, dataset, tmp_path):
@@ -357,3 +385,88 @@ def test_a_frame_of_one_pixel_hardly_moves_what_is_pooled():
     means = summary([*frames, {"error_rate": None, "iou": None, "pixels": 0}])
     assert means["error_rate"] == {"mean": 0.55, "std": 0.45, "count": 2, "pooled": pytest.approx(0.109)}
     assert means["iou"] == {"mean": 0.25, "std": 0.25, "count": 2}
+
+
+def photographs(dataset):
+    """The dataset as a camera on Earth would give it: opaque pictures, no Sun, no truth."""
+    for frame in dataset.test:
+        path = dataset.root / frame.file_path
+        write_png(path, np.ascontiguousarray(read_png(path)[..., :3]))
+    return elsewhere(dataset, sun=None, gt_path=None, silhouette_path=None)
+
+
+def test_photographs_have_no_shadow_metrics(make_run, dataset, tmp_path):
+    out = tmp_path / "eval"
+    metrics = evaluate(make_run(shifted), photographs(dataset), out)
+    assert metrics["image_region"] == "frame"
+    assert metrics["image"] == metrics["image_full"]
+    assert metrics["shadow"] is metrics["shadow_full"] is metrics["geometry"] is metrics["shadow_mask"] is None
+    assert metrics["dataset"]["truth"] is False
+    assert all(frame["ber"] is None for frame in metrics["frames"])
+    assert not list(out.glob("frames/*/shadow_*.png"))
+    assert any(
+        note.startswith("shadow and shadow_full are null: the pictures say neither") for note in metrics["notes"]
+    )
+    assert not any("the silhouette is" in note for note in metrics["notes"])
+
+
+def test_silhouettes_without_suns_keep_luminance_and_lose_groups_by_sun(make_run, dataset, tmp_path):
+    metrics = evaluate(make_run(shifted), elsewhere(dataset, sun=None, gt_path=None), tmp_path / "eval")
+    assert metrics["image_region"] == "silhouette"
+    assert metrics["shadow"]["ber"]["count"] == 4
+    assert metrics["known_suns"] is metrics["unseen_suns"] is metrics["by_grazing_angle"] is None
+
+
+def test_the_same_frames_have_the_same_digest(make_run, dataset, tmp_path):
+    def digest(data):
+        return evaluate(make_run(), data, tmp_path / "eval")["dataset"]["digest"]
+
+    assert digest(dataset) != digest(replace(dataset, test=dataset.test[:1]))
+
+
+def test_the_gain_of_each_half_is_judged_on_the_other(make_run, dataset, tmp_path):
+    """The truth's left half is half as bright as shown, its right half as bright: each is drawn with the other's."""
+    left = np.arange(SIZE) < SIZE // 2
+
+    def brighter(rgb):
+        linear = linear_from_srgb(np.clip(rgb, 0, 1))
+        return srgb_from_linear(np.where(left[None, :, None], 2 * np.minimum(linear, 0.5), linear))
+
+    dimmed = {frame.file_path for frame in dataset.test}
+    for name in dimmed:
+        rgba = read_png(dataset.root / name)
+        half = np.rint(255 * srgb_from_linear(0.4 * linear_from_srgb(rgba[..., :3] / 255))).astype(np.uint8)
+        write_png(dataset.root / name, np.dstack([half, rgba[..., 3]]))
+    run, out = make_run(brighter), tmp_path / "eval"
+    plain = evaluate(run, dataset, out)
+    assert plain["fitted"] is None
+    assert "fitted" not in plain["frames"][0]
+    metrics = evaluate(run, dataset, out, EvaluateConfig(fit_gain=True))
+    assert [part["name"] for part in metrics["fitted"]] == ["gain"]
+    assert any("no pixel is judged by numbers that were fitted on it" in note for note in metrics["notes"])
+    for frame in metrics["frames"]:
+        assert frame["fitted"]["from_column"] == SIZE // 2
+        assert frame["fitted"]["gain"] == pytest.approx([0.5, 1.0], rel=0.02)
+    shown = read_png(out / "frames" / "test_00000" / "prediction.png") / 255
+    truth = read_png(out / "frames" / "test_00000" / "truth.png") / 255
+    expected = linear_from_srgb(truth) * np.where(left, 2.0, 0.5)[None, :, None]
+    np.testing.assert_allclose(shown, srgb_from_linear(expected), atol=0.02)
+
+
+def test_a_gain_that_is_missing_costs_nothing_once_it_is_fitted(make_run, dataset, tmp_path):
+    def darker(rgb):
+        return srgb_from_linear(0.5 * linear_from_srgb(np.clip(rgb, 0, 1)))
+
+    plain, fitted = (
+        evaluate(make_run(darker), dataset, tmp_path / "eval", EvaluateConfig(fit_gain=gain)) for gain in (False, True)
+    )
+    assert plain["image"]["psnr"]["mean"] < 27
+    assert fitted["image"]["psnr"]["mean"] > 55
+
+
+def test_frames_without_an_object_are_not_fitted(make_run, dataset, tmp_path):
+    frame = dataset.test[0]
+    write_png(dataset.root / frame.silhouette_path, np.zeros((SIZE, SIZE), np.uint8))
+    metrics = evaluate(make_run(), dataset, tmp_path / "eval", EvaluateConfig(fit_gain=True))
+    assert metrics["frames"][0]["fitted"] is None
+    assert any(note.startswith("In 1 of 4 frames nothing was fitted") for note in metrics["notes"])

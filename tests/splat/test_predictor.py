@@ -10,6 +10,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose import ComposedRun, Composition, PlacedRun, Pose, load_predictor
+from spacesim.splat.compose.aligned import AlignedRun
 from spacesim.splat.compose.run import PlacedPart
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Part, Predictor, Run
@@ -35,12 +36,14 @@ def scene(run, tmp_path) -> ComposedRun:
     return ComposedRun(Composition(models), tmp_path / "scene.toml")
 
 
-@pytest.mark.parametrize("kind", [Run, ComposedRun, Composition])
+@pytest.mark.parametrize("kind", [Run, AlignedRun, ComposedRun, Composition])
 def test_predict_is_asked_in_the_same_words(kind):
     assert words_of(kind.predict) == words_of(Predictor.predict)
 
 
-@pytest.mark.parametrize(("kind", "protocol"), [(Run, Predictor), (ComposedRun, Predictor), (PlacedPart, Part)])
+@pytest.mark.parametrize(
+    ("kind", "protocol"), [(Run, Predictor), (AlignedRun, Predictor), (ComposedRun, Predictor), (PlacedPart, Part)]
+)
 def test_all_that_is_asked_for_is_there(kind, protocol):
     asked = {name for name in vars(protocol) if not name.startswith("_")}
     assert len(asked) > 3

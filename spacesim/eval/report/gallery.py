@@ -35,7 +35,7 @@ MISTAKES = {
 
 
 def gallery(runs: Sequence[Evaluation]) -> str:
-    """HTML of the frames chosen by PSNR over the silhouette."""
+    """HTML of the frames chosen by PSNR."""
 
     def psnr(frame: Mapping[str, Any]) -> float | None:
         value: float | None = frame["psnr"]
@@ -46,11 +46,16 @@ def gallery(runs: Sequence[Evaluation]) -> str:
 
     stops = ", ".join(css(color) for color in error_colors(np.linspace(0, 1, 17)))
     bar = f'<span class="bar" style="background: linear-gradient(90deg, {stops})"></span>'
-    keys = (
-        f'<p class="key"><span>Error, mean of the channels: 0 {bar} {ERROR_SCALE} and more</span></p>'
-        f'<p class="key">{swatches(MISTAKES)}</p>'
-    )
-    return keys + strips(runs, _PANELS, "prediction", psnr, words)
+    keys = f'<p class="key"><span>Error, mean of the channels: 0 {bar} {ERROR_SCALE} and more</span></p>'
+    panels = dict(_PANELS)
+    if all(run.metrics["dataset"].get("truth") is False for run in runs):
+        panels["truth"] = "Picture"
+    if all(run.metrics["shadow"] is not None for run in runs):
+        keys += f'<p class="key">{swatches(MISTAKES)}</p>'
+        panels |= {"shadow_truth": f"Dark pixels, {panels['truth'].lower()}"}
+    else:
+        panels = {name: label for name, label in panels.items() if not name.startswith("shadow")}
+    return keys + strips(runs, panels, "prediction", psnr, words)
 
 
 def strips(
@@ -110,11 +115,9 @@ def css(color: Sequence[int] | np.ndarray) -> str:
 
 
 def _comparable(runs: Sequence[Evaluation]) -> list[list[Evaluation]]:
-    """All runs as one group if they share frames of the same data, else each on its own."""
+    """All runs as one group if they share frames, else each on its own."""
     shared = set.intersection(*(set(run.frames) for run in runs))
-    if shared and len({run.metrics["data"] for run in runs}) == 1:
-        return [list(runs)]
-    return [[run] for run in runs]
+    return [list(runs)] if shared else [[run] for run in runs]
 
 
 def _select_frames(rank: Mapping[str, float]) -> list[tuple[str, str]]:
@@ -139,4 +142,5 @@ def _strip(run: Evaluation, name: str, panels: Panels, captions: Panels, limit: 
         )
         for panel, label in panels.items()
     ]
-    return f'<div class="{small}strip">{"".join(figures)}</div>'
+    three = " three" if len(panels) == 3 else ""
+    return f'<div class="{small}strip{three}">{"".join(figures)}</div>'

@@ -1,7 +1,7 @@
 """EVAL folders as the report reads them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,17 @@ class Evaluation:
         """What the pictures show: the scene's name or else the data folder's."""
         return str(self.metrics["dataset"].get("scene") or Path(self.metrics["data"]).name)
 
+    @property
+    def whole_pictures(self) -> bool:
+        """Whether no silhouette is known: then "image" is over whole pictures."""
+        return self.metrics.get("image_region") == "frame"
+
+    @property
+    def tag(self) -> str:
+        """HTML: what was fitted to the pictures that it is judged by, "" for nothing."""
+        fitted = ", ".join(part["name"] for part in self.metrics.get("fitted") or [])
+        return f' <small class="fitted">{escape(fitted)} fitted</small>' if fitted else ""
+
     def mean(self, group: str, metric: str) -> float | None:
         """Mean of a metric over the frames; None where it is null."""
         value = self.summary(group, metric)
@@ -56,6 +67,29 @@ def read_evals(folders: Sequence[Path]) -> list[Evaluation]:
     names = _unique_names(contents, [Path(folder) for folder in folders])
     together = zip(folders, names, contents, strict=True)
     return [Evaluation(Path(folder), index, name, metrics) for index, (folder, name, metrics) in enumerate(together)]
+
+
+def by_data(runs: Sequence[Evaluation]) -> list[list[Evaluation]]:
+    """The runs that were evaluated on the same frames, together, in their order; each numbered within its group.
+
+    Frames are known by their digest; where a file does not tell it, those of one folder and split are the same.
+    """
+    groups: list[list[Evaluation]] = []
+    for run in runs:
+        for group in groups:
+            if _same_frames(run, group[0]):
+                group.append(replace(run, index=len(group)))
+                break
+        else:
+            groups.append([replace(run, index=0)])
+    return groups
+
+
+def _same_frames(one: Evaluation, other: Evaluation) -> bool:
+    digests = [run.metrics["dataset"].get("digest") for run in (one, other)]
+    if all(digests):
+        return bool(digests[0] == digests[1])
+    return all(one.metrics[key] == other.metrics[key] for key in ("data", "split"))
 
 
 def legend(runs: Sequence[Evaluation]) -> str:

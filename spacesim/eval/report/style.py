@@ -67,6 +67,11 @@ thead small, td small { color: var(--muted); font-weight: 400; font-size: 0.86em
 tbody th { font-weight: 400; }
 .dense th, .dense td { padding: 0.4rem 0.5rem; font-size: 0.84rem; }
 .dense th:first-child { padding-left: 0; } .dense th:last-child, .dense td:last-child { padding-right: 0; }
+small.fitted { color: var(--muted); font-style: italic; margin-left: 0.4rem; }
+.data { margin-top: 5rem; padding-top: 1.6rem; border-top: 4px double var(--line); }
+.data h1 { font-size: clamp(1.6rem, 3.5vw, 2.2rem); }
+.data h1 small { font: 1rem var(--sans); color: var(--muted); margin-left: 0.5rem; letter-spacing: 0; }
+.data + section, .contents + section { margin-top: 2rem; }
 tr.group th { color: var(--muted); font-size: 0.86rem; padding-top: 1rem; }
 .best { font-weight: 700; }
 .facts td, .facts th, .facts th:last-child {
@@ -91,6 +96,7 @@ tr.group th { color: var(--muted); font-size: 0.86rem; padding-top: 1rem; }
 .bar { display: inline-block; width: 11rem; height: 0.75rem; border-radius: 3px; margin: 0 0.5rem;
   vertical-align: -0.08rem; border: 1px solid var(--line); }
 .strip { display: grid; grid-template-columns: repeat(5, 1fr); gap: 0.7rem; margin: 0 0 1.2rem; }
+.strip.three { grid-template-columns: repeat(3, 1fr); }
 .thirds { display: grid; grid-template-columns: repeat(3, 1fr); gap: 0.7rem; margin: 0 0 1.2rem; }
 .thirds figcaption:empty { display: none; }
 .strip.small img { image-rendering: pixelated; }

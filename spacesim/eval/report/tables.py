@@ -30,15 +30,24 @@ _OBJECT_TABLES: tuple[tuple[str, str, tuple[Metric, ...]], ...] = (
 
 
 def results(runs: Sequence[Evaluation]) -> str:
-    """HTML of every group's table with what its metrics mean; groups that no run has are left out."""
+    """HTML of every group's table with what its metrics mean; groups and metrics that no run has are left out."""
     parts = []
+    whole = all(run.whole_pictures for run in runs)
+    titles = {group: _sentence_case(where) for group, (where, _) in GROUPS.items()}
+    if whole:
+        titles |= {group: "Over whole pictures; no silhouette is known" for group in ("image", "shadow")}
     for caption, metrics, groups, described in _TABLES:
-        present = [group for group in groups if any(run.metrics.get(group) is not None for run in runs)]
-        if not present:
+        shown = groups[:1] if whole else groups  # "image_full" is "image" there
+        present = [group for group in shown if any(run.metrics.get(group) is not None for run in runs)]
+        metrics, described = (
+            tuple(m for m in some if any(run.mean(group, m.key) is not None for run in runs for group in present))
+            for some in (metrics, described)
+        )
+        if not metrics:
             continue
         head = ["", *(_heading(metric) for metric in metrics)]
         columns = {group: [(group, metric) for metric in metrics] for group in present}
-        bodies = [(_sentence_case(GROUPS[group][0]), _rows(runs, columns[group])) for group in present]
+        bodies = [(titles[group], _rows(runs, columns[group])) for group in present]
         parts += [table(caption, head, bodies), _meanings(described)]
     return "".join(parts)
 
@@ -50,7 +59,8 @@ def results_by_suns(runs: Sequence[Evaluation]) -> str:
     psnr, ssim, lpips, flip = (metric_of(key, IMAGE) for key in ("psnr", "ssim", "lpips", "flip"))
     perceived = lpips if any(run.mean("image", "lpips") is not None for run in runs) else flip
     columns = [("image", metric) for metric in (psnr, ssim, perceived)]
-    columns += [("shadow", SHADOW[0]), ("shadow", SHADOW[2])]
+    if any(run.metrics["shadow"] is not None for run in runs):
+        columns += [("shadow", SHADOW[0]), ("shadow", SHADOW[2])]
     if any(run.metrics["shadow_mask"] for run in runs):
         columns.append(("shadow_mask", SHADOW_MASK[0]))
     head = ["", *(_heading(metric, "Mask " * (group == "shadow_mask")) for group, metric in columns)]
@@ -116,7 +126,7 @@ def _rows(runs: Sequence[Evaluation], columns: Sequence[tuple[str, Metric]], sun
         cells = [summary_cell(run, group, metric, suns) for run in runs]
         numbers = best_in_bold(metric, cells)
         cells_by_column.append([f"{n} <small>{cell[2]}</small>" for n, cell in zip(numbers, cells, strict=True)])
-    return [[run.label, *row] for run, *row in zip(runs, *cells_by_column, strict=True)]
+    return [[run.label + run.tag, *row] for run, *row in zip(runs, *cells_by_column, strict=True)]
 
 
 def _object_rows(runs: Sequence[Evaluation], number: int, group: str, metrics: Sequence[Metric]) -> list[list[str]]:

@@ -13,9 +13,10 @@ from spacesim.data.files import read_bytes, write_bytes
 from spacesim.eval.labels import IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric, metric_of
 from spacesim.eval.report.charts import column_histograms, histogram, line_chart, shared_edges
 from spacesim.eval.report.gallery import gallery
+from spacesim.eval.report.headings import aligned_words, common_header, data_header, fitted_words, header
 from spacesim.eval.report.html import escape, page, picture, section, table
 from spacesim.eval.report.lighting import by_grazing_angle, relighting, shadow_masks
-from spacesim.eval.report.read import Evaluation, legend, read_evals
+from spacesim.eval.report.read import Evaluation, by_data, legend, read_evals
 from spacesim.eval.report.surfaces import shapes
 from spacesim.eval.report.tables import Cell, best_in_bold, by_object, results, results_by_suns, summary_cell
 
@@ -42,12 +43,26 @@ def write_report(evals: Sequence[Path], out: Path) -> None:
 
 
 def _content(runs: Sequence[Evaluation]) -> str:
-    """The page."""
+    """The page: runs are compared where they were evaluated on the same frames, one part of it for each such data."""
+    groups = by_data(runs)
     scenes = " and ".join(sorted({run.scene for run in runs}))
-    body = [
-        _header(runs, scenes),
+    if len(groups) == 1:
+        body = [header(groups[0], scenes), *_sections(groups[0])]
+    else:
+        body = [common_header(groups, scenes)]
+        for number, group in enumerate(groups, start=1):
+            body += [data_header(number, group), *_sections(group)]
+    body.append("<footer>Written by spacesim. Equation numbers: the thesis that defines the metrics.</footer>")
+    return page(f"{scenes} · reconstruction report", "\n".join(body))
+
+
+def _sections(runs: Sequence[Evaluation]) -> list[str]:
+    """What is said of runs that were evaluated on the same frames."""
+    over = "" if all(run.whole_pictures for run in runs) else " over the silhouette"
+    known = any(run.metrics["dataset"]["suns"] for run in runs)
+    return [
         _headlines(runs),
-        section("Frames", gallery(runs), "Best, median and worst by PSNR over the silhouette."),
+        section("Frames", gallery(runs), f"Best, median and worst by PSNR{over}."),
         _section(
             "One view, many Suns",
             relighting(runs),
@@ -60,7 +75,7 @@ def _content(runs: Sequence[Evaluation]) -> str:
             "over lit and cast-shadow pixels, of the frames that show enough of these. Half of the solar disc or "
             "more is lit.",
         ),
-        section("Results", results(runs), "Mean ± population standard deviation over the frames."),
+        _section("Results", results(runs), "Mean ± population standard deviation over the frames."),
         _section(
             "Object by object",
             by_object(runs),
@@ -70,8 +85,8 @@ def _content(runs: Sequence[Evaluation]) -> str:
         _section(
             "Known and unseen Suns",
             results_by_suns(runs),
-            "Views of Suns of training and of Suns never seen, apart. Over the silhouette; the mask's error rate over "
-            "lit and cast-shadow pixels.",
+            "Views of Suns of training and of Suns never seen, apart. "
+            f"{over.strip().capitalize() or 'Whole pictures'}; the mask's error rate over lit and cast-shadow pixels.",
         ),
         _section(
             "By grazing angle",
@@ -87,22 +102,20 @@ def _content(runs: Sequence[Evaluation]) -> str:
             "seen of both from outside.",
         ),
         section(
-            "By Sun",
+            "By Sun" if known else "All frames",
             _histograms(runs),
-            "How many frames reach which PSNR [dB] over the silhouette, by azimuth and elevation.",
+            f"How many frames reach which PSNR [dB]{over}{', by azimuth and elevation' * known}.",
         ),
         _section(
             "Training cameras",
             _camera_density(runs),
-            "From where the training cameras look at the object, in views per steradian: of sides that none has seen a "
-            "run knows nothing.",
+            f"From where the training cameras look at {'what they show' if not over else 'the object'}, in views per "
+            "steradian: of sides that none has seen a run knows nothing.",
         ),
         _training(runs),
         section("How it was made", _making(runs)),
         section("Notes", _notes(runs)),
-        "<footer>Written by spacesim. Equation numbers: the thesis that defines the metrics.</footer>",
     ]
-    return page(f"{scenes} · reconstruction report", "\n".join(body))
 
 
 def _section(title: str, body: str, lead: str) -> str:
@@ -110,29 +123,14 @@ def _section(title: str, body: str, lead: str) -> str:
     return section(title, body, lead) if body else ""
 
 
-def _header(runs: Sequence[Evaluation], scenes: str) -> str:
-    counts = {f"{run.metrics['dataset']['frames']} {run.metrics['split']}" for run in runs}
-    frames = counts.pop() if len(counts) == 1 else "their"
-    what = "One reconstruction" if len(runs) == 1 else f"{len(runs)} reconstructions"
-    lead = f"{what}, evaluated on {frames} frames against the truth."
-    width, height = runs[0].metrics["dataset"]["resolution"]
-    suns = runs[0].metrics["dataset"]["suns"]
-    facts = [f"{width} × {height} pixels"]
-    if suns:
-        unseen = (runs[0].metrics.get("unseen_suns") or {}).get("suns", 0)
-        never = f", {unseen} of them never seen in training" if unseen else ""
-        facts.append(("one Sun" if suns == 1 else f"{suns} Suns") + never)
-    return (
-        f'<header><p class="eyebrow">Reconstruction report</p><h1>{escape(scenes)}</h1>'
-        f'<p class="lead">{escape(lead)} {escape(", ".join(facts))}.</p></header>'
-    )
-
-
 def _headlines(runs: Sequence[Evaluation]) -> str:
     """A card for each number that people ask for first."""
     psnr, ssim, lpips, flip = (metric_of(key, IMAGE) for key in ("psnr", "ssim", "lpips", "flip"))
     perceived = lpips if any(run.mean("image", "lpips") is not None for run in runs) else flip
-    chosen = [("image", psnr), ("image", ssim), ("image", perceived), ("shadow", SHADOW[0])]
+    chosen = [("image", psnr), ("image", ssim), ("image", perceived)]
+    shadows = any(run.metrics["shadow"] is not None for run in runs)
+    if shadows:
+        chosen.append(("shadow", SHADOW[0]))
     if any(run.metrics["shadow_mask"] is not None for run in runs):
         chosen.append(("shadow_mask", replace(SHADOW_MASK[0], label="Shadow mask error")))
     cards = [_card(metric, runs, [summary_cell(run, group, metric) for run in runs]) for group, metric in chosen]
@@ -142,9 +140,12 @@ def _headlines(runs: Sequence[Evaluation]) -> str:
     for metric in (_GAUSSIANS, _RENDER):
         cards.append(_card(metric, runs, [_model_cell(run, metric) for run in runs]))
     many = " many" if len(runs) > 1 else " more" if len(cards) > 6 else ""
-    lead = "Image and shadow numbers are means over the frames, taken over the object's silhouette"
+    whole = all(run.whole_pictures for run in runs)
+    lead = f"Image{' and shadow' * shadows} numbers are means over the frames, taken over "
+    lead += "whole pictures: no silhouette is known" if whole else "the object's silhouette"
     masks = any(group == "shadow_mask" for group, _ in chosen)
     lead += "; shadow masks over lit and cast-shadow pixels." if masks else "."
+    lead += fitted_words(runs) + aligned_words(runs)
     return f'<div class="cards{many}">{"".join(cards)}</div><p class="lead">{lead}</p>'
 
 
@@ -191,7 +192,10 @@ def _histograms(runs: Sequence[Evaluation]) -> str:
     unseen = {_sun_key(frame) for run in runs for frame in run.metrics["frames"] if frame.get("known_sun") is False}
     charts = [
         histogram(
-            _sun_name(sun) + " · unseen" * (sun in unseen), [groups.get(sun, []) for groups in by_sun], edges, tallest
+            _sun_name(sun) + " · unseen" * (sun in unseen) if any(suns) else "PSNR [dB]",
+            [groups.get(sun, []) for groups in by_sun],
+            edges,
+            tallest,
         )
         for sun in suns
     ]

@@ -183,16 +183,18 @@ class LightModel:
         camera: Projection,
         sun: np.ndarray | None,
         sunlight: Sunlight | None = None,
+        embedding: np.ndarray | None = None,
     ) -> tuple[list[Float], Any]:
         """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. sunlight: `sunlight` of this
-        Sun, of an earlier picture. The embedding is the mean one. What the field's first layer makes of the features
-        does not change with Sun or camera and stays for the next picture: as many numbers for each Gaussian as the
-        layer has units."""
+        Sun, of an earlier picture;  embedding: [E] of the picture, None: the mean one. What the field's first layer
+        makes of the features does not change with Sun or camera and stays for the next picture: as many numbers for
+        each Gaussian as the layer has units."""
         light = self.sunlight(gaussians, sun) if sunlight is None else sunlight
         of_any_size = replace(camera, width=1, height=1)  # directions do not depend on it: one recording for all sizes
         batch = PaddedBatch.of(gaussians.count, still=True)
         cache = self._picture_cache(gaussians.features, batch)
-        inputs = self._inputs(gaussians, of_any_size, self._told(sun, cache.embedding), None)
+        told = cache.embedding if embedding is None else [upload(np.asarray(embedding, np.float64))]
+        inputs = self._inputs(gaussians, of_any_size, self._told(sun, told), None)
         of_field, _ = split_weights(self.config, self.weights)
         visibility = [] if light.visibility is None else [light.visibility]
         shown = kernels.shade_picture(

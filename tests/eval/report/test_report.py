@@ -345,6 +345,73 @@ def test_runs_side_by_side(folder):
     assert "3.000" not in best
 
 
+def test_runs_on_other_frames_are_not_compared(folder):
+    """Three evaluations, two of them on the same frames: two parts, and a best one among those two alone."""
+
+    def worse(metrics):
+        metrics |= {"run": "runs/worse", "data": "/elsewhere/moved"}  # the frames say that they are the same
+        for summary in metrics["image"].values():
+            if summary:
+                summary["mean"] += 0.5
+
+    def other(metrics):
+        metrics |= {"run": "runs/other"}
+        metrics["dataset"] |= {"digest": "0123", "scene": "teapot", "resolution": [640, 480]}
+        metrics["image"]["psnr"]["mean"] = 99.25
+
+    page_of(folder, another(folder, "worse", worse), another(folder, "other", other))
+    text = (folder.parent / "report.html").read_text()
+    first, second = text.split('id="data-1"')[1].split('id="data-2"')
+    assert "640 × 480 pixels" in second
+    assert "640 × 480 pixels" not in first
+    assert "99.25" not in first
+    assert 'class="best"' in first
+    assert 'class="best"' not in second
+    assert text.count("<caption>Image</caption>") == 2
+    assert "2 sets of frames" in text
+
+
+def test_evaluations_without_a_digest_are_known_by_their_folder(folder):
+    def older(metrics):
+        del metrics["dataset"]["digest"]
+        metrics["run"] = "runs/older"
+
+    def elsewhere(metrics):
+        older(metrics)
+        metrics["data"] = "/elsewhere"
+
+    assert "sets of frames" not in "".join(page_of(folder, another(folder, "older", older)).text)
+    assert "2 sets of frames" in "".join(page_of(folder, another(folder, "elsewhere", elsewhere)).text)
+
+
+def test_photographs_are_spoken_of_as_such(folder):
+    def photographs(metrics):
+        metrics |= dict.fromkeys(("shadow", "shadow_full", "by_grazing_angle", "known_suns", "unseen_suns", "relight"))
+        metrics |= {"image_region": "frame", "image": metrics["image_full"], "notes": []}
+        metrics["dataset"] |= {"truth": False, "suns": 0}
+        for frame in metrics["frames"]:
+            frame["sun"] = None
+
+    page = page_of(another(folder, "photographs", photographs))
+    text = "".join(page.text)
+    for word in ("silhouette.", "BER", "Dark pixels", "Sun not known", "By Sun", "Truth", "object's"):
+        assert word not in text, word
+    assert "Over whole pictures; no silhouette is known" in text
+    assert "against the pictures themselves" in text
+    assert "Picture" in page.text
+    assert len(page.values("img", "src")) == 9
+
+
+def test_what_was_fitted_is_said_beside_the_numbers(folder):
+    def fitted(metrics):
+        metrics["run"] = "runs/fitted"
+        metrics["fitted"] = [{"name": "embedding", "how": "48 numbers"}, {"name": "gain", "how": "a factor"}]
+
+    text = "".join(page_of(folder, another(folder, "fitted", fitted)).text)
+    assert text.count("embedding, gain fitted") > 3
+    assert "judged on the other (fitted: embedding, gain)" in text
+
+
 def test_runs_of_the_same_name_are_told_apart(folder):
     def moved(metrics):
         metrics["run"] = "elsewhere/fake"

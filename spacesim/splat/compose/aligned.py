@@ -1,0 +1,96 @@
+"""A run in the world of another dataset: one that was trained in axes and a scale of its own."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacesim.data.records import Camera, Frame, Sun
+from spacesim.splat.compose.members import Ensemble, Member
+from spacesim.splat.compose.pose import Pose
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.run import Prediction, Run
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedRun:
+    """A run whose model is turned, moved and scaled; see `Predictor`."""
+
+    run: Run
+    pose: Pose  #: of the model in the world
+
+    @property
+    def path(self) -> Path:
+        """The run's folder."""
+        return self.run.path
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """How it was trained."""
+        return self.run.config
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """How training went."""
+        return self.run.training
+
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """Its Gaussians in the world, colours left out."""
+        member = Member.of(self.run)
+        return Ensemble([member] if member.count else []).placed([self.pose])
+
+    @property
+    def gaussian_count(self) -> int:
+        """Number of Gaussians."""
+        return self.run.gaussian_count
+
+    @property
+    def model_bytes(self) -> int:
+        """Size of the model's file."""
+        return self.run.model_bytes
+
+    @property
+    def backend(self) -> str:
+        """The backend that renders now."""
+        return self.run.backend
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether Gaussians are drawn with the anti-aliasing filter."""
+        return self.run.antialiased
+
+    @property
+    def relightable(self) -> bool:
+        """Whether the Sun's direction changes what is predicted."""
+        return self.run.relightable
+
+    @property
+    def parts(self) -> tuple[()]:
+        """None: it was trained as one."""
+        return ()
+
+    def with_embedding(self, embedding: np.ndarray) -> "AlignedRun":
+        """See `Run.with_embedding`."""
+        return replace(self, run=self.run.with_embedding(embedding))
+
+    def predict(
+        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
+    ) -> Prediction:
+        """As `Run.predict`, of a camera and a Sun in the world."""
+        near = self.pose.camera_in_model(camera)
+        towards = None if sun is None else Sun(self.pose.direction_in_model(sun.direction))
+        drawn = self.run.predict(near, towards, normals, exposure)
+        normal = None if drawn.normal is None else drawn.normal @ self.pose.rotation.T.astype(np.float32)
+        return replace(drawn, depth=drawn.depth * np.float32(self.pose.scale), normal=normal)
+
+
+def moved_frame(frame: Frame, pose: Pose) -> Frame:
+    """A frame of a model's own dataset in the world: its camera and its Sun."""
+    place = np.eye(4)
+    place[:3, :3] = pose.rotation @ frame.camera.world_from_camera[:3, :3]
+    place[:3, 3] = pose.points(frame.camera.position)
+    sun = None if frame.sun is None else Sun(pose.rotation @ frame.sun.direction)
+    return replace(frame, camera=replace(frame.camera, world_from_camera=place), sun=sun)
