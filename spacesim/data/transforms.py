@@ -7,7 +7,8 @@ Blender's pair transforms_train.json and transforms_test.json is taken too. Pose
 2. else those in a folder named test, else val, where there is a folder named train beside it;
 3. else every 8th frame, beginning with the first, in the order of their file paths.
 
-Frames whose image is not there are left out, with a warning that counts them.
+Frames whose image is not there are left out, with a warning that counts them; but where digests lie beside, the folder
+has been whole, and what is missing is damage.
 """
 
 import logging
@@ -23,6 +24,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import MAX_LIST_BYTES, read_json
 from spacesim.data.geometry import OPENCV_FROM_OPENGL
 from spacesim.data.images import image_size
+from spacesim.data.integrity.manifest import NAME as DIGESTS
 from spacesim.data.records import SUN_WORDS, Camera, Dataset, Frame, Sun
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
@@ -142,14 +144,13 @@ def _read_frames(source: Path, meta: Json) -> tuple[tuple[Frame, ...], tuple[str
     for (first, _), (second, _) in pairwise(named):
         if first == second:
             raise InputError(f"{source}: expected each image once, found {first} twice")
-    there = [is_file(source.parent / path) for path, _ in named]
-    if not any(there):
-        path = named[0][0]
-        raise InputError(f"{source}: frame {path}: expected an image file, found none, nor one of any other frame")
-    frames = [
-        _read_frame(source, meta, entry, path) for (path, entry), it_is in zip(named, there, strict=True) if it_is
-    ]
-    return tuple(frames), tuple(path for (path, _), it_is in zip(named, there, strict=True) if not it_is)
+    there = {path for path, _ in named if _exists(source.parent / path)}
+    missing = tuple(path for path, _ in named if path not in there)
+    if missing and (not there or (source.parent / DIGESTS).is_file()):
+        others = "" if there else ", nor one of any other frame"
+        raise InputError(f"{source}: frame {missing[0]}: expected an image file, found none{others}")
+    frames = [_read_frame(source, meta, entry, path) for path, entry in named if path in there]
+    return tuple(frames), missing
 
 
 def image_path(source: Path, entry: Json) -> str:
@@ -166,6 +167,8 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
     image = source.parent / file_path
     values = _without_nulls({**meta, **entry})
     try:
+        if not is_file(image):
+            raise InputError("expected an image file, found something else")
         camera, distortion, sun = _read_camera(values, image), _read_distortion(values), _read_sun(values)
     except InputError as error:
         raise InputError(f"{source}: frame {file_path}: {error}") from None
@@ -174,9 +177,10 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
 
 
 def _read_camera(values: Json, image: Path) -> Camera:
-    model = values.get("camera_model", "OPENCV")
+    model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else values.get("camera_model", "OPENCV")
     if model not in _PERSPECTIVE:
-        raise InputError(f"expected a camera_model among {', '.join(_PERSPECTIVE)}, found {model}")
+        help_ = "; spacesim import nerfstudio undistorts it" if model == "OPENCV_FISHEYE" else ""
+        raise InputError(f"expected a camera_model among {', '.join(_PERSPECTIVE)}, found {model}{help_}")
     if "w" in values and "h" in values:
         width, height = round(_number(values, "w")), round(_number(values, "h"))
     else:
@@ -267,6 +271,13 @@ def _listed(source: Path, names: Any, paths: list[str], missing: tuple[str, ...]
     if unknown:
         raise InputError(f"{source}: expected a frame for each name in its lists, found none for {unknown[0]}")
     return listed
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
 
 
 def is_file(path: Path) -> bool:

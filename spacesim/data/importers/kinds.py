@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError
-from spacesim.data.importers import nerfstudio, speedplus
+from spacesim.data.importers import colmap, nerfstudio, speedplus
 from spacesim.data.importers.importer import Importer
 from spacesim.data.importers.writing import Progress
 from spacesim.data.records import Dataset
@@ -13,6 +13,7 @@ from spacesim.data.structure import did_you_mean
 KINDS: dict[str, Importer] = {
     "nerfstudio": nerfstudio.NERFSTUDIO,
     "blender": nerfstudio.BLENDER,
+    "colmap": colmap.COLMAP,
     "speedplus": speedplus.SPEEDPLUS,
 }
 """By their names on the command line."""

@@ -1,18 +1,68 @@
-"""Folders of Nerfstudio and of NeRF-synthetic (Blender) as datasets of ours."""
+"""Folders of Nerfstudio, instant-ngp and NeRF-synthetic (Blender) as datasets of ours.
 
+What `data.transforms` reads by itself, and: lenses of OPENCV_FISHEYE, which are undistorted; depth, which comes out in
+millimetres. Its unit is what transforms.json says as `depth_unit_scale_factor` or instant-ngp's `integer_depth_scale`;
+Nerfstudio itself has it among the options of training, a millimetre by default.
+"""
+
+import io
+import logging
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.importers.importer import Importer
-from spacesim.data.importers.writing import ImportedFrame, Progress, write_dataset
+from spacesim.data.files import read_bytes
+from spacesim.data.images import read_png
+from spacesim.data.importers.importer import Importer, Option
+from spacesim.data.importers.lenses import LENS_MODELS, Lens, LensModel
+from spacesim.data.importers.masks import MASKED
+from spacesim.data.importers.pictures import FrameMaker, View, fitted
+from spacesim.data.importers.writing import ImportedFrame, Progress, frame_names, write_dataset
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import read_points
-from spacesim.data.transforms import read_dataset
+from spacesim.data.transforms import dataset_of, dataset_of_pair, image_path, read_object, read_pair
+
+_MODELS: dict[str, LensModel] = {model.name: model for model in LENS_MODELS.values()}
+_UNITS = ("depth_unit_scale_factor", "integer_depth_scale")
+_MILLIMETRE = 1e-3  # metres a step of depth/*.png; Nerfstudio's default
+
+_log = logging.getLogger(__name__)
 
 
-def import_nerfstudio(src: Path, out: Path, *, progress: Progress | None = None) -> Dataset:
-    """Import a folder with a transforms.json, or the file itself. Raises InputError as `read_dataset` does."""
-    return _import("nerfstudio", read_dataset(src), src, out, progress)
+@dataclass
+class _Extras:
+    """What transforms.json says and `data.transforms` does not read, by the paths of images."""
+
+    fisheye: dict[str, tuple[float, ...]] = field(default_factory=dict)  #: k1 to k4 of OPENCV_FISHEYE
+    depth: dict[str, tuple[str, float]] = field(default_factory=dict)  #: (path, metres a step)
+
+
+def import_nerfstudio(
+    src: Path,
+    out: Path,
+    *,
+    masked: str = "unknown",
+    depth_unit: float | None = None,
+    progress: Progress | None = None,
+) -> Dataset:
+    """Import a folder with a transforms.json, or the file itself: cameras, pictures, Suns, masks, depth and points.
+
+    masked: what black in the pictures of mask_path means, see `masks.MASKED`
+    depth_unit: metres a step of the depth files; None is what transforms.json says, else a millimetre
+
+    Truth beyond these stays behind. Raises InputError as `read_dataset` does, and where a file is broken.
+    """
+    path = src / "transforms.json" if src.is_dir() else src
+    extras = _Extras()
+    dataset = dataset_of(path, _take_extras(path, read_object(path), extras, depth_unit))
+    source = {"kind": "nerfstudio", "source": str(src), "masked": masked, "depth_unit": depth_unit}
+    return _write(dataset, extras, out, source, progress)
 
 
 def import_blender(src: Path, out: Path, *, progress: Progress | None = None) -> Dataset:
@@ -20,26 +70,153 @@ def import_blender(src: Path, out: Path, *, progress: Progress | None = None) ->
 
     Raises InputError where there is none, and as `read_dataset` does.
     """
-    path = src / "transforms_train.json" if src.is_dir() else src
-    if not path.is_file():
+    root = src if src.is_dir() else src.parent
+    if not (root / "transforms_train.json").is_file():
         raise InputError(f"{src}: expected a folder with transforms_train.json, found none in it")
-    return _import("blender", read_dataset(path), src, out, progress)
+    train, test = read_pair(root)
+    extras = _Extras()
+    train = _take_extras(root / "transforms_train.json", train, extras, None)
+    if test is not None:
+        test = test[0], _take_extras(root / test[0], test[1], extras, None)
+    source = {"kind": "blender", "source": str(src), "masked": "unknown"}
+    return _write(dataset_of_pair(root, train, test), extras, out, source, progress)
 
 
-def _import(kind: str, dataset: Dataset, src: Path, out: Path, progress: Progress | None) -> Dataset:
-    train, test = ([_frame(dataset, frame) for frame in group] for group in (dataset.train, dataset.test))
+def _take_extras(path: Path, meta: Mapping[str, Any], extras: _Extras, unit: float | None) -> Mapping[str, Any]:
+    """`meta` without what goes to `extras`. What is malformed stays, for `data.transforms` to complain of."""
+    frames = meta.get("frames")
+    if unit is not None and not (math.isfinite(unit) and unit > 0):
+        raise InputError(f"depth_unit: expected metres above 0, found {unit}")
+    if not isinstance(frames, list) or not all(isinstance(entry, dict) for entry in frames):
+        return meta
+    kept = []
+    for entry in frames:
+        values = {key: value for key, value in {**meta, **entry}.items() if value is not None}
+        name = image_path(path, entry)
+        if values.get("camera_model") == "OPENCV_FISHEYE" or values.get("is_fisheye") is True:
+            numbers = [values.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")]
+            if not all(_is_number(number) for number in numbers):
+                raise InputError(f"{path}: frame {name}: expected finite numbers as k1 to k4, found {numbers}")
+            extras.fisheye[name] = tuple(map(float, numbers))
+            entry = {
+                **entry,
+                "camera_model": "OPENCV",
+                "is_fisheye": False,
+                **dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0),
+            }
+        depth = values.get("depth_file_path", values.get("depth_path"))
+        if isinstance(depth, str) and depth:
+            extras.depth[name] = depth, _unit(path, name, values) if unit is None else unit
+        kept.append(entry)
+    return {**meta, "frames": kept}
+
+
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, int | float) and abs(value) < 1e30
+
+
+def _unit(path: Path, name: str, values: Mapping[str, Any]) -> float:
+    """Metres a step of a frame's depth."""
+    key = next((key for key in _UNITS if key in values), None)
+    if key is None:
+        return _MILLIMETRE
+    if not _is_number(values[key]) or not values[key] > 0:
+        raise InputError(f"{path}: frame {name}: expected metres above 0 as {key}, found {values[key]!r}")
+    return float(values[key])
+
+
+def _write(
+    dataset: Dataset, extras: _Extras, out: Path, source: Mapping[str, Any], progress: Progress | None
+) -> Dataset:
+    assert source["masked"] in MASKED
+    maker, depths = FrameMaker(source["masked"]), _DepthReader()
+    names = dict(zip(dataset.frames, frame_names([frame.file_path for frame in dataset.frames]), strict=True))
+
+    def make(frames: Iterable[Frame]) -> list[ImportedFrame]:
+        return [maker.frame(_view(dataset, frame, names[frame], extras, depths)) for frame in frames]
+
     points = None if dataset.ply_file_path is None else read_points(dataset.root / dataset.ply_file_path)
-    return write_dataset(out, train, test, {"kind": kind, "source": str(src)}, points, progress=progress)
+    return write_dataset(out, make(dataset.train), make(dataset.test), source, points, progress=progress)
 
 
-def _frame(dataset: Dataset, frame: Frame) -> ImportedFrame:
-    root = dataset.root
-    name = Path(frame.file_path).with_suffix("").as_posix().lstrip("./").removeprefix("images/")
-    silhouette, mask = (None if p is None else root / p for p in (frame.silhouette_path, frame.mask_path))
-    return ImportedFrame(
-        name, root / frame.file_path, frame.camera, frame.distortion, frame.sun, silhouette=silhouette, mask=mask
-    )
+def _view(dataset: Dataset, frame: Frame, name: str, extras: _Extras, depths: "_DepthReader") -> View:
+    camera, path = frame.camera, dataset.root / frame.file_path
+    fisheye = extras.fisheye.get(frame.file_path)
+    model = _MODELS["FULL_OPENCV" if fisheye is None else "OPENCV_FISHEYE"]
+    brown = (*(frame.distortion or (0.0,) * 5), 0.0, 0.0, 0.0)
+    parameters = (camera.fx, camera.fy, camera.cx, camera.cy, *(brown if fisheye is None else fisheye))
+    try:
+        lens = fitted(Lens(model, camera.width, camera.height, parameters), path)
+    except InputError as error:
+        raise InputError(
+            f"{dataset.root / frame.file_path}: {error}" if str(path) not in str(error) else str(error)
+        ) from None
+    mask, silhouette = (None if p is None else dataset.root / p for p in (frame.mask_path, frame.silhouette_path))
+    depth: Callable[[], np.ndarray] | None = None
+    if frame.file_path in extras.depth:
+        file, unit = extras.depth[frame.file_path]
+        depth = partial(depths.read, dataset.root / file, unit, lens.width, lens.height)
+    return View(name, path, camera.world_from_camera, lens, mask, frame.sun, silhouette, depth)
 
 
-NERFSTUDIO = Importer(import_nerfstudio, "a folder with a transforms.json", "folder or transforms.json")
+@dataclass
+class _DepthReader:
+    """Reads depth in any unit. Warns once of what does not fit into 16 bits."""
+
+    warned: bool = False
+
+    def read(self, path: Path, unit: float, width: int, height: int) -> np.ndarray:
+        """[H, W] uint16 millimetres of a picture, or an array of NumPy's (.npy), in steps of `unit` metres; another
+        size is brought to width x height by the nearest pixel. 0 where there is none or it is beyond 65.535 m."""
+        steps = _read_npy(path) if path.suffix == ".npy" else read_png(path)
+        if steps.ndim != 2:
+            raise InputError(f"{path}: expected depth in one channel, found {list(steps.shape)}")
+        if steps.shape != (height, width):
+            rows = (np.arange(height) + 0.5) * steps.shape[0] / height
+            columns = (np.arange(width) + 0.5) * steps.shape[1] / width
+            steps = steps[rows.astype(np.intp)[:, None], columns.astype(np.intp)]
+        with np.errstate(invalid="ignore", over="ignore"):
+            millimetres = np.rint(steps.astype(np.float64) * (unit / _MILLIMETRE))
+            fits = (millimetres > 0) & (millimetres <= np.iinfo(np.uint16).max)
+        if not self.warned and (millimetres[np.isfinite(millimetres)] > np.iinfo(np.uint16).max).any():
+            _log.warning("%s: depth beyond 65.535 m is stored as 0, none", path)
+            self.warned = True
+        return np.where(fits, millimetres, 0).astype(np.uint16)
+
+
+def _read_npy(path: Path) -> np.ndarray:
+    content = read_bytes(path, "depth")
+    try:
+        file = io.BytesIO(content)
+        major, _ = np.lib.format.read_magic(file)
+        head = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+        shape, by_columns, dtype = head(file)
+        if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content) - file.tell():
+            raise ValueError("its header promises another size")
+        values: Any = np.frombuffer(content, dtype, offset=file.tell()).reshape(shape, order="F" if by_columns else "C")
+    except Exception as error:  # NumPy documents none of what it raises
+        raise InputError(f"{path}: expected an array of NumPy's, found another file ({error})") from None
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if values.dtype.kind not in "uif" or not values.size:
+        raise InputError(f"{path}: expected numbers, found {values.dtype} {list(values.shape)}")
+    return values
+
+
+NERFSTUDIO = Importer(
+    import_nerfstudio,
+    "a folder with a transforms.json, of Nerfstudio or instant-ngp",
+    "folder, or the transforms.json",
+    (
+        Option(
+            "masked",
+            str,
+            "WHAT",
+            "pixels black in mask_path: unknown = training ignores them (default); "
+            "empty = nothing is there, and training learns it",
+            MASKED,
+        ),
+        Option("depth_unit", float, "M", "metres a step of depth files (what transforms.json says, else 0.001)"),
+    ),
+)
 BLENDER = Importer(import_blender, "NeRF-synthetic: transforms_train.json and its like", "folder")

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -29,8 +30,10 @@ from spacesim.data.store import write_points
 from spacesim.data.transforms import dataset_of, read_dataset
 
 SOURCE = "import.json"  #: of a dataset: where it comes from and what was asked for; written first
+_PARTS = {"silhouette": "silhouette_path", "mask": "mask_path", "depth": "depth_file_path"}
 Picture = Path | Callable[[], np.ndarray]
-"""A file, copied as it is, or what makes pixels when they are written: uint8 [H, W], [H, W, 3] or [H, W, 4]."""
+"""A file, copied as it is, or what makes pixels when they are written: uint8 [H, W], [H, W, 3] or [H, W, 4], of depth
+uint16 [H, W]."""
 Progress = Callable[[int, int, str], None]
 """Called with how many pictures are written, of how many, and the name of the last."""
 
@@ -46,6 +49,7 @@ class ImportedFrame:
     sun: Sun | None = None
     silhouette: Picture | None = None  #: 255 object, 0 none: a pixel without is empty
     mask: Picture | None = None  #: 255 counts, 0: ignore this pixel, nothing is known of it
+    depth: Picture | None = None  #: 16 bits, millimetres along the optical axis, 0 none
     keys: Mapping[str, Any] = field(default_factory=dict)  #: that transforms.json has of the frame besides
 
 
@@ -79,10 +83,10 @@ def write_dataset(
             entry = _entry(frame)
             entries.append(entry)
             paths += [_write(out, frame.picture, entry["file_path"])]
-            for key in ("silhouette", "mask"):
-                picture = getattr(frame, key)
+            for part, key in _PARTS.items():
+                picture = getattr(frame, part)
                 if picture is not None:
-                    paths.append(_write(out, picture, entry[f"{key}_path"]))
+                    paths.append(_write(out, picture, entry[key]))
             if progress is not None:
                 progress(number, len(frames), frame.name)
         meta: dict[str, Any] = {"camera_model": "OPENCV", "frames": entries}
@@ -104,6 +108,21 @@ def write_dataset(
         flush_disks()
         write_bytes(path, content)
     return read_dataset(out)
+
+
+def frame_names(paths: Sequence[str]) -> list[str]:
+    """Names of frames for relative paths of pictures: without a folder images/ and without the suffix, which is kept
+    where two would be the same ("a.jpg", "a.png": "a_jpg", "a_png"). Raises InputError for a path that leads out of its
+    folder."""
+    stems = []
+    for path in map(PurePosixPath, paths):
+        if path.is_absolute() or ".." in path.parts or not path.name:
+            raise InputError(f"{path}: expected a name of a picture below its folder, found another")
+        parts = path.parts[1:] if path.parts[0] == "images" and len(path.parts) > 1 else path.parts
+        stems.append(PurePosixPath(*parts).with_suffix("").as_posix())
+    counts = Counter(stems)
+    ends = [PurePosixPath(path).suffix[1:] for path in paths]
+    return [stem if counts[stem] == 1 else f"{stem}_{end}" for stem, end in zip(stems, ends, strict=True)]
 
 
 def _claim(out: Path, source: Mapping[str, Any]) -> None:
@@ -139,11 +158,11 @@ def _entry(frame: ImportedFrame) -> dict[str, Any]:
         azimuth, elevation = frame.sun.angles
         entry |= {"sun_direction": frame.sun.direction.tolist()}
         entry |= {"sun_azimuth_deg": azimuth, "sun_elevation_deg": elevation}
-    for key in ("silhouette", "mask"):
-        picture = getattr(frame, key)
+    for part, key in _PARTS.items():
+        picture = getattr(frame, part)
         if picture is not None:
             of_picture = picture.suffix.lower() if isinstance(picture, Path) else ".png"
-            entry[f"{key}_path"] = f"{key}/{frame.name}{of_picture}"
+            entry[key] = f"{part}/{frame.name}{of_picture}"
     return entry | dict(frame.keys)
 
 

@@ -1,0 +1,162 @@
+"""COLMAP projects as datasets: a sparse model and its pictures."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from spacesim.data.errors import InputError
+from spacesim.data.importers.colmap_model import (
+    ColmapImage,
+    ColmapModel,
+    count_images,
+    holds_model,
+    parts_of,
+    read_model,
+)
+from spacesim.data.importers.importer import Importer, Option
+from spacesim.data.importers.masks import MASK_OPTIONS, MaskFolder
+from spacesim.data.importers.pictures import FrameMaker, View, fitted
+from spacesim.data.importers.writing import Progress, frame_names, write_dataset
+from spacesim.data.records import Dataset
+from spacesim.data.transforms import is_file
+
+_WILD = 100.0  # times as far out as 95 % of points and cameras: points beyond are taken for wrong matches
+
+_log = logging.getLogger(__name__)
+
+
+def import_colmap(
+    src: Path,
+    out: Path,
+    *,
+    images: Path | None = None,
+    masks: Path | None = None,
+    masked: str = "empty",
+    progress: Progress | None = None,
+) -> Dataset:
+    """Import a COLMAP project: the folder of a sparse model, binary or text, or one with it in sparse/ or sparse/0/.
+
+    images: the folder of the pictures, by default SRC/images or what lies beside the model. They may have any size of
+        the cameras' shape: intrinsics are scaled to each
+    masks, masked: see `masks.MASKED`
+
+    Poses are taken as they are, in the model's axes and units. Of several models the largest is taken; images without
+    a file are left out; both are logged. Raises InputError where there is no model, as `read_model` does, where no
+    image has a file, and where a picture has another shape than its camera.
+    """
+    folder = _find_model(src)
+    model = read_model(folder)
+    connected = _largest_part(folder, model)
+    projects = dict.fromkeys([src, folder.parent, folder.parent.parent])
+    paths = _find_pictures(folder, list(projects), connected, images)
+    used = [image for image in connected if image.name in paths]
+    found_masks = {} if masks is None else MaskFolder(masks).find_all([image.name for image in used])
+    maker = FrameMaker(masked)
+    frames = []
+    for name, image in zip(frame_names([image.name for image in used]), used, strict=True):
+        path = paths[image.name]
+        lens = fitted(model.cameras[image.camera], path)
+        frames.append(maker.frame(View(name, path, image.world_from_camera, lens, found_masks.get(image.name))))
+    source = {
+        "kind": "colmap",
+        "source": str(src),
+        "images": None if images is None else str(images),
+        "masks": None if masks is None else str(masks),
+        "masked": masked,
+    }
+    return write_dataset(out, frames, [], source, _start_points(folder, model, connected), progress=progress)
+
+
+def _find_model(src: Path) -> Path:
+    """The folder of the model in a project; of several the one with most images."""
+    if not src.is_dir():
+        raise InputError(
+            f"{src}: expected a folder with a COLMAP model, found {'a file' if src.exists() else 'nothing'}"
+        )
+    for folder in (src, src / "sparse", src / "colmap" / "sparse"):
+        if not folder.is_dir():
+            continue
+        if holds_model(folder):
+            return folder
+        models = sorted(path for path in folder.iterdir() if path.is_dir() and holds_model(path))
+        if models:
+            if len(models) == 1:
+                return models[0]
+            counts = {path: count_images(path) for path in models}
+            largest = max(models, key=lambda path: counts[path])
+            _log.warning(
+                    "%s: %d models; the largest is taken, %s with %d images",
+                    folder, len(models), largest.name, counts[largest],
+                )  # fmt: skip
+            return largest
+    names = "cameras and images (.bin or .txt), in it, in sparse or in sparse/0"
+    raise InputError(f"{src}: expected a COLMAP model, {names}, found none")
+
+
+def _largest_part(folder: Path, model: ColmapModel) -> list[ColmapImage]:
+    parts = parts_of(model)
+    if len(parts) > 1:
+        left = len(model.images) - len(parts[0])
+        _log.warning(
+            "%s: the model falls into %d parts that share no point, so where they lie to each other is unknown; the "
+            "largest is taken, with %d images, and %d are left out",
+            folder, len(parts), len(parts[0]), left,
+        )  # fmt: skip
+    return parts[0]
+
+
+def _find_pictures(
+    folder: Path, projects: Sequence[Path], images: Sequence[ColmapImage], given: Path | None
+) -> dict[str, Path]:
+    """Files of images by their names, those that there are."""
+    if given is not None and not given.is_dir():
+        raise InputError(f"images: expected a folder, found {'a file' if given.exists() else 'none'} at {given}")
+    places = [given] if given is not None else [p for project in projects for p in (project / "images", project)]
+    for place in places:
+        found = {image.name: place / image.name for image in images if is_file(place / image.name)}
+        if found:
+            break
+    else:
+        where = given or places[0]
+        raise InputError(
+            f"{where}: expected the pictures of {folder} ({images[0].name}), found none; name their folder with images"
+        )
+    if len(found) < len(images):
+        first = next(image.name for image in images if image.name not in found)
+        lacking = len(images) - len(found)
+        _log.warning(
+            "%s: %d of %d images of the model have no file and are left out, %s first",
+            place, lacking, len(images), first[:200],
+        )  # fmt: skip
+    return found
+
+
+def _start_points(
+    folder: Path, model: ColmapModel, images: Sequence[ColmapImage]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Points and colours that the images see, or all where no image tells, without those that lie absurdly far out."""
+    seen = np.concatenate([image.points for image in images])
+    chosen = np.isin(model.numbers, seen) if len(seen) else np.ones(len(model.numbers), bool)
+    points, colors = model.points[chosen], model.colors[chosen]
+    if not len(points):
+        return None
+    cameras = np.array([image.world_from_camera[:3, 3] for image in images])
+    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    reach = np.quantile(np.linalg.norm(np.concatenate([points, cameras]) - np.median(points, axis=0), axis=1), 0.95)
+    near = distances <= _WILD * reach
+    if not near.all():
+        _log.info(
+            "%s: %d of %d points lie more than %g times as far out as 95 %% of points and cameras; left out",
+            folder, (~near).sum(), len(points), _WILD,
+        )  # fmt: skip
+    return points[near], colors[near]
+
+
+COLMAP = Importer(
+    import_colmap,
+    "a COLMAP project: a sparse model, binary or text, and its pictures",
+    "folder with sparse/0 and images, or that of the model",
+    (Option("images", Path, "DIR", "folder of the pictures, of any scale (SRC/images)"), *MASK_OPTIONS),
+)

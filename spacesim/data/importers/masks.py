@@ -1,0 +1,83 @@
+"""Masks from a folder, made by hand or by another program, and what they say of the pixels that they cut off."""
+
+import logging
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from PIL import Image as PillowImage
+
+from spacesim.data.errors import InputError
+from spacesim.data.images import read_png
+from spacesim.data.importers.importer import Option
+
+MASKED = "empty", "unknown"
+"""Of the pixels that are black in a mask: nothing of the object is there, which training learns (silhouette_path); or
+nothing is known of them, and training ignores them (mask_path)."""
+MASK_OPTIONS = (
+    Option("masks", Path, "DIR", "masks of the same relative names as the pictures, any suffix: white = object"),
+    Option(
+        "masked",
+        str,
+        "WHAT",
+        "pixels black in a mask: empty = nothing is there, and training learns it (default); "
+        "unknown = training ignores them",
+        MASKED,
+    ),
+)
+"""Of importers that take masks."""
+
+_log = logging.getLogger(__name__)
+
+
+class MaskFolder:
+    """Masks by the names of the pictures. Raises InputError where there is no folder."""
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise InputError(f"masks: expected a folder, found {'a file' if folder.exists() else 'none'} at {folder}")
+        self.folder = folder
+        files = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+        self._by_stem = {path.relative_to(folder).with_suffix("").as_posix(): path for path in reversed(files)}
+
+    def find(self, name: str) -> Path | None:
+        """The mask of the picture `name` (relative, with suffix): DIR/name.png, as COLMAP has it, else a file that
+        differs in its suffix alone."""
+        return self._by_stem.get(name) or self._by_stem.get(PurePosixPath(name).with_suffix("").as_posix())
+
+    def find_all(self, names: Iterable[str]) -> dict[str, Path]:
+        """Masks of pictures. Logs how many have none; raises InputError where none has one."""
+        names = list(names)
+        found = {name: path for name in names if (path := self.find(name)) is not None}
+        if not found:
+            raise InputError(f"masks: expected masks named like the pictures ({names[0]}), found none in {self.folder}")
+        if len(found) < len(names):
+            first = next(name for name in names if name not in found)
+            lacking = len(names) - len(found)
+            _log.warning(
+                "%s: %d of %d pictures have no mask and count as a whole, %s first",
+                self.folder, lacking, len(names), first,
+            )  # fmt: skip
+        return found
+
+
+def read_mask(path: Path, width: int, height: int) -> np.ndarray:
+    """[H, W] bool, True where the mask is white: its alpha where it has one that is not 1 everywhere, else its
+    brightest channel, from one half on, or from 1 on where no pixel has more. One of the same shape but another size is
+    scaled, by the nearest pixel.
+
+    Raises InputError where it is no picture or of another shape.
+    """
+    pixels = read_png(path)
+    values = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=-1)
+    if pixels.ndim == 3 and pixels.shape[2] == 4 and pixels[..., 3].min() < 255:
+        values = pixels[..., 3]  # a picture that has been cut out
+    white = values >= (1 if values.max() == 1 else (np.iinfo(values.dtype).max + 1) // 2)
+    found_height, found_width = white.shape
+    if (found_width, found_height) == (width, height):
+        return white
+    if abs(found_width * height - found_height * width) > max(found_width, found_height, width, height):
+        expected = f"{width}x{height} pixels, or a multiple or fraction, as its picture"
+        raise InputError(f"{path}: expected {expected}, found {found_width}x{found_height}")
+    resized = PillowImage.fromarray(white.astype(np.uint8)).resize((width, height), PillowImage.Resampling.NEAREST)
+    return np.asarray(resized) > 0

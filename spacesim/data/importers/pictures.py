@@ -1,0 +1,135 @@
+"""Pictures of a lens and their masks as frames: copied where our cameras can say the lens, else resampled."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacesim.backend.memory import check_memory
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import Array
+from spacesim.data.images import Resampling, has_alpha, image_size, read_png, resample
+from spacesim.data.importers.lenses import Lens
+from spacesim.data.importers.masks import read_mask
+from spacesim.data.importers.writing import ImportedFrame
+from spacesim.data.records import Camera, Image, Sun
+
+_UNDISTORTING = 120  # bytes a pixel, for a while
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A picture, from where and through which lens it was taken."""
+
+    name: str  #: of the frame
+    path: Path  #: of the picture, which has the lens's size
+    world_from_camera: Array  #: [4, 4]
+    lens: Lens
+    mask: Path | None = None  #: white = object, or = known, as the frames' maker says
+    sun: Sun | None = None
+    silhouette: Path | None = None  #: other than 0 = object, of the picture's size
+    depth: Callable[[], np.ndarray] | None = None  #: makes uint16 [H, W], millimetres along the optical axis
+
+
+@dataclass
+class FrameMaker:
+    """Makes frames of views. Where a lens is more than Brown-Conrady's, pictures and masks are resampled to the pinhole
+    camera in its middle, and what it does not image is unknown."""
+
+    masked: str = "empty"  #: what black in a mask means, see `masks.MASKED`
+    _resampling: Any = field(init=False)  # of a lens: two are kept
+    _sees_all: Any = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._resampling = lru_cache(maxsize=2)(_undistortion)
+        self._sees_all = lru_cache(maxsize=None)(lambda lens: bool(self._resampling(lens).inside.all()))
+
+    def frame(self, view: View) -> ImportedFrame:
+        """Pictures are read when the frame is written. Raises InputError for a camera that cannot be."""
+        lens, empty = view.lens, self.masked == "empty"
+        try:
+            camera = Camera(view.world_from_camera, lens.width, lens.height, *lens.pinhole)
+        except InputError as error:
+            raise InputError(f"{view.path}: {error}") from None
+        distortion = lens.distortion
+        resampled = distortion is None
+        cut_out = view.mask is not None and empty and has_alpha(view.path)
+        unknown = (view.mask is not None and not empty) or (resampled and not self._sees_all(lens))
+        in_file = view.mask is not None and empty and not cut_out
+        silhouette = (lambda: self._silhouette(view)) if in_file or (resampled and view.silhouette) else view.silhouette
+        return ImportedFrame(
+            name=view.name,
+            picture=(lambda: self._picture(view)) if resampled or cut_out else view.path,
+            camera=camera,
+            distortion=distortion or (),
+            sun=view.sun,
+            silhouette=silhouette,
+            mask=(lambda: self._known(view)) if unknown else None,
+            depth=None if view.depth is None else partial(self._depth, view.depth, view),
+        )
+
+    def _picture(self, view: View) -> np.ndarray:
+        """uint8, with the file's channels."""
+        pixels = read_png(view.path)
+        values = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+        shape = values.shape[:2]
+        alpha = values[..., 3] if values.shape[2] == 4 else np.ones(shape, np.float32)
+        if values.shape[2] == 4 and view.mask is not None and self.masked == "empty":
+            alpha = alpha * read_mask(view.mask, view.lens.width, view.lens.height)
+        image = Image(np.broadcast_to(values[..., :3], (*shape, 3)), alpha, np.ones(shape, bool))
+        if view.lens.distortion is None:
+            image = resample(image, self._resampling(view.lens))
+        rgb = image.rgb[..., 0] if values.shape[2] == 1 else image.rgb
+        planes = np.concatenate([rgb, image.alpha[..., None]], axis=-1) if values.shape[2] == 4 else rgb
+        return np.rint(255 * planes).astype(np.uint8)
+
+    def _silhouette(self, view: View) -> np.ndarray:
+        """255 object, 0 none."""
+        if view.mask is not None and self.masked == "empty":
+            known = read_mask(view.mask, view.lens.width, view.lens.height)
+        else:
+            known = _read_labels(view.silhouette) > 0
+        return self._labels(view, np.where(known, 255, 0).astype(np.uint8))
+
+    def _known(self, view: View) -> np.ndarray:
+        """255 counts, 0 unknown."""
+        known = np.ones((view.lens.height, view.lens.width), bool)
+        if view.mask is not None and self.masked == "unknown":
+            known = read_mask(view.mask, view.lens.width, view.lens.height)
+        if view.lens.distortion is None:
+            source = self._resampling(view.lens)
+            known = source.inside & (source.linear(known.astype(np.float32)) > 0.999)  # no unknown pixel takes part
+        return np.where(known, 255, 0).astype(np.uint8)
+
+    def _depth(self, read: Callable[[], np.ndarray], view: View) -> np.ndarray:
+        return self._labels(view, read())
+
+    def _labels(self, view: View, labels: np.ndarray) -> np.ndarray:
+        return self._resampling(view.lens).nearest(labels) if view.lens.distortion is None else labels
+
+
+def fitted(lens: Lens, path: Path) -> Lens:
+    """The lens before a picture, which may have a fraction of the camera's size, its sides rounded. Raises InputError
+    for one of another shape."""
+    width, height = image_size(path)
+    if (width, height) == (lens.width, lens.height):
+        return lens
+    if abs(width - lens.width * height / lens.height) > 1 and abs(height - lens.height * width / lens.width) > 1:
+        expected = f"{lens.width}x{lens.height} pixels as its camera says, or a multiple or fraction"
+        raise InputError(f"{path}: expected {expected}, found {width}x{height}")
+    return lens.scaled(width, height)
+
+
+def _undistortion(lens: Lens) -> Resampling:
+    check_memory(_UNDISTORTING * lens.width * lens.height, f"undistorting {lens.width} x {lens.height} pixels")
+    return lens.undistortion()
+
+
+def _read_labels(path: Path | None) -> np.ndarray:
+    """[H, W]"""
+    assert path is not None
+    pixels = read_png(path)
+    return pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=-1)

@@ -1,0 +1,263 @@
+"""Folders of Nerfstudio and of NeRF-synthetic as the world has them."""
+
+import json
+import logging
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import spacesim as ss
+from spacesim.data.errors import InputError
+from spacesim.data.images import read_png
+from spacesim.data.store import find_unreadable_files, read_points, write_points
+
+POSE = [[1, 0, 0, 0.5], [0, 0, -1, -4], [0, 1, 0, 1], [0, 0, 0, 1]]
+CAMERA = {"fl_x": 20.0, "fl_y": 21.0, "cx": 7.5, "cy": 6.0, "w": 16, "h": 12}
+
+
+def write_picture(path, size=(16, 12), color=(10, 20, 30)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGBA" if len(color) == 4 else "RGB", size, color).save(path)
+
+
+def folder(root, frames, name="transforms.json", size=(16, 12), **meta):
+    """With a picture for each frame, which has file_path and what else it has."""
+    root.mkdir(parents=True, exist_ok=True)
+    for frame in frames:
+        frame.setdefault("transform_matrix", POSE)
+        write_picture(root / frame["file_path"], size)
+    (root / name).write_text(json.dumps({**CAMERA, **meta, "frames": frames}))
+    return root
+
+
+def named(count, **keys):
+    return [{"file_path": f"images/{k}.png", **keys} for k in range(count)]
+
+
+def imported(root, out, kind="nerfstudio", **options):
+    dataset = ss.import_dataset(kind, root, out, **options)
+    assert find_unreadable_files(out) == []
+    return dataset
+
+
+def of_name(dataset, name):
+    return next(frame for frame in dataset.frames if frame.file_path == name)
+
+
+def test_what_is_read_directly_and_what_is_imported_are_the_same(tmp_path):
+    frames = named(3, sun_direction=[0, 0.6, 0.8])
+    frames[1] |= {"fl_x": 33.0, "k1": 0.1, "p2": -0.01, "sun_direction": None}
+    root = folder(tmp_path / "src", frames, applied_transform=[[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], k2=0.02)
+    write_points(root / "sparse.ply", np.eye(3), np.full((3, 3), 9, np.uint8))
+    meta = json.loads((root / "transforms.json").read_text())
+    (root / "transforms.json").write_text(json.dumps({**meta, "ply_file_path": "sparse.ply"}))
+    before, after = ss.read_dataset(root), imported(root, tmp_path / "out")
+    assert [f.file_path for f in before.train] == [f.file_path for f in after.train]
+    assert [f.file_path for f in before.test] == [f.file_path for f in after.test]
+    for one, two in zip(before.frames, after.frames, strict=True):
+        np.testing.assert_allclose(one.camera.world_from_camera, two.camera.world_from_camera, atol=1e-15)
+        keys = "width", "height", "fx", "fy", "cx", "cy"
+        assert [getattr(one.camera, key) for key in keys] == [getattr(two.camera, key) for key in keys]
+        assert one.distortion == two.distortion
+        assert (one.sun is None) == (two.sun is None)
+        assert one.sun is None or np.allclose(one.sun.direction, two.sun.direction)
+    np.testing.assert_array_equal(read_points(tmp_path / "out/points.ply")[0], np.eye(3))
+
+
+def test_a_folder_that_lacks_pictures_is_imported_and_read(tmp_path, caplog):
+    """As the fox that instant-ngp comes with: 67 frames, 50 files."""
+    root = folder(tmp_path / "src", named(67))
+    for k in range(0, 67, 4):
+        (root / f"images/{k}.png").unlink()
+    dataset = imported(root, tmp_path / "out")
+    assert len(dataset.frames) == len(ss.read_dataset(root).frames) == 50
+    messages = [record.getMessage() for record in caplog.records]
+    assert messages == 2 * [
+        f"{root / 'transforms.json'}: 17 of 67 frames have no image and are left out, images/0.png first"
+    ]
+
+
+def test_fisheye_cameras_are_undistorted(tmp_path):
+    width, height, f, k1 = 128, 96, 90.0, 0.08
+    x, y = np.meshgrid((np.arange(width) + 0.5 - 64) / f, (np.arange(height) + 0.5 - 48) / f)
+    t = np.linspace(0, 1.5, 200_000)
+    slope = np.tan(np.interp(np.hypot(x, y), t + k1 * t**3, t)) / np.hypot(x, y)
+
+    def pattern(x, y):
+        return 0.5 + 0.25 * np.sin(9 * x + 1) + 0.25 * np.cos(7 * y)
+
+    camera = {"fl_x": f, "fl_y": f, "cx": 64.0, "cy": 48.0, "w": width, "h": height, "k1": k1}
+    frames = named(2)
+    frames[1]["camera_model"] = "PINHOLE"
+    frames[1]["k1"] = 0
+    root = folder(tmp_path / "src", frames, size=(width, height), camera_model="OPENCV_FISHEYE", **camera)
+    Image.fromarray(np.rint(255 * pattern(x * slope, y * slope)).astype(np.uint8)).save(root / "images/0.png")
+    dataset = imported(root, tmp_path / "out")
+    frame = of_name(dataset, "images/0.png")
+    image = ss.load_image(dataset, frame)
+    assert np.abs(image.rgb[..., 0] - pattern(x, y))[image.valid].max() < 0.02
+    assert image.valid.mean() > 0.95
+    assert of_name(dataset, "images/1.png").distortion == ()
+    with pytest.raises(InputError, match="found OPENCV_FISHEYE; spacesim import nerfstudio undistorts"):
+        ss.read_dataset(root)
+
+
+def test_fisheye_cameras_of_instant_ngp(tmp_path):
+    root = folder(tmp_path / "src", named(2), is_fisheye=True, k1=0.01)
+    assert imported(root, tmp_path / "out").frames[0].distortion == ()
+    with pytest.raises(InputError, match="found OPENCV_FISHEYE"):
+        ss.read_dataset(root)
+
+
+def test_masks_mean_what_is_asked(tmp_path):
+    root = folder(tmp_path / "src", named(2, mask_path="masks/m.png"))
+    mask = np.zeros((12, 16), np.uint8)
+    mask[:, :8] = 1  # as some programs write them: 0 and 1
+    (root / "masks").mkdir()
+    Image.fromarray(mask).save(root / "masks/m.png")
+    dataset = imported(root, tmp_path / "unknown")
+    image = ss.load_image(dataset, dataset.frames[0])
+    assert (image.valid == (mask > 0)).all()
+    assert image.alpha.min() == 1
+    dataset = imported(root, tmp_path / "empty", masked="empty")
+    image = ss.load_image(dataset, dataset.frames[0])
+    assert image.valid.all()
+    assert (image.alpha == mask).all()
+
+
+@pytest.mark.parametrize("form", ["png", "npy", "float npy"])
+@pytest.mark.parametrize("declared", [{}, {"depth_unit_scale_factor": 0.01}, {"integer_depth_scale": 0.25}, None])
+def test_depth_of_any_unit_becomes_millimetres(tmp_path, caplog, form, declared):
+    unit = 0.5 if declared is None else next(iter(declared.values()), 0.001)
+    key = "depth_path" if declared and "integer_depth_scale" in declared else "depth_file_path"
+    steps = np.arange(192).reshape(12, 16).astype(np.uint16)
+    root = folder(tmp_path / "src", named(2, **{key: f"depth.{form[-3:]}"}), **(declared or {}))
+    if form == "png":
+        Image.fromarray(steps).save(root / "depth.png")
+    else:
+        np.save(root / "depth.npy", steps.astype(np.float32)[..., None] if form == "float npy" else steps)
+    dataset = imported(root, tmp_path / "out", **({"depth_unit": 0.5} if declared is None else {}))
+    depth = read_png(tmp_path / "out" / dataset.frames[0].depth_file_path)
+    exact = np.rint(steps * unit * 1000)
+    np.testing.assert_array_equal(depth, np.where(exact <= 65535, exact, 0))
+    assert (len([r for r in caplog.records if "65.535" in r.getMessage()]) == 1) == (exact.max() > 65535)
+
+
+def test_pictures_of_a_fraction_of_the_size(tmp_path):
+    root = folder(tmp_path / "src", named(2), size=(8, 6), k1=0.1)
+    camera = imported(root, tmp_path / "out").frames[0].camera
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (8, 6, 10.0, 10.5, 3.75, 3.0)
+
+
+def blender(root):
+    for split, count in (("train", 3), ("test", 2)):
+        frames = [{"file_path": f"./{split}/r_{k}", "transform_matrix": POSE} for k in range(count)]
+        for k in range(count):
+            write_picture(root / split / f"r_{k}.png", color=(9, 9, 9, 128))
+        (root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    return root
+
+
+def test_nerf_synthetic(tmp_path):
+    root = blender(tmp_path / "src")
+    (root / "train/r_1.png").unlink()
+    dataset = imported(root, tmp_path / "out", "blender")
+    assert [frame.file_path for frame in dataset.train] == ["images/train/r_0.png", "images/train/r_2.png"]
+    assert [frame.file_path for frame in dataset.test] == ["images/test/r_0.png", "images/test/r_1.png"]
+    camera = dataset.train[0].camera
+    assert camera.fx == camera.fy == pytest.approx(8 / np.tan(0.35))
+    assert (camera.cx, camera.cy) == (8, 6)
+    assert ss.load_image(dataset, dataset.train[0]).alpha[0, 0] == pytest.approx(128 / 255)
+
+
+def test_a_dataset_of_ours_comes_through(tiny_data, tmp_path):
+    before, after = ss.read_dataset(tiny_data), imported(tiny_data, tmp_path / "out")
+    for one, two in zip(before.frames, after.frames, strict=True):
+        assert one.file_path == two.file_path
+        np.testing.assert_allclose(one.sun.direction, two.sun.direction, atol=1e-15)
+        for name in (one.file_path, one.silhouette_path):
+            assert (tiny_data / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+        mine, theirs = (read_png(root / f.depth_file_path) for root, f in ((tiny_data, one), (tmp_path / "out", two)))
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def change(**keys):
+    return lambda root: edit(root, lambda meta: meta.update(keys))
+
+
+def edit(root, what):
+    meta = json.loads((root / "transforms.json").read_text())
+    what(meta)
+    (root / "transforms.json").write_text(json.dumps(meta))
+
+
+BROKEN = {
+    "nothing": (lambda root: (root / "transforms.json").unlink(), "transforms.json: expected a JSON file, found none"),
+    "no JSON": (lambda root: (root / "transforms.json").write_text("{"), "transforms.json: expected JSON, found text"),
+    "a list": (lambda root: (root / "transforms.json").write_text("[]"), "expected a JSON object, found list"),
+    "no frames": (change(frames=[]), "expected a list of frames, found none"),
+    "other frames": (change(frames=[1]), "expected a list of frames, found another value"),
+    "no pictures": (
+        lambda root: [path.unlink() for path in (root / "images").iterdir()],
+        "expected an image file, found none",
+    ),
+    "another model": (change(camera_model="EQUIRECTANGULAR"), "found EQUIRECTANGULAR"),
+    "fisheye of words": (change(camera_model="OPENCV_FISHEYE", k2="a"), "expected finite numbers as k1 to k4, found"),
+    "another shape": (change(w=12, h=16), "expected 12x16 pixels as its camera says, or a multiple"),
+    "no unit": (change(depth_unit_scale_factor=0), "expected metres above 0 as depth_unit_scale_factor, found 0"),
+    "unit in words": (change(integer_depth_scale="mm"), "expected metres above 0 as integer_depth_scale, found 'mm'"),
+    "no depth": (lambda root: (root / "depth.npy").unlink(), "depth.npy: expected depth, found none"),
+    "depth cut": (
+        lambda root: (root / "depth.npy").write_bytes((root / "depth.npy").read_bytes()[:-8]),
+        "another size",
+    ),
+    "depth of objects": (
+        lambda root: np.save(root / "depth.npy", np.array([{}])),
+        "expected an array of NumPy's, found",
+    ),
+    "depth of colours": (
+        lambda root: np.save(root / "depth.npy", np.zeros((12, 16, 3))),
+        "expected depth in one channel",
+    ),
+    "depth of words": (lambda root: np.save(root / "depth.npy", np.array(["a"])), "expected numbers, found <U1"),
+    "no mask": (lambda root: (root / "mask.png").unlink(), "mask.png: expected a file, found none"),
+    "mask of a shape": (lambda root: write_picture(root / "mask.png", (12, 16)), "mask.png: expected 16x12 pixels, or"),
+    "no points": (change(ply_file_path="a.ply"), "a.ply: expected a mesh, found none"),
+    "bent pose": (
+        lambda root: edit(root, lambda m: m["frames"][0].update(transform_matrix=[[1] * 4] * 4)),
+        "expected a rot",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_folder_ends_in_one_sentence(tmp_path, case):
+    damage, sentence = BROKEN[case]
+    root = folder(tmp_path / "src", named(3, depth_file_path="depth.npy", mask_path="mask.png"))
+    np.save(root / "depth.npy", np.ones((12, 16)))
+    write_picture(root / "mask.png")
+    damage(root)
+    with pytest.raises(InputError) as caught:
+        ss.import_dataset("nerfstudio", root, tmp_path / "out")
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out/transforms.json").exists()
+
+
+def test_wrong_kinds_and_options(tmp_path, caplog):
+    caplog.set_level(logging.ERROR)
+    root = folder(tmp_path / "src", named(2))
+    with pytest.raises(InputError, match=r"kind: expected one of nerfstudio, .*, found 'nerf'"):
+        ss.import_dataset("nerf", root, tmp_path / "out")
+    with pytest.raises(InputError, match="depth_unit: expected metres above 0, found -1"):
+        ss.import_dataset("nerfstudio", root, tmp_path / "out", depth_unit=-1.0)
+    with pytest.raises(InputError, match=r"expected a folder with transforms_train\.json, found none"):
+        ss.import_dataset("blender", root, tmp_path / "out")
+
+
+def test_training_takes_what_was_imported(spacesim, tmp_path):
+    done = spacesim("import", "blender", blender(tmp_path / "src"), "--out", tmp_path / "data")
+    assert done.code == 0, done.errors
+    few = "--preset", "demo", "--iterations", 2, "--init-count", 20
+    assert spacesim("train", tmp_path / "data", "--out", tmp_path / "run", *few).code == 0
