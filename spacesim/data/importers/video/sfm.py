@@ -16,7 +16,7 @@ import numpy as np
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import Array
-from spacesim.data.importers.model import Model
+from spacesim.data.importers.video.model import Model
 
 INSTALL = "pip install 'spacesim[sfm]'"
 SEED = 1
