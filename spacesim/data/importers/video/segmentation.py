@@ -10,6 +10,7 @@ to their neighbours, where it is nearly at the same place and of the same colour
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from PIL import Image
@@ -25,6 +26,7 @@ _STAR = 16  # pixels at the working size of the largest star
 _COLORS = 6  # Gaussians of a mixture
 _SAMPLES = 4000  # pixels that a mixture is fitted to
 _REACH = 0.12  # of the object's size: how far its outline moves from frame to frame, at most
+_CUT = 2.5  # times the median change from frame to frame: the film is cut there
 _ODDS = 6.0  # largest log-odds of one pixel's colour
 _SMOOTH = 12.0  # weight of an edge between equal neighbours, of one pixel's odds
 _CONTRAST = 60.0  # how fast that falls with the squared difference of colours
@@ -64,8 +66,10 @@ def segment_sequence(pictures: Sequence[Load], progress: Callable[[int], None] |
         start = len(small) // 2
         masks[start] = _before_earth(small[start])
         done = 1
+    changes = [0.0, *(_change(a, b) for a, b in pairwise(small))]
+    limit = _CUT * max(float(np.median(changes)), 0.004)
     for index, neighbour in _outwards([mask is not None for mask in masks]):
-        if small[index].shape != small[neighbour].shape:
+        if changes[max(index, neighbour)] > limit:
             masks[index] = _before_earth(small[index])
         else:
             known = masks[neighbour]
@@ -88,6 +92,15 @@ def _outwards(known: Sequence[bool]) -> list[tuple[int, int]]:
         distance[k] = min(distance[k], distance[k + 1] + 1)
     order = [int(k) for k in np.argsort(distance, kind="stable") if distance[k] > 0]
     return [(k, k - 1 if k > 0 and distance[k - 1] < distance[k] else k + 1) for k in order]
+
+
+def _change(image: np.ndarray, other: np.ndarray) -> float:
+    """Mean change of the pixels of the middle, where the object is."""
+    if image.shape != other.shape:
+        return math.inf
+    height, width = image.shape[:2]
+    middle = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    return float(np.abs(image[middle] - other[middle]).mean())
 
 
 def _working(picture: np.ndarray) -> np.ndarray:
@@ -144,6 +157,13 @@ def _before_sky(image: np.ndarray) -> _Guess:
     return _Guess(mask, apart and areas[largest] > 8 * _STAR and _is_middle(mask))
 
 
+def _without_stars(bright: np.ndarray) -> np.ndarray:
+    labels, _ = ndimage.label(bright, np.ones((3, 3)))
+    areas = np.bincount(labels.ravel())
+    areas[0] = 0
+    return areas[labels] > _STAR
+
+
 def _is_middle(mask: np.ndarray) -> bool:
     """Whether its centre lies within the middle two thirds of the picture."""
     centre = np.array(ndimage.center_of_mass(mask)) / mask.shape
@@ -196,6 +216,8 @@ def _follow(image: np.ndarray, other: np.ndarray, mask: np.ndarray) -> np.ndarra
 
 def _before_earth(image: np.ndarray) -> np.ndarray:
     """The object in one picture alone: what is near the middle and of other colours than what is at the border."""
+    if not _without_stars(~_sky(image)).any():
+        return np.zeros(image.shape[:2], bool)
     height, width = image.shape[:2]
     y, x = np.mgrid[:height, :width]
     off = np.hypot((x + 0.5) / width - 0.5, (y + 0.5) / height - 0.5)  # 0 in the middle, 0.5 at the sides' middles
