@@ -560,3 +560,27 @@ def test_attack_tells_what_was_tried_and_held(place, command):
     assert tried["the viewer"] > 10
     assert tried == {"damaged inputs, command lines": 8, "kills and signals": 1, "flipped bits": 2, "the viewer": ANY}
     assert all(row["held"] == row["tried"] for row in found["rows"])
+
+
+@pytest.mark.skipif(
+    not all(map(importlib.util.find_spec, ("av", "pycolmap"))), reason="PyAV or pycolmap is not installed"
+)
+@smallest("video_import.py --backend llvm --out OUT --width 64 --frames 8 --spp 1 --json")
+def test_video_import_tells_what_cannot_be_found(command, place):
+    """At this size there is nothing to be matched; what is found is tested with the importer."""
+    rows = json.loads(call(command))["rows"]
+    assert [row["field of view"] for row in rows] == ["told", "estimated"]
+    assert all("expected" in row["note"] for row in rows)
+    assert (place / "OUT" / "film.mp4").stat().st_size > 1000
+
+
+def test_similarity_brings_cameras_together():
+    import video_import
+
+    rng = np.random.default_rng(0)
+    true = rng.normal(size=(9, 3))
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    scale, aligned = video_import.similarity(0.25 * true @ turn.T + [1, 2, 3], true)
+    assert scale == pytest.approx(4)
+    np.testing.assert_allclose(aligned, true, atol=1e-12)

@@ -247,7 +247,7 @@ def test_a_camera_that_only_turns_shows_no_parallax(tmp_path):
         turned = pose.copy()
         turned[:3, :3] = pose[:3, :3] @ Rotation.from_euler("y", k - 2.5, degrees=True).as_matrix()
         write_png(tmp_path / "in" / f"{k}.png", box_from(turned)[0])
-    with pytest.raises(InputError, match="in: expected .*no parallax"):
+    with pytest.raises(InputError, match=r"in: expected .*no parallax"):
         import_dataset("images", tmp_path / "in", tmp_path / "out", fov=FOV)
     assert not (tmp_path / "out").exists()
 
@@ -257,5 +257,5 @@ def test_pictures_of_different_things_do_not_fit_together(tmp_path):
     rng = np.random.default_rng(0)
     for k in range(4):
         write_png(tmp_path / "in" / f"{k}.png", rng.integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8))
-    with pytest.raises(InputError, match="in: expected .*too few matches"):
+    with pytest.raises(InputError, match=r"in: expected .*too few matches"):
         import_dataset("images", tmp_path / "in", tmp_path / "out", masks="none")

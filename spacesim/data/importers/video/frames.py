@@ -61,7 +61,9 @@ def read_frames(path: Path) -> Iterator[np.ndarray]:
             broken = _reason(error)
         declared = int(stream.frames or 0)
         if count == 0:
-            raise InputError(f"{path}: expected a video, found no frame that can be decoded ({broken or 'it is empty'})")
+            raise InputError(
+                f"{path}: expected a video, found no frame that can be decoded ({broken or 'it is empty'})"
+            )
         if broken or count < declared:
             whole = f" of {declared}" if declared else ""
             _log.warning("%s: breaks off after %d%s frames (%s)", path, count, whole, broken or "it is cut off")

@@ -79,12 +79,16 @@ def import_video(
         chosen = choose(seen, frames)
         if len(chosen) < LEAST:
             raise InputError(
-                f"{src}: expected at least {LEAST} frames that differ, found {len(chosen)} of {len(seen.motion)}: nothing "
-                "moves"
+                f"{src}: expected at least {LEAST} frames that differ, found {len(chosen)} of {len(seen.motion)}: "
+                "nothing moves"
             )
-        names = []
+        names: list[str] = []
+        size: tuple[int, ...] | None = None
         for number, picture in enumerate(read_frames(src)):
             if number in set(chosen.tolist()):
+                size = size or picture.shape
+                if picture.shape != size:
+                    raise InputError(f"{src}: expected pictures of one size, found another from frame {number} on")
                 names.append(f"frame_{number:06d}.png")
                 write_png(folder / "pictures" / names[-1], _scaled(picture, asked.height), durable=False)
         return _import(src, out, folder, names, True, asked, source, tell, {"frames_of_video": len(seen.motion)})
@@ -115,7 +119,7 @@ def import_images(src: Path, out: Path, *, progress: Progress | None = None, **w
                 expected = f"{size[1]}x{size[0]} pixels as the first picture has"
                 raise InputError(f"{path}: expected {expected}, found {pixels.shape[1]}x{pixels.shape[0]}")
             write_png(folder / "pictures" / name, _scaled(pixels, asked.height), durable=False)
-        return _import(src, out, folder, names, True, asked, source, tell, {})
+        return _import(src, out, folder, names, False, asked, source, tell, {})
 
 
 def _import(
@@ -194,9 +198,7 @@ def _hide_background(folder: Path, names: Sequence[str]) -> Path:
         mask = read_png(folder / "masks" / name) > 0
         write_png(folder / "features" / name, np.where(mask[..., None], pixels, 0).astype(np.uint8), durable=False)
         inner = ndimage.binary_erosion(mask, iterations=_RIM)
-        write_png(
-            folder / "feature_masks" / f"{name}.png", np.where(inner, 255, 0).astype(np.uint8), durable=False
-        )
+        write_png(folder / "feature_masks" / f"{name}.png", np.where(inner, 255, 0).astype(np.uint8), durable=False)
     return folder / "feature_masks"
 
 

@@ -154,7 +154,7 @@ def _before_sky(image: np.ndarray) -> _Guess:
     around = ndimage.distance_transform_edt(~mask)
     around = (around > 2) & (around <= max(6.0, 0.5 * _REACH * _size_of(mask)))
     apart = np.count_nonzero(bright[around]) <= 0.02 * np.count_nonzero(around)
-    return _Guess(mask, apart and areas[largest] > 8 * _STAR and _is_middle(mask))
+    return _Guess(mask, bool(apart and areas[largest] > 8 * _STAR and _is_middle(mask)))
 
 
 def _without_stars(bright: np.ndarray) -> np.ndarray:
@@ -285,7 +285,8 @@ def _walk(image: np.ndarray, odds: np.ndarray) -> np.ndarray:
     """[h, w] bool: where a random walker, who crosses no edges, would rather end inside than outside."""
     height, width = odds.shape
     index = np.arange(height * width).reshape(height, width)
-    pairs, weights = [], []
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
+    weights: list[np.ndarray] = []
     for a, b in (
         (np.s_[:, :-1], np.s_[:, 1:]),
         (np.s_[:-1], np.s_[1:]),

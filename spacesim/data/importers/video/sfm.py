@@ -8,6 +8,7 @@ import importlib
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,8 +21,8 @@ from spacesim.data.importers.video.model import Model
 
 INSTALL = "pip install 'spacesim[sfm]'"
 SEED = 1
-EXHAUSTIVE = 60  #: pictures, up to which each is matched with each, whatever their order
-OVERLAP = 12  #: pictures in time order: each is matched with so many next ones, and 2, 4, 8, ... beyond
+EXHAUSTIVE = 60, 300  #: pictures in time order, in any: up to so many each is matched with each
+OVERLAP = 12  #: of more: each is matched with so many next ones, and 2, 4, 8, ... beyond
 _PEAK = 0.0027  # of SIFT's difference of Gaussians; 0.0067 by default: a spacecraft has little texture
 _FEATURES = 8192
 _LEAST_FEATURES, _LEAST_MATCHES = 50, 15
@@ -55,7 +56,7 @@ def reconstruct(
 
     masks: a folder of NAME.png, features are taken where they are not black
     focal: pixels, where it is known; else it is estimated
-    ordered: the pictures are in time order: each is matched with its neighbours only
+    ordered: the pictures are in time order
     workspace: an empty folder for what is needed meanwhile
 
     Raises InputError where pycolmap is missing, and where the pictures do not tell poses: too few features or matches,
@@ -77,8 +78,8 @@ def reconstruct(
     found = _matches(colmap, database)
     if found.features < _LEAST_FEATURES:
         raise InputError(
-            f"{folder.name}: expected at least {_LEAST_FEATURES} features in a picture, found {found.features:.0f} in the "
-            "median one: too dark, too blurred or too small an object"
+            f"{folder.name}: expected at least {_LEAST_FEATURES} features in a picture, found {found.features:.0f} in "
+            "the median one: too dark, too blurred or too small an object"
         )
     if found.pairs < len(names) // 2:
         raise InputError(
@@ -135,21 +136,18 @@ def _find_features(
     single = colmap.CameraMode.SINGLE
     colmap.import_images(database, folder, camera_mode=single, image_names=list(names), options=reader)  # numbers them
     for start in range(0, len(names), 8):
-        some = list(names[start : start + 8])
         report("features", start, len(names))
-        _run(
-            colmap,
-            lambda token, some=some: colmap.extract_features(
-                database,
-                folder,
-                some,
-                camera_mode=single,
-                reader_options=reader,
-                extraction_options=options,
-                device=colmap.Device.cpu,
-                cancellation_token=token,
-            ),
+        extract = partial(
+            colmap.extract_features,
+            database,
+            folder,
+            list(names[start : start + 8]),
+            camera_mode=single,
+            reader_options=reader,
+            extraction_options=options,
+            device=colmap.Device.cpu,
         )
+        _run(colmap, lambda token, extract=extract: extract(cancellation_token=token))  # type: ignore[misc]
 
 
 def _match(colmap: ModuleType, database: Path, count: int, ordered: bool, report: Progress) -> None:
@@ -163,7 +161,7 @@ def _match(colmap: ModuleType, database: Path, count: int, ordered: bool, report
         "verification_options": verification,
         "device": colmap.Device.cpu,
     }
-    if ordered and count > EXHAUSTIVE:
+    if count > EXHAUSTIVE[0 if ordered else 1]:
         pairing = colmap.SequentialPairingOptions()
         pairing.overlap = OVERLAP
         match = colmap.match_sequential
@@ -279,14 +277,14 @@ def _checked(model: Model, found: Matches, count: int, name: str) -> Model:
     ratio = model.focal / max(model.width, model.height)
     if not 0.2 < ratio < 90:
         raise InputError(
-            f"{name}: expected a focal length of 0.2 to 90 widths, found {ratio:.3g}: a broken model; name the field of "
-            "view with fov"
+            f"{name}: expected a focal length of 0.2 to 90 widths, found {ratio:.3g}: a broken model; name the field "
+            "of view with fov"
         )
     behind = np.mean([_depths(model, k) <= 0 for k in range(registered)])
     if behind > 0.05:
         raise InputError(
-            f"{name}: expected the object before the cameras, found {100 * behind:.0f} % of points behind them: a mirrored "
-            "or broken model"
+            f"{name}: expected the object before the cameras, found it behind {100 * behind:.0f} % of them: a "
+            "mirrored or broken model"
         )
     return model
 
@@ -311,10 +309,10 @@ def _depths(model: Model, k: int) -> float:
 def _why_none(found: Matches) -> str:
     if found.pairs and found.flat_pairs > _FLAT * found.pairs:
         return (
-            f"expected cameras that move around the object, found {found.flat_pairs} of {found.pairs} pairs of pictures "
-            "that a rotation or a plane explains: no parallax"
+            f"expected cameras that move around the object, found {found.flat_pairs} of {found.pairs} pairs of "
+            "pictures that a rotation or a plane explains: no parallax"
         )
     return (
-        f"expected pictures that fit together, found {found.pairs} pairs with matches and no poses that agree with them: "
-        "too few matches"
+        f"expected pictures that fit together, found {found.pairs} pairs with matches and no poses that agree with "
+        "them: too few matches"
     )
