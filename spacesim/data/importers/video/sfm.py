@@ -153,6 +153,7 @@ def _find_features(
 def _match(colmap: ModuleType, database: Path, count: int, ordered: bool, report: Progress) -> None:
     options = colmap.FeatureMatchingOptions()
     options.use_gpu = False
+    options.num_threads = 1
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     report("matches", 0, 1)
