@@ -595,3 +595,27 @@ def test_noise_like_speedpluss_is_that_of_the_full_size_averaged():
     np.testing.assert_array_equal(noisy, speedplus_data.degraded(grey, (0, 1)))
     full = speedplus_data.degraded(np.full((1200, 1920), 128, np.uint8), (0, 1))
     assert full.std() == pytest.approx(sigma, rel=0.02)
+
+
+@pytest.mark.skipif(
+    not all(map(importlib.util.find_spec, ("av", "pycolmap"))), reason="PyAV or pycolmap is not installed"
+)
+@smallest("video_import.py --backend llvm --out OUT --width 64 --frames 8 --spp 1 --json")
+def test_video_import_tells_what_cannot_be_found(command, place):
+    """At this size there is nothing to be matched; what is found is tested with the importer."""
+    rows = json.loads(call(command))["rows"]
+    assert [row["field of view"] for row in rows] == ["told", "estimated"]
+    assert all("expected" in row["note"] for row in rows)
+    assert (place / "OUT" / "film.mp4").stat().st_size > 1000
+
+
+def test_similarity_brings_cameras_together():
+    import video_import
+
+    rng = np.random.default_rng(0)
+    true = rng.normal(size=(9, 3))
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    scale, aligned = video_import.similarity(0.25 * true @ turn.T + [1, 2, 3], true)
+    assert scale == pytest.approx(4)
+    np.testing.assert_allclose(aligned, true, atol=1e-12)

@@ -6,6 +6,7 @@ from typing import Any
 from spacesim.data.errors import InputError
 from spacesim.data.importers import colmap, nerfstudio, speedplus
 from spacesim.data.importers.importer import Importer, Option
+from spacesim.data.importers.video import importing as video
 from spacesim.data.importers.writing import Progress
 from spacesim.data.records import Dataset
 from spacesim.data.structure import did_you_mean
@@ -15,6 +16,8 @@ KINDS: dict[str, Importer] = {
     "blender": nerfstudio.BLENDER,
     "colmap": colmap.COLMAP,
     "speedplus": speedplus.SPEEDPLUS,
+    "images": video.IMAGES,
+    "video": video.VIDEO,
 }
 """By their names on the command line."""
 

@@ -129,19 +129,27 @@ def frame_names(paths: Sequence[str]) -> list[str]:
     return names if len(set(names)) == len(names) else ended
 
 
-def _claim(out: Path, source: Mapping[str, Any]) -> None:
-    """Write import.json into a new folder, or into that of an import that has not ended."""
+def check_free(out: Path, source: Mapping[str, Any]) -> bool:
+    """Whether the folder `out` holds an unfinished import of `source`. Raises InputError where it holds anything else:
+    what takes long asks before."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: expected a folder to write to, found a file")
     path = out / SOURCE
     if path.is_file() and not (out / "transforms.json").exists():
         if read_json(path, MAX_LIST_BYTES) != source:
             raise InputError(f"{out}: expected a new or empty folder, found an unfinished import of something else")
-        remove_leftovers(out)
-    elif holds_files(out):
+        return True
+    if holds_files(out):
         raise InputError(f"{out}: expected a new or empty folder, found files in it")
+    return False
+
+
+def _claim(out: Path, source: Mapping[str, Any]) -> None:
+    """Write import.json into a new folder, or into that of an import that has not ended."""
+    if check_free(out, source):
+        remove_leftovers(out)
     else:
-        write_json(path, dict(source))
+        write_json(out / SOURCE, dict(source))
 
 
 def _entry(frame: ImportedFrame) -> dict[str, Any]:

@@ -31,11 +31,12 @@ class Video:
     """A film in the making: `add` pictures, then take the file's `content`.
 
     width, height: pixels of every picture; an odd side gets one more row or column, as H.264 wants even ones
+    bit_rate: bits a second; None: as many as QUALITY takes
     rate: pictures a second; in the file it is the nearest fraction with a denominator of FINEST_RATE at most
     Raises RuntimeError where there is no `encoder`, ValueError for a rate that is none.
     """
 
-    def __init__(self, width: int, height: int, rate: float | Fraction) -> None:
+    def __init__(self, width: int, height: int, rate: float | Fraction, bit_rate: int | None = None) -> None:
         library = encoder()
         if library is None:
             raise RuntimeError(f"video: PyAV is not installed; type: {INSTALL}")
@@ -46,10 +47,14 @@ class Video:
         self._shape = height, width, 3
         self._buffer = io.BytesIO()
         self._file = library.open(self._buffer, "w", format="mp4", options={"fflags": "+bitexact"})
-        options = {"crf": QUALITY, "preset": "medium", "threads": "1", "flags": "+bitexact"}
+        options = {"preset": "medium", "threads": "1", "flags": "+bitexact"}
+        if bit_rate is None:
+            options["crf"] = QUALITY
         self._stream: Any = self._file.add_stream("libx264", rate=exact, options=options)
         self._stream.width, self._stream.height = width + width % 2, height + height % 2
         self._stream.pix_fmt = "yuv420p"
+        if bit_rate is not None:
+            self._stream.bit_rate = bit_rate
         self._stream.gop_size = max(1, round(exact))  # a picture that stands alone each second
         context = self._stream.codec_context
         context.color_primaries = context.colorspace = _BT709

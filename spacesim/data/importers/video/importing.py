@@ -1,0 +1,297 @@
+"""`import video` and `import images`: pictures without poses as a dataset."""
+
+import io
+import logging
+import math
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from spacesim.data.errors import InputError, expect
+from spacesim.data.files import json_bytes
+from spacesim.data.images import read_png, write_png
+from spacesim.data.importers.importer import Importer, Option
+from spacesim.data.importers.masks import MASKED, MaskFolder, read_mask
+from spacesim.data.importers.video.chart import draw_cameras
+from spacesim.data.importers.video.frames import choose, read_frames, survey
+from spacesim.data.importers.video.model import Model, placed, report_of, without_floating
+from spacesim.data.importers.video.segmentation import segment_sequence
+from spacesim.data.importers.video.sfm import reconstruct
+from spacesim.data.importers.writing import ImportedFrame, Progress, check_free, frame_names, write_dataset
+from spacesim.data.records import Camera, Dataset
+
+FRAMES = 120  #: taken of a video, at most
+LEAST = 3  #: pictures that poses can be found of
+REGISTERED = 0.9  #: share of pictures with a pose below which a warning tells
+NO_MASKS = "none"
+_RIM = 2  # pixels along the outline in which no features are taken: they are of what is behind, too
+_STAGES = ("cut out", "features", "matches", "poses", "write")
+_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What both importers are asked for. Raises InputError for a value out of range."""
+
+    masks: str | Path | None = None  #: a folder; "none": the background stays; None: cut out by `segment_sequence`
+    masked: str = "empty"  #: what black in a mask means, see `masks.MASKED`
+    fov: float | None = None  #: degrees of the pictures' width; None: estimated
+    length: float | None = None  #: metres of the object along its longest axis
+    distance: float | None = None  #: metres from the cameras to the object, the median
+    height: int | None = None  #: pixels that pictures are scaled down to
+
+    def __post_init__(self) -> None:
+        expect(self.masked in MASKED, "masked", f"one of {', '.join(MASKED)}", self.masked)
+        expect(self.fov is None or 0.1 <= self.fov <= 150, "fov", "degrees from 0.1 to 150", self.fov)
+        for name in ("length", "distance"):
+            metres = getattr(self, name)
+            expect(metres is None or 1e-6 <= metres <= 1e12, name, "metres from 1e-06 to 1e+12", metres)
+        if self.length is not None and self.distance is not None:
+            raise InputError("length, distance: expected one of them, found both")
+        expect(self.height is None or self.height >= 16, "height", "at least 16 pixels", self.height)
+
+
+def import_video(
+    src: Path, out: Path, *, frames: int = FRAMES, progress: Progress | None = None, **wishes: Any
+) -> Dataset:
+    """Import a video of one object. frames: taken at most, see `frames.choose`; wishes: fields of `Wishes`.
+
+    The dataset has structure.json, which tells how the poses were found, and cameras.png. Its unit is the median
+    distance of the cameras where neither `length` nor `distance` is known. Raises InputError as `read_frames` and
+    `reconstruct` do, and where `out` is not free.
+    """
+    asked = Wishes(**wishes)
+    expect(LEAST <= frames <= 5000, "frames", f"{LEAST} to 5000", frames)
+    source = _source("video", src, asked, frames=frames)
+    check_free(out, source)
+    with _workspace() as folder:
+        tell = _Teller(progress, ("look", *_STAGES))
+        seen = survey(read_frames(src), lambda count: tell("look", 0, 1, f"frame {count}"))
+        chosen = choose(seen, frames)
+        if len(chosen) < LEAST:
+            raise InputError(
+                f"{src}: expected at least {LEAST} frames that differ, found {len(chosen)} of {len(seen.motion)}: "
+                "nothing moves"
+            )
+        names: list[str] = []
+        size: tuple[int, ...] | None = None
+        for number, picture in enumerate(read_frames(src)):
+            if number in set(chosen.tolist()):
+                size = size or picture.shape
+                if picture.shape != size:
+                    raise InputError(f"{src}: expected pictures of one size, found another from frame {number} on")
+                names.append(f"frame_{number:06d}.png")
+                write_png(folder / "pictures" / names[-1], _scaled(picture, asked.height), durable=False)
+        return _import(src, out, folder, names, True, asked, source, tell, {"frames_of_video": len(seen.motion)})
+
+
+def import_images(src: Path, out: Path, *, progress: Progress | None = None, **wishes: Any) -> Dataset:
+    """Import a folder of pictures of one object by one camera; of their names' order, in time where there are many.
+
+    wishes: fields of `Wishes`. Raises InputError as `import_video` does, and for pictures of several sizes.
+    """
+    asked = Wishes(**wishes)
+    if not src.is_dir():
+        raise InputError(f"{src}: expected a folder of pictures, found {'a file' if src.exists() else 'nothing'}")
+    source = _source("images", src, asked)
+    check_free(out, source)
+    paths = sorted(p for p in src.rglob("*") if p.suffix.lower() in _SUFFIXES and not p.name.startswith("."))
+    if len(paths) < LEAST:
+        raise InputError(f"{src}: expected at least {LEAST} pictures, found {len(paths)}")
+    names = [f"{name}.png" for name in frame_names([path.relative_to(src).as_posix() for path in paths])]
+    with _workspace() as folder:
+        tell = _Teller(progress, ("look", *_STAGES))
+        size = None
+        for k, (path, name) in enumerate(zip(paths, names, strict=True)):
+            tell("look", k, len(paths), name)
+            pixels = _as_color(read_png(path))
+            size = size or pixels.shape[:2]
+            if pixels.shape[:2] != size:
+                expected = f"{size[1]}x{size[0]} pixels as the first picture has"
+                raise InputError(f"{path}: expected {expected}, found {pixels.shape[1]}x{pixels.shape[0]}")
+            write_png(folder / "pictures" / name, _scaled(pixels, asked.height), durable=False)
+        return _import(src, out, folder, names, False, asked, source, tell, {})
+
+
+def _import(
+    src: Path,
+    out: Path,
+    folder: Path,
+    names: Sequence[str],
+    ordered: bool,
+    asked: Wishes,
+    source: dict[str, Any],
+    tell: "_Teller",
+    facts: dict[str, Any],
+) -> Dataset:
+    """Of pictures in folder/pictures, all of one size."""
+    width, height = Image.open(folder / "pictures" / names[0]).size
+    has_masks = _find_masks(folder, names, asked, tell)
+    focal = None if asked.fov is None else 0.5 * width / math.tan(math.radians(0.5 * asked.fov))
+    features = _hide_background(folder, names) if has_masks else None
+    shown = folder / ("features" if has_masks else "pictures")
+    work = folder / "work"
+    work.mkdir()
+    try:
+        found = reconstruct(shown, names, (width, height), work, features, focal, ordered, tell)
+    except InputError as error:
+        raise InputError(str(error).replace(f"{shown.name}: ", f"{src}: ", 1)) from None
+    model = placed(without_floating(found), asked.length, asked.distance)
+    if len(model.names) < REGISTERED * len(names):
+        _log.warning(
+            "%s: %d of %d pictures have a pose; the others are left out (structure.json names them)",
+            src, len(model.names), len(names),
+        )  # fmt: skip
+    stream = io.BytesIO()
+    Image.fromarray(draw_cameras(model)).save(stream, format="PNG")
+    unit = "metres" if asked.length or asked.distance else "median distance of the cameras"
+    report = {**facts, "unit": unit, **report_of(model, names)}
+    files = {"structure.json": json_bytes(report), "cameras.png": stream.getvalue()}
+    frames = list(_frames(folder, model, has_masks, asked.masked))
+    points = (model.points, model.colors)
+    return write_dataset(
+        out, frames, [], source, points, files, lambda done, total, name: tell("write", done, total, name)
+    )
+
+
+def _find_masks(folder: Path, names: Sequence[str], asked: Wishes, tell: "_Teller") -> bool:
+    """Write folder/masks/NAME, 255 the object; False where the background stays."""
+    if asked.masks is not None and str(asked.masks) == NO_MASKS:
+        return False
+    if asked.masks is not None:
+        given = MaskFolder(Path(asked.masks)).find_all(names)
+        masks = []
+        for k, name in enumerate(names):
+            tell("cut out", k, len(names), name)
+            height, width = read_png(folder / "pictures" / name).shape[:2]
+            whole = np.ones((height, width), bool)
+            masks.append(read_mask(given[name], width, height) if name in given else whole)
+    else:
+        loads: list[Callable[[], np.ndarray]] = [
+            lambda name=name: _over_black(read_png(folder / "pictures" / name))  # type: ignore[misc]
+            for name in names
+        ]
+        masks = segment_sequence(loads, lambda count: tell("cut out", count, len(names), ""))
+    empty = [name for name, mask in zip(names, masks, strict=True) if not mask.any()]
+    if len(empty) == len(names):
+        raise InputError("masks: expected an object in the pictures, found none; give masks, or masks none")
+    if empty:
+        _log.warning("masks: nothing is found in %d of %d pictures, %s first", len(empty), len(names), empty[0])
+    for name, mask in zip(names, masks, strict=True):
+        write_png(folder / "masks" / name, np.where(mask, 255, 0).astype(np.uint8), durable=False)
+    return True
+
+
+def _hide_background(folder: Path, names: Sequence[str]) -> Path:
+    """Write folder/features/NAME, the object over black, and return the folder of where features may be."""
+    for name in names:
+        pixels = _over_black(read_png(folder / "pictures" / name))
+        mask = read_png(folder / "masks" / name) > 0
+        write_png(folder / "features" / name, np.where(mask[..., None], pixels, 0).astype(np.uint8), durable=False)
+        inner = ndimage.binary_erosion(mask, iterations=_RIM)
+        write_png(folder / "feature_masks" / f"{name}.png", np.where(inner, 255, 0).astype(np.uint8), durable=False)
+    return folder / "feature_masks"
+
+
+def _frames(folder: Path, model: Model, has_masks: bool, masked: str) -> Iterator[ImportedFrame]:
+    distortion = (model.k1, 0.0, 0.0, 0.0, 0.0)
+    for name, pose in zip(model.names, model.world_from_camera, strict=True):
+        picture, mask = folder / "pictures" / name, folder / "masks" / name
+        cut_out = has_masks and masked == "empty"
+
+        def with_alpha(picture: Path = picture, mask: Path = mask) -> np.ndarray:
+            pixels = _as_color(read_png(picture))
+            alpha = read_png(mask) if pixels.shape[2] == 3 else np.minimum(pixels[..., 3], read_png(mask))
+            return np.dstack([pixels[..., :3], alpha])
+
+        yield ImportedFrame(
+            name=name.removesuffix(".png"),
+            picture=with_alpha if cut_out else picture,
+            camera=Camera(pose, model.width, model.height, model.focal, model.focal, *model.centre),
+            distortion=distortion,
+            mask=mask if has_masks and masked == "unknown" else None,
+        )
+
+
+def _source(kind: str, src: Path, asked: Wishes, **more: Any) -> dict[str, Any]:
+    options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(asked).items()}
+    return {"kind": kind, "source": str(src), **more, **options}
+
+
+class _Teller:
+    """Tells a `Progress` of stages as parts of one whole."""
+
+    def __init__(self, progress: Progress | None, stages: Sequence[str]) -> None:
+        self.progress, self.stages = progress, stages
+
+    def __call__(self, stage: str, done: int, total: int, detail: str = "") -> None:
+        if self.progress is not None:
+            part = 100 * (self.stages.index(stage) + done / max(total, 1))
+            self.progress(round(part), 100 * len(self.stages), f"{stage} {detail}".rstrip())
+
+
+class _workspace:  # noqa: N801
+    """A temporary folder, gone afterwards whatever happens."""
+
+    def __enter__(self) -> Path:
+        self.folder = Path(tempfile.mkdtemp(prefix="spacesim-"))
+        return self.folder
+
+    def __exit__(self, *_: object) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _as_color(pixels: np.ndarray) -> np.ndarray:
+    """[H, W, 3] or [H, W, 4] uint8."""
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    return np.repeat(pixels[..., None], 3, axis=-1) if pixels.ndim == 2 else pixels
+
+
+def _over_black(pixels: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint8."""
+    pixels = _as_color(pixels)
+    if pixels.shape[2] == 3:
+        return pixels
+    return ((pixels[..., :3].astype(np.uint16) * pixels[..., 3:] + 127) // 255).astype(np.uint8)
+
+
+def _scaled(pixels: np.ndarray, height: int | None) -> np.ndarray:
+    if height is None or height >= pixels.shape[0]:
+        return pixels
+    width = max(1, round(pixels.shape[1] * height / pixels.shape[0]))
+    return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.LANCZOS))
+
+
+_OPTIONS = (
+    Option(
+        "masks",
+        Path,
+        "DIR",
+        "masks named like the pictures (of a video: like the frames of an earlier import), white = object; "
+        "none: the background stays (default: the object is cut out by what space looks like)",
+    ),
+    Option("masked", str, "WHAT", "pixels black in a mask: empty (default) or unknown, which training ignores", MASKED),
+    Option("fov", float, "DEG", "angle that a picture's width covers, where it is known (estimated)"),
+    Option("length", float, "M", "metres of the object along its longest axis (unit: median distance of the cameras)"),
+    Option("distance", float, "M", "metres from the cameras to the object, the median, instead of a length"),
+    Option("height", int, "PX", "scale pictures down to this height"),
+)
+VIDEO = Importer(
+    import_video,
+    "a video of one object, without poses (needs the extras video and sfm)",
+    "video file",
+    (Option("frames", int, "N", f"frames to take, at most ({FRAMES})"), *_OPTIONS),
+)
+IMAGES = Importer(
+    import_images, "pictures of one object by one camera, without poses (needs the extra sfm)", "folder", _OPTIONS
+)

@@ -1,0 +1,106 @@
+"""What structure from motion finds, put upright, to scale and about the object."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import Array, normalize
+
+EXTENT = 0.5, 99.5  #: percentiles of points along the longest axis between which an object's length lies
+_NEIGHBOURS = 8  # of a point, by whose distance it floats or not
+_FLOATING = 4.0  # times the median of that distance
+_LEAST_TRACK = 3  # pictures that see a point
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Poses of pictures, their camera, and points."""
+
+    names: tuple[str, ...]  #: of the pictures that have a pose, sorted
+    world_from_camera: Array  #: [N, 4, 4] OpenCV axes
+    focal: float  #: pixels
+    centre: tuple[float, float]  #: principal point, pixels
+    k1: float  #: of Brown-Conrady's radial distortion
+    width: int  #: pixels
+    height: int  #: pixels
+    points: Array  #: [P, 3]
+    colors: np.ndarray  #: [P, 3] uint8
+    errors: Array  #: [P] mean distance of a point's features from where it is projected, pixels
+    seen_by: tuple[tuple[int, ...], ...]  #: of each point, numbers of the pictures that see it
+    sizes: tuple[int, ...]  #: pictures of all models that were found, the largest first
+
+    @property
+    def positions(self) -> Array:
+        """[N, 3] camera centres."""
+        return self.world_from_camera[:, :3, 3]
+
+
+def without_floating(model: Model) -> Model:
+    """The model without points that few pictures see or that float away from the others (thesis 6.4.1)."""
+    tracks = np.array([len(frames) for frames in model.seen_by])
+    kept = np.flatnonzero(tracks >= min(_LEAST_TRACK, tracks.max()))
+    if len(kept) > 10 * _NEIGHBOURS:
+        points = model.points[kept]
+        gaps = cKDTree(points).query(points, _NEIGHBOURS + 1)[0][:, 1:].mean(axis=1)
+        kept = kept[gaps <= _FLOATING * np.median(gaps)]
+    return replace(
+        model,
+        points=model.points[kept],
+        colors=model.colors[kept],
+        errors=model.errors[kept],
+        seen_by=tuple(model.seen_by[k] for k in kept),
+    )
+
+
+def placed(model: Model, length: float | None = None, distance: float | None = None) -> Model:
+    """The model about the origin, z towards where the pictures' upper sides point in the mean, x along the object.
+
+    length: metres of the object along its longest axis: of 99 % of the points
+    distance: metres from the cameras to the object's middle, the median
+    Without either the unit is that median distance. Raises InputError where both are given.
+    """
+    if length is not None and distance is not None:
+        raise InputError("length, distance: expected one of them, found both")
+    middle = np.median(model.points, axis=0)
+    offsets = model.points - middle
+    axis = np.linalg.svd(offsets - offsets.mean(axis=0), full_matrices=False)[2][0]
+    axis = axis if axis[np.argmax(np.abs(axis))] > 0 else -axis
+    low, high = np.percentile(offsets @ axis, EXTENT)
+    if length is not None:
+        scale = length / (high - low)
+    else:
+        scale = (distance or 1.0) / float(np.median(np.linalg.norm(model.positions - middle, axis=1)))
+    up = normalize(-model.world_from_camera[:, :3, 1].mean(axis=0))
+    along = axis - (axis @ up) * up
+    if np.linalg.norm(along) < 0.1:  # the object stands upright
+        along = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    along = normalize(along)
+    rotation = np.stack([along, np.cross(up, along), up])
+    poses = model.world_from_camera.copy()
+    poses[:, :3, :3] = rotation @ poses[:, :3, :3]
+    poses[:, :3, 3] = scale * (model.positions - middle) @ rotation.T
+    return replace(model, world_from_camera=poses, points=scale * offsets @ rotation.T)
+
+
+def report_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
+    """What import tells of it. names: of all pictures."""
+    tracks = [len(frames) for frames in model.seen_by]
+    centres = np.linalg.norm(model.positions, axis=1)
+    extent = np.percentile(model.points, EXTENT, axis=0)
+    return {
+        "pictures": len(names),
+        "registered": list(model.names),
+        "not_registered": [name for name in names if name not in set(model.names)],
+        "models": list(model.sizes),
+        "points": len(model.points),
+        "reprojection_error_px": round(float(model.errors.mean()), 4),
+        "track_length": {"mean": round(float(np.mean(tracks)), 2), "median": float(np.median(tracks))},
+        "focal_length_px": round(model.focal, 3),
+        "k1": round(model.k1, 6),
+        "distance": [round(float(centres.min()), 6), round(float(centres.max()), 6)],
+        "extent": np.round(extent[1] - extent[0], 6).tolist(),
+    }

@@ -1,0 +1,319 @@
+"""Structure from motion: poses, one camera and points of pictures of one object, by pycolmap on the CPU.
+
+J. L. Schoenberger, J.-M. Frahm, "Structure-from-motion revisited", CVPR 2016. Steps run in a thread of their own, so
+that Ctrl-C is heard: it ends them through pycolmap's own token.
+"""
+
+import importlib
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from spacesim.data.errors import InputError, WorkError
+from spacesim.data.geometry import Array
+from spacesim.data.importers.video.model import Model
+
+INSTALL = "pip install 'spacesim[sfm]'"
+SEED = 1
+EXHAUSTIVE = 60, 300  #: pictures in time order, in any: up to so many each is matched with each
+OVERLAP = 12  #: of more: each is matched with so many next ones, and 2, 4, 8, ... beyond
+_PEAK = 0.0027  # of SIFT's difference of Gaussians; 0.0067 by default: a spacecraft has little texture
+_FEATURES = 8192
+_LEAST_FEATURES, _LEAST_MATCHES = 50, 15
+_FLAT = 0.8  # share of pairs that a homography explains wholly, from which on there is no parallax
+_LEAST_ANGLE = 2.0  # degrees: of the median point, from which on its depth is known
+
+Progress = Callable[[str, int, int], None]
+"""Called with the step's name, how much of it is done, and of how much."""
+
+
+@dataclass(frozen=True)
+class Matches:
+    """What was found before any pose was."""
+
+    features: float  #: median number of a picture
+    pairs: int  #: of pictures that share enough matches
+    flat_pairs: int  #: of these, such that a homography explains: no parallax, or a plane
+
+
+def reconstruct(
+    folder: Path,
+    names: Sequence[str],
+    size: tuple[int, int],
+    workspace: Path,
+    masks: Path | None = None,
+    focal: float | None = None,
+    ordered: bool = False,
+    progress: Progress | None = None,
+) -> Model:
+    """Poses of the pictures folder/NAME, all of one camera and of `size` (width, height).
+
+    masks: a folder of NAME.png, features are taken where they are not black
+    focal: pixels, where it is known; else it is estimated
+    ordered: the pictures are in time order
+    workspace: an empty folder for what is needed meanwhile
+
+    Raises InputError where pycolmap is missing, and where the pictures do not tell poses: too few features or matches,
+    no parallax, less than half of the pictures in one model, an absurd one.
+    """
+    colmap = _library()
+    report = progress or (lambda step, done, total: None)
+    database = workspace / "database.db"
+    colmap.logging.minloglevel = 3
+    colmap.set_random_seed(SEED)
+    reader = colmap.ImageReaderOptions()
+    reader.camera_model = "SIMPLE_RADIAL"
+    if masks is not None:
+        reader.mask_path = str(masks)
+    if focal is not None:
+        reader.camera_params = f"{focal},{size[0] / 2},{size[1] / 2},0"
+    _find_features(colmap, database, folder, names, reader, report)
+    _match(colmap, database, len(names), ordered, report)
+    found = _matches(colmap, database)
+    if found.features < _LEAST_FEATURES:
+        raise InputError(
+            f"{folder.name}: expected at least {_LEAST_FEATURES} features in a picture, found {found.features:.0f} in "
+            "the median one: too dark, too blurred or too small an object"
+        )
+    if found.pairs < len(names) // 2:
+        raise InputError(
+            f"{folder.name}: expected neighbouring pictures to share {_LEAST_MATCHES} matches or more, found "
+            f"{found.pairs} such pairs of {len(names)} pictures: too few matches"
+        )
+    models = _map(colmap, database, folder, workspace, focal, len(names), report)
+    if not models:
+        raise InputError(f"{folder.name}: {_why_none(found)}")
+    models.sort(key=lambda model: -model.num_reg_images())
+    return _checked(_model(models[0], [m.num_reg_images() for m in models]), found, len(names), folder.name)
+
+
+def _library() -> ModuleType:
+    try:
+        return importlib.import_module("pycolmap")
+    except (ImportError, OSError):
+        raise InputError(f"structure from motion: expected pycolmap, found none; type: {INSTALL}") from None
+
+
+def _run(colmap: ModuleType, work: Callable[[Any], Any], poll: Callable[[], None] | None = None) -> Any:
+    """What `work` gives, which is called with a token that ends it. `poll` is called while it runs."""
+    token, results, failures = colmap.CancellationToken(), [], []
+
+    def call() -> None:
+        try:
+            results.append(work(token))
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=call, daemon=True)
+    thread.start()
+    try:
+        while thread.is_alive():
+            thread.join(0.25)
+            if poll is not None:
+                poll()
+    except BaseException:
+        token.cancel()
+        thread.join()
+        raise
+    if failures:
+        raise WorkError(f"structure from motion: pycolmap failed ({' '.join(str(failures[0]).split())})")
+    return results[0]
+
+
+def _find_features(
+    colmap: ModuleType, database: Path, folder: Path, names: Sequence[str], reader: Any, report: Progress
+) -> None:
+    options = colmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.sift.peak_threshold, options.sift.max_num_features = _PEAK, _FEATURES
+    colmap.Database.open(database).close()
+    single = colmap.CameraMode.SINGLE
+    colmap.import_images(database, folder, camera_mode=single, image_names=list(names), options=reader)  # numbers them
+    for start in range(0, len(names), 8):
+        report("features", start, len(names))
+        extract = partial(
+            colmap.extract_features,
+            database,
+            folder,
+            list(names[start : start + 8]),
+            camera_mode=single,
+            reader_options=reader,
+            extraction_options=options,
+            device=colmap.Device.cpu,
+        )
+        _run(colmap, lambda token, extract=extract: extract(cancellation_token=token))  # type: ignore[misc]
+
+
+def _match(colmap: ModuleType, database: Path, count: int, ordered: bool, report: Progress) -> None:
+    options = colmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    options.num_threads = 1
+    verification = colmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    report("matches", 0, 1)
+    shared = {
+        "matching_options": options,
+        "verification_options": verification,
+        "device": colmap.Device.cpu,
+    }
+    if count > EXHAUSTIVE[0 if ordered else 1]:
+        pairing = colmap.SequentialPairingOptions()
+        pairing.overlap = OVERLAP
+        match = colmap.match_sequential
+    else:
+        pairing = colmap.ExhaustivePairingOptions()
+        match = colmap.match_exhaustive
+    _run(colmap, lambda token: match(database, pairing_options=pairing, cancellation_token=token, **shared))
+    report("matches", 1, 1)
+
+
+def _matches(colmap: ModuleType, path: Path) -> Matches:
+    database = colmap.Database.open(path)
+    try:
+        counts = [database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()]
+        pairs = [pair for _, pair in zip(*_columns(database.read_two_view_geometries()), strict=True)]
+    finally:
+        database.close()
+    used = [pair for pair in pairs if len(pair.inlier_matches) >= _LEAST_MATCHES]
+    kinds = colmap.TwoViewGeometryConfiguration
+    flat = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
+    return Matches(float(np.median(counts)), len(used), sum(pair.config in flat for pair in used))
+
+
+def _columns(pairs: Any) -> Any:
+    """(numbers, geometries), whichever of the two forms pycolmap's versions give."""
+    return pairs if isinstance(pairs, tuple) else (list(zip(*pairs, strict=True)) or [(), ()])
+
+
+def _map(
+    colmap: ModuleType,
+    database: Path,
+    folder: Path,
+    workspace: Path,
+    focal: float | None,
+    count: int,
+    report: Progress,
+) -> list[Any]:
+    """Models, empty where nothing came out."""
+    options = colmap.IncrementalPipelineOptions()
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    options.num_threads = options.mapper.num_threads = 1
+    options.min_model_size = 3
+    options.max_focal_length_ratio = options.mapper.max_focal_length_ratio = 100.0  # telescopes
+    options.triangulation.max_focal_length_ratio = 100.0
+    options.mapper.init_min_tri_angle = 8.0  # neighbours in a video see the object from almost one side
+    options.mapper.init_min_num_inliers = 50
+    options.mapper.abs_pose_min_num_inliers = 20
+    options.ba_refine_focal_length = focal is None
+    options.mapper.abs_pose_refine_focal_length = focal is None
+    registered = 0
+
+    def another() -> None:
+        nonlocal registered
+        registered += 1
+
+    output = workspace / "models"
+    output.mkdir()
+    models = _run(
+        colmap,
+        lambda token: colmap.incremental_mapping(
+            database, folder, output, options, next_image_callback=another, cancellation_token=token
+        ),
+        lambda: report("poses", min(registered, count), count),
+    )
+    return list(models.values())
+
+
+def _model(model: Any, sizes: list[int]) -> Model:
+    images = sorted((model.images[number] for number in model.reg_image_ids()), key=lambda image: image.name)
+    poses = []
+    for image in images:
+        world_from_camera = np.eye(4)
+        world_from_camera[:3] = image.cam_from_world().inverse().matrix()
+        poses.append(world_from_camera)
+    camera = model.cameras[images[0].camera_id]
+    points = [model.points3D[number] for number in sorted(model.points3D)]
+    numbers = {image.image_id: k for k, image in enumerate(images)}
+    seen = [[numbers[e.image_id] for e in point.track.elements if e.image_id in numbers] for point in points]
+    focal, cx, cy, k1 = camera.params.tolist()
+    return Model(
+        names=tuple(image.name for image in images),
+        world_from_camera=np.array(poses),
+        focal=focal,
+        centre=(cx, cy),
+        k1=k1,
+        width=camera.width,
+        height=camera.height,
+        points=np.array([point.xyz for point in points]).reshape(-1, 3),
+        colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        errors=np.array([point.error for point in points]),
+        seen_by=tuple(tuple(dict.fromkeys(frames)) for frames in seen),
+        sizes=tuple(sizes),
+    )
+
+
+def _checked(model: Model, found: Matches, count: int, name: str) -> Model:
+    """Raises InputError for a model that cannot be believed."""
+    registered = len(model.names)
+    if len(model.points) < 30 or registered < 3:
+        raise InputError(f"{name}: {_why_none(found)}")
+    angle = median_angle(model)
+    if angle < _LEAST_ANGLE:
+        raise InputError(
+            f"{name}: expected cameras that see the object from several sides, found them within {angle:.1f} degrees: "
+            "no parallax"
+        )
+    if registered < 0.5 * count:
+        others = ", ".join(map(str, model.sizes[1:])) or "none"
+        raise InputError(
+            f"{name}: expected one model of at least half of the {count} pictures, found one of {registered} (others: "
+            f"{others}): pictures between them are missing or share too few features"
+        )
+    ratio = model.focal / max(model.width, model.height)
+    if not 0.2 < ratio < 90:
+        raise InputError(
+            f"{name}: expected a focal length of 0.2 to 90 widths, found {ratio:.3g}: a broken model; name the field "
+            "of view with fov"
+        )
+    behind = np.mean([_depths(model, k) <= 0 for k in range(registered)])
+    if behind > 0.05:
+        raise InputError(
+            f"{name}: expected the object before the cameras, found it behind {100 * behind:.0f} % of them: a "
+            "mirrored or broken model"
+        )
+    return model
+
+
+def median_angle(model: Model) -> float:
+    """Degrees between the two rays furthest apart on which the median point is seen."""
+    centres = model.world_from_camera[:, :3, 3]
+    angles = []
+    for point, frames in zip(model.points, model.seen_by, strict=True):
+        rays = centres[list(frames)] - point
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+    return float(np.median(angles))
+
+
+def _depths(model: Model, k: int) -> float:
+    """Median depth of all points before camera k."""
+    pose: Array = model.world_from_camera[k]
+    return float(np.median((model.points - pose[:3, 3]) @ pose[:3, 2]))
+
+
+def _why_none(found: Matches) -> str:
+    if found.pairs and found.flat_pairs > _FLAT * found.pairs:
+        return (
+            f"expected cameras that move around the object, found {found.flat_pairs} of {found.pairs} pairs of "
+            "pictures that a rotation or a plane explains: no parallax"
+        )
+    return (
+        f"expected pictures that fit together, found {found.pairs} pairs with matches and no poses that agree with "
+        "them: too few matches"
+    )

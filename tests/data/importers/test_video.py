@@ -1,0 +1,261 @@
+"""Pictures without poses: the object cut out, frames chosen, poses found, and what is said where they cannot be."""
+
+import importlib.util
+import io
+import json
+
+import numpy as np
+import pytest
+from made_pictures import BOX, FOCAL, SIZE, before, box_from, earth, poses_around
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import fibonacci_sphere
+from spacesim.data.images import load_image, read_png, write_png
+from spacesim.data.importers.kinds import import_dataset
+from spacesim.data.importers.video import frames as frames_of
+from spacesim.data.importers.video.chart import draw_cameras
+from spacesim.data.importers.video.frames import Survey, choose, read_frames, survey
+from spacesim.data.importers.video.model import Model, placed, report_of, without_floating
+from spacesim.data.importers.video.segmentation import segment, segment_sequence
+
+FOV = float(np.degrees(2 * np.arctan(SIZE[0] / 2 / FOCAL)))
+needs_colmap = pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed")
+needs_av = pytest.mark.skipif(importlib.util.find_spec("av") is None, reason="PyAV is not installed")
+
+
+def overlap(mask: np.ndarray, truth: np.ndarray) -> float:
+    return (mask & truth).sum() / (mask | truth).sum()
+
+
+@pytest.mark.parametrize("edge", [2.0, 0.85])
+def test_before_the_sky_the_object_is_what_is_bright(edge):
+    picture, truth = box_from(poses_around(1)[0])
+    seen = before(picture, truth, earth(0, edge))
+    assert overlap(segment(seen), truth) > 0.97
+    grey = seen.mean(axis=-1).astype(np.uint8)
+    assert overlap(segment(grey), truth) > 0.97
+
+
+def test_the_object_is_followed_before_the_earth():
+    pictures, truths = [], []
+    for k, pose in enumerate(poses_around(6, 8.0)):
+        picture, truth = box_from(pose)
+        pictures.append(before(picture, truth, earth(40 * k, 0.8 - 0.25 * k)))
+        truths.append(truth)
+    told = []
+    masks = segment_sequence([lambda picture=picture: picture for picture in pictures], told.append)
+    assert [overlap(mask, truth) > 0.95 for mask, truth in zip(masks, truths, strict=True)] == [True] * 6
+    assert told[-1] == 6
+    again = segment_sequence([lambda picture=picture: picture for picture in pictures])
+    assert all(np.array_equal(a, b) for a, b in zip(masks, again, strict=True))
+
+
+def test_a_picture_of_stars_alone_has_no_object():
+    assert not segment(earth(0, 2.0)).any()
+
+
+def test_chosen_frames_are_sharp_and_spread_over_the_motion():
+    rng = np.random.default_rng(0)
+    sharpness = rng.uniform(size=200)
+    motion = np.r_[np.zeros(50), np.full(150, 0.01)]  # it stands still first
+    chosen = choose(Survey(sharpness, motion), 15)
+    assert len(chosen) == 15
+    assert (np.diff(chosen) > 0).all()
+    assert (chosen[1:] >= 50).all()
+    assert sharpness[chosen].mean() > 0.8  # the best of about ten each
+    assert np.histogram(chosen[1:], 3, (50, 200))[0].min() >= 4
+    assert choose(Survey(sharpness, motion), 500).tolist() == [0, *range(50, 200)]
+
+
+def test_a_blurred_frame_is_less_sharp():
+    picture, _ = box_from(poses_around(1)[0])
+    blurred = ndimage.gaussian_filter(picture, (0, 3, 0))  # moved sideways
+    seen = survey(iter([picture, blurred, blurred]))
+    assert seen.sharpness[0] > 2 * seen.sharpness[1]
+    assert seen.motion[1] > 0
+    assert seen.motion[2] == 0
+
+
+def film(path, pictures, **options):
+    from spacesim.splat.export.video import Video
+
+    video = Video(*SIZE, 25, **options)
+    for picture in pictures:
+        video.add(picture)
+    path.write_bytes(video.content())
+    return path
+
+
+@needs_av
+def test_broken_videos_end_in_a_sentence(tmp_path, caplog):
+    noise = np.random.default_rng(0).integers(0, 255, (12, SIZE[1], SIZE[0], 3), np.uint8)
+    path = film(tmp_path / "film.mp4", noise)
+    assert len(list(read_frames(path))) == 12
+    (tmp_path / "text.mp4").write_text("no video at all")
+    with pytest.raises(InputError, match=r"text.mp4: expected a video that FFmpeg reads, found"):
+        next(read_frames(tmp_path / "text.mp4"))
+    with pytest.raises(InputError, match=r"none.mp4: expected a video file, found none"):
+        next(read_frames(tmp_path / "none.mp4"))
+    (tmp_path / "cut.mp4").write_bytes(path.read_bytes()[: path.stat().st_size // 2])  # its index is at the end
+    with pytest.raises(InputError, match=r"cut.mp4: expected a video"):
+        list(read_frames(tmp_path / "cut.mp4"))
+    with pytest.raises(InputError, match="nothing moves"):
+        import_dataset("video", film(tmp_path / "still.mp4", [noise[0]] * 12), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@needs_av
+def test_a_film_of_sound_alone_has_no_pictures(tmp_path):
+    import av
+
+    stream = io.BytesIO()
+    with av.open(stream, "w", format="wav") as file:
+        sound = file.add_stream("pcm_s16le", rate=8000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        frame.rate = 8000
+        file.mux(sound.encode(frame))
+    (tmp_path / "sound.wav").write_bytes(stream.getvalue())
+    with pytest.raises(InputError, match=r"sound.wav: expected a video, found a file without pictures"):
+        next(read_frames(tmp_path / "sound.wav"))
+
+
+def test_what_is_missing_is_named(tmp_path, monkeypatch):
+    import importlib
+
+    def missing(name):
+        raise ImportError(name)
+
+    for k, pose in enumerate(poses_around(3)):
+        write_png(tmp_path / "in" / f"{k}.png", box_from(pose)[0])
+    monkeypatch.setattr(importlib, "import_module", missing)
+    with pytest.raises(InputError, match=r"pip install 'spacesim\[video\]'"):
+        next(read_frames(tmp_path / "film.mp4"))
+    with pytest.raises(InputError, match=r"pip install 'spacesim\[sfm\]'"):
+        import_dataset("images", tmp_path / "in", tmp_path / "out")
+    assert frames_of.INSTALL == "pip install 'spacesim[video]'"
+
+
+@pytest.mark.parametrize(
+    ("wishes", "sentence"),
+    [
+        ({"fov": 0.0}, "fov: expected degrees from 0.1 to 150, found 0.0"),
+        ({"length": -1.0}, "length: expected metres"),
+        ({"length": 1.0, "distance": 2.0}, "length, distance: expected one of them, found both"),
+        ({"height": 3}, "height: expected at least 16 pixels"),
+        ({"masks": "nowhere"}, "masks: expected a folder, found none"),
+    ],
+)
+def test_wrong_options_are_named(tmp_path, wishes, sentence):
+    for k, pose in enumerate(poses_around(3)):
+        write_png(tmp_path / "in" / f"{k}.png", box_from(pose)[0])
+    with pytest.raises(InputError, match=sentence):
+        import_dataset("images", tmp_path / "in", tmp_path / "out", **wishes)
+
+
+def test_wrong_folders_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"in: expected a folder of pictures, found nothing"):
+        import_dataset("images", tmp_path / "in", tmp_path / "out")
+    write_png(tmp_path / "in" / "a.png", np.zeros((20, 30), np.uint8))
+    with pytest.raises(InputError, match="expected at least 3 pictures, found 1"):
+        import_dataset("images", tmp_path / "in", tmp_path / "out")
+    for name in "bc":
+        write_png(tmp_path / "in" / f"{name}.png", np.zeros((20, 31), np.uint8))
+    with pytest.raises(InputError, match=r"b.png: expected 30x20 pixels as the first picture has, found 31x20"):
+        import_dataset("images", tmp_path / "in", tmp_path / "out")
+    with pytest.raises(InputError, match="expected a new or empty folder, found files in it"):
+        import_dataset("images", tmp_path / "in", tmp_path)
+
+
+def model_of(points: np.ndarray, turn: Rotation, scale: float, shift: np.ndarray) -> Model:
+    """Cameras around points along x, in another frame."""
+    poses = np.array(poses_around(5))
+    moved = poses.copy()
+    moved[:, :3, :3] = turn.as_matrix() @ poses[:, :3, :3]
+    moved[:, :3, 3] = scale * turn.apply(poses[:, :3, 3]) + shift
+    seen = tuple((0, 1, 2) for _ in points)
+    count = len(points)
+    return Model(
+        *(tuple("abcde"), moved, FOCAL, (160.0, 120.0), 0.0, *SIZE),
+        *(scale * turn.apply(points) + shift, np.zeros((count, 3), np.uint8), np.ones(count), seen, (5,)),
+    )
+
+
+def test_a_model_is_put_upright_to_scale_and_about_the_object():
+    points = fibonacci_sphere(2001) * [3.0, 1.0, 1.0]
+    model = model_of(points, Rotation.from_rotvec([1.0, 2.0, 3.0]), 7.0, np.array([10.0, -20.0, 30.0]))
+    right = placed(model, length=12.0)
+    assert np.abs(np.median(right.points, axis=0)).max() < 0.1
+    assert 2 * np.linalg.norm(right.points, axis=1).max() == pytest.approx(12.0, rel=0.02)  # 99 % of the points
+    assert (right.world_from_camera[:, 2, 1] < -0.8).all()  # pictures are upright
+    np.testing.assert_allclose(np.linalg.det(right.world_from_camera[:, :3, :3]), 1)
+
+    def median(found: Model) -> float:
+        return float(np.median(np.linalg.norm(found.positions, axis=1)))
+
+    assert median(placed(model, distance=40.0)) == pytest.approx(40)
+    assert median(placed(model)) == pytest.approx(1)
+    report = report_of(right, ["a", "b", "c", "d", "e", "f"])
+    assert report["not_registered"] == ["f"]
+    assert report["track_length"] == {"mean": 3.0, "median": 3.0}
+    assert draw_cameras(right).shape[2] == 3
+
+
+def test_points_that_float_are_left_out():
+    points = np.concatenate([fibonacci_sphere(500), [[0.0, 0.0, 9.0], [4.0, 4.0, 0.0]]])
+    model = model_of(points, Rotation.identity(), 1.0, np.zeros(3))
+    kept = without_floating(model).points
+    assert len(kept) >= 499 - 1
+    assert np.linalg.norm(kept, axis=1).max() < 1.5
+
+
+@needs_colmap
+def test_poses_of_pictures_are_found(tmp_path):
+    poses, truths = poses_around(12), []
+    for k, pose in enumerate(poses):
+        picture, truth = box_from(pose)
+        write_png(tmp_path / "in" / f"{k:02d}.png", before(picture, truth, earth(10 * k, 2.0)))
+        truths.append(truth)
+    told = []
+    data = import_dataset(
+        "images", tmp_path / "in", tmp_path / "out", lambda *step: told.append(step[0]), fov=FOV, distance=5.0
+    )
+    assert told == sorted(told)
+    frames = sorted(data.frames, key=lambda frame: frame.file_path)
+    assert [len(data.train), len(data.test)] == [10, 2]
+    found, true = np.array([f.camera.position for f in frames]), np.array([pose[:3, 3] for pose in poses])
+    found, true = found - found.mean(axis=0), true - true.mean(axis=0)
+    scale = np.linalg.norm(true) / np.linalg.norm(found)
+    turn, _ = Rotation.align_vectors(true, found)
+    assert np.linalg.norm(scale * turn.apply(found) - true, axis=1).max() < 0.03  # of 5
+    assert scale == pytest.approx(1, abs=0.1)  # the middle of the points is that of the sides that are seen
+    for frame, truth in zip(frames, truths, strict=True):
+        assert overlap(load_image(data, frame).alpha > 0.5, truth) > 0.95
+    assert read_png(tmp_path / "out" / "cameras.png").ndim == 3
+    report = json.loads((tmp_path / "out" / "structure.json").read_text())
+    assert report["pictures"] == 12
+    assert report["not_registered"] == []
+    assert report["reprojection_error_px"] < 1
+    assert max(report["extent"]) < 2.1 * np.linalg.norm(BOX)
+
+
+@needs_colmap
+def test_a_camera_that_only_turns_shows_no_parallax(tmp_path):
+    pose = poses_around(1)[0]
+    for k in range(6):
+        turned = pose.copy()
+        turned[:3, :3] = pose[:3, :3] @ Rotation.from_euler("y", k - 2.5, degrees=True).as_matrix()
+        write_png(tmp_path / "in" / f"{k}.png", box_from(turned)[0])
+    with pytest.raises(InputError, match=r"in: expected .*no parallax"):
+        import_dataset("images", tmp_path / "in", tmp_path / "out", fov=FOV)
+    assert not (tmp_path / "out").exists()
+
+
+@needs_colmap
+def test_pictures_of_different_things_do_not_fit_together(tmp_path):
+    rng = np.random.default_rng(0)
+    for k in range(4):
+        write_png(tmp_path / "in" / f"{k}.png", rng.integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8))
+    with pytest.raises(InputError, match=r"in: expected .*too few matches"):
+        import_dataset("images", tmp_path / "in", tmp_path / "out", masks="none")
