@@ -58,9 +58,9 @@ class LearningRates:
     networks: float = 3e-3  #: of their weights, at the start
     networks_final: float = 3e-4  #: of their weights, at the end
     #: of the pictures' poses (`refine_poses`), radians and shares of the distance, at the start; falls to a hundredth
-    poses: float = 3e-3
+    poses: float = 5e-3
     #: of the logarithms of the pictures' gains (`exposure_per_picture`), at the start; falls to a hundredth
-    gains: float = 3e-2
+    gains: float = 5e-2
 
     def __post_init__(self) -> None:
         for f in fields(self):
