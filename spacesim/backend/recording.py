@@ -14,7 +14,6 @@ RECORDINGS = 256  #: of a function that are kept: one for each size of picture, 
 _PLAIN = frozenset((int, float, bool, str, type(None)))
 _EQUAL_TO_INTEGERS = frozenset((float, bool))  # 1, 1.0 and True are one key of a dictionary, 0.0 and -0.0 too
 MAX_KEYS = 2**14  # that are remembered of what is not an array
-_made = 0  # recordings, ever
 _constants: dict[int, tuple[Any, Any]] = {}  # frozen dataclasses without arrays, by `id`: what `_split` told of them
 _leaves: set[type] = set()  # types of arguments that Dr.Jit is left to look into
 
@@ -86,8 +85,7 @@ class Recorded(Generic[P, R]):
         now = self._now = _Arguments()
 
         def replay(_: str, arrays: list[Any]) -> Any:
-            global _made
-            _made += 1
+            _made.count += 1
             rest = iter(arrays)
             return function(*_joined(now.arguments, rest), **_joined(now.named, rest))
 
@@ -116,6 +114,15 @@ class Recorded(Generic[P, R]):
             now.arguments, now.named = (), {}
             if collecting:
                 gc.enable()
+
+
+class _Counter:
+    """Of recordings; to Dr.Jit an object that never changes, where a number would make every call a new one."""
+
+    count = 0
+
+
+_made = _Counter()
 
 
 class _Arguments:
@@ -226,4 +233,4 @@ def _names(kind: Any) -> tuple[str, ...] | None:
 
 def recordings() -> int:
     """How many recordings the functions of `recorded` have made: once warm, it stands still."""
-    return _made
+    return _made.count
