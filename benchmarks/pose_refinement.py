@@ -2,12 +2,12 @@
 
     python benchmarks/pose_refinement.py --out OUT [--degrees 1,3] [--iterations 4000] [--backend auto] [--json]
 
-boxsat of 128 pixels under one Sun, 60 training views, the preset fast. Each training camera is turned by so many degrees
-about an axis through itself and moved by as many % of its distance, both at random and each for itself; test cameras
+boxsat of 128 pixels under one Sun, 60 training views, the preset fast. Each training camera is turned by so many
+degrees about an axis through itself and moved by as many % of its distance, both at random and each for itself; test cameras
 stay. Trained with the true cameras, the disturbed ones, and these refined. PSNR is over the silhouette of the test
 views. Pose errors are medians over the training cameras against the true ones: as they are, and "aligned", after the
-turn, shift and growth that fit all of them best to the true ones; that common motion is the gauge, which pictures do not
-tell: turn in degrees, shift in % of the distance, growth in %.
+turn, shift and growth that fit all of them best to the true ones; that common motion is the gauge, which pictures do
+not tell: turn in degrees, shift in % of the distance, growth in %.
 """
 
 import argparse
@@ -43,7 +43,11 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of refined trainings")
     options = parser.parse_args()
     backend.select(options.backend)
-    sizes = {"views": options.views, "resolution": options.resolution, "known_test_views": min(TEST_VIEWS, options.views)}
+    sizes = {
+        "views": options.views,
+        "resolution": options.resolution,
+        "known_test_views": min(TEST_VIEWS, options.views),
+    }
     data = read_dataset(common.generated("boxsat", options.out / "data", **SCENE, **sizes))
     rows = list(rows_of(data, options))
     common.emit({"rows": rows}, {"Errors of poses, preset " + options.preset: rows}, options)

@@ -62,7 +62,10 @@ def option_of(field: str, options: argparse.Namespace) -> str | None:
     """The option that sets a field, by the field's dotted name."""
     from spacesim.splat.train.config import TrainConfig
 
-    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | {"warm_start": "--warm-start", "refine_poses": "--refine-poses"}
+    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | {
+        "warm_start": "--warm-start",
+        "refine_poses": "--refine-poses",
+    }
     typed = {text.partition("=")[0].partition(".")[0].strip() for text in options.set}  # of which some are no fields
     is_field = field.partition(".")[0] in typed | set(TrainConfig.__dataclass_fields__)
     return options_by_key.get(field) or (f"--set {field}" if is_field else None)

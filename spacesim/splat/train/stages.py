@@ -99,8 +99,8 @@ def picture_loss(
     size: tuple[int, int],
     config: LossSettings,
 ) -> tuple[Float, dict[str, list[Float]], Float, Float | None]:
-    """Loss of a picture over the target's background, and its gradients by its planes (by name), transmittance and gains.
-    size: width and height of the target, pixels, before it is downscaled"""
+    """Loss of a picture over the target's background, and its gradients by its planes (by name), transmittance and
+    gains. size: width and height of the target, pixels, before it is downscaled"""
     times = config.downscale
     covered, alpha = covered_color(target.rgba, size, times, config.tone, light=config.supersample > 1)
     valid, truths = valid_squares(target.valid, size, times), truth_of_squares(target.truth, size, times)

@@ -292,6 +292,8 @@ class Trainer:
     def means_rate(self, index: int) -> float:
         """Metres; falls exponentially over `means_steps`, which begin after a warm start that has larger ones."""
         rates, warm = self.config.rates, self.config.warm_start
+        if self.pictures.model_stays(index):
+            return 0.0
         waits = warm.steps if warm and warm.travel > 0 else 0
         steps = self.config.means_steps or self.config.iterations - waits
         done = min(max(index - waits, 0) / max(steps, 1), 1)

@@ -117,8 +117,7 @@ def distance_image(mask: np.ndarray, config: WarmStartConfig, valid: np.ndarray 
         height, width = (-(-side // step) * step for side in pixels.shape)
         padded = np.zeros((height, width), bool)
         padded[: pixels.shape[0], : pixels.shape[1]] = pixels
-        found: np.ndarray = padded.reshape(height // step, step, width // step, step).any(axis=(1, 3))
-        return found
+        return np.asarray(padded.reshape(height // step, step, width // step, step).any(axis=(1, 3)))
 
     coarse = is_any(mask)
     if not coarse.any():
@@ -228,8 +227,8 @@ def projected_loss(
 
 
 def bilinear(image: Float, size: tuple[int, int], u: Float, v: Float) -> Float:
-    """[N] of the magnitudes of an image Float [h * w] at columns u and rows v, whose whole numbers are the centres of its
-    pixels; linear beyond the outermost. Differentiable by u and v."""
+    """[N] of the magnitudes of an image Float [h * w] at columns u and rows v, whose whole numbers are the centres of
+    its pixels; linear beyond the outermost. Differentiable by u and v."""
     width, height = size
     left = dr.clip(dr.floor(dr.detach(u)), 0, max(width - 2, 0))
     top = dr.clip(dr.floor(dr.detach(v)), 0, max(height - 2, 0))

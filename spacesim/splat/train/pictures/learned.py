@@ -23,7 +23,12 @@ class LearnedPictures:
     def __init__(self, dataset: Dataset, config: TrainConfig) -> None:
         rates, steps = config.rates, config.iterations
         self.frames = dataset.train
-        self.poses = PoseRefinement(dataset, rates.poses, steps, config.antialiased) if config.refine_poses else None
+        self.poses: PoseRefinement | None = None
+        if config.refine_poses:
+            known = config.init in ("points", "mesh") or bool(dataset.ply_file_path or dataset.mesh_path)
+            anchor = known and config.init != "random" and config.warm_start is None
+            how = rates.poses, steps, config.antialiased, anchor, config.views_per_step
+            self.poses = PoseRefinement(dataset, *how)
         self.exposures = Exposures(len(dataset.train), rates.gains, steps) if config.exposure_per_picture else None
 
     def shown(self, view: TrainingView) -> TrainingView:
@@ -44,27 +49,34 @@ class LearnedPictures:
         grad_splats: SplatGradients,
         scale: float,
     ) -> None:
-        """What a view has taught in a step. rows: of the Gaussians that were drawn;  scale: metres, the unit of depth"""
+        """What a view has taught in a step. rows: of the Gaussians that were drawn;  scale: metres, unit of depth"""
         if self.poses:
             grad_depth = [gradient / scale for gradient in drawn.group(grad_splats.features, "depth")]
             self.poses.learn(view.index, step, rows, drawn.camera, grad_splats.splats, grad_depth)
         if self.exposures and loss.grad_gains is not None:
             self.exposures.learn(view.index, step, loss.grad_gains)
 
+    def model_stays(self, step: int) -> bool:
+        """Whether the Gaussians' centres wait in a step, the first of which is 0, while cameras find their places."""
+        return self.poses is not None and step < self.poses.anchored
+
     def hold(self, steps: int) -> None:
         """After so many steps: what pictures cannot tell stays as it is given."""
-        for learned in filter(None, (self.poses, self.exposures)):
+        for learned in self._learned().values():
             learned.hold(steps)
 
     def tensors(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
         numbers = {name: learned.numbers for name, learned in self._learned().items()}
-        return {key: array for name, one in numbers.items() for key, array in one.tensors(name).items()}
+        tensors = {key: array for name, one in numbers.items() for key, array in one.tensors(name).items()}
+        return tensors | ({"pictures.poses.common": self.poses.common} if self.poses else {})
 
     def restore(self, tensors: Mapping[str, np.ndarray]) -> None:
         """The inverse of `tensors`. Raises KeyError, or ValueError for another number of pictures."""
         for name, learned in self._learned().items():
             learned.numbers.restore(name, tensors)
+        if self.poses:
+            self.poses.common = np.array(tensors["pictures.poses.common"], np.float64)
 
     def cameras(self) -> dict[str, Any] | None:
         """For RUN/cameras.json: the training pictures' cameras and gains, in the form of transforms.json; None where

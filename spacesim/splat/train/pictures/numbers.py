@@ -12,7 +12,7 @@ import numpy as np
 from spacesim.data.geometry import Array
 from spacesim.splat.train.optimizer.adam import EPSILON
 
-BETA1, BETA2 = 0.8, 0.99  #: of Adam: a picture has some hundred steps at most, so its moments forget sooner
+BETA1, BETA2 = 0.5, 0.9  #: of Adam: a picture has some hundred steps at most, so its moments forget sooner
 
 
 class PictureNumbers:

@@ -10,9 +10,11 @@ in other ways than moved so, and a step of each moves pixels about as far:
 
     p' = exp([w]) (p - m) + m + d u        p: in the given camera's axes;  m: the centre there;  d = |m|
 
-The world's axes, origin and unit of length cannot be told from pictures. They are held where the given cameras have
-them: what the numbers of all pictures share with a turn, a shift and a growth of all cameras (7 ways, linearised at the
-given ones, least squares of angles and of shifts per distance) is taken out every `GAUGE_EVERY` steps.
+The world's axes, origin and unit of length cannot be told from pictures. Where training starts at points or a mesh,
+these tell: at first their centres stay, and each camera finds its place before them. From then on, and from the first
+step where training starts at random, the world is held where the cameras have it: what the numbers of all pictures
+share with a turn, a shift and a growth of all cameras (7 ways, linearised at the given ones, least squares of angles
+and of shifts per distance) stays as it was, by a correction every `GAUGE_EVERY` steps.
 """
 
 from dataclasses import dataclass
@@ -33,8 +35,10 @@ from spacesim.splat.train.optimizer.adam import OWN
 from spacesim.splat.train.pictures.numbers import PictureNumbers, falling
 from spacesim.splat.train.start import focus_point
 
-START = 500  #: steps at most that poses wait, until the picture is rough
-START_SHARE = 0.1  #: of the training that they wait at most
+START, START_SHARE = 100, 0.025  #: steps that poses wait at most, until colours are rough, and share of the training
+ANCHORED, ANCHORED_SHARE = 10, 0.25  #: times that each picture is shown to a model that stays; most of the training
+END_SHARE = 0.5  #: of the training; then poses stay, as a model gets no sharper than its cameras stand still
+SHIFTS_FIRST = 5  #: steps of a picture that move it alone: a turn before these would only blur what a shift mends
 GAUGE_EVERY = 50  #: steps
 WAYS = ("opacity", "x", "y", "a", "b", "c")  #: of a splat's numbers that blending differentiates by
 
@@ -42,16 +46,23 @@ WAYS = ("opacity", "x", "y", "a", "b", "c")  #: of a splat's numbers that blendi
 class PoseRefinement:
     """The poses of a training's pictures."""
 
-    def __init__(self, dataset: Dataset, rate: float, iterations: int, antialiased: bool) -> None:
-        """rate: step size at the start, radians and shares of the distance"""
+    def __init__(
+        self, dataset: Dataset, rate: float, iterations: int, antialiased: bool, anchor: bool = False, views: int = 1
+    ) -> None:
+        """rate: step size at the start, radians and shares of the distance;  anchor: whether the model starts where the
+        object is;  views: of a step"""
         self.given = [frame.camera for frame in dataset.train]
         self.rate, self.iterations, self.antialiased = rate, iterations, antialiased
         self.start = int(min(START, START_SHARE * iterations))
+        self.end = int(END_SHARE * iterations)
+        shown = -(-ANCHORED * len(self.given) // views)
+        self.anchored = int(min(self.start + shown, ANCHORED_SHARE * iterations)) if anchor else 0
         self.centre = focus_point(dataset)
         self.seen = np.array([c.camera_from_world[:3, :3] @ (self.centre - c.position) for c in self.given])
         self.distances = np.maximum(np.linalg.norm(self.seen, axis=1), 1e-6)
-        self.numbers = PictureNumbers(len(self.given), 6, self._by_numbers)
+        self.numbers = PictureNumbers(len(self.given), 6, self._taught)
         self._gauge = _Gauge.of(self.given, self.centre, self.seen, self.distances)
+        self.common = np.zeros(self._gauge.shares.shape[0])  #: of the gauge's ways, what is held
         self._centre = ad.Float(self.centre.tolist())
         self._gradient = recorded(pose_gradient)
 
@@ -64,17 +75,21 @@ class PoseRefinement:
     ) -> None:
         """What a view that was drawn teaches of its pose. step: number of the step, the first of which is 0;  camera:
         that it was drawn with;  grad_splats: gradients of its splats;  grad_depth: of their depths, metres, if any"""
-        if step < self.start:
+        if not self.start <= step < self.end:
             return
         gradient = self._gradient(rows[:OWN], camera, grad_splats, grad_depth, self._centre, self.antialiased)
-        done = (step - self.start) / max(self.iterations - self.start, 1)
+        done = (step - self.start) / max(self.end - self.start, 1)
         self.numbers.learn(picture, gradient, falling(self.rate, done))
 
     def hold(self, steps: int) -> None:
-        """After so many steps: take out what all cameras moved alike, if it is time to."""
-        if steps % GAUGE_EVERY == 0 or steps == self.iterations:
+        """After so many steps: take out what all cameras moved alike, if it is time to; or, where the model has stayed
+        until now, remember it."""
+        if steps == self.anchored and steps > 0:
             self.numbers.follow()
-            self.numbers.values = self._gauge.held(self.numbers.values)
+            self.common = self._gauge.rigid(self.numbers.values)
+        elif steps > self.anchored and (steps % GAUGE_EVERY == 0 or steps == self.iterations):
+            self.numbers.follow()
+            self.numbers.values = self._gauge.held(self.numbers.values, self.common)
 
     def moves(self) -> Array:
         """[V, 2] how far each camera was turned, degrees, and moved, share of the distance."""
@@ -90,6 +105,13 @@ class PoseRefinement:
         middle, turn = self.seen[picture], numbers[:3]
         shift = self.distances[picture] * numbers[3:] + middle - Rotation.from_rotvec(turn).apply(middle)
         return np.concatenate([turn, shift])
+
+    def _taught(self, picture: int, gradient: Array) -> Array:
+        """`_by_numbers`, without that by the turn while a picture is only shifted."""
+        taught = self._by_numbers(picture, gradient)
+        if self.numbers.steps[picture] < SHIFTS_FIRST:
+            taught[:3] = 0
+        return taught
 
     def _by_numbers(self, picture: int, gradient: Array) -> Array:
         """[6] gradient by the numbers, from that of `pose_gradient`: exp([w + dw]) = exp([J dw]) exp([w])."""
@@ -158,6 +180,7 @@ class _Gauge:
 
     ways: Array  #: [6 V, R] numbers that a common motion gives; R of 7, fewer where cameras are few
     shares: Array  #: [R, 6 V] of each, in given numbers
+    growth: Array  #: [R] unit, of the ways: what a growth gives
 
     @staticmethod
     def of(cameras: list[Camera], centre: Array, seen: Array, distances: Array) -> "_Gauge":
@@ -179,11 +202,17 @@ class _Gauge:
         basis = left[:, sizes > 1e-6 * sizes.max()].reshape(len(cameras), 6, -1)
         ways = np.einsum("vij,vjk->vik", back, basis).reshape(6 * len(cameras), -1)
         shares = np.einsum("vjk,vji->kvi", basis, forward).reshape(-1, 6 * len(cameras))
-        return _Gauge(ways, shares)
+        growth = basis.reshape(6 * len(cameras), -1).T @ common[:, :, 6].ravel()
+        return _Gauge(ways, shares, growth / max(float(np.linalg.norm(growth)), 1e-12))
 
-    def held(self, numbers: Array) -> Array:
-        """The numbers [V, 6] without what all share."""
+    def rigid(self, numbers: Array) -> Array:
+        """[R] of each way in numbers [V, 6], without growth: splats' sizes, which change while their centres stay,
+        would tell of that."""
+        shares = self.shares @ numbers.ravel()
+        rigid: Array = shares - self.growth * (self.growth @ shares)
+        return rigid
+
+    def held(self, numbers: Array, common: Array | float = 0.0) -> Array:
+        """The numbers [V, 6] with `common` [R] in place of what all share."""
         flat = numbers.ravel()
-        return (flat - self.ways @ (self.shares @ flat)).reshape(numbers.shape)
-
-
+        return (flat - self.ways @ (self.shares @ flat - common)).reshape(numbers.shape)

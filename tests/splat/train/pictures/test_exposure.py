@@ -16,7 +16,7 @@ from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import TrainConfig, preset, with_settings
 from spacesim.splat.train.trainer import Trainer
 
-RANGE = 0.35  #: of the logarithms of gains
+RANGES = 0.7, 0.35  #: of the logarithms of gains: of one picture a view, of several
 
 
 @pytest.fixture(scope="module")
@@ -32,18 +32,19 @@ def again(small_dataset, tmp_path_factory) -> tuple[Dataset, np.ndarray]:
 
 
 def with_gains(dataset: Dataset, root: Path, views: int, times: int) -> tuple[Dataset, np.ndarray]:
-    """(dataset, gains [V, 3]): pictures half as bright, so that none clips, under random gains in light, whose mean
-    logarithm is 0 over all pictures, and over those of a view where there are several."""
+    """(dataset, gains [V, 3]): pictures 0.45 as bright, so that hardly any clips, under random gains in light, whose
+    mean logarithm is 0 over all pictures, and over those of a view where there are several."""
     (root / "images").mkdir()
     values = json.loads((dataset.root / "transforms.json").read_text())
-    logs = np.random.default_rng(0).uniform(-RANGE, RANGE, (views, times, 3))
+    logs = np.random.default_rng(0).uniform(-1, 1, (views, times, 3))
+    logs *= RANGES[times > 1]
     logs -= logs.mean(axis=1 if times > 1 else 0, keepdims=True)
     poses = {frame["file_path"]: frame["transform_matrix"] for frame in values["frames"]}
     frames = []
 
     def write(source: str, name: str, gain: np.ndarray) -> None:
         rgba = np.asarray(Image.open(dataset.root / source)) / 255
-        shown = np.dstack([srgb_from_linear(0.5 * linear_from_srgb(rgba[..., :3]) * gain), rgba[..., 3:]])
+        shown = np.dstack([srgb_from_linear(0.45 * linear_from_srgb(rgba[..., :3]) * gain), rgba[..., 3:]])
         Image.fromarray(np.rint(255 * shown).astype(np.uint8)).save(root / name)
         frames.append({"file_path": name, "transform_matrix": poses[source]})
 
@@ -60,7 +61,7 @@ def with_gains(dataset: Dataset, root: Path, views: int, times: int) -> tuple[Da
 
 
 def trained(dataset: Dataset, config: TrainConfig) -> Trainer:
-    trainer = Trainer(dataset, replace(config, init_count=150, iterations=300))
+    trainer = Trainer(dataset, replace(config, init_count=150, iterations=600))
     trainer.run(lambda progress: None, lambda: None)
     return trainer
 
@@ -68,7 +69,7 @@ def trained(dataset: Dataset, config: TrainConfig) -> Trainer:
 def psnr_of_tests(trainer: Trainer, dataset: Dataset) -> float:
     errors = []
     for frame in dataset.test:
-        color, alpha, _ = render(trainer.gaussians, Pinhole.of(frame.camera)).to_numpy()
+        color, _, _ = render(trainer.gaussians, Pinhole.of(frame.camera)).to_numpy()
         rgba = np.asarray(Image.open(dataset.root / frame.file_path)) / 255
         errors.append(((np.clip(color, 0, 1) - rgba[..., :3] * rgba[..., 3:])[rgba[..., 3] > 0.5] ** 2).mean())
     return float(-10 * np.log10(np.mean(errors)))
@@ -80,8 +81,8 @@ def test_known_gains_are_found_in_light(again):
     config = with_settings(preset("demo", "relight"), {**light, "light.field.width": 16, "light.field.features": 8})
     found = trained(dataset, replace(config, exposure_per_picture=True)).pictures.exposures.all_gains()
     np.testing.assert_allclose(np.log(found).mean(axis=0), 0, atol=1e-9)
-    assert np.abs(np.log(gains)).mean() > 0.1
-    assert np.abs(np.log(found / gains)).mean() < 0.03
+    assert np.abs(np.log(gains)).mean() > 0.15
+    assert np.abs(np.log(found / gains)).mean() < 0.05
 
 
 def test_pictures_of_a_model_of_srgb_values_gain(exposed):
@@ -91,7 +92,7 @@ def test_pictures_of_a_model_of_srgb_values_gain(exposed):
     without, trainer = trained(dataset, config), trained(dataset, replace(config, exposure_per_picture=True))
     found, true = np.log(trainer.pictures.exposures.all_gains()).ravel(), np.log(gains).ravel()
     assert 1 / 2.4 - 0.1 < found @ true / (true @ true) < 1 / 2.4 + 0.1
-    assert np.corrcoef(found, true)[0, 1] > 0.97
+    assert np.corrcoef(found, true)[0, 1] > 0.95
     assert psnr_of_tests(trainer, dataset) > psnr_of_tests(without, dataset) + 0.5
 
 

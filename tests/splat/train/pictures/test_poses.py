@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from spacesim.backend import ad, recordings
 from spacesim.data.records import Dataset
 from spacesim.data.transforms import read_camera
-from spacesim.splat.pose import moved
+from spacesim.splat.pose import moved, twist_between
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole, project
-from spacesim.splat.train.config import TrainConfig, preset
+from spacesim.splat.train.config import preset
 from spacesim.splat.train.pictures.numbers import PictureNumbers
 from spacesim.splat.train.pictures.poses import WAYS, PoseRefinement, left_jacobian
 from spacesim.splat.train.train import train
@@ -82,30 +82,28 @@ def test_the_gradient_by_the_numbers_follows_from_that_of_a_small_motion(small_d
     np.testing.assert_allclose(poses._by_numbers(1, gradient), expected, rtol=1e-6)
 
 
-def test_the_loss_falls_as_the_gradient_says(small_dataset):
-    """Central differences of the whole loss. The adjoint leaves out what is cut off at an alpha of 1/255."""
-    trainer = Trainer(disturbed(small_dataset, 3), replace(CONFIG, sh_degree=0, iterations=200))
-    for _ in range(150):
-        trainer.step()
-    poses, view_pass = trainer.pictures.poses, trainer._view_pass
-    poses.numbers.follow()
-    at = poses.numbers.values[0].copy()
+def test_the_loss_falls_as_the_gradient_says(small_dataset, known_gaussians):
+    """Central differences of the whole loss, of the true model from a wrong place. The adjoint leaves out that splats
+    are cut off at an alpha of 1/255."""
+    trainer = Trainer(small_dataset, CONFIG)
+    trainer.gaussians = Gaussians.from_numpy(known_gaussians)
+    poses, view_pass, rows = trainer.pictures.poses, trainer._view_pass, trainer.gaussians.rows()
+    at = np.array([0.03, -0.04, 0.05, 0.02, -0.03, 0.04])
 
     def loss(numbers: np.ndarray) -> tuple[float, np.ndarray]:
         poses.numbers.values[0] = numbers
         view = trainer.pictures.shown(trainer.views[0])
-        rows = trainer.gaussians.rows()
         drawn = view_pass.forward(trainer.gaussians, rows, None, view, 0, 1, False)
         found = view_pass.loss(drawn, trainer._target_image(5, view, None), view.camera)
         grad_splats = view_pass.backward(drawn, found, absolute=False)
         read = poses._gradient(rows[:11], drawn.camera, grad_splats.splats, [], poses._centre, False)
         return float(found.value[0]), poses._by_numbers(0, np.array(read, np.float64))
 
-    step = 2e-3
+    step = 1e-3
     slopes = [(loss(at + way)[0] - loss(at - way)[0]) / (2 * step) for way in step * np.eye(6)]
     gradient = loss(at)[1]
     for part in (slice(0, 3), slice(3, 6)):
-        np.testing.assert_allclose(gradient[part], slopes[part], atol=0.15 * np.abs(slopes[part]).max())
+        np.testing.assert_allclose(gradient[part], slopes[part], atol=0.1 * np.abs(slopes[part]).max())
 
 
 def test_the_left_jacobian_says_how_turns_add():
@@ -144,23 +142,50 @@ def test_one_camera_stays(small_dataset):
     np.testing.assert_allclose(poses.numbers.values, 0, atol=1e-12)
 
 
-def test_disturbed_poses_come_back(small_dataset):
-    """Their common motion apart, which `errors` takes out; the picture's shift is what shows most."""
+def test_disturbed_poses_come_back_before_a_model_that_is_right(small_dataset, known_gaussians):
+    """Where the object is seen, and how it is turned: medians."""
     given = disturbed(small_dataset, 2)
-    trainer = Trainer(given, replace(CONFIG, iterations=400))
-    trainer.run(lambda progress: None, lambda: None)
+    config = replace(CONFIG, iterations=1_600, rates=replace(CONFIG.rates, poses=6e-3))
+    trainer = Trainer(given, config)
+    trainer.gaussians = Gaussians.from_numpy(known_gaussians)
     poses = trainer.pictures.poses
 
-    def off(cameras) -> float:
-        """Pixels that the centre is off, median."""
-        pixels = []
-        for camera, frame in zip(cameras, small_dataset.train, strict=True):
-            seen = [c.camera_from_world[:3, :3] @ (poses.centre - c.position) for c in (camera, frame.camera)]
-            pixels.append(camera.fx * np.linalg.norm(seen[0][:2] / seen[0][2] - seen[1][:2] / seen[1][2]))
-        return float(np.median(pixels))
+    def off() -> tuple[float, float]:
+        shifts, turns = [], []
+        for i, frame in enumerate(small_dataset.train):
+            camera = poses.camera(i)
+            seen, true = (c.camera_from_world[:3, :3] @ (poses.centre - c.position) for c in (camera, frame.camera))
+            shifts.append(np.linalg.norm(seen - true) / 3)
+            turns.append(np.linalg.norm(twist_between(camera, frame.camera)[:3]))
+        return float(np.median(shifts)), float(np.median(turns))
 
-    before = off([frame.camera for frame in given.train])
-    assert off([poses.camera(i) for i in range(len(given.train))]) < 0.5 * before
+    before = off()
+    rows = trainer.gaussians.rows()
+    for step in range(40, 700):
+        view = trainer.pictures.shown(trainer.views.at_step(step))
+        drawn = trainer._view_pass.forward(trainer.gaussians, rows, None, view, 1, 1, False)
+        loss = trainer._view_pass.loss(drawn, trainer._target_image(step, view, None), view.camera)
+        grad_splats = trainer._view_pass.backward(drawn, loss, absolute=False)
+        trainer.pictures.learn(step, view, rows, drawn, loss, grad_splats, trainer.scene_scale)
+    after = off()
+    assert after[0] < 0.2 * before[0]
+    assert after[1] < 0.4 * before[1]
+
+
+def test_the_model_stays_while_cameras_find_their_places(small_dataset):
+    trainer = Trainer(small_dataset, replace(CONFIG, iterations=100))
+    before = trainer.gaussians.to_numpy()["means"]
+    assert trainer.pictures.poses.anchored == 25
+    while trainer.iteration < 25:
+        trainer.step()
+    np.testing.assert_array_equal(trainer.gaussians.to_numpy()["means"], before)
+    common = trainer.pictures.poses.common
+    assert np.abs(common).max() > 0
+    while trainer.iteration < 100:
+        trainer.step()
+    assert np.abs(trainer.gaussians.to_numpy()["means"] - before).max() > 0
+    poses = trainer.pictures.poses
+    np.testing.assert_allclose(poses._gauge.shares @ poses.numbers.values.ravel(), common, atol=1e-9)
 
 
 @pytest.mark.parametrize("changes", [{}, {"views_per_step": 3}, {"num_downscales": 1, "supersample": 2}])
@@ -196,7 +221,9 @@ def test_a_checkpoint_does_not_change_what_follows(small_dataset, tmp_path):
 
 @pytest.mark.parametrize("method", ["shadow-map", "shadow-splat"])
 def test_methods_with_shadows_refine_poses_too(small_lit_dataset, method):
-    trainer = Trainer(small_lit_dataset, replace(preset("demo", method), init_count=60, iterations=30, refine_poses=True))
+    trainer = Trainer(
+        small_lit_dataset, replace(preset("demo", method), init_count=60, iterations=30, refine_poses=True)
+    )
     while trainer.iteration < 12:
         trainer.step()
     trainer.pictures.poses.numbers.follow()
