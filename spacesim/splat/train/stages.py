@@ -98,9 +98,9 @@ def picture_loss(
     target: TargetImage,
     size: tuple[int, int],
     config: LossSettings,
-) -> tuple[Float, dict[str, list[Float]], Float, Float | None]:
-    """Loss of a picture over the target's background, and its gradients by its planes (by name), transmittance and
-    gains. size: width and height of the target, pixels, before it is downscaled"""
+) -> tuple[Float, dict[str, list[Float]], Float]:
+    """Loss of a picture over the target's background, and its gradients by its planes (by name), with those by "gains"
+    where the target has some, and transmittance. size: width and height of the target, pixels, before it is downscaled"""
     times = config.downscale
     covered, alpha = covered_color(target.rgba, size, times, config.tone, light=config.supersample > 1)
     valid, truths = valid_squares(target.valid, size, times), truth_of_squares(target.truth, size, times)
@@ -136,7 +136,9 @@ def picture_loss(
         loss += weight * foreground_loss(transmittance, mask)
     dr.backward(loss)
     grad_planes = {name: [dr.grad(plane) for plane in group] for name, group in inputs.items()}
-    return dr.detach(loss), grad_planes, dr.grad(input_transmittance), None if gains is None else dr.grad(gains)
+    if gains is not None:
+        grad_planes["gains"] = [dr.grad(gains)]
+    return dr.detach(loss), grad_planes, dr.grad(input_transmittance)
 
 
 def on_screen(absolute: tuple[Float, Float], radii: Float, sizes: Float) -> tuple[Float, Float, Bool]:

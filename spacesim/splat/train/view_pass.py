@@ -135,8 +135,10 @@ class ViewPass:
         blended = drawn.tape.blended
         planes, size = _group_by_name(blended.features, drawn.channels), (camera.width, camera.height)
         terms = self._loss_settings[drawn.downscale]
-        value, grad_planes, *rest = self._loss(planes, blended.transmittance, target, size, terms)
-        return ViewLoss(value, [plane for group in grad_planes.values() for plane in group], *rest)
+        value, grad_planes, grad_transmittance = self._loss(planes, blended.transmittance, target, size, terms)
+        grad_gains = grad_planes.pop("gains", [None])[0]
+        in_order = [plane for group in grad_planes.values() for plane in group]
+        return ViewLoss(value, in_order, grad_transmittance, grad_gains)
 
     def backward(self, drawn: RenderedView, loss: ViewLoss, absolute: bool) -> SplatGradients:
         """Gradients of the loss by splats and by what was blended. absolute: also what `watched` reads"""

@@ -46,7 +46,7 @@ def gradients(unknown: bool, weights: dict[str, float]) -> dict[str, np.ndarray]
     target = TargetImage(upload(bytes_.view("<u4").ravel(), ad.UInt32), ad.Float([0.9, 0.1, 0.5]), valid, truth)
     settings = replace(SETTINGS, **{"ssim": 0.0, "visibility": 0.0, "depth": 0.0, "normal": 0.0, **weights})
     transmittance = upload(rng.uniform(0.3, 0.7, count))
-    _, by_planes, by_transmittance, _ = picture_loss(drawn, transmittance, target, SIZE, settings)
+    _, by_planes, by_transmittance = picture_loss(drawn, transmittance, target, SIZE, settings)
     found = {name: np.array([np.array(plane) for plane in group]) for name, group in by_planes.items()}
     found["transmittance"] = np.array(by_transmittance)[None]
     return {name: values.reshape(-1, 16, 24) for name, values in found.items()}
