@@ -100,7 +100,7 @@ def picture_loss(
     config: LossSettings,
 ) -> tuple[Float, dict[str, list[Float]], Float]:
     """Loss of a picture over the target's background, and its gradients by its planes (by name), with those by "gains"
-    where the target has some, and transmittance. size: width and height of the target, pixels, before it is downscaled"""
+    where the target has some, and transmittance. size: width and height of the target, pixels, before downscaling"""
     times = config.downscale
     covered, alpha = covered_color(target.rgba, size, times, config.tone, light=config.supersample > 1)
     valid, truths = valid_squares(target.valid, size, times), truth_of_squares(target.truth, size, times)
