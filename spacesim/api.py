@@ -21,12 +21,14 @@ from spacesim.splat.compose import PosedScene, load_predictor
 from spacesim.splat.compose.output import Composed
 from spacesim.splat.compose.output import compose as _compose
 from spacesim.splat.compose.scenefile import load_scene
+from spacesim.splat.fit import estimate_sun
 from spacesim.splat.pose import RefinedPose, refine_pose
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import RenderOutput
 from spacesim.splat.raster.render import render as _render
 from spacesim.splat.run import Rendering, Run, load_run
+from spacesim.splat.sun_search import SunEstimate
 from spacesim.splat.train.config import TrainConfig, preset
 
 ProgressCallback = Callable[[int, int, str], None]
@@ -47,9 +49,11 @@ __all__ = [
     "Run",
     "SceneConfig",
     "Sun",
+    "SunEstimate",
     "TrainConfig",
     "Truth",
     "compose",
+    "estimate_sun",
     "evaluate",
     "generate",
     "import_dataset",

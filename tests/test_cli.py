@@ -93,7 +93,17 @@ def test_the_help_of_train_fits_on_a_screen(spacesim, monkeypatch):
     assert "docs/how-to/choose.md" in shown
     assert re.findall(r"^  (--[a-z-]+)", shown, re.MULTILINE) == [
         *("--out", "--method", "--strategy", "--preset", "--iterations", "--seed", "--init", "--init-count"),
-        *("--max-gaussians", "--warm-start", "--resume", "--set", "--fields", "--backend", "--debug"),
+        *(
+            "--max-gaussians",
+            "--warm-start",
+            "--sun",
+            "--refine-poses",
+            "--resume",
+            "--set",
+            "--fields",
+            "--backend",
+            "--debug",
+        ),
     ]
 
 

@@ -171,6 +171,7 @@ class Frame:
     id_path: str | None = None
     depth_file_path: str | None = None
     mask_path: str | None = None  #: 0 = ignore this pixel
+    time: float | None = None  #: when it was taken, in any unit: pictures of one film
     distortion: tuple[float, ...] = ()  #: Brown-Conrady k1, k2, p1, p2, k3 of the stored image; () for none
 
 

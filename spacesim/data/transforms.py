@@ -170,10 +170,11 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
         if not is_file(image):
             raise InputError("expected an image file, found something else")
         camera, distortion, sun = _read_camera(values, image), _read_distortion(values), _read_sun(values)
+        time = _number(entry, "time") if entry.get("time") is not None else None
     except InputError as error:
         raise InputError(f"{source}: frame {file_path}: {error}") from None
     paths = {key: _path(source, entry, key) for key in TRUTH_PATHS}
-    return Frame(file_path, camera, sun, **paths, distortion=distortion)
+    return Frame(file_path, camera, sun, **paths, time=time, distortion=distortion)
 
 
 def _read_camera(values: Json, image: Path) -> Camera:

@@ -9,18 +9,23 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
-from spacesim.data.records import Camera, Sun
+from spacesim.data.records import Camera, Image, Sun
 from spacesim.splat.compose.aligned import AlignedRun
+from spacesim.splat.pose import checked_picture
 from spacesim.splat.run import Prediction, Predictor, Run
+from spacesim.splat.sun_search import SmallPicture, SunEstimate, SunFinder
 
 SATURATED = 254.5 / 255  #: sRGB value from which on a pixel says only that it is bright
 SIDE = 128  #: pixels of the longer side, at most, of the picture that embeddings are fitted on
 VARIANCE, MAX_AXES = 0.99, 16  #: share of the training embeddings' variance that is searched, and its axes at most
 STEP = 0.1  #: standard deviations along an axis, of a finite difference
 ITERATIONS, HALVINGS = 4, 4  #: Gauss-Newton steps, and how often each is halved until it helps
+HALF = 0.5  #: least alpha of a pixel that counts, and least share of such ones in a small picture's
 ENOUGH = 1e-3  #: a step that lowers the cost by less than this share is the last
 
 
@@ -64,12 +69,35 @@ def find_unknowns(run: Predictor, gain: bool = False) -> tuple[Unknown, ...]:
     model = run.run if isinstance(run, AlignedRun) else run
     light = model.light if isinstance(model, Run) else None
     unknowns: list[Unknown] = []
+    if isinstance(model, Run) and light is not None and model.config.get("sun") == "unknown":
+        unknowns.append(SunFit(SunFinder(model.gaussians, light, model.antialiased, model.curve)))
     if light is not None and light.embeddings:
         size = light.config.field.embeddings
         unknowns.append(EmbeddingFit.of(np.array(light.embeddings[0], np.float64).reshape(-1, size)))
     if gain:
         unknowns.append(GainFit())
     return tuple(unknowns)
+
+
+def estimate_sun(run: Run, image: ArrayLike | Image, camera: Camera, mask: ArrayLike | None = None) -> SunEstimate:
+    """The Sun under which the model of `run` looks most like a picture: its direction, and how sure that is.
+
+    image: [H, W, 3] sRGB values, float in [0, 1] or uint8, or [H, W, 4] with straight alpha; or what `load_image` gives
+    camera: of the picture, with its size and intrinsics (no distortion);  mask: [H, W], where not 0 the pixel counts
+    Pixels count where the picture's alpha is at least one half, or the model's where the picture has none. All
+    directions are compared, shadows included, on a picture of 64 pixels; the picture's exposure is taken for that of
+    the training pictures. Raises InputError where the run knows no Sun, for no such picture, and where none counts.
+    """
+    if not run.relightable or run.light is None:
+        raise InputError(f"run: expected one of a method that is told the Sun, found {run.config['method']}")
+    pixels, counts = checked_picture(image, mask, camera)
+    rgb = pixels[..., :3]
+    seen = pixels[..., 3] if pixels.shape[2] == 4 else run.predict(camera, Sun(np.array([0.0, 0.0, 1.0]))).alpha
+    shown = (seen >= HALF) & (counts[..., 0] > 0)
+    if not shown.any():
+        raise InputError("image: expected a picture of the object, found no pixel that counts")
+    picture = SmallPicture.of(camera, Image(rgb, np.ones_like(seen), shown), least=HALF)
+    return SunFinder(run.gaussians, run.light, run.antialiased, run.curve).estimate(picture)
 
 
 def draw(run: Predictor, camera: Camera, light: PictureLight) -> Prediction:
@@ -79,6 +107,34 @@ def draw(run: Predictor, camera: Camera, light: PictureLight) -> Prediction:
         run = run.with_embedding(light.embedding)
     drawn = run.predict(camera, light.sun)
     return drawn if light.gain == 1 else replace(drawn, rgb=srgb_from_linear(light.gain * linear_from_srgb(drawn.rgb)))
+
+
+@dataclass(frozen=True, eq=False)
+class SunFit:
+    """The Sun of a picture that does not name it, by a run whose training pictures did not name theirs."""
+
+    finder: SunFinder
+
+    name = "sun"
+    how = "its direction, searched over the sphere by shading and shadows of a picture of 64 pixels"
+
+    def fit(
+        self, run: Predictor, picture: Picture, masks: Sequence[np.ndarray], start: Sequence[PictureLight]
+    ) -> list[PictureLight]:
+        """See `Unknown`. A Sun that is named stays."""
+        pose = run.pose if isinstance(run, AlignedRun) else None
+        camera = picture.camera if pose is None else pose.camera_in_model(picture.camera)
+        opaque = np.ones(picture.rgb.shape[:2], np.float32)
+        lights = []
+        for mask, light in zip(masks, start, strict=True):
+            if light.sun is None:
+                image = Image(picture.rgb.astype(np.float32), opaque, mask)
+                direction = self.finder.estimate(SmallPicture.of(camera, image, least=HALF)).direction
+                if pose is not None:
+                    direction = pose.rotation @ direction
+                light = replace(light, sun=Sun(direction))
+            lights.append(light)
+        return lights
 
 
 class GainFit:

@@ -108,7 +108,7 @@ def refine_pose(
     told = Sun.of(sun)
     if told is None and run.relightable:
         raise InputError(f"sun: expected its direction for a run of {run.config['method']}, found none")
-    target, counts = _checked_picture(image, mask, camera)
+    target, counts = checked_picture(image, mask, camera)
     _check_numbers(within, starts)
     check_picture(camera)
     drawing = _Drawing.of(run, told)
@@ -499,7 +499,7 @@ def _first_gain(target: np.ndarray, counts: np.ndarray, background: np.ndarray |
     return float(np.clip(target_sum / max(model_sum, 1e-9), *GAINS))
 
 
-def _checked_picture(image: ArrayLike | Image, mask: ArrayLike | None, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def checked_picture(image: ArrayLike | Image, mask: ArrayLike | None, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """([H, W, 3] or premultiplied [H, W, 4], [H, W, 1] 1 where it counts, 0 elsewhere), float32."""
     size = (camera.height, camera.width)
     counts = np.ones(size, np.float32)

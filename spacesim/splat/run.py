@@ -195,6 +195,7 @@ class TrainingRecord:
     versions: Mapping[str, str] = field(default_factory=dict)  #: of libraries
     poses: Mapping[str, float] | None = None  #: how far training moved them (medians), where it did: degrees, share
     gains: Mapping[str, float] | None = None  #: least and most of the pictures', where they were learned
+    suns: Mapping[str, float] | None = None  #: how sure they are, where they were estimated: degrees, median
 
     def __post_init__(self) -> None:
         if not self.history:

@@ -1,6 +1,6 @@
 """The appearance field: colour of each Gaussian by its features, the Sun and the view (thesis 4.1, 4.2, table 4.1)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -151,6 +151,35 @@ def normals_adjoint(
         along += gradient * _faces(cosines[0], inputs, batch)
     dr.backward(along)
     return batch.matrix(list(dr.grad(normals)))
+
+
+def sun_adjoint(
+    config: FieldConfig,
+    inputs: FieldInputs,
+    grad_items: TensorXf,
+    grad_facing: list[Float],
+    grad_encoding: Float,
+    batch: PaddedBatch,
+) -> Float:
+    """Float [3]: gradient of the Sun's direction through what the network is told of it; shadows count as given.
+    grad_items, grad_facing: as in `normals_adjoint`;  grad_encoding: of what `FieldConfig.sun` says, then of whatever
+    """
+    sun = ad.Array3f(inputs.sun)
+    dr.enable_grad(sun)
+    along = ad.Float(0)
+    if config.surface:
+        direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
+        cosines = surface_cosines(_normals(config, inputs, batch), direction, sun)
+        first = config.features + config.view.size
+        for i, cosine in enumerate(cosines):
+            along += dr.sum(cosine * batch.row(grad_items, first + i))
+        facing = replace(inputs, sun=sun)
+        for gradient in grad_facing:
+            along += dr.sum(gradient * _faces(cosines[0], facing, batch))
+    for i, term in enumerate(config.sun(sun)):
+        along += term * dr.gather(ad.Float, grad_encoding, ad.UInt32(i))
+    dr.backward(along)
+    return dr.concat(list(dr.grad(sun)))
 
 
 def is_back_side_seen(config: FieldConfig, inputs: FieldInputs, batch: PaddedBatch) -> Bool:

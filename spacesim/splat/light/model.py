@@ -105,6 +105,8 @@ class LightGradients:
     #: of the first 11 rows of the Gaussians (`Gaussians.rows`), through their shadows, or nothing where shadows count
     #: as given
     geometry: list[Float]
+    #: of the Sun's direction through the field, Float [3] in a list, shadows as given, or nothing where not asked for
+    sun: list[Float]
 
 
 class LightModel:
@@ -202,9 +204,11 @@ class LightModel:
         )
         return shown[:3], shown[3] if visibility else None
 
-    def adjoint(self, shading: Shading, grad_color: list[Float], grad_visibility: Any = None) -> "LightGradients":
+    def adjoint(
+        self, shading: Shading, grad_color: list[Float], grad_visibility: Any = None, by_sun: bool = False
+    ) -> "LightGradients":
         """From the gradients of the dimmed colours (3 arrays [N]) and, where visibility is seen on its own, of the
-        visibility [N]."""
+        visibility [N]. by_sun: also the gradient of the Sun's direction"""
         grad_visibilities = [] if grad_visibility is None else [grad_visibility]
         arguments = (
             self.config,
@@ -214,11 +218,12 @@ class LightModel:
             shading.tape,
             grad_color,
             grad_visibilities,
+            by_sun,
         )
-        grad_features, grad_weights, grad_occlusion, by_told = kernels.adjoint(*arguments)
+        grad_features, grad_weights, grad_occlusion, by_told, grad_sun = kernels.adjoint(*arguments)
         grad_geometry = shading.shadows.adjoint(grad_occlusion[0]) if grad_occlusion and shading.shadows else []
         by_embeddings = [self._embedding_gradient(gradient, shading.picture) for gradient in by_told]
-        return LightGradients(grad_features, grad_weights, by_embeddings, grad_geometry)
+        return LightGradients(grad_features, grad_weights, by_embeddings, grad_geometry, grad_sun)
 
     def tensors(self) -> dict[str, np.ndarray]:
         """For a file: the weights, the embeddings [V, E] where pictures have some, and the training frame."""

@@ -20,6 +20,7 @@ from spacesim.splat.light.field import (
     field_views,
     is_back_side_seen,
     normals_adjoint,
+    sun_adjoint,
     sun_facing,
 )
 from spacesim.splat.light.padded_batch import PaddedBatch, round_up_rows
@@ -177,9 +178,11 @@ def adjoint(
     tape: ShadingTape,
     grad_color: list[Float],
     grad_visibility: list[Float],
-) -> tuple[Float, list[Float], list[Float], list[Float]]:
+    by_sun: bool,
+) -> tuple[Float, list[Float], list[Float], list[Float], list[Float]]:
     """(gradient of the features, gradients of the weights, [gradient of the raw occlusion] where it is asked for,
-    [gradient of `SunEncoding.field`] where pictures have embeddings)."""
+    [gradient of `SunEncoding.field`] where pictures have embeddings, [gradient of the Sun's direction, Float [3]] where
+    `by_sun` asks for it)."""
     field_weights, refine_weights = split_weights(config, weights)
     visibility = 1 - tape.occlusion[0] if tape.occlusion else 1
     gradients = [batch.pad_zeros(gradient) for gradient in grad_color]
@@ -192,11 +195,16 @@ def adjoint(
     grad_weights, grad_items = mlp.backward(
         config.field.shape, field_weights, tape.field, inputs.sun.field_encoding, grad_output
     )
-    by_told = [mlp.shared_gradient(config.field.shape, field_weights, grad_weights)] if config.field.embeddings else []
+    by_told = []
+    if config.field.embeddings or by_sun:
+        by_told = [mlp.shared_gradient(config.field.shape, field_weights, grad_weights)]
     parts = [(grad_items, 0, config.field.features)]
     grad_shown = [batch.pad_zeros(gradient) for gradient in grad_visibility]
+    grad_facing = [gradient * visibility for gradient in grad_shown] if config.field.surface else []
+    grad_sun = []
+    if by_sun:
+        grad_sun = [sun_adjoint(config.field, _field_inputs(inputs), grad_items, grad_facing, by_told[0], batch)]
     if config.field.surface:
-        grad_facing = [gradient * visibility for gradient in grad_shown]
         parts.append((normals_adjoint(config.field, _field_inputs(inputs), grad_items, grad_facing, batch), 0, 3))
     grad_occlusion: Any = -sum(
         (g * c for g, c in pairs), sum((_picture_visibility(g, tape.faces) for g in grad_shown), ad.Float(0))
@@ -221,7 +229,9 @@ def adjoint(
         parts.append((batch.matrix(grad_albedo), 0, 3))
     grad_raw_occlusion = [grad_occlusion] if config.shadow and config.shadow.gradients else []
     dr.eval(grad_raw_occlusion)
-    return batch.pack(parts, inputs.features), grad_weights, batch.unpad(grad_raw_occlusion, inputs.means.x), by_told
+    by_told = by_told if config.field.embeddings else []
+    grad_raw_occlusion = batch.unpad(grad_raw_occlusion, inputs.means.x)
+    return batch.pack(parts, inputs.features), grad_weights, grad_raw_occlusion, by_told, grad_sun
 
 
 def _refine_items(config: LightConfig, refine: RefineConfig, inputs: ShadingInputs, batch: PaddedBatch) -> TensorXf:

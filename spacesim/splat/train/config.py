@@ -59,6 +59,8 @@ class LearningRates:
     networks_final: float = 3e-4  #: of their weights, at the end
     #: of the pictures' poses (`refine_poses`), radians and shares of the distance, at first; falls to a hundredth
     poses: float = 5e-3
+    #: of the pictures' Suns (`sun = "unknown"`), radians, at the start; falls to a hundredth
+    suns: float = 2e-2
     #: of the logarithms of the pictures' gains (`exposure_per_picture`), at the start; falls to a hundredth
     gains: float = 5e-2
 
@@ -101,6 +103,8 @@ class TrainConfig:
     warm_start: WarmStartConfig | None = None  #: pull Gaussians to the foreground before refinement (thesis 5.3)
     init_box: float | None = None  #: side of the cube that `random` fills, in sizes of the object
     checkpoint_every: int = 1_000  #: iterations between two checkpoints
+    #: where the pictures' Suns come from: the data, or estimated with the model
+    sun: Literal["given", "unknown"] = "given"
     refine_poses: bool = False  #: move the cameras of training pictures to where these fit the model
     exposure_per_picture: bool = (
         False  #: learn a gain of each channel for each training picture: exposure, white balance
@@ -128,6 +132,8 @@ class TrainConfig:
         if self.means_steps is not None:
             check_ranges(self, means_steps=(1, MAX_STEPS))
         check_ranges(self, ssim_weight=(0, 1), seed=(0, 2**63), **{name: (0, MAX_LOSS_WEIGHT) for name in WEIGHTS})
+        if self.sun == "unknown" and not (self.light and self.light.field.knows_sun):
+            raise InputError(f"sun: expected a method that is told the Sun, as shadow-map, found {self.method}")
         if self.visibility_weight > 0 and not (self.light and self.light.shadow):
             raise InputError(f"visibility_weight: expected a method with shadows, found {self.method}")
         if self.prior == "mesh" and not self.shape_terms:

@@ -20,11 +20,13 @@ from spacesim.data.files import holds_files, read_json, remove_leftovers, write_
 from spacesim.data.identity import training_digest
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Dataset
+from spacesim.data.store import write_points
 from spacesim.data.tone import tone_and_exposure
 from spacesim.splat.run import Run, load_run, read_config
-from spacesim.splat.train.checkpoint import write_tensors
+from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.start import distance_warning, scale_warning
+from spacesim.splat.train.pictures.suns import FirstSuns, check_pictures, first_suns, shape_config, surface_points
+from spacesim.splat.train.start import distance_warning, farthest_camera, focus_point, scale_warning
 from spacesim.splat.train.trainer import Trainer, TrainingProgress
 
 KEEP_CHECKPOINTS = 2
@@ -53,15 +55,39 @@ def train(
         return load_run(out)
     if config.warm_start is not None and (remark := config.warm_start.remark(config.iterations)):
         log.warning(remark)
-    trainer = Trainer(dataset, config)
+    if config.sun == "given":
+        trainer = Trainer(dataset, config)
+    else:
+        check_pictures(dataset)
     for remark in filter(None, (scale_warning(dataset), distance_warning(dataset))):
         log.warning(remark)
     with lock_folder(out):
         _check_folder(out, described, resume)  # again: another training may have come and gone
         remove_leftovers(out)
         write_json(out / "config.json", described)
+        if config.sun == "unknown":
+            trainer = _trainer_from_shape(dataset, config, out, on_progress)
         _train(trainer, out, on_progress, command)
     return load_run(out)
+
+
+def _trainer_from_shape(
+    dataset: Dataset, config: TrainConfig, out: Path, on_progress: Callable[[TrainingProgress], None]
+) -> Trainer:
+    """Of Suns that are unknown: a run without light, RUN/shape, is trained first. It gives the first Suns, kept in
+    RUN/suns.safetensors, and the points to start from, RUN/points.ply, where `init` is not to be another one."""
+    path, points = out / "suns.safetensors", out / "points.ply"
+    if not path.exists():
+        run = train(dataset, out / "shape", shape_config(config), resume=True, on_progress=on_progress)
+        log.info("looking for the Suns of %d pictures by shape and shading", len(dataset.train))
+        write_points(points, *surface_points(run.gaussians))
+        distance = farthest_camera(dataset, focus_point(dataset))
+        write_tensors(path, first_suns(dataset, run.gaussians, run.antialiased, distance).tensors(), {})
+    suns = FirstSuns.of(read_tensors(path)[0], len(dataset.train), path)
+    if config.init in (None, "random"):
+        dataset = replace(dataset, ply_file_path=str(points.absolute()))
+        config = replace(config, init="points", init_box=None, warm_start=None)
+    return Trainer(dataset, config, suns)
 
 
 def _train(

@@ -29,6 +29,7 @@ from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.adam import Adam, NetworkAdam
 from spacesim.splat.train.optimizer.update import Update
 from spacesim.splat.train.pictures.learned import LearnedPictures
+from spacesim.splat.train.pictures.suns import FirstSuns
 from spacesim.splat.train.prior import MeshPrior
 from spacesim.splat.train.stages import TargetImage, update_light
 from spacesim.splat.train.start import (
@@ -64,11 +65,12 @@ class Trainer:
     The same dataset, configuration and backend give bitwise the same model, also across `save` and `restore`.
     """
 
-    def __init__(self, dataset: Dataset, config: TrainConfig) -> None:
+    def __init__(self, dataset: Dataset, config: TrainConfig, first_suns: FirstSuns | None = None) -> None:
+        """first_suns: where the Suns of pictures that name none start, of a configuration that estimates them"""
         self.config, self.iteration, self.refinement_seconds = config, 0, 0.0
         _check_sizes(dataset, config)
         self.views = _views(dataset, config)
-        self.pictures = LearnedPictures(dataset, config)
+        self.pictures = LearnedPictures(dataset, config, first_suns)
         self.scene_scale = scene_scale(dataset)
         features = config.light.features if config.light else 0
         start = config.init_count, config.sh_degree, config.seed, features, config.init_box, config.splatfacto_start
@@ -125,6 +127,8 @@ class Trainer:
 
         self.iteration += 1
         self.pictures.hold(self.iteration)
+        if self.light:
+            self.pictures.find_suns(self.iteration, self.gaussians, self.light)
         self.strategy.add_noise(self.iteration, self.gaussians, self.means_rate(index), config.seed)
         self._refine()
         losses = [result.loss for result in results]
@@ -160,7 +164,9 @@ class Trainer:
         if watched:
             self.strategy.observe(*view_pass.watched(drawn, grad_splats))
         grad_rows = self._add_attraction(rows, view, attraction) if attraction else []
-        return view_pass.to_gradients(drawn, loss, grad_splats, self.light, grad_rows)
+        result = view_pass.to_gradients(drawn, loss, grad_splats, self.light, grad_rows)
+        self.pictures.learn_sun(self.iteration, view, result.by_sun)
+        return result
 
     def _warming(self, index: int) -> bool:
         """Whether the warm start keeps refinement off in step number `index`, the first of which is 0."""
@@ -336,7 +342,7 @@ def _views(dataset: Dataset, config: TrainConfig) -> TrainingViews:
     """The training pictures with the truth that the loss asks for."""
     truth = config.shape_terms + (("visibility",) if config.visibility_weight > 0 else ())
     prior = MeshPrior.of(dataset) if config.shape_terms and config.prior == "mesh" else None
-    suns = config.light is not None and config.light.field.knows_sun
+    suns = config.light is not None and config.light.field.knows_sun and config.sun == "given"
     return TrainingViews(dataset, config.seed, suns, truth, prior)
 
 

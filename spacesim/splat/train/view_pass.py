@@ -73,6 +73,7 @@ class ViewResult:
     gradients: ViewGradients | None
     loss: Any
     by_networks: Any = None  #: by their weights, then by the pictures' embeddings
+    by_sun: Any = None  #: Float [3], by its direction, of pictures whose Suns are unknown
 
     def take_gradients(self) -> ViewGradients:
         """The gradients, which are not held any longer."""
@@ -170,10 +171,12 @@ class ViewPass:
                 ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_rows=grad_rows), loss.value
             )
         grad_visibility = grad_values.pop("visibility", [None])[0]
-        grad_light = light.adjoint(drawn.shading, grad_values.pop("color"), grad_visibility)
+        by_sun = self.config.sun == "unknown"
+        grad_light = light.adjoint(drawn.shading, grad_values.pop("color"), grad_visibility, by_sun)
         grad_rows = _sum_rows(grad_light.geometry, grad_rows)
         gradients = ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_light.features, grad_rows)
-        return ViewResult(gradients, loss.value, [*grad_light.weights, *grad_light.embeddings])
+        learned = [*grad_light.weights, *grad_light.embeddings]
+        return ViewResult(gradients, loss.value, learned, grad_light.sun[0] if by_sun else None)
 
 
 def _group_by_name(values: list[Any], counts: dict[str, int]) -> dict[str, list[Any]]:

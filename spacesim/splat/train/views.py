@@ -139,8 +139,8 @@ def _check_known(dataset: Dataset, suns: bool, traced: Sequence[str]) -> None:
     for frame in dataset.train:
         if suns and frame.sun is None:
             raise InputError(
-                f"{dataset.root}: expected sun_direction in every training frame, or the method relight with "
-                f"light.field.inputs=view, which is told none, found none in {frame.file_path}"
+                f"{dataset.root}: expected sun_direction in every training frame, or sun=unknown, which "
+                f"estimates it, or the method relight with light.field.inputs=view, found none in {frame.file_path}"
             )
         if traced and frame.gt_path is None:
             raise InputError(

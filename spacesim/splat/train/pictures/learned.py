@@ -9,18 +9,22 @@ import numpy as np
 from spacesim.backend.arrays import Float
 from spacesim.data.records import Dataset
 from spacesim.data.store import intrinsics_of
+from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.adjoint import SplatGradients
+from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.pictures.exposure import Exposures
 from spacesim.splat.train.pictures.poses import PoseRefinement
+from spacesim.splat.train.pictures.suns import FirstSuns, SunEstimation
 from spacesim.splat.train.view_pass import RenderedView, ViewLoss
 from spacesim.splat.train.views import TrainingView
 
 
 class LearnedPictures:
-    """poses, exposures: of the training pictures, None where the configuration does not ask for them"""
+    """poses, exposures, suns: of the training pictures, None where the configuration does not ask for them"""
 
-    def __init__(self, dataset: Dataset, config: TrainConfig) -> None:
+    def __init__(self, dataset: Dataset, config: TrainConfig, first_suns: FirstSuns | None = None) -> None:
+        """first_suns: where Suns start that are unknown"""
         rates, steps = config.rates, config.iterations
         self.frames = dataset.train
         self.poses: PoseRefinement | None = None
@@ -30,9 +34,15 @@ class LearnedPictures:
             how = rates.poses, steps, config.antialiased, anchor, config.views_per_step
             self.poses = PoseRefinement(dataset, *how)
         self.exposures = Exposures(len(dataset.train), rates.gains, steps) if config.exposure_per_picture else None
+        self.suns, self._antialiased = None, config.antialiased
+        if config.sun == "unknown":
+            assert first_suns is not None, "Suns that are unknown start somewhere"
+            self.suns = SunEstimation(dataset, first_suns, rates.suns, steps)
 
     def shown(self, view: TrainingView) -> TrainingView:
-        """A view from where its camera is thought to stand."""
+        """A view from where its camera is thought to stand, under the Sun that is thought to shine."""
+        if self.suns:
+            view = replace(view, sun=self.suns.direction(view.index))
         return replace(view, camera=self.poses.camera(view.index)) if self.poses else view
 
     def gains(self, view: TrainingView) -> Float | None:
@@ -56,20 +66,33 @@ class LearnedPictures:
         if self.exposures and loss.grad_gains is not None:
             self.exposures.learn(view.index, step, loss.grad_gains)
 
+    def learn_sun(self, step: int, view: TrainingView, gradient: Any) -> None:
+        """gradient: Float [3] by the direction of the view's Sun, of Suns that are unknown"""
+        if self.suns:
+            self.suns.learn(view.index, step, gradient)
+
+    def find_suns(self, steps: int, gaussians: Gaussians, light: LightModel) -> None:
+        """After so many steps: look for better Suns of all pictures, if it is time to."""
+        if self.suns:
+            self.suns.search(steps, gaussians, light, self._antialiased)
+
     def model_stays(self, step: int) -> bool:
         """Whether the Gaussians' centres wait in a step, the first of which is 0, while cameras find their places."""
         return self.poses is not None and step < self.poses.anchored
 
     def hold(self, steps: int) -> None:
         """After so many steps: what pictures cannot tell stays as it is given."""
-        for learned in self._learned().values():
-            learned.hold(steps)
+        if self.poses:
+            self.poses.hold(steps)
+        if self.exposures:
+            self.exposures.hold(steps)
 
     def tensors(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
         numbers = {name: learned.numbers for name, learned in self._learned().items()}
         tensors = {key: array for name, one in numbers.items() for key, array in one.tensors(name).items()}
-        return tensors | ({"pictures.poses.common": self.poses.common} if self.poses else {})
+        tensors |= {"pictures.poses.common": self.poses.common} if self.poses else {}
+        return tensors | (self.suns.tensors() if self.suns else {})
 
     def restore(self, tensors: Mapping[str, np.ndarray]) -> None:
         """The inverse of `tensors`. Raises KeyError, or ValueError for another number of pictures."""
@@ -77,6 +100,8 @@ class LearnedPictures:
             learned.numbers.restore(name, tensors)
         if self.poses:
             self.poses.common = np.array(tensors["pictures.poses.common"], np.float64)
+        if self.suns:
+            self.suns.restore(tensors)
 
     def cameras(self) -> dict[str, Any] | None:
         """For RUN/cameras.json: the training pictures' cameras and gains, in the form of transforms.json; None where
@@ -91,17 +116,21 @@ class LearnedPictures:
             frames[-1] |= intrinsics_of(camera)
             if gains is not None:
                 frames[-1]["gain"] = gains[picture].tolist()
+            if self.suns:
+                frames[-1] |= self.suns.described(picture)
         return {"camera_model": "PINHOLE", "frames": frames}
 
     def summary(self) -> dict[str, dict[str, float]]:
-        """For training.json: medians of how far poses moved, and the range of gains."""
-        told = {}
+        """For training.json: medians of how far poses moved, the range of gains, how sure Suns are."""
+        told: dict[str, dict[str, float]] = {}
         if self.poses:
             degrees, share = np.median(self.poses.moves(), axis=0).tolist()
             told["poses"] = {"degrees": degrees, "share_of_distance": share}
         if self.exposures:
             gains = self.exposures.all_gains().mean(axis=1)
             told["gains"] = {"least": float(gains.min()), "most": float(gains.max())}
+        if self.suns:
+            told["suns"] = {"sigma_deg": float(np.median(self.suns.sigmas))}
         return told
 
     def sentences(self) -> list[str]:
@@ -113,8 +142,12 @@ class LearnedPictures:
         if "gains" in told:
             least, most = told["gains"].values()
             sentences.append(f"pictures' gains are from {least:.2f} to {most:.2f}")
+        if "suns" in told:
+            sentences.append(
+                f"Suns are estimated to {told['suns']['sigma_deg']:.1f} degrees (median of their own sigma)"
+            )
         return sentences
 
-    def _learned(self) -> dict[str, PoseRefinement | Exposures]:
-        both = {"pictures.poses": self.poses, "pictures.exposures": self.exposures}
-        return {name: learned for name, learned in both.items() if learned is not None}
+    def _learned(self) -> dict[str, PoseRefinement | Exposures | SunEstimation]:
+        every = {"pictures.poses": self.poses, "pictures.exposures": self.exposures, "pictures.suns": self.suns}
+        return {name: learned for name, learned in every.items() if learned is not None}

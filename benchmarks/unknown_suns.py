@@ -1,0 +1,116 @@
+"""Pictures like SPEED+'s that do not name their Suns: what estimating these is worth (`train --sun unknown`).
+
+    python benchmarks/unknown_suns.py --out OUT [--frames 600] [--height 300] [--iterations 7000] [--json]
+
+Data as of speedplus_data.py, silhouettes known. Trained: "told", with the true Suns; "unknown", with estimated ones;
+without Suns, the field of view alone with embeddings of pictures, and vanilla. PSNR is over the silhouette of test
+views, which have Suns of their own: "told" is told these, and the others are not. What they do not know of a test
+picture, Sun or embedding, is fitted on one half of it and judged on the other. Errors of Suns are against the true
+ones: of all training pictures, and of those whose Sun the estimate calls sure (sigma below its median).
+"""
+
+import argparse
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import common
+import numpy as np
+import speedplus_data
+
+from spacesim import backend
+from spacesim.data.files import read_json
+from spacesim.data.importers.writing import ImportedFrame, write_dataset
+from spacesim.data.records import Dataset
+from spacesim.data.store import read_dataset
+from spacesim.eval.evaluate import EvaluateConfig
+from spacesim.splat.train.config import TrainConfig, preset, warm_start, with_options, with_settings
+
+METHOD = "shadow-map"
+EMBEDDINGS = 16  #: numbers of a picture
+
+
+def main() -> None:
+    parser = common.arguments(__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="where data and runs are, or are made")
+    parser.add_argument("--frames", type=common.positive, default=600, help="training pictures")
+    parser.add_argument("--height", type=common.positive, default=300, help="pixels")
+    parser.add_argument("--spp", type=common.positive, default=64)
+    parser.add_argument("--iterations", type=common.positive, default=7000)
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--rows", default="told,unknown,embeddings,vanilla", help="what to train, commas between")
+    options = parser.parse_args()
+    backend.select(options.backend)
+    data = speedplus_data.make(options.out, options.frames, options.height, spp=options.spp)
+    rows = list(rows_of(data, options))
+    common.emit({"rows": rows}, {"Suns unknown, preset " + options.preset: rows}, options)
+
+
+def rows_of(data: speedplus_data.SpeedplusData, options: argparse.Namespace) -> Iterator[common.Row]:
+    untold = without_suns(data.told, options.out / "untold")
+    judge = EvaluateConfig(geometry=None)
+    for name, config in configurations(options).items():
+        if name not in common.row_names(options.rows):
+            continue
+        folder = options.out / name
+        found = common.measured(name, config, judge, data.told if name == "told" else untold, folder)
+        if "note" in found:
+            yield {"Suns": name, **found}
+            continue
+        row = {"Suns": name, "PSNR, dB": found["image"]["psnr"]["mean"], "SSIM": found["image"]["ssim"]["mean"]}
+        row |= {"Gaussians": found["model"]["gaussians"], "s": found["training"]["seconds"]}
+        yield row | (sun_errors(folder / "run" / "cameras.json", data.made) if name == "unknown" else {})
+
+
+def configurations(options: argparse.Namespace) -> dict[str, TrainConfig]:
+    """By the names of rows."""
+
+    def of(method: str) -> TrainConfig:
+        config = with_options(preset(options.preset, method), warm_start=warm_start(options.preset))
+        return with_options(config, iterations=options.iterations)
+
+    view = {"light.field.inputs": "view", "light.field.embeddings": EMBEDDINGS}
+    return {
+        "told": of(METHOD),
+        "unknown": with_settings(of(METHOD), {"sun": "unknown"}),
+        "embeddings": with_settings(of("relight"), view),
+        "vanilla": of("vanilla"),
+    }
+
+
+def without_suns(told: Dataset, out: Path) -> Dataset:
+    """The same pictures and silhouettes without Suns."""
+    if not (out / "transforms.json").exists():
+        shutil.rmtree(out, ignore_errors=True)
+
+        def untold(frame: "speedplus_data.Frame") -> ImportedFrame:
+            assert frame.silhouette_path is not None
+            paths = told.root / frame.file_path, told.root / frame.silhouette_path
+            return ImportedFrame(
+                Path(frame.file_path).stem, paths[0], frame.camera, frame.distortion, silhouette=paths[1]
+            )
+
+        groups = [list(map(untold, group)) for group in (told.train, told.test)]
+        write_dataset(out, *groups, {"kind": "untold", "source": str(told.root)})
+    return read_dataset(out)
+
+
+def sun_errors(path: Path, made: Dataset) -> common.Row:
+    """Of a run's estimates (cameras.json), degrees."""
+    frames = read_json(path)["frames"]
+    found = np.array([frame["sun_direction"] for frame in frames])
+    sigmas = np.array([frame["sun_sigma_deg"] for frame in frames])
+    true = np.array([frame.sun.direction for frame in made.train if frame.sun is not None])
+    errors = np.degrees(np.arccos(np.clip((found * true).sum(axis=1), -1, 1)))
+    return {
+        "Sun off, deg": float(np.median(errors)),
+        "mean": float(errors.mean()),
+        "at most 8 deg, %": float(100 * (errors <= 8).mean()),
+        "over 60 deg, %": float(100 * (errors > 60).mean()),
+        "of the surer half, deg": float(np.median(errors[sigmas <= np.median(sigmas)])),
+        "sigma, deg": float(np.median(sigmas)),
+    }
+
+
+if __name__ == "__main__":
+    common.told(main)

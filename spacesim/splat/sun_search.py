@@ -1,0 +1,291 @@
+"""The Sun of a picture that does not name it: by the shape of Gaussians at first, then by a model of light.
+
+Both compare small pictures with what is expected under the Suns of a lattice over the sphere, shadows included. Where
+poses and shape are known, shading fixes the direction in the model's axes: no rotation and no mirror image is left, but
+what is turned away from the Sun says little, and one flat surface alone only how obliquely it is lit.
+
+Shape alone, by alternation (`ShapeSearch`): surfaces are Lambertian, their albedo at first the mean colour of all
+pictures, then what the Suns found so far leave. All pictures share one exposure, as brightness tells the angle.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim.backend import ad
+from spacesim.backend.arrays import Float
+from spacesim.backend.upload import upload
+from spacesim.data.geometry import Array, fibonacci_sphere
+from spacesim.data.images import linear_from_srgb, luminance
+from spacesim.data.records import Camera, Image
+from spacesim.splat.light.model import LightModel, Sunlight
+from spacesim.splat.light.shadow.cast import ShadowConfig, cast_shadows
+from spacesim.splat.light.shadow.light_camera import light_rows
+from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.render import render
+from spacesim.splat.raster.tone import adjust_exposure
+
+SPHERE = 300  #: Suns of the lattice: 12 degrees apart
+SIDE = 64  #: pixels of the longer side of a small picture, which shows the object alone
+ERROR = 0.05  #: sRGB values, or roots of linear ones: an error so large counts half (Cauchy's loss)
+BLOCK = 8.0  #: pixels of a small picture whose errors count as one
+COVERED = 0.5  #: least alpha of a pixel that counts
+AMBIENT = 0.02  #: light that comes from everywhere, as a share of the Sun's
+MEAN_COSINE = 0.2  #: of a surface's n . s times visibility over Suns all round: a quarter without shadows
+ALTERNATIONS = 3  #: of Suns and albedo
+RINGS = 8.0, 3.0  #: degrees about the best Sun, at which a paraboloid is fitted
+RING = 6  #: Suns of a ring
+
+
+@dataclass(frozen=True, eq=False)
+class SunEstimate:
+    """A Sun's direction by a picture."""
+
+    direction: Array  #: [3] unit, world axes, towards the Sun
+    #: degrees: root mean square angle to the other Suns that would do, by how well they do. Of a model that is wrong as
+    #: a whole it says nothing: a lower bound
+    sigma_deg: float
+    loss: float  #: of Cauchy, summed over blocks of pixels, lower is better
+
+
+@dataclass(frozen=True, eq=False)
+class SmallPicture:
+    """A picture of few pixels, and which of them count."""
+
+    camera: Camera  #: of as many pixels
+    rgb: Array  #: [H, W, 3] sRGB values over black
+    counts: np.ndarray  #: [H, W] bool, on the object, as far as known
+
+    @staticmethod
+    def of(camera: Camera, image: Image, least: float = 0.999) -> "SmallPicture":
+        """The object's part of a picture, in means over squares of pixels, of those that are valid. least: share of
+        them in a square that counts"""
+        rows, columns = cropped(image)
+        factor = max(1, -(-max(rows.stop - rows.start, columns.stop - columns.start) // SIDE))
+        numbers = camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start
+        small = Camera(
+            camera.world_from_camera,
+            max((columns.stop - columns.start) // factor, 1),
+            max((rows.stop - rows.start) // factor, 1),
+            *(number / factor for number in numbers),
+        )
+        image = Image(image.rgb[rows, columns], image.alpha[rows, columns], image.valid[rows, columns])
+        valid = image.valid.astype(np.float32)
+        share = block_means(valid, factor)
+        weights = (image.alpha * valid)[..., None]
+        rgb = block_means(image.rgb * weights, factor) / np.maximum(share, 1e-6)[..., None]
+        covered = block_means(weights[..., 0], factor) / np.maximum(share, 1e-6)
+        return SmallPicture(small, rgb, (covered >= COVERED) & (share >= least))
+
+
+def cropped(image: Image) -> tuple[slice, slice]:
+    """Rows and columns that hold what of a picture is valid and not empty; all where there is none."""
+    shown = (image.alpha >= COVERED) & image.valid
+    if not shown.any():
+        return slice(0, shown.shape[0]), slice(0, shown.shape[1])
+    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def block_means(values: np.ndarray, factor: int) -> np.ndarray:
+    """[H // f, W // f, ...] means over squares of f pixels a side."""
+    height, width = max(values.shape[0] // factor, 1), max(values.shape[1] // factor, 1)
+    cut = values[: height * factor, : width * factor]
+    if cut.shape[0] < factor or cut.shape[1] < factor:
+        return cut.mean(axis=(0, 1), keepdims=True)
+    means: np.ndarray = cut.reshape(height, factor, width, factor, *values.shape[2:]).mean(axis=(1, 3))
+    return means
+
+
+class SunFinder:
+    """Finds Suns of pictures by a model that is told the Sun.
+
+    gaussians, light: the model;  antialiased: whether it is drawn so;  curve: as `Run.curve`
+    """
+
+    def __init__(
+        self, gaussians: Gaussians, light: LightModel, antialiased: bool, curve: tuple[str, float] | None
+    ) -> None:
+        self.gaussians, self.light, self.antialiased, self.curve = gaussians, light, antialiased, curve
+        self.sphere = fibonacci_sphere(SPHERE)
+        self._sunlight: dict[int, Sunlight] = {}
+
+    def estimate(
+        self,
+        picture: SmallPicture,
+        among: Sequence[int] | None = None,
+        cost: Callable[[Array], float] = lambda direction: 0.0,
+    ) -> SunEstimate:
+        """The Sun under which the model looks most like a picture.
+
+        among: numbers of the lattice that are looked at, by default all;  cost: what a direction [3] costs besides
+        """
+        numbers = list(range(SPHERE)) if among is None else sorted({int(number) for number in among})
+        directions = list(self.sphere[numbers])
+        losses = [self._loss(picture, self.sphere[k], k) + cost(self.sphere[k]) for k in numbers]
+        for degrees in RINGS:
+            best = directions[int(np.argmin(losses))]
+            around = ring(best, degrees)
+            of_ring = [self._loss(picture, direction) + cost(direction) for direction in around]
+            directions, losses = [*directions, *around], [*losses, *of_ring]
+            lowest = paraboloid_minimum(best, around, min(losses), of_ring, degrees)
+            directions.append(lowest)
+            losses.append(self._loss(picture, lowest) + cost(lowest))
+        best = int(np.argmin(losses))
+        return SunEstimate(directions[best], spread(np.array(directions), np.array(losses)), float(losses[best]))
+
+    def neighbours(self, direction: Array, degrees: float) -> list[int]:
+        """Numbers of the lattice's Suns within so many degrees."""
+        return [int(k) for k in np.flatnonzero(self.sphere @ direction >= np.cos(np.radians(degrees)))]
+
+    def _loss(self, picture: SmallPicture, direction: Array, number: int | None = None) -> float:
+        """number: of the lattice, whose light is kept for other pictures"""
+        camera = Pinhole.of(picture.camera)
+        light = None if number is None else self._sunlight.get(number)
+        if light is None:
+            light = self.light.sunlight(self.gaussians, direction)
+            if number is not None:
+                self._sunlight[number] = light
+        colors, _ = self.light.shade_picture(self.gaussians, camera, direction, sunlight=light)
+        drawn = render(self.gaussians, camera, outputs=(), features=colors, antialiased=self.antialiased)
+        rgb = drawn.image("features")
+        if self.curve:
+            rgb = adjust_exposure(rgb, self.curve[0])
+        return cauchy((rgb - picture.rgb)[picture.counts].ravel()) / 3
+
+
+def cauchy(errors: np.ndarray) -> float:
+    """Sum of log(1 + (e / ERROR)^2) over blocks of pixels."""
+    return float(np.log1p((errors / ERROR) ** 2).sum()) / BLOCK
+
+
+def ring(direction: Array, degrees: float) -> list[Array]:
+    """Directions so far from one, all round."""
+    right, up = tangents(direction)
+    turns, slope = 2 * np.pi * np.arange(RING) / RING, np.tan(np.radians(degrees))
+    return [_unit(direction + slope * (np.cos(turn) * right + np.sin(turn) * up)) for turn in turns]
+
+
+def tangents(direction: Array) -> tuple[Array, Array]:
+    """Two unit vectors [3] that stand upright on a direction and on each other."""
+    axis = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    right = _unit(np.cross(axis, direction))
+    return right, np.cross(direction, right)
+
+
+def paraboloid_minimum(best: Array, around: list[Array], loss: float, losses: list[float], degrees: float) -> Array:
+    """Where a paraboloid through `best` and the ring about it is lowest, within the ring."""
+    right, up = tangents(best)
+    slope = np.tan(np.radians(degrees))
+    x, y = (np.array([(one / (one @ best)) @ axis / slope for one in (best, *around)]) for axis in (right, up))
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    _, bx, by, cxx, cxy, cyy = np.linalg.lstsq(terms, np.array([loss, *losses]), rcond=None)[0]
+    curvature = np.array([[2 * cxx, cxy], [cxy, 2 * cyy]])
+    if np.linalg.eigvalsh(curvature)[0] <= 1e-9:
+        return best
+    step = -np.linalg.solve(curvature, [bx, by])
+    step *= min(1.0, 1.0 / max(float(np.linalg.norm(step)), 1e-9))
+    return _unit(best + slope * (step[0] * right + step[1] * up))
+
+
+def spread(directions: Array, losses: Array) -> float:
+    """Degrees: root mean square angle to the best of directions [K, 3], weighted by exp(-loss)."""
+    likely = np.exp(-(losses - losses.min()))
+    angles = np.degrees(np.arccos(np.clip(directions @ directions[int(np.argmin(losses))], -1, 1)))
+    return float(np.sqrt((likely * angles**2).sum() / likely.sum()))
+
+
+class ShapeSearch:
+    """Suns of many pictures by the Gaussians of a training that was told none.
+
+    gaussians: their colours are the mean of all pictures from there;  distance: metres, of the farthest camera
+    """
+
+    def __init__(self, gaussians: Gaussians, antialiased: bool, distance: float) -> None:
+        self.gaussians, self.antialiased = gaussians, antialiased
+        self.sphere = fibonacci_sphere(SPHERE)
+        shadow = ShadowConfig(size=256, refine=None)
+        self.visible = [upload(1 - np.array(self._occlusion(sun, shadow, distance))) for sun in self.sphere]
+        self.albedo = np.full(gaussians.count, 1 / MEAN_COSINE)  #: over what is seen in the mean
+
+    def losses(
+        self, pictures: Sequence[SmallPicture], progress: Callable[[int, int], None] = lambda done, total: None
+    ) -> Array:
+        """[V, SPHERE] of the pictures under the lattice's Suns, after `ALTERNATIONS`."""
+        total, found = ALTERNATIONS * len(pictures), np.zeros((len(pictures), SPHERE))
+        for turn in range(ALTERNATIONS):
+            albedo, sums = upload(self.albedo.astype(np.float32)), np.zeros((2, self.gaussians.count))
+            for i, picture in enumerate(pictures):
+                found[i], target = self._compare(picture, albedo)
+                sums += self._spread_back(picture, target)
+                progress(turn * len(pictures) + i + 1, total)
+            self.albedo *= np.clip((sums[0] + 1e-3) / (sums[1] + 1e-3), 0.3, 3)
+        return found
+
+    def _occlusion(self, sun: Array, config: ShadowConfig, distance: float) -> Float:
+        return cast_shadows(self.gaussians, light_rows(sun), config, distance).occlusion
+
+    def _compare(self, picture: SmallPicture, albedo: Float) -> tuple[Array, list[np.ndarray]]:
+        """(loss under each Sun of the lattice [SPHERE], planes [H, W] of light that is seen and that is expected)."""
+        drawn = render(
+            self.gaussians,
+            Pinhole.of(picture.camera),
+            outputs=("alpha", "normal", "color"),
+            features=[*self.visible, albedo],
+            antialiased=self.antialiased,
+        )
+        alpha, planes = drawn.image("alpha"), drawn.image("features")
+        counts = picture.counts & (alpha >= COVERED)
+        seen = luminance(linear_from_srgb(picture.rgb[counts]))
+        visible, factor = (planes[counts] / alpha[counts][:, None])[:, :SPHERE], planes[counts][:, SPHERE]
+        mean = luminance(linear_from_srgb(drawn.image("color")[counts] / alpha[counts][:, None]))
+        reflected = np.maximum(mean, 1e-3) * factor
+        light = np.maximum(drawn.image("normal")[counts] @ self.sphere.T, 0) * visible + AMBIENT
+        errors = np.sqrt(np.maximum(reflected[:, None] * light, 0)) - np.sqrt(seen)[:, None]
+        losses = np.log1p((errors / ERROR) ** 2).sum(axis=0) / BLOCK
+        likely = np.exp(-(losses - losses.min()))
+        expected = light @ (likely / likely.sum())
+        weights = expected / (0.05 + expected)
+        target = [np.zeros(counts.shape, np.float32) for _ in range(2)]
+        target[0][counts] = np.minimum(seen, 3 * reflected * expected + 0.01) * weights
+        target[1][counts] = reflected * expected * weights
+        return losses, target
+
+    def _spread_back(self, picture: SmallPicture, planes: list[np.ndarray]) -> Array:
+        """[2, N] sums over pixels of what each Gaussian has of them, times the planes [H, W]."""
+        shares = [upload(np.full(self.gaussians.count, 1e-9 * i, np.float32)) for i in range(len(planes))]
+        dr.enable_grad(shares)
+        camera = Pinhole.of(picture.camera)
+        drawn: Any = render(self.gaussians, camera, outputs=(), features=shares, antialiased=self.antialiased)
+        total = ad.Float(0)
+        for blended, plane in zip(drawn.features, planes, strict=True):
+            total += dr.sum(blended * upload(np.ascontiguousarray(plane.ravel())))
+        dr.backward(total)
+        return np.array([np.array(dr.grad(share)) for share in shares])
+
+
+def smoothest(losses: Array, sphere: Array, degrees: float) -> list[int]:
+    """The Suns of pictures in time order: numbers of the lattice whose losses and turns cost least (Viterbi 1967).
+
+    losses: [V, K];  sphere: [K, 3];  degrees: a turn from one picture to the next that costs half
+    """
+    turns = np.degrees(np.arccos(np.clip(sphere @ sphere.T, -1, 1)))
+    cost = 0.5 * (turns / degrees) ** 2
+    total, before = losses[0].copy(), np.zeros(losses.shape, int)
+    for i in range(1, len(losses)):
+        ways = total[:, None] + cost
+        before[i] = ways.argmin(axis=0)
+        total = ways.min(axis=0) + losses[i]
+    path = [int(total.argmin())]
+    for i in range(len(losses) - 1, 0, -1):
+        path.append(int(before[i][path[-1]]))
+    return path[::-1]
+
+
+def _unit(vector: Array) -> Array:
+    unit: Array = vector / np.linalg.norm(vector)
+    return unit

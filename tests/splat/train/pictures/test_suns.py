@@ -1,0 +1,127 @@
+"""Suns estimated in training: resume to the bit, what a run tells of them, time order, sentences."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import fibonacci_sphere
+from spacesim.data.records import Sun
+from spacesim.splat.fit import estimate_sun, find_unknowns
+from spacesim.splat.sun_search import SPHERE
+from spacesim.splat.train.config import preset, with_settings
+from spacesim.splat.train.pictures import suns
+from spacesim.splat.train.pictures.suns import CHOICES, FirstSuns, SunEstimation, time_order
+from spacesim.splat.train.train import train
+
+CONFIG = replace(preset("demo", "shadow-map"), sun="unknown", init_count=150, iterations=20, checkpoint_every=6)
+
+
+@pytest.fixture
+def untold(small_dataset):
+    """The training pictures under Suns that nobody tells, each three times, so that there are enough."""
+    frames = tuple(replace(frame, sun=None) for frame in small_dataset.train)
+    return replace(small_dataset, train=tuple(frames * 3)[: max(8, len(frames))])
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Few comparisons: one in training, one at its end."""
+    monkeypatch.setattr(suns, "SEARCHES", (0.5,))
+    monkeypatch.setattr(suns, "SHAPE_STEPS", 12)
+    monkeypatch.setattr(suns, "NEAR", 14.0)
+
+
+class StoppedError(Exception):
+    pass
+
+
+def test_training_estimates_and_resumes_to_the_bit(untold, quick, tmp_path):
+    whole = train(untold, tmp_path / "whole", CONFIG)
+
+    def stop(progress) -> None:
+        if progress.iteration == progress.iterations == CONFIG.iterations:
+            raise StoppedError
+
+    with pytest.raises(StoppedError):  # after the last checkpoint at 18, before the model is written
+        train(untold, tmp_path / "again", CONFIG, on_progress=stop)
+    assert (tmp_path / "again" / "suns.safetensors").exists()
+    again = train(untold, tmp_path / "again", CONFIG, resume=True)
+    names = "model.safetensors", "cameras.json"
+    for name in names:
+        assert (whole.path / name).read_bytes() == (again.path / name).read_bytes(), name
+    frames = json.loads((whole.path / "cameras.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == [frame.file_path for frame in untold.train]
+    found = np.array([frame["sun_direction"] for frame in frames])
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1)
+    assert all(0 <= frame["sun_sigma_deg"] <= 180 for frame in frames)
+    assert whole.training["suns"]["sigma_deg"] == pytest.approx(np.median([frame["sun_sigma_deg"] for frame in frames]))
+    assert (whole.path / "shape" / "model.safetensors").exists()
+    assert [unknown.name for unknown in find_unknowns(whole)] == ["sun"]
+
+
+def test_a_run_tells_the_sun_of_a_new_picture(small_dataset, tmp_path):
+    """Of any method that is told the Sun; here only that it is one, the same each time, and what is refused."""
+    config = replace(CONFIG, sun="given", iterations=10)
+    lit = tuple(replace(frame, sun=Sun.from_angles(30, 40)) for frame in small_dataset.train)
+    run = train(replace(small_dataset, train=lit), tmp_path / "run", config)
+    frame = small_dataset.train[0]
+    picture = np.full((frame.camera.height, frame.camera.width, 4), 0.5)
+    estimate = estimate_sun(run, picture, frame.camera)
+    assert np.linalg.norm(estimate.direction) == pytest.approx(1)
+    np.testing.assert_array_equal(estimate_sun(run, picture, frame.camera).direction, estimate.direction)
+    with pytest.raises(InputError, match="no pixel that counts"):
+        estimate_sun(run, np.zeros_like(picture), frame.camera)
+    with pytest.raises(InputError, match=r"image: expected \["):
+        estimate_sun(run, picture[1:], frame.camera)
+    plain = train(small_dataset, tmp_path / "plain", replace(preset("demo"), init_count=100, iterations=3))
+    with pytest.raises(InputError, match="run: expected one of a method that is told the Sun, found vanilla"):
+        estimate_sun(plain, picture, frame.camera)
+
+
+def test_a_sun_stays_on_the_sphere_and_follows_its_gradient(untold):
+    start = fibonacci_sphere(len(untold.train))
+    first = FirstSuns(start, np.zeros((len(start), CHOICES), int))
+    estimation = SunEstimation(untold, first, 0.01, 100)
+    way = np.cross(start[2], [0.6, 0.0, 0.8])
+    for step in range(5):
+        estimation.learn(2, step, -way - 3 * estimation.direction(2))  # what points outwards does not count
+    moved = estimation.direction(2)
+    assert np.linalg.norm(moved) == pytest.approx(1)
+    assert 0.02 < np.arccos(moved @ start[2]) < 0.1
+    assert (moved - start[2]) @ way > 0.99 * np.linalg.norm(moved - start[2]) * np.linalg.norm(way) * 0.9
+    np.testing.assert_array_equal(estimation.direction(1), start[1])
+
+
+def test_frames_that_tell_their_time_are_in_order(untold):
+    frames = [replace(frame, time=float(time)) for frame, time in zip(untold.train, range(9, 0, -1), strict=False)]
+    np.testing.assert_array_equal(time_order(frames), np.arange(len(frames))[::-1])
+    assert time_order(untold.train) is None
+    assert time_order([replace(frame, time=1.0) for frame in untold.train]) is None
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda tensors: {**tensors, "directions": tensors["directions"][1:]},
+        lambda tensors: {**tensors, "directions": np.nan * tensors["directions"]},
+        lambda tensors: {**tensors, "choices": tensors["choices"] + SPHERE},
+        lambda tensors: {"directions": tensors["directions"]},
+    ],
+)
+def test_first_suns_that_cannot_be_are_told(damage, tmp_path):
+    whole = FirstSuns(fibonacci_sphere(9), np.zeros((9, CHOICES), int)).tensors()
+    np.testing.assert_array_equal(FirstSuns.of(whole, 9, tmp_path).directions, whole["directions"])
+    with pytest.raises(InputError, match="expected the Suns of 9 pictures"):
+        FirstSuns.of(damage(whole), 9, tmp_path)
+
+
+def test_what_cannot_be_estimated_is_told(small_dataset, tmp_path):
+    with pytest.raises(InputError, match="sun: expected a method that is told the Sun, as shadow-map, found vanilla"):
+        with_settings(preset("demo"), {"sun": "unknown"})
+    few = replace(small_dataset, train=small_dataset.train[:3])
+    with pytest.raises(InputError, match="sun: expected at least 8 training pictures to estimate it, found 3"):
+        train(few, tmp_path / "run", CONFIG)
+    assert not (tmp_path / "run").exists()
