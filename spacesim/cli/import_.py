@@ -25,14 +25,14 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
         for option in importer.options:
             flag = f"--{option.name.replace('_', '-')}"
             if option.type is bool:
-                of_kind.add_argument(flag, action="store_true", default=None, help=option.help)
+                of_kind.add_argument(flag, action="store_true", default=None, help=option.help.replace("%", "%%"))
             else:
                 of_kind.add_argument(
                     flag,
                     type=option.type,
                     metavar=option.value,
                     choices=option.choices or None,
-                    help=option.help,
+                    help=option.help.replace("%", "%%"),
                 )
         of_kind.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
         of_kind.set_defaults(flags=of_kind.flags())
