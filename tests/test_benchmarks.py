@@ -465,6 +465,16 @@ def test_pose_tells_errors_before_and_after(command, tiny_data, tiny_run, place)
         assert row["s a view"] > 0
 
 
+@smallest("pose_refinement.py --backend llvm --out OUT --views 4 --resolution 24 --iterations 30 --degrees 2 --json")
+def test_pose_refinement_tells_errors_and_gauge(command, place):
+    rows = {row["cameras"]: row for row in json.loads(call(command))["rows"]}
+    assert list(rows) == ["true", "off by 2, refined", "off by 2", "true, refined"]
+    assert rows["true"]["off, deg"] == pytest.approx(0, abs=1e-6)
+    assert (rows["off by 2"]["off, deg"], rows["off by 2"]["off, %"]) == pytest.approx((2, 2))
+    assert 0 < rows["true, refined"]["off, deg"] < 5
+    assert all(row["PSNR, dB"] > 5 for row in rows.values())
+
+
 @smallest("background.py DATA --backend llvm --preset demo --iterations 8 --json")
 def test_background_tells_both(command, small_lit, place):
     (place / "DATA").symlink_to(small_lit)

@@ -46,6 +46,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
         text = f"{words} (default: {shown})"
         parser.add_argument(option, type=kind, default=default, metavar=value, help=text)
     parser.add_argument("--warm-start", action="store_true", help=meanings["warm_start"].meaning.partition(";")[0])
+    parser.add_argument("--refine-poses", action="store_true", help=meanings["refine_poses"].meaning)
     parser.add_argument("--resume", action="store_true", help="go on from the newest checkpoint")
     parser.add_argument(
         "--set",
@@ -61,7 +62,10 @@ def option_of(field: str, options: argparse.Namespace) -> str | None:
     """The option that sets a field, by the field's dotted name."""
     from spacesim.splat.train.config import TrainConfig
 
-    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | {"warm_start": "--warm-start"}
+    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | {
+        "warm_start": "--warm-start",
+        "refine_poses": "--refine-poses",
+    }
     typed = {text.partition("=")[0].partition(".")[0].strip() for text in options.set}  # of which some are no fields
     is_field = field.partition(".")[0] in typed | set(TrainConfig.__dataclass_fields__)
     return options_by_key.get(field) or (f"--set {field}" if is_field else None)
@@ -79,6 +83,7 @@ def run(options: argparse.Namespace) -> None:
         config = replace(config, warm_start=warm_start(options.preset))
     config = with_options(config, iterations=options.iterations)
     settings = {key: getattr(options, option[2:].replace("-", "_")) for option, (key, _) in OPTIONS.items()}
+    settings["refine_poses"] = options.refine_poses or None
     chosen = {key: value for key, value in settings.items() if value is not None and key not in _NAMES}
     try:
         config = with_settings(config, chosen | dict(map(parse_setting, options.set)))

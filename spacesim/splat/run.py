@@ -4,6 +4,7 @@ RUN/config.json        how it was trained and on what
 RUN/checkpoints/*      where training can go on
 RUN/model.safetensors  the trained Gaussians: there once training is done
 RUN/training.json      history, time, backend, versions
+RUN/cameras.json       poses and gains of the training pictures, where they were learned
 """
 
 from collections.abc import Mapping, Sequence
@@ -192,6 +193,8 @@ class TrainingRecord:
     device: str | None = None  #: that trained
     command: str | None = None  #: the command line, or None of another caller
     versions: Mapping[str, str] = field(default_factory=dict)  #: of libraries
+    poses: Mapping[str, float] | None = None  #: how far training moved them (medians), where it did: degrees, share
+    gains: Mapping[str, float] | None = None  #: least and most of the pictures', where they were learned
 
     def __post_init__(self) -> None:
         if not self.history:

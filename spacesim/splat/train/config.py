@@ -57,6 +57,10 @@ class LearningRates:
     features: float = 2e-2
     networks: float = 3e-3  #: of their weights, at the start
     networks_final: float = 3e-4  #: of their weights, at the end
+    #: of the pictures' poses (`refine_poses`), radians and shares of the distance, at first; falls to a hundredth
+    poses: float = 5e-3
+    #: of the logarithms of the pictures' gains (`exposure_per_picture`), at the start; falls to a hundredth
+    gains: float = 5e-2
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -97,6 +101,10 @@ class TrainConfig:
     warm_start: WarmStartConfig | None = None  #: pull Gaussians to the foreground before refinement (thesis 5.3)
     init_box: float | None = None  #: side of the cube that `random` fills, in sizes of the object
     checkpoint_every: int = 1_000  #: iterations between two checkpoints
+    refine_poses: bool = False  #: move the cameras of training pictures to where these fit the model
+    exposure_per_picture: bool = (
+        False  #: learn a gain of each channel for each training picture: exposure, white balance
+    )
     means_steps: int | None = None  #: in which the centres' step size falls; none: in the whole training
     rates: LearningRates = field(default_factory=LearningRates)  #: step sizes
     refinement: RefinementConfig = field(default_factory=RefinementConfig)  #: schedule and rules of every strategy

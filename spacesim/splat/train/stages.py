@@ -75,6 +75,7 @@ class TargetImage:
     valid: Bool  #: Bool [H * W] or of width 1
     #: Floats [H * W] by name, see `TrainingView`, and "foreground": Bool [H * W] and its weight, Float
     truth: dict[str, list[Any]]
+    gains: Float | None = None  #: Float [3], of the channels of what is drawn
 
 
 @dataclass(frozen=True)
@@ -98,8 +99,8 @@ def picture_loss(
     size: tuple[int, int],
     config: LossSettings,
 ) -> tuple[Float, dict[str, list[Float]], Float]:
-    """Loss of a picture over the target's background, and its gradients by its planes (by name) and transmittance.
-    size: width and height of the target, pixels, before it is downscaled"""
+    """Loss of a picture over the target's background, and its gradients by its planes (by name), with those by "gains"
+    where the target has some, and transmittance. size: width and height of the target, pixels, before downscaling"""
     times = config.downscale
     covered, alpha = covered_color(target.rgba, size, times, config.tone, light=config.supersample > 1)
     valid, truths = valid_squares(target.valid, size, times), truth_of_squares(target.truth, size, times)
@@ -110,11 +111,15 @@ def picture_loss(
     truth = covered + (1 - alpha) * below
     planes = {name: [ad.Float(plane) for plane in group] for name, group in planes.items()}
     transmittance = ad.Float(transmittance)
-    dr.enable_grad(planes, transmittance)
+    gains = None if target.gains is None else ad.Float(target.gains)
+    dr.enable_grad(planes, transmittance, gains)
     inputs, input_transmittance = planes, transmittance
     if config.supersample > 1:
         planes, transmittance = pixel_means(planes, transmittance, size, config.supersample, config.tone is not None)
-    picture = dr.select(valid, ad.Array3f(planes["color"]) + transmittance * below, truth)
+    color = ad.Array3f(planes["color"])
+    if gains is not None:
+        color *= ad.Array3f([dr.gather(ad.Float, gains, ad.UInt32(c)) for c in range(3)])
+    picture = dr.select(valid, color + transmittance * below, truth)
     if config.tone:
         picture, truth = tone_map(picture, config.tone), tone_map(truth, config.tone)
     loss = photometric_loss(picture, truth, *size, ssim_weight=config.ssim)
@@ -131,6 +136,8 @@ def picture_loss(
         loss += weight * foreground_loss(transmittance, mask)
     dr.backward(loss)
     grad_planes = {name: [dr.grad(plane) for plane in group] for name, group in inputs.items()}
+    if gains is not None:
+        grad_planes["gains"] = [dr.grad(gains)]
     return dr.detach(loss), grad_planes, dr.grad(input_transmittance)
 
 

@@ -83,6 +83,8 @@ def _train(
     with interrupts.defer_interrupts() as should_stop:  # the writing, too: the last steps may have no checkpoint yet
         trainer.run(on_progress, checkpoint, should_stop)
         _write(trainer, out, seconds.total(), command)
+        for sentence in trainer.pictures.sentences():
+            log.info(sentence)
 
 
 def _write(trainer: Trainer, out: Path, seconds: float, command: Sequence[str]) -> None:
@@ -98,8 +100,12 @@ def _write(trainer: Trainer, out: Path, seconds: float, command: Sequence[str]) 
             "device": device(),
             "command": shlex.join(command) if command else None,
             "versions": versions(),
+            **trainer.pictures.summary(),
         },
     )
+    cameras = trainer.pictures.cameras()
+    if cameras is not None:
+        write_json(out / "cameras.json", cameras)
     header = {"iteration": trainer.iteration, "config": trainer.config.to_json()}
     write_tensors(out / "model.safetensors", trainer.model_tensors(), header)
 

@@ -28,6 +28,7 @@ from spacesim.splat.train.checkpoint import CheckpointHeader, read_tensors, writ
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.adam import Adam, NetworkAdam
 from spacesim.splat.train.optimizer.update import Update
+from spacesim.splat.train.pictures.learned import LearnedPictures
 from spacesim.splat.train.prior import MeshPrior
 from spacesim.splat.train.stages import TargetImage, update_light
 from spacesim.splat.train.start import (
@@ -67,6 +68,7 @@ class Trainer:
         self.config, self.iteration, self.refinement_seconds = config, 0, 0.0
         _check_sizes(dataset, config)
         self.views = _views(dataset, config)
+        self.pictures = LearnedPictures(dataset, config)
         self.scene_scale = scene_scale(dataset)
         features = config.light.features if config.light else 0
         start = config.init_count, config.sh_degree, config.seed, features, config.init_box, config.splatfacto_start
@@ -122,6 +124,7 @@ class Trainer:
             self._step_light(self.light, results)
 
         self.iteration += 1
+        self.pictures.hold(self.iteration)
         self.strategy.add_noise(self.iteration, self.gaussians, self.means_rate(index), config.seed)
         self._refine()
         losses = [result.loss for result in results]
@@ -146,13 +149,14 @@ class Trainer:
 
     def _forward_backward(self, rows: list[Any], degree: int, number: int) -> ViewResult:
         """Forward, loss, backward for one view, `number` of the training."""
-        view, view_pass = self.views.at_step(number), self._view_pass
+        view, view_pass = self.pictures.shown(self.views.at_step(number)), self._view_pass
         watched = self.strategy.observes_step(self.iteration + 1) and not self._warming(self.iteration)
         downscale = self.config.downscale(self.iteration)
         drawn = view_pass.forward(self.gaussians, rows, self.light, view, degree, downscale, watched)
         attraction = self._attraction(view)
         loss = view_pass.loss(drawn, self._target_image(number, view, attraction), view.camera)
         grad_splats = view_pass.backward(drawn, loss, absolute=watched)
+        self.pictures.learn(self.iteration, view, rows, drawn, loss, grad_splats, self.scene_scale)
         if watched:
             self.strategy.observe(*view_pass.watched(drawn, grad_splats))
         grad_rows = self._add_attraction(rows, view, attraction) if attraction else []
@@ -180,7 +184,8 @@ class Trainer:
                 **truth,
                 "foreground": [attraction.mask, dr.opaque(ad.Float, self.warm_start.config.strength(self.iteration))],
             }
-        return TargetImage(rgba, ad.Float(self.background(number, view).tolist()), valid, truth)
+        background = ad.Float(self.background(number, view).tolist())
+        return TargetImage(rgba, background, valid, truth, self.pictures.gains(view))
 
     def _step_gaussians(self, degree: int, results: list[ViewResult]) -> None:
         factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
@@ -214,6 +219,7 @@ class Trainer:
         for name, optimizer in (("adam", self.optimizer), ("adam.light", self.light_optimizer)):
             for order, moments in zip(("first", "second"), optimizer.moments(), strict=True):
                 tensors |= {f"{name}.{order}.{i:02d}": moment for i, moment in enumerate(moments)}
+        tensors |= self.pictures.tensors()
         tensors |= {f"strategy.{name}": np.array(value) for name, value in self.strategy.state.items()}
         if self.warm_start and self._warming(self.iteration):
             tensors |= {f"warm_start.{name}": np.array(value) for name, value in self.warm_start.state.items()}
@@ -243,6 +249,7 @@ class Trainer:
             optimizer, light_optimizer = Adam(gaussians.rows()), NetworkAdam(_learned(light))
             _restore_moments(optimizer, tensors, "adam")
             _restore_moments(light_optimizer, tensors, "adam.light")
+            self.pictures.restore(tensors)
             state = _restore_state(self.strategy.state, tensors, "strategy", gaussians.count)
             warming = self.warm_start is not None and self._warming(checkpoint.iteration)
             names = self.warm_start.state if self.warm_start and warming else {}
@@ -285,6 +292,8 @@ class Trainer:
     def means_rate(self, index: int) -> float:
         """Metres; falls exponentially over `means_steps`, which begin after a warm start that has larger ones."""
         rates, warm = self.config.rates, self.config.warm_start
+        if self.pictures.model_stays(index):
+            return 0.0
         waits = warm.steps if warm and warm.travel > 0 else 0
         steps = self.config.means_steps or self.config.iterations - waits
         done = min(max(index - waits, 0) / max(steps, 1), 1)

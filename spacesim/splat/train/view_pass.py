@@ -45,6 +45,10 @@ class RenderedView:
     shading: Shading | None  #: its light, of a method of light
     tape: BlendTape | None  #: until the way back has read it
 
+    def group(self, values: list[Any], name: str) -> list[Any]:
+        """Of what was blended, or its gradients, what has that name."""
+        return _group_by_name(values, self.channels).get(name, [])
+
     def take_tape(self) -> BlendTape:
         """What blending left behind, which is not held any longer: memory is shortest here."""
         assert self.tape is not None, "a view goes back once"
@@ -59,6 +63,7 @@ class ViewLoss:
     value: Any  #: Float of width 1
     grad_planes: list[Any]  #: gradients by the blended planes, in their order
     grad_transmittance: Any  #: plane
+    grad_gains: Any = None  #: Float [3] by the target's gains, if it has some
 
 
 @dataclass
@@ -131,7 +136,9 @@ class ViewPass:
         planes, size = _group_by_name(blended.features, drawn.channels), (camera.width, camera.height)
         terms = self._loss_settings[drawn.downscale]
         value, grad_planes, grad_transmittance = self._loss(planes, blended.transmittance, target, size, terms)
-        return ViewLoss(value, [plane for group in grad_planes.values() for plane in group], grad_transmittance)
+        grad_gains = grad_planes.pop("gains", [None])[0]
+        in_order = [plane for group in grad_planes.values() for plane in group]
+        return ViewLoss(value, in_order, grad_transmittance, grad_gains)
 
     def backward(self, drawn: RenderedView, loss: ViewLoss, absolute: bool) -> SplatGradients:
         """Gradients of the loss by splats and by what was blended. absolute: also what `watched` reads"""

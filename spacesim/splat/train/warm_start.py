@@ -107,18 +107,23 @@ def disc(radius: int) -> np.ndarray:
     return across[:, None] ** 2 + across**2 <= radius**2
 
 
-def distance_image(mask: np.ndarray, config: WarmStartConfig) -> np.ndarray:
+def distance_image(mask: np.ndarray, config: WarmStartConfig, valid: np.ndarray | None = None) -> np.ndarray:
     """[h, w] float32, a pixel for each `downsampling`^2 of the mask: distance to the nearest of them that shows
-    foreground, as a share of `reach` times the picture's smaller side (5.26). 0 where there is no foreground."""
+    foreground, as a share of `reach` times the picture's smaller side (5.26). 0 where there is no foreground.
+    Negative where no pixel counts by `valid` [H, W]: what is unknown is not empty, and pulls nothing away."""
     step = config.downsampling
-    height, width = (-(-side // step) * step for side in mask.shape)
-    padded = np.zeros((height, width), bool)
-    padded[: mask.shape[0], : mask.shape[1]] = mask
-    coarse = padded.reshape(height // step, step, width // step, step).any(axis=(1, 3))
+
+    def is_any(pixels: np.ndarray) -> np.ndarray:
+        height, width = (-(-side // step) * step for side in pixels.shape)
+        padded = np.zeros((height, width), bool)
+        padded[: pixels.shape[0], : pixels.shape[1]] = pixels
+        return np.asarray(padded.reshape(height // step, step, width // step, step).any(axis=(1, 3)))
+
+    coarse = is_any(mask)
     if not coarse.any():
         return np.zeros(coarse.shape, np.float32)
-    pixels = step * distance_transform_edt(~coarse)
-    return np.asarray(pixels / (config.reach * min(mask.shape)), np.float32)
+    shares = step * distance_transform_edt(~coarse) / (config.reach * min(mask.shape))
+    return np.asarray(shares if valid is None else np.where(is_any(valid), shares, -shares), np.float32)
 
 
 @dataclass
@@ -192,8 +197,9 @@ class WarmStart:
             raise_opacities(gaussians, optimizer, config.revive)
 
     def _attraction(self, index: int) -> Attraction:
-        mask = foreground(self.views[index], self.config)
-        image = distance_image(mask, self.config)
+        view = self.views[index]
+        mask = foreground(view, self.config)
+        image = distance_image(mask, self.config, None if view.valid is None else view.valid.reshape(mask.shape))
         return Attraction(upload(mask.ravel(), ad.Bool), upload(image.ravel()), (image.shape[1], image.shape[0]))
 
 
@@ -204,29 +210,32 @@ def projected_loss(
     where each centre falls, over those that are in front of the camera and in the picture. Differentiable by `means`
     (Array3f [3, N]). The square root of the square is the value itself: distances are not negative.
 
-    image: Float [h * w] of size (w, h);  step: pixels of the picture for one of its pixels
+    image: Float [h * w] of size (w, h), see `distance_image`;  step: pixels of the picture for one of its pixels
     """
     center = camera.transform(means)
     ahead = dr.detach(camera.in_reach(center)) & (dr.detach(center.z) > NEAR)
     screen = camera.screen(dr.select(ahead, center, ad.Array3f(0, 0, 1)))
     x, y = screen.x, screen.y
     framed = ahead & dr.detach((x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
-    value = dr.select(framed, bilinear(image, size, x / step - 0.5, y / step - 0.5), 0)
+    u, v = (ad.UInt32(dr.select(framed, dr.detach(place) / step, 0)) for place in (screen.x, screen.y))
+    nearest = dr.minimum(v, size[1] - 1) * size[0] + dr.minimum(u, size[0] - 1)
+    known = framed & (dr.gather(ad.Float, image, nearest) >= 0)
+    value = dr.select(known, bilinear(image, size, x / step - 0.5, y / step - 0.5), 0)
     ones = dr.select(framed, ad.Float(1), 0)
     count = dr.maximum(dr.sum(ones), 1)
     return dr.sum(value) / count, framed
 
 
 def bilinear(image: Float, size: tuple[int, int], u: Float, v: Float) -> Float:
-    """[N] of an image Float [h * w] at columns u and rows v, whose whole numbers are the centres of its pixels; linear
-    beyond the outermost. Differentiable by u and v."""
+    """[N] of the magnitudes of an image Float [h * w] at columns u and rows v, whose whole numbers are the centres of
+    its pixels; linear beyond the outermost. Differentiable by u and v."""
     width, height = size
     left = dr.clip(dr.floor(dr.detach(u)), 0, max(width - 2, 0))
     top = dr.clip(dr.floor(dr.detach(v)), 0, max(height - 2, 0))
     fx, fy = u - left, v - top
     i, j = ad.UInt32(left), ad.UInt32(top)
     i1, j1 = dr.minimum(i + 1, width - 1), dr.minimum(j + 1, height - 1)
-    corners = [dr.gather(ad.Float, image, row * width + column) for row in (j, j1) for column in (i, i1)]
+    corners = [dr.abs(dr.gather(ad.Float, image, row * width + column)) for row in (j, j1) for column in (i, i1)]
     upper, lower = dr.lerp(corners[0], corners[1], fx), dr.lerp(corners[2], corners[3], fx)
     return dr.lerp(upper, lower, fy)
 

@@ -1,0 +1,218 @@
+"""Poses refined in training: each training picture's camera moves as its own loss asks.
+
+What moves a camera moves the whole model the other way. So the gradient by a pose is a force and a torque: sums over
+the Gaussians of what the splats' adjoint gives their centres and rotations (`pose_gradient`). Colours, shadows and
+normals count as given within a step, as they hardly change with so small a motion.
+
+A picture has six numbers (w, u): the camera sees the object turned by w (rotation vector, radians, camera axes) about
+its centre, where the cameras look, and moved by u (camera axes) in units of the distance. Turned so, a picture changes
+in other ways than moved so, and a step of each moves pixels about as far:
+
+    p' = exp([w]) (p - m) + m + d u        p: in the given camera's axes;  m: the centre there;  d = |m|
+
+The world's axes, origin and unit of length cannot be told from pictures. Where training starts at points or a mesh,
+these tell: at first their centres stay, and each camera finds its place before them. From then on, and from the first
+step where training starts at random, the world is held where the cameras have it: what the numbers of all pictures
+share with a turn, a shift and a growth of all cameras (7 ways, linearised at the given ones, least squares of angles
+and of shifts per distance) stays as it was, by a correction every `GAUGE_EVERY` steps.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spacesim.backend import ad, recorded
+from spacesim.backend.arrays import Float
+from spacesim.data.geometry import Array
+from spacesim.data.records import Camera, Dataset
+from spacesim.splat.pose import moved, twist_between
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Pinhole, Splats, project
+from spacesim.splat.train.optimizer.adam import OWN
+from spacesim.splat.train.pictures.numbers import PictureNumbers, falling
+from spacesim.splat.train.start import focus_point
+
+START, START_SHARE = 100, 0.025  #: steps that poses wait at most, until colours are rough, and share of the training
+ANCHORED, ANCHORED_SHARE = 10, 0.25  #: times that each picture is shown to a model that stays; most of the training
+END_SHARE = 0.5  #: of the training; then poses stay, as a model gets no sharper than its cameras stand still
+SHIFTS_FIRST = 5  #: steps of a picture that move it alone: a turn before these would only blur what a shift mends
+GAUGE_EVERY = 50  #: steps
+WAYS = ("opacity", "x", "y", "a", "b", "c")  #: of a splat's numbers that blending differentiates by
+
+
+class PoseRefinement:
+    """The poses of a training's pictures."""
+
+    def __init__(
+        self, dataset: Dataset, rate: float, iterations: int, antialiased: bool, anchor: bool = False, views: int = 1
+    ) -> None:
+        """rate: step size at the start, radians and shares of the distance;  anchor: whether the model starts where the
+        object is;  views: of a step"""
+        self.given = [frame.camera for frame in dataset.train]
+        self.rate, self.iterations, self.antialiased = rate, iterations, antialiased
+        self.start = int(min(START, START_SHARE * iterations))
+        self.end = int(END_SHARE * iterations)
+        shown = -(-ANCHORED * len(self.given) // views)
+        self.anchored = int(min(self.start + shown, ANCHORED_SHARE * iterations)) if anchor else 0
+        self.centre = focus_point(dataset)
+        self.seen = np.array([c.camera_from_world[:3, :3] @ (self.centre - c.position) for c in self.given])
+        self.distances = np.maximum(np.linalg.norm(self.seen, axis=1), 1e-6)
+        self.numbers = PictureNumbers(len(self.given), 6, self._taught)
+        self._gauge = _Gauge.of(self.given, self.centre, self.seen, self.distances)
+        self.common = np.zeros(self._gauge.shares.shape[0])  #: of the gauge's ways, what is held
+        self._centre = ad.Float(self.centre.tolist())
+        self._gradient = recorded(pose_gradient)
+
+    def camera(self, picture: int) -> Camera:
+        """Of a training picture, where it is thought to stand."""
+        return moved(self.given[picture], self._twist(picture, self.numbers.of(picture)))
+
+    def learn(
+        self, picture: int, step: int, rows: list[Float], camera: Pinhole, grad_splats: Splats, grad_depth: list[Float]
+    ) -> None:
+        """What a view that was drawn teaches of its pose. step: number of the step, the first of which is 0;  camera:
+        that it was drawn with;  grad_splats: gradients of its splats;  grad_depth: of their depths, metres, if any"""
+        if not self.start <= step < self.end:
+            return
+        gradient = self._gradient(rows[:OWN], camera, grad_splats, grad_depth, self._centre, self.antialiased)
+        done = (step - self.start) / max(self.end - self.start, 1)
+        self.numbers.learn(picture, gradient, falling(self.rate, done))
+
+    def hold(self, steps: int) -> None:
+        """After so many steps: take out what all cameras moved alike, if it is time to; or, where the model has stayed
+        until now, remember it."""
+        if steps == self.anchored and steps > 0:
+            self.numbers.follow()
+            self.common = self._gauge.rigid(self.numbers.values)
+        elif steps > self.anchored and (steps % GAUGE_EVERY == 0 or steps == self.iterations):
+            self.numbers.follow()
+            self.numbers.values = self._gauge.held(self.numbers.values, self.common)
+
+    def moves(self) -> Array:
+        """[V, 2] how far each camera was turned, degrees, and moved, share of the distance."""
+        found = []
+        for picture, (camera, distance) in enumerate(zip(self.given, self.distances, strict=True)):
+            there = self.camera(picture)
+            turn = np.linalg.norm(twist_between(camera, there)[:3])
+            found.append([np.degrees(turn), np.linalg.norm(there.position - camera.position) / distance])
+        return np.array(found)
+
+    def _twist(self, picture: int, numbers: Array) -> Array:
+        """[6] of `moved`, from the given camera."""
+        middle, turn = self.seen[picture], numbers[:3]
+        shift = self.distances[picture] * numbers[3:] + middle - Rotation.from_rotvec(turn).apply(middle)
+        return np.concatenate([turn, shift])
+
+    def _taught(self, picture: int, gradient: Array) -> Array:
+        """`_by_numbers`, without that by the turn while a picture is only shifted."""
+        taught = self._by_numbers(picture, gradient)
+        if self.numbers.steps[picture] < SHIFTS_FIRST:
+            taught[:3] = 0
+        return taught
+
+    def _by_numbers(self, picture: int, gradient: Array) -> Array:
+        """[6] gradient by the numbers, from that of `pose_gradient`: exp([w + dw]) = exp([J dw]) exp([w])."""
+        camera_from_world = self.camera_axes(picture)
+        force, torque = camera_from_world @ gradient[:3], camera_from_world @ gradient[3:]
+        turns = left_jacobian(self.numbers.values[picture, :3])
+        return np.concatenate([turns.T @ torque, self.distances[picture] * force])
+
+    def camera_axes(self, picture: int) -> Array:
+        """[3, 3] rotation camera_from_world of the refined camera."""
+        turn = Rotation.from_rotvec(self.numbers.values[picture, :3]).as_matrix()
+        axes: Array = turn @ self.given[picture].camera_from_world[:3, :3]
+        return axes
+
+
+def pose_gradient(
+    rows: list[Float],
+    camera: Pinhole,
+    grad_splats: Splats,
+    grad_depth: list[Float],
+    centre: Float,
+    antialiased: bool,
+) -> Float:
+    """Float [6]: gradient by a shift of all Gaussians (force, per metre) and by a turn of them about `centre` (torque,
+    per radian), world axes, from the gradients of one view's splats.
+
+    A quaternion q of a Gaussian that is turned by a small vector t becomes q + (0, t) q / 2.
+    rows: place, shape and opacity;  grad_depth: Float [N] or nothing;  centre: Float [3], metres
+    """
+    rows = [ad.Float(row) for row in rows]
+    dr.enable_grad(rows[:3], rows[6:10])
+    gaussians = Gaussians.from_rows(rows)
+    splats, _ = project(gaussians, camera, antialiased)
+    along: Any = ad.Float(0)
+    for name in WAYS:
+        along += getattr(splats, name) * getattr(grad_splats, name)
+    for gradient in grad_depth:
+        along += splats.depth * gradient
+    dr.backward(along)
+    force = ad.Array3f([dr.grad(row) for row in rows[:3]])
+    w, x, y, z = (dr.detach(row) for row in rows[6:10])
+    gw, gx, gy, gz = (dr.grad(row) for row in rows[6:10])
+    arm = ad.Array3f([dr.detach(rows[i]) - dr.gather(ad.Float, centre, ad.UInt32(i)) for i in range(3)])
+    torque = dr.cross(arm, force) + 0.5 * ad.Array3f(
+        w * gx - x * gw + y * gz - z * gy,
+        w * gy - y * gw + z * gx - x * gz,
+        w * gz - z * gw + x * gy - y * gx,
+    )
+    return dr.concat([dr.sum(value) for value in (*force, *torque)])
+
+
+def left_jacobian(turn: Array) -> Array:
+    """[3, 3] J of SO(3): exp([w + dw]) = exp([J dw]) exp([w]) to first order."""
+    angle = float(np.linalg.norm(turn))
+    cross = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
+    if angle < 1e-6:
+        return np.eye(3) + 0.5 * cross
+    half = (1 - np.cos(angle)) / angle**2
+    jacobian: Array = np.eye(3) + half * cross + (angle - np.sin(angle)) / angle**3 * cross @ cross
+    return jacobian
+
+
+@dataclass(frozen=True, eq=False)
+class _Gauge:
+    """What all cameras may share: 7 ways of the numbers of all pictures, and how much of each there is."""
+
+    ways: Array  #: [6 V, R] numbers that a common motion gives; R of 7, fewer where cameras are few
+    shares: Array  #: [R, 6 V] of each, in given numbers
+    growth: Array  #: [R] unit, of the ways: what a growth gives
+
+    @staticmethod
+    def of(cameras: list[Camera], centre: Array, seen: Array, distances: Array) -> "_Gauge":
+        # y = (turn w, shift of the camera per distance) = A (w, u);  the camera shifts by w x m / d - u
+        forward, back = np.zeros((2, len(cameras), 6, 6))
+        common = np.zeros((len(cameras), 6, 7))
+        for i, (camera, middle, distance) in enumerate(zip(cameras, seen, distances, strict=True)):
+            x, y, z = middle / distance
+            levers = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # w x m / d = levers w
+            forward[i] = np.block([[np.eye(3), np.zeros((3, 3))], [levers, -np.eye(3)]])
+            back[i] = forward[i]  # its own inverse
+            axes, arm = camera.camera_from_world[:3, :3], camera.position - centre
+            turned = np.array([[0, arm[2], -arm[1]], [-arm[2], 0, arm[0]], [arm[1], -arm[0], 0]])  # t x arm
+            common[i, :3, :3] = -axes
+            common[i, 3:, :3] = axes @ turned / distance
+            common[i, 3:, 3:6] = axes / distances.mean()
+            common[i, 3:, 6] = axes @ arm / distance
+        left, sizes, _ = np.linalg.svd(common.reshape(-1, 7), full_matrices=False)
+        basis = left[:, sizes > 1e-6 * sizes.max()].reshape(len(cameras), 6, -1)
+        ways = np.einsum("vij,vjk->vik", back, basis).reshape(6 * len(cameras), -1)
+        shares = np.einsum("vjk,vji->kvi", basis, forward).reshape(-1, 6 * len(cameras))
+        growth = basis.reshape(6 * len(cameras), -1).T @ common[:, :, 6].ravel()
+        return _Gauge(ways, shares, growth / max(float(np.linalg.norm(growth)), 1e-12))
+
+    def rigid(self, numbers: Array) -> Array:
+        """[R] of each way in numbers [V, 6], without growth: splats' sizes, which change while their centres stay,
+        would tell of that."""
+        shares = self.shares @ numbers.ravel()
+        rigid: Array = shares - self.growth * (self.growth @ shares)
+        return rigid
+
+    def held(self, numbers: Array, common: Array | float = 0.0) -> Array:
+        """The numbers [V, 6] with `common` [R] in place of what all share."""
+        flat = numbers.ravel()
+        return (flat - self.ways @ (self.shares @ flat - common)).reshape(numbers.shape)

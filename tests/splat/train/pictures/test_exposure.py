@@ -1,0 +1,117 @@
+"""Gains of pictures: known ones are found, others are drawn without, off changes nothing."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from spacesim.data.images import linear_from_srgb, srgb_from_linear
+from spacesim.data.records import Dataset
+from spacesim.data.store import read_dataset
+from spacesim.splat.raster.project import Pinhole
+from spacesim.splat.raster.render import render
+from spacesim.splat.train.config import TrainConfig, preset, with_settings
+from spacesim.splat.train.trainer import Trainer
+
+RANGES = 0.7, 0.35  #: of the logarithms of gains: of one picture a view, of several
+
+
+@pytest.fixture(scope="module")
+def exposed(small_dataset, tmp_path_factory) -> tuple[Dataset, np.ndarray]:
+    """Its pictures under known gains."""
+    return with_gains(small_dataset, tmp_path_factory.mktemp("exposed"), len(small_dataset.train), 1)
+
+
+@pytest.fixture(scope="module")
+def again(small_dataset, tmp_path_factory) -> tuple[Dataset, np.ndarray]:
+    """Three of its pictures, each under three gains: what depends on the view explains no difference of these."""
+    return with_gains(small_dataset, tmp_path_factory.mktemp("again"), 3, 3)
+
+
+def with_gains(dataset: Dataset, root: Path, views: int, times: int) -> tuple[Dataset, np.ndarray]:
+    """(dataset, gains [V, 3]): pictures 0.45 as bright, so that hardly any clips, under random gains in light, whose
+    mean logarithm is 0 over all pictures, and over those of a view where there are several."""
+    (root / "images").mkdir()
+    values = json.loads((dataset.root / "transforms.json").read_text())
+    logs = np.random.default_rng(0).uniform(-1, 1, (views, times, 3))
+    logs *= RANGES[times > 1]
+    logs -= logs.mean(axis=1 if times > 1 else 0, keepdims=True)
+    poses = {frame["file_path"]: frame["transform_matrix"] for frame in values["frames"]}
+    frames = []
+
+    def write(source: str, name: str, gain: np.ndarray) -> None:
+        rgba = np.asarray(Image.open(dataset.root / source)) / 255
+        shown = np.dstack([srgb_from_linear(0.45 * linear_from_srgb(rgba[..., :3]) * gain), rgba[..., 3:]])
+        Image.fromarray(np.rint(255 * shown).astype(np.uint8)).save(root / name)
+        frames.append({"file_path": name, "transform_matrix": poses[source]})
+
+    for view, frame in enumerate(dataset.train[:views]):
+        for k in range(times):
+            write(frame.file_path, f"images/train_{times * view + k:02d}.png", np.exp(logs[view, k]))
+    values["train_filenames"] = [frame["file_path"] for frame in frames]
+    for view, frame in enumerate(dataset.test):
+        write(frame.file_path, f"images/test_{view:02d}.png", np.ones(3))
+    values["test_filenames"] = [frame["file_path"] for frame in frames[views * times :]]
+    (root / "points.ply").write_bytes((dataset.root / "points.ply").read_bytes())
+    (root / "transforms.json").write_text(json.dumps({**values, "frames": frames}))
+    return read_dataset(root), np.exp(logs.reshape(-1, 3))
+
+
+def trained(dataset: Dataset, config: TrainConfig) -> Trainer:
+    trainer = Trainer(dataset, replace(config, init_count=150, iterations=600))
+    trainer.run(lambda progress: None, lambda: None)
+    return trainer
+
+
+def psnr_of_tests(trainer: Trainer, dataset: Dataset) -> float:
+    errors = []
+    for frame in dataset.test:
+        color, _, _ = render(trainer.gaussians, Pinhole.of(frame.camera)).to_numpy()
+        rgba = np.asarray(Image.open(dataset.root / frame.file_path)) / 255
+        errors.append(((np.clip(color, 0, 1) - rgba[..., :3] * rgba[..., 3:])[rgba[..., 3] > 0.5] ** 2).mean())
+    return float(-10 * np.log10(np.mean(errors)))
+
+
+def test_known_gains_are_found_in_light(again):
+    dataset, gains = again
+    light = {"light.linear": True, "light.tone": "srgb", "light.exposure": 0.0, "light.field.inputs": "view"}
+    config = with_settings(preset("demo", "relight"), {**light, "light.field.width": 16, "light.field.features": 8})
+    found = trained(dataset, replace(config, exposure_per_picture=True)).pictures.exposures.all_gains()
+    np.testing.assert_allclose(np.log(found).mean(axis=0), 0, atol=1e-9)
+    assert np.abs(np.log(gains)).mean() > 0.15
+    assert np.abs(np.log(found / gains)).mean() < 0.05
+
+
+def test_pictures_of_a_model_of_srgb_values_gain(exposed):
+    """There a gain of light g is one of about g^(1 / 2.4), and pictures that were not trained on are nearer."""
+    dataset, gains = exposed
+    config = replace(preset("demo"), sh_degree=0)
+    without, trainer = trained(dataset, config), trained(dataset, replace(config, exposure_per_picture=True))
+    found, true = np.log(trainer.pictures.exposures.all_gains()).ravel(), np.log(gains).ravel()
+    assert 1 / 2.4 - 0.1 < found @ true / (true @ true) < 1 / 2.4 + 0.1
+    assert np.corrcoef(found, true)[0, 1] > 0.95
+    assert psnr_of_tests(trainer, dataset) > psnr_of_tests(without, dataset) + 0.5
+
+
+def test_the_gradient_by_gains_is_that_of_the_loss(exposed):
+    trainer = Trainer(exposed[0], replace(preset("demo"), init_count=150, iterations=50, exposure_per_picture=True))
+    for _ in range(20):
+        trainer.step()
+    exposures, view, rows = trainer.pictures.exposures, trainer.views[0], trainer.gaussians.rows()
+    exposures.numbers.follow()
+
+    def loss():
+        drawn = trainer._view_pass.forward(trainer.gaussians, rows, None, view, 0, 1, False)
+        return trainer._view_pass.loss(drawn, trainer._target_image(3, view, None), view.camera)
+
+    gradient = exposures._by_numbers(0, np.array(loss().grad_gains, np.float64))
+    for channel in range(3):
+        ends = []
+        for step in (0.01, -0.02):
+            exposures.numbers.values[0, channel] += step
+            ends.append(float(loss().value[0]))
+        exposures.numbers.values[0, channel] += 0.01
+        assert gradient[channel] == pytest.approx((ends[0] - ends[1]) / 0.02, rel=0.05)
