@@ -617,15 +617,3 @@ def test_video_import_tells_what_cannot_be_found(command, place):
     assert [row["field of view"] for row in rows] == ["told", "estimated"]
     assert all("expected" in row["note"] for row in rows)
     assert (place / "OUT" / "film.mp4").stat().st_size > 1000
-
-
-def test_similarity_brings_cameras_together():
-    import video_import
-
-    rng = np.random.default_rng(0)
-    true = rng.normal(size=(9, 3))
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    turn *= np.sign(np.linalg.det(turn))
-    scale, aligned = video_import.similarity(0.25 * true @ turn.T + [1, 2, 3], true)
-    assert scale == pytest.approx(4)
-    np.testing.assert_allclose(aligned, true, atol=1e-12)
