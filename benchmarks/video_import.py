@@ -179,7 +179,7 @@ def trainings_of(options: argparse.Namespace, truth: list[TrueFrame]) -> Iterato
     plain = with_settings(plain, dict(map(parse_setting, options.set)))
     judge = EvaluateConfig(geometry=None)
     aligned = replace(judge, align=own)
-    best = None
+    best = float("nan")
     for name, config, data, judged in (
         ("true", plain, true, judge),
         ("found", plain, own, aligned),
@@ -190,7 +190,7 @@ def trainings_of(options: argparse.Namespace, truth: list[TrueFrame]) -> Iterato
             yield {"poses and masks": name, "note": found["note"]}
             continue
         psnr = found["image"]["psnr"]["mean"]
-        best = psnr if best is None else best
+        best = psnr if name == "true" else best
         yield {
             "poses and masks": name,
             "PSNR, dB": psnr,
@@ -212,10 +212,9 @@ def true_dataset(folder: Path, own: Dataset, truth: list[TrueFrame]) -> Dataset:
 
     def true_frame(number: int, frame: Frame) -> ImportedFrame:
         def picture() -> np.ndarray:
-            seen = (
-                opaque(*truth[number]) if frame.file_path in held_out else read_png(own.root / frame.file_path)[..., :3]
-            )
-            return np.dstack([seen, true_mask(truth[number])])
+            of_film = read_png(own.root / frame.file_path)[..., :3]
+            shown = opaque(*truth[number]) if frame.file_path in held_out else of_film
+            return np.dstack([shown, true_mask(truth[number])])
 
         return ImportedFrame(
             name=Path(frame.file_path).stem,
@@ -241,9 +240,8 @@ def numbered(data: Dataset) -> dict[int, Frame]:
 def pose_of(frames: dict[int, Frame], truth: list[TrueFrame]) -> Pose:
     """Of an import in the truth's world."""
     true = [truth[number][1] for number in frames]
-    return robust_similarity(
-        *(np.array([f.camera.world_from_camera for f in group]) for group in (frames.values(), true))
-    )[0]
+    poses = (np.array([frame.camera.world_from_camera for frame in group]) for group in (frames.values(), true))
+    return robust_similarity(*poses)[0]
 
 
 def true_mask(frame: TrueFrame) -> np.ndarray:
