@@ -111,9 +111,16 @@ def generated(scene: str, out: Path, **options: Any) -> Path:
     return out
 
 
-def measured(name: str, config: "TrainConfig", judge: "EvaluateConfig", dataset: Dataset, folder: Path) -> Row:
-    """metrics.json of a configuration, trained in FOLDER/run and evaluated in FOLDER/eval, as far as that is not done;
-    "training" beside it, or {"note": why} where training fails."""
+def measured(
+    name: str,
+    config: "TrainConfig",
+    judge: "EvaluateConfig",
+    dataset: Dataset,
+    folder: Path,
+    truth: Dataset | None = None,
+) -> Row:
+    """metrics.json of a configuration, trained on a dataset in FOLDER/run and evaluated on it, or on `truth`, in
+    FOLDER/eval, as far as that is not done; "training" beside it, or {"note": why} where training fails."""
     from spacesim.progress import show_progress
     from spacesim.reproduce.perform import evaluated, trained
 
@@ -121,7 +128,7 @@ def measured(name: str, config: "TrainConfig", judge: "EvaluateConfig", dataset:
         run = trained(folder / "run", dataset, config, name, show_progress)
     except WorkError as error:
         return {"note": str(error)}
-    return {**evaluated(run, dataset, folder / "eval", judge, name, show_progress), "training": run.training}
+    return {**evaluated(run, truth or dataset, folder / "eval", judge, name, show_progress), "training": run.training}
 
 
 def row_names(text: str) -> list[str]:

@@ -1,16 +1,23 @@
-"""How well `spacesim import video` finds poses and masks: a film of the spent upper stage, the Earth passing behind.
+"""A film of the spent upper stage, the Earth passing behind: `import video`, `train` and `eval` against the truth.
 
-    python benchmarks/video_import.py --out OUT [--width 960] [--frames 100]
+    python benchmarks/video_import.py --out OUT [--width 960] [--frames 100] [--iterations N]
 
 It path-traces the film as far as OUT lacks it: three quarters of it a fly-around of 90 degrees from ahead to above, one
 quarter an approach from above, one Sun; the sky, then the Earth's limb, then its clouds and seas behind. It is encoded
 as H.264 at 4 Mbit/s and imported, once with the field of view told and once without. Positions are compared after the
-similarity that fits the cameras best (S. Umeyama, "Least-squares estimation of transformation parameters", 1991), in
-per cent of each camera's distance from the stage; masks with the traced silhouettes of the same frames.
+alignment of `eval --align`, in per cent of each camera's distance from the stage; masks with the traced silhouettes of
+the same frames.
+
+The method vanilla is then trained on the import with the field of view told, with the poses as found and with these
+refined, and on the same frames of the film with the true poses and masks, from the same points. All are evaluated on
+the traced pictures of the frames held out, seen by their true cameras, over the true silhouettes.
 """
 
+import argparse
 import json
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -19,13 +26,19 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.files import write_bytes
-from spacesim.data.geometry import Array
-from spacesim.data.images import load_image, read_png
+from spacesim.data.files import read_json, write_bytes
+from spacesim.data.images import read_png
 from spacesim.data.importers.kinds import import_dataset
+from spacesim.data.importers.writing import ImportedFrame, write_dataset
 from spacesim.data.records import Dataset, Frame
-from spacesim.data.store import read_dataset
+from spacesim.data.store import read_dataset, read_points
+from spacesim.eval.align import KEY, robust_similarity
+from spacesim.eval.evaluate import EvaluateConfig
 from spacesim.progress import show_progress
+from spacesim.splat.compose.pose import Pose
+from spacesim.splat.train.config import preset, with_options, with_settings
+
+TrueFrame = tuple[Dataset, Frame]
 
 FOV, LENGTH = 24.0, 11.0  #: degrees, metres of the stage
 BIT_RATE, RATE = 4_000_000, Fraction(25)
@@ -67,6 +80,9 @@ def main() -> None:
     parser.add_argument("--width", type=common.positive, default=960, help="pixels (default 960), 16:9")
     parser.add_argument("--frames", type=common.positive, default=100, help="of the film (default 100)")
     parser.add_argument("--spp", type=common.positive, default=16)
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--iterations", type=common.positive, help="of each training (default: the preset's)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of each training")
     options = parser.parse_args()
     backend.select(options.backend)
     if options.frames < 4:
@@ -87,10 +103,15 @@ def main() -> None:
         except (InputError, WorkError) as error:
             row, note = {}, {"note": str(error)}
         rows.append({"field of view": name, **row, **note})
-    common.emit({"rows": rows}, {f"A film of {len(truth)} frames, {options.width} pixels wide": rows}, options)
+    trainings = list(trainings_of(options, truth)) if "note" not in rows[0] else []
+    tables = {
+        f"A film of {len(truth)} frames, {options.width} pixels wide": rows,
+        f"Trained on it, the field of view told, preset {options.preset}": trainings,
+    }
+    common.emit({"rows": rows, "trainings": trainings}, tables, options)
 
 
-def film_of(out: Path, width: int, frames: int, spp: int) -> list[tuple[Dataset, Frame]]:
+def film_of(out: Path, width: int, frames: int, spp: int) -> list[TrueFrame]:
     """The film's frames with their truth, in order."""
     approach = frames // 4
     truth = []
@@ -121,26 +142,25 @@ def encoded(pictures: list[np.ndarray]) -> bytes:
     return video.content()
 
 
-def compared(data: Dataset, truth: list[tuple[Dataset, Frame]]) -> common.Row:
+def compared(data: Dataset, truth: list[TrueFrame]) -> common.Row:
     """Of an import: share of frames with a pose, errors of positions, of scale, and of masks."""
     report = json.loads((data.root / "structure.json").read_text())
-    frames = {int(Path(frame.file_path).stem.removeprefix("frame_")): frame for frame in data.frames}
-    numbers = sorted(frames)
-    found = np.array([frames[k].camera.position for k in numbers])
-    true = np.array([truth[k][1].camera.position for k in numbers])
-    scale, aligned = similarity(found, true)
+    frames = numbered(data)
+    numbers = list(frames)
+    pose, true = pose_of(frames, truth), np.array([truth[k][1].camera.position for k in numbers])
+    aligned = pose.points(np.array([frame.camera.position for frame in frames.values()]))
     errors = 100 * np.linalg.norm(aligned - true, axis=1) / np.linalg.norm(true, axis=1)
     overlaps = []
     for k in numbers:
-        mask = load_image(data, frames[k]).alpha > 0.5
-        silhouette = read_png(truth[k][0].root / truth[k][1].silhouette_path) > 0
+        mask = read_png(data.root / frames[k].file_path)[..., 3] > 127  # of the film's pixels, whatever the lens found
+        silhouette = true_mask(truth[k]) > 0
         overlaps.append((mask & silhouette).sum() / max((mask | silhouette).sum(), 1))
     true_focal = truth[0][1].camera.fx
     return {
         "registered": len(numbers) / report["pictures"],
         "position, % median": float(np.median(errors)),
         "% largest": float(errors.max()),
-        "length, % off": float(100 * abs(1 / scale - 1)),
+        "length, % off": float(100 * abs(1 / pose.scale - 1)),
         "focal length, % off": float(100 * abs(frames[numbers[0]].camera.fx / true_focal - 1)),
         "mask IoU": float(np.mean(overlaps)),
         "least": float(np.min(overlaps)),
@@ -149,13 +169,84 @@ def compared(data: Dataset, truth: list[tuple[Dataset, Frame]]) -> common.Row:
     }
 
 
-def similarity(source: Array, target: Array) -> tuple[float, Array]:
-    """(scale, `source` [N, 3] moved) by the similarity that brings it nearest to `target` [N, 3]."""
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    scale = float((s * signs).sum() / (a**2).sum())
-    return scale, scale * a @ ((u * signs) @ vt).T + target.mean(axis=0)
+def trainings_of(options: argparse.Namespace, truth: list[TrueFrame]) -> Iterator[common.Row]:
+    """With the true poses and masks; with those found; with these refined."""
+    from spacesim.cli.train import parse_setting
+
+    own = read_dataset(options.out / "import-told")
+    true = true_dataset(options.out / "truth", own, truth)
+    plain = with_options(preset(options.preset, "vanilla"), iterations=options.iterations)
+    plain = with_settings(plain, dict(map(parse_setting, options.set)))
+    judge = EvaluateConfig(geometry=None)
+    aligned = replace(judge, align=own)
+    best = float("nan")
+    for name, config, data, judged in (
+        ("true", plain, true, judge),
+        ("found", plain, own, aligned),
+        ("found, refined", replace(plain, refine_poses=True), own, aligned),
+    ):
+        found = common.measured(name, config, judged, data, options.out / name.replace(", ", "-"), true)
+        if "note" in found:
+            yield {"poses and masks": name, "note": found["note"]}
+            continue
+        psnr = found["image"]["psnr"]["mean"]
+        best = psnr if name == "true" else best
+        yield {
+            "poses and masks": name,
+            "PSNR, dB": psnr,
+            "below true, dB": best - psnr,
+            "SSIM": found["image"]["ssim"]["mean"],
+            "test views": len(found["frames"]),
+            "iterations": config.iterations,
+            "Gaussians": found["model"]["gaussians"],
+            "s": found["training"]["seconds"],
+        }
+
+
+def true_dataset(folder: Path, own: Dataset, truth: list[TrueFrame]) -> Dataset:
+    """The frames of an import with their true cameras and masks: those to train on as the film shows them, those held
+    out as they were traced. It starts at the import's points, moved by the alignment."""
+    if (folder / "transforms.json").exists():
+        return read_dataset(folder)
+    frames, held_out = numbered(own), {frame.file_path for frame in own.test}
+
+    def true_frame(number: int, frame: Frame) -> ImportedFrame:
+        def picture() -> np.ndarray:
+            of_film = read_png(own.root / frame.file_path)[..., :3]
+            shown = opaque(*truth[number]) if frame.file_path in held_out else of_film
+            return np.dstack([shown, true_mask(truth[number])])
+
+        return ImportedFrame(
+            name=Path(frame.file_path).stem,
+            picture=picture,
+            camera=truth[number][1].camera,
+            keys={KEY: number},
+        )
+
+    made = {frame.file_path: true_frame(number, frame) for number, frame in frames.items()}
+    train, test = ([made[frame.file_path] for frame in split] for split in (own.train, own.test))
+    points, colors = read_points(own.root / str(own.ply_file_path))
+    source = {"kind": "truth", "source": str(own.root)}
+    return write_dataset(folder, train, test, source, (pose_of(frames, truth).points(points), colors))
+
+
+def numbered(data: Dataset) -> dict[int, Frame]:
+    """The frames of an import by their numbers in the film, in its order."""
+    entries = read_json(data.root / "transforms.json")["frames"]
+    numbers = {entry["file_path"]: entry[KEY] for entry in entries}
+    return {numbers[frame.file_path]: frame for frame in sorted(data.frames, key=lambda f: numbers[f.file_path])}
+
+
+def pose_of(frames: dict[int, Frame], truth: list[TrueFrame]) -> Pose:
+    """Of an import in the truth's world."""
+    true = [truth[number][1] for number in frames]
+    poses = (np.array([frame.camera.world_from_camera for frame in group]) for group in (frames.values(), true))
+    return robust_similarity(*poses)[0]
+
+
+def true_mask(frame: TrueFrame) -> np.ndarray:
+    """[H, W] uint8, 255 the stage."""
+    return read_png(frame[0].root / str(frame[1].silhouette_path))
 
 
 if __name__ == "__main__":

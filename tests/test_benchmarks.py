@@ -17,8 +17,14 @@ import pytest
 
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.images import load_image
-from spacesim.data.store import read_dataset
+from spacesim.data.geometry import look_at
+from spacesim.data.images import load_image, read_png, write_png
+from spacesim.data.importers.writing import ImportedFrame, write_dataset
+from spacesim.data.records import Camera, Dataset, Frame
+from spacesim.data.store import read_dataset, read_points
+from spacesim.eval.align import align
+from spacesim.splat.compose.aligned import moved_frame
+from spacesim.splat.compose.pose import Pose
 from spacesim.splat.train.config import PRESETS, preset
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
@@ -619,13 +625,57 @@ def test_video_import_tells_what_cannot_be_found(command, place):
     assert (place / "OUT" / "film.mp4").stat().st_size > 1000
 
 
-def test_similarity_brings_cameras_together():
+def test_a_film_is_compared_with_its_own_frames(tmp_path):
+    """An import that lacks two frames of a film and has its own axes, scale, masks and split."""
     import video_import
 
     rng = np.random.default_rng(0)
-    true = rng.normal(size=(9, 3))
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    turn *= np.sign(np.linalg.det(turn))
-    scale, aligned = video_import.similarity(0.25 * true @ turn.T + [1, 2, 3], true)
-    assert scale == pytest.approx(4)
-    np.testing.assert_allclose(aligned, true, atol=1e-12)
+    places = [12 * np.array([np.cos(a), np.sin(a), 0.1 * a]) for a in np.linspace(0, 1.5, 12)]
+    cameras = [Camera.from_fov(look_at(place, np.zeros(3)), 8, 6, 40) for place in places]
+    silhouettes = [(255 * (rng.uniform(size=(6, 8)) > 0.5)).astype(np.uint8) for _ in cameras]
+    colors = rng.integers(0, 256, (2, 12, 6, 8, 3), np.uint8)  # as traced, as in the film
+    frames = []
+    for k, camera in enumerate(cameras):
+        frames.append(Frame(f"images/{k}.png", camera, silhouette_path=f"silhouette/{k}.png"))
+        write_png(tmp_path / "film" / frames[k].file_path, colors[0, k])
+        write_png(tmp_path / "film" / str(frames[k].silhouette_path), silhouettes[k])
+    film = [(Dataset(tmp_path / "film", tuple(frames), ()), frame) for frame in frames]
+    inside = Pose(look_at([1.0, 2.0, 3.0], np.zeros(3))[:3, :3], [4.0, 5.0, 6.0], 0.25)  # of the truth in the import
+    imported = [
+        ImportedFrame(
+            f"frame_{k:06d}",
+            lambda k=k: np.dstack([colors[1, k], 255 - silhouettes[k]]),
+            moved_frame(frame, inside).camera,
+            keys={"source_index": k},
+        )
+        for k, frame in enumerate(frames)
+        if k not in (0, 5)
+    ]
+    points = rng.normal(size=(7, 3))
+    cloud = inside.points(points), np.zeros((7, 3), np.uint8)
+    report = {"structure.json": b'{"pictures": 12, "reprojection_error_px": 0.5, "points": 7}'}
+    own = write_dataset(tmp_path / "own", imported, [], {}, cloud, report)
+    row = video_import.compared(own, film)
+    assert row["registered"] == pytest.approx(10 / 12)
+    assert row["% largest"] == pytest.approx(0, abs=1e-9)
+    assert row["length, % off"] == pytest.approx(75)
+    assert row["mask IoU"] == 0
+    true = video_import.true_dataset(tmp_path / "true", own, film)
+    assert (
+        [f.file_path for f in true.test]
+        == [f.file_path for f in own.test]
+        == [
+            "images/frame_000001.png",
+            "images/frame_000010.png",
+        ]
+    )
+    for split, source in ((true.train, colors[1]), (true.test, colors[0])):
+        for frame in split:
+            number = int(frame.file_path[-6:-4])
+            np.testing.assert_allclose(frame.camera.world_from_camera, cameras[number].world_from_camera, atol=1e-12)
+            pixels = read_png(true.root / frame.file_path)
+            np.testing.assert_array_equal(pixels, np.dstack([source[number], silhouettes[number]]))
+    np.testing.assert_allclose(read_points(true.root / "points.ply")[0], points, atol=1e-5)
+    found = align(own, true)
+    assert (found.cameras, found.matched_by) == (10, "source_index in transforms.json")
+    np.testing.assert_allclose(found.pose.matrix, inside.inverse().matrix, atol=1e-9)

@@ -19,6 +19,8 @@ from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import Survey, choose, read_frames, survey
 from spacesim.data.importers.video.model import Model, placed, report_of, without_floating
 from spacesim.data.importers.video.segmentation import segment, segment_sequence
+from spacesim.data.records import Camera, Dataset, Frame
+from spacesim.eval.align import align
 
 FOV = float(np.degrees(2 * np.arctan(SIZE[0] / 2 / FOCAL)))
 needs_colmap = pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed")
@@ -238,6 +240,29 @@ def test_poses_of_pictures_are_found(tmp_path):
     assert report["not_registered"] == []
     assert report["reprojection_error_px"] < 1
     assert max(report["extent"]) < 2.1 * np.linalg.norm(BOX)
+
+
+@needs_av
+@needs_colmap
+def test_frames_of_a_film_tell_which_they_are(tmp_path):
+    """Also where frames that repeat the one before are left out, so that numbers differ from places in the list."""
+    poses = poses_around(10)
+    shown = [0, 0, 0, *range(10)]
+    pictures = [before(*box_from(pose), earth(10 * k, 2.0)) for k, pose in enumerate(poses)]
+    path = film(tmp_path / "film.mp4", [pictures[k] for k in shown], bit_rate=8_000_000)
+    data = import_dataset("video", path, tmp_path / "out", fov=FOV)
+    entries = json.loads((data.root / "transforms.json").read_text())["frames"]
+    numbers = [entry["source_index"] for entry in entries]
+    assert set(range(4, 13)) <= set(numbers)
+    assert len(numbers) < len(shown)
+    assert [entry["time"] for entry in entries] == pytest.approx([number / 25 for number in numbers])
+    cameras = [Camera.from_fov(poses[k], *SIZE, FOV) for k in shown]
+    frames = [Frame(f"images/train_{number:05d}.png", camera) for number, camera in enumerate(cameras)]
+    found = align(data, Dataset(tmp_path / "truth", tuple(frames), ()))
+    assert found.matched_by == "source_index in transforms.json, against the order of file paths"
+    assert found.cameras == len(numbers)
+    assert found.rms < 0.01 * found.distance
+    assert found.turn_deg < 0.5
 
 
 @needs_colmap

@@ -31,8 +31,16 @@ class Survey:
     motion: np.ndarray  #: [N] mean change of pixels since the frame before, sRGB values, 0 of the first
 
 
-def read_frames(path: Path) -> Iterator[np.ndarray]:
-    """The frames of a video in order, [H, W, 3] uint8.
+@dataclass(frozen=True, eq=False)
+class FilmFrame:
+    """A decoded frame of a video."""
+
+    picture: np.ndarray  #: [H, W, 3] uint8
+    time: float | None  #: seconds at which the file shows it, None where it does not tell
+
+
+def read_frames(path: Path) -> Iterator[FilmFrame]:
+    """The frames of a video in order.
 
     Raises InputError where PyAV is missing, where the file is no video or has none that can be decoded. Where it breaks
     off, the frames until there are given, and a warning tells.
@@ -56,7 +64,7 @@ def read_frames(path: Path) -> Iterator[np.ndarray]:
         try:
             for frame in container.decode(stream):
                 count += 1
-                yield frame.to_ndarray(format="rgb24")
+                yield FilmFrame(frame.to_ndarray(format="rgb24"), None if frame.time is None else float(frame.time))
         except (OSError, ValueError) as error:
             broken = _reason(error)
         declared = int(stream.frames or 0)

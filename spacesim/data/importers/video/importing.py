@@ -5,7 +5,7 @@ import logging
 import math
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,23 +75,24 @@ def import_video(
     check_free(out, source)
     with _workspace() as folder:
         tell = _Teller(progress, ("look", *_STAGES))
-        seen = survey(read_frames(src), lambda count: tell("look", 0, 1, f"frame {count}"))
+        seen = survey((frame.picture for frame in read_frames(src)), lambda count: tell("look", 0, 1, f"frame {count}"))
         chosen = choose(seen, frames)
         if len(chosen) < LEAST:
             raise InputError(
                 f"{src}: expected at least {LEAST} frames that differ, found {len(chosen)} of {len(seen.motion)}: "
                 "nothing moves"
             )
-        names: list[str] = []
+        keys: dict[str, dict[str, Any]] = {}
         size: tuple[int, ...] | None = None
-        for number, picture in enumerate(read_frames(src)):
+        for number, frame in enumerate(read_frames(src)):
             if number in set(chosen.tolist()):
-                size = size or picture.shape
-                if picture.shape != size:
+                size = size or frame.picture.shape
+                if frame.picture.shape != size:
                     raise InputError(f"{src}: expected pictures of one size, found another from frame {number} on")
-                names.append(f"frame_{number:06d}.png")
-                write_png(folder / "pictures" / names[-1], _scaled(picture, asked.height), durable=False)
-        return _import(src, out, folder, names, True, asked, source, tell, {"frames_of_video": len(seen.motion)})
+                name = f"frame_{number:06d}.png"
+                write_png(folder / "pictures" / name, _scaled(frame.picture, asked.height), durable=False)
+                keys[name] = {"source_index": number} | ({} if frame.time is None else {"time": frame.time})
+        return _import(src, out, folder, keys, True, asked, source, tell, {"frames_of_video": len(seen.motion)})
 
 
 def import_images(src: Path, out: Path, *, progress: Progress | None = None, **wishes: Any) -> Dataset:
@@ -119,21 +120,23 @@ def import_images(src: Path, out: Path, *, progress: Progress | None = None, **w
                 expected = f"{size[1]}x{size[0]} pixels as the first picture has"
                 raise InputError(f"{path}: expected {expected}, found {pixels.shape[1]}x{pixels.shape[0]}")
             write_png(folder / "pictures" / name, _scaled(pixels, asked.height), durable=False)
-        return _import(src, out, folder, names, False, asked, source, tell, {})
+        return _import(src, out, folder, {name: {} for name in names}, False, asked, source, tell, {})
 
 
 def _import(
     src: Path,
     out: Path,
     folder: Path,
-    names: Sequence[str],
+    keys: Mapping[str, Mapping[str, Any]],
     ordered: bool,
     asked: Wishes,
     source: dict[str, Any],
     tell: "_Teller",
     facts: dict[str, Any],
 ) -> Dataset:
-    """Of pictures in folder/pictures, all of one size."""
+    """Of pictures in folder/pictures, all of one size. keys: of each picture by its name, what transforms.json has of
+    it besides"""
+    names = list(keys)
     width, height = Image.open(folder / "pictures" / names[0]).size
     has_masks = _find_masks(folder, names, asked, tell)
     focal = None if asked.fov is None else 0.5 * width / math.tan(math.radians(0.5 * asked.fov))
@@ -156,7 +159,7 @@ def _import(
     unit = "metres" if asked.length or asked.distance else "median distance of the cameras"
     report = {**facts, "unit": unit, **report_of(model, names)}
     files = {"structure.json": json_bytes(report), "cameras.png": stream.getvalue()}
-    frames = list(_frames(folder, model, has_masks, asked.masked))
+    frames = list(_frames(folder, model, has_masks, asked.masked, keys))
     points = (model.points, model.colors)
     return write_dataset(
         out, frames, [], source, points, files, lambda done, total, name: tell("write", done, total, name)
@@ -202,7 +205,9 @@ def _hide_background(folder: Path, names: Sequence[str]) -> Path:
     return folder / "feature_masks"
 
 
-def _frames(folder: Path, model: Model, has_masks: bool, masked: str) -> Iterator[ImportedFrame]:
+def _frames(
+    folder: Path, model: Model, has_masks: bool, masked: str, keys: Mapping[str, Mapping[str, Any]]
+) -> Iterator[ImportedFrame]:
     distortion = (model.k1, 0.0, 0.0, 0.0, 0.0)
     for name, pose in zip(model.names, model.world_from_camera, strict=True):
         picture, mask = folder / "pictures" / name, folder / "masks" / name
@@ -219,6 +224,7 @@ def _frames(folder: Path, model: Model, has_masks: bool, masked: str) -> Iterato
             camera=Camera(pose, model.width, model.height, model.focal, model.focal, *model.centre),
             distortion=distortion,
             mask=mask if has_masks and masked == "unknown" else None,
+            keys=keys[name],
         )
 
 
