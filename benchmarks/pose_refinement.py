@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="where data and runs are, or are made")
     parser.add_argument("--views", type=common.positive, default=60)
     parser.add_argument("--resolution", type=common.positive, default=128, help="pixels of a side")
-    parser.add_argument("--degrees", default="1,3", help="of the errors, and % of the distance: numbers with commas")
+    parser.add_argument("--degrees", default="1,3", help="of the errors, and %% of the distance: numbers with commas")
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--method", default="vanilla")
     parser.add_argument("--iterations", type=common.positive, default=4000)

@@ -20,7 +20,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.images import load_image, read_png, write_png
 from spacesim.data.importers.writing import ImportedFrame, write_dataset
-from spacesim.data.records import Camera, Dataset, Frame
+from spacesim.data.records import Camera, Dataset, Frame, Sun
 from spacesim.data.store import read_dataset, read_points
 from spacesim.eval.align import align
 from spacesim.splat.compose.aligned import moved_frame
@@ -596,6 +596,35 @@ def test_data_like_speedplus_have_no_suns_but_those_that_are_told(command, place
         np.testing.assert_array_equal(frame.camera.world_from_camera, told.camera.world_from_camera)
         assert (load_image(made.data, frame).alpha == 1).all()
         assert load_image(made.told, told).alpha.min() == 0
+
+
+@smallest(
+    "unknown_suns.py --out OUT --frames 8 --height 30 --spp 2 --preset demo --iterations 8 --rows told,unknown,vanilla"
+    " --backend llvm --json"
+)
+def test_unknown_suns_are_compared_with_true_ones(command, place):
+    rows = {row["Suns"]: row for row in json.loads(call(command))["rows"]}
+    assert list(rows) == ["told", "unknown", "vanilla"]
+    assert 0 <= rows["unknown"]["Sun off, deg"] <= 180
+    assert all(5 < row["PSNR, dB"] < 60 for row in rows.values())
+
+
+def test_errors_of_suns(tmp_path):
+    """Two Suns that are right and two a quarter turn off, the less sure ones."""
+    import unknown_suns
+
+    true = [(0, 0), (10, 20), (30, 40), (50, 60)]
+    frames = tuple(Frame("a.png", Camera.from_fov(np.eye(4), 4, 4, 40), sun=Sun.from_angles(*pair)) for pair in true)
+    found = [Sun.from_angles(*true[0]), Sun.from_angles(*true[1])]
+    found += [Sun.from_angles(azimuth, elevation - 90) for azimuth, elevation in true[2:]]
+    told = [
+        {"sun_direction": sun.direction.tolist(), "sun_sigma_deg": sigma}
+        for sun, sigma in zip(found, (1, 2, 9, 30), strict=True)
+    ]
+    (tmp_path / "cameras.json").write_text(json.dumps({"frames": told}))
+    row = unknown_suns.sun_errors(tmp_path / "cameras.json", Dataset(tmp_path, frames, ()))
+    assert (row["mean"], row["Sun off, deg"], row["of the surer half, deg"]) == pytest.approx((45, 45, 0), abs=1e-4)
+    assert (row["at most 8 deg, %"], row["over 60 deg, %"], row["sigma, deg"]) == (50, 50, 5.5)
 
 
 def test_noise_like_speedpluss_is_that_of_the_full_size_averaged():

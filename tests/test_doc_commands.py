@@ -55,6 +55,8 @@ SMALLER = {  # and other values of those that it has
     **{"--max-gaussians": "150", "--frame": "0"},
 }
 NOT_RUN = {  # commands with these words: why they do not run here
+    "how-to/video.md: spacesim import": "a minute of matching; tests/data/importers/test_video.py makes small films",
+    "eval run --data truth": "asks for a truth of the same film; tests/eval/test_align.py makes both",
     "--ray auto": "needs a Ray cluster; tests/scenes/generation/test_workers.py starts one",
     "spacesim reproduce": "minutes with --quick, else a day; tests/test_reproduce.py does all of it at its smallest",
     "tests/scenes/truth.py": "a minute; tests/scenes/test_truth.py bounds its figures",
