@@ -340,6 +340,7 @@ def test_numbers_that_cannot_be_drawn_harm_no_others():
 )
 def test_what_does_not_fit_is_told(changes, words):
     leaves = as_floats(scene())
+    changes = {key: value.to(DEVICE) if torch.is_tensor(value) else value for key, value in changes.items()}
     with pytest.raises(ValueError, match=words):
         rasterization(**{**leaves, "width": SIDE, "height": SIDE, "sh_degree": 1, **changes})
 
