@@ -426,7 +426,13 @@ def given(tiny_data, tmp_path_factory) -> dict[str, Path]:
     evaluated = call("eval", run, "--data", tiny_data, "--out", folder / "eval", "--no-geometry")
     assert evaluated.code == 0, evaluated.errors
     return {
-        **{"data": tiny_data, "DATA": tiny_data, "PAIR": folder / "pair", "SCENE.toml": folder / "scene.toml"},
+        **{
+            "data": tiny_data,
+            "DATA": tiny_data,
+            "fox": tiny_data,
+            "PAIR": folder / "pair",
+            "SCENE.toml": folder / "scene.toml",
+        },
         **{name: run for name in ("run", "RUN", "other", "out/demo/run", "runs/boxsat")},
         **{name: folder / "eval" for name in ("eval", "eval-other")},
         **{name: folder / name for name in files},
