@@ -479,6 +479,10 @@ def test_pose_refinement_tells_errors_and_gauge(command, place):
     assert (rows["off by 2"]["off, deg"], rows["off by 2"]["off, %"]) == pytest.approx((2, 2))
     assert 0 < rows["true, refined"]["off, deg"] < 5
     assert all(row["PSNR, dB"] > 5 for row in rows.values())
+    assert [name for name, row in rows.items() if row["aligned, dB"] != row["PSNR, dB"]] == [
+        "off by 2, refined",
+        "true, refined",
+    ]
 
 
 @smallest("background.py DATA --backend llvm --preset demo --iterations 8 --json")
