@@ -10,7 +10,8 @@ the same frames.
 
 The method vanilla is then trained on the import with the field of view told, with the poses as found and with these
 refined, and on the same frames of the film with the true poses and masks, from the same points. All are evaluated on
-the traced pictures of the frames held out, seen by their true cameras, over the true silhouettes.
+the traced pictures of the frames held out, over the true silhouettes: each model seen by the cameras that its own poses
+give these frames, and, "aligned", by the true cameras, after one motion of the whole model.
 """
 
 import argparse
@@ -35,7 +36,9 @@ from spacesim.data.store import read_dataset, read_points
 from spacesim.eval.align import KEY, robust_similarity
 from spacesim.eval.evaluate import EvaluateConfig
 from spacesim.progress import show_progress
+from spacesim.reproduce.perform import evaluated
 from spacesim.splat.compose.pose import Pose
+from spacesim.splat.run import load_run
 from spacesim.splat.train.config import preset, with_options, with_settings
 
 TrueFrame = tuple[Dataset, Frame]
@@ -178,23 +181,29 @@ def trainings_of(options: argparse.Namespace, truth: list[TrueFrame]) -> Iterato
     plain = with_options(preset(options.preset, "vanilla"), iterations=options.iterations)
     plain = with_settings(plain, dict(map(parse_setting, options.set)))
     judge = EvaluateConfig(geometry=None)
-    aligned = replace(judge, align=own)
-    best = float("nan")
+    seen, best = seen_by(own, true), float("nan")
     for name, config, data, judged in (
-        ("true", plain, true, judge),
-        ("found", plain, own, aligned),
-        ("found, refined", replace(plain, refine_poses=True), own, aligned),
+        ("true", plain, true, true),
+        ("found", plain, own, seen),
+        ("found, refined", replace(plain, refine_poses=True), own, seen),
     ):
-        found = common.measured(name, config, judged, data, options.out / name.replace(", ", "-"), true)
+        folder = options.out / name.replace(", ", "-")
+        found = common.measured(name, config, judge, data, folder, judged)
         if "note" in found:
             yield {"poses and masks": name, "note": found["note"]}
             continue
-        psnr = found["image"]["psnr"]["mean"]
-        best = psnr if name == "true" else best
+        psnr = aligned = found["image"]["psnr"]["mean"]
+        if name == "true":
+            best = psnr
+        else:
+            aligned_judge, run = replace(judge, align=own), load_run(folder / "run")
+            moved = evaluated(run, true, folder / "eval-aligned", aligned_judge, f"{name}, aligned", show_progress)
+            aligned = moved["image"]["psnr"]["mean"]
         yield {
             "poses and masks": name,
             "PSNR, dB": psnr,
             "below true, dB": best - psnr,
+            "aligned, dB": aligned,
             "SSIM": found["image"]["ssim"]["mean"],
             "test views": len(found["frames"]),
             "iterations": config.iterations,
@@ -228,6 +237,13 @@ def true_dataset(folder: Path, own: Dataset, truth: list[TrueFrame]) -> Dataset:
     points, colors = read_points(own.root / str(own.ply_file_path))
     source = {"kind": "truth", "source": str(own.root)}
     return write_dataset(folder, train, test, source, (pose_of(frames, truth).points(points), colors))
+
+
+def seen_by(own: Dataset, true: Dataset) -> Dataset:
+    """`true`, its held-out frames seen by the cameras that `own` gives them."""
+    cameras = {Path(frame.file_path).stem: frame.camera for frame in own.test}
+    frames = (replace(frame, camera=cameras[Path(frame.file_path).stem]) for frame in true.test)
+    return replace(true, test=tuple(frames))
 
 
 def numbered(data: Dataset) -> dict[int, Frame]:

@@ -649,7 +649,7 @@ def test_noise_like_speedpluss_is_that_of_the_full_size_averaged():
 @pytest.mark.skipif(
     not all(map(importlib.util.find_spec, ("av", "pycolmap"))), reason="PyAV or pycolmap is not installed"
 )
-@smallest("video_import.py --backend llvm --out OUT --width 64 --frames 8 --spp 1 --json")
+@smallest("video_import.py --backend llvm --out OUT --width 64 --frames 8 --spp 1 --iterations 5 --json")
 def test_video_import_tells_what_cannot_be_found(command, place):
     """At this size there is nothing to be matched; what is found is tested with the importer."""
     rows = json.loads(call(command))["rows"]
@@ -702,6 +702,10 @@ def test_a_film_is_compared_with_its_own_frames(tmp_path):
             "images/frame_000010.png",
         ]
     )
+    seen = video_import.seen_by(own, true)
+    for frame, of_truth, of_import in zip(seen.test, true.test, own.test, strict=True):
+        assert frame.file_path == of_truth.file_path
+        np.testing.assert_array_equal(frame.camera.world_from_camera, of_import.camera.world_from_camera)
     for split, source in ((true.train, colors[1]), (true.test, colors[0])):
         for frame in split:
             number = int(frame.file_path[-6:-4])
