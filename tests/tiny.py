@@ -4,12 +4,18 @@ import contextlib
 import io
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 from spacesim.cli import main
 
 GENERATE = ("--views", "6", "--test-views", "2", "--resolution", "40", "--spp", "4")
 TRAIN = ("--preset", "demo", "--iterations", "50", "--init-count", "300")
 PROGRESS = re.compile(r"(generate|train|evaluate|sweep|compose|export): \d+/\d+ ")
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """What the files under a folder hold, by their paths in it."""
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import call
+from tiny import call, contents
 
 from spacesim import backend
 from spacesim.backend.upload import upload
@@ -35,10 +35,6 @@ SUNLIGHT = np.full(3, 1361.0)
 
 def boxsat(**changes):
     return read_scene("boxsat", **{**SMALL, **changes})
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 @pytest.fixture(scope="module")

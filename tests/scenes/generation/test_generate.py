@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny import contents
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.store import FrameWriter, find_unreadable_files, read_points
@@ -21,10 +22,6 @@ SMALL = {"views": 4, "test_views": 2, "resolution": (24, 24), "spp": 4, "points"
 
 def boxsat(**changes):
     return read_scene("boxsat", **{**SMALL, **changes})
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tiny import contents
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.scenes import generate, read_scene
@@ -21,10 +22,6 @@ from spacesim.scenes.generation.workers import make_in_processes
 
 OPTIONS = {"views": 60, "test_views": 0, "resolution": (24, 24), "spp": 4, "points": 100}
 CONFIG = read_scene("boxsat", **OPTIONS)
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 @pytest.fixture(scope="module")
