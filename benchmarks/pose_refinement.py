@@ -20,9 +20,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spacesim import backend
+from spacesim.data.files import read_json
+from spacesim.data.geometry import OPENCV_FROM_OPENGL
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import read_dataset
-from spacesim.data.transforms import read_camera
 from spacesim.eval.evaluate import EvaluateConfig
 from spacesim.progress import show_progress
 from spacesim.reproduce.perform import evaluated
@@ -105,13 +106,9 @@ def disturbed(data: Dataset, degrees: float, seed: int) -> Dataset:
 
 def cameras_of(path: Path) -> Iterator[Camera]:
     """Of RUN/cameras.json."""
-    from spacesim.data.files import read_json, write_json
-
-    one = path.with_name("one_camera.json")
     for frame in read_json(path)["frames"]:
-        write_json(one, frame)
-        yield read_camera(one)
-    one.unlink()
+        numbers = (frame[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy"))
+        yield Camera(np.array(frame["transform_matrix"]) @ OPENCV_FROM_OPENGL, *numbers)
 
 
 def errors(cameras: list[Camera], true: list[Camera]) -> common.Row:

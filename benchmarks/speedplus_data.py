@@ -9,11 +9,8 @@ import argparse
 import json
 import shutil
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import common
 import numpy as np
@@ -92,13 +89,6 @@ def _told(made: Dataset, data: Dataset, known: Frame, frame: Frame) -> ImportedF
     return ImportedFrame(name, picture, frame.camera, frame.distortion, known.sun, silhouette=silhouette)
 
 
-def _timed(times: dict[str, float], name: str, work: Callable[[], Any]) -> Any:
-    start = time.perf_counter()
-    result = work()
-    times[name] = time.perf_counter() - start
-    return result
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
@@ -110,16 +100,16 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     name = backend.select(options.backend)
-    times: dict[str, float] = {}
-    work = partial(make, options.out, options.frames, options.height, options.seed, options.spp)
-    result: SpeedplusData = _timed(times, "seconds", work)
+    start = time.perf_counter()
+    result = make(options.out, options.frames, options.height, options.seed, options.spp)
+    seconds = time.perf_counter() - start
     count = len(result.data.frames)
     pictures = [read_png(result.data.root / frame.file_path) for frame in result.data.frames]
     report = {
         "backend": name,
         "frames": count,
         "size": [result.data.frames[0].camera.width, options.height],
-        "seconds_a_frame": times["seconds"] / count,
+        "seconds_a_frame": seconds / count,
         "mean": float(np.mean([picture.mean() for picture in pictures])),
     }
     print(json.dumps(report) if options.json else "\n".join(f"{key}: {value}" for key, value in report.items()))

@@ -20,8 +20,9 @@ import speedplus_data
 
 from spacesim import backend
 from spacesim.data.files import read_json
+from spacesim.data.geometry import degrees_between
 from spacesim.data.importers.writing import ImportedFrame, write_dataset
-from spacesim.data.records import Dataset
+from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import read_dataset
 from spacesim.eval.evaluate import EvaluateConfig
 from spacesim.splat.train.config import TrainConfig, preset, warm_start, with_options, with_settings
@@ -83,7 +84,7 @@ def without_suns(told: Dataset, out: Path) -> Dataset:
     if not (out / "transforms.json").exists():
         shutil.rmtree(out, ignore_errors=True)
 
-        def untold(frame: "speedplus_data.Frame") -> ImportedFrame:
+        def untold(frame: Frame) -> ImportedFrame:
             assert frame.silhouette_path is not None
             paths = told.root / frame.file_path, told.root / frame.silhouette_path
             return ImportedFrame(
@@ -101,7 +102,7 @@ def sun_errors(path: Path, made: Dataset) -> common.Row:
     found = np.array([frame["sun_direction"] for frame in frames])
     sigmas = np.array([frame["sun_sigma_deg"] for frame in frames])
     true = np.array([frame.sun.direction for frame in made.train if frame.sun is not None])
-    errors = np.degrees(np.arccos(np.clip((found * true).sum(axis=1), -1, 1)))
+    errors = degrees_between((found * true).sum(axis=1))
     return {
         "Sun off, deg": float(np.median(errors)),
         "mean": float(errors.mean()),

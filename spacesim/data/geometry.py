@@ -44,6 +44,12 @@ def angles_from_direction(direction: ArrayLike) -> tuple[float, float]:
     return (0.0 if azimuth >= 360.0 else azimuth), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 
+def degrees_between(cosines: ArrayLike) -> Array:
+    """Angles of unit vectors, degrees, from their dot products, which rounding may take past 1. Any shape."""
+    angles: Array = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    return angles
+
+
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
     """world_from_camera [4, 4] (OpenCV axes) of a camera at `origin` [3] that looks at `target` [3], metres.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spacesim.data.geometry import degrees_between
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.eval import pictures
@@ -69,8 +70,7 @@ def plan_sweep(frames: Sequence[Frame], every: Sequence[Frame]) -> Sweep | None:
 def phase_deg(camera: Camera, lit_as: Frame) -> float:
     """Degrees between the Sun and the way back along the optical axis: 0 the Sun is behind the camera, 180 ahead."""
     assert lit_as.sun is not None, "only frames with a Sun are asked about"
-    cosine = float(lit_as.sun.direction @ -camera.world_from_camera[:3, 2])
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return float(degrees_between(lit_as.sun.direction @ -camera.world_from_camera[:3, 2]))
 
 
 def write_sweep(

@@ -18,7 +18,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
-from spacesim.data.geometry import Array, fibonacci_sphere
+from spacesim.data.geometry import Array, degrees_between, fibonacci_sphere
 from spacesim.data.images import linear_from_srgb, luminance
 from spacesim.data.records import Camera, Image
 from spacesim.splat.light.model import LightModel, Sunlight
@@ -195,7 +195,7 @@ def paraboloid_minimum(best: Array, around: list[Array], loss: float, losses: li
 def spread(directions: Array, losses: Array) -> float:
     """Degrees: root mean square angle to the best of directions [K, 3], weighted by exp(-loss)."""
     likely = np.exp(-(losses - losses.min()))
-    angles = np.degrees(np.arccos(np.clip(directions @ directions[int(np.argmin(losses))], -1, 1)))
+    angles = degrees_between(directions @ directions[int(np.argmin(losses))])
     return float(np.sqrt((likely * angles**2).sum() / likely.sum()))
 
 
@@ -273,7 +273,7 @@ def smoothest(losses: Array, sphere: Array, degrees: float) -> list[int]:
 
     losses: [V, K];  sphere: [K, 3];  degrees: a turn from one picture to the next that costs half
     """
-    turns = np.degrees(np.arccos(np.clip(sphere @ sphere.T, -1, 1)))
+    turns = degrees_between(sphere @ sphere.T)
     cost = 0.5 * (turns / degrees) ** 2
     total, before = losses[0].copy(), np.zeros(losses.shape, int)
     for i in range(1, len(losses)):

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, degrees_between
 from spacesim.data.importers.video.model import Model
 
 INSTALL = "pip install 'spacesim[sfm]'"
@@ -297,7 +297,7 @@ def median_angle(model: Model) -> float:
     for point, frames in zip(model.points, model.seen_by, strict=True):
         rays = centres[list(frames)] - point
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+        angles.append(degrees_between((rays @ rays.T).min()))
     return float(np.median(angles))
 
 

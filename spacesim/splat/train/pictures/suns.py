@@ -20,7 +20,7 @@ import numpy as np
 
 from spacesim.backend.arrays import Float
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, degrees_between
 from spacesim.data.images import load_image
 from spacesim.data.records import Dataset, Frame, Sun
 from spacesim.splat.light.model import LightModel
@@ -101,7 +101,7 @@ class SunEstimation:
                 lambda direction, before=before: _turn_cost(direction, before),  # type: ignore[misc]
             )
             found[picture], self.sigmas[picture] = estimate.direction, estimate.sigma_deg
-        moved = np.degrees(np.arccos(np.clip((found * self.directions()).sum(axis=1), -1, 1)))
+        moved = degrees_between((found * self.directions()).sum(axis=1))
         log.info("Suns compared with the model: moved by %.1f degrees (median)", np.median(moved))
         self.numbers.values = found
         self.numbers.first[:] = 0
@@ -190,7 +190,7 @@ def check_pictures(dataset: Dataset) -> None:
 def _turn_cost(direction: Array, before: Array | None) -> float:
     if before is None:
         return 0.0
-    turn = np.degrees(np.arccos(np.clip(direction @ before, -1, 1)))
+    turn = degrees_between(direction @ before)
     return float(0.5 * (turn / TURN) ** 2)
 
 
