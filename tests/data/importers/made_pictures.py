@@ -18,11 +18,11 @@ def poses_around(count: int, degrees: float = 60.0, distance: float = 5.0) -> li
     return [look_at(distance * np.array([np.cos(a) * 0.9, np.sin(a), 0.45]), np.zeros(3)) for a in angles]
 
 
-def box_from(world_from_camera: Array) -> tuple[np.ndarray, np.ndarray]:
+def box_from(world_from_camera: Array, focal: float = FOCAL) -> tuple[np.ndarray, np.ndarray]:
     """([H, W, 3] uint8 over black, [H, W] bool where the box is)."""
     width, height = SIZE
     u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
-    rays = np.stack([u / FOCAL, v / FOCAL, np.ones_like(u)], axis=-1) @ world_from_camera[:3, :3].T
+    rays = np.stack([u / focal, v / focal, np.ones_like(u)], axis=-1) @ world_from_camera[:3, :3].T
     origin = world_from_camera[:3, 3]
     slabs = np.stack([(-BOX - origin) / rays, (BOX - origin) / rays])
     near, far = slabs.min(axis=0), slabs.max(axis=0)
