@@ -22,6 +22,7 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import write_bytes
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera, Dataset
+from spacesim.eval.report.html import escape
 
 if TYPE_CHECKING:
     from spacesim.eval.evaluate import EvaluateConfig
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 WARM_UP = 5  #: calls that do not count
 PACKAGES = ("spacesim", "drjit", "mitsuba", "numpy", "torch", "gsplat", "fused_ssim")
 FIELD_OF_VIEW = 35  #: degrees
+CURVES = "#5a6472", "#b9560f", "#2a66ad", "#3d7a3a"  #: colours of a chart that stands alone
 DISTANCE = float(np.sqrt(18))  #: of the cameras from the centre of a sphere of radius 1: it fills most of the picture
 
 Work = Callable[[], Any]
@@ -129,6 +131,19 @@ def measured(
     except WorkError as error:
         return {"note": str(error)}
     return {**evaluated(run, truth or dataset, folder / "eval", judge, name, show_progress), "training": run.training}
+
+
+def standalone(drawn: str, names: Sequence[str]) -> str:
+    """An SVG file's text of a `line_chart`: its own colours and letters, and the curves' names."""
+    style = ".line{fill:none;stroke-width:2}.axis{stroke:#e2e3de}text{font:12px sans-serif;fill:#1b2027}"
+    style += "".join(f".s{i}{{stroke:{color}}}" for i, color in enumerate(CURVES))
+    marks = [f"<style>{style}</style>", '<rect width="100%" height="100%" fill="#fff"/>']
+    for row, name in enumerate(names):
+        marks.append(
+            f'<text x="250" y="{130 + 16 * row}" style="fill:{CURVES[row % len(CURVES)]}">{escape(name)}</text>'
+        )
+    head, inner = drawn.split(">", 1)
+    return f'{head} xmlns="http://www.w3.org/2000/svg">{"".join(marks)}{inner}\n'
 
 
 def row_names(text: str) -> list[str]:

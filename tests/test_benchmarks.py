@@ -224,6 +224,20 @@ def test_rasterizer_tells_growth_and_goes_on_without_its_peer(command, place):
     assert len(list(ElementTree.parse(place / "growth.svg").iter(f"{SVG}circle"))) == 2
 
 
+@smallest(
+    "schedule.py --out out --data DATA --methods vanilla --preset demo --iterations 110 --views 1 --svg curve.svg"
+    " --backend llvm --json"
+)
+def test_a_schedule_is_followed_and_goes_on(command, place, small_lit):
+    (place / "DATA").symlink_to(small_lit)
+    rows = json.loads(call(command))["rows"]
+    assert [row["iteration"] for row in rows] == [50, 100, 110]
+    assert all(row["Gaussians"] > 0 and 0 < row["PSNR, unseen Suns"] < 60 for row in rows)
+    assert len(list(ElementTree.parse(place / "curve.svg").iter(f"{SVG}path"))) >= 1
+    (place / "out/vanilla/kept/step_00000100.json").unlink()
+    assert json.loads(call(command))["rows"] == rows
+
+
 def slope_of(rows, time_of):
     (first, last), pairs = [time_of(row) for row in rows], [row["pairs"] for row in rows]
     return np.log(last / first) / np.log(pairs[1] / pairs[0])

@@ -18,7 +18,7 @@ from spacesim.reproduce.experiments import Experiment, check_parts, datasets_for
 from spacesim.reproduce.perform import depth_picture, is_fully_lit
 from spacesim.reproduce.reproduce import reproduce
 from spacesim.reproduce.results import value_of
-from spacesim.reproduce.size import FULL, QUICK, Size
+from spacesim.reproduce.size import FULL, QUICK, REDUCED, Size
 from spacesim.reproduce.thesis import Column, best, holds, pairs, parse, thesis
 
 SMALLEST = Size(
@@ -83,7 +83,7 @@ def test_best_and_order_of_a_column():
     assert pairs(lower, printed, {"a": None, "b": 6.0, "c": 4.0}) == []
 
 
-@pytest.mark.parametrize("size", [FULL, QUICK], ids=lambda size: size.name)
+@pytest.mark.parametrize("size", [FULL, REDUCED, QUICK], ids=lambda size: size.name)
 def test_tables_share_trainings(size):
     def names(*parts: str) -> set[str]:
         return {one.name for one in experiments_for(size, parts, 1)}
@@ -93,7 +93,7 @@ def test_tables_share_trainings(size):
     assert names("4.4") & names("5.4") >= {"thesis-shadow-map"}
     whole = experiments_for(size, parts_known(), 1)
     assert {one.name for one in whole} == set().union(*(names(part) for part in parts_known()))
-    assert len({one.name for one in whole}) == len(whole) == (20 if size is FULL else 19)
+    assert len({one.name for one in whole}) == len(whole) == (19 if size is QUICK else 20)
     relit = next(one for one in whole if one.name == "thesis-relight")
     assert isinstance(relit, Experiment)
     assert set(relit.parts) == {"own", "pair", "suns", "one-sun"}
@@ -107,6 +107,14 @@ def test_full_trainings_are_the_presets_own():
     assert configs["thesis-shadow-map"].iterations == 200_000
     assert configs["telescope"].refinement.refine_stop == 40_000
     assert {configs[name].preset for name in configs if name.startswith("fine")} == {"fine"}
+
+
+def test_reduced_trainings_are_the_presets_with_shorter_schedules():
+    configs = {one.name: one.config for one in experiments_for(REDUCED, parts_known(), 1)}
+    found = {config.iterations for name, config in configs.items() if not name.startswith("figure")}
+    assert found == {10_000}
+    assert configs["thesis-shadow-map"].refinement.refine_stop == 7_500
+    assert configs["telescope"].refinement.refine_stop == 8_000
 
 
 def test_the_quick_ones_have_its_settings_where_there_are_such_fields():
@@ -261,3 +269,6 @@ def test_the_command_line(spacesim, tmp_path, monkeypatch):
     done = spacesim("reproduce", "4.4", "figure-5.5", "--quick", "--resume", "--seeds", 2, "--out", tmp_path / "a")
     assert (done.code, done.output.strip()) == (0, str(tmp_path / "a"))
     assert called[0][2:] == (["4.4", "figure-5.5"], QUICK, True, None, 2)
+    assert spacesim("reproduce", "--reduced", "--out", tmp_path / "a").code == 0
+    assert called[1][3] is REDUCED
+    assert spacesim("reproduce", "--reduced", "--quick", "--out", tmp_path / "a").is_refusal("--quick", "--reduced")

@@ -15,7 +15,11 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
 
     parser.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {', '.join(parts_known())} (all)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--quick", action="store_true", help="tiny: minutes on two cores, to see that all of it works")
+    sizes = parser.add_mutually_exclusive_group()
+    sizes.add_argument(
+        "--reduced", action="store_true", help="a quarter of the pixels, 10,000 iterations: an hour or two on a GPU"
+    )
+    sizes.add_argument("--quick", action="store_true", help="tiny: minutes on two cores, to see that all of it works")
     parser.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="trainings of each row, whose spread is told (1)"
     )
@@ -26,8 +30,8 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
 def run(options: argparse.Namespace) -> None:
     from spacesim.progress import show_progress
     from spacesim.reproduce.reproduce import reproduce
-    from spacesim.reproduce.size import FULL, QUICK
+    from spacesim.reproduce.size import FULL, QUICK, REDUCED
 
-    size = QUICK if options.quick else FULL
+    size = QUICK if options.quick else REDUCED if options.reduced else FULL
     page = reproduce(options.out, show_progress, options.tables, size, options.resume, options.ray, options.seeds)
     interrupts.print_output(page)

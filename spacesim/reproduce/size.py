@@ -1,4 +1,4 @@
-"""How large a reproduction is: the full one, and the quick one that shows that the machinery works."""
+"""How large a reproduction is: the full one, a reduced one that says most of it, a quick one that says that it runs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -39,6 +39,20 @@ class Size:
 
 
 FULL = Size()
+
+REDUCED = Size(
+    name="reduced",
+    resolution=256,
+    views=20,
+    known_test_views=1,
+    test_views=3,
+    pair_views=40,
+    one_sun_views=200,
+    one_sun_test_views=100,
+    telescope_views=40,
+    telescope_iterations=10_000,
+    iterations=10_000,
+)
 
 QUICK = Size(
     name="quick",
