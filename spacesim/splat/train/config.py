@@ -231,7 +231,8 @@ def shortened(config: TrainConfig, iterations: int) -> TrainConfig:
     (first refinement, pauses, harmonics, coarse pictures, warm start, what strategies wait for) shrinks by the same
     share, or to a twentieth of the training where that is longer. Learning rates follow the training's length by
     themselves, but for `means_steps`. Refinements and opacity resets are as far apart as they were: both take the steps
-    that they take. In a longer training nothing changes but for the steps that come last.
+    that they take. Where screen sizes cull nothing, being over with the pause after the first reset, they go on culling
+    nothing. In a longer training nothing changes but for the steps that come last.
     """
     share = iterations / config.iterations
     if not 0 < share < 1:
@@ -242,11 +243,16 @@ def shortened(config: TrainConfig, iterations: int) -> TrainConfig:
         return {name: max(round(share * n), min(n, iterations // 20), min(n, 1)) for name, n in lengths.items()}
 
     refinement, strategy, warm = config.refinement, config.strategy, config.warm_start
+    first_reset = refinement.reset_every * refinement.refine_every
+    culls_by_screen = refinement.screen_size_stop > first_reset + refinement.pause_after_reset
     refinement = replace(
         refinement,
         **beginning(refinement, "refine_start", "pause_after_reset"),
         refine_stop=round(share * refinement.refine_stop),
     )
+    if not culls_by_screen:
+        over = first_reset + refinement.pause_after_reset
+        refinement = replace(refinement, screen_size_stop=min(refinement.screen_size_stop, over))
     if isinstance(strategy, SupportAwareConfig):
         strategy = replace(strategy, **beginning(strategy, "warm_up", "backfill_start"))
     elif isinstance(strategy, MeshAwareConfig):

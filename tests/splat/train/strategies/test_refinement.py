@@ -10,7 +10,7 @@ import pytest
 from spacesim.backend import ad, select
 from spacesim.backend.upload import upload
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
-from spacesim.splat.train.config import preset
+from spacesim.splat.train.config import preset, shortened
 from spacesim.splat.train.optimizer.adam import Adam, NetworkAdam, adam_step
 from spacesim.splat.train.strategies.control import RefinementConfig
 from spacesim.splat.train.strategies.default import DefaultStrategy
@@ -174,7 +174,12 @@ def test_the_thesis_splits_by_size_on_the_screen_before_the_first_reset_alone():
     refined = [step for step in range(100, 200_000, 100) if config.refine_start < step < config.refine_stop]
     refined = [step for step in refined if step % cycle >= config.pause_after_reset]
     assert [step for step in refined if step < config.screen_size_stop] == list(range(1000, 3000, 100))
-    assert not [step for step in refined if cycle < step < config.screen_size_stop]
+    for iterations in (200_000, 15_000, 10_000, 5_000):
+        config = shortened(preset("thesis"), iterations).refinement
+        refined = [step for step in range(100, iterations, 100) if config.refines_at(step)]
+        assert not [step for step in refined if cycle < step < config.screen_size_stop]
+    config = shortened(preset("fast"), 3_500).refinement
+    assert config.screen_size_stop == preset("fast").refinement.screen_size_stop, "which culls by it"
 
 
 @pytest.mark.parametrize("step", [100, 500, 999, 1150, 3500, 15_000, 20_000])
