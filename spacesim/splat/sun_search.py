@@ -222,7 +222,7 @@ class _LitSurface:
     """What a small picture shows of a Lambertian surface, P pixels."""
 
     counts: np.ndarray  #: [H, W] bool, which pixels
-    seen: Array  #: [P] luminance in the picture, linear
+    seen: np.ndarray  #: [P] luminance in the picture, linear
     reflected: Array  #: [P] luminance under the Sun overhead
     light: Array  #: [P, SPHERE] share of it under the lattice's Suns
 
