@@ -5,7 +5,8 @@ poses and shape are known, shading fixes the direction in the model's axes: no r
 what is turned away from the Sun says little, and one flat surface alone only how obliquely it is lit.
 
 Shape alone, by alternation (`ShapeSearch`): surfaces are Lambertian, their albedo at first the mean colour of all
-pictures, then what the Suns found so far leave. All pictures share one exposure, as brightness tells the angle.
+pictures times the number that suits them best, then what the Suns found so far leave. All pictures share one exposure,
+as brightness tells the angle: too large an albedo would put all Suns too low.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +26,7 @@ from spacesim.splat.light.model import LightModel, Sunlight
 from spacesim.splat.light.shadow.cast import ShadowConfig, cast_shadows
 from spacesim.splat.light.shadow.light_camera import light_rows
 from spacesim.splat.raster.cameras import Pinhole
-from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 from spacesim.splat.raster.render import render
 from spacesim.splat.raster.tone import adjust_exposure
 
@@ -35,8 +36,10 @@ ERROR = 0.05  #: sRGB values, or roots of linear ones: an error so large counts 
 BLOCK = 8.0  #: pixels of a small picture whose errors count as one
 COVERED = 0.5  #: least alpha of a pixel that counts
 AMBIENT = 0.02  #: light that comes from everywhere, as a share of the Sun's
-MEAN_COSINE = 0.2  #: of a surface's n . s times visibility over Suns all round: a quarter without shadows
-ALTERNATIONS = 3  #: of Suns and albedo
+#: of a surface's n . s times visibility over the Suns of pictures, one of these: a quarter under Suns all round without
+#: shadows, more where nobody takes pictures against the Sun
+MEAN_COSINES = 0.14, 0.2, 0.28, 0.4, 0.56
+ALTERNATIONS = 2  #: of Suns and albedo
 RINGS = 8.0, 3.0  #: degrees about the best Sun, at which a paraboloid is fitted
 RING = 6  #: Suns of a ring
 
@@ -192,6 +195,21 @@ def paraboloid_minimum(best: Array, around: list[Array], loss: float, losses: li
     return _unit(best + slope * (step[0] * right + step[1] * up))
 
 
+def constant_colors(gaussians: Gaussians) -> Array:
+    """[N, 3] sRGB values, mean over all directions."""
+    colors: Array = 0.5 + SH_C0 * gaussians.to_numpy()["sh"].reshape(gaussians.count, -1, 3)[:, 0]
+    return colors
+
+
+def lowest_between(places: Array, losses: Array) -> float:
+    """Where a parabola through the lowest of `losses` and its neighbours is lowest; the end where that is one."""
+    best = int(np.argmin(losses))
+    if best in (0, len(losses) - 1):
+        return float(places[best])
+    a, b, _ = np.polyfit(places[best - 1 : best + 2] - places[best], losses[best - 1 : best + 2], 2)
+    return float(places[best] - b / (2 * a)) if a > 0 else float(places[best])
+
+
 def spread(directions: Array, losses: Array) -> float:
     """Degrees: root mean square angle to the best of directions [K, 3], weighted by exp(-loss)."""
     likely = np.exp(-(losses - losses.min()))
@@ -199,10 +217,26 @@ def spread(directions: Array, losses: Array) -> float:
     return float(np.sqrt((likely * angles**2).sum() / likely.sum()))
 
 
+@dataclass(frozen=True, eq=False)
+class _LitSurface:
+    """What a small picture shows of a Lambertian surface, P pixels."""
+
+    counts: np.ndarray  #: [H, W] bool, which pixels
+    seen: np.ndarray  #: [P] luminance in the picture, linear
+    reflected: Array  #: [P] luminance under the Sun overhead
+    light: Array  #: [P, SPHERE] share of it under the lattice's Suns
+
+    def losses(self, brighter: float = 1.0) -> Array:
+        """[SPHERE], of a surface that reflects so many times as much."""
+        errors = np.sqrt(brighter * self.reflected[:, None] * self.light) - np.sqrt(self.seen)[:, None]
+        losses: Array = np.log1p((errors / ERROR) ** 2).sum(axis=0) / BLOCK
+        return losses
+
+
 class ShapeSearch:
     """Suns of many pictures by the Gaussians of a training that was told none.
 
-    gaussians: their colours are the mean of all pictures from there;  distance: metres, of the farthest camera
+    gaussians: their colours are the mean of all pictures;  distance: metres, of the farthest camera
     """
 
     def __init__(self, gaussians: Gaussians, antialiased: bool, distance: float) -> None:
@@ -210,14 +244,20 @@ class ShapeSearch:
         self.sphere = fibonacci_sphere(SPHERE)
         shadow = ShadowConfig(size=256, refine=None)
         self.visible = [upload(1 - np.array(self._occlusion(sun, shadow, distance))) for sun in self.sphere]
-        self.albedo = np.full(gaussians.count, 1 / MEAN_COSINE)  #: over what is seen in the mean
+        self.albedo = np.maximum(luminance(linear_from_srgb(np.clip(constant_colors(gaussians), 0, 1))), 1e-3)
 
     def losses(
         self, pictures: Sequence[SmallPicture], progress: Callable[[int, int], None] = lambda done, total: None
     ) -> Array:
         """[V, SPHERE] of the pictures under the lattice's Suns, after `ALTERNATIONS`."""
-        total, found = ALTERNATIONS * len(pictures), np.zeros((len(pictures), SPHERE))
-        for turn in range(ALTERNATIONS):
+        total, found = (1 + ALTERNATIONS) * len(pictures), np.zeros((len(pictures), SPHERE))
+        lowest = np.zeros(len(MEAN_COSINES))
+        for i, picture in enumerate(pictures):
+            surface = self._surface(picture, upload(self.albedo.astype(np.float32)))
+            lowest += [surface.losses(1 / cosine).min() for cosine in MEAN_COSINES]
+            progress(i + 1, total)
+        self.albedo /= np.exp(lowest_between(np.log(MEAN_COSINES), lowest))
+        for turn in range(1, 1 + ALTERNATIONS):
             albedo, sums = upload(self.albedo.astype(np.float32)), np.zeros((2, self.gaussians.count))
             for i, picture in enumerate(pictures):
                 found[i], target = self._compare(picture, albedo)
@@ -231,29 +271,30 @@ class ShapeSearch:
 
     def _compare(self, picture: SmallPicture, albedo: Float) -> tuple[Array, list[np.ndarray]]:
         """(loss under each Sun of the lattice [SPHERE], planes [H, W] of light that is seen and that is expected)."""
+        surface = self._surface(picture, albedo)
+        losses = surface.losses()
+        likely = np.exp(-(losses - losses.min()))
+        expected = surface.light @ (likely / likely.sum())
+        reflected, weights = surface.reflected, expected / (0.05 + expected)
+        target = [np.zeros(surface.counts.shape, np.float32) for _ in range(2)]
+        target[0][surface.counts] = np.minimum(surface.seen, 3 * reflected * expected + 0.01) * weights
+        target[1][surface.counts] = reflected * expected * weights
+        return losses, target
+
+    def _surface(self, picture: SmallPicture, albedo: Float) -> "_LitSurface":
         drawn = render(
             self.gaussians,
             Pinhole.of(picture.camera),
-            outputs=("alpha", "normal", "color"),
+            outputs=("alpha", "normal"),
             features=[*self.visible, albedo],
             antialiased=self.antialiased,
         )
         alpha, planes = drawn.image("alpha"), drawn.image("features")
         counts = picture.counts & (alpha >= COVERED)
-        seen = luminance(linear_from_srgb(picture.rgb[counts]))
-        visible, factor = (planes[counts] / alpha[counts][:, None])[:, :SPHERE], planes[counts][:, SPHERE]
-        mean = luminance(linear_from_srgb(drawn.image("color")[counts] / alpha[counts][:, None]))
-        reflected = np.maximum(mean, 1e-3) * factor
+        visible, reflected = (planes[counts] / alpha[counts][:, None])[:, :SPHERE], planes[counts][:, SPHERE]
         light = np.maximum(drawn.image("normal")[counts] @ self.sphere.T, 0) * visible + AMBIENT
-        errors = np.sqrt(np.maximum(reflected[:, None] * light, 0)) - np.sqrt(seen)[:, None]
-        losses = np.log1p((errors / ERROR) ** 2).sum(axis=0) / BLOCK
-        likely = np.exp(-(losses - losses.min()))
-        expected = light @ (likely / likely.sum())
-        weights = expected / (0.05 + expected)
-        target = [np.zeros(counts.shape, np.float32) for _ in range(2)]
-        target[0][counts] = np.minimum(seen, 3 * reflected * expected + 0.01) * weights
-        target[1][counts] = reflected * expected * weights
-        return losses, target
+        seen = luminance(linear_from_srgb(picture.rgb[counts]))
+        return _LitSurface(counts, seen, reflected, light)
 
     def _spread_back(self, picture: SmallPicture, planes: list[np.ndarray]) -> Array:
         """[2, N] sums over pixels of what each Gaussian has of them, times the planes [H, W]."""

@@ -19,6 +19,7 @@ from spacesim.splat.raster.render import render
 from spacesim.splat.sun_search import ShapeSearch, SmallPicture, SunFinder
 
 NOTHING = Encoding("harmonics", 0)
+MEAN_COSINE = 0.35  #: of pictures that were not taken against the Sun
 FIELD = FieldConfig(features=4, width=12, layers=3, inputs=SurfaceConfig(NOTHING, NOTHING))
 TOLD = FieldConfig(features=4, width=12, layers=3, inputs=DirectionsConfig(Encoding("harmonics", 2), NOTHING))
 
@@ -32,10 +33,10 @@ def eye(position=(0.0, -6.0, 1.0), side: int = 48) -> Camera:
 
 
 def ball(count: int = 1500, features: int = 0) -> Gaussians:
-    """Flat Gaussians on the unit sphere, shortest axis outwards, grey as under Suns all round."""
+    """Flat Gaussians on the unit sphere, shortest axis outwards, grey as under Suns of the near half."""
     rng, normals = np.random.default_rng(3), fibonacci_sphere(count)
     turn = normalize(np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1))
-    grey = (float(srgb_from_linear(0.5 * sun_search.MEAN_COSINE)) - 0.5) / 0.28209479177387814
+    grey = (float(srgb_from_linear(0.5 * MEAN_COSINE)) - 0.5) / 0.28209479177387814
     arrays = {
         "means": normals,
         "log_scales": np.tile(np.log([0.07, 0.07, 0.004]), (count, 1)),
@@ -125,6 +126,14 @@ def test_shape_and_shading_tell_the_sun():
     losses = search.losses(pictures)
     errors = [angle(search.sphere[row.argmin()], sun) for row, sun in zip(losses, suns, strict=True)]
     assert max(errors) < 14, errors
+    assert np.median(search.albedo) == pytest.approx(0.5, rel=0.15)  # of all that is between black and white
+
+
+def test_the_lowest_place_of_a_parabola_is_found():
+    places = np.array([0.0, 1.0, 2.0, 4.0])
+    assert sun_search.lowest_between(places, 3 * (places - 1.7) ** 2 - 5) == pytest.approx(1.7)
+    assert sun_search.lowest_between(places, places) == 0
+    assert sun_search.lowest_between(places, -places) == 4
 
 
 def model(field: FieldConfig) -> LightModel:

@@ -24,8 +24,8 @@ from spacesim.data.geometry import Array, degrees_between
 from spacesim.data.images import load_image
 from spacesim.data.records import Dataset, Frame, Sun
 from spacesim.splat.light.model import LightModel
-from spacesim.splat.raster.gaussians import SH_C0, Gaussians
-from spacesim.splat.sun_search import SPHERE, ShapeSearch, SmallPicture, SunFinder, smoothest
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.sun_search import SPHERE, ShapeSearch, SmallPicture, SunFinder, constant_colors, smoothest
 from spacesim.splat.train.config import TrainConfig, preset, shortened, with_options
 from spacesim.splat.train.pictures.numbers import PictureNumbers, falling
 
@@ -155,12 +155,6 @@ def surface_points(gaussians: Gaussians) -> tuple[Array, np.ndarray]:
     solid = arrays["logit_opacities"].ravel() > 0
     solid = solid if solid.any() else np.ones_like(solid)
     return arrays["means"][solid], np.rint(255 * np.clip(constant_colors(gaussians)[solid], 0, 1)).astype(np.uint8)
-
-
-def constant_colors(gaussians: Gaussians) -> Array:
-    """[N, 3] sRGB values, mean over all directions."""
-    colors: Array = 0.5 + SH_C0 * gaussians.to_numpy()["sh"].reshape(gaussians.count, -1, 3)[:, 0]
-    return colors
 
 
 def first_suns(dataset: Dataset, gaussians: Gaussians, antialiased: bool, distance: float) -> FirstSuns:
