@@ -10,6 +10,7 @@ SOURCES = scripts/setup.sh requirements/lock.txt pyproject.toml
 demo: .venv/base.done
 	$(BIN)/spacesim demo --out out/demo
 
+test: export PYTHONDONTWRITEBYTECODE = # byte code is kept: tests start the program a hundred times
 test: lint
 	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 

@@ -100,7 +100,7 @@ def _teller(name: str, count: int) -> attack.Tell:
 def _once_more(root: Path, place: Path, seed: int, number: int) -> None:
     place.mkdir()
     (place / "out").mkdir()
-    trial = attack.prepared(root, place, seed, number)
+    trial = attack.prepared(attack.Copy(root, place / "in"), place / "out", seed, number)
     worker = attack.Worker(trial.folder)
     answer = worker.run(trial.words, trial.folder)
     worker.stop()

@@ -14,6 +14,7 @@ import os
 import re
 import sys
 import textwrap
+import tokenize
 from collections.abc import Iterable, Iterator
 from dataclasses import is_dataclass, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import Any, get_args, get_type_hints
 from unittest.mock import patch
 
 WIDTH = 100  #: characters of a line of help and of a signature
+LONGEST = 120  #: characters of a field with its comment
 
 
 def pages() -> dict[str, str]:
@@ -105,21 +107,62 @@ def class_entry(title: str, cls: Any) -> str:
 
 
 def field_lines(cls: type) -> Iterator[str]:
-    """Fields as they stand in the code, with the values of constants in the place of their names."""
+    """Fields as they stand in the code, each with its comment beside it, or above it where both are too long for a
+    line, and with the values of constants in the place of their names."""
     source = textwrap.dedent(inspect.getsource(cls))
-    lines = source.splitlines()
     definition = ast.parse(source).body[0]
     assert isinstance(definition, ast.ClassDef)
+    comments = comments_in(source)
+    code = without_comments(source)
     for statement in definition.body:
-        if isinstance(statement, ast.AnnAssign) and not ast.unparse(statement.target).startswith("_"):
-            assert statement.end_lineno is not None
-            text = textwrap.dedent("\n".join(lines[statement.lineno - 1 : statement.end_lineno]))
-            if isinstance(statement.value, ast.Name):
-                assert isinstance(statement.target, ast.Name)
-                default = getattr(cls, statement.target.id)
-                shown = f"{default:.6g}" if isinstance(default, float) else repr(default)
-                text = text.replace(f"= {statement.value.id}", f"= {shown}")
-            yield text
+        if not isinstance(statement, ast.AnnAssign) or ast.unparse(statement.target).startswith("_"):
+            continue
+        assert isinstance(statement.target, ast.Name)
+        assert statement.end_lineno is not None
+        text = f"{statement.target.id}: {flattened(code, statement.annotation)}"
+        if isinstance(statement.value, ast.Name):
+            default = getattr(cls, statement.target.id)
+            text += f" = {f'{default:.6g}' if isinstance(default, float) else repr(default)}"
+        elif statement.value is not None:
+            text += f" = {flattened(code, statement.value)}"
+        above = statement.lineno - 1
+        while above in comments and comments[above][0]:
+            above -= 1
+        said = [comments[line][1] for line in range(above + 1, statement.end_lineno + 1) if line in comments]
+        comment = f"#: {' '.join(said)}"
+        if len(f"{text}  {comment}") > LONGEST:
+            yield f"{textwrap.fill(comment, LONGEST, subsequent_indent='#: ')}\n{text}"
+        else:
+            yield f"{text}  {comment}" if said else text
+
+
+def comment_tokens(source: str) -> list[tokenize.TokenInfo]:
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    return [token for token in tokens if token.type == tokenize.COMMENT]
+
+
+def comments_in(source: str) -> dict[int, tuple[bool, str]]:
+    """{line: (whether nothing else stands on it, words)} of the comments that begin with "#:"."""
+    tokens = [token for token in comment_tokens(source) if token.string.startswith("#:")]
+    return {token.start[0]: (token.line.strip() == token.string, token.string[2:].strip()) for token in tokens}
+
+
+def without_comments(source: str) -> str:
+    """With spaces in their place."""
+    lines = source.splitlines()
+    for token in comment_tokens(source):
+        row, column = token.start
+        lines[row - 1] = lines[row - 1][:column] + " " * len(token.string)
+    return "\n".join(lines)
+
+
+def flattened(code: str, node: ast.expr) -> str:
+    """An expression as it stands in code, on one line."""
+    segment = ast.get_source_segment(code, node)
+    assert segment is not None
+    if "\n" not in segment:
+        return segment
+    return re.sub(r",? (?=[\])}])", "", re.sub(r"(?<=[\[({]) ", "", " ".join(segment.split())))
 
 
 def members(cls: type) -> Iterator[tuple[str, Any]]:
@@ -205,7 +248,7 @@ def record_in(hint: Any) -> Any:
 def record_entry(cls: type, keys: Iterable[str]) -> str:
     """A record: its docstring, and those of its fields that are keys of a file."""
     known = set(keys)
-    lines = [line for line in field_lines(cls) if line.partition(":")[0] in known]
+    lines = [line for line in field_lines(cls) if line.splitlines()[-1].partition(":")[0] in known]
     return f"{block(inspect.getdoc(cls) or '')}\n\n{block(chr(10).join(lines), 'python')}"
 
 

@@ -6,7 +6,7 @@ import inspect
 import re
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -149,6 +149,43 @@ def test_the_reference_has_every_public_name(name):
     docstring = inspect.getdoc(getattr(ss, name))
     assert docstring
     assert docstring in entry[1]
+
+
+@pytest.mark.parametrize("name", [name for name in ss.__all__ if is_dataclass(getattr(ss, name))])
+def test_the_reference_explains_every_field(name):
+    """Each has a comment, beside it or above."""
+    lines = {}
+    for line in generator().field_lines(getattr(ss, name)):
+        *above, text = line.splitlines()
+        lines[text.partition(":")[0]] = above or re.findall(r"#: \S", text)
+    assert list(lines) == [field.name for field in fields(getattr(ss, name)) if not field.name.startswith("_")]
+    assert [field for field, comments in lines.items() if not comments] == []
+
+
+def test_comments_of_fields_are_read_wherever_they_stand(tmp_path, monkeypatch):
+    source = """
+        class Record:
+            #: above
+            #: it
+            first: int = 1
+            second: tuple[
+                str, ...
+            ] = ()  #: behind
+            third: str | None = (
+                None  #: # within "(brackets)"
+            )
+            long: int = 2  #: {words}
+            bare: str = "#: no comment"
+    """
+    long = " ".join(["word"] * 25)
+    monkeypatch.setattr(inspect, "getsource", lambda cls: source.replace("{words}", long).lstrip("\n"))
+    assert list(generator().field_lines(int)) == [
+        "first: int = 1  #: above it",
+        "second: tuple[str, ...] = ()  #: behind",
+        'third: str | None = None  #: # within "(brackets)"',
+        f"#: {' '.join(['word'] * 23)}\n#: word word\nlong: int = 2",
+        'bare: str = "#: no comment"',
+    ]
 
 
 def test_the_reference_has_rasterization():

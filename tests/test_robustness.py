@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from safetensors.numpy import save
-from tiny import GENERATE, PROGRESS, outcome
+from tiny import GENERATE, PROGRESS, contents, outcome
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.store import find_unreadable_files, load_truth, read_dataset, write_points
@@ -52,11 +52,6 @@ from spacesim.splat.train.config import *
 from spacesim.splat.train.train import train
 train(read_dataset(sys.argv[3]), Path(sys.argv[4]), {CONFIG!r})
 """
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """{path: bytes} of all files in a folder."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def kill(program: str, moment: int, after: bool, *arguments: object) -> None:

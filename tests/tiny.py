@@ -3,6 +3,8 @@
 import contextlib
 import io
 import re
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,12 +44,19 @@ def outcome(code: int, output: str, errors: str) -> Outcome:
     return Outcome(code, output, [line for line in errors.splitlines() if not PROGRESS.match(line)])
 
 
-def call(*arguments: object) -> Outcome:
-    """Run a command in this process."""
+def captured(run: Callable[[list[str]], int | None], arguments: list[str]) -> Outcome:
+    """Of a program that runs in this process, and returns its exit code or raises SystemExit."""
     output, errors = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
         try:
-            code = main([str(argument) for argument in arguments])
+            code = run(arguments) or 0
         except SystemExit as end:
-            code = int(end.code or 0)
+            code = end.code if isinstance(end.code, int) else 0 if end.code is None else 1
+            if isinstance(end.code, str):
+                print(end.code, file=sys.stderr)
     return outcome(code, output.getvalue(), errors.getvalue())
+
+
+def call(*arguments: object) -> Outcome:
+    """Run a command in this process."""
+    return captured(main, [str(argument) for argument in arguments])

@@ -97,12 +97,13 @@ def _run(arguments: Sequence[str]) -> None:
 
 
 def parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
-    """The parser of the command line; commands that `arguments` do not name have no options in it, as to find out what
-    these are takes time."""
+    """The parser of the command line: of the command that stands first in `arguments`, and with the names of all where
+    none does, as to find out what their options are takes time."""
     root = Parser(prog="spacesim", description="Simulate spacecraft images, reconstruct them, evaluate the result.")
     root.add_argument("--version", action="version", version=f"spacesim {__version__}")
     commands = root.add_subparsers(required=True, metavar="COMMAND", dest="command", parser_class=Parser)
-    for name, command in COMMANDS.items():
+    named = {name: command for name, command in COMMANDS.items() if name in arguments[:1]}
+    for name, command in (named or COMMANDS).items():
         command_parser: Parser = commands.add_parser(name, help=command.SUMMARY, description=command.SUMMARY)
         if name in arguments:
             command_parser.set_defaults(backend="auto")

@@ -18,7 +18,6 @@ import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image as PillowImage
 from PIL import UnidentifiedImageError
-from scipy.ndimage import map_coordinates
 
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
@@ -242,6 +241,8 @@ class Resampling:
 
     def linear(self, picture: np.ndarray) -> np.ndarray:
         """`picture` [H, W] or [H, W, C] resampled bilinearly, float32; 0 outside."""
+        from scipy.ndimage import map_coordinates  # a quarter of a second, that most who read pictures need not wait
+
         if picture.ndim == 3:
             return np.stack([self.linear(picture[..., k]) for k in range(picture.shape[2])], axis=-1)
         places = [self._rows, self._columns]

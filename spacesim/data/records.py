@@ -163,13 +163,13 @@ class Frame:
     """One view. Paths are relative to the dataset's root; truth that is not there is None."""
 
     file_path: str  #: the image
-    camera: Camera
-    sun: Sun | None = None
-    gt_path: str | None = None
-    shadow_path: str | None = None
-    silhouette_path: str | None = None
-    id_path: str | None = None
-    depth_file_path: str | None = None
+    camera: Camera  #: of the image without its distortion
+    sun: Sun | None = None  #: None where nobody told it
+    gt_path: str | None = None  #: EXR of all that `Truth` has
+    shadow_path: str | None = None  #: PNG of shadow classes: see `spacesim.data.store.SHADOW_*`
+    silhouette_path: str | None = None  #: PNG, 255 where an object is
+    id_path: str | None = None  #: PNG, 1 for the first object, 0 none
+    depth_file_path: str | None = None  #: depth along the optical axis, as Nerfstudio has it
     mask_path: str | None = None  #: 0 = ignore this pixel
     time: float | None = None  #: when it was taken, in any unit: pictures of one film
     distortion: tuple[float, ...] = ()  #: Brown-Conrady k1, k2, p1, p2, k3 of the stored image; () for none
@@ -179,15 +179,14 @@ class Frame:
 class Dataset:
     """A folder of frames: `root` and what transforms.json says."""
 
-    root: Path
-    train: tuple[Frame, ...]
-    test: tuple[Frame, ...]
+    root: Path  #: the folder
+    train: tuple[Frame, ...]  #: for training
+    test: tuple[Frame, ...]  #: for evaluation
     ply_file_path: str | None = None  #: points to start from
     mesh_path: str | None = None  #: the ground-truth mesh, world frame, metres
     scene: Mapping[str, Any] = field(default_factory=dict)  #: scene.json, {} for data from elsewhere
-    missing: tuple[
-        str, ...
-    ] = ()  #: images that transforms.json names and that are not there: their frames are left out
+    #: images that transforms.json names and that are not there: their frames are left out
+    missing: tuple[str, ...] = ()
 
     @property
     def frames(self) -> tuple[Frame, ...]:

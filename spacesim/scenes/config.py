@@ -114,16 +114,16 @@ class QualityConfig:
 class SceneConfig:
     """All of a scene."""
 
-    name: str
-    objects: tuple[ObjectConfig, ...]
+    name: str  #: of the scene
+    objects: tuple[ObjectConfig, ...]  #: at least one
     seed: int = 0  #: of view lattices, noise and points
-    materials: Mapping[str, MaterialConfig] = field(default_factory=dict)
-    sun: SunConfig = field(default_factory=SunConfig)
-    earth: EarthConfig | None = None
+    materials: Mapping[str, MaterialConfig] = field(default_factory=dict)  #: by name, beside those of the table
+    sun: SunConfig = field(default_factory=SunConfig)  #: its size and brightness
+    earth: EarthConfig | None = None  #: lights the scene; none: the Sun alone
     background: BackgroundConfig | None = None  #: drawn behind the objects; none: pictures have alpha
-    rig: RigConfig = field(default_factory=FibonacciRig)
-    camera: CameraConfig = field(default_factory=CameraConfig)
-    quality: QualityConfig = field(default_factory=QualityConfig)
+    rig: RigConfig = field(default_factory=FibonacciRig)  #: where cameras and Suns stand
+    camera: CameraConfig = field(default_factory=CameraConfig)  #: that takes the pictures
+    quality: QualityConfig = field(default_factory=QualityConfig)  #: samples and points
     folder: Path | None = field(default=None, compare=False)  #: where relative paths of meshes begin
 
     def __post_init__(self) -> None:

@@ -213,12 +213,11 @@ class Run:
     path: Path  #: the folder
     config: dict[str, Any]  #: what config.json says
     training: dict[str, Any]  #: what training.json says, see docs/reference/runs.md
-    gaussians: Gaussians
+    gaussians: Gaussians  #: the model
     model_bytes: int  #: size of the model's file
     light: LightModel | None = None  #: None of a method without light
-    embedding: np.ndarray | None = (
-        None  #: [E] of every view, None: the mean of the training pictures', if they have any
-    )
+    #: [E] of every view, None: the mean of the training pictures', if they have any
+    embedding: np.ndarray | None = None
 
     @property
     def gaussian_count(self) -> int:

@@ -156,21 +156,59 @@ def verdict(answer: dict[str, Any]) -> str | None:
 # ---- damaged inputs and command lines ----
 
 
+Listing = dict[str, tuple[int, int, int]]
+"""Of all below a folder, by its path in it: size of what is a file or leads to one, kind and permissions, inode."""
+
+
 @dataclass(frozen=True)
 class Trial:
-    """One damaged input. words: the command;  what: in words, how to make it again"""
+    """One damaged input. words: the command;  what: in words, how to make it again;  path: what is damaged, or None"""
 
     folder: Path
     words: tuple[str, ...]
     what: str
+    path: Path | None = None
 
 
-def prepared(root: Path, place: Path, seed: int, number: int) -> Trial:
-    """Damage a copy of the corpus as (seed, number) say."""
-    rng = random.Random(f"{seed}/{number}")
-    folder = corpus.linked_copy(root, place / "in")
+class Copy:
+    """A copy of the corpus in which one file after the other is damaged and mended again. It is made anew where a
+    command has changed what is in it."""
+
+    def __init__(self, root: Path, folder: Path) -> None:
+        self.root, self.folder = root, folder
+        self._honest: Listing = {}
+
+    def restored(self) -> Path:
+        """The folder, with nothing damaged."""
+        if not self._honest:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            self._honest = _listing(corpus.linked_copy(self.root, self.folder))
+        return self.folder
+
+    def strange(self, trial: Trial) -> list[str]:
+        """What lies there after a trial and did not before, the damage aside. Mends the damage."""
+        name = str(trial.path.relative_to(self.folder)) if trial.path else ""
+        before, after = dict(self._honest), _listing(self.folder)
+        if trial.path:
+            before[name] = after.pop(name, before[name])
+            after[name] = before[name]
+        if trial.path and after == before:
+            _remove(trial.path)
+            os.link(self.root / name, trial.path)
+        elif after != before:
+            self._honest = {}
+        return sorted(name for name, found in after.items() if before.get(name, (0, 0, 0))[:2] != found[:2])
+
+
+def _remove(path: Path) -> None:
+    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
+
+
+def prepared(copy: Copy, out: Path, seed: int, number: int) -> Trial:
+    """Damage the copy as (seed, number) say. out: a new folder for what the command writes"""
+    rng, folder = random.Random(f"{seed}/{number}"), copy.restored()
     if rng.random() < 0.15:
-        return _named(folder, place, corpus.command_line(rng), f"{number} command line")
+        return _named(folder, out, corpus.command_line(rng), f"{number} command line")
     kind = rng.choice(corpus.KINDS)
     at = rng.randrange(len(kind.files))
     path = folder / kind.files[at]
@@ -183,7 +221,7 @@ def prepared(root: Path, place: Path, seed: int, number: int) -> Trial:
         data = path.read_bytes()
         path.unlink()
         path.write_bytes(_damaged(rng, way, data))
-    return _named(folder, place, list(words), f"{number} {kind.name}: {path.relative_to(folder)} {how}")
+    return _named(folder, out, list(words), f"{number} {kind.name}: {path.relative_to(folder)} {how}", path)
 
 
 def _damaged(rng: random.Random, way: mutations.Mutation, data: bytes) -> bytes:
@@ -219,10 +257,10 @@ def _special(rng: random.Random, path: Path) -> str:
     return f"as {kind}"
 
 
-def _named(folder: Path, place: Path, words: list[str], what: str) -> Trial:
-    out = str(place / "out" / "x")
-    named = tuple(word.replace("{out}", out) for word in words)
-    return Trial(folder, named, f"{what} | {' '.join(word.replace(str(place), '.') for word in named)}")
+def _named(folder: Path, out: Path, words: list[str], what: str, path: Path | None = None) -> Trial:
+    named = tuple(word.replace("{out}", str(out / "x")) for word in words)
+    told = " ".join(word.replace(str(out.parent), ".") for word in named)
+    return Trial(folder, named, f"{what} | {told}", path)
 
 
 def _is_quick(words: Sequence[str]) -> bool:
@@ -242,10 +280,10 @@ def attack_inputs(root: Path, work: Path, seed: int, count: int, processes: int 
     def attacked(worker_number: int) -> Iterator[str | None]:
         place = work / f"worker{worker_number}"
         corpus.linked_copy(root, place / "honest")
-        worker = Worker(place / "honest", WARM_UP)
+        worker, copy = Worker(place / "honest", WARM_UP), Copy(root, place / "in")
         try:
             for number in range(worker_number, count, processes):
-                yield one_trial(root, place / "trial", worker, seed, number)
+                yield one_trial(copy, place / "out", worker, seed, number)
         finally:
             worker.stop()
 
@@ -260,20 +298,18 @@ def attack_inputs(root: Path, work: Path, seed: int, count: int, processes: int 
     return tally
 
 
-def one_trial(root: Path, place: Path, worker: Worker, seed: int, number: int) -> str | None:
-    """A find, or None."""
-    place.mkdir(parents=True)
-    (place / "out").mkdir()
+def one_trial(copy: Copy, out: Path, worker: Worker, seed: int, number: int) -> str | None:
+    """A find, or None. out: a folder that is there for the trial alone"""
+    out.mkdir()
     try:
-        trial = prepared(root, place, seed, number)
-        inputs = _listing(trial.folder)
+        trial = prepared(copy, out, seed, number)
         wrong = verdict(worker.run(trial.words, trial.folder))
-        strange = _listing(trial.folder) - inputs if not _writes_here(trial.words) else set()
-        if wrong is None and strange:
-            wrong = f"a write outside of the output: {sorted(strange)[0]}"
+        strange = copy.strange(trial)
+        if wrong is None and strange and not _writes_here(trial.words):
+            wrong = f"a write outside of the output: {strange[0]}"
         return None if wrong is None else f"{trial.what} -> {wrong}"
     finally:
-        shutil.rmtree(place, ignore_errors=True)
+        shutil.rmtree(out, ignore_errors=True)
 
 
 def _writes_here(words: Sequence[str]) -> bool:
@@ -286,15 +322,19 @@ def _writes_here(words: Sequence[str]) -> bool:
     return any(not os.path.isabs(name) for name in named)
 
 
-def _listing(folder: Path) -> set[tuple[str, int, int]]:
-    """Of all below a folder: path, size of what is a file or leads to one, kind and permissions."""
-    found = set()
-    for place, folders, files in os.walk(folder):
-        for name in (*folders, *files):
-            path = os.path.join(place, name)
-            told = os.lstat(path)
-            size = told.st_size if os.path.isfile(path) else 0
-            found.add((os.path.relpath(path, folder), size, told.st_mode))
+def _listing(folder: Path) -> Listing:
+    found: Listing = {}
+
+    def visit(place: str, above: str) -> None:
+        with os.scandir(place) as entries:
+            for entry in entries:
+                told = entry.stat(follow_symlinks=False)
+                size = told.st_size if os.path.isfile(entry.path) else 0
+                found[above + entry.name] = (size, told.st_mode, told.st_ino)
+                if entry.is_dir(follow_symlinks=False):
+                    visit(entry.path, f"{above}{entry.name}/")
+
+    visit(str(folder), "")
     return found
 
 

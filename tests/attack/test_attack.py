@@ -1,11 +1,15 @@
 """The attack at its smallest: nothing is found. And it would find what it looks for."""
 
+import re
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import attack
 import corpus
 import pytest
 from attack import Worker, attack_bits, attack_inputs, attack_kills, verdict
+from tiny import contents
 
 SEED = 20261122
 
@@ -60,6 +64,18 @@ cli.main = main
 """
 
 
+@pytest.fixture(scope="module")
+def weak(tmp_path_factory) -> Iterator[Worker]:
+    """A worker whose program fails in each of WAYS."""
+    folder = tmp_path_factory.mktemp("weak")
+    (folder / "sitecustomize.py").write_text(WEAK)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(attack.ENVIRONMENT, "PYTHONPATH", f"{folder}:{attack.ENVIRONMENT['PYTHONPATH']}")
+        worker = Worker(folder, [["doctor"]], headroom=1 << 30)
+        yield worker
+        worker.stop()
+
+
 @pytest.mark.parametrize(
     ("way", "words"),
     [
@@ -72,20 +88,15 @@ cli.main = main
         ("runtime", "unexplained: .*of no known reason"),
     ],
 )
-def test_it_finds(tmp_path, monkeypatch, way, words):
-    (tmp_path / "sitecustomize.py").write_text(WEAK)
-    path = attack.ENVIRONMENT["PYTHONPATH"]
-    monkeypatch.setitem(attack.ENVIRONMENT, "PYTHONPATH", f"{tmp_path}:{path}")
-    worker = Worker(tmp_path, [["doctor"]], headroom=1 << 30)
-    assert verdict(worker.run(["doctor"], tmp_path)) is None
+def test_it_finds(weak, tmp_path, monkeypatch, way, words):
+    assert verdict(weak.run(["doctor"], tmp_path)) is None
     if way == "sleep":
         monkeypatch.setattr(attack, "PATIENCE", 3.0)
-    found = verdict(worker.run([way], tmp_path))
+    found = verdict(weak.run([way], tmp_path))
     monkeypatch.setattr(attack, "PATIENCE", 60.0)
-    assert verdict(worker.run(["doctor"], tmp_path)) is None, "it is started anew"
-    worker.stop()
+    assert verdict(weak.run(["doctor"], tmp_path)) is None, "it is started anew"
     assert found is not None
-    assert pytest.importorskip("re").search(words, found), found
+    assert re.search(words, found), found
 
 
 @pytest.mark.parametrize(
@@ -125,7 +136,7 @@ def test_it_finds_what_a_kill_has_spoilt(root, tmp_path, monkeypatch):
 
 
 def test_it_finds_writes_outside_of_the_output(root, tmp_path, monkeypatch):
-    place = tmp_path / "place"
+    copy = attack.Copy(root, tmp_path / "in")
 
     class Writing:
         def run(self, words, folder):
@@ -133,5 +144,26 @@ def test_it_finds_writes_outside_of_the_output(root, tmp_path, monkeypatch):
             return {"code": 0, "errors": ""}
 
     monkeypatch.setattr(corpus, "command_line", lambda rng: ["doctor"])
-    finds = [attack.one_trial(root, place, Writing(), SEED, number) for number in range(5)]  # type: ignore[arg-type]
-    assert all(find is not None and "a write outside of the output: ('data/images/new.png'" in find for find in finds)
+    finds = [attack.one_trial(copy, tmp_path / "out", Writing(), SEED, n) for n in range(5)]  # type: ignore[arg-type]
+    assert all(find is not None and "a write outside of the output: data/images/new.png" in find for find in finds)
+
+
+def test_a_copy_is_mended_after_each_trial(root, tmp_path):
+    """Whatever was damaged, and whatever a command left, replaced or took away."""
+    copy, honest = attack.Copy(root, tmp_path / "in"), contents(root)
+
+    def replace(folder):
+        path = folder / "camera.json"
+        data = bytes(reversed(path.read_bytes()))
+        path.unlink()
+        path.write_bytes(data)  # of the same size
+
+    deeds = (lambda folder: None, lambda folder: (folder / "run/new").touch(), replace)
+    deeds += (lambda folder: (folder / "boat.obj").unlink(), lambda folder: shutil.rmtree(folder / "run"))
+    for number in range(60):
+        trial = attack.prepared(copy, tmp_path / "out", SEED, number)
+        deeds[number % len(deeds)](trial.folder)
+        strange = copy.strange(trial)
+        assert ("run/new" in strange) == (number % len(deeds) == 1)
+        assert contents(copy.restored()) == honest
+    assert contents(root) == honest

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image as PillowImage
+from tiny import contents
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import fibonacci_sphere, look_at
@@ -86,10 +87,6 @@ def write_dataset(root, resume=False, frames=None):
             writer.write_frame(name, *make_frame(seed))
     frames = frames or make_frames(TRAIN + TEST)
     return writer.finish(frames[:2], frames[2:], POINTS, COLORS, trimesh.creation.box())
-
-
-def contents(root):
-    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
 @pytest.fixture
@@ -214,7 +211,7 @@ def test_resume_completes_what_was_left(root, tmp_path):
 def test_a_killed_writer_leaves_whole_frames_only(tmp_path):
     program = f"""
         import sys
-        sys.path.insert(0, {str(os.path.dirname(__file__))!r})
+        sys.path[:0] = {[os.path.dirname(__file__), *sys.path]!r}
         from pathlib import Path
         from test_store import SCENE, DatasetWriter, make_frame
         writer = DatasetWriter(Path({str(tmp_path / "data")!r}), SCENE)

@@ -103,10 +103,10 @@ class PosedScene:
     composition: Composition  #: runs with their poses
     sun: Sun | None = None  #: None where it names none
     camera: Camera | None = None  #: None where it names none
-    keyframes: Sequence[Keyframe] = ()
-    orbit: Orbit | None = None
+    keyframes: Sequence[Keyframe] = ()  #: of camera, Sun and models, by time
+    orbit: Orbit | None = None  #: on which the camera flies
     frames: int = 1  #: pictures, 1 / fps seconds apart
-    fps: float = FPS
+    fps: float = FPS  #: pictures a second
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "keyframes", tuple(sorted(self.keyframes, key=lambda key: key.time)))

@@ -7,7 +7,6 @@ from functools import lru_cache
 
 import drjit as dr
 import numpy as np
-from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Bool, Float
@@ -90,6 +89,10 @@ class WarmStartConfig:
 def foreground(view: TrainingView, config: WarmStartConfig) -> np.ndarray:
     """[H, W] bool: where the picture shows the object. By alpha; of a picture without transparency, or of all without
     `alpha_mask`, by luminance over black, dilated (5.23, 5.24). Pixels that are to be ignored show nothing."""
+    from scipy.ndimage import (
+        binary_dilation,
+    )  # a quarter of a second, that other trainings need not wait
+
     bytes_ = view.rgba.view(np.uint8).reshape(view.camera.height, view.camera.width, 4)
     if view.opaque or not config.alpha_mask:
         straight, alpha = bytes_[..., :3] / np.float32(255), bytes_[..., 3:] / np.float32(255)
@@ -111,6 +114,8 @@ def distance_image(mask: np.ndarray, config: WarmStartConfig, valid: np.ndarray 
     """[h, w] float32, a pixel for each `downsampling`^2 of the mask: distance to the nearest of them that shows
     foreground, as a share of `reach` times the picture's smaller side (5.26). 0 where there is no foreground.
     Negative where no pixel counts by `valid` [H, W]: what is unknown is not empty, and pulls nothing away."""
+    from scipy.ndimage import distance_transform_edt
+
     step = config.downsampling
 
     def is_any(pixels: np.ndarray) -> np.ndarray:

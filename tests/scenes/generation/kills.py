@@ -12,6 +12,9 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from tiny import contents
+
 SCENE = ("boxsat", "--views", "400", "--test-views", "40", "--resolution", "32", "--spp", "4", "--seed", "1")
 
 
@@ -42,10 +45,6 @@ def killed(out: Path, kills: int, workers: int, seed: int = 0) -> list[int]:
 
 def count(out: Path) -> int:
     return len(list(out.glob("gt/*.exr")))
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 def main() -> None:
