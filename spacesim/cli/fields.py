@@ -77,7 +77,7 @@ def type_words(hint: Any) -> str:
     return " | ".join([*words, *(["none"] if NoneType in inner else [])])
 
 
-def listing(config: TrainConfig) -> str:
+def listing(config: Any) -> str:
     """A line for each field of a configuration: key, default, type, meaning."""
     rows = list(fields_of(config))
     key, default = max(len(row.key) for row in rows), max(len(row.default) for row in rows)

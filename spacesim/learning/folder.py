@@ -37,6 +37,21 @@ class TrainingData:
     test_frames: int | None = None
 
 
+@dataclass(frozen=True)
+class TrainingProgress:
+    """What a training loop tells of itself now and then."""
+
+    iteration: int
+    iterations: int
+    loss: float
+    gaussian_count: int | None = None  #: None of a radiance field
+
+    @property
+    def words(self) -> str:
+        """For a bar or a line."""
+        return f"loss {self.loss:.4f}" + ("" if self.gaussian_count is None else f", {self.gaussian_count} Gaussians")
+
+
 def check_folder(out: Path, described: dict[str, Any], resume: bool, read_config: ReadConfig) -> None:
     """Raises InputError where a run that is so described cannot be written to `out`, or completed in it. read_config:
     of the method"""

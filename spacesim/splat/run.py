@@ -56,7 +56,8 @@ class Part(Protocol):
 
 
 class Predictor(Protocol):
-    """What evaluating, sweeping and showing ask for: a trained `Run`, or several in one scene (`ComposedRun`)."""
+    """What evaluating, sweeping and showing ask for: a trained `Run`, or several in one scene (`ComposedRun`),
+    or a radiance field (`nerf.run.NerfRun`)."""
 
     @property
     def path(self) -> Path:
@@ -71,12 +72,12 @@ class Predictor(Protocol):
         """How training went, see `TrainingRecord`; {} of a scene."""
 
     @property
-    def gaussians(self) -> Gaussians:
-        """All Gaussians, in the world's axes."""
+    def gaussians(self) -> Gaussians | None:
+        """All Gaussians, in the world's axes; None of a radiance field."""
 
     @property
-    def gaussian_count(self) -> int:
-        """Number of Gaussians."""
+    def gaussian_count(self) -> int | None:
+        """Number of Gaussians; None of a radiance field."""
 
     @property
     def model_bytes(self) -> int:

@@ -15,6 +15,7 @@ from spacesim.data.tone import tone_and_exposure
 from spacesim.learning.cameras import farthest_camera, focus_point
 from spacesim.learning.folder import (
     TrainingClock,
+    TrainingProgress,
     check_folder,
     checkpoints,
     describe_data,
@@ -27,7 +28,7 @@ from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.pictures.suns import FirstSuns, check_pictures, first_suns, shape_config, surface_points
 from spacesim.splat.train.start import distance_warning, scale_warning
-from spacesim.splat.train.trainer import Trainer, TrainingProgress
+from spacesim.splat.train.trainer import Trainer
 
 log = logging.getLogger(__name__)
 

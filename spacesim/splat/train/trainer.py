@@ -6,7 +6,7 @@ A step takes one view or several forward and backward (`view_pass`), moves all p
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from spacesim.data.structure import Rules, structure
 from spacesim.data.toml import Document
 from spacesim.learning.adam import NetworkAdam
 from spacesim.learning.cameras import farthest_camera, focus_point, nearest_camera
+from spacesim.learning.folder import TrainingProgress
 from spacesim.splat.light.bounce import ALBEDO
 from spacesim.splat.light.model import LightModel, TrainingFrame, is_near, robust_radius
 from spacesim.splat.raster.gaussians import Gaussians
@@ -41,16 +42,6 @@ from spacesim.splat.train.views import TrainingView, TrainingViews
 from spacesim.splat.train.warm_start import Attraction, WarmStart
 
 HISTORY_EVERY = 50  #: iterations between two entries of the history
-
-
-@dataclass(frozen=True)
-class TrainingProgress:
-    """What a training loop tells of itself now and then."""
-
-    iteration: int
-    iterations: int
-    loss: float
-    gaussian_count: int
 
 
 class Trainer:
