@@ -15,7 +15,7 @@ from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
 from spacesim.data.store import load_truth
 from spacesim.data.transforms import read_dataset
-from spacesim.methods import load_predictor, load_run, preset
+from spacesim.methods import load_predictor, load_run, load_scene, preset
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.run import NerfRun
 from spacesim.scenes import SceneConfig, read_scene
@@ -23,7 +23,6 @@ from spacesim.scenes import generate as _generate
 from spacesim.splat.compose import PosedScene
 from spacesim.splat.compose.output import Composed
 from spacesim.splat.compose.output import compose as _compose
-from spacesim.splat.compose.scenefile import load_scene
 from spacesim.splat.fit import estimate_sun
 from spacesim.splat.pose import RefinedPose, refine_pose
 from spacesim.splat.raster.cameras import Pinhole

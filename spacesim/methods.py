@@ -19,6 +19,7 @@ from spacesim.splat.train.config import TrainConfig
 if TYPE_CHECKING:
     from spacesim.learning.folder import TrainingProgress
     from spacesim.nerf.run import NerfRun
+    from spacesim.splat.compose.path import PosedScene
     from spacesim.splat.run import Predictor, Run
 
 METHODS = (*splat.METHODS, *nerf.METHODS)
@@ -83,10 +84,34 @@ def load_run(path: str | Path) -> "Run | NerfRun":
     return load_splats(path)
 
 
+def load_scene(path: str | Path) -> "PosedScene":
+    """The scene that a TOML file describes, of Gaussians or of radiance fields. Raises InputError with file, line and
+    key, and where it has both."""
+    from spacesim.splat.compose.scenefile import load_scene as load
+
+    return load(path, load_run, _compose)
+
+
 def load_predictor(path: Path) -> "Predictor":
     """The run in a folder, or the scene of a TOML file at its beginning. Raises InputError where there is neither."""
     if path.suffix != ".toml":
         return load_run(path)
-    from spacesim.splat.compose import load_predictor as load_composed
+    from spacesim.splat.compose import ComposedRun
+    from spacesim.splat.compose.scene import Composition
 
-    return load_composed(path)
+    composition = load_scene(path).posed_at(0.0)
+    if not isinstance(composition, Composition):
+        raise InputError(f"{path}: expected a run, or a scene of Gaussians, found a scene of radiance fields")
+    return ComposedRun(composition, path)
+
+
+def _compose(models: Sequence[Any], config: Any, path: Path) -> Any:
+    """What draws posed runs of one family."""
+    from spacesim.nerf.compose import Composition as Fields
+    from spacesim.nerf.run import NerfRun
+    from spacesim.splat.compose.scene import Composition
+
+    fields = [isinstance(model.run, NerfRun) for model in models]
+    if any(fields) and not all(fields):
+        raise InputError(f"{path}: expected runs of Gaussians, or of radiance fields, found both in one scene")
+    return Fields(models, config, path) if all(fields) else Composition(models, config, path)

@@ -27,6 +27,16 @@ class Prediction:
     normal: np.ndarray | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class ComposedPrediction(Prediction):
+    """A view of a scene. visibility: of models without shadows of their own 1 where no other model is before the
+    Sun."""
+
+    #: [H, W] int32, number of the object with the largest share of the pixel, counted from 1 in the order of the
+    #: models; 0 where less than half of the pixel is covered
+    id: np.ndarray | None = None
+
+
 class Predicts(Protocol):
     """What predicts views: a run of any method."""
 
