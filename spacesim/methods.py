@@ -63,7 +63,7 @@ def train(
 ) -> "Run | NerfRun":
     """Train with the family's own `train`."""
     if isinstance(config, NerfConfig):
-        from spacesim.nerf.train import train as train_field
+        from spacesim.nerf.train.train import train as train_field
 
         return train_field(dataset, out, config, resume, on_progress, command)
     from spacesim.splat.train.train import train as train_splats

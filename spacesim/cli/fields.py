@@ -88,10 +88,11 @@ def listing(config: Any) -> str:
     return "\n".join(lines)
 
 
-def reference() -> str:
-    """Markdown: a table for each record, with the defaults of the record itself, and where it is found."""
+def reference(config: Any = TrainConfig) -> str:
+    """Markdown: a table for each record of a configuration, with the defaults of the record itself, and where it is
+    found."""
     parts = []
-    for cls, places in _records(TrainConfig).items():
+    for cls, places in _records(config).items():
         where = ", ".join(f"`{place}`" for place in places if place)
         kind = f" (`{kind_of(cls)}`)" if kind_of(cls) else ""
         lead = " ".join((inspect.getdoc(cls) or "").split("\n\n")[0].split())

@@ -30,12 +30,12 @@ from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
 from spacesim.learning.prediction import ComposedPrediction, check_picture
 from spacesim.nerf.draw import Samples, sample_field, shown, unit_normals
-from spacesim.nerf.field import Parameters
-from spacesim.nerf.model import Networks
-from spacesim.nerf.rays import Rays, camera_rows, pixel_rays
-from spacesim.nerf.render import sum_rays, volume_weights
+from spacesim.nerf.fields.field import Parameters
+from spacesim.nerf.fields.model import Networks
 from spacesim.nerf.run import NerfRun
-from spacesim.nerf.sampler import count_below
+from spacesim.nerf.sampling.rays import Rays, camera_rows, pixel_rays
+from spacesim.nerf.sampling.render import sum_rays, volume_weights
+from spacesim.nerf.sampling.sampler import count_below
 
 COVERED = 0.5  #: alpha from which on a pixel shows a model
 SHADOWS = ("trained", "none")  #: of models on each other, as scene files have it: fields know none

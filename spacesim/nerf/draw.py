@@ -9,11 +9,11 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.records import Camera
-from spacesim.nerf.box import SceneBox
-from spacesim.nerf.field import Parameters
-from spacesim.nerf.model import Networks, places
-from spacesim.nerf.rays import Rays, camera_rows, pixel_rays
-from spacesim.nerf.render import Weights, expected_depth, median_depth, sum_rays, volume_weights
+from spacesim.nerf.fields.field import Parameters
+from spacesim.nerf.fields.model import Networks, places
+from spacesim.nerf.sampling.box import SceneBox
+from spacesim.nerf.sampling.rays import Rays, camera_rows, pixel_rays
+from spacesim.nerf.sampling.render import Weights, expected_depth, median_depth, sum_rays, volume_weights
 
 PLANES = {"rgb": 3, "alpha": 1, "depth": 1, "median_depth": 1, "normal": 3}
 """Of a picture, in this order: colours over black, opacity, depths (sides of the box, along the ray), and the sum of

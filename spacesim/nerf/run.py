@@ -26,12 +26,12 @@ from spacesim.data.toml import Document
 from spacesim.learning.folder import TrainingData
 from spacesim.learning.prediction import Prediction, Rendering, check_picture
 from spacesim.learning.tensors import read_tensors
-from spacesim.nerf.box import SceneBox
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.draw import draw
-from spacesim.nerf.field import Parameters
-from spacesim.nerf.model import Networks
-from spacesim.nerf.trainer import FORMAT, HistoryEntry, box_of
+from spacesim.nerf.fields.field import Parameters
+from spacesim.nerf.fields.model import Networks
+from spacesim.nerf.sampling.box import SceneBox
+from spacesim.nerf.train.trainer import FORMAT, HistoryEntry, box_of
 
 OPAQUE = 0.5  #: alpha from which on a pixel shows a surface
 

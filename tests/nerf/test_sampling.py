@@ -1,13 +1,13 @@
 """Sampling against its twin; unbiased; the same numbers whatever computes them."""
 
 import drjit as dr
+import nerf_twin as twin
 import numpy as np
 import pytest
-import twin
 
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
-from spacesim.nerf import sampler
+from spacesim.nerf.sampling import sampler
 
 
 def key(number: int = 7):

@@ -1,14 +1,14 @@
 """Volume rendering and losses against their twins, closed forms and finite differences."""
 
 import drjit as dr
+import nerf_twin as twin
 import numpy as np
 import pytest
-import twin
 
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
-from spacesim.nerf import losses, render, sampler
-from spacesim.nerf.rays import Rays, box_interval
+from spacesim.nerf.sampling import losses, render, sampler
+from spacesim.nerf.sampling.rays import Rays, box_interval
 
 RAYS, SAMPLES = 30, 13
 

@@ -15,7 +15,7 @@ from spacesim.backend.arrays import Array3f, Float, TensorXf
 from spacesim.learning import mlp
 from spacesim.learning.mlp import MlpShape, round_up_rows, sigmoid
 from spacesim.nerf.config import CHUNK, GridConfig, NerfConfig
-from spacesim.nerf.hashgrid import HashGrid
+from spacesim.nerf.fields.hashgrid import HashGrid
 
 MAX_LOG_DENSITY = 12.0  #: e^12 a side: opaque within a hundred-thousandth of it
 

@@ -12,11 +12,11 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.nerf.config import NerfConfig
-from spacesim.nerf.field import DensityField, DensityTape, Field, Parameters
-from spacesim.nerf.occupancy import Occupancy
-from spacesim.nerf.rays import Rays
-from spacesim.nerf.render import Weights, volume_weights
-from spacesim.nerf.sampler import intervals, random, resample, uniform_edges
+from spacesim.nerf.fields.field import DensityField, DensityTape, Field, Parameters
+from spacesim.nerf.sampling.occupancy import Occupancy
+from spacesim.nerf.sampling.rays import Rays
+from spacesim.nerf.sampling.render import Weights, volume_weights
+from spacesim.nerf.sampling.sampler import intervals, random, resample, uniform_edges
 
 
 @dataclass

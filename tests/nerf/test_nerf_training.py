@@ -16,11 +16,12 @@ from spacesim.data.records import Dataset
 from spacesim.data.store import read_dataset
 from spacesim.learning.tensors import read_tensors, write_tensors
 from spacesim.methods import load_predictor
-from spacesim.nerf.box import scene_box
 from spacesim.nerf.config import GridConfig, NerfConfig, ProposalConfig, preset, with_settings
 from spacesim.nerf.run import NerfRun, load_run
-from spacesim.nerf.train import train
-from spacesim.nerf.trainer import FORMAT, Trainer
+from spacesim.nerf.sampling.box import scene_box
+from spacesim.nerf.train.train import train
+from spacesim.nerf.train.trainer import FORMAT, Trainer
+from spacesim.viewer.load import _scene as scene_to_view
 
 GRID = GridConfig(4, 8, 48, 12)
 CONFIG = NerfConfig(
@@ -88,7 +89,7 @@ import os, signal
 from pathlib import Path
 from spacesim.data.store import read_dataset
 from spacesim.nerf.config import NerfConfig
-from spacesim.nerf.train import train
+from spacesim.nerf.train.train import train
 config = NerfConfig.from_json({CONFIG.to_json()!r})
 def die(progress):
     if progress.iteration == 150:
@@ -224,6 +225,10 @@ def test_the_commands(spacesim, tiny_data, tmp_path):
     assert read_png(tmp_path / "rgb.png").shape == (40, 40, 4)
     done = spacesim("render", run, "--kind", "shadow", "--out", tmp_path / "no.png")
     assert (done.code, "predicts none" in done.errors[0]) == (2, True)
+    done = spacesim("sweep", run, "--out", tmp_path / "sweep")
+    assert (done.code, "expected a run that the Sun relights" in done.errors[0]) == (2, True)
+    with pytest.raises(InputError, match="found a radiance field; `spacesim render` draws it"):
+        scene_to_view(run)
     done = spacesim("export", run, "--ply", tmp_path / "no.ply")
     assert (done.code, "a radiance field; --mesh takes it" in done.errors[0]) == (2, True)
     done = spacesim("export", run, "--mesh", tmp_path / "mesh.ply", "--views", 6, "--voxel", 0.2)

@@ -3,21 +3,21 @@
 from dataclasses import replace
 
 import drjit as dr
+import nerf_twin as twin
 import numpy as np
 import pytest
-import twin
 
 from spacesim.backend import ad
 from spacesim.backend.upload import upload, upload_rows
 from spacesim.nerf.config import CHUNK, GridConfig, NerfConfig, ProposalConfig
-from spacesim.nerf.field import DensityField, Field
-from spacesim.nerf.hashgrid import PRIMES, HashGrid
-from spacesim.nerf.model import Networks
-from spacesim.nerf.occupancy import Occupancy
-from spacesim.nerf.pixels import Pixels
-from spacesim.nerf.rays import Rays
-from spacesim.nerf.sampler import step_key
-from spacesim.nerf.step import StepNumbers, loss_and_gradients
+from spacesim.nerf.fields.field import DensityField, Field
+from spacesim.nerf.fields.hashgrid import PRIMES, HashGrid
+from spacesim.nerf.fields.model import Networks
+from spacesim.nerf.sampling.occupancy import Occupancy
+from spacesim.nerf.sampling.rays import Rays
+from spacesim.nerf.sampling.sampler import step_key
+from spacesim.nerf.train.pixels import Pixels
+from spacesim.nerf.train.step import StepNumbers, loss_and_gradients
 
 GRID = GridConfig(levels=3, coarsest=3, finest=20, log2_size=8)
 TINY = NerfConfig(

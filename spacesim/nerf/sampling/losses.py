@@ -4,8 +4,8 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float
-from spacesim.nerf.render import spread, sum_rays
-from spacesim.nerf.sampler import count_below, intervals
+from spacesim.nerf.sampling.render import spread, sum_rays
+from spacesim.nerf.sampling.sampler import count_below, intervals
 
 EPSILON = 1e-5  #: to which the interlevel loss compares weights
 

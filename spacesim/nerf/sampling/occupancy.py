@@ -7,8 +7,8 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float, UInt32
-from spacesim.nerf.rays import Rays
-from spacesim.nerf.sampler import random
+from spacesim.nerf.sampling.rays import Rays
+from spacesim.nerf.sampling.sampler import random
 
 DECAY = 0.9  #: of a cell's density from one look at it to the next (Müller et al. 2022 take 0.95, of more looks)
 FILLED = 0.01  #: alpha of a cell's width from which on it is filled

@@ -14,7 +14,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float, UInt32
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
-from spacesim.nerf.box import SceneBox
+from spacesim.nerf.sampling.box import SceneBox
 
 NUMBERS = 16  #: of a camera in `camera_rows`
 PARALLEL = 1e-9  #: a direction's coordinate below which it counts as this

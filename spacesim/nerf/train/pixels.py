@@ -14,8 +14,8 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset
-from spacesim.nerf.box import SceneBox
-from spacesim.nerf.rays import camera_rows
+from spacesim.nerf.sampling.box import SceneBox
+from spacesim.nerf.sampling.rays import camera_rows
 
 A_PIXEL = 12  #: bytes on the device
 

@@ -8,13 +8,13 @@ import drjit as dr
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float, UInt32
 from spacesim.learning.adam import adam_step
-from spacesim.nerf.field import Parameters
-from spacesim.nerf.losses import distortion, interlevel
-from spacesim.nerf.model import Networks, places
-from spacesim.nerf.pixels import Pixels
-from spacesim.nerf.rays import pixel_rays
-from spacesim.nerf.render import spread, sum_rays, volume_weights, weights_adjoint
-from spacesim.nerf.sampler import random, random_below
+from spacesim.nerf.fields.field import Parameters
+from spacesim.nerf.fields.model import Networks, places
+from spacesim.nerf.sampling.losses import distortion, interlevel
+from spacesim.nerf.sampling.rays import pixel_rays
+from spacesim.nerf.sampling.render import spread, sum_rays, volume_weights, weights_adjoint
+from spacesim.nerf.sampling.sampler import random, random_below
+from spacesim.nerf.train.pixels import Pixels
 
 RAY, BACKGROUND = 8, 9  #: streams of random numbers
 

@@ -24,7 +24,7 @@ from spacesim.learning.folder import (
 from spacesim.learning.tensors import write_tensors
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.run import NerfRun, load_run, read_config
-from spacesim.nerf.trainer import FORMAT, Trainer
+from spacesim.nerf.train.trainer import FORMAT, Trainer
 
 log = logging.getLogger(__name__)
 

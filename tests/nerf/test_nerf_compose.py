@@ -4,10 +4,10 @@ import json
 from dataclasses import replace
 
 import drjit as dr
+import nerf_twin as twin
 import numpy as np
 import pytest
-import twin
-from test_training import CONFIG
+from test_nerf_training import CONFIG
 
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
@@ -18,9 +18,9 @@ from spacesim.data.store import read_dataset
 from spacesim.methods import load_scene
 from spacesim.nerf.compose import Composition, merge
 from spacesim.nerf.draw import Samples
-from spacesim.nerf.render import sum_rays, volume_weights
 from spacesim.nerf.run import NerfRun
-from spacesim.nerf.train import train
+from spacesim.nerf.sampling.render import sum_rays, volume_weights
+from spacesim.nerf.train.train import train
 from spacesim.splat.compose.pose import Pose, rotation_about
 from spacesim.splat.compose.scene import ComposeConfig, PlacedRun
 

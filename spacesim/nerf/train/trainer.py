@@ -18,12 +18,12 @@ from spacesim.data.toml import Document
 from spacesim.learning.adam import corrections
 from spacesim.learning.folder import TrainingProgress
 from spacesim.learning.tensors import read_tensors, write_tensors
-from spacesim.nerf.box import SceneBox, scene_box
 from spacesim.nerf.config import NerfConfig
-from spacesim.nerf.model import Networks
-from spacesim.nerf.pixels import training_pixels
-from spacesim.nerf.sampler import step_key
-from spacesim.nerf.step import StepNumbers, look_around, step
+from spacesim.nerf.fields.model import Networks
+from spacesim.nerf.sampling.box import SceneBox, scene_box
+from spacesim.nerf.sampling.sampler import step_key
+from spacesim.nerf.train.pixels import training_pixels
+from spacesim.nerf.train.step import StepNumbers, look_around, step
 
 FORMAT = "spacesim-nerf-1"
 HISTORY_EVERY = 50  #: iterations between two entries of the history
