@@ -59,7 +59,8 @@ class NerfConfig:
     width: int = 32  #: units of hidden layers
     features: int = 15  #: numbers that the density network tells the colour network of a point
     color_layers: int = 3  #: matrix products of the colour network
-    harmonics: int = 3  #: degree of spherical harmonics of the view's direction, and the Sun's
+    harmonics: int = 3  #: degree of spherical harmonics of the view's direction
+    sun_harmonics: int = 1  #: of the Sun's, of `nerf-relight`: more of them tell training's few Suns apart by heart
     grid: GridConfig = field(default_factory=GridConfig)  #: what the field knows of places
     coarse: ProposalConfig = field(default_factory=ProposalConfig)  #: first round: reads evenly spaced samples
     fine: ProposalConfig = field(default_factory=lambda: ProposalConfig(16))  #: second: where the first saw density
@@ -80,7 +81,9 @@ class NerfConfig:
         check_choices(self)
         check_ranges(self, iterations=(1, MAX_STEPS), seed=(0, 2**63), checkpoint_every=(1, MAX_STEPS))
         check_ranges(self, rays=(CHUNK, MAX_RAYS), chunk=(CHUNK, MAX_RAYS), samples=(2, MAX_SAMPLES), width=(1, 1024))
-        check_ranges(self, features=(1, 256), color_layers=(2, 8), harmonics=(0, 6), occupancy=(4, 512))
+        check_ranges(
+            self, features=(1, 256), color_layers=(2, 8), harmonics=(0, 6), sun_harmonics=(1, 6), occupancy=(4, 512)
+        )
         check_ranges(self, proposals_every=(1, MAX_STEPS), warm_up=(0, MAX_STEPS), occupancy_every=(1, MAX_STEPS))
         check_ranges(self, interlevel_weight=(0, 1e6), distortion_weight=(0, 1e6), margin=(0, 10))
         check_ranges(self, rate=(0, 10), rate_final=(0, 10))

@@ -242,6 +242,12 @@ class Run:
         return _prediction(output, rgb, visibility, normals)
 
 
+def check_gaussians(run: Predictor) -> None:
+    """Raise InputError for a run of a method without Gaussians."""
+    if run.gaussians is None:
+        raise InputError(f"run: expected one of Gaussians, found one of the method {run.config['method']}")
+
+
 def stops(curve: tuple[str, float] | None, exposure: float | None, source: str) -> float:
     """By how many EV a picture is exposed more than those of training: none where no `exposure` is asked for. curve: as
     `Run.curve`;  source: whose it is. Raises InputError for colours that are sRGB values, and for no such exposure."""

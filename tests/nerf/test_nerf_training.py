@@ -200,6 +200,26 @@ def test_a_field_that_is_told_the_sun(dataset, tmp_path):
         run.predict(camera, ss.Sun.from_angles(0, 0), exposure=1.0)
 
 
+def test_what_asks_for_gaussians_says_so(dataset, finished, tmp_path):
+    image = load_image(dataset, dataset.test[0])
+    with pytest.raises(InputError, match="run: expected one of Gaussians, found one of the method nerf"):
+        ss.refine_pose(finished, image, dataset.test[0].camera)
+    with pytest.raises(InputError, match="run: expected one of Gaussians"):
+        ss.estimate_sun(finished, image, dataset.test[0].camera)
+    with pytest.raises(InputError, match="align: expected a run of Gaussians"):
+        ss.evaluate(finished, dataset, tmp_path / "eval", align=dataset)
+
+
+def test_runs_of_both_families_are_evaluated_and_reported_side_by_side(dataset, finished, tiny_run, tmp_path):
+    folders = []
+    for number, run in enumerate((finished, ss.load_run(tiny_run))):
+        folders.append(tmp_path / f"eval_{number}")
+        ss.evaluate(run, dataset, folders[-1], geometry=False, fit_gain=number == 0)
+    page = ss.write_report([str(folder) for folder in folders], tmp_path / "report.html").read_text()
+    assert "nerf" in page
+    assert "vanilla" in page
+
+
 def test_the_commands(spacesim, tiny_data, tmp_path):
     """One run through train, eval, render and export."""
     run = tmp_path / "run"

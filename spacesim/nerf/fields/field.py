@@ -96,16 +96,17 @@ class Field:
 
     density: DensityField
     color: MlpShape
-    harmonics: int  #: degree, of directions
-    knows_sun: bool
+    harmonics: int  #: degree, of the view's direction
+    sun_harmonics: int | None  #: degree, of the Sun's; None of a field that is not told
 
     @staticmethod
     def of(config: NerfConfig) -> "Field":
         """Of a configuration."""
         density = DensityField.of(config.grid, config.width, config.features)
-        terms = (config.harmonics + 1) ** 2 * (2 if config.knows_sun else 1)
+        of_sun = config.sun_harmonics if config.knows_sun else None
+        terms = (config.harmonics + 1) ** 2 + (0 if of_sun is None else (of_sun + 1) ** 2)
         shape = MlpShape(config.features + terms, 1, 3, config.width, config.color_layers)
-        return Field(density, shape, config.harmonics, config.knows_sun)
+        return Field(density, shape, config.harmonics, of_sun)
 
     @property
     def split(self) -> int:
@@ -119,9 +120,9 @@ class Field:
     def directions(self, view: Array3f, sun: Array3f | None) -> list[Float]:
         """What the colour network is told of directions [3, N], unit: real spherical harmonics."""
         terms = list(dr.sh_eval(view, self.harmonics))
-        if self.knows_sun:
+        if self.sun_harmonics is not None:
             assert sun is not None, "a field that is told the Sun"
-            terms += dr.sh_eval(sun, self.harmonics)
+            terms += dr.sh_eval(sun, self.sun_harmonics)
         return [ad.Float(term) for term in terms]
 
     def look_up(
