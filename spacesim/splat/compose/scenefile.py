@@ -213,11 +213,12 @@ class SceneEntry:
 
 
 def load_scene(
-    path: str | Path, load: Callable[[Path], Any] = load_run, compose: Callable[..., Any] = Composition
+    path: str | Path, load: Callable[[Path], Any] | None = None, compose: Callable[..., Any] = Composition
 ) -> PosedScene:
     """The scene that a TOML file describes, its runs loaded, each once. Raises InputError with file, line and key.
 
-    load: a folder to a run;  compose: makes a `Composition`, or what has its words for runs of other methods
+    load: a folder to a run, None: one of Gaussians;  compose: makes a `Composition`, or what has its words for runs of
+    other methods
     """
     path = Path(path)
     document = toml.read_document(path)
@@ -228,7 +229,7 @@ def load_scene(
     for index, (model, name) in enumerate(zip(entry.models, names, strict=True)):
         folder = (path.parent / model.run).resolve()
         if folder not in runs:
-            runs[folder] = _load_model(path.parent / model.run, document, index, load)
+            runs[folder] = _load_model(path.parent / model.run, document, index, load or load_run)
         models.append(PlacedRun(runs[folder], model.pose(Pose()), name))
     composition = compose(models, ComposeConfig(entry.shadows), path)
     camera = None if entry.camera is None else _camera(entry.camera, path.parent, document)
