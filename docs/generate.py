@@ -201,13 +201,14 @@ def split(arguments: str) -> list[str]:
 def options_page() -> str:
     """Every field of a training's configuration."""
     from spacesim.cli.fields import reference
+    from spacesim.nerf.config import NerfConfig
 
     lead = (
-        "Every field of `TrainConfig` and of the records in it, with the defaults of the records. `--set KEY=VALUE` "
-        "takes each; `spacesim train --fields` lists them with what preset, method and strategy give them. The presets "
-        "are files in `spacesim/assets/presets/`."
+        "Every field of `TrainConfig`, of `NerfConfig` (`--method nerf`) and of the records in them, with the defaults "
+        "of the records. `--set KEY=VALUE` takes each; `spacesim train --fields` lists them with what preset, method "
+        "and strategy give them. The presets are files in `spacesim/assets/presets/`."
     )
-    return f"# Options of a training\n\n{lead}\n\n{reference().strip()}\n"
+    return f"# Options of a training\n\n{lead}\n\n{reference().strip()}\n\n{reference(NerfConfig).strip()}\n"
 
 
 def scene_page() -> str:

@@ -15,21 +15,23 @@ from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
 from spacesim.data.store import load_truth
 from spacesim.data.transforms import read_dataset
+from spacesim.methods import load_predictor, load_run, load_scene, preset
+from spacesim.nerf.config import NerfConfig
+from spacesim.nerf.run import NerfRun
 from spacesim.scenes import SceneConfig, read_scene
 from spacesim.scenes import generate as _generate
-from spacesim.splat.compose import PosedScene, load_predictor
+from spacesim.splat.compose import PosedScene
 from spacesim.splat.compose.output import Composed
 from spacesim.splat.compose.output import compose as _compose
-from spacesim.splat.compose.scenefile import load_scene
 from spacesim.splat.fit import estimate_sun
 from spacesim.splat.pose import RefinedPose, refine_pose
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import RenderOutput
 from spacesim.splat.raster.render import render as _render
-from spacesim.splat.run import Rendering, Run, load_run
+from spacesim.splat.run import Rendering, Run
 from spacesim.splat.sun_search import SunEstimate
-from spacesim.splat.train.config import TrainConfig, preset
+from spacesim.splat.train.config import TrainConfig
 
 ProgressCallback = Callable[[int, int, str], None]
 """Called now and then with how much is done, of how much, and words about it."""
@@ -42,6 +44,8 @@ __all__ = [
     "Frame",
     "Gaussians",
     "Image",
+    "NerfConfig",
+    "NerfRun",
     "PosedScene",
     "RefinedPose",
     "RenderOutput",
@@ -121,7 +125,7 @@ def import_dataset(
 def train(
     data: str | Path | Dataset,
     out: str | Path,
-    config: TrainConfig | None = None,
+    config: TrainConfig | NerfConfig | None = None,
     *,
     preset: str | None = None,
     method: str | None = None,
@@ -130,14 +134,14 @@ def train(
     resume: bool = False,
     progress: ProgressCallback | None = None,
     **options: Any,
-) -> Run:
-    """Train Gaussians on a dataset and write the run to the folder `out`.
+) -> Run | NerfRun:
+    """Train Gaussians, or a radiance field, on a dataset and write the run to the folder `out`.
 
     data: a folder of a Nerfstudio dataset, ours or another's, or what `read_dataset` returns
     config: the whole configuration; without one, what `preset` returns for these names, refused beside a configuration
-    preset: None is "fast";  method: None is "vanilla";  strategy: None is "default"
-    options: fields of TrainConfig in place of the configuration's: iterations=7000, which shortens its whole schedule
-        where it is fewer, seed=0, init_count=20000, ...
+    preset: None is "fast";  method: None is "vanilla";  strategy: None is "default", of Gaussians
+    options: fields of TrainConfig, or NerfConfig of a radiance field, in place of the configuration's: seed=0,
+        iterations=7000, which shortens its whole schedule where it is fewer, ...
     settings: fields by their dotted names, as `spacesim train --set` has them: {"light.shadow.bias": 5}
     resume: go on from the newest checkpoint, with the same result to the bit; a finished run is returned as it is
     progress: called with (iterations done, iterations in all, "loss 0.0123, 4000 Gaussians") now and then
@@ -145,32 +149,31 @@ def train(
     Raises InputError for data, a configuration or a folder that cannot be, WorkError where the loss is not finite or
     the disk is full, BackendError where no backend can run.
     """
-    from spacesim.splat.train import config as configuration
-    from spacesim.splat.train.train import train as run_training
+    from spacesim import methods
 
     names = {"preset": preset, "method": method, "strategy": strategy}
     choices = {name: word for name, word in names.items() if word is not None}
     if config is None:
-        config = configuration.preset(choices.pop("preset", "fast"), **choices)
+        config = methods.preset(choices.pop("preset", "fast"), **choices)
     elif choices:
         name, word = next(iter(choices.items()))
         raise InputError(f"{name}: expected none beside a configuration, found {word!r}")
-    unknown = [name for name in options if name not in TrainConfig.__dataclass_fields__]
+    unknown = [name for name in options if name not in type(config).__dataclass_fields__]
     if unknown:
-        raise InputError(f"{unknown[0]}: expected a field of TrainConfig, found none of that name")
-    config = configuration.shortened(config, options.get("iterations", config.iterations))
-    config = configuration.with_settings(replace(config, **options), settings or {})
+        raise InputError(f"{unknown[0]}: expected a field of {type(config).__name__}, found none of that name")
+    config = methods.shortened(config, options.get("iterations"))
+    config = methods.with_settings(replace(config, **options), settings or {})
     dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
 
     def tell(state: Any) -> None:
         if progress is not None:
-            progress(state.iteration, state.iterations, f"loss {state.loss:.4f}, {state.gaussian_count} Gaussians")
+            progress(state.iteration, state.iterations, state.words)
 
-    return run_training(dataset, Path(out), config, resume, tell)
+    return methods.train(dataset, Path(out), config, resume, tell)
 
 
 def evaluate(
-    run: str | Path | Run,
+    run: str | Path | Run | NerfRun,
     data: str | Path | Dataset,
     out: str | Path,
     *,

@@ -10,7 +10,7 @@ from rich import progress
 from rich.console import Console
 
 if TYPE_CHECKING:
-    from spacesim.splat.train.trainer import TrainingProgress
+    from spacesim.learning.folder import TrainingProgress
 
 LINE_EVERY = 5.0  #: seconds between two plain lines
 
@@ -42,7 +42,7 @@ class Reporter:
 
 def report_training(report: Reporter) -> "Callable[[TrainingProgress], None]":
     """What tells `report` of a training's progress."""
-    return lambda p: report(p.iteration, p.iterations, f"loss {p.loss:.4f}  {p.gaussian_count} Gaussians")
+    return lambda p: report(p.iteration, p.iterations, p.words)
 
 
 @contextmanager

@@ -40,8 +40,8 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.data.store import read_dataset
     from spacesim.eval.evaluate import EvaluateConfig, evaluate
     from spacesim.eval.report.write import write_report
+    from spacesim.methods import load_predictor
     from spacesim.progress import show_progress
-    from spacesim.splat.compose import load_predictor
 
     own = None if options.align is None else read_dataset(options.align)
     config = EvaluateConfig(options.split, options.lpips_weights, fit_gain=options.fit_gain, align=own)

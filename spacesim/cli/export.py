@@ -49,12 +49,15 @@ def run(options: argparse.Namespace) -> None:
 
 def _export_ply(options: argparse.Namespace) -> None:
     from spacesim.data.records import Sun
+    from spacesim.methods import load_run
+    from spacesim.nerf.run import NerfRun
     from spacesim.splat.export.bake import bake
     from spacesim.splat.export.ply import write_ply
-    from spacesim.splat.run import load_run
 
     backend.select(options.backend)
     run = load_run(options.path)
+    if isinstance(run, NerfRun):
+        raise InputError(f"ply: expected a run of Gaussians, found {options.path}, a radiance field; --mesh takes it")
     model = run.gaussians
     if options.sun is None and run.relightable:
         raise InputError("sun: expected AZ,EL, under which a relightable run is to be exported, found none")
@@ -71,9 +74,10 @@ def _export_ply(options: argparse.Namespace) -> None:
 def _export_mesh(options: argparse.Namespace) -> None:
     from spacesim.data.mesh import mesh_suffix, write_mesh
     from spacesim.data.store import read_dataset
+    from spacesim.methods import load_run
+    from spacesim.nerf.run import NerfRun
     from spacesim.progress import show_progress
-    from spacesim.splat.export.mesh import MeshConfig, cameras_around, mesh_of
-    from spacesim.splat.run import load_run
+    from spacesim.splat.export.mesh import MeshConfig, cameras_around, mesh_of, mesh_of_depths
 
     mesh_suffix(options.mesh)
     settings = {"voxel": options.voxel, "truncation": options.truncation, "views": options.views}
@@ -83,11 +87,16 @@ def _export_mesh(options: argparse.Namespace) -> None:
     data = options.data or Path(run.config["data"]["path"])
     if options.data or data.exists():
         cameras = [frame.camera for frame in read_dataset(data).train]
+    elif isinstance(run, NerfRun):
+        raise InputError(f"{data}: expected the data that the run was trained on, found nothing; name it with --data")
     else:
         print(f"{data}: is gone; {config.views} cameras around the model take the place of its views", file=sys.stderr)
         cameras = cameras_around(run.gaussians, config.views)
     with show_progress("export", "steps") as report:
-        surface = mesh_of(run.gaussians, cameras, config, run.antialiased, report)
+        if isinstance(run, NerfRun):
+            surface = mesh_of_depths(run.surface_depth, cameras, config, report)
+        else:
+            surface = mesh_of(run.gaussians, cameras, config, run.antialiased, report)
     if len(surface.faces) == 0:
         raise WorkError(f"{options.path}: no view of the run shows an opaque surface, so there is no mesh to write")
     write_mesh(options.mesh, surface.vertices, surface.faces)

@@ -77,7 +77,7 @@ def type_words(hint: Any) -> str:
     return " | ".join([*words, *(["none"] if NoneType in inner else [])])
 
 
-def listing(config: TrainConfig) -> str:
+def listing(config: Any) -> str:
     """A line for each field of a configuration: key, default, type, meaning."""
     rows = list(fields_of(config))
     key, default = max(len(row.key) for row in rows), max(len(row.default) for row in rows)
@@ -88,10 +88,11 @@ def listing(config: TrainConfig) -> str:
     return "\n".join(lines)
 
 
-def reference() -> str:
-    """Markdown: a table for each record, with the defaults of the record itself, and where it is found."""
+def reference(config: Any = TrainConfig) -> str:
+    """Markdown: a table for each record of a configuration, with the defaults of the record itself, and where it is
+    found."""
     parts = []
-    for cls, places in _records(TrainConfig).items():
+    for cls, places in _records(config).items():
         where = ", ".join(f"`{place}`" for place in places if place)
         kind = f" (`{kind_of(cls)}`)" if kind_of(cls) else ""
         lead = " ".join((inspect.getdoc(cls) or "").split("\n\n")[0].split())

@@ -25,8 +25,8 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from spacesim.data.records import Sun
-    from spacesim.splat.export.pictures import write_picture
-    from spacesim.splat.run import load_run
+    from spacesim.learning.pictures import write_picture
+    from spacesim.methods import load_run
 
     run = load_run(options.path)
     sun = Sun.from_angles(*options.sun) if options.sun else None

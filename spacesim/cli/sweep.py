@@ -26,9 +26,9 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
+    from spacesim.methods import load_run
     from spacesim.progress import show_progress
     from spacesim.splat.export.sweep import FRAMES, resize_camera, suns_around, sweep
-    from spacesim.splat.run import load_run
 
     suns = suns_around(FRAMES if options.frames is None else options.frames, options.elevation, options.azimuth)
     run = load_run(options.path)

@@ -1,4 +1,4 @@
-"""`spacesim train`. Its options stand for fields of TrainConfig, whose comments say what they mean."""
+"""`spacesim train`. Its options stand for fields of TrainConfig and NerfConfig, whose comments say what they mean."""
 
 import argparse
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from spacesim import interrupts
 from spacesim.cli.parser import Parser
 from spacesim.data.errors import InputError
 
-SUMMARY, NEEDS_BACKEND = "reconstruct a dataset with Gaussian splatting", True
+SUMMARY, NEEDS_BACKEND = "reconstruct a dataset with Gaussian splatting or a radiance field", True
 OPTIONS = {
     "--method": ("method", "NAME"),
     "--strategy": ("strategy", "NAME"),
@@ -24,10 +24,12 @@ OPTIONS = {
 """Options with a value: the field that each sets, and what stands for its value. Every other field is for --set."""
 
 _NAMES = ("method", "strategy", "preset")  #: of a configuration: `preset` makes it, with all its defaults
+_OF_BOTH = ("iterations", "seed")  #: fields of options that a radiance field has, too
 
 
 def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     from spacesim.cli.fields import fields_of
+    from spacesim.methods import METHODS
     from spacesim.splat.train.config import TrainConfig
 
     lists = "--fields" in arguments
@@ -40,7 +42,8 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     for option, (key, value) in OPTIONS.items():
         field = meanings[key]
         words = field.type.removesuffix(" | none").replace(" | ", ", ") if value == "NAME" else field.meaning
-        default = field.default if key in _NAMES else None
+        words = ", ".join(METHODS) if key == "method" else words
+        default = field.default if key in ("method", "preset") else None
         kind = int if value == "N" else str
         shown = field.default if key in (*_NAMES, "seed") else "what the data has" if key == "init" else "of the preset"
         text = f"{words} (default: {shown})"
@@ -62,6 +65,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
 
 def option_of(field: str, options: argparse.Namespace) -> str | None:
     """The option that sets a field, by the field's dotted name."""
+    from spacesim.nerf.config import NerfConfig
     from spacesim.splat.train.config import TrainConfig
 
     options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | {
@@ -70,24 +74,29 @@ def option_of(field: str, options: argparse.Namespace) -> str | None:
         "sun": "--sun",
     }
     typed = {text.partition("=")[0].partition(".")[0].strip() for text in options.set}  # of which some are no fields
-    is_field = field.partition(".")[0] in typed | set(TrainConfig.__dataclass_fields__)
+    is_field = field.partition(".")[0] in typed | set(TrainConfig.__dataclass_fields__) | set(
+        NerfConfig.__dataclass_fields__
+    )
     return options_by_key.get(field) or (f"--set {field}" if is_field else None)
 
 
 def run(options: argparse.Namespace) -> None:
     from spacesim.cli.fields import listing
     from spacesim.data.store import read_dataset
+    from spacesim.methods import preset, shortened, train, with_settings
     from spacesim.progress import report_training, show_progress
-    from spacesim.splat.train.config import preset, warm_start, with_options, with_settings
-    from spacesim.splat.train.train import train
+    from spacesim.splat.train.config import TrainConfig, warm_start
 
     config = preset(options.preset, options.method, options.strategy)
-    if options.warm_start:
-        config = replace(config, warm_start=warm_start(options.preset))
-    config = with_options(config, iterations=options.iterations)
     settings = {key: getattr(options, option[2:].replace("-", "_")) for option, (key, _) in OPTIONS.items()}
     settings |= {"refine_poses": options.refine_poses or None, "sun": options.sun if options.sun != "given" else None}
     chosen = {key: value for key, value in settings.items() if value is not None and key not in _NAMES}
+    if isinstance(config, TrainConfig):
+        if options.warm_start:
+            config = replace(config, warm_start=warm_start(options.preset))
+    elif others := [*(["warm_start"] if options.warm_start else []), *(key for key in chosen if key not in _OF_BOTH)]:
+        raise InputError(f"{others[0]}: expected with a method of Gaussians, found with {options.method}")
+    config = shortened(config, options.iterations)
     try:
         config = with_settings(config, chosen | dict(map(parse_setting, options.set)))
     except InputError as error:
@@ -98,9 +107,10 @@ def run(options: argparse.Namespace) -> None:
     dataset = read_dataset(options.data)
     with show_progress("train", "iterations") as report:
         done = train(dataset, options.out, config, options.resume, report_training(report), options.arguments)
-    history = done.training["history"]
+    history, gaussians = done.training["history"], done.gaussian_count
+    size = f"{done.training['parameters']} numbers" if gaussians is None else f"{gaussians} Gaussians"
     interrupts.print_output(
-        f"{options.out}: {done.gaussian_count} Gaussians after {config.iterations} iterations in "
+        f"{options.out}: {size} after {config.iterations} iterations in "
         f"{done.training['seconds']:.0f} s on {done.training['backend']}, final loss {history[-1]['loss']:.4f}"
     )
 

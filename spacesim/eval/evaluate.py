@@ -43,6 +43,7 @@ from spacesim.eval.relight import write_sweep
 from spacesim.eval.schema import SCHEMA
 from spacesim.eval.shape import write_shapes
 from spacesim.eval.suns import count_suns, known_suns, rounded_angles, training_frames
+from spacesim.nerf.run import NerfRun
 from spacesim.splat.compose.aligned import AlignedRun, moved_frame
 from spacesim.splat.fit import Unknown, find_unknowns
 from spacesim.splat.run import Run
@@ -93,6 +94,8 @@ def evaluate(
         raise InputError(f"{dataset.root}: expected frames in the split {config.split}, found none")
     alignment = align(config.align, dataset) if config.align else None
     if alignment:
+        if isinstance(run, NerfRun):
+            raise InputError(f"align: expected a run of Gaussians, found {run.path}, a radiance field")
         if not isinstance(run, Run):
             raise InputError(f"align: expected a run, found {run.path}, a scene, which says itself where models stand")
         run = AlignedRun(run, alignment.pose)

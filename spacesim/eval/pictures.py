@@ -9,7 +9,7 @@ from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT
 from spacesim.data.tone import as_bytes
 from spacesim.eval.metrics.image import Mask
 from spacesim.eval.metrics.shadow import KINDS
-from spacesim.splat.export.pictures import LIT, SHADOWED
+from spacesim.learning.pictures import LIT, SHADOWED
 
 ERROR_SCALE = 0.25
 """Mean absolute error of the channels at the bright end of the colour map; more is drawn as that."""

@@ -193,13 +193,15 @@ class AlignmentFacts:
 class ModelFacts:
     """Size and speed of a model."""
 
-    gaussians: int
+    gaussians: int | None  #: None of a radiance field
     bytes: int
     render_ms: float  #: median of a frame
     backend: str
 
     def __post_init__(self) -> None:
-        check_ranges(self, gaussians=(0, MAX_NUMBER), bytes=(0, MAX_NUMBER), render_ms=(0, MAX_NUMBER))
+        check_ranges(self, bytes=(0, MAX_NUMBER), render_ms=(0, MAX_NUMBER))
+        if self.gaussians is not None:
+            check_ranges(self, gaussians=(0, MAX_NUMBER))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.data.records import Camera, Image, Sun
 from spacesim.splat.compose.aligned import AlignedRun
 from spacesim.splat.pose import checked_picture
-from spacesim.splat.run import Prediction, Predictor, Run
+from spacesim.splat.run import Prediction, Predictor, Run, check_gaussians
 from spacesim.splat.sun_search import SmallPicture, SunEstimate, SunFinder
 
 SATURATED = 254.5 / 255  #: sRGB value from which on a pixel says only that it is bright
@@ -88,6 +88,7 @@ def estimate_sun(run: Run, image: ArrayLike | Image, camera: Camera, mask: Array
     directions are compared, shadows included, on a picture of 64 pixels; the picture's exposure is taken for that of
     the training pictures. Raises InputError where the run knows no Sun, for no such picture, and where none counts.
     """
+    check_gaussians(run)
     if not run.relightable or run.light is None:
         raise InputError(f"run: expected one of a method that is told the Sun, found {run.config['method']}")
     pixels, counts = checked_picture(image, mask, camera)

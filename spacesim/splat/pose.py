@@ -27,7 +27,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import RenderOutput, render
 from spacesim.splat.raster.supersample import render_supersampled
 from spacesim.splat.raster.tone import adjust_exposure
-from spacesim.splat.run import Run, check_picture
+from spacesim.splat.run import Run, check_gaussians, check_picture
 
 UNKNOWNS = 7  #: a turn, a shift and the logarithm of the gain
 COARSEST = 64  #: pixels that the longer side of the coarsest picture keeps
@@ -107,6 +107,7 @@ def refine_pose(
     Raises InputError where the picture, the mask or the numbers are not as above, where the run needs a Sun and none is
     told, and where the camera does not see the model.
     """
+    check_gaussians(run)
     told = Sun.of(sun)
     if told is None and run.relightable:
         raise InputError(f"sun: expected its direction for a run of {run.config['method']}, found none")

@@ -9,19 +9,20 @@ RUN/cameras.json       poses and gains of the training pictures, where they were
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from spacesim import backend
-from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import Rules, read_record, structure
 from spacesim.data.toml import Document
+from spacesim.learning.folder import TrainingData
+from spacesim.learning.prediction import Prediction, Rendering, check_picture
 from spacesim.splat.light.config import MAX_EXPOSURE
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.gaussians import Gaussians
@@ -32,72 +33,6 @@ from spacesim.splat.raster.supersample import render_supersampled
 from spacesim.splat.raster.tone import adjust_exposure
 from spacesim.splat.train.checkpoint import HistoryEntry, read_tensors
 from spacesim.splat.train.config import TrainConfig
-
-
-class Rendering:
-    """A view of a run, drawn when an array of it is asked for first. See `Run.render`."""
-
-    def __init__(self, run: "Predictor", camera: Camera, sun: Sun | None, exposure: float | None = None) -> None:
-        self.run, self.camera, self.sun, self.exposure = run, camera, sun, exposure
-
-    @cached_property
-    def _drawn(self) -> "Prediction":
-        return self.run.predict(self.camera, self.sun, exposure=self.exposure)
-
-    @property
-    def rgb(self) -> np.ndarray:
-        """[H, W, 3] float32, sRGB values over black, beyond 1 where what bounces makes them brighter than white."""
-        return self._drawn.rgb
-
-    @property
-    def alpha(self) -> np.ndarray:
-        """[H, W] float32 in [0, 1]."""
-        return self._drawn.alpha
-
-    @property
-    def depth(self) -> np.ndarray:
-        """[H, W] float32: expected depth along the optical axis, metres; 0 where alpha is 0."""
-        return self._drawn.depth
-
-    @property
-    def visibility(self) -> np.ndarray | None:
-        """[H, W] float32: the share of the Sun that the surface sees, 0 to 1; None of a method without shadows."""
-        return self._drawn.visibility
-
-    @cached_property
-    def normal(self) -> np.ndarray:
-        """[H, W, 3] float32: unit vectors in world axes; 0 where there is no surface."""
-        drawn = self.run.predict(self.camera, self.sun, normals=True, exposure=self.exposure)
-        assert drawn.normal is not None
-        return drawn.normal
-
-    def save(self, path: str | Path, kind: str = "rgb") -> Path:
-        """Write a PNG to look at or an EXR to compute with; returns its path.
-
-        kind: "rgb", "alpha", "depth", "normal" or "shadow". Raises InputError for another suffix, and for shadows of a
-        method without.
-        """
-        from spacesim.splat.export.pictures import write_picture
-
-        drawn = replace(self._drawn, normal=self.normal) if kind == "normal" else self._drawn
-        write_picture(drawn, kind, Path(path))
-        return Path(path)
-
-
-A_PIXEL = {"cuda": 80, "llvm": 225}
-"""Bytes of main memory that a predicted pixel takes at most, until it is written: 160 and then 65 were seen on LLVM."""
-
-
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """A rendered view, float32."""
-
-    rgb: np.ndarray  #: [H, W, 3] sRGB values over black, beyond 1 where what bounces makes them brighter than white
-    alpha: np.ndarray  #: [H, W]
-    depth: np.ndarray  #: [H, W] expected depth in metres, 0 where alpha is 0
-    visibility: np.ndarray | None  #: [H, W], or None from a method without
-    #: [H, W, 3] unit vectors in world axes, 0 where there is no surface, or None where not asked for
-    normal: np.ndarray | None = None
 
 
 class Part(Protocol):
@@ -121,7 +56,8 @@ class Part(Protocol):
 
 
 class Predictor(Protocol):
-    """What evaluating, sweeping and showing ask for: a trained `Run`, or several in one scene (`ComposedRun`)."""
+    """What evaluating, sweeping and showing ask for: a trained `Run`, or several in one scene (`ComposedRun`),
+    or a radiance field (`nerf.run.NerfRun`)."""
 
     @property
     def path(self) -> Path:
@@ -136,12 +72,12 @@ class Predictor(Protocol):
         """How training went, see `TrainingRecord`; {} of a scene."""
 
     @property
-    def gaussians(self) -> Gaussians:
-        """All Gaussians, in the world's axes."""
+    def gaussians(self) -> Gaussians | None:
+        """All Gaussians, in the world's axes; None of a radiance field."""
 
     @property
-    def gaussian_count(self) -> int:
-        """Number of Gaussians."""
+    def gaussian_count(self) -> int | None:
+        """Number of Gaussians; None of a radiance field."""
 
     @property
     def model_bytes(self) -> int:
@@ -169,16 +105,6 @@ class Predictor(Protocol):
         """Render one view. normals: predict these, too;  exposure: EV, of colours that are linear; by default that of
         the training pictures. Raises InputError where the Sun matters and none is told, and for an exposure of colours
         that are sRGB values."""
-
-
-@dataclass(frozen=True)
-class TrainingData:
-    """What a run says of its data."""
-
-    path: str  #: of the folder
-    digest: str | None = None  #: see `training_digest`, of runs that tell it
-    train_frames: int | None = None
-    test_frames: int | None = None
 
 
 @dataclass(frozen=True)
@@ -315,10 +241,10 @@ class Run:
         return _prediction(output, rgb, visibility, normals)
 
 
-def check_picture(camera: Camera) -> None:
-    """Raise MemoryError, before it is drawn, where a camera's picture does not fit into memory."""
-    needed = A_PIXEL[backend.select()] * camera.width * camera.height
-    check_memory(needed, f"a picture of {camera.width} x {camera.height} pixels")
+def check_gaussians(run: Predictor) -> None:
+    """Raise InputError for a run of a method without Gaussians."""
+    if run.gaussians is None:
+        raise InputError(f"run: expected one of Gaussians, found one of the method {run.config['method']}")
 
 
 def stops(curve: tuple[str, float] | None, exposure: float | None, source: str) -> float:

@@ -13,8 +13,9 @@ from spacesim.data.mesh import SignedDistance, read_mesh
 from spacesim.data.records import Camera, Dataset
 from spacesim.eval.metrics.exterior import Samples, exterior_samples
 from spacesim.eval.metrics.solid import filled_beyond, filled_voxels
+from spacesim.nerf.run import NerfRun
 from spacesim.splat.export.fusion import Grid
-from spacesim.splat.export.mesh import MeshConfig, RunMesh, cameras_around, mesh_of
+from spacesim.splat.export.mesh import MeshConfig, RunMesh, cameras_around, mesh_of, mesh_of_depths
 
 if TYPE_CHECKING:
     from spacesim.splat.raster.gaussians import Gaussians
@@ -96,11 +97,13 @@ def compare_geometry(run: "Predictor", dataset: Dataset, config: GeometryConfig 
         size_of(*truth)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    model = run.gaussians
+    model, cameras = run.gaussians, [frame.camera for frame in dataset.train or dataset.frames]
+    if isinstance(run, NerfRun):
+        return _compare_surface(mesh_of_depths(run.surface_depth, cameras, config.mesh), None, "median", truth, config)
+    if model is None:
+        return ShapeResult(None, "Geometry is null: a composed scene of radiance fields has no cameras of its own.")
     if run.parts:  # trained on other data: what this dataset looks at says nothing
         cameras = cameras_around(model, config.mesh.views)
-    else:
-        cameras = [frame.camera for frame in dataset.train or dataset.frames]
     return compare_shape(model, run.antialiased, cameras, truth, config)
 
 
@@ -111,18 +114,30 @@ def compare_shape(
 
     Raises InputError where the truth is a point or the grid does not fit into memory.
     """
-    size = size_of(*truth)
     mesh = mesh_of(model, cameras, config.mesh, antialiased)
+    return _compare_surface(mesh, model, config.mesh.depth, truth, config)
+
+
+def _compare_surface(
+    mesh: RunMesh, model: "Gaussians | None", depth: str, truth: Mesh, config: GeometryConfig
+) -> ShapeResult:
+    """The surface of a model, Gaussians or None, against a true mesh. depth: which was fused"""
+    size = size_of(*truth)
     answer = compare_meshes(truth, (mesh.vertices, mesh.faces), config) if len(mesh.faces) else NO_SURFACE
     compared = answer if isinstance(answer, Comparison) else None
-    note = "" if compared else f"Geometry is null but for its floaters: {answer}."
+    but = "" if model is None else " but for its floaters"
+    note = "" if compared else f"Geometry is null{but}: {answer}."
     values = {
         **(compared.values if compared else dict.fromkeys(COMPARED)),
-        "floaters": floaters(model.to_numpy(), SignedDistance(*truth), config.share * size),
+        "floaters": _floaters(model, truth, config.share * size),
         "size": size,
-        "mesh": {"faces": len(mesh.faces), "voxel": mesh.voxel, "views": mesh.views, "depth": config.mesh.depth},
+        "mesh": {"faces": len(mesh.faces), "voxel": mesh.voxel, "views": mesh.views, "depth": depth},
     }
     return ShapeResult(values, note, compared, truth, mesh)
+
+
+def _floaters(model: "Gaussians | None", truth: Mesh, within: float) -> dict[str, float] | None:
+    return None if model is None else floaters(model.to_numpy(), SignedDistance(*truth), within)
 
 
 def size_of(vertices: Array, faces: np.ndarray) -> float:

@@ -168,7 +168,7 @@ def _card_numbers(metric: Metric, cells: Sequence[Cell]) -> list[str]:
 
 def _model_cell(run: Evaluation, metric: Metric) -> Cell:
     value = run.metrics["model"][metric.key]
-    return value, f"{value:,.{metric.digits}f}", ""
+    return value, "–" if value is None else f"{value:,.{metric.digits}f}", ""
 
 
 def _histograms(runs: Sequence[Evaluation]) -> str:
@@ -232,7 +232,7 @@ def _training(runs: Sequence[Evaluation]) -> str:
 
     charts = [
         line_chart("Loss", "iteration", curves("loss", 0.0), log=True),
-        line_chart("Gaussians", "iteration", curves("gaussians", -1.0)),
+        *([line_chart("Gaussians", "iteration", counts)] if any(counts := curves("gaussians", -1.0)) else []),
     ]
     return section("Training", legend(runs) + f'<div class="charts">{"".join(charts)}</div>')
 
@@ -292,7 +292,7 @@ def _model_facts(run: Evaluation) -> dict[str, Any]:
     seconds = training.get("seconds")
     return {
         "run": run.metrics["run"],
-        "Gaussians": f"{model['gaussians']:,}",
+        "Gaussians": None if model["gaussians"] is None else f"{model['gaussians']:,}",
         "file": f"{model['bytes'] / 1e6:.2f} MB",
         "rendering a frame": f"{model['render_ms']:.1f} ms",
         "rendered on": model["backend"],

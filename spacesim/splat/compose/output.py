@@ -28,9 +28,9 @@ from spacesim.data.lock import lock_folder
 from spacesim.data.sheet import DARK_PAGE, Tile, contact_sheet, fit_picture
 from spacesim.data.store import intrinsics_of
 from spacesim.data.tone import as_bytes
+from spacesim.learning.pictures import write_picture
 from spacesim.splat.compose.path import PosedScene, SceneFrame
 from spacesim.splat.compose.scene import ComposedPrediction
-from spacesim.splat.export.pictures import write_picture
 from spacesim.splat.export.sweep import COLUMNS, MAX_TILES, SIDE, resize_camera, sky_mark
 from spacesim.splat.export.video import INSTALL, Video, encoder
 

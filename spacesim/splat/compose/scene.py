@@ -21,6 +21,7 @@ from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
+from spacesim.learning.prediction import ComposedPrediction, check_picture
 from spacesim.splat.compose.members import Ensemble, Member, display_colors
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.light.shadow.cast import CrossShadow, cast_cross_shadows
@@ -30,7 +31,7 @@ from spacesim.splat.raster.output import RenderOutput
 from spacesim.splat.raster.render import render
 from spacesim.splat.raster.supersample import render_supersampled
 from spacesim.splat.raster.tone import adjust_exposure
-from spacesim.splat.run import Prediction, Run, check_picture, stops
+from spacesim.splat.run import Run, stops
 
 OUTPUTS = ("rgb", "alpha", "depth", "median_depth", "normal", "visibility", "id")
 SHADOWS = ("trained", "others", "ratio", "none")
@@ -63,16 +64,6 @@ class ComposeConfig:
     def __post_init__(self) -> None:
         if self.shadows not in SHADOWS:
             raise InputError(f"shadows: expected one of {', '.join(SHADOWS)}, found {self.shadows!r}")
-
-
-@dataclass(frozen=True, eq=False)
-class ComposedPrediction(Prediction):
-    """A view of a scene. visibility: of models without shadows of their own 1 where no other model is before the
-    Sun."""
-
-    #: [H, W] int32, number of the object with the largest share of the pixel, counted from 1 in the order of the
-    #: models; 0 where less than half of the pixel is covered
-    id: np.ndarray | None = None
 
 
 @dataclass

@@ -2,7 +2,7 @@
 wrong, and writing them."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from spacesim.data.transforms import read_camera, read_dataset
 from spacesim.splat.compose.path import FPS, MAX_FRAMES, ORBIT_FRAMES, CameraView, Keyframe, Orbit, PosedScene
 from spacesim.splat.compose.pose import Pose, rotation_about
 from spacesim.splat.compose.scene import ComposeConfig, Composition, PlacedRun
-from spacesim.splat.run import Run, load_run
+from spacesim.splat.run import load_run
 
 FOV_DEG = 35.0  #: of a camera where nothing is said
 RESOLUTION = (512, 512)  #: pixels
@@ -212,20 +212,26 @@ class SceneEntry:
         ComposeConfig(self.shadows)
 
 
-def load_scene(path: str | Path) -> PosedScene:
-    """The scene that a TOML file describes, its runs loaded, each once. Raises InputError with file, line and key."""
+def load_scene(
+    path: str | Path, load: Callable[[Path], Any] | None = None, compose: Callable[..., Any] = Composition
+) -> PosedScene:
+    """The scene that a TOML file describes, its runs loaded, each once. Raises InputError with file, line and key.
+
+    load: a folder to a run, None: one of Gaussians;  compose: makes a `Composition`, or what has its words for runs of
+    other methods
+    """
     path = Path(path)
     document = toml.read_document(path)
     entry = structure(SceneEntry, document, RULES)
     names = _names(entry.models, document)
-    runs: dict[Path, Run] = {}
+    runs: dict[Path, Any] = {}
     models = []
     for index, (model, name) in enumerate(zip(entry.models, names, strict=True)):
         folder = (path.parent / model.run).resolve()
         if folder not in runs:
-            runs[folder] = _load_model(path.parent / model.run, document, index)
+            runs[folder] = _load_model(path.parent / model.run, document, index, load or load_run)
         models.append(PlacedRun(runs[folder], model.pose(Pose()), name))
-    composition = Composition(models, ComposeConfig(entry.shadows), path)
+    composition = compose(models, ComposeConfig(entry.shadows), path)
     camera = None if entry.camera is None else _camera(entry.camera, path.parent, document)
     width = camera.width if camera else RESOLUTION[0]
     keyframes = [_keyframe(keyframe, k, entry, models, width, document) for k, keyframe in enumerate(entry.keyframes)]
@@ -279,9 +285,9 @@ def _names(models: Sequence[ModelEntry], document: toml.Document) -> list[str]:
     return names
 
 
-def _load_model(folder: Path, document: toml.Document, index: int) -> Run:
+def _load_model(folder: Path, document: toml.Document, index: int, load: Callable[[Path], Any]) -> Any:
     try:
-        return load_run(folder)
+        return load(folder)
     except InputError as error:
         raise InputError(f"{document.label(('models', index, 'run'))}: {error}") from None
 

@@ -83,6 +83,17 @@ def mesh_of(
     Raises InputError where the grid does not fit into memory.
     """
     config = config or MeshConfig()
+    return mesh_of_depths(lambda camera: depth_of(model, camera, config.depth, antialiased), cameras, config, progress)
+
+
+def mesh_of_depths(
+    depth: Callable[[Camera], np.ndarray],
+    cameras: Sequence[Camera],
+    config: MeshConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> RunMesh:
+    """The surface of what a camera sees at `depth`, [H, W] metres along its axis, 0 where there is no surface; see
+    `mesh_of`."""
     chosen = select_views(cameras, config.views)
     steps = 2 * len(chosen) + 1
 
@@ -93,7 +104,7 @@ def mesh_of(
     views: list[DepthView] = []
     for camera in chosen:
         report(len(views))
-        views.append(DepthView(camera, depth_of(model, camera, config.depth, antialiased)))
+        views.append(DepthView(camera, depth(camera)))
     box = bounds(views)
     if box is None:
         report(steps)

@@ -20,7 +20,7 @@ from spacesim.data.images import write_png
 from spacesim.data.records import MAX_SIDE, Camera, Sun, check_size
 from spacesim.data.sheet import DARK_PAGE, DETAIL, LABEL_HEIGHT, MIN_TILE_WIDTH, Tile, contact_sheet, fit_picture, font
 from spacesim.data.tone import as_bytes
-from spacesim.splat.export.pictures import shadow_colors
+from spacesim.learning.pictures import shadow_colors
 from spacesim.splat.export.video import INSTALL, Video, encoder
 from spacesim.splat.run import Predictor
 

@@ -15,8 +15,8 @@ from drjit import nn
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
-from spacesim.splat.light import mlp
-from spacesim.splat.light.mlp import MlpShape
+from spacesim.learning import mlp
+from spacesim.learning.mlp import MlpShape
 from spacesim.splat.light.padded_batch import PaddedBatch
 
 AGREES = 2e-3  #: difference to single precision up to which `is_usable` accepts a network's sigmoid

@@ -8,8 +8,8 @@ import drjit as dr
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, TensorXf
 from spacesim.data.errors import check_ranges
+from spacesim.learning.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape
 from spacesim.splat.light.encoding import Encoding
-from spacesim.splat.light.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.surface import shortest_axis

@@ -18,7 +18,8 @@ from spacesim.backend import ad, select
 from spacesim.backend.arrays import Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array
-from spacesim.splat.light import cooperative, mlp
+from spacesim.learning import mlp
+from spacesim.splat.light import cooperative
 from spacesim.splat.light import shading as kernels
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.padded_batch import PaddedBatch

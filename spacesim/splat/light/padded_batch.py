@@ -10,7 +10,6 @@ from spacesim.backend.arrays import Float, TensorXf, UInt32
 from spacesim.splat.raster.tiles import round_capacity
 
 CHUNK = 512  #: columns of a chunk, of which `round_capacity` is a multiple: 100,000 Gaussians fill a GPU
-ALIGNED = 4  #: rows of matrices are a multiple of it
 
 
 @dataclass
@@ -88,9 +87,3 @@ class PaddedBatch:
     def _matrix_index(lane: UInt32, row: UInt32 | int, height: int) -> UInt32:
         """Where a matrix of `height` rows has this row of this column."""
         return ((lane // CHUNK) * height + row) * CHUNK + lane % CHUNK
-
-
-def round_up_rows(rows: int) -> int:
-    """`rows` rounded up to what matrix products are fast at: Dr.Jit 1.5 reads four numbers at once on CUDA where rows
-    of memory allow it, and works in tiles of 64 x 64 instead of 8 x 8."""
-    return -(-rows // ALIGNED) * ALIGNED

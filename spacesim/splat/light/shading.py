@@ -10,7 +10,9 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Array4f, Float, TensorXf
-from spacesim.splat.light import cooperative, mlp
+from spacesim.learning import mlp
+from spacesim.learning.mlp import round_up_rows
+from spacesim.splat.light import cooperative
 from spacesim.splat.light.bounce import Scatterers, add_irradiance, add_irradiance_slopes, irradiance
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.field import (
@@ -23,7 +25,7 @@ from spacesim.splat.light.field import (
     sun_adjoint,
     sun_facing,
 )
-from spacesim.splat.light.padded_batch import PaddedBatch, round_up_rows
+from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shadow.light_camera import towards_sun
 from spacesim.splat.light.shadow.refine import RefineConfig, refine_inputs, refine_occlusion, refine_occlusion_slope
 from spacesim.splat.raster.cameras import Projection

@@ -1,19 +1,14 @@
-"""Models and checkpoints: safetensors files with a JSON header, complete or not there."""
+"""Checkpoints of Gaussians, and what they say of themselves."""
 
-import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
-from spacesim.backend.memory import check_memory
-from spacesim.data.errors import InputError, check_ranges
-from spacesim.data.files import open_regular, write_bytes
+from spacesim.data.errors import check_ranges
+from spacesim.learning import tensors as files
 
 FORMAT = "spacesim-gaussians-1"
 
@@ -41,27 +36,10 @@ class CheckpointHeader:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
-    """Write named arrays and a JSON header to `path`, atomically."""
-    metadata = {"spacesim": json.dumps({"format": FORMAT, **header}, sort_keys=True)}
-    contiguous = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-    write_bytes(path, save(contiguous, metadata=metadata))
+    """Write a model or a checkpoint of Gaussians; see `learning.tensors`."""
+    files.write_tensors(path, tensors, header, FORMAT)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """(arrays, header) of a file that `write_tensors` wrote. Raises InputError for anything else, and for arrays of
-    other numbers than floating-point ones."""
-    with open_regular(path, "a model") as file:
-        check_memory(os.fstat(file.fileno()).st_size, f"{path}: reading it")
-    try:
-        with safe_open(path, framework="numpy") as file:
-            header = json.loads((file.metadata() or {}).get("spacesim", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(f"{path}: expected a safetensors file, found one that cannot be read ({error})") from None
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        found = repr(header.get("format")) if isinstance(header, dict) else "none"
-        raise InputError(f"{path}: expected a {FORMAT} file, found format {found}")
-    for name, tensor in tensors.items():
-        if tensor.dtype not in (np.float32, np.float64):
-            raise InputError(f"{path}: expected floating-point numbers as {name}, found {tensor.dtype}")
-    return tensors, header
+    """The inverse of `write_tensors`. Raises InputError for another file."""
+    return files.read_tensors(path, FORMAT)

@@ -8,6 +8,7 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.learning.adam import adam_step
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Footprints, Splats, project
@@ -17,7 +18,6 @@ from spacesim.splat.raster.surface import normals
 from spacesim.splat.raster.tone import inverse_tone_map, tone_map
 from spacesim.splat.train.downscale import covered_color, truth_of_squares, valid_squares
 from spacesim.splat.train.loss.terms import depth_loss, normal_loss, photometric_loss, visibility_loss
-from spacesim.splat.train.optimizer.adam import adam_step
 from spacesim.splat.train.warm_start import foreground_loss
 
 

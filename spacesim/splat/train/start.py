@@ -10,6 +10,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.mesh import read_mesh
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_points
+from spacesim.learning.cameras import focus_point, nearest_camera
 from spacesim.splat.raster.cameras import NEAR
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 
@@ -172,24 +173,3 @@ def object_size(dataset: Dataset) -> float:
     else:
         raise InputError(f"{dataset.root}: init_box expects a mesh or points that tell the object's size, found none")
     return float(np.ptp(points, axis=0).max())
-
-
-def farthest_camera(dataset: Dataset, center: np.ndarray) -> float:
-    """Metres from `center` [3] to the farthest training camera (dist_max of thesis 4.5)."""
-    return float(max(np.linalg.norm(frame.camera.position - center) for frame in dataset.train))
-
-
-def nearest_camera(dataset: Dataset, center: np.ndarray) -> float:
-    """Metres from `center` [3] to the nearest training camera."""
-    return float(min(np.linalg.norm(frame.camera.position - center) for frame in dataset.train))
-
-
-def focus_point(dataset: Dataset) -> np.ndarray:
-    """[3] the point nearest to all optical axes, in the least-squares sense."""
-    A, b = 1e-9 * np.eye(3), np.zeros(3)
-    for frame in dataset.train:
-        axis = frame.camera.world_from_camera[:3, 2]
-        across = np.eye(3) - np.outer(axis, axis)
-        A += across
-        b += across @ frame.camera.position
-    return np.linalg.solve(A, b)

@@ -6,7 +6,7 @@ A step takes one view or several forward and backward (`view_pass`), moves all p
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,42 +20,28 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
 from spacesim.data.toml import Document
+from spacesim.learning.adam import NetworkAdam
+from spacesim.learning.cameras import farthest_camera, focus_point, nearest_camera
+from spacesim.learning.folder import TrainingProgress
 from spacesim.splat.light.bounce import ALBEDO
 from spacesim.splat.light.model import LightModel, TrainingFrame, is_near, robust_radius
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.train.checkpoint import CheckpointHeader, read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.optimizer.adam import Adam, NetworkAdam
+from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.optimizer.update import Update
 from spacesim.splat.train.pictures.learned import LearnedPictures
 from spacesim.splat.train.pictures.suns import FirstSuns
 from spacesim.splat.train.prior import MeshPrior
 from spacesim.splat.train.stages import TargetImage, update_light
-from spacesim.splat.train.start import (
-    farthest_camera,
-    focus_point,
-    initial_gaussians,
-    nearest_camera,
-    scene_scale,
-    surface_normals,
-)
+from spacesim.splat.train.start import initial_gaussians, scene_scale, surface_normals
 from spacesim.splat.train.strategies.factory import make_strategy
 from spacesim.splat.train.view_pass import ViewPass, ViewResult
 from spacesim.splat.train.views import TrainingView, TrainingViews
 from spacesim.splat.train.warm_start import Attraction, WarmStart
 
 HISTORY_EVERY = 50  #: iterations between two entries of the history
-
-
-@dataclass(frozen=True)
-class TrainingProgress:
-    """What a training loop tells of itself now and then."""
-
-    iteration: int
-    iterations: int
-    loss: float
-    gaussian_count: int
 
 
 class Trainer:

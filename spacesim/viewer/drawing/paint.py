@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 
 from spacesim.data.sheet import font
 from spacesim.eval.pictures import error_colors
-from spacesim.splat.export.pictures import LIT, SHADOWED
+from spacesim.learning.pictures import LIT, SHADOWED
 
 Bytes = NDArray[np.uint8]
 

@@ -14,8 +14,8 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.images import read_png
 from spacesim.data.records import Camera, Sun
+from spacesim.learning.pictures import LIT, SHADOWED, shadow_colors, write_picture
 from spacesim.splat.export import sweep as module
-from spacesim.splat.export.pictures import LIT, SHADOWED, shadow_colors, write_picture
 from spacesim.splat.export.sweep import SUN, resize_camera, sky_mark, suns_around, sweep
 from spacesim.splat.export.video import Video, encoder, yuv420_from_rgb
 from spacesim.splat.light.config import LightConfig

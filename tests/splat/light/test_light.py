@@ -18,12 +18,12 @@ from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import read_points, write_points
+from spacesim.learning.mlp import MlpShape
 from spacesim.splat.export.bake import bake
 from spacesim.splat.light import model as light_module
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.field import DirectionsConfig, FieldConfig, SurfaceConfig, ViewAloneConfig
-from spacesim.splat.light.mlp import MlpShape
 from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig, cast_shadows
 from spacesim.splat.light.shadow.light_camera import light_rows

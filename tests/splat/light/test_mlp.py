@@ -6,9 +6,10 @@ import pytest
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.upload import upload
-from spacesim.splat.light import cooperative, mlp
-from spacesim.splat.light.mlp import MlpShape
-from spacesim.splat.light.padded_batch import CHUNK, PaddedBatch, round_up_rows
+from spacesim.learning import mlp
+from spacesim.learning.mlp import MlpShape, round_up_rows
+from spacesim.splat.light import cooperative
+from spacesim.splat.light.padded_batch import CHUNK, PaddedBatch
 
 SHAPES = {
     "filled up": MlpShape(5, 3, 2, 12, 3),

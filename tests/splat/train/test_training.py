@@ -15,6 +15,7 @@ from spacesim.cli import main
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image
 from spacesim.data.lock import lock_folder
+from spacesim.learning.cameras import focus_point
 from spacesim.splat.export.ply import read_ply, write_ply
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
@@ -23,7 +24,7 @@ from spacesim.splat.run import load_run
 from spacesim.splat.train import views
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig, preset, with_options
-from spacesim.splat.train.start import distance_warning, focus_point, initial_gaussians, scale_warning, scene_scale
+from spacesim.splat.train.start import distance_warning, initial_gaussians, scale_warning, scene_scale
 from spacesim.splat.train.strategies.control import RefinementConfig
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer

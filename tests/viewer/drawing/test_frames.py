@@ -9,8 +9,8 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.eval.pictures import error_colors
+from spacesim.learning.pictures import LIT, SHADOWED
 from spacesim.splat.compose import Composition, Pose
-from spacesim.splat.export.pictures import LIT, SHADOWED
 from spacesim.viewer.drawing.frames import (
     BUDGET,
     MIN_SIDE,

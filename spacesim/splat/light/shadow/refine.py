@@ -8,8 +8,8 @@ import drjit as dr
 from spacesim.backend.arrays import Array3f, Float
 from spacesim.data.errors import check_ranges
 from spacesim.data.structure import check_choices
+from spacesim.learning.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape, sigmoid
 from spacesim.splat.light.encoding import Encoding
-from spacesim.splat.light.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape, sigmoid
 
 SURE = 0.02  #: a raw occlusion nearer to 0 or 1 counts as this near: the network can still change it
 

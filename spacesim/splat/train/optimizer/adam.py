@@ -8,6 +8,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float, UInt32
 from spacesim.backend.upload import upload
+from spacesim.learning.adam import corrections
 from spacesim.splat.raster.gaussians import ROWS, gather_entries
 from spacesim.splat.train.optimizer.packing import (
     PackedArray,
@@ -20,7 +21,6 @@ from spacesim.splat.train.optimizer.packing import (
     zeros,
 )
 
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 OWN = ROWS["sh"].start  #: rows of place, shape and opacity; harmonics or features come behind
 CONSTANT = 3  #: rows of the constant harmonic, which are moved with them
 PART = 15  #: rows of harmonics that are moved at once: five coefficients
@@ -45,7 +45,7 @@ class Adam:
     def corrections(self) -> tuple[float, float]:
         """Count a step; the factors that make the moments unbiased estimates."""
         self.steps += 1
-        return _corrections(self.steps)
+        return corrections(self.steps)
 
     def select(self, index: UInt32, fresh: Bool) -> None:
         """Entry i of each moment becomes entry index[i], or zero where `fresh[i]`. index, fresh: [M]."""
@@ -96,58 +96,9 @@ class Adam:
         self.layouts = [plan_packing(rows.stop - rows.start, count) for rows in self.slices]
 
 
-class NetworkAdam:
-    """Moments of the weights of networks, arrays of any lengths."""
-
-    def __init__(self, weights: list[Float]) -> None:
-        self.first = [dr.zeros(ad.Float, dr.width(weight)) for weight in weights]
-        self.second = [dr.zeros(ad.Float, dr.width(weight)) for weight in weights]
-        self.steps = 0
-
-    def corrections(self) -> tuple[float, float]:
-        """See `Adam.corrections`."""
-        self.steps += 1
-        return _corrections(self.steps)
-
-    def moments(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """The first and the second moment of each array."""
-        return [np.array(moment) for moment in self.first], [np.array(moment) for moment in self.second]
-
-    def put(self, first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> None:
-        """The inverse of `moments`."""
-        self.first, self.second = [upload(moment) for moment in first], [upload(moment) for moment in second]
-
-
 def parts(rows: int) -> list[slice]:
     """Rows that are moved at once, of so many (`Gaussians.rows`) without features: those of place, shape and opacity
     with the constant harmonic, where there are harmonics, then `PART` each."""
     drawn = rows - (rows % 3 == 0)  # 11, and harmonics come in threes
     first = min(OWN + CONSTANT, drawn)
     return [slice(0, first), *(slice(start, min(start + PART, drawn)) for start in range(first, drawn, PART))]
-
-
-def adam_step(
-    rows: list[Float],
-    gradients: list[Float],
-    moments: tuple[list[Float], list[Float]],
-    rates: list[Float],
-    corrections: tuple[Float, Float],
-) -> tuple[list[Float], list[Float], list[Float]]:
-    """(rows, first, second) after a step; pure, so that it can be recorded once and replayed. rates: a row each.
-
-    Gradients below EPSILON count as 0. They are round-off, and their squares are denormal numbers, which Dr.Jit's
-    worker threads flush to zero and the main thread does not: Adam would make the number of threads visible.
-    """
-    moved, first, second = [], [], []
-    for row, gradient, m, v, rate in zip(rows, gradients, *moments, rates, strict=True):
-        gradient = dr.select(dr.abs(gradient) < EPSILON, 0, gradient)
-        m = BETA1 * m + (1 - BETA1) * gradient
-        v = BETA2 * v + (1 - BETA2) * gradient * gradient
-        moved.append(row - rate * (corrections[0] * m) / (dr.sqrt(corrections[1] * v) + EPSILON))
-        first.append(m)
-        second.append(v)
-    return moved, first, second
-
-
-def _corrections(steps: int) -> tuple[float, float]:
-    return 1 / (1 - BETA1**steps), 1 / (1 - BETA2**steps)

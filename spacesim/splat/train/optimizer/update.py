@@ -13,12 +13,13 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
+from spacesim.learning.adam import adam_step
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 from spacesim.splat.raster.project import Splats, project
 from spacesim.splat.raster.render import harmonics, is_unclamped
 from spacesim.splat.train.loss.terms import penalty
-from spacesim.splat.train.optimizer.adam import OWN, Adam, adam_step
+from spacesim.splat.train.optimizer.adam import OWN, Adam
 from spacesim.splat.train.optimizer.packing import PackedArray, load, store
 from spacesim.splat.train.stages import mean, shape_values
 

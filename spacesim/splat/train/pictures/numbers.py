@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.geometry import Array
-from spacesim.splat.train.optimizer.adam import EPSILON
+from spacesim.learning.adam import EPSILON
 
 BETA1, BETA2 = 0.5, 0.9  #: of Adam: a picture has some hundred steps at most, so its moments forget sooner
 

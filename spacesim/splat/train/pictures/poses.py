@@ -28,12 +28,12 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Dataset
+from spacesim.learning.cameras import focus_point
 from spacesim.splat.pose import moved, twist_between
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole, Splats, project
 from spacesim.splat.train.optimizer.adam import OWN
 from spacesim.splat.train.pictures.numbers import PictureNumbers, falling
-from spacesim.splat.train.start import focus_point
 
 START, START_SHARE = 100, 0.025  #: steps that poses wait at most, until colours are rough, and share of the training
 ANCHORED, ANCHORED_SHARE = 10, 0.25  #: times that each picture is shown to a model that stays; most of the training

@@ -9,9 +9,10 @@ import pytest
 
 from spacesim.backend import ad, select
 from spacesim.backend.upload import upload
+from spacesim.learning.adam import NetworkAdam, adam_step
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
 from spacesim.splat.train.config import preset, shortened
-from spacesim.splat.train.optimizer.adam import Adam, NetworkAdam, adam_step
+from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.strategies.control import RefinementConfig
 from spacesim.splat.train.strategies.default import DefaultStrategy
 from spacesim.splat.train.strategies.densify import grow, limit_opacities, prune, rearrange

@@ -1,0 +1,163 @@
+"""A run's folder while it is trained: what is in it, checkpoints, the time that training took."""
+
+import logging
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import spacesim
+from spacesim import backend
+from spacesim.data.errors import InputError
+from spacesim.data.files import holds_files, read_json, write_json
+from spacesim.data.identity import training_digest
+from spacesim.data.records import Dataset
+
+KEEP_CHECKPOINTS = 2
+
+log = logging.getLogger(__name__)
+
+ReadConfig = Callable[[Path], tuple[Any, dict[str, Any]]]
+"""config.json to (configuration, with `to_json`; what it says of the data, as `TrainingData`)."""
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """What a run says of its data."""
+
+    path: str  #: of the folder
+    digest: str | None = None  #: see `training_digest`, of runs that tell it
+    train_frames: int | None = None
+    test_frames: int | None = None
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """What a training loop tells of itself now and then."""
+
+    iteration: int
+    iterations: int
+    loss: float
+    gaussian_count: int | None = None  #: None of a radiance field
+
+    @property
+    def words(self) -> str:
+        """For a bar or a line."""
+        return f"loss {self.loss:.4f}" + ("" if self.gaussian_count is None else f", {self.gaussian_count} Gaussians")
+
+
+def check_folder(out: Path, described: dict[str, Any], resume: bool, read_config: ReadConfig) -> None:
+    """Raises InputError where a run that is so described cannot be written to `out`, or completed in it. read_config:
+    of the method"""
+    if (out / "config.json").exists():
+        if checkpoints(out) or (out / "model.safetensors").exists():  # else nothing is there that could be lost
+            _check_resumable(out, described, resume, read_config)
+    elif out.exists() and not out.is_dir():
+        raise InputError(f"{out}: expected an empty or new folder for the run, found no folder")
+    elif holds_files(out):
+        raise InputError(f"{out}: expected an empty or new folder for the run, found other files in it")
+
+
+def checkpoints(out: Path) -> list[Path]:
+    """Files of a run's checkpoints, oldest first."""
+    return sorted((out / "checkpoints").glob("step_*.safetensors"))
+
+
+class TrainingClock:
+    """Wall-clock time of training, kept across interruptions beside the checkpoints."""
+
+    def __init__(self, out: Path, iteration: int) -> None:
+        """iteration: that training goes on from"""
+        self.path = out / "checkpoints" / "seconds.json"
+        self.kept = _read_seconds(self.path)
+        self.before, self.start = self.kept.get(str(iteration), 0.0), time.monotonic()
+
+    def total(self) -> float:
+        """Seconds until now."""
+        return self.before + time.monotonic() - self.start
+
+    def write(self, iteration: int, **more: float) -> None:
+        """At a checkpoint; more: other seconds to keep."""
+        write_json(self.path, {str(iteration): self.total(), **more})
+
+
+def write_checkpoint(save: Callable[[Path], None], out: Path, iteration: int) -> None:
+    """Let `save` write the checkpoint of an iteration, then delete all but the newest."""
+    save(out / "checkpoints" / f"step_{iteration:08d}.safetensors")
+    for old in checkpoints(out)[:-KEEP_CHECKPOINTS]:
+        old.unlink(missing_ok=True)
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    packages = {"spacesim": spacesim.__version__, "drjit": version("drjit"), "numpy": np.__version__}
+    return {**packages, "python": platform.python_version()}
+
+
+def device() -> str:
+    """What computes, in words."""
+    if backend.select() == "cuda":
+        import drjit as dr
+
+        return f"CUDA device of compute capability {dr.detail.cuda_compute_capability() / 10:.1f}"
+    return f"{platform.machine()} CPU, {os.cpu_count()} cores"
+
+
+def describe_data(dataset: Dataset) -> dict[str, Any]:
+    """What a run remembers of its data: enough to find it again and to notice another one in its place."""
+    return {
+        "path": str(dataset.root.resolve()),
+        "digest": training_digest(dataset),
+        "train_frames": len(dataset.train),
+        "test_frames": len(dataset.test),
+    }
+
+
+def _check_resumable(out: Path, described: dict[str, Any], resume: bool, read_config: ReadConfig) -> None:
+    if not resume:
+        raise InputError(f"resume: expected with {out}, which holds a run already, or a new folder, found neither")
+    config, data = read_config(out / "config.json")
+    data["path"] = described["data"]["path"]  # it may have moved
+    current = {**config.to_json(), "data": data}  # what an older version did not write is as by default
+    difference = _first_difference(current, described)
+    if difference is not None:
+        key, old, new = difference
+        raise InputError(f"{out}: was started with {key} {old!r}, expected the same to resume it, found {new!r}")
+
+
+def _first_difference(old: dict[str, Any], new: dict[str, Any], within: str = "") -> tuple[str, Any, Any] | None:
+    """(key, old value, new value) of the first key of `new` that `old` has otherwise; "light.field.width" within
+    others."""
+    for key, value in new.items():
+        was = old.get(key)
+        if isinstance(was, dict) and isinstance(value, dict):
+            difference = _first_difference(was, value, f"{within}{key}.")
+            if difference is not None:
+                return difference
+        elif was != value:
+            return f"{within}{key}", was, value
+    return None
+
+
+def _read_seconds(path: Path) -> dict[str, float]:
+    """{iteration of a checkpoint, or "refinement": seconds}; {}, with a warning, where the file is damaged: only the
+    report tells of them."""
+    if not path.exists():
+        return {}
+    try:
+        values = read_json(path)
+        if not isinstance(values, dict):
+            raise InputError(f"{path}: expected a JSON object, found another value")
+        for key, value in values.items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e12:
+                raise InputError(f"{path}: {key}: expected seconds, found {value!r:.60}")
+        return {key: float(value) for key, value in values.items()}
+    except InputError as error:
+        log.warning("%s; the time that training took before is not known", error)
+        return {}

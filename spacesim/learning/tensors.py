@@ -1,0 +1,42 @@
+"""Named arrays in safetensors files with a JSON header, complete or not there."""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from spacesim.backend.memory import check_memory
+from spacesim.data.errors import InputError
+from spacesim.data.files import open_regular, write_bytes
+
+
+def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], header: Mapping[str, Any], form: str) -> None:
+    """Write named arrays and a JSON header to `path`, atomically. form: the word by which `read_tensors` knows it."""
+    metadata = {"spacesim": json.dumps({"format": form, **header}, sort_keys=True)}
+    contiguous = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+    write_bytes(path, save(contiguous, metadata=metadata))
+
+
+def read_tensors(path: Path, form: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """(arrays, header) of a file that `write_tensors` wrote. Raises InputError for anything else, and for arrays of
+    other numbers than floating-point ones."""
+    with open_regular(path, "a model") as file:
+        check_memory(os.fstat(file.fileno()).st_size, f"{path}: reading it")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {}).get("spacesim", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(f"{path}: expected a safetensors file, found one that cannot be read ({error})") from None
+    if not isinstance(header, dict) or header.get("format") != form:
+        found = repr(header.get("format")) if isinstance(header, dict) else "none"
+        raise InputError(f"{path}: expected a {form} file, found format {found}")
+    for name, tensor in tensors.items():
+        if tensor.dtype not in (np.float32, np.float64):
+            raise InputError(f"{path}: expected floating-point numbers as {name}, found {tensor.dtype}")
+    return tensors, header

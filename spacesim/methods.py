@@ -1,0 +1,117 @@
+"""All methods of reconstruction behind one door: Gaussians (`splat`) and radiance fields (`nerf`).
+
+Which family a method is of is told by its name, and of a run by the method that its config.json names.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from spacesim.data.errors import InputError
+from spacesim.data.files import read_json
+from spacesim.data.records import Dataset
+from spacesim.data.structure import did_you_mean
+from spacesim.nerf import config as nerf
+from spacesim.nerf.config import NerfConfig
+from spacesim.splat.train import config as splat
+from spacesim.splat.train.config import TrainConfig
+
+if TYPE_CHECKING:
+    from spacesim.learning.folder import TrainingProgress
+    from spacesim.nerf.run import NerfRun
+    from spacesim.splat.compose.path import PosedScene
+    from spacesim.splat.run import Predictor, Run
+
+METHODS = (*splat.METHODS, *nerf.METHODS)
+Config = TrainConfig | NerfConfig
+
+
+def preset(name: str = "fast", method: str = "vanilla", strategy: str | None = None) -> Config:
+    """The configuration of a preset; see `splat.train.config.preset` and `nerf.config.preset`. Raises InputError for a
+    name that is none, and for a strategy of a method without Gaussians."""
+    if method not in nerf.METHODS:
+        if method not in (*splat.METHODS, *splat.ALIASES):
+            hint = did_you_mean(method, METHODS)
+            raise InputError(f"method: expected one of {', '.join(METHODS)}, found {method!r}{hint}")
+        return splat.preset(name, method, strategy or "default")
+    if strategy is not None:
+        raise InputError(f"strategy: expected with a method of Gaussians, found {strategy!r} with {method}")
+    return nerf.preset(name, method)
+
+
+def shortened(config: Config, iterations: int | None) -> Config:
+    """`config` with so many iterations, its schedule with them where they are fewer; as it is for None."""
+    if iterations is None:
+        return config
+    return nerf.shortened(config, iterations) if isinstance(config, NerfConfig) else splat.shortened(config, iterations)
+
+
+def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
+    """`config` with fields set by their dotted names. Raises InputError for a name or a value that cannot be."""
+    if isinstance(config, NerfConfig):
+        return nerf.with_settings(config, settings)
+    return splat.with_settings(config, settings)
+
+
+def train(
+    dataset: Dataset,
+    out: Path,
+    config: Config,
+    resume: bool = False,
+    on_progress: "Callable[[TrainingProgress], None]" = lambda progress: None,
+    command: Sequence[str] = (),
+) -> "Run | NerfRun":
+    """Train with the family's own `train`."""
+    if isinstance(config, NerfConfig):
+        from spacesim.nerf.train.train import train as train_field
+
+        return train_field(dataset, out, config, resume, on_progress, command)
+    from spacesim.splat.train.train import train as train_splats
+
+    return train_splats(dataset, out, config, resume, on_progress, command)
+
+
+def load_run(path: str | Path) -> "Run | NerfRun":
+    """Load a finished run of any method. Raises InputError where the folder is no run or its training has not ended."""
+    config = Path(path) / "config.json"
+    values = read_json(config) if config.exists() else {}
+    if isinstance(values, dict) and values.get("method") in nerf.METHODS:
+        from spacesim.nerf.run import load_run as load_field
+
+        return load_field(path)
+    from spacesim.splat.run import load_run as load_splats
+
+    return load_splats(path)
+
+
+def load_scene(path: str | Path) -> "PosedScene":
+    """The scene that a TOML file describes, of Gaussians or of radiance fields. Raises InputError with file, line and
+    key, and where it has both."""
+    from spacesim.splat.compose.scenefile import load_scene as load
+
+    return load(path, load_run, _compose)
+
+
+def load_predictor(path: Path) -> "Predictor":
+    """The run in a folder, or the scene of a TOML file at its beginning. Raises InputError where there is neither."""
+    if path.suffix != ".toml":
+        return load_run(path)
+    from spacesim.splat.compose import ComposedRun
+    from spacesim.splat.compose.scene import Composition
+
+    composition = load_scene(path).posed_at(0.0)
+    if not isinstance(composition, Composition):
+        raise InputError(f"{path}: expected a run, or a scene of Gaussians, found a scene of radiance fields")
+    return ComposedRun(composition, path)
+
+
+def _compose(models: Sequence[Any], config: Any, path: Path) -> Any:
+    """What draws posed runs of one family."""
+    from spacesim.nerf.compose import Composition as Fields
+    from spacesim.nerf.run import NerfRun
+    from spacesim.splat.compose.scene import Composition
+
+    fields = [isinstance(model.run, NerfRun) for model in models]
+    if any(fields) and not all(fields):
+        raise InputError(f"{path}: expected runs of Gaussians, or of radiance fields, found both in one scene")
+    return Fields(models, config, path) if all(fields) else Composition(models, config, path)

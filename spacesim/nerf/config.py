@@ -1,0 +1,150 @@
+"""How a radiance field is trained: one frozen record, its presets (assets/presets/nerf.toml), settings by name."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from spacesim.data.errors import InputError, check_ranges
+from spacesim.data.structure import Rules, check_choices, did_you_mean, plain, structure
+from spacesim.data.toml import Document, read_document
+
+Method = Literal["nerf", "nerf-relight"]
+Preset = Literal["demo", "fast", "thesis"]
+METHODS: tuple[str, ...] = get_args(Method)
+PRESETS: tuple[str, ...] = get_args(Preset)
+ASSET = Path(__file__).parents[1] / "assets" / "presets" / "nerf.toml"
+CHUNK = 512  #: samples of which networks read a multiple, see `field.Columns`
+MAX_STEPS, MAX_RAYS, MAX_SAMPLES = 10_000_000, 2**20, 1024
+
+
+@dataclass(frozen=True)
+class GridConfig:
+    """A multi-resolution hash grid (Müller et al. 2022): two numbers at each vertex of each level."""
+
+    levels: int = 8  #: resolutions
+    coarsest: int = 16  #: cells along the box's longest side, of the first level
+    finest: int = 256  #: of the last level; those between grow by one factor
+    log2_size: int = 15  #: vertices that a level stores at most, as a power of 2; beyond that they share by a hash
+
+    def __post_init__(self) -> None:
+        check_ranges(self, levels=(1, 32), coarsest=(1, 4096), finest=(1, 2**16), log2_size=(4, 24))
+        if self.finest < self.coarsest:
+            raise InputError(f"finest: expected at least coarsest, {self.coarsest}, found {self.finest}")
+
+
+@dataclass(frozen=True)
+class ProposalConfig:
+    """One of the two coarse density fields that say where samples are worth their cost."""
+
+    samples: int = 32  #: of a ray
+    width: int = 16  #: units of the hidden layer
+    grid: GridConfig = field(default_factory=lambda: GridConfig(4, 8, 64, 13))  #: where it stores what it knows
+
+    def __post_init__(self) -> None:
+        check_ranges(self, samples=(2, MAX_SAMPLES), width=(1, 256))
+
+
+@dataclass(frozen=True)
+class NerfConfig:
+    """Everything that decides a trained radiance field, apart from the data and the backend."""
+
+    method: Method = "nerf"  #: whether colours are told the Sun
+    preset: Preset | None = None  #: the preset that this started from
+    iterations: int = 2_000  #: steps of training
+    seed: int = 0  #: random seed: same seed, same bits
+    rays: int = 1_024  #: of a step; a multiple of 512
+    samples: int = 16  #: of a ray, of the field itself
+    width: int = 32  #: units of hidden layers
+    features: int = 15  #: numbers that the density network tells the colour network of a point
+    color_layers: int = 3  #: matrix products of the colour network
+    harmonics: int = 3  #: degree of spherical harmonics of the view's direction
+    sun_harmonics: int = 1  #: of the Sun's, of `nerf-relight`: more of them tell training's few Suns apart by heart
+    grid: GridConfig = field(default_factory=GridConfig)  #: what the field knows of places
+    coarse: ProposalConfig = field(default_factory=ProposalConfig)  #: first round: reads evenly spaced samples
+    fine: ProposalConfig = field(default_factory=lambda: ProposalConfig(16))  #: second: where the first saw density
+    proposals_every: int = 4  #: steps after which proposals learn, once `warm_up` is over
+    warm_up: int = 250  #: steps in which proposals learn each time and the whole box counts as filled
+    occupancy: int = 32  #: cells along the box's longest side that are known as empty or not
+    occupancy_every: int = 25  #: steps between two looks at these
+    interlevel_weight: float = 1.0  #: in the loss: proposals that miss what the field has (Barron et al. 2022)
+    distortion_weight: float = 0.002  #: in the loss: weights of a ray that lie apart (Barron et al. 2022)
+    random_background: bool = True  #: each ray over another colour, by alpha; false: over black
+    rate: float = 1e-2  #: Adam's step size at the start
+    rate_final: float = 1e-3  #: at the end; it falls exponentially
+    margin: float = 0.05  #: of the object's size, around it, that the box has
+    checkpoint_every: int = 1_000  #: iterations between two checkpoints
+    chunk: int = 8_192  #: rays that are drawn at once: bounds memory, changes no picture
+
+    def __post_init__(self) -> None:
+        check_choices(self)
+        check_ranges(self, iterations=(1, MAX_STEPS), seed=(0, 2**63), checkpoint_every=(1, MAX_STEPS))
+        check_ranges(self, rays=(CHUNK, MAX_RAYS), chunk=(CHUNK, MAX_RAYS), samples=(2, MAX_SAMPLES), width=(1, 1024))
+        check_ranges(
+            self, features=(1, 256), color_layers=(2, 8), harmonics=(0, 6), sun_harmonics=(1, 6), occupancy=(4, 512)
+        )
+        check_ranges(self, proposals_every=(1, MAX_STEPS), warm_up=(0, MAX_STEPS), occupancy_every=(1, MAX_STEPS))
+        check_ranges(self, interlevel_weight=(0, 1e6), distortion_weight=(0, 1e6), margin=(0, 10))
+        check_ranges(self, rate=(0, 10), rate_final=(0, 10))
+        if self.occupancy % 8:
+            raise InputError(f"occupancy: expected a multiple of 8, found {self.occupancy}")
+        for name in ("rays", "chunk"):
+            if getattr(self, name) % CHUNK:
+                raise InputError(f"{name}: expected a multiple of {CHUNK}, found {getattr(self, name)}")
+
+    @property
+    def knows_sun(self) -> bool:
+        """Whether colours are told the Sun."""
+        return self.method == "nerf-relight"
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for config.json."""
+        values: dict[str, Any] = plain(self)
+        return values
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any], name: str = "config.json") -> "NerfConfig":
+        """The inverse of `to_json`; the key data, which a run's config.json has besides, is passed over. Raises
+        InputError for a key that is not known and for a value that cannot be."""
+        settings = {key: value for key, value in values.items() if key != "data"}
+        return structure(NerfConfig, Document(name, settings, {}), Rules())
+
+
+def preset(name: str, method: str = "nerf") -> NerfConfig:
+    """What assets/presets/nerf.toml says: `thesis` has nerfacto's sizes (Tancik et al. 2023), `fast` and `demo` are for
+    pictures of some hundred pixels on two CPU cores. Raises InputError for another name or method."""
+    for what, word, words in (("preset", name, PRESETS), ("method", method, METHODS)):
+        if word not in words:
+            raise InputError(f"{what}: expected one of {', '.join(words)}, found {word!r}{did_you_mean(word, words)}")
+    values = {**_sections()[name], "preset": name, "method": method}
+    return structure(NerfConfig, Document(str(ASSET), values, {}), Rules())
+
+
+@cache
+def _sections() -> Mapping[str, Any]:
+    return read_document(ASSET).values
+
+
+def shortened(config: NerfConfig, iterations: int) -> NerfConfig:
+    """`config` with so many iterations; where they are fewer, the warm-up shrinks by the same share."""
+    share = min(iterations / config.iterations, 1)
+    return replace(config, iterations=iterations, warm_up=round(share * config.warm_up))
+
+
+def with_settings(config: NerfConfig, settings: Mapping[str, Any]) -> NerfConfig:
+    """`config` with fields set by their dotted names: {"grid.levels": 12}. Raises InputError
+    "grid.levels: expected ..., found ..." for a name or a value that cannot be."""
+    values = config.to_json()
+    for name, value in settings.items():
+        *tables, key = name.split(".")
+        table = values
+        for depth, part in enumerate(tables, start=1):
+            inner = table.setdefault(part, {})
+            if not isinstance(inner, dict):
+                raise InputError(
+                    f"{name}: expected {'.'.join(tables[:depth])} alone, which has no fields, found {name}"
+                )
+            table = inner
+        table[key] = value
+    return structure(NerfConfig, Document("", values, {}), Rules(none="none"))

@@ -1,0 +1,153 @@
+"""Pictures of a radiance field: rays of a chunk at a time, and of these only such as cross what is filled."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+
+from spacesim.backend import ad, recorded
+from spacesim.backend.arrays import Array3f, Float, UInt32
+from spacesim.backend.upload import upload
+from spacesim.data.records import Camera
+from spacesim.nerf.fields.field import Parameters
+from spacesim.nerf.fields.model import Networks, places
+from spacesim.nerf.sampling.box import SceneBox
+from spacesim.nerf.sampling.rays import Rays, camera_rows, pixel_rays
+from spacesim.nerf.sampling.render import Weights, expected_depth, median_depth, sum_rays, volume_weights
+
+PLANES = {"rgb": 3, "alpha": 1, "depth": 1, "median_depth": 1, "normal": 3}
+"""Of a picture, in this order: colours over black, opacity, depths (sides of the box, along the ray), and the sum of
+density gradients by weight, which points inwards."""
+
+
+@dataclass
+class Samples:
+    """Of R rays, S samples each: what several fields are merged from, see `compose`."""
+
+    low: Float  #: [R S] t
+    high: Float  #: [R S] t
+    density: Float  #: [R S] per unit of t
+    color: list[Float]  #: 3 times [R S]
+
+
+def sample_field(networks: Networks, parameters: Parameters, rays: Rays, count: int, sun: Float | None) -> Samples:
+    """Intervals of the field's own samples of `count` rays, and what it has there. sun: Float [3], towards it"""
+    samples = networks.config.samples
+    edges, _ = networks.sample(parameters, rays, count, None)
+    t, lengths, index = places(rays, edges, count, samples)
+    point, direction = rays.at(index, t)
+    own = networks.of_round(parameters, 2)
+    density, color, _ = networks.field.look_up(own, point, networks.field.directions(direction, _towards(sun)))
+    return Samples(t - 0.5 * lengths, t + 0.5 * lengths, density, color)
+
+
+def draw_rays(
+    networks: Networks, parameters: Parameters, rays: Rays, count: int, sun: Float | None, normals: bool
+) -> Float:
+    """[C R] planes of `PLANES`, packed, of `count` rays, with the normals or without."""
+    samples = networks.config.samples
+    seen = sample_field(networks, parameters, rays, count, sun)
+    made = volume_weights(seen.density * (seen.high - seen.low), samples)
+    planes = shown(made, seen, rays, samples)
+    if normals:
+        index = dr.arange(ad.UInt32, count * samples) // samples
+        point, _ = rays.at(index, 0.5 * (seen.low + seen.high))
+        _, tape = networks.density_tape(parameters, point)
+        slopes = networks.field.density.slopes(networks.of_round(parameters, 2)[: networks.field.split], tape)
+        planes += [sum_rays(made.weights * slopes[i], samples) for i in range(3)]
+    return dr.concat(planes)
+
+
+def shown(made: Weights, seen: Samples, rays: Rays, samples: int) -> list[Float]:
+    """[R] each: colour (3), opacity, expected and median depth along the optical axis, unit of t."""
+    planes = [sum_rays(made.weights * seen.color[i], samples) for i in range(3)]
+    expected = expected_depth(made.weights, 0.5 * (seen.low + seen.high), samples)
+    median = median_depth(made, seen.low, seen.high, samples)
+    return [*planes, sum_rays(made.weights, samples), expected * rays.across, median * rays.across]
+
+
+def draw_chunk(
+    networks: Networks,
+    parameters: Parameters,
+    filled: Float,
+    cameras: Float,
+    pixel: UInt32,
+    width: UInt32,
+    extent: Float,
+    sun: Float | None,
+    normals: bool,
+) -> Float:
+    """`draw_rays` of pixels [R], row by row, of a camera."""
+    rays, _ = networks.occupancy.clip(_rays(cameras, pixel, width, extent), filled)
+    dr.eval(rays.origin, rays.direction, rays.near, rays.far, rays.across)
+    return draw_rays(networks, parameters, rays, networks.config.chunk, sun, normals)
+
+
+def find_crossing(
+    networks: Networks, filled: Float, cameras: Float, first: UInt32, width: UInt32, extent: Float
+) -> UInt32:
+    """[R] 1 where the ray through a pixel, number `first` and the following, crosses what is filled."""
+    pixel = dr.arange(ad.UInt32, networks.config.chunk) + first
+    _, crosses = networks.occupancy.clip(_rays(cameras, pixel, width, extent), filled)
+    return dr.select(crosses, ad.UInt32(1), ad.UInt32(0))
+
+
+_draw_chunk, _find_crossing = recorded(draw_chunk), recorded(find_crossing)
+
+
+def draw(
+    networks: Networks,
+    parameters: Parameters,
+    filled: Float,
+    box: SceneBox,
+    camera: Camera,
+    sun: np.ndarray | None,
+    normals: bool,
+) -> dict[str, np.ndarray]:
+    """Planes of a picture by name, [H, W] or [H, W, 3] float32, depths in metres. Memory on the device is that of a
+    chunk of rays. sun: [3] towards it, of a field that is told"""
+    names = [name for name in PLANES if name != "normal" or normals]
+    size, chunk = camera.width * camera.height, networks.config.chunk
+    cameras, extent = upload(camera_rows([camera], box)), upload(box.extent)
+    width = dr.opaque(ad.UInt32, camera.width)
+    towards = None if sun is None else upload(sun)
+    crossing = np.concatenate(
+        [
+            np.array(_find_crossing(networks, filled, cameras, dr.opaque(ad.UInt32, first), width, extent), bool)
+            for first in range(0, size, chunk)
+        ]
+    )[:size]
+    pixels = np.flatnonzero(crossing).astype(np.uint32)
+    planes = np.zeros((sum(PLANES[name] for name in names), size), np.float32)
+    for start in range(0, len(pixels), chunk):
+        part = pixels[start : start + chunk]
+        padded = upload(np.concatenate([part, np.repeat(part[-1:], chunk - len(part))]), ad.UInt32)
+        packed = _draw_chunk(networks, parameters, filled, cameras, padded, width, extent, towards, normals)
+        planes[:, part] = np.array(packed).reshape(-1, chunk)[:, : len(part)]
+    result, row = {}, 0
+    for name in names:
+        count = PLANES[name]
+        values = np.moveaxis(planes[row : row + count].reshape(count, camera.height, camera.width), 0, -1)
+        result[name] = np.ascontiguousarray(values if count > 1 else values[..., 0])
+        row += count
+    for name in ("depth", "median_depth"):
+        result[name] *= np.float32(box.side)
+    if normals:
+        result["normal"] = unit_normals(result["normal"])
+    return result
+
+
+def unit_normals(slopes: np.ndarray) -> np.ndarray:
+    """[H, W, 3] unit vectors against density gradients, 0 where there are none."""
+    length = np.linalg.norm(slopes, axis=-1, keepdims=True)
+    return np.asarray(np.where(length > 0, -slopes / np.maximum(length, 1e-30), 0), np.float32)
+
+
+def _rays(cameras: Float, pixel: UInt32, width: UInt32, extent: Float) -> Rays:
+    across = dr.maximum(width, 1)
+    x, y = ad.Float(pixel % across) + 0.5, ad.Float(pixel // across) + 0.5
+    return pixel_rays(cameras, dr.zeros(ad.UInt32, dr.width(pixel)), x, y, extent)
+
+
+def _towards(sun: Float | None) -> Array3f | None:
+    return None if sun is None else ad.Array3f([dr.gather(ad.Float, sun, ad.UInt32(i)) for i in range(3)])

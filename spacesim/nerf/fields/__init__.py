@@ -1,0 +1,1 @@
+"""Density and colour at points: grids, networks, the fields of a model."""

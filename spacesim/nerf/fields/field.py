@@ -1,0 +1,171 @@
+"""Fields: density and colour at points of the box, by a hash grid and small networks (2.1).
+
+Points are the columns of matrices [B, C, 512] that networks read (`learning.mlp`): N is a multiple of 512. Densities
+are per side of the box, so that a field does not know how large it is.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim.backend import ad
+from spacesim.backend.arrays import Array3f, Float, TensorXf
+from spacesim.learning import mlp
+from spacesim.learning.mlp import MlpShape, round_up_rows, sigmoid
+from spacesim.nerf.config import CHUNK, GridConfig, NerfConfig
+from spacesim.nerf.fields.hashgrid import HashGrid
+
+MAX_LOG_DENSITY = 12.0  #: e^12 a side: opaque within a hundred-thousandth of it
+
+Parameters = list[Float]
+"""A grid's table, then the weights of networks, as `mlp.initial_weights` orders them."""
+
+
+@dataclass
+class DensityTape:
+    """What the adjoint of a density wants."""
+
+    point: Array3f  #: [3, N]
+    layers: list[Any]  #: of the network
+    log_density: Float  #: [N]
+
+
+@dataclass(frozen=True)
+class DensityField:
+    """Density, and numbers that tell a colour network of the place."""
+
+    grid: HashGrid
+    shape: MlpShape
+
+    @staticmethod
+    def of(config: GridConfig, width: int, features: int = 0) -> "DensityField":
+        """features: numbers beside the density"""
+        grid = HashGrid(config)
+        return DensityField(grid, MlpShape(grid.outputs, 1, 1 + features, width, 2))
+
+    def initial(self, rng: np.random.Generator) -> list[np.ndarray]:
+        """`Parameters` to start from."""
+        return [self.grid.initial(rng), *mlp.initial_weights(self.shape, rng)]
+
+    def look_up(self, parameters: Parameters, point: Array3f) -> tuple[Float, TensorXf, DensityTape]:
+        """(density [N] per side, outputs [B, 1 + features, 512], tape) at points [3, N] of the box."""
+        items = to_matrix(self.grid.look_up(parameters[0], point))
+        output, layers = mlp.forward(self.shape, parameters[1:], items, _one())
+        log_density = row(output, 0)
+        return dr.exp(dr.minimum(log_density, MAX_LOG_DENSITY)), output, DensityTape(point, layers, log_density)
+
+    def adjoint(
+        self, parameters: Parameters, tape: DensityTape, by_density: Float, by_features: list[Float]
+    ) -> Parameters:
+        """Gradients by the parameters, from those [N] by the density and by the features."""
+        by_output = self._by_output(tape, by_density, by_features)
+        weights, by_items = mlp.backward(self.shape, parameters[1:], tape.layers, _one(), by_output)
+        rows = [row(by_items, i) for i in range(self.grid.outputs)]
+        dr.eval(rows, weights)
+        return [self.grid.adjoint(tape.point, rows), *weights]
+
+    def slopes(self, parameters: Parameters, tape: DensityTape) -> Array3f:
+        """[3, N] gradient of the density by the points."""
+        none = [ad.Float(0)] * (self.shape.outputs - 1)
+        by_output = self._by_output(tape, dr.full(ad.Float, 1, dr.width(tape.log_density)), none)
+        _, by_items = mlp.backward(self.shape, parameters[1:], tape.layers, _one(), by_output)
+        rows = [row(by_items, i) for i in range(self.grid.outputs)]
+        return self.grid.slopes(parameters[0], tape.point, rows)
+
+    def _by_output(self, tape: DensityTape, by_density: Float, by_features: list[Float]) -> TensorXf:
+        is_free = tape.log_density < MAX_LOG_DENSITY
+        by_log = dr.select(is_free, by_density * dr.exp(dr.minimum(tape.log_density, MAX_LOG_DENSITY)), 0)
+        return to_matrix([by_log, *by_features], exact=True)
+
+
+@dataclass
+class FieldTape:
+    """What the adjoint of a field wants."""
+
+    density: DensityTape
+    layers: list[Any]  #: of the colour network
+    color: list[Float]  #: [N] each
+
+
+@dataclass(frozen=True)
+class Field:
+    """Density and colour of a radiance field; the colour is told the direction of the view, and of the Sun where the
+    method is."""
+
+    density: DensityField
+    color: MlpShape
+    harmonics: int  #: degree, of the view's direction
+    sun_harmonics: int | None  #: degree, of the Sun's; None of a field that is not told
+
+    @staticmethod
+    def of(config: NerfConfig) -> "Field":
+        """Of a configuration."""
+        density = DensityField.of(config.grid, config.width, config.features)
+        of_sun = config.sun_harmonics if config.knows_sun else None
+        terms = (config.harmonics + 1) ** 2 + (0 if of_sun is None else (of_sun + 1) ** 2)
+        shape = MlpShape(config.features + terms, 1, 3, config.width, config.color_layers)
+        return Field(density, shape, config.harmonics, of_sun)
+
+    @property
+    def split(self) -> int:
+        """Where the colour network's weights begin among the parameters."""
+        return 2 + 2 * self.density.shape.layers
+
+    def initial(self, rng: np.random.Generator) -> list[np.ndarray]:
+        """`Parameters` to start from."""
+        return [*self.density.initial(rng), *mlp.initial_weights(self.color, rng)]
+
+    def directions(self, view: Array3f, sun: Array3f | None) -> list[Float]:
+        """What the colour network is told of directions [3, N], unit: real spherical harmonics."""
+        terms = list(dr.sh_eval(view, self.harmonics))
+        if self.sun_harmonics is not None:
+            assert sun is not None, "a field that is told the Sun"
+            terms += dr.sh_eval(sun, self.sun_harmonics)
+        return [ad.Float(term) for term in terms]
+
+    def look_up(
+        self, parameters: Parameters, point: Array3f, directions: list[Float]
+    ) -> tuple[Float, list[Float], FieldTape]:
+        """(density [N] per side, colour, 3 Floats [N] in 0 to 1, tape) at points [3, N] seen along `directions`."""
+        density, output, tape = self.density.look_up(parameters[: self.split], point)
+        features = [row(output, 1 + i) for i in range(output.shape[1] - 1)]
+        items = to_matrix([*features, *directions])
+        raw, layers = mlp.forward(self.color, parameters[self.split :], items, _one())
+        color = [sigmoid(row(raw, i)) for i in range(3)]
+        return density, color, FieldTape(tape, layers, color)
+
+    def adjoint(self, parameters: Parameters, tape: FieldTape, by_density: Float, by_color: list[Float]) -> Parameters:
+        """Gradients by the parameters, from those [N] by density and colour."""
+        by_raw = [gradient * c * (1 - c) for gradient, c in zip(by_color, tape.color, strict=True)]
+        by_raw_matrix = to_matrix(by_raw, exact=True)
+        colors, by_items = mlp.backward(self.color, parameters[self.split :], tape.layers, _one(), by_raw_matrix)
+        by_features = [row(by_items, i) for i in range(self.density.shape.outputs - 1)]
+        return self.density.adjoint(parameters[: self.split], tape.density, by_density, by_features) + colors
+
+
+def to_matrix(rows: list[Float], exact: bool = False) -> TensorXf:
+    """[B, C, 512] of rows [N]; C is rounded up to what products are fast at, by rows of 0, unless it is to be exact."""
+    height, count = len(rows) if exact else round_up_rows(len(rows)), max(dr.width(value) for value in rows)
+    column = dr.arange(ad.UInt32, count)
+    numbers = dr.empty(ad.Float, height * count)
+    for i in range(height):
+        value = rows[i] if i < len(rows) else ad.Float(0)
+        dr.scatter(numbers, value, _place(column, i, height), mode=dr.ReduceMode.Permute)
+    return ad.TensorXf(numbers, (count // CHUNK, height, CHUNK))
+
+
+def row(matrix: TensorXf, i: int) -> Float:
+    """Row i [N] of a matrix [B, C, 512]."""
+    column = dr.arange(ad.UInt32, matrix.shape[0] * CHUNK)
+    return dr.gather(ad.Float, matrix.array, _place(column, i, matrix.shape[1]))
+
+
+def _place(column: Any, i: int, height: int) -> Any:
+    return ((column // CHUNK) * height + i) * CHUNK + column % CHUNK
+
+
+def _one() -> Float:
+    """What all points share: nothing, so the first layer has a second bias."""
+    return dr.opaque(ad.Float, 1, 1)

@@ -1,0 +1,151 @@
+"""A trained radiance field on disk, and what it predicts.
+
+RUN/config.json        how it was trained and on what
+RUN/checkpoints/*      where training can go on
+RUN/model.safetensors  grids, networks, which cells are filled, the box: there once training is done
+RUN/training.json      history, time, backend, versions
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim import backend
+from spacesim.backend import ad
+from spacesim.backend.arrays import Float
+from spacesim.backend.upload import upload
+from spacesim.data.errors import InputError
+from spacesim.data.files import read_json
+from spacesim.data.records import Camera, Sun
+from spacesim.data.structure import Rules, read_record, structure
+from spacesim.data.toml import Document
+from spacesim.learning.folder import TrainingData
+from spacesim.learning.prediction import Prediction, Rendering, check_picture
+from spacesim.learning.tensors import read_tensors
+from spacesim.nerf.config import NerfConfig
+from spacesim.nerf.draw import draw
+from spacesim.nerf.fields.field import Parameters
+from spacesim.nerf.fields.model import Networks
+from spacesim.nerf.sampling.box import SceneBox
+from spacesim.nerf.train.trainer import FORMAT, HistoryEntry, box_of
+
+OPAQUE = 0.5  #: alpha from which on a pixel shows a surface
+
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """What training.json says: how a run came to be."""
+
+    history: tuple[HistoryEntry, ...]  #: of some iterations, in order
+    seconds: float  #: of training
+    parameters: int  #: numbers that were trained
+    backend: str  #: that trained
+    device: str | None = None  #: that trained
+    command: str | None = None  #: the command line, or None of another caller
+    versions: Mapping[str, str] = field(default_factory=dict)  #: of libraries
+
+
+@dataclass(frozen=True, eq=False)
+class NerfRun:
+    """A trained radiance field with its history; a `Predictor` without Gaussians."""
+
+    path: Path  #: the folder
+    config: dict[str, Any]  #: what config.json says
+    training: dict[str, Any]  #: what training.json says
+    networks: Networks
+    parameters: Parameters
+    filled: Float  #: see `Occupancy.filled`
+    box: SceneBox
+    model_bytes: int  #: size of the model's file
+    gaussians: None = None
+    gaussian_count: None = None
+    antialiased: bool = False
+
+    @property
+    def backend(self) -> str:
+        """The backend that renders now."""
+        return backend.select()
+
+    @property
+    def relightable(self) -> bool:
+        """Whether the Sun's direction changes what is predicted."""
+        return self.networks.config.knows_sun
+
+    @property
+    def parts(self) -> tuple[()]:
+        """None: it was trained as one."""
+        return ()
+
+    def render(self, camera: Camera, sun: Sun | Sequence[float] | None = None) -> Rendering:
+        """What `camera` sees under a Sun: rgb, alpha, depth and normal as numpy arrays, drawn when they are asked for.
+
+        sun: (azimuth, elevation) in degrees, a direction [3] towards it, or a Sun.  Raises InputError where a run needs
+        the Sun and none is told.
+        """
+        direction = Sun.of(sun)
+        self._check(direction, None)
+        return Rendering(self, camera, direction)
+
+    def predict(
+        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
+    ) -> Prediction:
+        """Render one view. Raises InputError where the Sun matters and none is told, and for an exposure: colours are
+        sRGB values."""
+        self._check(sun, exposure)
+        drawn = self._draw(camera, sun, normals)
+        return Prediction(drawn["rgb"], drawn["alpha"], drawn["depth"], None, drawn.get("normal"))
+
+    def surface_depth(self, camera: Camera) -> np.ndarray:
+        """[H, W] float32: depth in metres along the optical axis at which half of the light is gone, 0 where it is
+        not. A field that is told the Sun has one shape under all."""
+        drawn = self._draw(camera, Sun(np.array([0.0, 0.0, 1.0])), False)
+        return np.where(drawn["alpha"] >= OPAQUE, drawn["median_depth"], np.float32(0))
+
+    def _draw(self, camera: Camera, sun: Sun | None, normals: bool) -> dict[str, np.ndarray]:
+        check_picture(camera)
+        towards = sun.direction if sun is not None and self.relightable else None
+        return draw(self.networks, self.parameters, self.filled, self.box, camera, towards, normals)
+
+    def _check(self, sun: Sun | None, exposure: float | None) -> None:
+        if sun is None and self.relightable:
+            raise InputError(f"sun: expected its direction for a run of {self.config['method']}, found none")
+        if exposure is not None:
+            raise InputError(f"exposure: expected a run trained in linear light (light.linear), found {self.path}")
+
+
+def load_run(path: str | Path) -> NerfRun:
+    """Load a finished run. Raises InputError where the folder is none of a radiance field, or its training has not
+    ended."""
+    path = Path(path)
+    model_path = path / "model.safetensors"
+    if not (path / "config.json").exists():
+        raise InputError(f"{path}: expected a run of `spacesim train`, found no config.json in it")
+    if not model_path.exists():
+        raise InputError(f"{path}: training has not ended; complete it with `spacesim train ... --resume`")
+    settings, data = read_config(path / "config.json")
+    _, training = read_record(path / "training.json", TrainingRecord)
+    tensors, _ = read_tensors(model_path, FORMAT)
+    networks = Networks(settings)
+    try:
+        parameters, box, state = networks.parameters(tensors), box_of(tensors), tensors["occupancy"]
+        if state.shape != (settings.occupancy**3,) or not np.isfinite(state).all():
+            raise ValueError(f"occupancy: expected {settings.occupancy**3} finite numbers, found others")
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{model_path}: expected the tensors of a model, found none or others ({error})") from None
+    filled = networks.occupancy.filled(upload(state)) if state.any() else dr.opaque(ad.Float, 1, len(state))
+    dr.eval(filled)
+    config = {**settings.to_json(), "data": data}
+    return NerfRun(path, config, training, networks, parameters, filled, box, model_path.stat().st_size)
+
+
+def read_config(path: Path) -> tuple[NerfConfig, dict[str, Any]]:
+    """(how a run is trained, what on: as `TrainingData`) by its config.json. Raises InputError where it is broken."""
+    values = read_json(path)
+    if not isinstance(values, dict) or "data" not in values:
+        raise InputError(f"{path}: expected an object with the key data, found none")
+    data = structure(TrainingData, Document(f"{path}: data", values["data"], {}), Rules())
+    return NerfConfig.from_json(values, str(path)), asdict(data)

@@ -1,0 +1,1 @@
+"""Rays, where they are sampled, and what samples add up to."""

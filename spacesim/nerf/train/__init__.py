@@ -1,0 +1,1 @@
+"""Training: pixels, a step, the loop, a run on disk."""

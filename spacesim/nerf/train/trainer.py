@@ -1,0 +1,183 @@
+"""The training loop of a radiance field: `step`, a look at what is empty now and then, checkpoints."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from spacesim.backend import ad, recorded
+from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.upload import upload
+from spacesim.data.errors import InputError, WorkError, check_ranges
+from spacesim.data.records import Dataset
+from spacesim.data.structure import Rules, structure
+from spacesim.data.toml import Document
+from spacesim.learning.adam import corrections
+from spacesim.learning.folder import TrainingProgress
+from spacesim.learning.tensors import read_tensors, write_tensors
+from spacesim.nerf.config import NerfConfig
+from spacesim.nerf.fields.model import Networks
+from spacesim.nerf.sampling.box import SceneBox, scene_box
+from spacesim.nerf.sampling.sampler import step_key
+from spacesim.nerf.train.pixels import training_pixels
+from spacesim.nerf.train.step import StepNumbers, look_around, step
+
+FORMAT = "spacesim-nerf-1"
+HISTORY_EVERY = 50  #: iterations between two entries of the history
+SLOPE = 10.0  #: of the power of proposals' weights as they warm up (Barron et al. 2022, annealing)
+
+
+@dataclass(frozen=True)
+class HistoryEntry:
+    """What training noted of a step."""
+
+    iteration: int  #: how many were finished
+    loss: float  #: mean squared error of the last one's colours
+
+
+@dataclass(frozen=True)
+class CheckpointHeader:
+    """What a checkpoint says beside its arrays."""
+
+    iteration: int  #: finished ones
+    history: tuple[HistoryEntry, ...]
+    proposal_steps: int  #: in which proposals have learned
+    format: str = FORMAT
+
+    def __post_init__(self) -> None:
+        check_ranges(self, iteration=(0, 2**53), proposal_steps=(0, 2**53))
+
+
+class Trainer:
+    """The parameters of a radiance field, their moments, and what is known as empty, one step after another.
+
+    The same dataset, configuration and backend give bitwise the same model, also across `save` and `restore`.
+    """
+
+    def __init__(self, dataset: Dataset, config: NerfConfig) -> None:
+        self.config, self.iteration, self.proposal_steps = config, 0, 0
+        self.box = scene_box(dataset, config.margin)
+        self.networks = Networks(config)
+        self.pixels = training_pixels(dataset, self.box, config.knows_sun)
+        self.parameters = [upload(values) for values in self.networks.initial(config.seed)]
+        self.first = [dr.zeros(ad.Float, dr.width(values)) for values in self.parameters]
+        self.second = [dr.zeros(ad.Float, dr.width(values)) for values in self.parameters]
+        self.occupancy = dr.opaque(ad.Float, 0, config.occupancy**3)  #: see `Occupancy`
+        self.filled = dr.opaque(ad.Float, 1, config.occupancy**3)
+        self.history: list[dict[str, float]] = []
+        self._step, self._look_around = recorded(step), recorded(look_around)
+
+    def run(
+        self,
+        on_progress: Callable[[TrainingProgress], None],
+        on_checkpoint: Callable[[], None],
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Train from `self.iteration` to the end. Raises KeyboardInterrupt after a step and its checkpoint where it is
+        asked to stop, WorkError where the loss is not finite."""
+        config = self.config
+        while self.iteration < config.iterations:
+            loss = self.step()
+            last = self.iteration == config.iterations
+            if self.iteration % HISTORY_EVERY == 0 or last:
+                self._check(float(loss[0]))
+                self.history.append({"iteration": self.iteration, "loss": float(loss[0])})
+                on_progress(TrainingProgress(self.iteration, config.iterations, float(loss[0])))
+            stop = should_stop()
+            if stop:
+                self._check(float(loss[0]))
+            if stop or (self.iteration % config.checkpoint_every == 0 and not last):
+                on_checkpoint()
+            if stop:
+                raise KeyboardInterrupt
+
+    def step(self) -> Any:
+        """One update. Returns the mean squared error of colours, Float of width 1."""
+        config, index = self.config, self.iteration
+        warm = index >= config.warm_up
+        learn = not warm or index % config.proposals_every == 0
+        self.proposal_steps += learn
+        done = index / max(config.iterations - 1, 1)
+        rate = config.rate ** (1 - done) * config.rate_final**done if config.rate_final > 0 else config.rate
+        begun = 1.0 if warm else index / config.warm_up
+        numbers = StepNumbers(
+            self._key(index),
+            dr.opaque(ad.Float, SLOPE * begun / ((SLOPE - 1) * begun + 1)),
+            dr.opaque(ad.Float, float(warm)),
+            ad.Float([*corrections(index + 1), *corrections(max(self.proposal_steps, 1)), rate]),
+        )
+        self.parameters, self.first, self.second, loss = self._step(
+            self.networks, self.parameters, self.first, self.second, self.pixels, self.filled, numbers, learn
+        )
+        self.iteration += 1
+        if self.iteration % config.occupancy_every == 0:
+            self.occupancy, self.filled = self._look_around(
+                self.networks, self.parameters, self.occupancy, self._key(2**40 + index)
+            )
+        return loss
+
+    def save(self, path: Path) -> None:
+        """Write everything that the next step depends on."""
+        tensors = self.model_tensors()
+        for name, values in (("adam.first", self.first), ("adam.second", self.second), ("filled", [self.filled])):
+            tensors |= {f"{name}.{i:02d}": np.array(value) for i, value in enumerate(values)}
+        header = {"iteration": self.iteration, "proposal_steps": self.proposal_steps, "history": self.history}
+        write_tensors(path, tensors, header, FORMAT)
+
+    def model_tensors(self) -> dict[str, np.ndarray]:
+        """The trained model by name."""
+        own = {name: np.array(values) for name, values in zip(self.networks.names(), self.parameters, strict=True)}
+        return {**own, "occupancy": np.array(self.occupancy), "box": np.stack([self.box.low, self.box.size])}
+
+    def restore(self, path: Path) -> None:
+        """Continue from what `save` wrote. Raises InputError where the file does not fit."""
+        tensors, header = read_tensors(path, FORMAT)
+        checkpoint = structure(CheckpointHeader, Document(f"{path}: header", header, {}), Rules())
+        if checkpoint.iteration > self.config.iterations:
+            raise InputError(
+                f"{path}: expected an iteration up to {self.config.iterations}, found {checkpoint.iteration}"
+            )
+        try:
+            parameters = self.networks.parameters(tensors)
+            first, second = (
+                [_sized(tensors, f"adam.{order}.{i:02d}", dr.width(one)) for i, one in enumerate(parameters)]
+                for order in ("first", "second")
+            )
+            occupancy, filled = (_sized(tensors, name, dr.width(self.occupancy)) for name in ("occupancy", "filled.00"))
+            box = box_of(tensors)
+        except KeyError as error:
+            (name,) = error.args
+            raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {name}") from None
+        except ValueError as error:
+            raise InputError(f"{path}: expected a checkpoint of this training ({error})") from None
+        if not (np.array_equal(box.low, self.box.low) and np.array_equal(box.size, self.box.size)):
+            raise InputError(f"{path}: expected a checkpoint of this data's scene box, found another box")
+        self.parameters, self.first, self.second = parameters, first, second
+        self.occupancy, self.filled = occupancy, filled
+        self.iteration, self.proposal_steps = checkpoint.iteration, checkpoint.proposal_steps
+        self.history = [asdict(entry) for entry in checkpoint.history]
+
+    def _key(self, number: int) -> UInt32:
+        return dr.opaque(ad.UInt32, step_key(self.config.seed, number))
+
+    def _check(self, loss: float) -> None:
+        if not np.isfinite(loss):
+            raise WorkError(f"training: the loss is {loss} at iteration {self.iteration}; the last checkpoint is kept")
+
+
+def box_of(tensors: dict[str, np.ndarray]) -> SceneBox:
+    """The box that `Trainer.model_tensors` names. Raises KeyError, or ValueError where it is none."""
+    box = tensors["box"].astype(np.float64)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > 0).all():
+        raise ValueError("box: expected a corner and three sides above 0, found others")
+    return SceneBox(box[0], box[1])
+
+
+def _sized(tensors: dict[str, np.ndarray], name: str, size: int) -> Float:
+    values = tensors[name]
+    if values.shape != (size,) or not np.isfinite(values).all():
+        raise ValueError(f"{name}: expected {size} finite numbers, found others")
+    return upload(values)

@@ -1,0 +1,219 @@
+"""Algorithm 1: exact where fields are constant in intervals; scenes of runs; scene files."""
+
+import json
+from dataclasses import replace
+
+import drjit as dr
+import nerf_twin as twin
+import numpy as np
+import pytest
+from test_nerf_training import CONFIG
+
+from spacesim.backend.upload import upload
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import look_at
+from spacesim.data.images import read_png
+from spacesim.data.records import Camera, Dataset
+from spacesim.data.store import read_dataset
+from spacesim.methods import load_scene
+from spacesim.nerf.compose import Composition, merge
+from spacesim.nerf.draw import Samples
+from spacesim.nerf.run import NerfRun
+from spacesim.nerf.sampling.render import sum_rays, volume_weights
+from spacesim.nerf.train.train import train
+from spacesim.splat.compose.pose import Pose, rotation_about
+from spacesim.splat.compose.scene import ComposeConfig, PlacedRun
+
+RED, GREEN, BLUE = np.eye(3)
+
+
+def samples_of(edges: np.ndarray, density: np.ndarray, color: np.ndarray) -> tuple[Samples, int]:
+    """Of edges [R, S + 1], densities [R, S] and colours [R, S, 3]."""
+    planes = [upload(color[..., i]) for i in range(3)]
+    return Samples(upload(edges[:, :-1]), upload(edges[:, 1:]), upload(density), planes), density.shape[1]
+
+
+def render_merged(models: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(colours [R, 3], opacities [R], expected depths [R]) of models' (edges, densities, colours)."""
+    rays = len(models[0][0])
+    merged, segments = merge([samples_of(*model) for model in models], rays)
+    made = volume_weights(merged.density * (merged.high - merged.low), segments)
+    color = [np.array(sum_rays(made.weights * channel, segments)) for channel in merged.color]
+    depth = sum_rays(made.weights * 0.5 * (merged.low + merged.high), segments)
+    return np.stack(color, axis=-1), np.array(sum_rays(made.weights, segments)), np.array(depth)
+
+
+def slab(low: float, high: float, density: float, color: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One ray through one slab, in three intervals."""
+    edges = np.linspace(low, high, 4)[None]
+    return edges, np.full((1, 3), density), np.broadcast_to(color, (1, 3, 3))
+
+
+def passed(length: float, density: float) -> float:
+    return float(np.exp(-length * density))
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_slabs_that_overlap_abut_coincide_and_lie_apart(order):
+    """Against closed forms: where both are, what is seen there has the mean colour by density."""
+    cases = {}
+    # apart: the nearer one hides the other
+    front, back = slab(1, 2, 0.7, RED), slab(3, 5, 2.0, BLUE)
+    cases["apart"] = front, back, (1 - passed(1, 0.7)) * RED + passed(1, 0.7) * (1 - passed(2, 2.0)) * BLUE
+    front, back = slab(1, 2, 0.7, RED), slab(2, 4, 0.3, BLUE)
+    cases["abut"] = front, back, (1 - passed(1, 0.7)) * RED + passed(1, 0.7) * (1 - passed(2, 0.3)) * BLUE
+    one, other = slab(1, 2.5, 0.5, RED), slab(1, 2.5, 1.5, BLUE)
+    cases["coincide"] = one, other, (1 - passed(1.5, 2.0)) * (0.25 * RED + 0.75 * BLUE)
+    one, other = slab(1, 3, 0.5, RED), slab(2, 4, 1.0, GREEN)
+    expected = (1 - passed(1, 0.5)) * RED
+    expected = expected + passed(1, 0.5) * (1 - passed(1, 1.5)) * (RED / 3 + 2 * GREEN / 3)
+    expected = expected + passed(1, 0.5) * passed(1, 1.5) * (1 - passed(1, 1.0)) * GREEN
+    cases["overlap"] = one, other, expected
+    one, other = slab(1, 4, 0.2, RED), slab(2, 3, 5.0, BLUE)
+    expected = (1 - passed(1, 0.2)) * RED + passed(1, 0.2) * (1 - passed(1, 5.2)) * (0.2 * RED + 5 * BLUE) / 5.2
+    cases["within"] = one, other, expected + passed(1, 0.2) * passed(1, 5.2) * (1 - passed(1, 0.2)) * RED
+    for name, (first, second, color) in cases.items():
+        found, opacity, _ = render_merged([(first, second)[i] for i in order])
+        np.testing.assert_allclose(found[0], color, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(opacity[0], color.sum(), atol=1e-6, err_msg=name)
+
+
+def test_merging_is_its_twin():
+    """Random intervals of three models, of which some are empty, some without length, some shared."""
+    rng, rays = np.random.default_rng(0), 60
+    models = []
+    for count in (7, 3, 12):
+        edges = np.sort(rng.integers(0, 20, (rays, count + 1)) / 4.0, axis=1)
+        density = rng.exponential(1, (rays, count)) * (rng.uniform(size=(rays, count)) > 0.3)
+        models.append((edges, density, rng.uniform(size=(rays, count, 3))))
+    color, opacity, depth = render_merged(models)
+    for ray in range(rays):
+        rows = [(edges[ray, :-1], edges[ray, 1:], density[ray], c[ray]) for edges, density, c in models]
+        boundaries, density, mixed = twin.merge(rows)
+        weights, seen, accumulated = twin.volume(density * np.diff(boundaries), mixed)
+        np.testing.assert_allclose(color[ray], seen, atol=2e-6)
+        np.testing.assert_allclose(opacity[ray], accumulated, atol=2e-6)
+        np.testing.assert_allclose(depth[ray], weights @ (0.5 * (boundaries[1:] + boundaries[:-1])), atol=2e-5)
+
+
+def test_merging_one_model_changes_nothing():
+    rng = np.random.default_rng(1)
+    edges, density = np.sort(rng.uniform(size=(9, 6)), axis=1), rng.exponential(3, (9, 5))
+    color = rng.uniform(size=(9, 5, 3))
+    found, opacity, _ = render_merged([(edges, density, color)])
+    alone = volume_weights(upload(density * np.diff(edges)), 5)
+    np.testing.assert_allclose(opacity, np.array(sum_rays(alone.weights, 5)), atol=1e-6)
+    red = np.array(sum_rays(alone.weights * upload(color[..., 0]), 5))
+    np.testing.assert_allclose(found[:, 0], red, atol=1e-6)
+
+
+def test_an_empty_ray_is_black():
+    color, opacity, _ = render_merged([slab(1, 1, 5.0, RED), slab(2, 2, 1.0, BLUE)])
+    assert not color.any()
+    assert not opacity.any()
+
+
+@pytest.fixture(scope="module")
+def dataset(tiny_data) -> Dataset:
+    return read_dataset(tiny_data)
+
+
+@pytest.fixture(scope="module")
+def run(dataset, tmp_path_factory) -> NerfRun:
+    return train(dataset, tmp_path_factory.mktemp("nerf") / "run", CONFIG)
+
+
+def scene(*models: tuple[NerfRun, Pose], shadows: str = "trained") -> Composition:
+    placed = [PlacedRun(run, pose, f"model-{i}") for i, (run, pose) in enumerate(models)]  # type: ignore[arg-type]
+    return Composition(placed, ComposeConfig(shadows))
+
+
+def camera_at(place, towards=(0, 0, 0), size=36) -> Camera:
+    return Camera.from_fov(look_at(place, towards), size, size, 45)
+
+
+def test_one_model_is_its_run(dataset, run):
+    camera = dataset.test[0].camera
+    one, alone = scene((run, Pose())).predict(camera, normals=True), run.predict(camera, normals=True)
+    for plane in ("rgb", "alpha", "depth"):
+        np.testing.assert_allclose(getattr(one, plane), getattr(alone, plane), atol=3e-4 * (1 + 9 * (plane == "depth")))
+    solid = alone.alpha > 0.5
+    assert np.einsum("nc,nc->n", one.normal[solid], alone.normal[solid]).min() > 0.99
+    np.testing.assert_array_equal(one.id, solid)
+
+
+def test_a_larger_model_is_not_more_opaque(run):
+    """Twice as large, turned and moved, seen from twice as far: the same picture, depths twice as large."""
+    camera, alone = camera_at((9, 2, 4)), run.predict(camera_at((9, 2, 4)))
+    turn = rotation_about((1, 2, 3), 70)
+    pose = Pose(turn, np.array([3.0, -20.0, 8.0]), 2.0)
+    place = np.eye(4)
+    place[:3, :3] = turn @ camera.world_from_camera[:3, :3]
+    place[:3, 3] = pose.points(camera.position)
+    seen = scene((run, pose)).predict(replace(camera, world_from_camera=place))
+    assert 0.02 < alone.alpha.mean() < 0.9
+    np.testing.assert_allclose(seen.alpha, alone.alpha, atol=5e-3)
+    np.testing.assert_allclose(seen.rgb, alone.rgb, atol=5e-3)
+    solid = alone.alpha > 0.5
+    np.testing.assert_allclose(seen.depth[solid], 2 * alone.depth[solid], rtol=5e-3)
+
+
+def test_the_nearer_model_hides_the_other(run):
+    camera = camera_at((14, 0, 0.5))
+    front, back = Pose(translation=np.array([4.0, 0, 0])), Pose(translation=np.array([-4.0, 0, 0]))
+    both, other = (scene(*models).predict(camera) for models in (((run, front), (run, back)), ((run, front),)))
+    behind = scene((run, back)).predict(camera)
+    opaque = (other.alpha > 0.97) & (behind.alpha > 0.5)
+    assert opaque.any()
+    np.testing.assert_allclose(both.rgb[opaque], other.rgb[opaque], atol=0.04)
+    assert (both.id[opaque] == 1).all()
+    clear = other.alpha < 1e-3
+    np.testing.assert_allclose(both.rgb[clear], behind.rgb[clear], atol=5e-3)
+    np.testing.assert_allclose(both.alpha, 1 - (1 - other.alpha) * (1 - behind.alpha), atol=5e-3)  # they lie apart
+    swapped = scene((run, back), (run, front)).predict(camera)
+    np.testing.assert_allclose(swapped.rgb, both.rgb, atol=1e-5)
+    assert (swapped.id[opaque] == 2).all()
+
+
+def test_scene_files(spacesim, tiny_run, run, tmp_path):
+    text = f"""
+[[models]]
+run = "{run.path}"
+name = "left"
+position = [-3, 0, 0]
+
+[[models]]
+run = "{run.path}"
+scale = 0.5
+position = [3, 0, 0]
+
+[camera]
+position = [0, -16, 3]
+look_at = [0, 0, 0]
+resolution = [48, 32]
+"""
+    (tmp_path / "scene.toml").write_text(text)
+    assert isinstance(load_scene(tmp_path / "scene.toml").composition, Composition)
+    done = spacesim("compose", tmp_path / "scene.toml", "--out", tmp_path / "out")
+    assert done.code == 0, done.errors
+    assert set(np.unique(read_png(tmp_path / "out/id/0000.png"))) == {0, 1, 2}
+    shot = json.loads((tmp_path / "out/shots/0000.json").read_text())
+    assert [model["name"] for model in shot["models"]] == ["left", "nerf0"] or len(shot["models"]) == 2
+    assert not (tmp_path / "out/visibility/0000.png").exists()
+    refused = {
+        'shadows = "ratio"\n' + text: "shadows: expected trained or none in a scene of radiance fields",
+        text.replace(f'"{run.path}"\nscale', f'"{tiny_run}"\nscale'): "found both in one scene",
+    }
+    for number, (content, words) in enumerate(refused.items()):
+        path = tmp_path / f"refused_{number}.toml"
+        path.write_text(content)
+        done = spacesim("compose", path, "--out", tmp_path / "none")
+        assert done.code == 2
+        assert words in done.errors[0]
+    done = spacesim("compose", tmp_path / "scene.toml", "--out", tmp_path / "none", "--ply", tmp_path / "none.ply")
+    assert (done.code, "expected a scene of Gaussians" in done.errors[0]) == (2, True)
+    done = spacesim("eval", tmp_path / "scene.toml", "--data", tmp_path, "--out", tmp_path / "none")
+    assert (done.code, "found a scene of radiance fields" in done.errors[0]) == (2, True)
+    with pytest.raises(InputError, match="exposure"):
+        load_scene(tmp_path / "scene.toml").composition.predict(camera_at((9, 0, 0)), exposure=1.0)
+    assert dr.width(run.filled) == CONFIG.occupancy**3

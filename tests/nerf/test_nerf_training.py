@@ -1,0 +1,315 @@
+"""Training, what it leaves on disk, and what a run predicts: through the commands and in Python."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import spacesim as ss
+from spacesim.data.errors import InputError
+from spacesim.data.images import load_image, read_png
+from spacesim.data.records import Dataset
+from spacesim.data.store import read_dataset
+from spacesim.learning.tensors import read_tensors, write_tensors
+from spacesim.methods import load_predictor
+from spacesim.nerf.config import GridConfig, NerfConfig, ProposalConfig, preset, with_settings
+from spacesim.nerf.run import NerfRun, load_run
+from spacesim.nerf.sampling.box import scene_box
+from spacesim.nerf.train.train import train
+from spacesim.nerf.train.trainer import FORMAT, Trainer
+from spacesim.viewer.load import _scene as scene_to_view
+
+GRID = GridConfig(4, 8, 48, 12)
+CONFIG = NerfConfig(
+    iterations=200,
+    rate=3e-2,
+    rays=512,
+    samples=10,
+    width=16,
+    features=7,
+    harmonics=2,
+    grid=GRID,
+    coarse=ProposalConfig(16, 8, GridConfig(2, 8, 16, 10)),
+    fine=ProposalConfig(8, 8, GridConfig(2, 8, 16, 10)),
+    warm_up=60,
+    occupancy=16,
+    occupancy_every=10,
+    checkpoint_every=60,
+    chunk=512,
+)
+
+
+@pytest.fixture(scope="module")
+def dataset(tiny_data) -> Dataset:
+    return read_dataset(tiny_data)
+
+
+@pytest.fixture(scope="module")
+def finished(dataset, tmp_path_factory) -> NerfRun:
+    return train(dataset, tmp_path_factory.mktemp("nerf") / "run", CONFIG)
+
+
+def model_bytes(run: NerfRun) -> bytes:
+    return (run.path / "model.safetensors").read_bytes()
+
+
+def test_training_learns_the_pictures(dataset, finished):
+    history = finished.training["history"]
+    assert [entry["iteration"] for entry in history] == [50, 100, 150, 200]
+    errors = []
+    for frame in dataset.train:
+        drawn, image = finished.predict(frame.camera), load_image(dataset, frame)
+        assert drawn.rgb.shape == (40, 40, 3)
+        assert drawn.rgb.dtype == np.float32
+        errors.append([np.mean((drawn.rgb - image.over(np.zeros(3))) ** 2), np.mean(image.over(np.zeros(3)) ** 2)])
+    error, power = np.mean(errors, axis=0)
+    assert error < 0.5 * power
+    assert np.array(finished.filled).mean() < 1  # some of the box is known as empty
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_does_not(dataset, finished, tmp_path):
+    again = train(dataset, tmp_path / "again", CONFIG)
+    assert model_bytes(again) == model_bytes(finished)
+    other = train(dataset, tmp_path / "other", replace(CONFIG, seed=1, iterations=5))
+    assert np.abs(np.array(other.parameters[0]) - np.array(finished.parameters[0])).max() > 0
+    camera = dataset.test[0].camera
+    first, second = (run.predict(camera, normals=True) for run in (again, finished))
+    for plane in ("rgb", "alpha", "depth", "normal"):
+        np.testing.assert_array_equal(getattr(first, plane), getattr(second, plane))
+
+
+def test_killed_training_is_completed_by_resume(dataset, finished, tmp_path):
+    """The process dies without warning; --resume gives the same model to the bit."""
+    script = f"""
+import os, signal
+from pathlib import Path
+from spacesim.data.store import read_dataset
+from spacesim.nerf.config import NerfConfig
+from spacesim.nerf.train.train import train
+config = NerfConfig.from_json({CONFIG.to_json()!r})
+def die(progress):
+    if progress.iteration == 150:
+        os.kill(os.getpid(), signal.SIGKILL)
+train(read_dataset(Path({str(dataset.root)!r})), Path({str(tmp_path / "run")!r}), config, on_progress=die)
+"""
+    died = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert died.returncode == -9, died.stderr
+    assert [path.name for path in sorted((tmp_path / "run/checkpoints").glob("*.safetensors"))] == [
+        "step_00000060.safetensors",
+        "step_00000120.safetensors",
+    ]
+    with pytest.raises(InputError, match="training has not ended"):
+        load_run(tmp_path / "run")
+    with pytest.raises(InputError, match="holds a run already"):
+        train(dataset, tmp_path / "run", CONFIG)
+    with pytest.raises(InputError, match="was started with seed 0"):
+        train(dataset, tmp_path / "run", replace(CONFIG, seed=5), resume=True)
+    resumed = train(dataset, tmp_path / "run", CONFIG, resume=True)
+    assert model_bytes(resumed) == model_bytes(finished)
+
+
+def test_damaged_checkpoints_are_told_in_one_sentence(dataset, tmp_path):
+    trainer = Trainer(dataset, CONFIG)
+    path = tmp_path / "good.safetensors"
+    trainer.save(path)
+    tensors, header = read_tensors(path, FORMAT)
+    header.pop("format")
+    broken = [
+        ({key: value for key, value in tensors.items() if key != "field.grid"}, header, "lacks field.grid"),
+        (tensors | {"field.grid": tensors["field.grid"][:-2]}, header, "field.grid: expected"),
+        (tensors | {"adam.first.00": np.full_like(tensors["adam.first.00"], np.nan)}, header, "finite"),
+        (tensors | {"box": tensors["box"] + 1}, header, "scene box"),
+        (tensors, header | {"iteration": 10**6}, "expected an iteration up to 200"),
+        (tensors, header | {"history": 3}, "history"),
+    ]
+    for content, told, words in broken:
+        write_tensors(tmp_path / "broken.safetensors", content, told, FORMAT)
+        with pytest.raises(InputError, match=words):
+            trainer.restore(tmp_path / "broken.safetensors")
+    write_tensors(tmp_path / "other.safetensors", tensors, header, "spacesim-gaussians-1")
+    with pytest.raises(InputError, match="expected a spacesim-nerf-1 file"):
+        trainer.restore(tmp_path / "other.safetensors")
+    trainer.restore(path)
+
+
+def test_memory_of_a_picture_is_that_of_a_chunk(dataset, finished):
+    """Chunks change no picture, to the last bits of a sum."""
+    camera = dataset.test[0].camera
+    config = replace(CONFIG, chunk=1024)
+    wider = replace(finished, networks=type(finished.networks)(config))
+    one, other = (run.predict(camera, normals=True) for run in (finished, wider))
+    for plane in ("rgb", "alpha", "depth"):
+        np.testing.assert_allclose(getattr(one, plane), getattr(other, plane), atol=2e-6)
+    np.testing.assert_array_equal(one.depth > 0, one.alpha > 0)
+    lengths = np.linalg.norm(one.normal, axis=-1)
+    np.testing.assert_allclose(lengths[one.alpha > 0.5], 1, atol=1e-4)
+
+
+def test_depth_and_normals_look_at_the_camera(dataset, finished):
+    frame = dataset.train[0]
+    drawn = finished.predict(frame.camera, normals=True)
+    solid = drawn.alpha > 0.9
+    assert solid.sum() > 20
+    away = frame.camera.position - scene_box(dataset, 0).low
+    assert (drawn.depth[solid] < np.linalg.norm(away) + 6).all()
+    axis = frame.camera.world_from_camera[:3, 2]
+    assert (drawn.normal[solid] @ axis < 0.2).mean() > 0.8
+
+
+def test_scene_boxes(dataset, tmp_path):
+    by_mesh = scene_box(dataset, 0.0)
+    by_points = scene_box(replace(dataset, mesh_path=None), 0.0)
+    np.testing.assert_allclose(by_points.low, by_mesh.low, atol=0.1)
+    np.testing.assert_allclose(by_points.size, by_mesh.size, atol=0.2)
+    by_cameras = scene_box(replace(dataset, mesh_path=None, ply_file_path=None), 0.0)
+    assert (by_cameras.low < by_mesh.low + by_mesh.size).all()
+    assert (by_cameras.low + by_cameras.size > by_mesh.low).all()
+    np.testing.assert_allclose(by_cameras.size, by_cameras.side)
+    assert scene_box(dataset, 0.1).side == pytest.approx(1.2 * by_mesh.side)
+
+
+def test_pictures_of_something_else_are_refused(dataset, tmp_path):
+    away = [replace(frame, camera=_turned(frame.camera)) for frame in dataset.train]
+    with pytest.raises(InputError, match="rays that all miss it"):
+        Trainer(replace(dataset, train=tuple(away)), CONFIG)
+    dark = replace(dataset, train=tuple(replace(frame, sun=None) for frame in dataset.train))
+    with pytest.raises(InputError, match="sun_direction in every training frame"):
+        Trainer(dark, replace(CONFIG, method="nerf-relight"))
+
+
+def _turned(camera):
+    pose = camera.world_from_camera.copy()
+    pose[:3, [0, 2]] *= -1
+    return replace(camera, world_from_camera=pose)
+
+
+def test_a_field_that_is_told_the_sun(dataset, tmp_path):
+    run = ss.train(dataset, tmp_path / "run", replace(CONFIG, method="nerf-relight", iterations=60))
+    assert isinstance(run, NerfRun)
+    camera = dataset.test[0].camera
+    one, other = (run.render(camera, sun=angles) for angles in ((40, 25), (220, 40)))
+    assert np.abs(one.rgb - other.rgb).max() > 1e-3
+    np.testing.assert_array_equal(one.alpha, other.alpha)
+    with pytest.raises(InputError, match="sun: expected its direction for a run of nerf-relight, found none"):
+        run.predict(camera)
+    with pytest.raises(InputError, match="exposure"):
+        run.predict(camera, ss.Sun.from_angles(0, 0), exposure=1.0)
+
+
+def test_what_asks_for_gaussians_says_so(dataset, finished, tmp_path):
+    image = load_image(dataset, dataset.test[0])
+    with pytest.raises(InputError, match="run: expected one of Gaussians, found one of the method nerf"):
+        ss.refine_pose(finished, image, dataset.test[0].camera)
+    with pytest.raises(InputError, match="run: expected one of Gaussians"):
+        ss.estimate_sun(finished, image, dataset.test[0].camera)
+    with pytest.raises(InputError, match="align: expected a run of Gaussians"):
+        ss.evaluate(finished, dataset, tmp_path / "eval", align=dataset)
+
+
+def test_runs_of_both_families_are_evaluated_and_reported_side_by_side(dataset, finished, tiny_run, tmp_path):
+    folders = []
+    for number, run in enumerate((finished, ss.load_run(tiny_run))):
+        folders.append(tmp_path / f"eval_{number}")
+        ss.evaluate(run, dataset, folders[-1], geometry=False, fit_gain=number == 0)
+    page = ss.write_report([str(folder) for folder in folders], tmp_path / "report.html").read_text()
+    assert "nerf" in page
+    assert "vanilla" in page
+
+
+def test_the_commands(spacesim, tiny_data, tmp_path):
+    """One run through train, eval, render and export."""
+    run = tmp_path / "run"
+    sizes = ["--set", "rays=512", "--set", "samples=8", "--set", "coarse.samples=12", "--set", "fine.samples=8"]
+    done = spacesim(
+        "train", tiny_data, "--out", run, "--method", "nerf", "--preset", "demo", "--iterations", 80, *sizes
+    )
+    assert done.code == 0, done.errors
+    assert "numbers after 80 iterations" in done.output
+    assert json.loads((run / "config.json").read_text())["coarse"]["samples"] == 12
+    assert isinstance(load_predictor(run), NerfRun)
+    done = spacesim("eval", run, "--data", tiny_data, "--out", tmp_path / "eval")
+    assert done.code == 0, done.errors
+    metrics = json.loads((tmp_path / "eval/metrics.json").read_text())
+    assert metrics["model"]["gaussians"] is None
+    assert metrics["image"]["psnr"]["mean"] > 5
+    assert metrics["geometry"]["mesh"]["depth"] == "median"
+    assert metrics["geometry"]["floaters"] is None
+    assert (tmp_path / "eval/report.html").exists()
+    for kind in ("rgb", "depth", "alpha", "normal"):
+        done = spacesim("render", run, "--frame", 0, "--kind", kind, "--out", tmp_path / f"{kind}.png")
+        assert done.code == 0, done.errors
+    assert read_png(tmp_path / "rgb.png").shape == (40, 40, 4)
+    done = spacesim("render", run, "--kind", "shadow", "--out", tmp_path / "no.png")
+    assert (done.code, "predicts none" in done.errors[0]) == (2, True)
+    done = spacesim("sweep", run, "--out", tmp_path / "sweep")
+    assert (done.code, "expected a run that the Sun relights" in done.errors[0]) == (2, True)
+    with pytest.raises(InputError, match="found a radiance field; `spacesim render` draws it"):
+        scene_to_view(run)
+    done = spacesim("export", run, "--ply", tmp_path / "no.ply")
+    assert (done.code, "a radiance field; --mesh takes it" in done.errors[0]) == (2, True)
+    done = spacesim("export", run, "--mesh", tmp_path / "mesh.ply", "--views", 6, "--voxel", 0.2)
+    assert done.code == 0 or "no view of the run shows an opaque surface" in done.errors[-1]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--strategy", "mcmc"], "--strategy: expected with a method of Gaussians, found 'mcmc' with nerf"),
+        (["--init", "mesh"], "--init: expected with a method of Gaussians, found with nerf"),
+        (["--init-count", "5"], "--init-count: expected with a method of Gaussians"),
+        (["--max-gaussians", "5"], "--max-gaussians: expected with a method of Gaussians"),
+        (["--warm-start"], "--warm-start: expected with a method of Gaussians"),
+        (["--sun", "unknown"], "--sun: expected with a method of Gaussians"),
+        (["--refine-poses"], "--refine-poses: expected with a method of Gaussians"),
+        (["--preset", "fine"], "--preset: expected one of demo, fast, thesis, found 'fine'"),
+        (["--set", "rays=100"], "rays: expected 512 to 1.04858e+06, found 100"),
+        (["--set", "rays=600"], "rays: expected a multiple of 512, found 600"),
+        (["--set", "grid.finest=4"], "finest: expected at least coarsest, 16, found 4"),
+        (["--set", "sh_degree=2"], "sh_degree"),
+    ],
+)
+def test_options_that_do_not_apply(spacesim, tiny_data, tmp_path, options, words):
+    done = spacesim("train", tiny_data, "--out", tmp_path / "run", "--method", "nerf", *options)
+    assert done.code == 2
+    assert words in done.errors[0]
+    assert not (tmp_path / "run").exists()
+
+
+def test_fields_are_listed(spacesim):
+    done = spacesim("train", "--fields", "--method", "nerf", "--preset", "thesis")
+    assert done.code == 0, done.errors
+    assert "grid.log2_size" in done.output
+    assert "init_count" not in done.output
+
+
+def test_settings_and_presets():
+    config = preset("thesis", "nerf-relight")
+    assert (config.samples, config.coarse.samples, config.fine.samples) == (48, 256, 96)
+    assert NerfConfig.from_json(config.to_json()) == config
+    assert with_settings(config, {"grid.levels": 3}).grid.levels == 3
+    with pytest.raises(InputError, match=r"rate\.x: expected rate alone"):
+        with_settings(config, {"rate.x": 3})
+    with pytest.raises(InputError, match="method: expected none beside a configuration"):
+        ss.train(Path("nowhere"), Path("run"), config, method="nerf")
+
+
+def test_a_run_is_refused_in_one_sentence(finished, tmp_path):
+    path = tmp_path / "run"
+    path.mkdir()
+    for name in ("config.json", "training.json"):
+        (path / name).write_bytes((finished.path / name).read_bytes())
+    tensors, header = read_tensors(finished.path / "model.safetensors", FORMAT)
+    header.pop("format")
+    for name in ("occupancy", "box", "field.color.1"):
+        short = {key: value for key, value in tensors.items() if key != name}
+        write_tensors(path / "model.safetensors", short, header, FORMAT)
+        with pytest.raises(InputError, match=name):
+            ss.load_run(path)
+    config = json.loads((path / "config.json").read_text())
+    (path / "config.json").write_text(json.dumps(config | {"rays": 7}))
+    with pytest.raises(InputError, match="rays: expected"):
+        ss.load_run(path)
