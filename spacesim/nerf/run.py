@@ -56,14 +56,14 @@ class NerfRun:
     path: Path  #: the folder
     config: dict[str, Any]  #: what config.json says
     training: dict[str, Any]  #: what training.json says
-    networks: Networks
-    parameters: Parameters
+    networks: Networks  #: the field and its proposals, without their numbers
+    parameters: Parameters  #: their numbers
     filled: Float  #: see `Occupancy.filled`
-    box: SceneBox
+    box: SceneBox  #: outside of which there is nothing
     model_bytes: int  #: size of the model's file
-    gaussians: None = None
-    gaussian_count: None = None
-    antialiased: bool = False
+    gaussians: None = None  #: there are none
+    gaussian_count: None = None  #: nor a number of them
+    antialiased: bool = False  #: rays see points, not areas of pixels
 
     @property
     def backend(self) -> str:
