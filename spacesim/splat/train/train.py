@@ -25,6 +25,7 @@ from spacesim.data.tone import tone_and_exposure
 from spacesim.splat.run import Run, load_run, read_config
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.pictures.poses import pose_config
 from spacesim.splat.train.pictures.suns import FirstSuns, check_pictures, first_suns, shape_config, surface_points
 from spacesim.splat.train.start import distance_warning, farthest_camera, focus_point, scale_warning
 from spacesim.splat.train.trainer import Trainer, TrainingProgress
@@ -55,9 +56,9 @@ def train(
         return load_run(out)
     if config.warm_start is not None and (remark := config.warm_start.remark(config.iterations)):
         log.warning(remark)
-    if config.sun == "given":
+    if config.sun == "given" and not config.refine_poses:
         trainer = Trainer(dataset, config)
-    else:
+    elif config.sun == "unknown":
         check_pictures(dataset)
     for remark in filter(None, (scale_warning(dataset), distance_warning(dataset))):
         log.warning(remark)
@@ -67,6 +68,8 @@ def train(
         write_json(out / "config.json", described)
         if config.sun == "unknown":
             trainer = _trainer_from_shape(dataset, config, out, on_progress)
+        elif config.refine_poses:
+            trainer = _trainer_of_poses(dataset, config, out, on_progress)
         _train(trainer, out, on_progress, command)
     return load_run(out)
 
@@ -87,7 +90,35 @@ def _trainer_from_shape(
     if config.init in (None, "random"):
         dataset = replace(dataset, ply_file_path=str(points.absolute()))
         config = replace(config, init="points", init_box=None, warm_start=None)
+    if config.refine_poses:
+        return _trainer_of_poses(dataset, config, out, on_progress, suns)
     return Trainer(dataset, config, suns)
+
+
+def _trainer_of_poses(
+    dataset: Dataset,
+    config: TrainConfig,
+    out: Path,
+    on_progress: Callable[[TrainingProgress], None],
+    suns: FirstSuns | None = None,
+) -> Trainer:
+    """Of poses that are refined: a run that learns them, RUN/poses, is trained first. What it finds is kept in
+    RUN/poses.safetensors; the model starts anew, and poses stay. suns: where unknown ones start"""
+    path, folder, shorter = out / "poses.safetensors", out / "poses", pose_config(config)
+    described = {**shorter.to_json(), "data": _identity(dataset)}
+    _check_folder(folder, described, resume=True)
+    if not path.exists():
+        first = Trainer(dataset, shorter, suns)
+        write_json(folder / "config.json", described)
+        log.info("learning the poses of %d pictures, %d iterations", len(dataset.train), shorter.iterations)
+        _train(first, folder, on_progress, ())
+        assert first.pictures.poses is not None
+        write_tensors(path, {"values": first.pictures.poses.numbers.values}, {})
+    log.info("training with the poses found")
+    values = read_tensors(path)[0].get("values", np.empty(0))
+    if values.shape != (len(dataset.train), 6) or not np.isfinite(values).all():
+        raise InputError(f"{path}: expected the poses of {len(dataset.train)} pictures, found others; delete it")
+    return Trainer(dataset, config, suns, values)
 
 
 def _train(
