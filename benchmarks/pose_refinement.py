@@ -78,7 +78,10 @@ def rows_of(data: Dataset, options: argparse.Namespace) -> Iterator[common.Row]:
         if config.refine_poses:
             cameras = list(cameras_of(folder / "run" / "cameras.json"))
             row["aligned, dB"] = aligned_psnr(data, cameras, folder, judge)
-        yield row | errors(cameras, [frame.camera for frame in data.train]) | {"s": found["training"]["seconds"]}
+        seconds = found["training"]["seconds"]
+        if config.refine_poses:
+            seconds += read_json(folder / "run" / "poses" / "training.json")["seconds"]
+        yield row | errors(cameras, [frame.camera for frame in data.train]) | {"s": seconds}
 
 
 def aligned_psnr(data: Dataset, cameras: list[Camera], folder: Path, judge: EvaluateConfig) -> float:

@@ -6,7 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from spacesim import backend, interrupts
+from spacesim.data.errors import InputError
 from spacesim.data.files import remove_leftovers, write_json
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Dataset
@@ -26,6 +29,7 @@ from spacesim.learning.folder import (
 from spacesim.splat.run import Run, load_run, read_config
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.pictures.poses import pose_config
 from spacesim.splat.train.pictures.suns import FirstSuns, check_pictures, first_suns, shape_config, surface_points
 from spacesim.splat.train.start import distance_warning, scale_warning
 from spacesim.splat.train.trainer import Trainer
@@ -54,9 +58,9 @@ def train(
         return load_run(out)
     if config.warm_start is not None and (remark := config.warm_start.remark(config.iterations)):
         log.warning(remark)
-    if config.sun == "given":
+    if config.sun == "given" and not config.refine_poses:
         trainer = Trainer(dataset, config)
-    else:
+    elif config.sun == "unknown":
         check_pictures(dataset)
     for remark in filter(None, (scale_warning(dataset), distance_warning(dataset))):
         log.warning(remark)
@@ -66,6 +70,8 @@ def train(
         write_json(out / "config.json", described)
         if config.sun == "unknown":
             trainer = _trainer_from_shape(dataset, config, out, on_progress)
+        elif config.refine_poses:
+            trainer = _trainer_of_poses(dataset, config, out, on_progress)
         _train(trainer, out, on_progress, command)
     return load_run(out)
 
@@ -86,7 +92,35 @@ def _trainer_from_shape(
     if config.init in (None, "random"):
         dataset = replace(dataset, ply_file_path=str(points.absolute()))
         config = replace(config, init="points", init_box=None, warm_start=None)
+    if config.refine_poses:
+        return _trainer_of_poses(dataset, config, out, on_progress, suns)
     return Trainer(dataset, config, suns)
+
+
+def _trainer_of_poses(
+    dataset: Dataset,
+    config: TrainConfig,
+    out: Path,
+    on_progress: Callable[[TrainingProgress], None],
+    suns: FirstSuns | None = None,
+) -> Trainer:
+    """Of poses that are refined: a run that learns them, RUN/poses, is trained first. What it finds is kept in
+    RUN/poses.safetensors; the model starts anew, and poses stay. suns: where unknown ones start"""
+    path, folder, learning = out / "poses.safetensors", out / "poses", pose_config(config)
+    described = {**learning.to_json(), "data": describe_data(dataset)}
+    check_folder(folder, described, True, read_config)
+    if not path.exists():
+        first = Trainer(dataset, learning, suns)
+        write_json(folder / "config.json", described)
+        log.info("learning the poses of %d pictures, %d iterations", len(dataset.train), learning.iterations)
+        _train(first, folder, on_progress, ())
+        assert first.pictures.poses is not None
+        write_tensors(path, {"values": first.pictures.poses.numbers.values}, {})
+    log.info("training with the poses found")
+    values = read_tensors(path)[0].get("values", np.empty(0))
+    if values.shape != (len(dataset.train), 6) or not np.isfinite(values).all():
+        raise InputError(f"{path}: expected the poses of {len(dataset.train)} pictures, found others; delete it")
+    return Trainer(dataset, config, suns, values)
 
 
 def _train(

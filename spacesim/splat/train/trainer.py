@@ -17,6 +17,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
 from spacesim.data.toml import Document
@@ -51,12 +52,15 @@ class Trainer:
     The same dataset, configuration and backend give bitwise the same model, also across `save` and `restore`.
     """
 
-    def __init__(self, dataset: Dataset, config: TrainConfig, first_suns: FirstSuns | None = None) -> None:
-        """first_suns: where the Suns of pictures that name none start, of a configuration that estimates them"""
+    def __init__(
+        self, dataset: Dataset, config: TrainConfig, first_suns: FirstSuns | None = None, poses: Array | None = None
+    ) -> None:
+        """first_suns: where the Suns of pictures that name none start, of a configuration that estimates them
+        poses: [V, 6] what an earlier training learned of them and stays, of a configuration that refines poses"""
         self.config, self.iteration, self.refinement_seconds = config, 0, 0.0
         _check_sizes(dataset, config)
         self.views = _views(dataset, config)
-        self.pictures = LearnedPictures(dataset, config, first_suns)
+        self.pictures = LearnedPictures(dataset, config, first_suns, poses)
         self.scene_scale = scene_scale(dataset)
         features = config.light.features if config.light else 0
         start = config.init_count, config.sh_degree, config.seed, features, config.init_box, config.splatfacto_start

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.backend.arrays import Float
+from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset
 from spacesim.data.store import intrinsics_of
 from spacesim.splat.light.model import LightModel
@@ -23,8 +24,11 @@ from spacesim.splat.train.views import TrainingView
 class LearnedPictures:
     """poses, exposures, suns: of the training pictures, None where the configuration does not ask for them"""
 
-    def __init__(self, dataset: Dataset, config: TrainConfig, first_suns: FirstSuns | None = None) -> None:
-        """first_suns: where Suns start that are unknown"""
+    def __init__(
+        self, dataset: Dataset, config: TrainConfig, first_suns: FirstSuns | None = None, poses: Array | None = None
+    ) -> None:
+        """first_suns: where Suns start that are unknown;  poses: [V, 6] numbers of `PoseRefinement` that stay, where
+        poses are refined; none are learned"""
         rates, steps = config.rates, config.iterations
         self.frames = dataset.train
         self.poses: PoseRefinement | None = None
@@ -33,6 +37,8 @@ class LearnedPictures:
             anchor = known and config.init != "random" and config.warm_start is None
             how = rates.poses, steps, config.antialiased, anchor, config.views_per_step
             self.poses = PoseRefinement(dataset, *how)
+            if poses is not None:
+                self.poses.stay(poses)
         self.exposures = Exposures(len(dataset.train), rates.gains, steps) if config.exposure_per_picture else None
         self.suns, self._antialiased = None, config.antialiased
         if config.sun == "unknown":

@@ -1,4 +1,9 @@
-"""Poses refined in training: each training picture's camera moves as its own loss asks.
+"""Poses of training pictures, refined: each camera moves as its own loss asks, in a training of its own.
+
+Its model only has to tell where cameras are and goes (`pose_config`); the run's model is trained from the start with
+the poses found, which stay, as one that learned before its cameras stood stays worse.
+It is drawn with the anti-aliasing filter: splats that are widened to a pixel cover more the farther a camera is, which
+turns and moves even a camera that is right.
 
 What moves a camera moves the whole model the other way. So the gradient by a pose is a force and a torque: sums over
 the Gaussians of what the splats' adjoint gives their centres and rotations (`pose_gradient`). Colours, shadows and
@@ -17,7 +22,7 @@ share with a turn, a shift and a growth of all cameras (7 ways, linearised at th
 and of shifts per distance) stays as it was, by a correction every `GAUGE_EVERY` steps.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -32,12 +37,12 @@ from spacesim.learning.cameras import focus_point
 from spacesim.splat.pose import moved, twist_between
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole, Splats, project
+from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.adam import OWN
 from spacesim.splat.train.pictures.numbers import PictureNumbers, falling
 
 START, START_SHARE = 100, 0.025  #: steps that poses wait at most, until colours are rough, and share of the training
-ANCHORED, ANCHORED_SHARE = 10, 0.25  #: times that each picture is shown to a model that stays; most of the training
-END_SHARE = 0.5  #: of the training; then poses stay, as a model gets no sharper than its cameras stand still
+ANCHORED, ANCHORED_SHARE = 16, 0.25  #: times that each picture is shown to a model that stays; most of the training
 SHIFTS_FIRST = 5  #: steps of a picture that move it alone: a turn before these would only blur what a shift mends
 GAUGE_EVERY = 50  #: steps
 WAYS = ("opacity", "x", "y", "a", "b", "c")  #: of a splat's numbers that blending differentiates by
@@ -54,7 +59,7 @@ class PoseRefinement:
         self.given = [frame.camera for frame in dataset.train]
         self.rate, self.iterations, self.antialiased = rate, iterations, antialiased
         self.start = int(min(START, START_SHARE * iterations))
-        self.end = int(END_SHARE * iterations)
+        self.end = iterations
         shown = -(-ANCHORED * len(self.given) // views)
         self.anchored = int(min(self.start + shown, ANCHORED_SHARE * iterations)) if anchor else 0
         self.centre = focus_point(dataset)
@@ -65,6 +70,13 @@ class PoseRefinement:
         self.common = np.zeros(self._gauge.shares.shape[0])  #: of the gauge's ways, what is held
         self._centre = ad.Float(self.centre.tolist())
         self._gradient = recorded(pose_gradient)
+
+    def stay(self, values: Array) -> None:
+        """Pictures have these numbers [V, 6] from now on. Raises ValueError for another number of pictures."""
+        if values.shape != self.numbers.values.shape:
+            raise ValueError(f"expected {list(self.numbers.values.shape)} numbers, found {list(values.shape)}")
+        self.numbers.values = np.array(values, np.float64)
+        self.end = self.anchored = 0
 
     def camera(self, picture: int) -> Camera:
         """Of a training picture, where it is thought to stand."""
@@ -84,6 +96,8 @@ class PoseRefinement:
     def hold(self, steps: int) -> None:
         """After so many steps: take out what all cameras moved alike, if it is time to; or, where the model has stayed
         until now, remember it."""
+        if self.end == 0:
+            return
         if steps == self.anchored and steps > 0:
             self.numbers.follow()
             self.common = self._gauge.rigid(self.numbers.values)
@@ -125,6 +139,11 @@ class PoseRefinement:
         turn = Rotation.from_rotvec(self.numbers.values[picture, :3]).as_matrix()
         axes: Array = turn @ self.given[picture].camera_from_world[:3, :3]
         return axes
+
+
+def pose_config(config: TrainConfig) -> TrainConfig:
+    """Of the training that learns poses, before the one of `config`."""
+    return replace(config, antialiased=True)
 
 
 def pose_gradient(

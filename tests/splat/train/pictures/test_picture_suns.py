@@ -11,6 +11,7 @@ from spacesim.data.geometry import fibonacci_sphere
 from spacesim.data.records import Sun
 from spacesim.splat.fit import estimate_sun, find_unknowns
 from spacesim.splat.sun_search import SPHERE
+from spacesim.splat.train.checkpoint import read_tensors
 from spacesim.splat.train.config import preset, with_settings
 from spacesim.splat.train.pictures import suns
 from spacesim.splat.train.pictures.suns import CHOICES, FirstSuns, SunEstimation, time_order
@@ -125,3 +126,11 @@ def test_what_cannot_be_estimated_is_told(small_dataset, tmp_path):
     with pytest.raises(InputError, match="sun: expected at least 8 training pictures to estimate it, found 3"):
         train(few, tmp_path / "run", CONFIG)
     assert not (tmp_path / "run").exists()
+
+
+def test_poses_are_learned_under_suns_that_are_estimated(untold, tmp_path, quick):
+    run = train(untold, tmp_path / "run", replace(CONFIG, refine_poses=True))
+    values = read_tensors(run.path / "poses.safetensors")[0]["values"]
+    assert values.shape == (len(untold.train), 6)
+    assert np.abs(values).max() > 0
+    assert {"poses", "suns"} <= set(json.loads((run.path / "training.json").read_text()))

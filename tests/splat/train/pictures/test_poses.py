@@ -10,14 +10,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from spacesim.backend import ad, recordings
+from spacesim.data.errors import InputError
+from spacesim.data.files import write_json
 from spacesim.data.records import Dataset
 from spacesim.data.transforms import read_camera
 from spacesim.splat.pose import moved, twist_between
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole, project
+from spacesim.splat.run import read_config
+from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.pictures.numbers import PictureNumbers
-from spacesim.splat.train.pictures.poses import WAYS, PoseRefinement, left_jacobian
+from spacesim.splat.train.pictures.poses import WAYS, PoseRefinement, left_jacobian, pose_config
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 
@@ -145,7 +149,7 @@ def test_one_camera_stays(small_dataset):
 def test_disturbed_poses_come_back_before_a_model_that_is_right(small_dataset, known_gaussians):
     """Where the object is seen, and how it is turned: medians."""
     given = disturbed(small_dataset, 2)
-    config = replace(CONFIG, iterations=1_600, rates=replace(CONFIG.rates, poses=6e-3))
+    config = replace(CONFIG, iterations=800, rates=replace(CONFIG.rates, poses=6e-3))
     trainer = Trainer(given, config)
     trainer.gaussians = Gaussians.from_numpy(known_gaussians)
     poses = trainer.pictures.poses
@@ -253,6 +257,56 @@ def test_a_run_tells_of_its_poses(small_dataset, tmp_path, caplog):
     assert 0 < np.abs(camera.world_from_camera - first.world_from_camera).max() < 0.3
 
 
+def test_the_model_starts_anew_with_poses_that_stay(small_dataset, tmp_path):
+    run = train(small_dataset, tmp_path / "run", CONFIG)
+    values = read_tensors(run.path / "poses.safetensors")[0]["values"]
+    first, _ = read_config(run.path / "poses" / "config.json")
+    assert (first.iterations, first.antialiased) == (CONFIG.iterations, True)
+    assert np.abs(values).max() > 0
+    trainer = Trainer(small_dataset, CONFIG, poses=values)
+    while trainer.iteration < CONFIG.iterations:
+        trainer.step()
+    np.testing.assert_array_equal(trainer.pictures.poses.numbers.values, values)
+    for name, array in trainer.gaussians.to_numpy().items():
+        np.testing.assert_array_equal(run.gaussians.to_numpy()[name], array, err_msg=name)
+    cameras = json.loads((run.path / "cameras.json").read_text())
+    np.testing.assert_allclose(cameras["frames"][3]["transform_matrix"], trainer.pictures.poses.camera(3).opengl)
+
+
+@pytest.mark.parametrize("at", [12, 40, 55])
+def test_an_interruption_in_either_phase_changes_nothing(small_dataset, tmp_path, monkeypatch, at):
+    """at: steps of both together; where a phase has not begun, its folder holds nothing that stands in the way."""
+    straight = train(small_dataset, tmp_path / "straight", CONFIG)
+    step, taken = Trainer.step, []
+
+    def killed(self):
+        if len(taken) == at:
+            raise SystemExit
+        taken.append(0)
+        return step(self)
+
+    config = replace(CONFIG, checkpoint_every=5)
+    monkeypatch.setattr(Trainer, "step", killed)
+    with pytest.raises(SystemExit):
+        train(small_dataset, tmp_path / "run", config)
+    monkeypatch.setattr(Trainer, "step", step)
+    run = train(small_dataset, tmp_path / "run", config, resume=True)
+    for name, array in straight.gaussians.to_numpy().items():
+        np.testing.assert_array_equal(run.gaussians.to_numpy()[name], array, err_msg=name)
+    assert (run.path / "cameras.json").read_bytes() == (straight.path / "cameras.json").read_bytes()
+
+
+def test_poses_of_another_training_are_refused(small_dataset, tmp_path):
+    train(small_dataset, tmp_path / "run" / "poses", pose_config(replace(CONFIG, refine_poses=False)))
+    write_json(tmp_path / "run" / "config.json", {})
+    with pytest.raises(InputError, match=r"poses: was started with refine_poses False"):
+        train(small_dataset, tmp_path / "run", CONFIG)
+    write_tensors(tmp_path / "other" / "poses.safetensors", {"values": np.zeros((2, 6))}, {})
+    write_json(tmp_path / "other" / "config.json", {})
+    with pytest.raises(InputError, match=r"expected the poses of .* pictures, found others; delete it"):
+        train(small_dataset, tmp_path / "other", CONFIG)
+
+
 def test_a_run_without_has_none(small_dataset, tmp_path):
     run = train(small_dataset, tmp_path / "run", replace(CONFIG, refine_poses=False, iterations=3))
     assert not (run.path / "cameras.json").exists()
@@ -260,8 +314,6 @@ def test_a_run_without_has_none(small_dataset, tmp_path):
 
 
 def test_a_checkpoint_of_other_pictures_is_refused(small_dataset, tmp_path):
-    from spacesim.data.errors import InputError
-
     fewer = replace(small_dataset, train=small_dataset.train[:-1])
     Trainer(fewer, CONFIG).save(tmp_path / "c.safetensors")
     with pytest.raises(InputError, match=r"expected a checkpoint of this training \(pictures\.poses\.values"):
