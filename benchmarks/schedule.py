@@ -24,11 +24,13 @@ from spacesim.eval.frame_metrics import frame_images
 from spacesim.eval.metrics import image
 from spacesim.eval.report.charts import line_chart
 from spacesim.eval.suns import known_suns
+from spacesim.learning.folder import TrainingProgress
+from spacesim.learning.loop import HISTORY_EVERY
 from spacesim.progress import report_training, show_progress
 from spacesim.splat.run import Run
 from spacesim.splat.train.config import TrainConfig, preset, with_options
 from spacesim.splat.train.train import train
-from spacesim.splat.train.trainer import HISTORY_EVERY, Trainer, TrainingProgress
+from spacesim.splat.train.trainer import Trainer
 
 SCENE = {"suns": 100, "views": 20, "test_suns": 20, "test_views": 3, "known_test_views": 1, "shared_test_views": True}
 SAMPLES = {"resolution": 256, "spp": 64, "test_spp": 1024}

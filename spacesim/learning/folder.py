@@ -69,6 +69,15 @@ def checkpoints(out: Path) -> list[Path]:
     return sorted((out / "checkpoints").glob("step_*.safetensors"))
 
 
+def finished_model(path: Path) -> Path:
+    """The model's file of a run. Raises InputError where the folder is no run or its training has not ended."""
+    if not (path / "config.json").exists():
+        raise InputError(f"{path}: expected a run of `spacesim train`, found no config.json in it")
+    if not (path / "model.safetensors").exists():
+        raise InputError(f"{path}: training has not ended; complete it with `spacesim train ... --resume`")
+    return path / "model.safetensors"
+
+
 class TrainingClock:
     """Wall-clock time of training, kept across interruptions beside the checkpoints."""
 

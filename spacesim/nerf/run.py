@@ -23,7 +23,7 @@ from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import Rules, read_record, structure
 from spacesim.data.toml import Document
-from spacesim.learning.folder import TrainingData
+from spacesim.learning.folder import TrainingData, finished_model
 from spacesim.learning.prediction import Prediction, Rendering, check_picture
 from spacesim.learning.tensors import read_tensors
 from spacesim.nerf.config import NerfConfig
@@ -121,11 +121,7 @@ def load_run(path: str | Path) -> NerfRun:
     """Load a finished run. Raises InputError where the folder is none of a radiance field, or its training has not
     ended."""
     path = Path(path)
-    model_path = path / "model.safetensors"
-    if not (path / "config.json").exists():
-        raise InputError(f"{path}: expected a run of `spacesim train`, found no config.json in it")
-    if not model_path.exists():
-        raise InputError(f"{path}: training has not ended; complete it with `spacesim train ... --resume`")
+    model_path = finished_model(path)
     settings, data = read_config(path / "config.json")
     _, training = read_record(path / "training.json", TrainingRecord)
     tensors, _ = read_tensors(model_path, FORMAT)

@@ -21,7 +21,7 @@ from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import Rules, read_record, structure
 from spacesim.data.toml import Document
-from spacesim.learning.folder import TrainingData
+from spacesim.learning.folder import TrainingData, finished_model
 from spacesim.learning.prediction import Prediction, Rendering, check_picture
 from spacesim.splat.light.config import MAX_EXPOSURE
 from spacesim.splat.light.model import LightModel
@@ -284,11 +284,7 @@ def _prediction(output: RenderOutput, rgb: np.ndarray, visibility: np.ndarray | 
 def load_run(path: str | Path) -> Run:
     """Load a finished run. Raises InputError where the folder is no run or its training has not ended."""
     path = Path(path)
-    model_path = path / "model.safetensors"
-    if not (path / "config.json").exists():
-        raise InputError(f"{path}: expected a run of `spacesim train`, found no config.json in it")
-    if not model_path.exists():
-        raise InputError(f"{path}: training has not ended; complete it with `spacesim train ... --resume`")
+    model_path = finished_model(path)
     train_config, data = read_config(path / "config.json")
     _, training = read_record(path / "training.json", TrainingRecord)
     config, light_config = {**train_config.to_json(), "data": data}, train_config.light

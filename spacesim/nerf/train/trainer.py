@@ -1,6 +1,5 @@
 """The training loop of a radiance field: `step`, a look at what is empty now and then, checkpoints."""
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,12 @@ import numpy as np
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float, UInt32
 from spacesim.backend.upload import upload
-from spacesim.data.errors import InputError, WorkError, check_ranges
+from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
 from spacesim.data.toml import Document
 from spacesim.learning.adam import corrections
-from spacesim.learning.folder import TrainingProgress
+from spacesim.learning.loop import TrainingLoop
 from spacesim.learning.tensors import read_tensors, write_tensors
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.fields.model import Networks
@@ -26,7 +25,6 @@ from spacesim.nerf.train.pixels import training_pixels
 from spacesim.nerf.train.step import StepNumbers, look_around, step
 
 FORMAT = "spacesim-nerf-1"
-HISTORY_EVERY = 50  #: iterations between two entries of the history
 SLOPE = 10.0  #: of the power of proposals' weights as they warm up (Barron et al. 2022, annealing)
 
 
@@ -51,7 +49,7 @@ class CheckpointHeader:
         check_ranges(self, iteration=(0, 2**53), proposal_steps=(0, 2**53))
 
 
-class Trainer:
+class Trainer(TrainingLoop):
     """The parameters of a radiance field, their moments, and what is known as empty, one step after another.
 
     The same dataset, configuration and backend give bitwise the same model, also across `save` and `restore`.
@@ -69,30 +67,6 @@ class Trainer:
         self.filled = dr.opaque(ad.Float, 1, config.occupancy**3)
         self.history: list[dict[str, float]] = []
         self._step, self._look_around = recorded(step), recorded(look_around)
-
-    def run(
-        self,
-        on_progress: Callable[[TrainingProgress], None],
-        on_checkpoint: Callable[[], None],
-        should_stop: Callable[[], bool] = lambda: False,
-    ) -> None:
-        """Train from `self.iteration` to the end. Raises KeyboardInterrupt after a step and its checkpoint where it is
-        asked to stop, WorkError where the loss is not finite."""
-        config = self.config
-        while self.iteration < config.iterations:
-            loss = self.step()
-            last = self.iteration == config.iterations
-            if self.iteration % HISTORY_EVERY == 0 or last:
-                self._check(float(loss[0]))
-                self.history.append({"iteration": self.iteration, "loss": float(loss[0])})
-                on_progress(TrainingProgress(self.iteration, config.iterations, float(loss[0])))
-            stop = should_stop()
-            if stop:
-                self._check(float(loss[0]))
-            if stop or (self.iteration % config.checkpoint_every == 0 and not last):
-                on_checkpoint()
-            if stop:
-                raise KeyboardInterrupt
 
     def step(self) -> Any:
         """One update. Returns the mean squared error of colours, Float of width 1."""
@@ -162,10 +136,6 @@ class Trainer:
 
     def _key(self, number: int) -> UInt32:
         return dr.opaque(ad.UInt32, step_key(self.config.seed, number))
-
-    def _check(self, loss: float) -> None:
-        if not np.isfinite(loss):
-            raise WorkError(f"training: the loss is {loss} at iteration {self.iteration}; the last checkpoint is kept")
 
 
 def box_of(tensors: dict[str, np.ndarray]) -> SceneBox:

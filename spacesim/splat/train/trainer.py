@@ -5,7 +5,7 @@ A step takes one view or several forward and backward (`view_pass`), moves all p
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,14 @@ import numpy as np
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
-from spacesim.data.errors import InputError, WorkError
+from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
 from spacesim.data.toml import Document
 from spacesim.learning.adam import NetworkAdam
 from spacesim.learning.cameras import farthest_camera, focus_point, nearest_camera
-from spacesim.learning.folder import TrainingProgress
+from spacesim.learning.loop import TrainingLoop
 from spacesim.splat.light.bounce import ALBEDO
 from spacesim.splat.light.model import LightModel, TrainingFrame, is_near, robust_radius
 from spacesim.splat.raster.gaussians import Gaussians
@@ -42,10 +42,8 @@ from spacesim.splat.train.view_pass import ViewPass, ViewResult
 from spacesim.splat.train.views import TrainingView, TrainingViews
 from spacesim.splat.train.warm_start import Attraction, WarmStart
 
-HISTORY_EVERY = 50  #: iterations between two entries of the history
 
-
-class Trainer:
+class Trainer(TrainingLoop):
     """Gaussians, their optimizer and their strategy, and the networks of light where the method has some, one step
     after another.
 
@@ -81,28 +79,10 @@ class Trainer:
         self._update = Update(config.antialiased, self.scene_scale)
         self._update_light = recorded(update_light)
 
-    def run(
-        self,
-        on_progress: Callable[[TrainingProgress], None],
-        on_checkpoint: Callable[[], None],
-        should_stop: Callable[[], bool] = lambda: False,
-    ) -> None:
-        """Train from `self.iteration` to the end. Raises KeyboardInterrupt after a step and its checkpoint where it is
-        asked to stop, WorkError where the loss is not finite."""
-        config = self.config
-        while self.iteration < config.iterations:
-            loss = self.step()
-            last = self.iteration == config.iterations
-            if self.iteration % HISTORY_EVERY == 0 or last:
-                self._record_history(float(loss[0]))
-                on_progress(TrainingProgress(self.iteration, config.iterations, float(loss[0]), self.gaussians.count))
-            stop = should_stop()
-            if stop:
-                self._check(float(loss[0]))
-            if stop or (self.iteration % config.checkpoint_every == 0 and not last):
-                on_checkpoint()
-            if stop:
-                raise KeyboardInterrupt
+    @property
+    def gaussian_count(self) -> int:
+        """At this iteration."""
+        return self.gaussians.count
 
     def step(self) -> Any:
         """One update from one view or several, refinement if it is time. Returns the mean loss, Float of width 1."""
@@ -309,14 +289,6 @@ class Trainer:
             self.gaussians.features = upload(features.T.ravel())
         frame = TrainingFrame(centre, self.scene_scale, farthest_camera(dataset, centre), robust_radius(means))
         return LightModel.initial(self.config.light, frame, self.config.seed, len(self.views))
-
-    def _check(self, loss: float) -> None:
-        if not np.isfinite(loss):
-            raise WorkError(f"training: the loss is {loss} at iteration {self.iteration}; the last checkpoint is kept")
-
-    def _record_history(self, loss: float) -> None:
-        self._check(loss)
-        self.history.append({"iteration": self.iteration, "loss": loss, "gaussians": self.gaussians.count})
 
 
 def _check_sizes(dataset: Dataset, config: TrainConfig) -> None:
