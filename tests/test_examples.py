@@ -96,3 +96,11 @@ def test_refine_pose(data, run):
     assert pose.covariance.shape == (6, 6)
     assert np.isfinite(after).all()
     assert after != before
+
+
+def test_radiance_fields(data, tmp_path):
+    trained = example("07_radiance_fields").main(data, tmp_path / "field", tmp_path / "out", size=32, iterations=60)
+    assert trained.gaussian_count is None
+    numbers = read_png(next((tmp_path / "out/id").glob("*.png")))
+    assert numbers.shape == (32, 32)
+    assert read_png(next((tmp_path / "out").glob("rgb/*.png"))).shape[:2] == (32, 32)
