@@ -36,7 +36,7 @@ from spacesim.eval.frame_metrics import (
 from spacesim.eval.labels import GROUPS, SHADOW
 from spacesim.eval.metrics import grazing, lpips, shadow
 from spacesim.eval.metrics.geometry import GeometryConfig, ShapeResult, compare_geometry
-from spacesim.eval.notes import MODELS_OF_A_SCENE, explain, explain_fit, explain_light, explain_objects
+from spacesim.eval.notes import MODELS_OF_A_SCENE, explain, explain_fit, explain_ignored, explain_light, explain_objects
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
 from spacesim.eval.objects import compare_object_shapes, object_groups, object_names, swapped_order
 from spacesim.eval.relight import write_sweep
@@ -128,6 +128,7 @@ def evaluate(
 
     method = str(run.config.get("method"))
     records = [result.record for result in results]
+    ignored = statistics.fmean(result.ignored for result in results)
     metrics = {
         "schema": SCHEMA,
         "run": str(run.path),
@@ -153,6 +154,7 @@ def evaluate(
             *explain_fit(unknowns, records),
             *([shape.note] if shape.note else []),
             *([no_map] if no_map else []),
+            *explain_ignored(ignored),
             *explain(records, [result.source for result in results], None if network else lpips_sentence, method),
             *explain_light(
                 [result.has_known_sun for result in results],
@@ -162,7 +164,7 @@ def evaluate(
             ),
             *explain_objects(objects, records, models, swapped_order(run, dataset)),
         ],
-        "dataset": _describe(dataset, frames),
+        "dataset": _describe(dataset, frames, ignored),
         "config": dict(run.config),
         "training": dict(run.training),
         "versions": _versions(),
@@ -180,6 +182,7 @@ class FrameResult:
     record: dict[str, Any]  #: its values by group, and what it is
     source: str  #: where its silhouette is from
     has_known_sun: bool | None  #: whether training has seen its Sun
+    ignored: float  #: share of its pixels that count nowhere
     grazing: Array | None  #: sums by grazing angle
     seconds: float  #: that its prediction took
 
@@ -228,6 +231,7 @@ def _evaluate_frame(
     view, source = frame_images(dataset, frame, prediction)
     light = frame_light(dataset, frame, prediction)
     photograph = is_photograph(frame, source)
+    ignored = float(1 - view.valid.mean())
     write_pictures(folder, view, light, photograph)
     named: dict[str, Any] = {
         "file_path": frame.file_path,
@@ -241,7 +245,7 @@ def _evaluate_frame(
     record: dict[str, Any] = named | groups | visibility_groups(light, view)
     if objects:
         record["objects"] = object_groups(dataset, frame, objects, view, light, network)
-    return FrameResult(frame, record, source, has_known_sun, tally_grazing(light, view), seconds)
+    return FrameResult(frame, record, source, has_known_sun, ignored, tally_grazing(light, view), seconds)
 
 
 def _summaries(results: Sequence[FrameResult]) -> dict[str, Any]:
@@ -302,10 +306,11 @@ def summary(records: Iterable[Mapping[str, float | None] | None]) -> dict[str, A
     return result
 
 
-def _describe(dataset: Dataset, frames: Sequence[Frame]) -> dict[str, Any]:
+def _describe(dataset: Dataset, frames: Sequence[Frame], ignored: float) -> dict[str, Any]:
     """What the report says about the data: its size, and from scene.json how it was made."""
     return {
         "digest": _digest(dataset, frames),
+        "ignored": ignored,
         "truth": any(frame.gt_path is not None for frame in frames),
         "frames": len(frames),
         "train_frames": len(dataset.train),
@@ -319,7 +324,7 @@ def _digest(dataset: Dataset, frames: Sequence[Frame]) -> str | None:
     """By which reports know that runs were evaluated on the same frames; None where their files do not say."""
     try:
         return frames_digest(dataset.root, frames)
-    except OSError:
+    except (OSError, InputError):
         return None
 
 

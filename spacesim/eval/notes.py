@@ -59,6 +59,13 @@ def explain_fit(unknowns: Sequence[Unknown], records: Sequence[dict[str, Any]]) 
     return notes
 
 
+def explain_ignored(share: float) -> list[str]:
+    """A sentence about pixels that count nowhere. share: of all"""
+    if share <= 0:
+        return []
+    return [f"{100 * share:.3g} % of the pixels count nowhere, not in image_full either: nothing is known of them."]
+
+
 def explain_light(
     known_suns: Sequence[bool | None], by_grazing_angle: bool, no_sweep: str, untold: str = ""
 ) -> list[str]:

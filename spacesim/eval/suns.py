@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from spacesim.data.errors import InputError
-from spacesim.data.identity import training_digest
+from spacesim.data.identity import same_digest, training_digest
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import read_dataset
 
@@ -28,13 +28,13 @@ def training_frames(config: Mapping[str, Any], dataset: Dataset) -> tuple[Sequen
         return dataset.train, ""
     path = Path(data["path"])
     digest = _digest(dataset)
-    if digest == data["digest"] or (digest is None and path == dataset.root.resolve()):
+    if _same(digest, data["digest"]) or (digest is None and path == dataset.root.resolve()):
         return dataset.train, ""
     try:
         training_set = read_dataset(path)
     except InputError:
         return (), f"the run was trained on other data, {path}, which is gone"
-    if _digest(training_set) != data["digest"]:
+    if not _same(_digest(training_set), data["digest"]):
         return (), f"the run was trained on other data, and {path} has changed since"
     return training_set.train, ""
 
@@ -58,11 +58,15 @@ def rounded_angles(frame: Frame) -> list[float] | None:
 
 
 def _digest(dataset: Dataset) -> str | None:
-    """As training has told it; None where pictures of it are missing."""
+    """As training has told it; None where pictures of it are missing or cannot be read."""
     try:
         return training_digest(dataset)
-    except OSError:
+    except (OSError, InputError):
         return None
+
+
+def _same(digest: str | None, told: Any) -> bool:
+    return digest is not None and same_digest(digest, str(told))
 
 
 def count_suns(frames: Sequence[Frame]) -> int:

@@ -316,6 +316,8 @@ def test_ignored_pixels_do_not_count(make_run, dataset, tmp_path):
     metrics = evaluate(make_run(spoiled), elsewhere(dataset, mask_path="mask.png"), tmp_path / "eval")
     assert metrics["image"]["mae"]["mean"] == metrics["image_full"]["mae"]["mean"] == 0
     assert metrics["image_full"]["flip"]["mean"] == 0
+    assert metrics["dataset"]["ignored"] == pytest.approx(25 / 40)
+    assert any(note.startswith("62.5 % of the pixels count nowhere") for note in metrics["notes"])
     for group in ("", "_full"):  # windows and slopes beside the mask read none of them either
         assert metrics[f"image{group}"]["ssim"]["mean"] == pytest.approx(1)
         assert metrics[f"shadow{group}"]["sharpness_ratio"]["mean"] == pytest.approx(1)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from spacesim.eval.notes import explain_ignored
 from spacesim.eval.report.html import escape, table
 from spacesim.eval.report.read import Evaluation
 
@@ -59,7 +60,8 @@ def _about(runs: Sequence[Evaluation]) -> str:
         facts.append(("one Sun" if suns == 1 else f"{suns} Suns") + never)
     elif data.get("truth") is False:
         facts.append("no Sun is named")
-    return f"{what}, evaluated on {data['frames']} {metrics['split']} frames against {against}. {', '.join(facts)}."
+    about = f"{what}, evaluated on {data['frames']} {metrics['split']} frames against {against}. {', '.join(facts)}."
+    return " ".join([about, *explain_ignored(data.get("ignored") or 0)])
 
 
 def fitted_words(runs: Sequence[Evaluation]) -> str:
