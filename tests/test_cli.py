@@ -157,6 +157,16 @@ def test_verify_draws_where_cameras_look_from(spacesim, tiny_data, tmp_path):
     assert (tmp_path / "map.png").read_bytes() == (tiny_data / "camera_density.png").read_bytes()
 
 
+def test_verify_says_how_to_mend_what_was_imported(spacesim, tiny_data, tmp_path):
+    assert spacesim("import", "nerfstudio", tiny_data, "--out", tmp_path / "data").code == 0
+    picture = next((tmp_path / "data/images").iterdir())
+    picture.write_bytes(picture.read_bytes()[:-40])
+    done = spacesim("verify", tmp_path / "data")
+    assert done.code == 1
+    assert done.errors[-1].endswith("1 faulty files; import it again, into a new folder")
+    assert "generate" not in "".join(done.errors)
+
+
 def test_suns_are_given_by_azimuth_and_elevation(spacesim, tmp_path):
     small = ("--views", "1", "--test-views", "0", "--resolution", "8", "--spp", "1")
     done = spacesim("generate", "boxsat", "--out", tmp_path / "data", *small, "--sun", "200,-10", "--sun", "5.5,80")

@@ -48,7 +48,7 @@ def read_dataset(path: str | Path) -> Dataset:
     source = root / "transforms.json" if path.is_dir() else path
     if source.is_file() and source.name != "transforms_train.json":
         return dataset_of(source, read_object(source))
-    if (root / "transforms_train.json").is_file():
+    if _exists(path) and (root / "transforms_train.json").is_file():
         return dataset_of_pair(root, *read_pair(root))
     raise InputError(_say_what_is_missing(path, root))
 
@@ -72,7 +72,7 @@ def dataset_of_pair(root: Path, meta: Json, held_out: tuple[str, Json] | None) -
     """The dataset of what `read_pair` returns. Raises InputError as `read_dataset`."""
     source = root / "transforms_train.json"
     train, missing = _read_frames(source, meta)
-    test, missing_test = _read_frames(root / held_out[0], held_out[1]) if held_out else ((), ())
+    test, missing_test = _read_frames(root / held_out[0], held_out[1], needed=False) if held_out else ((), ())
     _warn_of_missing(source, missing + missing_test, len(train) + len(test))
     return _dataset(source, meta, train, test, missing + missing_test)
 
@@ -135,8 +135,9 @@ def read_object(path: Path) -> Json:
     return value
 
 
-def _read_frames(source: Path, meta: Json) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
-    """(all frames with an image, paths of the images that are not there), each in the order of their file paths."""
+def _read_frames(source: Path, meta: Json, needed: bool = True) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
+    """(all frames with an image, paths of the images that are not there), each in the order of their file paths.
+    needed: there must be one"""
     entries = meta.get("frames")
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{source}: expected a list of frames, found {'none' if not entries else 'another value'}")
@@ -146,7 +147,7 @@ def _read_frames(source: Path, meta: Json) -> tuple[tuple[Frame, ...], tuple[str
             raise InputError(f"{source}: expected each image once, found {first} twice")
     there = {path for path, _ in named if _exists(source.parent / path)}
     missing = tuple(path for path, _ in named if path not in there)
-    if missing and (not there or (source.parent / DIGESTS).is_file()):
+    if missing and ((needed and not there) or (source.parent / DIGESTS).is_file()):
         others = "" if there else ", nor one of any other frame"
         raise InputError(f"{source}: frame {missing[0]}: expected an image file, found none{others}")
     frames = [_read_frame(source, meta, entry, path) for path, entry in named if path in there]

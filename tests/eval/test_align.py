@@ -144,6 +144,12 @@ def test_frames_of_a_video_are_counted(truth, tmp_path):
     assert words == "source_index in transforms.json"
 
 
+def test_keys_that_are_no_numbers_of_frames_do_not_count(truth, tmp_path):
+    own = reconstruction(truth, tmp_path / "own")
+    with_keys(own, [float("inf"), *range(1, len(own.frames))])
+    assert match_frames(own, truth)[1] == "file name"
+
+
 @pytest.fixture
 def drawn(tmp_path) -> tuple[Run, Dataset, Dataset]:
     """A run, pictures of it in the truth's world, and its own dataset, in its own."""

@@ -1,6 +1,6 @@
 """Pictures of a lens and their masks as frames: copied where our cameras can say the lens, else resampled."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.images import Resampling, has_alpha, image_size, read_png, resample
 from spacesim.data.importers.lenses import Lens
-from spacesim.data.importers.masks import read_mask
+from spacesim.data.importers.masks import read_mask, read_silhouette
 from spacesim.data.importers.writing import ImportedFrame
 from spacesim.data.records import Camera, Image, Sun
 
@@ -30,8 +30,9 @@ class View:
     lens: Lens
     mask: Path | None = None  #: white = object, or = known, as the frames' maker says
     sun: Sun | None = None
-    silhouette: Path | None = None  #: other than 0 = object, of the picture's size
+    silhouette: Path | None = None  #: other than 0 = object
     depth: Callable[[], np.ndarray] | None = None  #: makes uint16 [H, W], millimetres along the optical axis
+    keys: Mapping[str, Any] = field(default_factory=dict)  #: as of `ImportedFrame`
 
 
 @dataclass
@@ -59,7 +60,10 @@ class FrameMaker:
         cut_out = view.mask is not None and empty and has_alpha(view.path)
         unknown = (view.mask is not None and not empty) or (resampled and not self._sees_all(lens))
         in_file = view.mask is not None and empty and not cut_out
-        silhouette = (lambda: self._silhouette(view)) if in_file or (resampled and view.silhouette) else view.silhouette
+        made = in_file or (
+            view.silhouette is not None and (resampled or image_size(view.silhouette) != (lens.width, lens.height))
+        )
+        silhouette = (lambda: self._silhouette(view)) if made else view.silhouette
         return ImportedFrame(
             name=view.name,
             picture=(lambda: self._picture(view)) if resampled or cut_out else view.path,
@@ -69,6 +73,7 @@ class FrameMaker:
             silhouette=silhouette,
             mask=(lambda: self._known(view)) if unknown else None,
             depth=None if view.depth is None else partial(self._depth, view.depth, view),
+            keys=view.keys,
         )
 
     def _picture(self, view: View) -> np.ndarray:
@@ -92,7 +97,8 @@ class FrameMaker:
         if view.mask is not None and self.masked == "empty":
             known = read_mask(view.mask, view.lens.width, view.lens.height)
         else:
-            known = _read_labels(view.silhouette) > 0
+            assert view.silhouette is not None
+            known = read_silhouette(view.silhouette, view.lens.width, view.lens.height)
         return self._labels(view, np.where(known, 255, 0).astype(np.uint8))
 
     def _known(self, view: View) -> np.ndarray:
@@ -127,10 +133,3 @@ def fitted(lens: Lens, path: Path) -> Lens:
 def _undistortion(lens: Lens) -> Resampling:
     check_memory(_UNDISTORTING * lens.width * lens.height, f"undistorting {lens.width} x {lens.height} pixels")
     return lens.undistortion()
-
-
-def _read_labels(path: Path | None) -> np.ndarray:
-    """[H, W]"""
-    assert path is not None
-    pixels = read_png(path)
-    return pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=-1)

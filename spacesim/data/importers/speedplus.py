@@ -12,6 +12,7 @@ world is the frame of the body. Labels stay with their frames in transforms.json
 """
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -101,7 +102,7 @@ def import_speedplus(
     broken, pictures of another size than the camera's, and where no frame is left.
     """
     expect(domain in DOMAINS, "domain", f"one of {', '.join(DOMAINS)}", domain)
-    expect(max_distance is None or max_distance > 0, "max_distance", "metres above 0", max_distance)
+    expect(max_distance is None or 0 < max_distance < math.inf, "max_distance", "metres above 0", max_distance)
     expect(count is None or count >= 2, "count", "at least 2 frames", count)
     expect(0 < scale <= 1, "scale", "a fraction above 0, up to 1", scale)
     expect(masked in MASKED, "masked", f"one of {', '.join(MASKED)}", masked)
@@ -130,7 +131,8 @@ def import_speedplus(
     train, test = (list(map(maker.frame, labels)) for labels in [*splits, []][:2])
     options = {"domain": domain, "max_distance": max_distance, "count": count, "scale": scale, "seed": seed}
     options |= {"masks": None if masks is None else str(masks), "masked": masked}
-    return write_dataset(out, train, test, {"kind": "speedplus", "source": str(src), **options}, progress=progress)
+    source = {"kind": "speedplus", "source": str(src), **options}
+    return write_dataset(out, train, test or None, source, progress=progress)
 
 
 def _lists(src: Path, domain: str) -> tuple[Path, list[Path]]:

@@ -258,7 +258,11 @@ def test_broken_files_end_in_one_sentence(published, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "option", [{"domain": "moon"}, {"max_distance": -1.0}, {"count": 1}, {"scale": 0.0}, {"scale": 2.0}, {"seed": -1}]
+    "option",
+    [
+        *({"domain": "moon"}, {"max_distance": -1.0}, {"max_distance": float("inf")}, {"count": 1}),
+        *({"scale": 0.0}, {"scale": 2.0}, {"seed": -1}),
+    ],
 )
 def test_wrong_options_are_refused(published, tmp_path, option):
     with pytest.raises(InputError, match=f"^{next(iter(option))}: expected"):

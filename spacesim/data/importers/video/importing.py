@@ -162,7 +162,7 @@ def _import(
     frames = list(_frames(folder, model, has_masks, asked.masked, keys))
     points = (model.points, model.colors)
     return write_dataset(
-        out, frames, [], source, points, files, lambda done, total, name: tell("write", done, total, name)
+        out, frames, None, source, points, files, lambda done, total, name: tell("write", done, total, name)
     )
 
 
