@@ -109,6 +109,32 @@ def test_broken_videos_end_in_a_sentence(tmp_path, caplog):
 
 
 @needs_av
+@pytest.mark.parametrize("kind", ["matroska", "mp4"])
+def test_a_film_that_is_cut_off_is_told_of_once(tmp_path, caplog, kind):
+    """Matroska tells how long it is, and not of how many frames; this MP4 has its index in front."""
+    import av
+
+    noise = np.random.default_rng(0).integers(0, 255, (12, SIZE[1], SIZE[0], 3), np.uint8)
+    path, options = tmp_path / f"film.{kind}", {} if kind == "matroska" else {"movflags": "faststart"}
+    with av.open(str(film(tmp_path / "f", noise))) as source, av.open(str(path), "w", kind, options) as target:
+        copy = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(source.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = copy
+                target.mux(packet)
+    assert len(list(read_frames(path))) == 12
+    assert caplog.records == []
+    path.write_bytes(path.read_bytes()[: 7 * path.stat().st_size // 10])
+    count = len(list(read_frames(path)))
+    assert 2 < count < 10
+    assert [r.getMessage().split(" (")[0] for r in caplog.records] == [
+        f"{path}: breaks off after {count}{' of 12' * (kind == 'mp4')} frames"
+    ]
+    assert len(list(read_frames(path, again=True))) == count
+    assert len(caplog.records) == 1
+
+
+@needs_av
 def test_a_film_of_sound_alone_has_no_pictures(tmp_path):
     import av
 

@@ -84,7 +84,7 @@ def import_video(
             )
         keys: dict[str, dict[str, Any]] = {}
         size: tuple[int, ...] | None = None
-        for number, frame in enumerate(read_frames(src)):
+        for number, frame in enumerate(read_frames(src, again=True)):
             if number in set(chosen.tolist()):
                 size = size or frame.picture.shape
                 if frame.picture.shape != size:
