@@ -5,6 +5,7 @@ population standard deviations are over the frames, without those where a metric
 differs from one call to the next.
 """
 
+import logging
 import math
 import statistics
 import time
@@ -36,13 +37,21 @@ from spacesim.eval.frame_metrics import (
 from spacesim.eval.labels import GROUPS, SHADOW
 from spacesim.eval.metrics import grazing, lpips, shadow
 from spacesim.eval.metrics.geometry import GeometryConfig, ShapeResult, compare_geometry
-from spacesim.eval.notes import MODELS_OF_A_SCENE, explain, explain_fit, explain_ignored, explain_light, explain_objects
+from spacesim.eval.notes import (
+    MODELS_OF_A_SCENE,
+    explain,
+    explain_fit,
+    explain_ignored,
+    explain_light,
+    explain_objects,
+    explain_other_data,
+)
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
 from spacesim.eval.objects import compare_object_shapes, object_groups, object_names, swapped_order
 from spacesim.eval.relight import write_sweep
 from spacesim.eval.schema import SCHEMA
 from spacesim.eval.shape import write_shapes
-from spacesim.eval.suns import count_suns, known_suns, rounded_angles, training_frames
+from spacesim.eval.suns import TrainedOn, count_suns, known_suns, rounded_angles, training_frames
 from spacesim.splat.compose.aligned import AlignedRun, moved_frame
 from spacesim.splat.fit import Unknown, find_unknowns
 from spacesim.splat.run import Run
@@ -51,6 +60,8 @@ if TYPE_CHECKING:
     from spacesim.splat.run import Predictor
 
 _PACKAGES = ("spacesim", "mitsuba", "drjit", "numpy", "scipy", "flip-evaluator", "torch")
+
+_log = logging.getLogger(__name__)
 
 EvaluationProgress = Callable[[int, int, str], None]
 
@@ -108,8 +119,12 @@ def evaluate(
         run.predict(frames[0].camera, frames[0].sun)  # compiles the kernels
     models = [part.name for part in run.parts] or None  # of a composed scene, which was not trained on this dataset
     own = config.align or dataset
-    trained, untold = training_frames(run.config, own) if models is None else ((), MODELS_OF_A_SCENE)
+    known = training_frames(run.config, own) if models is None else TrainedOn((), MODELS_OF_A_SCENE)
+    trained = known.frames
+    other_data = explain_other_data(known.other, config.align.root if config.align else None)
     if alignment:
+        for sentence in other_data:
+            _log.warning("%s", sentence)
         trained = [moved_frame(frame, alignment.pose) for frame in trained]
     objects = object_names(dataset, models or ())
     knows_sun = known_suns(frames, trained)
@@ -151,6 +166,7 @@ def evaluate(
         "relight": sweep,
         "notes": [
             *([alignment.note] if alignment else []),
+            *other_data,
             *explain_fit(unknowns, records),
             *([shape.note] if shape.note else []),
             *([no_map] if no_map else []),
@@ -160,7 +176,7 @@ def evaluate(
                 [result.has_known_sun for result in results],
                 any(result.grazing is not None for result in results),
                 no_sweep,
-                untold,
+                known.untold,
             ),
             *explain_objects(objects, records, models, swapped_order(run, dataset)),
         ],

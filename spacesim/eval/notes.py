@@ -1,6 +1,7 @@
 """Why a value of metrics.json is null, and what stands in for missing truth: a sentence each."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from spacesim.eval.labels import GROUPS
@@ -64,6 +65,16 @@ def explain_ignored(share: float) -> list[str]:
     if share <= 0:
         return []
     return [f"{100 * share:.3g} % of the pixels count nowhere, not in image_full either: nothing is known of them."]
+
+
+def explain_other_data(trained: Path | None, aligned: Path | None) -> list[str]:
+    """A sentence where a run is judged in axes that may not be its own. trained: the data that it was trained on, where
+    it is evaluated on, or aligned by, others;  aligned: what it is aligned by"""
+    if trained is None:
+        return []
+    if aligned is not None:
+        return [f"The run was moved as one in the axes and scale of {aligned}, but was trained on {trained}."]
+    return [f"The run was trained on other data, {trained}, and is taken to be in the axes and scale of these."]
 
 
 def explain_light(
