@@ -119,6 +119,19 @@ def read_camera(path: Path) -> Camera:
         raise InputError(f"{path}: {error}") from None
 
 
+def read_sun(path: Path, file_path: str) -> Sun | None:
+    """The Sun that a file like transforms.json has of a frame, None where it has none. Raises InputError where it is
+    broken."""
+    entries = read_object(path).get("frames")
+    for entry in entries if isinstance(entries, list) else ():
+        if isinstance(entry, dict) and entry.get("file_path") == file_path:
+            try:
+                return _read_sun(_without_nulls(entry))
+            except InputError as error:
+                raise InputError(f"{path}: frame {file_path}: {error}") from None
+    return None
+
+
 def _say_what_is_missing(path: Path, root: Path) -> str:
     if not path.exists():
         return f"{path}: expected a dataset folder or a transforms.json, found nothing"

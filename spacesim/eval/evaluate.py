@@ -5,7 +5,6 @@ population standard deviations are over the frames, without those where a metric
 differs from one call to the next.
 """
 
-import logging
 import math
 import statistics
 import time
@@ -60,8 +59,6 @@ if TYPE_CHECKING:
     from spacesim.splat.run import Predictor
 
 _PACKAGES = ("spacesim", "mitsuba", "drjit", "numpy", "scipy", "flip-evaluator", "torch")
-
-_log = logging.getLogger(__name__)
 
 EvaluationProgress = Callable[[int, int, str], None]
 
@@ -123,8 +120,6 @@ def evaluate(
     trained = known.frames
     other_data = explain_other_data(known.other, config.align.root if config.align else None)
     if alignment:
-        for sentence in other_data:
-            _log.warning("%s", sentence)
         trained = [moved_frame(frame, alignment.pose) for frame in trained]
     objects = object_names(dataset, models or ())
     knows_sun = known_suns(frames, trained)
