@@ -192,7 +192,9 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
 
 
 def _read_camera(values: Json, image: Path) -> Camera:
-    model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else values.get("camera_model", "OPENCV")
+    if (fisheye := values.get("is_fisheye", False)) not in (False, True):
+        raise InputError(f"expected true or false as is_fisheye, found {fisheye!r}")
+    model = "OPENCV_FISHEYE" if fisheye else values.get("camera_model", "OPENCV")
     if model not in _PERSPECTIVE:
         help_ = "; spacesim import nerfstudio undistorts it" if model == "OPENCV_FISHEYE" else ""
         raise InputError(f"expected a camera_model among {', '.join(_PERSPECTIVE)}, found {model}{help_}")
@@ -205,7 +207,11 @@ def _read_camera(values: Json, image: Path) -> Camera:
     if fx is None or fy is None:
         raise InputError("expected fl_x or camera_angle_x, found neither")
     cx, cy = _number(values, "cx", 0.5 * width), _number(values, "cy", 0.5 * height)
-    return Camera(_read_pose(values) @ OPENCV_FROM_OPENGL, width, height, fx, fy, cx, cy)
+    pose = _read_pose(values)
+    camera = Camera(pose @ OPENCV_FROM_OPENGL, width, height, fx, fy, cx, cy)
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise InputError(f"expected 0 0 0 1 as the last row of transform_matrix, found {pose[3].tolist()}")
+    return camera
 
 
 def _focal_length(values: Json, key: str, angle_key: str, size: int) -> float | None:

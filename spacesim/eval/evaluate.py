@@ -139,6 +139,7 @@ def evaluate(
     method = str(run.config.get("method"))
     records = [result.record for result in results]
     ignored = statistics.fmean(result.ignored for result in results)
+    region = "frame" if all(result.source == "frame" for result in results) else "silhouette"
     metrics = {
         "schema": SCHEMA,
         "run": str(run.path),
@@ -150,7 +151,7 @@ def evaluate(
             "render_ms": 1e3 * statistics.median(result.seconds for result in results),
             "backend": run.backend,
         },
-        "image_region": "frame" if all(result.source == "frame" for result in results) else "silhouette",
+        "image_region": region,
         "fitted": [{"name": unknown.name, "how": unknown.how} for unknown in unknowns] or None,
         "alignment": alignment.to_json() if alignment else None,
         **_summaries(results),
@@ -162,7 +163,7 @@ def evaluate(
         "notes": [
             *([alignment.note] if alignment else []),
             *other_data,
-            *explain_fit(unknowns, records),
+            *explain_fit(unknowns, records, region == "frame"),
             *([shape.note] if shape.note else []),
             *([no_map] if no_map else []),
             *explain_ignored(ignored),

@@ -46,17 +46,19 @@ def explain(records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips:
     return notes + _explain_kinds(records)
 
 
-def explain_fit(unknowns: Sequence[Unknown], records: Sequence[dict[str, Any]]) -> list[str]:
-    """Sentences about what was fitted to the pictures."""
+def explain_fit(unknowns: Sequence[Unknown], records: Sequence[dict[str, Any]], whole: bool = False) -> list[str]:
+    """Sentences about what was fitted to the pictures. whole: no silhouette is known"""
     if not unknowns:
         return []
     what = "; ".join(f"{unknown.name} ({unknown.how})" for unknown in unknowns)
+    of_what = "it" if whole else "the object in it"
     notes = [
-        f"Fitted to each evaluated picture: {what}. On the left half of the object in it, judged on the right half, "
-        "and the other way round: no pixel is judged by numbers that were fitted on it."
+        f"Fitted to each evaluated picture: {what}. On the left half of {of_what}, judged on the right half, and "
+        "the other way round: no pixel is judged by numbers that were fitted on it."
     ]
     if missing := sum(record["fitted"] is None for record in records):
-        notes.append(f"In {missing} of {len(records)} frames nothing was fitted: a half shows no object.")
+        why = "a half has no pixel that counts" if whole else "a half shows no object"
+        notes.append(f"In {missing} of {len(records)} frames nothing was fitted: {why}.")
     return notes
 
 

@@ -95,7 +95,7 @@ def _take_extras(path: Path, meta: Mapping[str, Any], extras: _Extras, unit: flo
     for entry in frames:
         values = {key: value for key, value in {**meta, **entry}.items() if value is not None}
         name = image_path(path, entry)
-        if values.get("camera_model") == "OPENCV_FISHEYE" or values.get("is_fisheye") is True:
+        if values.get("camera_model") == "OPENCV_FISHEYE" or values.get("is_fisheye") in (True,):
             numbers = [values.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")]
             if not all(_is_number(number) for number in numbers):
                 raise InputError(f"{path}: frame {name}: expected finite numbers as k1 to k4, found {numbers}")

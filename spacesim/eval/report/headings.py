@@ -71,7 +71,8 @@ def fitted_words(runs: Sequence[Evaluation]) -> str:
     if not parts:
         return ""
     what = parts[0][1] if len(runs) == 1 else "; ".join(f"{name}: {names}" for name, names in parts)
-    return f" Fitted to each picture on one half of the object and judged on the other ({escape(what)})."
+    half = "one half" if all(run.whole_pictures for run in runs) else "one half of the object"
+    return f" Fitted to each picture on {half} and judged on the other ({escape(what)})."
 
 
 def aligned_words(runs: Sequence[Evaluation]) -> str:
