@@ -25,7 +25,7 @@ from PIL import Image as PillowImage
 
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import MAX_LIST_BYTES, read_json
-from spacesim.data.geometry import Array, rotation_from_quaternion
+from spacesim.data.geometry import Array, camera_that_sees
 from spacesim.data.images import image_size, read_png
 from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.masks import MASK_OPTIONS, MASKED, MaskFolder, read_mask
@@ -55,12 +55,8 @@ class _Label:
 
     @property
     def world_from_camera(self) -> Array:
-        """[4, 4] in the body's frame: the transpose of the quaternion's rotation, and -R^T r."""
-        turn, place = rotation_from_quaternion(self.quaternion), self.position
-        pose = np.eye(4)
-        pose[:3, :3] = turn.T
-        pose[:3, 3] = -(place[0] * turn[0] + place[1] * turn[1] + place[2] * turn[2])  # to the bit, whatever the BLAS
-        return pose
+        """[4, 4] in the body's frame."""
+        return camera_that_sees(self.quaternion, self.position)
 
 
 @dataclass(frozen=True, eq=False)

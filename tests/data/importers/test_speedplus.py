@@ -94,6 +94,38 @@ def test_our_own_export_read_back_is_equal_to_the_bit(generated, exported, tmp_p
     assert find_unreadable_files(again.root) == []
 
 
+def test_the_export_of_an_import_is_the_first_export_to_the_bit(exported, tmp_path):
+    data = import_speedplus(exported, tmp_path / "data")
+    write_speedplus(data, tmp_path / "again")
+    for name in ("camera.json", "synthetic/train.json", "synthetic/validation.json"):
+        assert (tmp_path / "again" / name).read_bytes() == (exported / name).read_bytes()
+    for path in (exported / "synthetic/images").iterdir():
+        np.testing.assert_array_equal(read_png(tmp_path / "again/synthetic/images" / path.name), read_png(path))
+    twice = import_speedplus(tmp_path / "again", tmp_path / "twice")
+    for one, two in zip(data.frames, twice.frames, strict=True):
+        np.testing.assert_array_equal(one.camera.world_from_camera, two.camera.world_from_camera)
+    with pytest.raises(InputError, match="object: expected one of 1 the body, found 'hubble'"):
+        write_speedplus(data, tmp_path / "none", "hubble")
+
+
+def test_poses_that_were_moved_have_labels_of_their_own(exported, tmp_path):
+    import_speedplus(exported, tmp_path / "data")
+
+    def move(meta):
+        meta["frames"][0]["transform_matrix"][0][3] += 0.5
+        meta["frames"][1]["q_vbs2tango_true"] = "none"
+
+    edit(tmp_path / "data/transforms.json", move)
+    moved = read_dataset(tmp_path / "data")
+    write_speedplus(moved, tmp_path / "again")
+    again = import_speedplus(tmp_path / "again", tmp_path / "twice")
+    for one, two in zip(moved.frames, again.frames, strict=True):
+        np.testing.assert_allclose(one.camera.world_from_camera, two.camera.world_from_camera, atol=1e-13)
+    labels = [labels_of(root / "synthetic/train.json") for root in (exported, tmp_path / "again")]
+    assert labels[0][0] != labels[1][0]
+    assert labels[0][2:] == labels[1][2:]
+
+
 def test_importing_twice_gives_the_same_bytes(exported, tmp_path):
     for name in ("a", "b"):
         import_dataset("speedplus", exported, tmp_path / name, scale=0.5, count=4)
