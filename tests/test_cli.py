@@ -6,12 +6,16 @@ import shutil
 import subprocess
 import sys
 import warnings
+from argparse import Namespace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tiny import GENERATE, TRAIN
 
+from spacesim.cli.parser import view_of
+from spacesim.data.errors import InputError
 from spacesim.data.images import read_exr, read_png
 from spacesim.data.store import find_unreadable_files, read_dataset
 from spacesim.splat.export.ply import read_ply
@@ -157,6 +161,16 @@ def test_verify_draws_where_cameras_look_from(spacesim, tiny_data, tmp_path):
     assert (tmp_path / "map.png").read_bytes() == (tiny_data / "camera_density.png").read_bytes()
 
 
+def test_verify_says_how_to_mend_what_was_imported(spacesim, tiny_data, tmp_path):
+    assert spacesim("import", "nerfstudio", tiny_data, "--out", tmp_path / "data").code == 0
+    picture = next((tmp_path / "data/images").iterdir())
+    picture.write_bytes(picture.read_bytes()[:-40])
+    done = spacesim("verify", tmp_path / "data")
+    assert done.code == 1
+    assert done.errors[-1].endswith("1 faulty files; import it again, into a new folder")
+    assert "generate" not in "".join(done.errors)
+
+
 def test_suns_are_given_by_azimuth_and_elevation(spacesim, tmp_path):
     small = ("--views", "1", "--test-views", "0", "--resolution", "8", "--spp", "1")
     done = spacesim("generate", "boxsat", "--out", tmp_path / "data", *small, "--sun", "200,-10", "--sun", "5.5,80")
@@ -296,6 +310,28 @@ def test_render_a_camera_file(spacesim, tiny_run, tiny_data, tmp_path):
     assert spacesim("render", tiny_run, "--camera", tmp_path / "camera.json", "--out", tmp_path / "a.png").code == 0
     assert spacesim("render", tiny_run, "--frame", 7, "--out", tmp_path / "b.png").code == 0
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_a_frame_is_seen_under_the_sun_that_was_estimated(tiny_data, tmp_path):
+    meta = json.loads((tiny_data / "transforms.json").read_text())
+    for entry in meta["frames"]:
+        for key in ("sun_direction", "sun_azimuth_deg", "sun_elevation_deg"):
+            del entry[key]
+    shutil.copytree(tiny_data, tmp_path / "data")
+    (tmp_path / "data/transforms.json").write_text(json.dumps(meta))
+    run = SimpleNamespace(path=tmp_path, config={"data": {"path": str(tmp_path / "data")}})
+    options = Namespace(camera=None, data=None, frame=1)
+    assert view_of(options, run)[1] is None
+    names = [frame.file_path for frame in read_dataset(tiny_data).train]
+    entries = [{"file_path": name, "sun_direction": [k, 0, 1]} for k, name in enumerate(names)]
+    (tmp_path / "cameras.json").write_text(json.dumps({"frames": entries}))
+    assert view_of(options, run)[1].angles == pytest.approx((0, 45))
+    options.data = tiny_data
+    assert view_of(options, run)[1].direction == pytest.approx(read_dataset(tiny_data).train[1].sun.direction)
+    options.data, entries[1]["sun_direction"] = None, "noon"
+    (tmp_path / "cameras.json").write_text(json.dumps({"frames": entries}))
+    with pytest.raises(InputError, match=r"cameras\.json: frame .*: expected 3 finite numbers"):
+        view_of(options, run)
 
 
 def test_render_where_the_data_has_moved(spacesim, tiny_data, tmp_path):

@@ -13,6 +13,8 @@ from spacesim.data.structure import did_you_mean
 
 if TYPE_CHECKING:
     from spacesim.data.records import Camera, Sun
+    from spacesim.nerf.run import NerfRun
+    from spacesim.splat.run import Run
 
 
 class Parser(argparse.ArgumentParser):
@@ -71,17 +73,19 @@ def add_view(parser: Parser) -> None:
     parser.add_argument("--data", type=Path, metavar="DATA", help="the dataset, where it has moved since training")
 
 
-def view_of(options: argparse.Namespace, config: dict[str, Any]) -> "tuple[Camera, Sun | None]":
-    """The camera that the options of `add_view` name, and the Sun of a frame. config: a run's config.json"""
-    from spacesim.data.transforms import read_camera, read_dataset
+def view_of(options: argparse.Namespace, run: "Run | NerfRun") -> "tuple[Camera, Sun | None]":
+    """The camera that the options of `add_view` name, and the Sun of a frame, which the run may have estimated."""
+    from spacesim.data.transforms import read_camera, read_dataset, read_sun
 
     if options.camera:
         return read_camera(options.camera), None
-    frames = read_dataset(options.data or _data_of(config)).frames
+    frames = read_dataset(options.data or _data_of(run.config)).frames
     index = options.frame or 0
     if not 0 <= index < len(frames):
         raise InputError(f"frame: expected 0 to {len(frames) - 1}, found {index}")
-    return frames[index].camera, frames[index].sun
+    frame, cameras = frames[index], run.path / "cameras.json"
+    estimated = read_sun(cameras, frame.file_path) if frame.sun is None and cameras.is_file() else None
+    return frame.camera, frame.sun or estimated
 
 
 def _data_of(config: dict[str, Any]) -> Path:

@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> None:
     sun = Sun.from_angles(*options.sun) if options.sun else None
     if sun is not None and not run.relightable:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
-    camera, sun_of_frame = view_of(options, run.config)
+    camera, sun_of_frame = view_of(options, run)
     sun = sun or sun_of_frame
     if sun is None and run.relightable:
         raise InputError("sun: expected AZ,EL for a run that can be relit and a camera without a Sun, found none")

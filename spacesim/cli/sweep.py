@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> None:
 
     suns = suns_around(FRAMES if options.frames is None else options.frames, options.elevation, options.azimuth)
     run = load_run(options.path)
-    camera, _ = view_of(options, run.config)
+    camera, _ = view_of(options, run)
     if options.size is not None:
         camera = resize_camera(camera, options.size)
     with show_progress("sweep", "frames") as report:

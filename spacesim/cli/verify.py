@@ -19,15 +19,13 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from spacesim.data.integrity.manifest import NAME
-    from spacesim.data.integrity.verify import has_digests, verify_files
+    from spacesim.data.integrity.verify import has_digests, repair_hint, verify_files
 
     dataset, problems = verify_files(options.data)
     for problem in problems:
         print(problem, file=sys.stderr)
     if problems:
-        raise WorkError(
-            f"{options.data}: {len(problems)} faulty files; delete them, generate --resume makes them again"
-        )
+        raise WorkError(f"{options.data}: {len(problems)} faulty files{repair_hint(dataset)}")
     interrupts.print_output(f"{options.data}: {len(dataset.frames)} frames, every file is there and whole")
     if options.camera_density is not None:
         from spacesim.data.density import write_camera_density

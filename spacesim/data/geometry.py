@@ -79,6 +79,16 @@ def rotation_from_quaternion(quaternions: ArrayLike) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def camera_that_sees(quaternion: ArrayLike, position: ArrayLike) -> Array:
+    """[4, 4] world_from_camera of the camera that has the world's point p at R(q) p + r: the transpose of R(q), and
+    -R^T r. quaternion: [4] (w, x, y, z), position: r [3]"""
+    turn, (x, y, z) = rotation_from_quaternion(quaternion), np.asarray(position, np.float64)
+    pose = np.eye(4)
+    pose[:3, :3] = turn.T
+    pose[:3, 3] = -(x * turn[0] + y * turn[1] + z * turn[2])  # to the bit, whatever the BLAS
+    return pose
+
+
 def quaternion_from_rotation(rotation: ArrayLike) -> Array:
     """Quaternion [4] (w, x, y, z), w >= 0, of a rotation matrix [3, 3] (largest eigenvector of Bar-Itzhack's K)."""
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)

@@ -54,13 +54,13 @@ def luminance(rgb: ArrayLike) -> Float:
     return rgb @ np.array([0.2126, 0.7152, 0.0722], rgb.dtype)
 
 
-def read_png(path: Path) -> np.ndarray:
-    """Pixels of an image file: [H, W], [H, W, 3] or [H, W, 4] uint8, or [H, W] uint16 for 16-bit grey.
+def read_png(path: Path, content: bytes | None = None) -> np.ndarray:
+    """Pixels of an image file (its `content`): [H, W], [H, W, 3] or [H, W, 4] uint8, or [H, W] uint16 of 16-bit grey.
 
     Takes what Pillow reads (JPEG, TIFF, ... too). Palettes and grey with alpha become RGB or RGBA. Raises
     InputError where the file is missing, broken, no image, or one of floating-point numbers, which have no range.
     """
-    content = read_bytes(path)
+    content = read_bytes(path) if content is None else content
     try:
         with PillowImage.open(io.BytesIO(content)) as picture:
             _check_size(path, picture)
@@ -102,8 +102,7 @@ def _is_transparent(picture: PillowImage.Image) -> bool:
 
 
 def _check_size(path: Path, picture: PillowImage.Image) -> None:
-    """Before a picture's pixels are asked for. Raises InputError for more than any camera has, MemoryError where they
-    do not fit into memory."""
+    """Raises InputError for more pixels than any camera has, MemoryError where they do not fit into memory."""
     width, height = picture.size
     check_size(width, height, str(path))
     check_memory(DECODING * width * height, f"{path}: a picture of {width} x {height} pixels")
@@ -198,10 +197,10 @@ def load_image(dataset: Dataset, frame: Frame) -> Image:
     if values.shape[2] == 4:
         alpha = np.ascontiguousarray(values[..., 3])
     elif frame.silhouette_path is not None:
-        alpha = (_read_grey(dataset.root / frame.silhouette_path, frame.camera) > 0).astype(np.float32)
+        alpha = (read_labels(dataset.root / frame.silhouette_path, frame.camera) > 0).astype(np.float32)
     valid = np.ones(alpha.shape, bool)
     if frame.mask_path is not None:
-        valid = _read_grey(dataset.root / frame.mask_path, frame.camera) > 0
+        valid = read_labels(dataset.root / frame.mask_path, frame.camera) > 0
     rgb = np.ascontiguousarray(np.broadcast_to(values[..., :3], (*alpha.shape, 3)))
     image = Image(*_without_ignored(rgb, alpha, valid), valid)
     return undistort(image, frame.camera, frame.distortion) if any(frame.distortion) else image
@@ -318,7 +317,8 @@ def _read_sized(path: Path, camera: Camera) -> np.ndarray:
     return pixels
 
 
-def _read_grey(path: Path, camera: Camera) -> np.ndarray:
+def read_labels(path: Path, camera: Camera) -> np.ndarray:
+    """[H, W] of a mask or silhouette, its brightest channel. Raises InputError for another size than the camera's."""
     pixels = _read_sized(path, camera)
     return pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=-1)
 

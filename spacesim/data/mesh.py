@@ -50,7 +50,8 @@ def load_trimesh(path: Path, kind: str | None = None) -> Any:
             io.BytesIO(content), kind[1:], resolver=beside, force=force, process=False, **options
         )
         if not isinstance(loaded, trimesh.Trimesh | trimesh.PointCloud):
-            raise InputError(f"found {type(loaded).__name__}")
+            empty = not getattr(loaded, "geometry", True)
+            raise InputError("there is nothing in it" if empty else f"found {type(loaded).__name__}")
         count = len(np.asarray(loaded.vertices, np.float64).reshape(-1, 3))
         declared = next((n for name, n in _elements(content) if name == b"vertex"), count) if kind == ".ply" else count
         if count != declared:

@@ -48,7 +48,7 @@ def read_dataset(path: str | Path) -> Dataset:
     source = root / "transforms.json" if path.is_dir() else path
     if source.is_file() and source.name != "transforms_train.json":
         return dataset_of(source, read_object(source))
-    if (root / "transforms_train.json").is_file():
+    if _exists(path) and (root / "transforms_train.json").is_file():
         return dataset_of_pair(root, *read_pair(root))
     raise InputError(_say_what_is_missing(path, root))
 
@@ -72,7 +72,7 @@ def dataset_of_pair(root: Path, meta: Json, held_out: tuple[str, Json] | None) -
     """The dataset of what `read_pair` returns. Raises InputError as `read_dataset`."""
     source = root / "transforms_train.json"
     train, missing = _read_frames(source, meta)
-    test, missing_test = _read_frames(root / held_out[0], held_out[1]) if held_out else ((), ())
+    test, missing_test = _read_frames(root / held_out[0], held_out[1], needed=False) if held_out else ((), ())
     _warn_of_missing(source, missing + missing_test, len(train) + len(test))
     return _dataset(source, meta, train, test, missing + missing_test)
 
@@ -119,6 +119,19 @@ def read_camera(path: Path) -> Camera:
         raise InputError(f"{path}: {error}") from None
 
 
+def read_sun(path: Path, file_path: str) -> Sun | None:
+    """The Sun that a file like transforms.json has of a frame, None where it has none. Raises InputError where it is
+    broken."""
+    entries = read_object(path).get("frames")
+    for entry in entries if isinstance(entries, list) else ():
+        if isinstance(entry, dict) and entry.get("file_path") == file_path:
+            try:
+                return _read_sun(_without_nulls(entry))
+            except InputError as error:
+                raise InputError(f"{path}: frame {file_path}: {error}") from None
+    return None
+
+
 def _say_what_is_missing(path: Path, root: Path) -> str:
     if not path.exists():
         return f"{path}: expected a dataset folder or a transforms.json, found nothing"
@@ -135,8 +148,9 @@ def read_object(path: Path) -> Json:
     return value
 
 
-def _read_frames(source: Path, meta: Json) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
-    """(all frames with an image, paths of the images that are not there), each in the order of their file paths."""
+def _read_frames(source: Path, meta: Json, needed: bool = True) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
+    """(all frames with an image, paths of the images that are not there), each in the order of their file paths.
+    needed: there must be one"""
     entries = meta.get("frames")
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{source}: expected a list of frames, found {'none' if not entries else 'another value'}")
@@ -146,7 +160,7 @@ def _read_frames(source: Path, meta: Json) -> tuple[tuple[Frame, ...], tuple[str
             raise InputError(f"{source}: expected each image once, found {first} twice")
     there = {path for path, _ in named if _exists(source.parent / path)}
     missing = tuple(path for path, _ in named if path not in there)
-    if missing and (not there or (source.parent / DIGESTS).is_file()):
+    if missing and ((needed and not there) or (source.parent / DIGESTS).is_file()):
         others = "" if there else ", nor one of any other frame"
         raise InputError(f"{source}: frame {missing[0]}: expected an image file, found none{others}")
     frames = [_read_frame(source, meta, entry, path) for path, entry in named if path in there]
@@ -178,7 +192,9 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
 
 
 def _read_camera(values: Json, image: Path) -> Camera:
-    model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else values.get("camera_model", "OPENCV")
+    if (fisheye := values.get("is_fisheye", False)) not in (False, True):
+        raise InputError(f"expected true or false as is_fisheye, found {fisheye!r}")
+    model = "OPENCV_FISHEYE" if fisheye else values.get("camera_model", "OPENCV")
     if model not in _PERSPECTIVE:
         help_ = "; spacesim import nerfstudio undistorts it" if model == "OPENCV_FISHEYE" else ""
         raise InputError(f"expected a camera_model among {', '.join(_PERSPECTIVE)}, found {model}{help_}")
@@ -191,7 +207,11 @@ def _read_camera(values: Json, image: Path) -> Camera:
     if fx is None or fy is None:
         raise InputError("expected fl_x or camera_angle_x, found neither")
     cx, cy = _number(values, "cx", 0.5 * width), _number(values, "cy", 0.5 * height)
-    return Camera(_read_pose(values) @ OPENCV_FROM_OPENGL, width, height, fx, fy, cx, cy)
+    pose = _read_pose(values)
+    camera = Camera(pose @ OPENCV_FROM_OPENGL, width, height, fx, fy, cx, cy)
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise InputError(f"expected 0 0 0 1 as the last row of transform_matrix, found {pose[3].tolist()}")
+    return camera
 
 
 def _focal_length(values: Json, key: str, angle_key: str, size: int) -> float | None:

@@ -185,7 +185,7 @@ def _by_key(dataset: Dataset) -> dict[int, Frame]:
         meta = read_json(dataset.root / "transforms.json", MAX_LIST_BYTES)
         entries = {str(PurePosixPath(entry["file_path"])): entry[KEY] for entry in meta["frames"]}
         numbers = {int(entries[frame.file_path]): frame for frame in dataset.frames}
-    except (InputError, KeyError, TypeError, ValueError):
+    except (InputError, KeyError, TypeError, ValueError, OverflowError):
         return {}
     return numbers if len(numbers) == len(dataset.frames) else {}
 

@@ -36,13 +36,21 @@ from spacesim.eval.frame_metrics import (
 from spacesim.eval.labels import GROUPS, SHADOW
 from spacesim.eval.metrics import grazing, lpips, shadow
 from spacesim.eval.metrics.geometry import GeometryConfig, ShapeResult, compare_geometry
-from spacesim.eval.notes import MODELS_OF_A_SCENE, explain, explain_fit, explain_light, explain_objects
+from spacesim.eval.notes import (
+    MODELS_OF_A_SCENE,
+    explain,
+    explain_fit,
+    explain_ignored,
+    explain_light,
+    explain_objects,
+    explain_other_data,
+)
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
 from spacesim.eval.objects import compare_object_shapes, object_groups, object_names, swapped_order
 from spacesim.eval.relight import write_sweep
 from spacesim.eval.schema import SCHEMA
 from spacesim.eval.shape import write_shapes
-from spacesim.eval.suns import count_suns, known_suns, rounded_angles, training_frames
+from spacesim.eval.suns import TrainedOn, count_suns, known_suns, rounded_angles, training_frames
 from spacesim.nerf.run import NerfRun
 from spacesim.splat.compose.aligned import AlignedRun, moved_frame
 from spacesim.splat.fit import Unknown, find_unknowns
@@ -111,7 +119,9 @@ def evaluate(
         run.predict(frames[0].camera, frames[0].sun)  # compiles the kernels
     models = [part.name for part in run.parts] or None  # of a composed scene, which was not trained on this dataset
     own = config.align or dataset
-    trained, untold = training_frames(run.config, own) if models is None else ((), MODELS_OF_A_SCENE)
+    known = training_frames(run.config, own) if models is None else TrainedOn((), MODELS_OF_A_SCENE)
+    trained = known.frames
+    other_data = explain_other_data(known.other, config.align.root if config.align else None)
     if alignment:
         trained = [moved_frame(frame, alignment.pose) for frame in trained]
     objects = object_names(dataset, models or ())
@@ -131,6 +141,8 @@ def evaluate(
 
     method = str(run.config.get("method"))
     records = [result.record for result in results]
+    ignored = statistics.fmean(result.ignored for result in results)
+    region = "frame" if all(result.source == "frame" for result in results) else "silhouette"
     metrics = {
         "schema": SCHEMA,
         "run": str(run.path),
@@ -142,7 +154,7 @@ def evaluate(
             "render_ms": 1e3 * statistics.median(result.seconds for result in results),
             "backend": run.backend,
         },
-        "image_region": "frame" if all(result.source == "frame" for result in results) else "silhouette",
+        "image_region": region,
         "fitted": [{"name": unknown.name, "how": unknown.how} for unknown in unknowns] or None,
         "alignment": alignment.to_json() if alignment else None,
         **_summaries(results),
@@ -153,19 +165,21 @@ def evaluate(
         "relight": sweep,
         "notes": [
             *([alignment.note] if alignment else []),
-            *explain_fit(unknowns, records),
+            *other_data,
+            *explain_fit(unknowns, records, region == "frame"),
             *([shape.note] if shape.note else []),
             *([no_map] if no_map else []),
+            *explain_ignored(ignored),
             *explain(records, [result.source for result in results], None if network else lpips_sentence, method),
             *explain_light(
                 [result.has_known_sun for result in results],
                 any(result.grazing is not None for result in results),
                 no_sweep,
-                untold,
+                known.untold,
             ),
             *explain_objects(objects, records, models, swapped_order(run, dataset)),
         ],
-        "dataset": _describe(dataset, frames),
+        "dataset": _describe(dataset, frames, ignored),
         "config": dict(run.config),
         "training": dict(run.training),
         "versions": _versions(),
@@ -183,6 +197,7 @@ class FrameResult:
     record: dict[str, Any]  #: its values by group, and what it is
     source: str  #: where its silhouette is from
     has_known_sun: bool | None  #: whether training has seen its Sun
+    ignored: float  #: share of its pixels that count nowhere
     grazing: Array | None  #: sums by grazing angle
     seconds: float  #: that its prediction took
 
@@ -231,6 +246,7 @@ def _evaluate_frame(
     view, source = frame_images(dataset, frame, prediction)
     light = frame_light(dataset, frame, prediction)
     photograph = is_photograph(frame, source)
+    ignored = float(1 - view.valid.mean())
     write_pictures(folder, view, light, photograph)
     named: dict[str, Any] = {
         "file_path": frame.file_path,
@@ -244,7 +260,7 @@ def _evaluate_frame(
     record: dict[str, Any] = named | groups | visibility_groups(light, view)
     if objects:
         record["objects"] = object_groups(dataset, frame, objects, view, light, network)
-    return FrameResult(frame, record, source, has_known_sun, tally_grazing(light, view), seconds)
+    return FrameResult(frame, record, source, has_known_sun, ignored, tally_grazing(light, view), seconds)
 
 
 def _summaries(results: Sequence[FrameResult]) -> dict[str, Any]:
@@ -305,10 +321,11 @@ def summary(records: Iterable[Mapping[str, float | None] | None]) -> dict[str, A
     return result
 
 
-def _describe(dataset: Dataset, frames: Sequence[Frame]) -> dict[str, Any]:
+def _describe(dataset: Dataset, frames: Sequence[Frame], ignored: float) -> dict[str, Any]:
     """What the report says about the data: its size, and from scene.json how it was made."""
     return {
         "digest": _digest(dataset, frames),
+        "ignored": ignored,
         "truth": any(frame.gt_path is not None for frame in frames),
         "frames": len(frames),
         "train_frames": len(dataset.train),
@@ -322,7 +339,7 @@ def _digest(dataset: Dataset, frames: Sequence[Frame]) -> str | None:
     """By which reports know that runs were evaluated on the same frames; None where their files do not say."""
     try:
         return frames_digest(dataset.root, frames)
-    except OSError:
+    except (OSError, InputError):
         return None
 
 

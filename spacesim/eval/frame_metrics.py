@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spacesim.data.errors import InputError, WorkError
+from spacesim.data.errors import WorkError
 from spacesim.data.geometry import Array
-from spacesim.data.images import load_image, luminance, read_png, write_png
+from spacesim.data.images import load_image, luminance, read_labels, write_png
 from spacesim.data.records import Dataset, Frame, Image, Truth
 from spacesim.data.store import SHADOW_NONE, SHADOW_SELF_CAST, load_truth
 from spacesim.eval import pictures
@@ -52,12 +52,7 @@ def frame_target(dataset: Dataset, frame: Frame) -> FrameTarget:
     """Raises InputError where the dataset is broken."""
     loaded = load_image(dataset, frame)
     if frame.silhouette_path is not None and not any(frame.distortion):
-        silhouette, source = read_png(dataset.root / frame.silhouette_path) > 0, "truth"
-        if silhouette.shape != loaded.alpha.shape:
-            raise InputError(
-                f"{dataset.root / frame.silhouette_path}: expected {loaded.alpha.shape} pixels, "
-                f"found {silhouette.shape}"
-            )
+        silhouette, source = read_labels(dataset.root / frame.silhouette_path, frame.camera) > 0, "truth"
     else:
         silhouette = loaded.alpha >= 0.5
         source = "frame" if np.all(loaded.alpha == 1) else "alpha"

@@ -1,6 +1,7 @@
 """Why a value of metrics.json is null, and what stands in for missing truth: a sentence each."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from spacesim.eval.labels import GROUPS
@@ -45,18 +46,37 @@ def explain(records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips:
     return notes + _explain_kinds(records)
 
 
-def explain_fit(unknowns: Sequence[Unknown], records: Sequence[dict[str, Any]]) -> list[str]:
-    """Sentences about what was fitted to the pictures."""
+def explain_fit(unknowns: Sequence[Unknown], records: Sequence[dict[str, Any]], whole: bool = False) -> list[str]:
+    """Sentences about what was fitted to the pictures. whole: no silhouette is known"""
     if not unknowns:
         return []
     what = "; ".join(f"{unknown.name} ({unknown.how})" for unknown in unknowns)
+    of_what = "it" if whole else "the object in it"
     notes = [
-        f"Fitted to each evaluated picture: {what}. On the left half of the object in it, judged on the right half, "
-        "and the other way round: no pixel is judged by numbers that were fitted on it."
+        f"Fitted to each evaluated picture: {what}. On the left half of {of_what}, judged on the right half, and "
+        "the other way round: no pixel is judged by numbers that were fitted on it."
     ]
     if missing := sum(record["fitted"] is None for record in records):
-        notes.append(f"In {missing} of {len(records)} frames nothing was fitted: a half shows no object.")
+        why = "a half has no pixel that counts" if whole else "a half shows no object"
+        notes.append(f"In {missing} of {len(records)} frames nothing was fitted: {why}.")
     return notes
+
+
+def explain_ignored(share: float) -> list[str]:
+    """A sentence about pixels that count nowhere. share: of all"""
+    if share <= 0:
+        return []
+    return [f"{100 * share:.3g} % of the pixels count nowhere, not in image_full either: nothing is known of them."]
+
+
+def explain_other_data(trained: Path | None, aligned: Path | None) -> list[str]:
+    """A sentence where a run is judged in axes that may not be its own. trained: the data that it was trained on, where
+    it is evaluated on, or aligned by, others;  aligned: what it is aligned by"""
+    if trained is None:
+        return []
+    if aligned is not None:
+        return [f"The run was moved as one in the axes and scale of {aligned}, but was trained on {trained}."]
+    return [f"The run was trained on other data, {trained}, and is taken to be in the axes and scale of these."]
 
 
 def explain_light(

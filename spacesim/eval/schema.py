@@ -213,6 +213,7 @@ class DatasetFacts:
     suns: int
     resolution: tuple[int, int]  #: width and height of the first frame, pixels
     digest: str | None = None  #: of the evaluated frames
+    ignored: float | None = None  #: share of their pixels that count nowhere
     truth: bool | None = None  #: whether it was path-traced
     scene: str | None = None
     config: Mapping[str, Any] | None = None

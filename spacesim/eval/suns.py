@@ -1,6 +1,7 @@
 """Which evaluated frames are lit by a Sun that training has seen."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from spacesim.data.errors import InputError
-from spacesim.data.identity import training_digest
+from spacesim.data.identity import same_digest, training_digest
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import read_dataset
 
@@ -17,26 +18,33 @@ SAME_SUN_DEG = 0.01
 the Suns of a dataset stand degrees apart)."""
 
 
-def training_frames(config: Mapping[str, Any], dataset: Dataset) -> tuple[Sequence[Frame], str]:
-    """The frames that a run was trained on, and "": those of the evaluated `dataset` if it is the run's own, else those
-    of the dataset that the run names. () where that one is gone or has changed, and why nothing can be said then.
+@dataclass(frozen=True, eq=False)
+class TrainedOn:
+    """What a run was trained on."""
 
-    config: the run's
+    frames: Sequence[Frame]  #: () where they are gone or have changed
+    untold: str = ""  #: why nothing can be said then
+    other: Path | None = None  #: their folder, where they are not those of the dataset asked for
+
+
+def training_frames(config: Mapping[str, Any], dataset: Dataset) -> TrainedOn:
+    """The frames that a run was trained on: those of `dataset` if it is the run's own, else those of the dataset that
+    the run names. config: the run's
     """
     data = config.get("data") or {}
     if "digest" not in data:
-        return dataset.train, ""
+        return TrainedOn(dataset.train)
     path = Path(data["path"])
     digest = _digest(dataset)
-    if digest == data["digest"] or (digest is None and path == dataset.root.resolve()):
-        return dataset.train, ""
+    if _same(digest, data["digest"]) or (digest is None and path == dataset.root.resolve()):
+        return TrainedOn(dataset.train)
     try:
         training_set = read_dataset(path)
     except InputError:
-        return (), f"the run was trained on other data, {path}, which is gone"
-    if _digest(training_set) != data["digest"]:
-        return (), f"the run was trained on other data, and {path} has changed since"
-    return training_set.train, ""
+        return TrainedOn((), f"the run was trained on other data, {path}, which is gone", path)
+    if not _same(_digest(training_set), data["digest"]):
+        return TrainedOn((), f"the run was trained on other data, and {path} has changed since", path)
+    return TrainedOn(training_set.train, other=path)
 
 
 def known_suns(frames: Sequence[Frame], training: Sequence[Frame]) -> list[bool | None]:
@@ -58,11 +66,15 @@ def rounded_angles(frame: Frame) -> list[float] | None:
 
 
 def _digest(dataset: Dataset) -> str | None:
-    """As training has told it; None where pictures of it are missing."""
+    """As training has told it; None where pictures of it are missing or cannot be read."""
     try:
         return training_digest(dataset)
-    except OSError:
+    except (OSError, InputError):
         return None
+
+
+def _same(digest: str | None, told: Any) -> bool:
+    return digest is not None and same_digest(digest, str(told))
 
 
 def count_suns(frames: Sequence[Frame]) -> int:

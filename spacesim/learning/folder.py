@@ -16,7 +16,7 @@ import spacesim
 from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, read_json, write_json
-from spacesim.data.identity import training_digest
+from spacesim.data.identity import same_digest, training_digest
 from spacesim.data.records import Dataset
 
 KEEP_CHECKPOINTS = 2
@@ -133,6 +133,8 @@ def _check_resumable(out: Path, described: dict[str, Any], resume: bool, read_co
         raise InputError(f"resume: expected with {out}, which holds a run already, or a new folder, found neither")
     config, data = read_config(out / "config.json")
     data["path"] = described["data"]["path"]  # it may have moved
+    if same_digest(str(data.get("digest")), described["data"]["digest"]):
+        data["digest"] = described["data"]["digest"]  # older versions told less
     current = {**config.to_json(), "data": data}  # what an older version did not write is as by default
     difference = _first_difference(current, described)
     if difference is not None:

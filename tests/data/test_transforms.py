@@ -186,6 +186,8 @@ NAN_POSE = [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (set_pose(NAN_POSE), "images/a.png: expected a transform_matrix of 4x4 finite"),
         (set_pose(None), "images/a.png: expected a transform_matrix"),
         (set_pose([[1, 2], [3]]), "images/a.png: expected a transform_matrix"),
+        (set_pose(np.diag([1, 1, 1, 2]).tolist()), "expected 0 0 0 1 as the last row of transform_matrix, found"),
+        (lambda m: m.update(is_fisheye="yes"), "expected true or false as is_fisheye, found 'yes'"),
         (set_pose("identity"), "images/a.png: expected a transform_matrix"),
         (set_pose(np.diag([2, 2, 2, 1]).tolist()), "images/a.png: world_from_camera: expected a rotation"),
         (lambda m: m.update(fl_x=-1), "images/a.png: camera: expected focal lengths above 0"),

@@ -9,6 +9,7 @@ import pytest
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at, rotation_from_quaternion
+from spacesim.data.identity import training_digest
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame, Sun
 from spacesim.eval.align import align, match_frames, moved_dataset, residuals, similarity
@@ -144,6 +145,12 @@ def test_frames_of_a_video_are_counted(truth, tmp_path):
     assert words == "source_index in transforms.json"
 
 
+def test_keys_that_are_no_numbers_of_frames_do_not_count(truth, tmp_path):
+    own = reconstruction(truth, tmp_path / "own")
+    with_keys(own, [float("inf"), *range(1, len(own.frames))])
+    assert match_frames(own, truth)[1] == "file name"
+
+
 @pytest.fixture
 def drawn(tmp_path) -> tuple[Run, Dataset, Dataset]:
     """A run, pictures of it in the truth's world, and its own dataset, in its own."""
@@ -182,6 +189,27 @@ def test_an_aligned_run_is_evaluated_in_the_truths_world(drawn, tmp_path, monkey
     plain = evaluate(run, truth, tmp_path / "plain")
     assert plain["alignment"] is None
     assert plain["image"]["psnr"]["mean"] < 20
+
+
+def test_data_that_are_not_the_runs_are_noted(drawn, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "nowhere"))
+    run, truth, own = drawn
+    for frame in own.frames:
+        write_png(own.root / frame.file_path, np.zeros((48, 48, 3), np.uint8))
+
+    def notes(data, **config):
+        told = replace(run, config={"method": "vanilla", "data": data})
+        config = EvaluateConfig(geometry=None, **config)
+        return [note for note in evaluate(told, truth, tmp_path / "eval", config)["notes"] if "trained on" in note][:1]
+
+    its_own = {"path": str(own.root), "digest": training_digest(own)}
+    others = {"path": "/elsewhere", "digest": "0123"}
+    assert notes(its_own, align=own) == []
+    assert notes(its_own)[0] == (
+        f"The run was trained on other data, {own.root}, and is taken to be in the axes and scale of these."
+    )
+    sentence = f"The run was moved as one in the axes and scale of {own.root}, but was trained on /elsewhere."
+    assert notes(others, align=own) == [sentence]
 
 
 def test_a_scene_is_not_aligned(drawn, tmp_path):

@@ -23,6 +23,7 @@ from spacesim.eval import pictures
 from spacesim.eval.evaluate import EvaluateConfig, evaluate, frame_names, summary
 from spacesim.eval.labels import GROUPS
 from spacesim.eval.metrics import image, lpips, shadow
+from spacesim.eval.report.write import write_report
 
 SIZE = 40
 
@@ -303,6 +304,11 @@ def test_data_without_alpha_is_judged_whole(make_run, dataset, tmp_path):
     assert metrics["image"] == metrics["image_full"]
     assert metrics["image_region"] == "frame"
     assert any("image is over whole pictures" in note for note in metrics["notes"])
+    photographs, config = elsewhere(dataset, silhouette_path=None), EvaluateConfig(fit_gain=True)
+    notes = evaluate(make_run(shifted), photographs, tmp_path / "fitted", config)["notes"]
+    assert any("On the left half of it, judged on the right half" in note for note in notes)
+    write_report([tmp_path / "fitted"], tmp_path / "report.html")
+    assert "on one half and judged on the other (gain)" in (tmp_path / "report.html").read_text()
 
 
 def test_ignored_pixels_do_not_count(make_run, dataset, tmp_path):
@@ -316,6 +322,8 @@ def test_ignored_pixels_do_not_count(make_run, dataset, tmp_path):
     metrics = evaluate(make_run(spoiled), elsewhere(dataset, mask_path="mask.png"), tmp_path / "eval")
     assert metrics["image"]["mae"]["mean"] == metrics["image_full"]["mae"]["mean"] == 0
     assert metrics["image_full"]["flip"]["mean"] == 0
+    assert metrics["dataset"]["ignored"] == pytest.approx(25 / 40)
+    assert any(note.startswith("62.5 % of the pixels count nowhere") for note in metrics["notes"])
     for group in ("", "_full"):  # windows and slopes beside the mask read none of them either
         assert metrics[f"image{group}"]["ssim"]["mean"] == pytest.approx(1)
         assert metrics[f"shadow{group}"]["sharpness_ratio"]["mean"] == pytest.approx(1)

@@ -5,13 +5,17 @@
     DIR/synthetic/validation.json        our test split, which is what SPEED+ calls its labelled synthetic images
     DIR/synthetic/images/NAME.png
 
+What was imported from SPEED+ keeps its labels: of frames whose poses have stayed, these are written again as they were.
+
 A point p of the body is at R(q) p + r in the camera: q is scalar-first, r in metres, the axes OpenCV's; SPEED+'s own
 utilities project it so. Pixels are as everywhere here: the image spans [0, Nu] x [0, Nv].
 """
 
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
+
+import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.exporters.objects import (
@@ -22,8 +26,8 @@ from spacesim.data.exporters.objects import (
     opaque_picture,
     select_object,
 )
-from spacesim.data.files import write_json
-from spacesim.data.geometry import quaternion_from_rotation
+from spacesim.data.files import MAX_LIST_BYTES, read_json, write_json
+from spacesim.data.geometry import camera_that_sees, quaternion_from_rotation
 from spacesim.data.identity import frame_names
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame
@@ -31,16 +35,22 @@ from spacesim.data.records import Camera, Dataset, Frame
 PIXEL_PITCH = 5.86e-6
 """Metres: that of the camera of SPEED+. We know focal lengths in pixels alone; SPEED+ gives them in metres as well."""
 
+LABEL = "q_vbs2tango_true", "r_Vo2To_vbs_true"
+BODY = LabelledObject(1, "the body", np.eye(4), np.empty((0, 3)), np.empty((0, 3), np.int64))
+"""Of an import, whose world is its frame."""
+
 
 def write_speedplus(
     dataset: Dataset, out: Path, target_name: str | None = None, progress: ExportProgress | None = None
 ) -> LabelledObject:
     """Write `dataset` into the new folder `out`; returns the object whose poses the labels are.
 
-    target_name: number or name of the object, None the first. Raises InputError for another object, for frames of
-    several cameras, which SPEED+ does not know, and for a folder that is not empty.
+    target_name: number or name of the object, None the first; of an import it is the body that the world is the frame
+    of. Raises InputError for another object, for frames of several cameras, which SPEED+ does not know, and for a
+    folder that is not empty.
     """
-    target = select_object(labelled_objects(dataset), target_name)
+    kept = {} if dataset.scene else _kept_labels(dataset)
+    target = select_object([BODY] if kept else labelled_objects(dataset), target_name)
     camera = _camera(dataset.frames)
     out = new_folder(out)
     frames = dataset.frames
@@ -49,19 +59,35 @@ def write_speedplus(
         write_png(out / "synthetic/images" / name, opaque_picture(dataset, frame), durable=False)
         if progress is not None:
             progress(number, len(frames), frame.file_path)
-    labels = [_label(name, frame, target) for name, frame in zip(names, frames, strict=True)]
+    labels = [_label(name, frame, target, kept.get(frame.file_path)) for name, frame in zip(names, frames, strict=True)]
     write_json(out / "synthetic/train.json", labels[: len(dataset.train)])
     write_json(out / "synthetic/validation.json", labels[len(dataset.train) :])
     write_json(out / "camera.json", camera)
     return target
 
 
-def _label(name: str, frame: Frame, target: LabelledObject) -> dict[str, Any]:
+def _kept_labels(dataset: Dataset) -> dict[str, dict[str, Any]]:
+    """What transforms.json keeps of an import's labels, by the paths of images; {} where a frame has none."""
+    try:
+        entries = read_json(dataset.root / "transforms.json", MAX_LIST_BYTES)["frames"]
+        labels = {str(PurePosixPath(entry["file_path"])): {key: entry[key] for key in LABEL} for entry in entries}
+    except (InputError, KeyError, TypeError):
+        return {}
+    return labels if all(frame.file_path in labels for frame in dataset.frames) else {}
+
+
+def _label(name: str, frame: Frame, target: LabelledObject, kept: dict[str, Any] | None = None) -> dict[str, Any]:
+    """kept: written as it is, where it says the frame's pose"""
     pose = target.camera_from_object(frame.camera)
+    if kept is not None:
+        try:
+            if np.array_equal(camera_that_sees(*(kept[key] for key in LABEL)), frame.camera.world_from_camera):
+                return {"filename": name, **kept}
+        except (TypeError, ValueError):  # it is no label
+            pass
     return {
         "filename": name,
-        "q_vbs2tango_true": quaternion_from_rotation(pose[:3, :3]).tolist(),
-        "r_Vo2To_vbs_true": pose[:3, 3].tolist(),
+        **dict(zip(LABEL, (quaternion_from_rotation(pose[:3, :3]).tolist(), pose[:3, 3].tolist()), strict=True)),
     }
 
 

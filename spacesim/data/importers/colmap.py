@@ -66,7 +66,7 @@ def import_colmap(
         "masks": None if masks is None else str(masks),
         "masked": masked,
     }
-    return write_dataset(out, frames, [], source, _start_points(folder, model, connected), progress=progress)
+    return write_dataset(out, frames, None, source, _start_points(folder, model, connected), progress=progress)
 
 
 def _find_model(src: Path) -> Path:

@@ -3,6 +3,7 @@
 Other files beside them (rigs, frames) are passed over: images hold their poses.
 """
 
+import codecs
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ _NAMES = {model.name: number for number, model in LENS_MODELS.items()} | {name: 
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = struct.Struct("<Q3d3BdQ")
 _MAX_NAME = 4096  # bytes
+Camera = Lens | InputError
+"""A camera, or what is wrong with one, which matters where an image is of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +41,7 @@ class ColmapImage:
 class ColmapModel:
     """A sparse model."""
 
-    cameras: dict[int, Lens]  #: by their numbers
+    cameras: dict[int, Lens]  #: of the images, by their numbers
     images: list[ColmapImage]  #: in the order of their names
     numbers: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))  #: [N] int64 of the points
     points: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))  #: [N, 3] float64, the model's units
@@ -72,21 +75,26 @@ def read_model(folder: Path) -> ColmapModel:
     cameras_path, images_path, points_path = (folder / f"{part}{end}" for part in ("cameras", "images", "points3D"))
     cameras = dict((_binary_cameras if is_binary else _text_cameras)(cameras_path))
     images: dict[str, ColmapImage] = {}
+    used: dict[int, Lens] = {}
     for image in (_binary_images if is_binary else _text_images)(images_path):
         if image.name in images:
             raise InputError(f"{images_path}: expected each image once, found {image.name} twice")
         if image.camera not in cameras:
             raise InputError(f"{images_path}: {image.name}: expected one of its cameras, found number {image.camera}")
         images[image.name] = image
+        lens = cameras[image.camera]
+        if isinstance(lens, InputError):
+            raise lens
+        used[image.camera] = lens
     if not images:
         raise InputError(f"{images_path}: expected registered images, found none")
     ordered = [images[name] for name in sorted(images)]
     if not points_path.is_file():
-        return ColmapModel(cameras, ordered)
+        return ColmapModel(used, ordered)
     numbers, points, colors = (_binary_points if is_binary else _text_points)(points_path)
     if not np.isfinite(points).all():
         raise InputError(f"{points_path}: expected finite positions, found another one")
-    return ColmapModel(cameras, ordered, numbers, points, colors)
+    return ColmapModel(used, ordered, numbers, points, colors)
 
 
 def parts_of(model: ColmapModel) -> list[list[ColmapImage]]:
@@ -109,15 +117,15 @@ def parts_of(model: ColmapModel) -> list[list[ColmapImage]]:
     return ordered
 
 
-def _lens(path: Path, number: int, model: int, width: int, height: int, parameters: tuple[float, ...]) -> Lens:
+def _lens(path: Path, number: int, model: int, width: int, height: int, parameters: tuple[float, ...]) -> Camera:
     if model in NO_PINHOLE:
-        raise InputError(
+        return InputError(
             f"{path}: camera {number}: expected a lens that a pinhole camera can stand for, found {NO_PINHOLE[model]}"
         )
     try:
         return Lens(LENS_MODELS[model], width, height, parameters)
     except InputError as error:
-        raise InputError(f"{path}: camera {number}: {error}") from None
+        return InputError(f"{path}: camera {number}: {error}")
 
 
 def _image(path: Path, name: str, camera: int, quaternion: Array, shift: Array, points: np.ndarray) -> ColmapImage:
@@ -177,15 +185,15 @@ class _Bytes:
         return InputError(f"{self.path}: expected a binary COLMAP model, found one that is cut off or damaged")
 
 
-def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     file = _Bytes(path)
     for _ in range(file.count(24)):
         number, model, width, height = map(int, file.take("iiQQ"))
         if model not in LENS_MODELS and model not in NO_PINHOLE:
             raise InputError(f"{path}: camera {number}: expected a camera model of COLMAP's, found number {model}")
-        if model in NO_PINHOLE:
-            _lens(path, number, model, width, height, ())
-        count = LENS_MODELS[model].focal_lengths + 2 + LENS_MODELS[model].others
+        count = 2  # of EQUIRECTANGULAR
+        if model not in NO_PINHOLE:
+            count = LENS_MODELS[model].focal_lengths + 2 + LENS_MODELS[model].others
         yield number, _lens(path, number, model, width, height, tuple(map(float, file.take(f"{count}d"))))
     file.end()
 
@@ -225,7 +233,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         raise InputError(
             f"{path}: expected a COLMAP model as text, found binary data; a binary model's files end in .bin"
         )
-    for number, line in enumerate(content.decode("utf-8", "surrogateescape").split("\n"), start=1):
+    text = content.removeprefix(codecs.BOM_UTF8).decode("utf-8", "surrogateescape")
+    for number, line in enumerate(text.split("\n"), start=1):
         if not line.startswith("#"):
             yield number, line.strip()
 
@@ -234,7 +243,7 @@ def _malformed(path: Path, number: int, line: str, expected: str) -> InputError:
     return InputError(f"{path}: line {number}: expected {expected}, found {line[:80]!r}")
 
 
-def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     for number, line in _lines(path):
         if not line:
             continue

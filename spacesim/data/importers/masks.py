@@ -73,6 +73,16 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     if pixels.ndim == 3 and pixels.shape[2] == 4 and pixels[..., 3].min() < 255:
         values = pixels[..., 3]  # a picture that has been cut out
     white = values >= (1 if values.max() == 1 else (np.iinfo(values.dtype).max + 1) // 2)
+    return _scaled(path, white, width, height)
+
+
+def read_silhouette(path: Path, width: int, height: int) -> np.ndarray:
+    """[H, W] bool, True where the file has another value than 0. Scaled, and raises InputError, as `read_mask`."""
+    pixels = read_png(path)
+    return _scaled(path, (pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=-1)) > 0, width, height)
+
+
+def _scaled(path: Path, white: np.ndarray, width: int, height: int) -> np.ndarray:
     found_height, found_width = white.shape
     if (found_width, found_height) == (width, height):
         return white

@@ -8,10 +8,11 @@ Nerfstudio itself has it among the options of training, a millimetre by default.
 import io
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,7 @@ class _Extras:
 
     fisheye: dict[str, tuple[float, ...]] = field(default_factory=dict)  #: k1 to k4 of OPENCV_FISHEYE
     depth: dict[str, tuple[str, float]] = field(default_factory=dict)  #: (path, metres a step)
+    index: dict[str, int] = field(default_factory=dict)  #: source_index, which frame of a video it is
 
 
 def import_nerfstudio(
@@ -71,7 +73,7 @@ def import_blender(src: Path, out: Path, *, progress: Progress | None = None) ->
     Raises InputError where there is none, and as `read_dataset` does.
     """
     root = src if src.is_dir() else src.parent
-    if not (root / "transforms_train.json").is_file():
+    if not src.exists() or not (root / "transforms_train.json").is_file():
         raise InputError(f"{src}: expected a folder with transforms_train.json, found none in it")
     train, test = read_pair(root)
     extras = _Extras()
@@ -93,7 +95,7 @@ def _take_extras(path: Path, meta: Mapping[str, Any], extras: _Extras, unit: flo
     for entry in frames:
         values = {key: value for key, value in {**meta, **entry}.items() if value is not None}
         name = image_path(path, entry)
-        if values.get("camera_model") == "OPENCV_FISHEYE" or values.get("is_fisheye") is True:
+        if values.get("camera_model") == "OPENCV_FISHEYE" or values.get("is_fisheye") in (True,):
             numbers = [values.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")]
             if not all(_is_number(number) for number in numbers):
                 raise InputError(f"{path}: frame {name}: expected finite numbers as k1 to k4, found {numbers}")
@@ -107,6 +109,8 @@ def _take_extras(path: Path, meta: Mapping[str, Any], extras: _Extras, unit: flo
         depth = values.get("depth_file_path", values.get("depth_path"))
         if isinstance(depth, str) and depth:
             extras.depth[name] = depth, _unit(path, name, values) if unit is None else unit
+        if isinstance(index := entry.get("source_index"), int) and not isinstance(index, bool):
+            extras.index[name] = index
         kept.append(entry)
     return {**meta, "frames": kept}
 
@@ -130,13 +134,23 @@ def _write(
 ) -> Dataset:
     assert source["masked"] in MASKED
     maker, depths = FrameMaker(source["masked"]), _DepthReader()
-    names = dict(zip(dataset.frames, frame_names([frame.file_path for frame in dataset.frames]), strict=True))
+    paths = _below_one_folder(dataset.root, [frame.file_path for frame in dataset.frames])
+    names = dict(zip(dataset.frames, frame_names(paths), strict=True))
 
     def make(frames: Iterable[Frame]) -> list[ImportedFrame]:
         return [maker.frame(_view(dataset, frame, names[frame], extras, depths)) for frame in frames]
 
     points = None if dataset.ply_file_path is None else read_points(dataset.root / dataset.ply_file_path)
     return write_dataset(out, make(dataset.train), make(dataset.test), source, points, progress=progress)
+
+
+def _below_one_folder(root: Path, paths: Sequence[str]) -> list[str]:
+    """`paths`, from `root`; where one leads out of it, all from the folder that they have in common."""
+    if not any(PurePosixPath(path).is_absolute() or ".." in PurePosixPath(path).parts for path in paths):
+        return list(paths)
+    whole = [os.path.abspath(root / path) for path in paths]
+    common = os.path.commonpath([os.path.dirname(path) for path in whole])
+    return [Path(path).relative_to(common).as_posix() for path in whole]
 
 
 def _view(dataset: Dataset, frame: Frame, name: str, extras: _Extras, depths: "_DepthReader") -> View:
@@ -156,7 +170,9 @@ def _view(dataset: Dataset, frame: Frame, name: str, extras: _Extras, depths: "_
     if frame.file_path in extras.depth:
         file, unit = extras.depth[frame.file_path]
         depth = partial(depths.read, dataset.root / file, unit, lens.width, lens.height)
-    return View(name, path, camera.world_from_camera, lens, mask, frame.sun, silhouette, depth)
+    keys = {"time": frame.time, "source_index": extras.index.get(frame.file_path)}
+    keys = {key: value for key, value in keys.items() if value is not None}
+    return View(name, path, camera.world_from_camera, lens, mask, frame.sun, silhouette, depth, keys)
 
 
 @dataclass

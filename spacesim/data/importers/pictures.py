@@ -1,6 +1,7 @@
 """Pictures of a lens and their masks as frames: copied where our cameras can say the lens, else resampled."""
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -11,13 +12,17 @@ import numpy as np
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
-from spacesim.data.images import Resampling, has_alpha, image_size, read_png, resample
+from spacesim.data.images import Resampling, Undistortion, has_alpha, image_size, read_png, resample
 from spacesim.data.importers.lenses import Lens
-from spacesim.data.importers.masks import read_mask
+from spacesim.data.importers.masks import read_mask, read_silhouette
 from spacesim.data.importers.writing import ImportedFrame
 from spacesim.data.records import Camera, Image, Sun
 
 _UNDISTORTING = 120  # bytes a pixel, for a while
+_BLIND = 0.1  # share of its pixels below which a camera can hardly be right
+_COARSE = 64  # pixels
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +35,9 @@ class View:
     lens: Lens
     mask: Path | None = None  #: white = object, or = known, as the frames' maker says
     sun: Sun | None = None
-    silhouette: Path | None = None  #: other than 0 = object, of the picture's size
+    silhouette: Path | None = None  #: other than 0 = object
     depth: Callable[[], np.ndarray] | None = None  #: makes uint16 [H, W], millimetres along the optical axis
+    keys: Mapping[str, Any] = field(default_factory=dict)  #: as of `ImportedFrame`
 
 
 @dataclass
@@ -41,11 +47,12 @@ class FrameMaker:
 
     masked: str = "empty"  #: what black in a mask means, see `masks.MASKED`
     _resampling: Any = field(init=False)  # of a lens: two are kept
-    _sees_all: Any = field(init=False)
+    _seen_share: Any = field(init=False)
+    _warned: set[Lens] = field(init=False, default_factory=set)
 
     def __post_init__(self) -> None:
         self._resampling = lru_cache(maxsize=2)(_undistortion)
-        self._sees_all = lru_cache(maxsize=None)(lambda lens: bool(self._resampling(lens).inside.all()))
+        self._seen_share = lru_cache(maxsize=None)(self._find_seen_share)
 
     def frame(self, view: View) -> ImportedFrame:
         """Pictures are read when the frame is written. Raises InputError for a camera that cannot be."""
@@ -56,10 +63,14 @@ class FrameMaker:
             raise InputError(f"{view.path}: {error}") from None
         distortion = lens.distortion
         resampled = distortion is None
+        self._warn_of_blindness(lens, view.path)
         cut_out = view.mask is not None and empty and has_alpha(view.path)
-        unknown = (view.mask is not None and not empty) or (resampled and not self._sees_all(lens))
+        unknown = (view.mask is not None and not empty) or (resampled and self._seen_share(lens) < 1)
         in_file = view.mask is not None and empty and not cut_out
-        silhouette = (lambda: self._silhouette(view)) if in_file or (resampled and view.silhouette) else view.silhouette
+        made = in_file or (
+            view.silhouette is not None and (resampled or image_size(view.silhouette) != (lens.width, lens.height))
+        )
+        silhouette = (lambda: self._silhouette(view)) if made else view.silhouette
         return ImportedFrame(
             name=view.name,
             picture=(lambda: self._picture(view)) if resampled or cut_out else view.path,
@@ -69,7 +80,25 @@ class FrameMaker:
             silhouette=silhouette,
             mask=(lambda: self._known(view)) if unknown else None,
             depth=None if view.depth is None else partial(self._depth, view.depth, view),
+            keys=view.keys,
         )
+
+    def _find_seen_share(self, lens: Lens) -> float:
+        """Of the pinhole camera's pixels, those that the lens images; of Brown-Conrady's lenses on a coarse grid."""
+        if lens.distortion is None:
+            return float(self._resampling(lens).inside.mean())
+        small = lens.scaled(min(lens.width, _COARSE), min(lens.height, _COARSE))
+        camera = Camera(np.eye(4), small.width, small.height, *small.pinhole)
+        return float(Undistortion(camera, lens.distortion).inside.mean()) if lens.distortion else 1.0
+
+    def _warn_of_blindness(self, lens: Lens, path: Path) -> None:
+        """Once of a lens."""
+        if lens not in self._warned and (share := self._seen_share(lens)) < _BLIND:
+            self._warned.add(lens)
+            _log.warning(
+                "%s: its lens images %.2g %% of the picture, the rest is unknown: its parameters may be wrong",
+                path, 100 * share,
+            )  # fmt: skip
 
     def _picture(self, view: View) -> np.ndarray:
         """uint8, with the file's channels."""
@@ -92,7 +121,8 @@ class FrameMaker:
         if view.mask is not None and self.masked == "empty":
             known = read_mask(view.mask, view.lens.width, view.lens.height)
         else:
-            known = _read_labels(view.silhouette) > 0
+            assert view.silhouette is not None
+            known = read_silhouette(view.silhouette, view.lens.width, view.lens.height)
         return self._labels(view, np.where(known, 255, 0).astype(np.uint8))
 
     def _known(self, view: View) -> np.ndarray:
@@ -127,10 +157,3 @@ def fitted(lens: Lens, path: Path) -> Lens:
 def _undistortion(lens: Lens) -> Resampling:
     check_memory(_UNDISTORTING * lens.width * lens.height, f"undistorting {lens.width} x {lens.height} pixels")
     return lens.undistortion()
-
-
-def _read_labels(path: Path | None) -> np.ndarray:
-    """[H, W]"""
-    assert path is not None
-    pixels = read_png(path)
-    return pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=-1)

@@ -12,6 +12,8 @@ world is the frame of the body. Labels stay with their frames in transforms.json
 """
 
 import logging
+import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,11 +25,11 @@ from PIL import Image as PillowImage
 
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import MAX_LIST_BYTES, read_json
-from spacesim.data.geometry import Array, rotation_from_quaternion
+from spacesim.data.geometry import Array, camera_that_sees
 from spacesim.data.images import image_size, read_png
 from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.masks import MASK_OPTIONS, MASKED, MaskFolder, read_mask
-from spacesim.data.importers.writing import ImportedFrame, Progress, write_dataset
+from spacesim.data.importers.writing import ImportedFrame, Progress, frame_names, write_dataset
 from spacesim.data.records import Camera, Dataset
 
 DOMAINS = ("synthetic", "lightbox", "sunlamp")
@@ -36,6 +38,7 @@ SPEED_CAMERA = {"Nu": 1920, "Nv": 1200, "ppx": 5.86e-6, "ppy": 5.86e-6, "fx": 0.
 
 _TURNS, _PLACES = ("q_vbs2tango_true", "q_vbs2tango"), ("r_Vo2To_vbs_true", "r_Vo2To_vbs")
 _UNIT = 1e-3  #: how far from 1 the length of a quaternion may be
+_SKEWED = 0.1  #: pixels from the top of a picture to its bottom: our cameras have none
 _FARTHEST = 1e9  #: metres
 _BOX = PillowImage.Resampling.BOX
 
@@ -52,12 +55,8 @@ class _Label:
 
     @property
     def world_from_camera(self) -> Array:
-        """[4, 4] in the body's frame: the transpose of the quaternion's rotation, and -R^T r."""
-        turn, place = rotation_from_quaternion(self.quaternion), self.position
-        pose = np.eye(4)
-        pose[:3, :3] = turn.T
-        pose[:3, 3] = -(place[0] * turn[0] + place[1] * turn[1] + place[2] * turn[2])  # to the bit, whatever the BLAS
-        return pose
+        """[4, 4] in the body's frame."""
+        return camera_that_sees(self.quaternion, self.position)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +100,7 @@ def import_speedplus(
     broken, pictures of another size than the camera's, and where no frame is left.
     """
     expect(domain in DOMAINS, "domain", f"one of {', '.join(DOMAINS)}", domain)
-    expect(max_distance is None or max_distance > 0, "max_distance", "metres above 0", max_distance)
+    expect(max_distance is None or 0 < max_distance < math.inf, "max_distance", "metres above 0", max_distance)
     expect(count is None or count >= 2, "count", "at least 2 frames", count)
     expect(0 < scale <= 1, "scale", "a fraction above 0, up to 1", scale)
     expect(masked in MASKED, "masked", f"one of {', '.join(MASKED)}", masked)
@@ -124,13 +123,17 @@ def import_speedplus(
         splits = _subsets(splits, count, seed)
     size = max(1, round(scale * intrinsics.width)), max(1, round(scale * intrinsics.height))
     folder = masks or pictures.parent / "masks"
-    names = [one.filename for labels in splits for one in labels]
-    found_masks = MaskFolder(folder).find_all(names) if masks or folder.is_dir() else {}
-    maker = _FrameMaker(pictures, intrinsics, size, found_masks, masked)
+    files = [one.filename for labels in splits for one in labels]
+    if twice := next((name for name, count in Counter(files).items() if count > 1), ""):
+        raise InputError(f"{lists[0]}: expected each image once, found {twice} twice, in it or in {lists[-1].name}")
+    found_masks = MaskFolder(folder).find_all(files) if masks or folder.is_dir() else {}
+    names = dict(zip(files, frame_names(files), strict=True))
+    maker = _FrameMaker(pictures, names, intrinsics, size, found_masks, masked)
     train, test = (list(map(maker.frame, labels)) for labels in [*splits, []][:2])
     options = {"domain": domain, "max_distance": max_distance, "count": count, "scale": scale, "seed": seed}
     options |= {"masks": None if masks is None else str(masks), "masked": masked}
-    return write_dataset(out, train, test, {"kind": "speedplus", "source": str(src), **options}, progress=progress)
+    source = {"kind": "speedplus", "source": str(src), **options}
+    return write_dataset(out, train, test or None, source, progress=progress)
 
 
 def _lists(src: Path, domain: str) -> tuple[Path, list[Path]]:
@@ -155,7 +158,9 @@ def _read_camera(src: Path, labels: Path) -> _Intrinsics:
         width, height = int(values["Nu"]), int(values["Nv"])
         if "cameraMatrix" in values:
             matrix = np.array(values["cameraMatrix"], np.float64).reshape(3, 3)
-            (fx, _, cx), (_, fy, cy) = matrix[:2].tolist()
+            (fx, skew, cx), (_, fy, cy) = matrix[:2].tolist()
+            if abs(skew) * height > _SKEWED * fy:
+                raise InputError(f"expected a cameraMatrix without skew, found {skew:g} in its first row")
         else:
             fx, fy = (float(values[f"f{axis}"]) / float(values[f"pp{axis}"]) for axis in "xy")
             cx, cy = float(values.get("ccx", 0.5 * width)), float(values.get("ccy", 0.5 * height))
@@ -232,6 +237,7 @@ class _FrameMaker:
     """What all frames share."""
 
     pictures: Path  #: their folder
+    names: Mapping[str, str]  #: of frames, by file names
     intrinsics: _Intrinsics
     size: tuple[int, int]  #: (width, height) that pictures get
     masks: Mapping[str, Path]  #: of file names
@@ -247,7 +253,7 @@ class _FrameMaker:
         mask = self.masks.get(label.filename)
         made = None if mask is None else partial(_resized_mask, mask, full, self.size)
         return ImportedFrame(
-            name=PurePosixPath(label.filename).with_suffix("").as_posix(),
+            name=self.names[label.filename],
             picture=path if self.size == full else partial(_resized, path, self.size),
             camera=self.intrinsics.camera(label.world_from_camera, self.size),
             distortion=self.intrinsics.distortion,
@@ -258,11 +264,19 @@ class _FrameMaker:
 
 
 def _resized(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """[h, w] or [h, w, 3] uint8: means over the areas of the pixels of `size` (width, height)."""
+    """Of `size` (width, height), as the file's [h, w] uint8 or uint16, or [h, w, 3] or [h, w, 4] uint8: means over the
+    areas of the pixels, of colours by their alpha."""
     pixels = read_png(path)
-    if pixels.dtype != np.uint8:
-        raise InputError(f"{path}: expected a picture of 8 bits, found one of 16")
-    return np.asarray(PillowImage.fromarray(pixels[..., :3] if pixels.ndim == 3 else pixels).resize(size, _BOX))
+    if pixels.dtype == np.uint8 and pixels.shape[2:] != (4,):
+        return np.asarray(PillowImage.fromarray(pixels).resize(size, _BOX))
+    planes = np.atleast_3d(pixels).astype(np.float32)
+    if planes.shape[2] == 4:
+        planes[..., :3] *= planes[..., 3:]
+    pictures = [PillowImage.fromarray(plane).resize(size, _BOX) for plane in np.moveaxis(planes, 2, 0)]
+    means = np.dstack([np.asarray(picture) for picture in pictures])
+    if planes.shape[2] == 4:
+        means[..., :3] /= np.where(means[..., 3:] > 0, means[..., 3:], 1)
+    return np.rint(means).astype(pixels.dtype).reshape(size[::-1] + pixels.shape[2:])
 
 
 def _resized_mask(path: Path, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:

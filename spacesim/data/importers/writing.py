@@ -22,7 +22,7 @@ from spacesim.data.files import (
     write_bytes,
     write_json,
 )
-from spacesim.data.images import write_png
+from spacesim.data.images import read_png, write_png
 from spacesim.data.integrity.manifest import write_manifest
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
@@ -56,7 +56,7 @@ class ImportedFrame:
 def write_dataset(
     out: str | Path,
     train: Sequence[ImportedFrame],
-    test: Sequence[ImportedFrame],
+    test: Sequence[ImportedFrame] | None,
     source: Mapping[str, Any],
     points: tuple[np.ndarray, np.ndarray] | None = None,
     files: Mapping[str, bytes] | None = None,
@@ -64,24 +64,23 @@ def write_dataset(
 ) -> Dataset:
     """Write frames from elsewhere into the folder `out` as a dataset, transforms.json last; returns it as read back.
 
-    train, test: where there are none to test with, every 8th frame is held out (`data.transforms`)
+    train, test: where `test` is None, every 8th frame is held out (`data.transforms`)
     source: what import.json says: the kind of import, from where, its options
     points: (positions [N, 3] metres, colours [N, 3] uint8) to start training from
     files: others by their names in `out`: pictures of the cameras, reports
     Where an earlier import of the same source was interrupted, it is begun anew in its folder. Raises InputError where
-    `out` holds anything else, where a picture cannot be read, and where no frame is left.
+    `out` holds anything else, where a picture cannot be read, where two have one name, and where no frame is left.
     """
     out, files, source = Path(out), dict(files or {}), json.loads(json_bytes(dict(source)))
-    frames = [*train, *test]
+    frames = [*train, *(test or ())]
     if not train:
         raise InputError(f"{source.get('source', out)}: expected frames to train on, found none")
+    entries = [_entry(frame) for frame in frames]
+    _check_names(str(source.get("source", out)), entries)
     with lock_folder(out):
         _claim(out, source)
         paths = [SOURCE]
-        entries = []
-        for number, frame in enumerate(frames, start=1):
-            entry = _entry(frame)
-            entries.append(entry)
+        for number, (frame, entry) in enumerate(zip(frames, entries, strict=True), start=1):
             paths += [_write(out, frame.picture, entry["file_path"])]
             for part, key in _PARTS.items():
                 picture = getattr(frame, part)
@@ -90,11 +89,9 @@ def write_dataset(
             if progress is not None:
                 progress(number, len(frames), frame.name)
         meta: dict[str, Any] = {"camera_model": "OPENCV", "frames": entries}
-        if test:
-            meta |= {
-                f"{split}_filenames": [_entry(frame)["file_path"] for frame in group]
-                for split, group in (("train", train), ("test", test))
-            }
+        if test is not None:
+            names = [entry["file_path"] for entry in entries]
+            meta |= {"train_filenames": names[: len(train)], "test_filenames": names[len(train) :]}
         if points is not None and len(points[0]):
             write_points(out / "points.ply", *points)
             meta["ply_file_path"] = "points.ply"
@@ -108,6 +105,14 @@ def write_dataset(
         flush_disks()
         write_bytes(path, content)
     return read_dataset(out)
+
+
+def _check_names(source: str, entries: Sequence[Mapping[str, Any]]) -> None:
+    """Raises InputError where two frames would be written to one file, before anything is."""
+    for key in ("file_path", *_PARTS.values()):
+        for path, count in Counter(entry[key] for entry in entries if key in entry).items():
+            if count > 1:
+                raise InputError(f"{source}: expected each image once, found {count} of the name {path}")
 
 
 def frame_names(paths: Sequence[str]) -> list[str]:
@@ -183,7 +188,9 @@ def _write(out: Path, picture: Picture, name: str) -> str:
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
         raise InputError(f"{name}: expected a name below the dataset's folder, found another")
     if isinstance(picture, Path):
-        write_bytes(out / name, read_bytes(picture, "a picture"), durable=False)
+        content = read_bytes(picture, "a picture")
+        read_png(picture, content)  # raises where it is cut off, which its header does not tell
+        write_bytes(out / name, content, durable=False)
     else:
         write_png(out / name, picture(), durable=False)
     return name

@@ -5,6 +5,7 @@ from typing import Any
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
+from spacesim.data.importers.writing import SOURCE
 from spacesim.data.integrity.manifest import NAME, check_manifest, read_manifest
 from spacesim.data.records import Dataset
 from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, find_unreadable_files, read_dataset
@@ -44,6 +45,13 @@ def _named(dataset: Dataset) -> set[str]:
 def has_digests(dataset: Dataset) -> bool:
     """Whether SHA256SUMS lies beside the data: without it, a changed byte of a file without checksums goes unseen."""
     return (dataset.root / NAME).exists()
+
+
+def repair_hint(dataset: Dataset) -> str:
+    """What to do about faulty files of a dataset, by what has made it; "" where that is not known."""
+    if dataset.scene:
+        return "; delete them, generate --resume makes them again"
+    return "; import it again, into a new folder" if (dataset.root / SOURCE).is_file() else ""
 
 
 def _repair_hint(root: Path, error: InputError) -> str:

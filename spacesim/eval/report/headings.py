@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from spacesim.eval.notes import explain_ignored
 from spacesim.eval.report.html import escape, table
 from spacesim.eval.report.read import Evaluation
 
@@ -59,7 +60,8 @@ def _about(runs: Sequence[Evaluation]) -> str:
         facts.append(("one Sun" if suns == 1 else f"{suns} Suns") + never)
     elif data.get("truth") is False:
         facts.append("no Sun is named")
-    return f"{what}, evaluated on {data['frames']} {metrics['split']} frames against {against}. {', '.join(facts)}."
+    about = f"{what}, evaluated on {data['frames']} {metrics['split']} frames against {against}. {', '.join(facts)}."
+    return " ".join([about, *explain_ignored(data.get("ignored") or 0)])
 
 
 def fitted_words(runs: Sequence[Evaluation]) -> str:
@@ -69,7 +71,8 @@ def fitted_words(runs: Sequence[Evaluation]) -> str:
     if not parts:
         return ""
     what = parts[0][1] if len(runs) == 1 else "; ".join(f"{name}: {names}" for name, names in parts)
-    return f" Fitted to each picture on one half of the object and judged on the other ({escape(what)})."
+    half = "one half" if all(run.whole_pictures for run in runs) else "one half of the object"
+    return f" Fitted to each picture on {half} and judged on the other ({escape(what)})."
 
 
 def aligned_words(runs: Sequence[Evaluation]) -> str:

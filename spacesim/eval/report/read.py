@@ -7,6 +7,7 @@ from typing import Any
 
 from spacesim.data.errors import InputError
 from spacesim.data.files import MAX_LIST_BYTES
+from spacesim.data.identity import same_digest
 from spacesim.data.structure import read_record
 from spacesim.eval.report.html import escape, swatch
 from spacesim.eval.schema import RULES, Metrics
@@ -72,12 +73,13 @@ def read_evals(folders: Sequence[Path]) -> list[Evaluation]:
 def by_data(runs: Sequence[Evaluation]) -> list[list[Evaluation]]:
     """The runs that were evaluated on the same frames, together, in their order; each numbered within its group.
 
-    Frames are known by their digest; where a file does not tell it, those of one folder and split are the same.
+    Frames are known by their digest; where a file does not tell it, those of one folder and split are the same. What
+    "image" is over must be the same, too.
     """
     groups: list[list[Evaluation]] = []
     for run in runs:
         for group in groups:
-            if _same_frames(run, group[0]):
+            if all(_same_frames(run, other) for other in group):
                 group.append(replace(run, index=len(group)))
                 break
         else:
@@ -86,9 +88,11 @@ def by_data(runs: Sequence[Evaluation]) -> list[list[Evaluation]]:
 
 
 def _same_frames(one: Evaluation, other: Evaluation) -> bool:
+    if one.whole_pictures != other.whole_pictures:
+        return False
     digests = [run.metrics["dataset"].get("digest") for run in (one, other)]
     if all(digests):
-        return bool(digests[0] == digests[1])
+        return same_digest(*digests)
     return all(one.metrics[key] == other.metrics[key] for key in ("data", "split"))
 
 

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
+from spacesim.data.images import has_alpha
 from spacesim.data.mesh import read_mesh
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_points
@@ -17,6 +18,7 @@ from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 OPACITY = 0.1  #: of every Gaussian at the start (Kerbl et al. 2023)
 NEIGHBOURS = 12  #: points that a normal is estimated from
 COARSE = 0.05  #: pixels: steps of 0.1 cost 0.4 dB of 26.6, those of 1 pixel 1.9 dB (boxsat, 96 pixels)
+MANY_PICTURES = 50  #: of which unknown Suns are told
 FEATURES = 0.3  #: standard deviation of the features at the start
 SPLATFACTO_CUBE = 10  #: scene scales, side of the cube that its random start fills (`random_scale`)
 
@@ -127,6 +129,18 @@ def distance_warning(dataset: Dataset) -> str:
         f"{dataset.root}: expected poses about an origin near the object, found it {away:.2g} m away, "
         f"where single precision has steps of {step:.2g} m, {step / pixel:.2g} pixels: move the poses"
     )
+
+
+def sun_warning(dataset: Dataset) -> str:
+    """A sentence where estimated Suns (`sun = "unknown"`) will hardly be right; "" where nothing speaks against it."""
+    lacking = []
+    if len(dataset.train) < MANY_PICTURES:
+        lacking.append(f"{len(dataset.train)} training pictures where it takes {MANY_PICTURES} or more")
+    cut_out = (f.silhouette_path or f.mask_path or has_alpha(dataset.root / f.file_path) for f in dataset.train)
+    if not any(cut_out):
+        lacking.append("no silhouette, mask or alpha to tell the object from what is behind it")
+    found = " and ".join(lacking)
+    return found and f"{dataset.root}: expected what unknown Suns can be told from, found {found}: they may be far off"
 
 
 def _from_points(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -31,7 +31,7 @@ from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.pictures.poses import pose_config
 from spacesim.splat.train.pictures.suns import FirstSuns, check_pictures, first_suns, shape_config, surface_points
-from spacesim.splat.train.start import distance_warning, scale_warning
+from spacesim.splat.train.start import distance_warning, scale_warning, sun_warning
 from spacesim.splat.train.trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,8 @@ def train(
         trainer = Trainer(dataset, config)
     elif config.sun == "unknown":
         check_pictures(dataset)
-    for remark in filter(None, (scale_warning(dataset), distance_warning(dataset))):
+    of_sun = sun_warning(dataset) if config.sun == "unknown" else ""
+    for remark in filter(None, (of_sun, scale_warning(dataset), distance_warning(dataset))):
         log.warning(remark)
     with lock_folder(out):
         check_folder(out, described, resume, read_config)  # again: another training may have come and gone

@@ -4,7 +4,7 @@ import struct
 
 import numpy as np
 import pytest
-from colmap_files import Model, imported, project, write_binary, write_masks, write_pictures
+from colmap_files import Model, imported, project, ring, write_binary, write_masks, write_pictures
 
 from spacesim.data.errors import InputError
 
@@ -87,7 +87,7 @@ BROKEN = {
     ),
     "spherical": (
         "binary",
-        poke("cameras.bin", 12, "<i", 17),
+        lambda root: write_binary(root / "sparse/0", ring(cameras={1: ("EQUIRECTANGULAR", 16, 12, (16.0, 12.0))})),
         "expected a lens that a pinhole camera can stand for, found EQUI",
     ),
     "NaN focal length": (
@@ -214,3 +214,18 @@ def test_masks_of_another_shape_end_in_one_sentence(tmp_path):
     write_masks(tmp_path / "masks", [f"view {k}.png" for k in range(5)], (12, 16))
     with pytest.raises(InputError, match=r"view 0\.png: expected 16x12 pixels, or a multiple or fraction"):
         imported(project(tmp_path / "src"), tmp_path / "out", masks=tmp_path / "masks")
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_cameras_of_no_image_do_not_matter(tmp_path, form):
+    camera = ("SIMPLE_PINHOLE", 16, 12, (20.0, 8.0, 6.0))
+    wrong = {2: ("EQUIRECTANGULAR", 16, 12, (16.0, 12.0)), 3: ("SIMPLE_PINHOLE", 0, 0, (0.0, 0.0, 0.0))}
+    root = project(tmp_path / "src", ring(cameras={1: camera} | wrong), form)
+    assert len(imported(root, tmp_path / "out").frames) == 5
+
+
+def test_a_text_model_may_begin_with_a_mark_of_its_encoding(tmp_path):
+    root = project(tmp_path / "src", ring(), "text")
+    for path in (root / "sparse/0").iterdir():
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(imported(root, tmp_path / "out").frames) == 5

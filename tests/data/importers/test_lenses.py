@@ -92,6 +92,18 @@ def test_what_the_lens_does_not_see_is_unknown(tmp_path):
     np.testing.assert_allclose(image.rgb[24, 32], np.array([10, 20, 30]) / 255, atol=1e-6)
 
 
+@pytest.mark.parametrize("lens", [("OPENCV", (-1e10, 0.0, 0.0, 0.0)), ("OPENCV_FISHEYE", (1e10, -1e10, 0.0, 0.0))])
+def test_a_lens_that_images_nothing_is_warned_of_once(tmp_path, caplog, lens):
+    name, others = lens
+    camera = (name, 16, 12, (20.0, 20.0, 8.0, 6.0, *others))
+    dataset = imported(project(tmp_path / "src", ring(3, cameras={1: camera})), tmp_path / "out")
+    share = ss.load_image(dataset, dataset.frames[0]).valid.mean()
+    assert share < 0.1
+    assert [record.getMessage().split("%")[1:] for record in caplog.records] == [
+        [" of the picture, the rest is unknown: its parameters may be wrong"]
+    ]
+
+
 def test_a_fold_of_the_lens_is_cut_off():
     """t - 0.3 t^3 turns back at t = 1.054, of tangent 1.77: beyond, the same pixels would be seen again."""
     lens = Lens(MODELS["SIMPLE_RADIAL_FISHEYE"], 400, 20, (50.0, 200.0, 10.0, -0.3))

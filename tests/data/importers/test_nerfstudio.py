@@ -2,6 +2,7 @@
 
 import json
 import logging
+import shutil
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import spacesim as ss
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
 from spacesim.data.store import find_unreadable_files, read_points, write_points
+from spacesim.eval.frame_metrics import frame_target
 
 POSE = [[1, 0, 0, 0.5], [0, 0, -1, -4], [0, 1, 0, 1], [0, 0, 0, 1]]
 CAMERA = {"fl_x": 20.0, "fl_y": 21.0, "cx": 7.5, "cy": 6.0, "w": 16, "h": 12}
@@ -110,6 +112,39 @@ def test_fisheye_cameras_of_instant_ngp(tmp_path):
         ss.read_dataset(root)
 
 
+def test_broken_pictures_are_not_imported(tmp_path):
+    """Their headers are whole."""
+    noise = np.random.default_rng(0).integers(0, 255, (12, 16, 3)).astype(np.uint8)
+    for suffix in ("jpg", "png", "tif"):
+        root = folder(tmp_path / suffix, [{"file_path": f"{k}.{suffix}"} for k in range(2)])
+        path = root / f"1.{suffix}"
+        if suffix == "tif":
+            Image.fromarray(noise[..., 0].astype(np.float32)).save(path)
+        else:
+            Image.fromarray(noise).save(path)
+            path.write_bytes(path.read_bytes()[:-100])
+        with pytest.raises(InputError, match=rf"1\.{suffix}: expected"):
+            ss.import_dataset("nerfstudio", root, tmp_path / f"out {suffix}")
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_the_split_stays(tmp_path, count):
+    """Also where nothing is to be tested with, which is no wish to have every eighth frame held out."""
+    frames = named(9)
+    names = [frame["file_path"] for frame in frames]
+    root = folder(tmp_path / "src", frames, train_filenames=names[count:], test_filenames=names[:count])
+    dataset = imported(root, tmp_path / "out")
+    assert [frame.file_path for frame in dataset.train] == names[count:]
+    assert [frame.file_path for frame in dataset.test] == names[:count]
+
+
+def test_blenders_pictures_of_training_alone(tmp_path):
+    frames = [{"file_path": f"train/{k}.png"} for k in range(3)]
+    root = folder(tmp_path / "src", frames, name="transforms_train.json")
+    dataset = imported(root, tmp_path / "out", kind="blender")
+    assert [(len(one.train), len(one.test)) for one in (dataset, ss.read_dataset(root))] == 2 * [(3, 0)]
+
+
 def test_masks_mean_what_is_asked(tmp_path):
     root = folder(tmp_path / "src", named(2, mask_path="masks/m.png"))
     mask = np.zeros((12, 16), np.uint8)
@@ -169,6 +204,74 @@ def test_nerf_synthetic(tmp_path):
     assert camera.fx == camera.fy == pytest.approx(8 / np.tan(0.35))
     assert (camera.cx, camera.cy) == (8, 6)
     assert ss.load_image(dataset, dataset.train[0]).alpha[0, 0] == pytest.approx(128 / 255)
+
+
+def test_what_a_film_knows_of_its_frames_stays(tmp_path):
+    frames = named(3)
+    for k, frame in enumerate(frames):
+        frame |= {"time": 0.25 * k, "source_index": 7 * k}
+    frames[2]["source_index"] = float("inf")
+    dataset = imported(folder(tmp_path / "src", frames), tmp_path / "out")
+    assert {frame.file_path[7]: frame.time for frame in dataset.frames} == {"0": 0, "1": 0.25, "2": 0.5}
+    entries = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+    assert {entry["file_path"][7]: entry.get("source_index") for entry in entries} == {"0": 0, "1": 7, "2": None}
+
+
+def test_blenders_pictures_to_test_with_may_all_be_missing(tmp_path, caplog):
+    root = blender(tmp_path / "src")
+    shutil.rmtree(root / "test")
+    dataset = imported(root, tmp_path / "out", "blender")
+    assert (len(dataset.train), len(dataset.test)) == (3, 0)
+    assert [r.getMessage() for r in caplog.records] == [
+        f"{root / 'transforms_train.json'}: 2 of 5 frames have no image and are left out, test/r_0 first"
+    ]
+    shutil.rmtree(root / "train")
+    with pytest.raises(InputError, match="nor one of any other frame"):
+        ss.read_dataset(root)
+
+
+def test_a_name_that_is_not_there_is_not_its_folder(tmp_path):
+    root = blender(tmp_path / "src")
+    with pytest.raises(InputError, match=r"nope: expected a folder with transforms_train\.json, found none"):
+        ss.import_dataset("blender", root / "nope", tmp_path / "out")
+    with pytest.raises(InputError, match=r"nope: expected a dataset folder or a transforms\.json, found nothing"):
+        ss.read_dataset(root / "nope")
+    assert len(ss.read_dataset(root / "transforms_train.json").frames) == 5
+
+
+@pytest.mark.parametrize(("size", "mode"), [((16, 12), "RGB"), ((8, 6), "L"), ((8, 6), "RGB")])
+@pytest.mark.parametrize("k4", [0.0, 0.001])
+def test_silhouettes_are_read_like_masks(tmp_path, size, mode, k4):
+    """Of several channels and of another size; those that are copied, too."""
+    lens = {"camera_model": "OPENCV_FISHEYE", "k4": k4} if k4 else {}
+    root = folder(tmp_path / "src", named(2, silhouette_path="s.png"), **lens)
+    left = np.where(np.arange(size[0]) < size[0] // 2, 1, 0)[None].repeat(size[1], 0).astype(np.uint8)
+    Image.fromarray(left).convert(mode).save(root / "s.png")
+    dataset = imported(root, tmp_path / "out")
+    target = frame_target(dataset, dataset.frames[0])
+    middle = target.silhouette[3:9, 3:13]
+    assert (target.image.alpha[3:9, 3:13] == middle).all()
+    assert (middle == (np.arange(3, 13) < 8)).all()
+    folder(tmp_path / "tall", named(2, silhouette_path="s.png"))
+    Image.new("L", (16, 24)).save(tmp_path / "tall/s.png")
+    with pytest.raises(InputError, match="or a multiple or fraction, as its picture, found 16x24"):
+        ss.import_dataset("nerfstudio", tmp_path / "tall", tmp_path / "none")
+
+
+@pytest.mark.parametrize("kind", ["up", "absolute", "both"])
+def test_pictures_may_lie_elsewhere(tmp_path, kind):
+    """As `read_dataset` takes them."""
+    elsewhere = tmp_path / "elsewhere"
+    root = folder(tmp_path / "src", named(3))
+    (root / "images").rename(elsewhere)
+    meta = json.loads((root / "transforms.json").read_text())
+    for k, entry in enumerate(meta["frames"]):
+        up = kind == "up" or (kind == "both" and k == 0)
+        entry["file_path"] = f"../elsewhere/{k}.png" if up else str(elsewhere / f"{k}.png")
+    (root / "transforms.json").write_text(json.dumps(meta))
+    assert len(ss.read_dataset(root).frames) == 3
+    dataset = imported(root, tmp_path / "out")
+    assert sorted(frame.file_path for frame in dataset.frames) == [f"images/{k}.png" for k in range(3)]
 
 
 def test_a_dataset_of_ours_comes_through(tiny_data, tmp_path):

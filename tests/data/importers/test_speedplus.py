@@ -94,6 +94,38 @@ def test_our_own_export_read_back_is_equal_to_the_bit(generated, exported, tmp_p
     assert find_unreadable_files(again.root) == []
 
 
+def test_the_export_of_an_import_is_the_first_export_to_the_bit(exported, tmp_path):
+    data = import_speedplus(exported, tmp_path / "data")
+    write_speedplus(data, tmp_path / "again")
+    for name in ("camera.json", "synthetic/train.json", "synthetic/validation.json"):
+        assert (tmp_path / "again" / name).read_bytes() == (exported / name).read_bytes()
+    for path in (exported / "synthetic/images").iterdir():
+        np.testing.assert_array_equal(read_png(tmp_path / "again/synthetic/images" / path.name), read_png(path))
+    twice = import_speedplus(tmp_path / "again", tmp_path / "twice")
+    for one, two in zip(data.frames, twice.frames, strict=True):
+        np.testing.assert_array_equal(one.camera.world_from_camera, two.camera.world_from_camera)
+    with pytest.raises(InputError, match="object: expected one of 1 the body, found 'hubble'"):
+        write_speedplus(data, tmp_path / "none", "hubble")
+
+
+def test_poses_that_were_moved_have_labels_of_their_own(exported, tmp_path):
+    import_speedplus(exported, tmp_path / "data")
+
+    def move(meta):
+        meta["frames"][0]["transform_matrix"][0][3] += 0.5
+        meta["frames"][1]["q_vbs2tango_true"] = "none"
+
+    edit(tmp_path / "data/transforms.json", move)
+    moved = read_dataset(tmp_path / "data")
+    write_speedplus(moved, tmp_path / "again")
+    again = import_speedplus(tmp_path / "again", tmp_path / "twice")
+    for one, two in zip(moved.frames, again.frames, strict=True):
+        np.testing.assert_allclose(one.camera.world_from_camera, two.camera.world_from_camera, atol=1e-13)
+    labels = [labels_of(root / "synthetic/train.json") for root in (exported, tmp_path / "again")]
+    assert labels[0][0] != labels[1][0]
+    assert labels[0][2:] == labels[1][2:]
+
+
 def test_importing_twice_gives_the_same_bytes(exported, tmp_path):
     for name in ("a", "b"):
         import_dataset("speedplus", exported, tmp_path / name, scale=0.5, count=4)
@@ -223,6 +255,7 @@ def edit(path: Path, change) -> None:
         ("camera.json", lambda v: v.update(cameraMatrix=[[1, 2], [3, 4]]), "expected Nu, Nv, cameraMatrix"),
         ("camera.json", lambda v: v.update(cameraMatrix=[[0, 0, 0]] * 3), "focal lengths"),
         ("camera.json", lambda v: v.update(distCoeffs=[1] * 8), "at most five distCoeffs"),
+        ("camera.json", lambda v: v["cameraMatrix"][0].__setitem__(1, 3.0), "without skew, found 3 in its first row"),
         ("camera.json", lambda v: v.update(Nu=1920), "expected 1920x30 pixels as camera.json says, found 48x30"),
     ],
 )
@@ -232,6 +265,53 @@ def test_broken_folders_end_in_one_sentence(published, tmp_path, file, change, w
         import_speedplus(published, tmp_path / "data")
     assert "\n" not in str(caught.value)
     assert str(tmp_path) in str(caught.value)
+
+
+def small_speedplus(root, **pictures):
+    """A folder whose pictures are given by their names, "a_png" for a.png."""
+    (root / "synthetic/images").mkdir(parents=True)
+    camera = {"Nu": 4, "Nv": 2, "cameraMatrix": [[5, 0, 2], [0, 5, 1], [0, 0, 1]], "distCoeffs": []}
+    (root / "camera.json").write_text(json.dumps(camera))
+    names = [name.replace("_", ".") for name in pictures]
+    for name, pixels in zip(names, pictures.values(), strict=True):
+        PillowImage.fromarray(pixels).save(root / "synthetic/images" / name)
+    pose = {"q_vbs2tango_true": [1, 0, 0, 0], "r_Vo2To_vbs_true": [0, 0, 3]}
+    (root / "synthetic/train.json").write_text(json.dumps([{"filename": name, **pose} for name in names]))
+    return root
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_names_that_differ_in_their_suffix_stay_apart(tmp_path, scale):
+    grey = np.zeros((2, 4), np.uint8)
+    root = small_speedplus(tmp_path / "src", a_png=grey, a_bmp=grey)
+    (root / "synthetic/masks").mkdir()
+    for name, value in (("a.png.png", 255), ("a.bmp.png", 0)):
+        PillowImage.fromarray(grey + np.uint8(value)).save(root / "synthetic/masks" / name)
+    data = import_speedplus(root, tmp_path / "data", scale=scale)
+    alphas = {Path(frame.file_path).stem: load_image(data, frame).alpha.mean() for frame in data.frames}
+    assert alphas == {"a_png": 1, "a_bmp": 0}
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_no_picture_counts_twice(published, tmp_path, scale):
+    edit(published / "synthetic/validation.json", lambda labels: labels[3].update(filename="img000004.jpg"))
+    shutil.copy(published / "synthetic/images/img000004.jpg", published / "synthetic/images/img001003.jpg")
+    words = r"speedplus/synthetic/train\.json: expected each image once, found img000004\.jpg twice"
+    with pytest.raises(InputError, match=words):
+        import_speedplus(published, tmp_path / "data", scale=scale)
+    assert not (tmp_path / "data").exists()
+
+
+def test_scaled_pictures_keep_alpha_and_depth_of_colour(tmp_path):
+    clear, deep = np.zeros((2, 4, 4), np.uint8), np.arange(8, dtype=np.uint16).reshape(2, 4) * 9000
+    clear[:, 0] = 200, 100, 50, 255
+    clear[:, 1] = 7, 8, 9, 0  # whatever colour it has
+    root = small_speedplus(tmp_path / "src", clear_png=clear, deep_png=deep)
+    data = import_speedplus(root, tmp_path / "data", scale=0.5)
+    pixels = {Path(frame.file_path).stem: read_png(data.root / frame.file_path) for frame in data.frames}
+    np.testing.assert_array_equal(pixels["clear"], [[[200, 100, 50, 128], [0, 0, 0, 0]]])
+    np.testing.assert_array_equal(pixels["deep"], deep.reshape(2, 2, 2).mean(axis=(0, 2), dtype=float)[None])
+    assert pixels["deep"].dtype == np.uint16
 
 
 def test_broken_files_end_in_one_sentence(published, tmp_path):
@@ -258,7 +338,11 @@ def test_broken_files_end_in_one_sentence(published, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "option", [{"domain": "moon"}, {"max_distance": -1.0}, {"count": 1}, {"scale": 0.0}, {"scale": 2.0}, {"seed": -1}]
+    "option",
+    [
+        *({"domain": "moon"}, {"max_distance": -1.0}, {"max_distance": float("inf")}, {"count": 1}),
+        *({"scale": 0.0}, {"scale": 2.0}, {"seed": -1}),
+    ],
 )
 def test_wrong_options_are_refused(published, tmp_path, option):
     with pytest.raises(InputError, match=f"^{next(iter(option))}: expected"):

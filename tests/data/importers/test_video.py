@@ -15,6 +15,7 @@ from spacesim.data.geometry import fibonacci_sphere
 from spacesim.data.images import load_image, read_png, write_png
 from spacesim.data.importers.kinds import import_dataset
 from spacesim.data.importers.video import frames as frames_of
+from spacesim.data.importers.video import importing
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import Survey, choose, read_frames, survey
 from spacesim.data.importers.video.model import Model, placed, report_of, without_floating
@@ -109,6 +110,32 @@ def test_broken_videos_end_in_a_sentence(tmp_path, caplog):
 
 
 @needs_av
+@pytest.mark.parametrize("kind", ["matroska", "mp4"])
+def test_a_film_that_is_cut_off_is_told_of_once(tmp_path, caplog, kind):
+    """Matroska tells how long it is, and not of how many frames; this MP4 has its index in front."""
+    import av
+
+    noise = np.random.default_rng(0).integers(0, 255, (12, SIZE[1], SIZE[0], 3), np.uint8)
+    path, options = tmp_path / f"film.{kind}", {} if kind == "matroska" else {"movflags": "faststart"}
+    with av.open(str(film(tmp_path / "f", noise))) as source, av.open(str(path), "w", kind, options) as target:
+        copy = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(source.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = copy
+                target.mux(packet)
+    assert len(list(read_frames(path))) == 12
+    assert caplog.records == []
+    path.write_bytes(path.read_bytes()[: 7 * path.stat().st_size // 10])
+    count = len(list(read_frames(path)))
+    assert 2 < count < 10
+    assert [r.getMessage().split(" (")[0] for r in caplog.records] == [
+        f"{path}: breaks off after {count}{' of 12' * (kind == 'mp4')} frames"
+    ]
+    assert len(list(read_frames(path, again=True))) == count
+    assert len(caplog.records) == 1
+
+
+@needs_av
 def test_a_film_of_sound_alone_has_no_pictures(tmp_path):
     import av
 
@@ -142,7 +169,8 @@ def test_what_is_missing_is_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("wishes", "sentence"),
     [
-        ({"fov": 0.0}, "fov: expected degrees from 0.1 to 150, found 0.0"),
+        ({"fov": 0.0}, "fov: expected degrees from 0.7 to 136, found 0.0"),
+        ({"fov": 140.0}, "fov: expected degrees from 0.7 to 136, found 140.0"),
         ({"length": -1.0}, "length: expected metres"),
         ({"length": 1.0, "distance": 2.0}, "length, distance: expected one of them, found both"),
         ({"height": 3}, "height: expected at least 16 pixels"),
@@ -154,6 +182,15 @@ def test_wrong_options_are_named(tmp_path, wishes, sentence):
         write_png(tmp_path / "in" / f"{k}.png", box_from(pose)[0])
     with pytest.raises(InputError, match=sentence):
         import_dataset("images", tmp_path / "in", tmp_path / "out", **wishes)
+
+
+def test_a_field_of_view_that_no_camera_has_is_refused_at_once(tmp_path, monkeypatch):
+    """It covers the width: of upright pictures the height's is larger."""
+    for k in range(3):
+        write_png(tmp_path / "in" / f"{k}.png", np.full((90, 30, 3), k, np.uint8))
+    monkeypatch.setattr(importing, "segment_sequence", lambda *_: pytest.fail("work was begun"))
+    with pytest.raises(InputError, match=r"^fov: expected a focal length of 0\.2 to 90 times .*, found 0\.0894"):
+        import_dataset("images", tmp_path / "in", tmp_path / "out", fov=123.6)
 
 
 def test_wrong_folders_are_named(tmp_path):

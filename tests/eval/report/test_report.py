@@ -371,6 +371,31 @@ def test_runs_on_other_frames_are_not_compared(folder):
     assert "2 sets of frames" in text
 
 
+def test_pictures_over_whole_frames_are_not_compared_with_those_over_silhouettes(folder):
+    """Older evaluations tell it by image_region alone."""
+
+    def whole(metrics):
+        metrics |= {"run": "runs/whole", "image_region": "frame"}
+        metrics["dataset"]["ignored"] = 0.84
+
+    text = "".join(page_of(folder, another(folder, "whole", whole)).text)
+    assert "2 sets of frames" in text
+    assert "Over whole pictures; no silhouette is known" in text
+    assert "84 % of the pixels count nowhere" in text
+
+
+def test_a_digest_of_an_older_version_is_compared_by_what_it_tells(folder):
+    digest = json.loads((folder / "metrics.json").read_text())["dataset"]["digest"]
+    head, content = digest.split("-")
+
+    def having(name, digest):
+        return another(folder, name, lambda m: m.update(run=name, dataset=m["dataset"] | {"digest": digest}))
+
+    old, other = having("old", head), having("other", f"{head}-{content[::-1]}")
+    assert "sets of frames" not in "".join(page_of(folder, old).text)
+    assert "2 sets of frames" in "".join(page_of(folder, old, other).text)
+
+
 def test_evaluations_without_a_digest_are_known_by_their_folder(folder):
     def older(metrics):
         del metrics["dataset"]["digest"]

@@ -116,6 +116,15 @@ def test_wrong_values_are_refused(wrong):
         boxsat(background="moon")
 
 
+def test_a_share_of_pictures_has_no_earth_that_is_fixed():
+    some = BackgroundConfig(share=0.5)
+    for placement in (None, "fixed"):
+        with pytest.raises(InputError, match="background: expected placement behind for a share of the pictures"):
+            replace(boxsat(), background=replace(some, placement=placement), earth=EarthConfig())
+    replace(boxsat(), background=some)
+    replace(boxsat(), background=replace(some, placement="behind"), earth=EarthConfig())
+
+
 def test_same_seed_gives_the_same_bytes_in_any_number_of_processes(made, tmp_path):
     generate(boxsat(background=BOTH), tmp_path / "again", workers=2)
     generate(boxsat(background=BOTH, seed=1), tmp_path / "other")

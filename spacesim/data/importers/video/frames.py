@@ -39,8 +39,8 @@ class FilmFrame:
     time: float | None  #: seconds at which the file shows it, None where it does not tell
 
 
-def read_frames(path: Path) -> Iterator[FilmFrame]:
-    """The frames of a video in order.
+def read_frames(path: Path, again: bool = False) -> Iterator[FilmFrame]:
+    """The frames of a video in order. again: what they lack has been told
 
     Raises InputError where PyAV is missing, where the file is no video or has none that can be decoded. Where it breaks
     off, the frames until there are given, and a warning tells.
@@ -60,11 +60,13 @@ def read_frames(path: Path) -> Iterator[FilmFrame]:
             raise InputError(f"{path}: expected a video of a codec that FFmpeg decodes, found another")
         check_size(stream.width or 1, stream.height or 1, str(path))
         stream.thread_type = "AUTO"
-        count, broken = 0, None
+        count, broken, end = 0, None, None
         try:
             for frame in container.decode(stream):
                 count += 1
-                yield FilmFrame(frame.to_ndarray(format="rgb24"), None if frame.time is None else float(frame.time))
+                time = None if frame.time is None else float(frame.time)
+                end = None if time is None else time + float((frame.duration or 0) * (frame.time_base or 0))
+                yield FilmFrame(frame.to_ndarray(format="rgb24"), time)
         except (OSError, ValueError) as error:
             broken = _reason(error)
         declared = int(stream.frames or 0)
@@ -72,9 +74,23 @@ def read_frames(path: Path) -> Iterator[FilmFrame]:
             raise InputError(
                 f"{path}: expected a video, found no frame that can be decoded ({broken or 'it is empty'})"
             )
-        if broken or count < declared:
+        seconds = _lost_seconds(container, end)
+        if (broken or count < declared or seconds) and not again:
             whole = f" of {declared}" if declared else ""
-            _log.warning("%s: breaks off after %d%s frames (%s)", path, count, whole, broken or "it is cut off")
+            lost = f"{seconds:.3g} seconds are missing" if seconds else "the rest cannot be decoded"
+            _log.warning("%s: breaks off after %d%s frames (%s)", path, count, whole, broken or lost)
+
+
+def _lost_seconds(container: Any, end: float | None) -> float:
+    """How much earlier the pictures end than the file declares, 0 where it does not tell or that may well be: by two
+    frames and a hundredth of it, beside sound by a second and a tenth."""
+    if end is None or not container.duration:
+        return 0.0
+    alone = len(container.streams) == 1
+    whole = float(container.duration) * 1e-6  # AV_TIME_BASE
+    lost = whole + float(container.start_time or 0) * 1e-6 - end
+    rate = float(container.streams.video[0].average_rate or 1)
+    return lost if lost > (2 / rate + 0.01 * whole if alone else 1 + 0.1 * whole) else 0.0
 
 
 def survey(frames: Iterator[np.ndarray], progress: Callable[[int], None] | None = None) -> Survey:

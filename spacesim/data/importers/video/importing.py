@@ -23,7 +23,7 @@ from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import choose, read_frames, survey
 from spacesim.data.importers.video.model import Model, placed, report_of, without_floating
 from spacesim.data.importers.video.segmentation import segment_sequence
-from spacesim.data.importers.video.sfm import reconstruct
+from spacesim.data.importers.video.sfm import check_focal, reconstruct
 from spacesim.data.importers.writing import ImportedFrame, Progress, check_free, frame_names, write_dataset
 from spacesim.data.records import Camera, Dataset
 
@@ -51,7 +51,7 @@ class Wishes:
 
     def __post_init__(self) -> None:
         expect(self.masked in MASKED, "masked", f"one of {', '.join(MASKED)}", self.masked)
-        expect(self.fov is None or 0.1 <= self.fov <= 150, "fov", "degrees from 0.1 to 150", self.fov)
+        expect(self.fov is None or 0.7 <= self.fov <= 136, "fov", "degrees from 0.7 to 136", self.fov)
         for name in ("length", "distance"):
             metres = getattr(self, name)
             expect(metres is None or 1e-6 <= metres <= 1e12, name, "metres from 1e-06 to 1e+12", metres)
@@ -84,7 +84,7 @@ def import_video(
             )
         keys: dict[str, dict[str, Any]] = {}
         size: tuple[int, ...] | None = None
-        for number, frame in enumerate(read_frames(src)):
+        for number, frame in enumerate(read_frames(src, again=True)):
             if number in set(chosen.tolist()):
                 size = size or frame.picture.shape
                 if frame.picture.shape != size:
@@ -138,8 +138,10 @@ def _import(
     it besides"""
     names = list(keys)
     width, height = Image.open(folder / "pictures" / names[0]).size
-    has_masks = _find_masks(folder, names, asked, tell)
     focal = None if asked.fov is None else 0.5 * width / math.tan(math.radians(0.5 * asked.fov))
+    if focal is not None:
+        check_focal(focal, (width, height), "fov")
+    has_masks = _find_masks(folder, names, asked, tell)
     features = _hide_background(folder, names) if has_masks else None
     shown = folder / ("features" if has_masks else "pictures")
     work = folder / "work"
@@ -162,7 +164,7 @@ def _import(
     frames = list(_frames(folder, model, has_masks, asked.masked, keys))
     points = (model.points, model.colors)
     return write_dataset(
-        out, frames, [], source, points, files, lambda done, total, name: tell("write", done, total, name)
+        out, frames, None, source, points, files, lambda done, total, name: tell("write", done, total, name)
     )
 
 

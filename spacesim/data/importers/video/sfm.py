@@ -27,6 +27,7 @@ _PEAK = 0.0027  # of SIFT's difference of Gaussians; 0.0067 by default: a spacec
 _FEATURES = 8192
 _LEAST_FEATURES, _LEAST_MATCHES = 50, 15
 _FLAT = 0.8  # share of pairs that a homography explains wholly, from which on there is no parallax
+FOCAL = 0.2, 90.0  #: of a camera, in longer sides of its pictures
 _LEAST_ANGLE = 2.0  # degrees: of the median point, from which on its depth is known
 
 Progress = Callable[[str, int, int], None]
@@ -258,6 +259,14 @@ def _model(model: Any, sizes: list[int]) -> Model:
     )
 
 
+def check_focal(focal: float, size: tuple[int, int], name: str, hint: str = "") -> None:
+    """Raises InputError in the name of what says the focal length (pixels) where no camera has it."""
+    ratio = focal / max(size)
+    if not FOCAL[0] < ratio < FOCAL[1]:
+        expected = f"a focal length of {FOCAL[0]:g} to {FOCAL[1]:g} times the longer side"
+        raise InputError(f"{name}: expected {expected}, found {ratio:.3g}{hint}")
+
+
 def _checked(model: Model, found: Matches, count: int, name: str) -> Model:
     """Raises InputError for a model that cannot be believed."""
     registered = len(model.names)
@@ -275,12 +284,7 @@ def _checked(model: Model, found: Matches, count: int, name: str) -> Model:
             f"{name}: expected one model of at least half of the {count} pictures, found one of {registered} (others: "
             f"{others}): pictures between them are missing or share too few features"
         )
-    ratio = model.focal / max(model.width, model.height)
-    if not 0.2 < ratio < 90:
-        raise InputError(
-            f"{name}: expected a focal length of 0.2 to 90 widths, found {ratio:.3g}: a broken model; name the field "
-            "of view with fov"
-        )
+    check_focal(model.focal, (model.width, model.height), name, ": a broken model; name the field of view with fov")
     behind = np.mean([_depths(model, k) <= 0 for k in range(registered)])
     if behind > 0.05:
         raise InputError(

@@ -8,13 +8,15 @@ import pytest
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere
-from spacesim.data.records import Sun
+from spacesim.data.images import write_png
+from spacesim.data.records import Camera, Dataset, Frame, Sun
 from spacesim.splat.fit import estimate_sun, find_unknowns
 from spacesim.splat.sun_search import SPHERE
 from spacesim.splat.train.checkpoint import read_tensors
 from spacesim.splat.train.config import preset, with_settings
 from spacesim.splat.train.pictures import suns
 from spacesim.splat.train.pictures.suns import CHOICES, FirstSuns, SunEstimation, time_order
+from spacesim.splat.train.start import MANY_PICTURES, sun_warning
 from spacesim.splat.train.train import train
 
 CONFIG = replace(preset("demo", "shadow-map"), sun="unknown", init_count=150, iterations=20, checkpoint_every=6)
@@ -134,3 +136,33 @@ def test_poses_are_learned_under_suns_that_are_estimated(untold, tmp_path, quick
     assert values.shape == (len(untold.train), 6)
     assert np.abs(values).max() > 0
     assert {"poses", "suns"} <= set(json.loads((run.path / "training.json").read_text()))
+
+
+def test_what_suns_cannot_be_told_from_is_warned_of(tmp_path):
+    write_png(tmp_path / "opaque.png", np.zeros((4, 4, 3), np.uint8))
+    write_png(tmp_path / "alpha.png", np.zeros((4, 4, 4), np.uint8))
+    camera = Camera.from_fov(np.eye(4), 4, 4, 40)
+
+    def remark(count, **frame):
+        return sun_warning(
+            Dataset(tmp_path, (Frame(**{"file_path": "opaque.png", "camera": camera} | frame),) * count, ())
+        )
+
+    few, bare = "12 training pictures", "no silhouette, mask or alpha"
+    assert few in remark(12)
+    assert bare in remark(12)
+    assert bare in remark(MANY_PICTURES)
+    assert few not in remark(MANY_PICTURES)
+    for cut_out in ({"file_path": "alpha.png"}, {"silhouette_path": "s.png"}, {"mask_path": "m.png"}):
+        assert few in remark(12, **cut_out)
+        assert bare not in remark(12, **cut_out)
+        assert remark(MANY_PICTURES, **cut_out) == ""
+
+
+def test_training_warns_of_suns_that_may_be_far_off(untold, quick, tmp_path, caplog):
+    def stop(progress) -> None:
+        raise StoppedError
+
+    with pytest.raises(StoppedError):
+        train(untold, tmp_path / "run", CONFIG, on_progress=stop)
+    assert any("they may be far off" in record.getMessage() for record in caplog.records)
