@@ -204,8 +204,9 @@ def options_page() -> str:
 
     lead = (
         "Every field of `TrainConfig` and of the records in it, with the defaults of the records. `--set KEY=VALUE` "
-        "takes each; `spacesim train --fields` lists them with what preset, method and strategy give them. The presets "
-        "are files in `spacesim/assets/presets/`."
+        "takes each but `method` and `preset`, which are options of their own: they bring what goes with them. "
+        "`spacesim train --fields` lists all with what preset, method and strategy give them. The presets are files in "
+        "`spacesim/assets/presets/`."
     )
     return f"# Options of a training\n\n{lead}\n\n{reference().strip()}\n"
 

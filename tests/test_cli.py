@@ -118,7 +118,8 @@ def test_fields_are_listed_with_the_defaults_of_a_preset(spacesim):
     assert (fine["light.shadow.method.filter"][0], fine["supersample"][0], fine["seed"][0]) == ("variance", "2", "8")
     assert "strategy.cull_every" in listed("--strategy", "mesh-aware")
     assert "strategy.cull_every" not in fast
-    assert " ".join(fast["init_count"]) == "20000 Gaussians at the start, at most [whole number]"
+    meaning = "Gaussians at the start, at most, and no more than refinement.max_gaussians"
+    assert " ".join(fast["init_count"]) == f"20000 {meaning} [whole number]"
 
 
 @pytest.mark.parametrize("strategy", ["mesh-aware", "support-aware"])

@@ -78,13 +78,12 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.cli.fields import listing
     from spacesim.data.store import read_dataset
     from spacesim.progress import report_training, show_progress
-    from spacesim.splat.train.config import preset, warm_start, with_options, with_settings
+    from spacesim.splat.train.config import preset, warm_start, with_settings
     from spacesim.splat.train.train import train
 
     config = preset(options.preset, options.method, options.strategy)
     if options.warm_start:
         config = replace(config, warm_start=warm_start(options.preset))
-    config = with_options(config, iterations=options.iterations)
     settings = {key: getattr(options, option[2:].replace("-", "_")) for option, (key, _) in OPTIONS.items()}
     settings |= {"refine_poses": options.refine_poses or None, "sun": options.sun if options.sun != "given" else None}
     chosen = {key: value for key, value in settings.items() if value is not None and key not in _NAMES}

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -206,7 +207,7 @@ def test_short_trainings_refine_and_then_go_on(name, shortest):
 
 def test_refinement_that_would_outlast_the_training_ends_before(small_dataset):
     for iterations, stop in ((20_000, 15_000), (150_000, 112_500), (160_000, 150_000)):
-        config = with_settings(preset("thesis"), {"iterations": iterations})
+        config = replace(preset("thesis"), iterations=iterations)
         assert make_strategy(config, small_dataset, 1.0, 1).config.refine_stop == stop
 
 
@@ -224,3 +225,15 @@ def test_the_command_line_and_python_shorten_alike(spacesim, tiny_data, tmp_path
     by_api = ss.train(tiny_data, tmp_path / "api", preset="demo", iterations=30)
     for run in (ss.load_run(tmp_path / "run"), by_api):
         assert run.config["refinement"]["refine_stop"] == 20
+
+
+def test_iterations_shorten_alike_however_they_are_set(spacesim):
+    """As an option and by --set, and before what else is set."""
+    config = replace(preset("fast"), warm_start=warm_start("fast"))
+    short = shortened(config, 700)
+    assert with_settings(config, {"iterations": 700}) == short
+    own = with_settings(config, {"refinement.refine_start": 7, "iterations": 700})
+    assert own == replace(short, refinement=replace(short.refinement, refine_start=7))
+    option = spacesim("train", "--fields", "--iterations", 700).output
+    assert spacesim("train", "--fields", "--set", "iterations=700").output == option
+    assert re.search(r"^refinement\.refine_start +50 ", option, re.MULTILINE)

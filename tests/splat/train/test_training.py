@@ -353,6 +353,13 @@ def test_opaque_pictures_are_trained_over_black(opaque_dataset):
     assert psnr(trainer.gaussians, opaque_dataset) > 20
 
 
+@pytest.mark.parametrize("init", ["points", "random"])
+def test_training_starts_with_no_more_gaussians_than_it_may_ever_have(small_dataset, init):
+    config = replace(CONFIG, init=init, init_count=60, refinement=replace(REFINEMENT, max_gaussians=25))
+    trainer = Trainer(small_dataset, config)
+    assert (trainer.gaussians.count, len(trainer.strategy.state["seen"])) == (25, 25)
+
+
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs processor affinity")
 def test_the_number_of_threads_does_not_show(small_dataset, tmp_path):
     """Round-off gradients of round splats are denormal when squared, and a lone thread does not flush those."""
