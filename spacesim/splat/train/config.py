@@ -294,12 +294,12 @@ def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConf
             table = inner
         table[keys[-1]] = _put(table.get(keys[-1]), settings[name])
     result = structure(TrainConfig, Document("", values, {}), Rules(none="none"))
-    if isinstance(result.strategy, McmcConfig):
-        for name in settings:
-            first, _, key = name.partition(".")
-            if first == "refinement" and key and key not in McmcConfig.reads:
-                found = "mcmc, which moves and copies"
-                raise InputError(f"{name}: expected a strategy that prunes and splits, found {found}")
+    reads: tuple[str, ...] | None = getattr(result.strategy, "reads", None)
+    for name in settings:
+        first, _, key = name.partition(".")
+        if reads is not None and first == "refinement" and key and key not in reads:
+            found = f"{result.strategy.kind}, which reads {', '.join(reads)} alone"
+            raise InputError(f"{name}: expected a strategy that reads it, found {found}")
     return result
 
 

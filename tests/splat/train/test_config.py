@@ -15,7 +15,6 @@ from spacesim.splat.light.shadow.cast import SplattingConfig
 from spacesim.splat.train.config import (
     METHODS,
     PRESETS,
-    STRATEGIES,
     TrainConfig,
     preset,
     shortened,
@@ -35,7 +34,11 @@ DIGESTS = {
     "fine": "16e7408f9e7c9d56",
     "thesis": "263dcda33eb0e21d",
 }
-"""Of all methods and strategies of a preset: a change here changes trained models."""
+"""Of these methods and strategies of a preset: a change here changes trained models."""
+HASHED = (
+    ("vanilla", "relight", "shadow-map", "shadow-splat", "baseline-park"),
+    ("default", "mesh-aware", "support-aware", "mcmc"),
+)
 
 
 def thesis_as_it_was(config: TrainConfig) -> TrainConfig:
@@ -54,7 +57,7 @@ def thesis_as_it_was(config: TrainConfig) -> TrainConfig:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_what_they_were(name):
-    every = [preset(name, method, strategy).to_json() for method in METHODS for strategy in STRATEGIES]
+    every = [preset(name, method, strategy).to_json() for method in HASHED[0] for strategy in HASHED[1]]
     text = json.dumps([*every, replace(preset(name), warm_start=warm_start(name)).to_json()], sort_keys=True)
     assert hashlib.sha256(text.encode()).hexdigest()[:16] == DIGESTS[name]
 
