@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.backend import BackendError
+from spacesim.backend.arrays import Float
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
@@ -23,7 +24,7 @@ from spacesim.splat.compose.output import compose as _compose
 from spacesim.splat.compose.scenefile import load_scene
 from spacesim.splat.fit import estimate_sun
 from spacesim.splat.pose import RefinedPose, refine_pose
-from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.cameras import Pinhole, Projection
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import RenderOutput
 from spacesim.splat.raster.render import render as _render
@@ -233,9 +234,14 @@ def compose(scene: str | Path | PosedScene, out: str | Path, *, size: int | tupl
     return _compose(posed, Path(out), size)
 
 
-def render(gaussians: Gaussians, camera: Camera, **options: Any) -> RenderOutput:
+def render(
+    gaussians: Gaussians, camera: Camera | Projection, *, twist: Float | None = None, **options: Any
+) -> RenderOutput:
     """Gaussians seen by a camera, as Dr.Jit arrays: differentiable by every parameter that has gradients enabled.
 
+    camera: a record, or one of spacesim.splat.raster.cameras, where arrays hold pose and intrinsics
+    twist: Float [6], moves the camera: a rotation vector (radians), then a translation (metres), in camera axes, which
+        take points from the old camera axes to the new ones; zeros to differentiate by the pose
     sh_degree: highest degree of spherical harmonics used; by default all that are stored
     outputs: ("color", "alpha", "depth") by default, also "median_depth" and "normal"; alpha is always there
     features: C arrays [N] of numbers to blend beside them
@@ -244,4 +250,5 @@ def render(gaussians: Gaussians, camera: Camera, **options: Any) -> RenderOutput
     `RenderOutput.to_numpy()` gives (colour [H, W, 3], alpha [H, W], depth [H, W] in metres). Raises ValueError for
     another output or features of another length, BackendError where no backend can run.
     """
-    return _render(gaussians, Pinhole.of(camera), **options)
+    view = camera if isinstance(camera, Projection) else Pinhole.of(camera)
+    return _render(gaussians, view if twist is None else view.moved(twist), **options)

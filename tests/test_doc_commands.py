@@ -485,7 +485,7 @@ SMALL_FACE = {  # of the six lines
 SMALL_BLOCKS = {  # in the Python of a document: what takes the place of what
     "README.md": SMALL_FACE,
     "index.md": SMALL_FACE,
-    "how-to/gradients.md": {"640, 480": "32, 24"},
+    "how-to/gradients.md": {"640, 480": "32, 24", "2000": "50"},
     "tutorials/first-model.md": {"256, 256": "24, 24"},
     "tutorials/torch.md": {"96, 400, 100": "24, 50, 3"},
     "tutorials/compose.md": {"frames = 48": "frames = 2", "size=128": "size=24"},
@@ -511,16 +511,13 @@ def shrunk(path: Path, text: str) -> str:
 
 @pytest.mark.parametrize("path", [path for path in DOCUMENTS if blocks(path, "python")], ids=name_of)
 def test_python_runs(path, given, tmp_path, monkeypatch, capsys):
-    """The blocks of a document one after the other, with what they take for given."""
-    from spacesim.splat.raster.gaussians import Gaussians
-
+    """The blocks of a document one after the other; only data and runs are given."""
     monkeypatch.chdir(tmp_path)
     desk = Desk(tmp_path, given, tmp_path, {})
     for name in ("runs/boxsat", *(("data", "run") if path.name not in ("README.md", "index.md") else ())):
         desk.put(name)
-    known: dict[str, Any] = {"gaussians": Gaussians.from_numpy(module_of("benchmarks/common.py").sphere_arrays(50))}
     text = shrunk(path, "\n".join(blocks(path, "python")))
-    exec(compile(text, path.name, "exec"), known)
+    exec(compile(text, path.name, "exec"), {})
     assert PRINTED.get(name_of(path), "") in capsys.readouterr().out
 
 
