@@ -15,6 +15,8 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
 from spacesim.data.store import load_truth
+from spacesim.data.structure import Rules, did_you_mean, places_of
+from spacesim.data.toml import dotted
 from spacesim.data.transforms import read_dataset
 from spacesim.scenes import SceneConfig, read_scene
 from spacesim.scenes import generate as _generate
@@ -156,9 +158,12 @@ def train(
     elif choices:
         name, word = next(iter(choices.items()))
         raise InputError(f"{name}: expected none beside a configuration, found {word!r}")
-    unknown = [name for name in options if name not in TrainConfig.__dataclass_fields__]
-    if unknown:
-        raise InputError(f"{unknown[0]}: expected a field of TrainConfig, found none of that name")
+    for name, value in options.items():
+        if name not in TrainConfig.__dataclass_fields__:
+            inner = [dotted(place) for place in places_of(TrainConfig, Rules()) if place[-1] == name]
+            settings_hint = f"; did you mean settings={{{inner[0]!r}: {value!r:.60}}}?" if inner else ""
+            hint = settings_hint or did_you_mean(name, TrainConfig.__dataclass_fields__)
+            raise InputError(f"{name}: expected a field of TrainConfig, found none of that name{hint}")
     config = configuration.shortened(config, options.get("iterations", config.iterations))
     config = configuration.with_settings(replace(config, **options), settings or {})
     dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))

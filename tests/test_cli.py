@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from tiny import GENERATE, TRAIN
 
+from spacesim.cli.program import in_flags, parser
 from spacesim.data.images import read_exr, read_png
 from spacesim.data.store import find_unreadable_files, read_dataset
 from spacesim.splat.export.ply import read_ply
@@ -448,6 +449,18 @@ def test_a_setting_that_cannot_be_is_named(spacesim, tiny_data, tmp_path, words,
         ("train DATA --out OUT --max-gaussians 0", ["--max-gaussians: expected at least 1, found 0"]),
         ("train DATA --out OUT --init sphere", ["--init", "points", "sphere"]),
         ("train DATA --out OUT --init-count 0", ["--init-count", "found 0"]),
+        (
+            "train DATA --out OUT --set warm_start=true",
+            ["--set warm_start: expected a table", "add --warm-start"],
+        ),
+        ("train DATA --out OUT --set warm_start.steps=4", ["found none; add --warm-start"]),
+        ("train DATA --out RUN", ["expected a new folder, found a run; --resume goes on with it"]),
+        ("generate boxsat --out DATA", ["expected a new folder, found a dataset; --resume goes on with it"]),
+        ("generate boxsat --out OUT --sun 1,2 --suns 2", ["--suns: expected 1, one for each direction given, found 2"]),
+        (
+            "generate boxsat --out OUT --known-test-views 2 --test-suns 0",
+            ["--known-test-views: expected 0 without --test-suns, where --test-views are of"],
+        ),
         ("train DATA --out OUT --method magic", ["--method", "vanilla, relight, shadow-map", "magic"]),
         ("train DATA --out OUT --seed -1", ["--seed", "found -1"]),
         ("train DATA --out OUT --backend vulkan", ["--backend", "vulkan"]),
@@ -486,6 +499,16 @@ def test_bad_usage_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tmp_path, a
     refused = spacesim(*words)
     assert refused.is_refusal(*names), refused
     assert not (tmp_path / "out").exists()
+
+
+def test_settings_in_a_sentence_are_told_as_options():
+    options = parser(["train"]).parse_args(["train", "a/seed=3", "--out", "OUT"])
+    asked = "expected sun_direction in every frame, or sun=unknown, or light.field.inputs=view"
+    told = "expected sun_direction in every frame, or --sun unknown, or --set light.field.inputs=view"
+    assert in_flags(f"a/seed=3: {asked}, found none", options) == f"a/seed=3: {told}, found none"
+    assert in_flags("seed: expected init_count, found init_count", options).endswith("--init-count, found init_count")
+    others = "OUT/config.json: init_count: expected another, found b=True"
+    assert in_flags(others, options) == others
 
 
 def test_a_folder_that_is_called_like_an_option_is_none(spacesim, tmp_path, monkeypatch):

@@ -64,14 +64,12 @@ def option_of(field: str, options: argparse.Namespace) -> str | None:
     """The option that sets a field, by the field's dotted name."""
     from spacesim.splat.train.config import TrainConfig
 
-    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | {
-        "warm_start": "--warm-start",
-        "refine_poses": "--refine-poses",
-        "sun": "--sun",
-    }
-    typed = {text.partition("=")[0].partition(".")[0].strip() for text in options.set}  # of which some are no fields
-    is_field = field.partition(".")[0] in typed | set(TrainConfig.__dataclass_fields__)
-    return options_by_key.get(field) or (f"--set {field}" if is_field else None)
+    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | {"sun": "--sun"}
+    keys = {text.partition("=")[0].strip() for text in options.set}  # of which some are no fields
+    switches = {"warm_start": "--warm-start", "refine_poses": "--refine-poses"}  # take no value
+    options_by_key |= {key: option for key, option in switches.items() if key not in keys}
+    known = {key.partition(".")[0] for key in keys} | set(TrainConfig.__dataclass_fields__)
+    return options_by_key.get(field) or (f"--set {field}" if field.partition(".")[0] in known else None)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -125,6 +123,8 @@ def _advice(sentence: str) -> str:
     field, _, rest = sentence.partition(": ")
     if rest.startswith(("expected light to be there", "expected light.shadow to be there")):
         return "; try --method shadow-map"
+    if field == "warm_start" or rest.startswith("expected warm_start to be there"):
+        return "; add --warm-start"
     is_unknown = f"found {field.rpartition('.')[2]!r}" in rest
     return "; see spacesim train --fields" if is_unknown and "did you mean" not in rest else ""
 

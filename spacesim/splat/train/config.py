@@ -287,9 +287,8 @@ def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConf
             if not isinstance(inner, dict):
                 first = ".".join(keys[:depth])
                 if inner is None:
-                    raise InputError(
-                        f"{name}: expected {first} to be there, found none under the method {config.method}"
-                    )
+                    why = f" under the method {config.method}" if keys[0] == "light" else ""
+                    raise InputError(f"{name}: expected {first} to be there, found none{why}")
                 raise InputError(f"{name}: expected {first} alone, which has no fields, found {name}")
             table = inner
         table[keys[-1]] = _put(table.get(keys[-1]), settings[name])

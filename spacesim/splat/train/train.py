@@ -184,7 +184,7 @@ def _identity(dataset: Dataset) -> dict[str, Any]:
 
 def _check_resumable(out: Path, described: dict[str, Any], resume: bool) -> None:
     if not resume:
-        raise InputError(f"resume: expected with {out}, which holds a run already, or a new folder, found neither")
+        raise InputError(f"{out}: expected a new folder, found a run; resume=True goes on with it")
     config, data = read_config(out / "config.json")
     data["path"] = described["data"]["path"]  # it may have moved
     current = {**config.to_json(), "data": data}  # what an older version did not write is as by default

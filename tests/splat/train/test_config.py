@@ -180,6 +180,10 @@ def test_settings_are_checked_before_the_dataset_is_read(tmp_path):
         ss.train(tmp_path / "nothing", tmp_path / "run", settings={"sede": 1})
     with pytest.raises(InputError, match=r"^iterations: expected at least 1, found 0"):
         ss.train(tmp_path / "nothing", tmp_path / "run", iterations=0)
+    with pytest.raises(InputError, match=r"did you mean settings=\{'refinement.max_gaussians': 5\}\?"):
+        ss.train(tmp_path / "nothing", tmp_path / "run", max_gaussians=5)
+    with pytest.raises(InputError, match=r"^itertions: .* did you mean iterations\?"):
+        ss.train(tmp_path / "nothing", tmp_path / "run", itertions=5)
 
 
 def test_a_shorter_training_shortens_its_schedule():

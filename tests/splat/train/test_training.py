@@ -144,7 +144,7 @@ train(read_dataset(Path({str(small_dataset.root)!r})), Path({str(tmp_path / "run
     assert died.returncode == -9, died.stderr
     with pytest.raises(InputError, match="resume"):
         load_run(tmp_path / "run")
-    with pytest.raises(InputError, match="holds a run already"):
+    with pytest.raises(InputError, match="expected a new folder, found a run; resume=True"):
         train(small_dataset, tmp_path / "run", CONFIG)
     with pytest.raises(InputError, match="seed"):
         train(small_dataset, tmp_path / "run", replace(CONFIG, seed=5), resume=True)
