@@ -46,7 +46,7 @@ OUTPUTS = ("--out", "--ply", "--mesh", "--speedplus", "--bop")
 
 SMALL = {  # options that a command gets, so that it is as small as can be
     "generate": {"--views": "2", "--test-views": "1", "--resolution": "24", "--spp": "1"},
-    "train": {"--preset": "demo", "--iterations": "8", "--init-count": "100"},
+    "train": {"--preset": "demo", "--iterations": "8", "--max-gaussians": "150"},
     "sweep": {"--frames": "2", "--size": "24"},
     "compose": {"--size": "24"},
     "view": {"--port": "0"},
@@ -407,7 +407,7 @@ def given(tiny_data, tmp_path_factory) -> dict[str, Path]:
     """What commands and blocks read: a dataset, one of two boxsats, a run of linear light with shadows, the scene file
     of docs/reference/composed-scenes.md, others."""
     folder = tmp_path_factory.mktemp("given")
-    words = "--method", "shadow-map", "--preset", "demo", "--iterations", 8, "--init-count", 200
+    words = "--method", "shadow-map", "--preset", "demo", "--iterations", 8, "--set", "init_count=200"
     small = "--set", "light.linear=true", "--set", "light.shadow.size=16"
     trained = call("train", tiny_data, "--out", folder / "runs/boxsat", *words, *small)
     assert trained.code == 0, trained.errors

@@ -18,7 +18,6 @@ OPTIONS = {
     "--iterations": ("iterations", "N"),
     "--seed": ("seed", "N"),
     "--init": ("init", "NAME"),
-    "--init-count": ("init_count", "N"),
     "--max-gaussians": ("refinement.max_gaussians", "N"),
 }
 """Options with a value: the field that each sets, and what stands for its value. Every other field is for --set."""
