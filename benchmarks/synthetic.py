@@ -59,7 +59,7 @@ def still_trainer(dataset: Dataset, count: int, arrays: dict[str, np.ndarray] | 
         init_count=count,
         sh_every=1,
         rates=STILL,
-        refinement=RefinementConfig(refine_start=NEVER, refine_stop=NEVER),
+        refinement=RefinementConfig(refine_start=NEVER, refine_stop=NEVER, max_gaussians=count),
         **options,
     )
     trainer = Trainer(dataset, config)

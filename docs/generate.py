@@ -48,8 +48,11 @@ def on_files(files: Any, config: Any) -> Any:
 def api_page() -> str:
     """Every public name with its signature and docstring."""
     import spacesim as ss
+    from spacesim.scenes.spacecraft import Part, Spacecraft, spacecraft
+    from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Pinhole, Projection
     from spacesim.torch import rasterization
 
+    cameras, models = (Projection, Pinhole, Orthographic, OrthographicCamera), (Spacecraft, Part)
     parts = [
         "# API",
         f"Generated from the docstrings of spacesim {ss.__version__}. `import spacesim as ss` gives the names below; "
@@ -63,6 +66,11 @@ def api_page() -> str:
         *(f"### ss.{name}\n\n{block(inspect.getdoc(getattr(ss, name)) or '')}" for name in errors(ss)),
         "## Torch",
         function_entry("spacesim.torch.rasterization", rasterization),
+        "## Cameras of arrays",
+        *(class_entry(f"spacesim.splat.raster.cameras.{cls.__name__}", cls) for cls in cameras),
+        "## Spacecraft",
+        function_entry("spacesim.scenes.spacecraft.spacecraft", spacecraft),
+        *(class_entry(f"spacesim.scenes.spacecraft.{cls.__name__}", cls) for cls in models),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -205,8 +213,9 @@ def options_page() -> str:
 
     lead = (
         "Every field of `TrainConfig`, of `NerfConfig` (`--method nerf`) and of the records in them, with the defaults "
-        "of the records. `--set KEY=VALUE` takes each; `spacesim train --fields` lists them with what preset, method "
-        "and strategy give them. The presets are files in `spacesim/assets/presets/`."
+        "of the records. `--set KEY=VALUE` takes each but `method` and `preset`, which are options of their own: they "
+        "bring what goes with them. `spacesim train --fields` lists all with what preset, method and strategy give "
+        "them. The presets are files in `spacesim/assets/presets/`."
     )
     return f"# Options of a training\n\n{lead}\n\n{reference().strip()}\n\n{reference(NerfConfig).strip()}\n"
 

@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.backend import BackendError
+from spacesim.backend.arrays import Float
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
 from spacesim.data.store import load_truth
+from spacesim.data.structure import Rules, did_you_mean, places_of
+from spacesim.data.toml import dotted
 from spacesim.data.transforms import read_dataset
 from spacesim.methods import load_predictor, load_run, load_scene, preset
 from spacesim.nerf.config import NerfConfig
@@ -25,7 +28,7 @@ from spacesim.splat.compose.output import Composed
 from spacesim.splat.compose.output import compose as _compose
 from spacesim.splat.fit import estimate_sun
 from spacesim.splat.pose import RefinedPose, refine_pose
-from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.cameras import Pinhole, Projection
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import RenderOutput
 from spacesim.splat.raster.render import render as _render
@@ -158,9 +161,13 @@ def train(
     elif choices:
         name, word = next(iter(choices.items()))
         raise InputError(f"{name}: expected none beside a configuration, found {word!r}")
-    unknown = [name for name in options if name not in type(config).__dataclass_fields__]
-    if unknown:
-        raise InputError(f"{unknown[0]}: expected a field of {type(config).__name__}, found none of that name")
+    kind = type(config)
+    for name, value in options.items():
+        if name not in kind.__dataclass_fields__:
+            inner = [dotted(place) for place in places_of(kind, Rules()) if place[-1] == name]
+            settings_hint = f"; did you mean settings={{{inner[0]!r}: {value!r:.60}}}?" if inner else ""
+            hint = settings_hint or did_you_mean(name, kind.__dataclass_fields__)
+            raise InputError(f"{name}: expected a field of {kind.__name__}, found none of that name{hint}")
     config = methods.shortened(config, options.get("iterations"))
     config = methods.with_settings(replace(config, **options), settings or {})
     dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
@@ -236,9 +243,14 @@ def compose(scene: str | Path | PosedScene, out: str | Path, *, size: int | tupl
     return _compose(posed, Path(out), size)
 
 
-def render(gaussians: Gaussians, camera: Camera, **options: Any) -> RenderOutput:
+def render(
+    gaussians: Gaussians, camera: Camera | Projection, *, twist: Float | None = None, **options: Any
+) -> RenderOutput:
     """Gaussians seen by a camera, as Dr.Jit arrays: differentiable by every parameter that has gradients enabled.
 
+    camera: a record, or one of spacesim.splat.raster.cameras, where arrays hold pose and intrinsics
+    twist: Float [6], moves the camera: a rotation vector (radians), then a translation (metres), in camera axes, which
+        take points from the old camera axes to the new ones; zeros to differentiate by the pose
     sh_degree: highest degree of spherical harmonics used; by default all that are stored
     outputs: ("color", "alpha", "depth") by default, also "median_depth" and "normal"; alpha is always there
     features: C arrays [N] of numbers to blend beside them
@@ -247,4 +259,5 @@ def render(gaussians: Gaussians, camera: Camera, **options: Any) -> RenderOutput
     `RenderOutput.to_numpy()` gives (colour [H, W, 3], alpha [H, W], depth [H, W] in metres). Raises ValueError for
     another output or features of another length, BackendError where no backend can run.
     """
-    return _render(gaussians, Pinhole.of(camera), **options)
+    view = camera if isinstance(camera, Projection) else Pinhole.of(camera)
+    return _render(gaussians, view if twist is None else view.moved(twist), **options)

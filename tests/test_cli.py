@@ -15,6 +15,7 @@ import pytest
 from tiny import GENERATE, TRAIN
 
 from spacesim.cli.parser import view_of
+from spacesim.cli.program import in_flags, parser
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_exr, read_png
 from spacesim.data.store import find_unreadable_files, read_dataset
@@ -70,7 +71,7 @@ def test_the_module_is_a_program_too():
         ("--method relight --set light.bounce=7", "light bounce", 7),
         ("--method vanilla --set supersample=3", "supersample", 3),
         ("--set antialiased=true --set antialiased=false", "antialiased", False),
-        ("--init-count 40 --set init_count=30", "init_count", 30),
+        ("--seed 40 --set seed=30", "seed", 30),
         ("--strategy mesh-aware --set strategy.cull_every=77", "strategy cull_every", 77),
         ("--set strategy.growth=0.5 --set strategy=mcmc", "strategy growth", 0.5),
         ("--max-gaussians 99", "refinement max_gaussians", 99),
@@ -79,7 +80,7 @@ def test_the_module_is_a_program_too():
     ],
 )
 def test_settings_reach_the_run(spacesim, tiny_data, tmp_path, words, keys, value):
-    small = "--preset", "demo", "--iterations", 1, "--init-count", 50
+    small = "--preset", "demo", "--iterations", 1, "--set", "init_count=50"
     shadowed = re.search("shadow|park", words) and "shadow.size" not in words
     size = ("--set", "light.shadow.size=16") if shadowed else ()
     assert spacesim("train", tiny_data, "--out", tmp_path / "run", *small, *size, *words.split()).code == 0
@@ -95,8 +96,10 @@ def test_the_help_of_train_fits_on_a_screen(spacesim, monkeypatch):
     assert shown.count("\n") <= 40
     assert re.search(r"--iterations N +steps of training \(default: of the preset\)", shown)
     assert "docs/how-to/choose.md" in shown
-    assert re.findall(r"^  (--[a-z-]+)", shown, re.MULTILINE) == [
-        *("--out", "--method", "--strategy", "--preset", "--iterations", "--seed", "--init", "--init-count"),
+    options = re.findall(r"^  (--[a-z-]+)", shown, re.MULTILINE)
+    assert len(options) <= 16
+    assert options == [
+        *("--out", "--method", "--strategy", "--preset", "--iterations", "--seed", "--init"),
         *(
             "--max-gaussians",
             "--warm-start",
@@ -122,12 +125,13 @@ def test_fields_are_listed_with_the_defaults_of_a_preset(spacesim):
     assert (fine["light.shadow.method.filter"][0], fine["supersample"][0], fine["seed"][0]) == ("variance", "2", "8")
     assert "strategy.cull_every" in listed("--strategy", "mesh-aware")
     assert "strategy.cull_every" not in fast
-    assert " ".join(fast["init_count"]) == "20000 Gaussians at the start, at most [whole number]"
+    meaning = "Gaussians at the start, at most, and no more than refinement.max_gaussians"
+    assert " ".join(fast["init_count"]) == f"20000 {meaning} [whole number]"
 
 
 @pytest.mark.parametrize("strategy", ["mesh-aware", "support-aware"])
 def test_backfill_keeps_to_the_most_gaussians(spacesim, tiny_data, tmp_path, strategy):
-    words = "--preset", "demo", "--iterations", 420, "--init-count", 100, "--max-gaussians", 150
+    words = "--preset", "demo", "--iterations", 420, "--set", "init_count=100", "--max-gaussians", 150
     assert spacesim("train", tiny_data, "--out", tmp_path / "run", "--strategy", strategy, *words).code == 0
     assert 100 <= json.loads((tmp_path / "run/training.json").read_text())["gaussians"] <= 150
 
@@ -336,7 +340,7 @@ def test_a_frame_is_seen_under_the_sun_that_was_estimated(tiny_data, tmp_path):
 
 def test_render_where_the_data_has_moved(spacesim, tiny_data, tmp_path):
     shutil.copytree(tiny_data, tmp_path / "data")
-    short = ("--iterations", 5, "--init-count", 50, "--preset", "demo")
+    short = ("--iterations", 5, "--set", "init_count=50", "--preset", "demo")
     assert spacesim("train", tmp_path / "data", "--out", tmp_path / "run", *short).code == 0
     (tmp_path / "data").rename(tmp_path / "moved")
     out = tmp_path / "a.png"
@@ -357,7 +361,7 @@ def test_export(spacesim, tiny_run, tmp_path):
 def test_paths_with_spaces_and_other_letters(spacesim, tiny_data, tmp_path):
     root = tmp_path / "Größe & Maß <1>"
     shutil.copytree(tiny_data, root / "данные")
-    short = ("--iterations", 3, "--init-count", 20, "--preset", "demo")
+    short = ("--iterations", 3, "--set", "init_count=20", "--preset", "demo")
     assert spacesim("train", root / "данные", "--out", root / "run 1", *short).code == 0
     assert spacesim("eval", root / "run 1", "--data", root / "данные", "--out", root / "e %20").code == 0
     assert "Größe &amp; Maß &lt;1&gt;" in (root / "e %20/report.html").read_text()
@@ -368,7 +372,7 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
     (tmp_path / "data").mkdir()
     small = ("--views", "1", "--test-views", "0", "--resolution", "8", "--spp", "1")
     assert spacesim("generate", "boxsat", "--out", tmp_path / "data", *small).code == 0
-    short = ("--iterations", 2, "--init-count", 20, "--preset", "demo")
+    short = ("--iterations", 2, "--set", "init_count=20", "--preset", "demo")
     assert spacesim("train", tiny_data, "--out", tmp_path / "run", *short).code == 0
 
 
@@ -482,7 +486,19 @@ def test_a_setting_that_cannot_be_is_named(spacesim, tiny_data, tmp_path, words,
         ("train DATA --out OUT --preset huge --method shadow-map", ["--preset", "fine, thesis", "huge"]),
         ("train DATA --out OUT --max-gaussians 0", ["--max-gaussians: expected at least 1, found 0"]),
         ("train DATA --out OUT --init sphere", ["--init", "points", "sphere"]),
-        ("train DATA --out OUT --init-count 0", ["--init-count", "found 0"]),
+        ("train DATA --out OUT --set init_count=0", ["--set init_count: expected at least 1", "found 0"]),
+        (
+            "train DATA --out OUT --set warm_start=true",
+            ["--set warm_start: expected a table", "add --warm-start"],
+        ),
+        ("train DATA --out OUT --set warm_start.steps=4", ["found none; add --warm-start"]),
+        ("train DATA --out RUN", ["expected a new folder, found a run; --resume goes on with it"]),
+        ("generate boxsat --out DATA", ["expected a new folder, found a dataset; --resume goes on with it"]),
+        ("generate boxsat --out OUT --sun 1,2 --suns 2", ["--suns: expected 1, one for each direction given, found 2"]),
+        (
+            "generate boxsat --out OUT --known-test-views 2 --test-suns 0",
+            ["--known-test-views: expected 0 without --test-suns, where --test-views are of"],
+        ),
         ("train DATA --out OUT --method magic", ["--method", "vanilla, relight, shadow-map", "magic"]),
         ("train DATA --out OUT --seed -1", ["--seed", "found -1"]),
         ("train DATA --out OUT --backend vulkan", ["--backend", "vulkan"]),
@@ -523,6 +539,18 @@ def test_bad_usage_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tmp_path, a
     assert not (tmp_path / "out").exists()
 
 
+def test_settings_in_a_sentence_are_told_as_options():
+    options = parser(["train"]).parse_args(["train", "a/seed=3", "--out", "OUT"])
+    asked = "expected sun_direction in every frame, or sun=unknown, or light.field.inputs=view"
+    told = "expected sun_direction in every frame, or --sun unknown, or --set light.field.inputs=view"
+    assert in_flags(f"a/seed=3: {asked}, found none", options) == f"a/seed=3: {told}, found none"
+    assert in_flags("seed: expected refine_poses, found max_gaussians", options).endswith(
+        "--refine-poses, found max_gaussians"
+    )
+    others = "OUT/config.json: refine_poses: expected another, found b=True"
+    assert in_flags(others, options) == others
+
+
 def test_a_folder_that_is_called_like_an_option_is_none(spacesim, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert spacesim("train", "seed", "--out", "out").is_refusal("spacesim: seed: expected a dataset folder")
@@ -537,7 +565,7 @@ UNWRITABLE = ["BELOW_A_FILE/out", *(path for path in ("/proc/out", "/dev/full") 
     "arguments",
     [
         "generate boxsat --views 1 --test-views 0 --resolution 8 --spp 1 --out OUT",
-        "train DATA --preset demo --iterations 2 --init-count 10 --out OUT",
+        "train DATA --preset demo --iterations 2 --set init_count=10 --out OUT",
         "eval RUN --data DATA --out OUT",
         "report EVAL --out OUT/a.html",
         "render RUN --out OUT/a.png",

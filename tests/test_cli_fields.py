@@ -1,13 +1,14 @@
 """The list of fields is read off the records: nothing in it is said a second time, and nothing is left out."""
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
 
 import pytest
 
 from spacesim.cli.fields import fields_of, meanings, reference
 from spacesim.cli.train import OPTIONS
-from spacesim.splat.train.config import METHODS, STRATEGIES, TrainConfig, preset, warm_start
+from spacesim.splat.train.config import METHODS, PRESETS, STRATEGIES, TrainConfig, preset, warm_start
 from spacesim.splat.train.strategies.support_aware import SupportAwareConfig
 
 
@@ -48,9 +49,20 @@ def test_every_field_has_a_meaning(method, strategy):
     assert {key for key, _ in OPTIONS.values()} <= {field.key for field in found}
 
 
+def records_in(record: Any) -> set[str]:
+    """Names of the classes of a record and of those within it."""
+    inner = [getattr(record, f.name) for f in fields(record)]
+    return {type(record).__name__}.union(*(records_in(value) for value in inner if is_dataclass(value)))
+
+
 def test_the_reference_has_a_table_for_each_record():
     shown = reference()
-    assert shown.count("\n## ") + 1 == len(re.findall(r"^## (\w+)$", shown, re.MULTILINE)) == 18
+    tables = re.findall(r"^## (\w+)$", shown, re.MULTILINE)
+    assert shown.count("\n## ") + 1 == len(tables) == len(set(tables))
+    presets = [preset(name, method, strategy) for name in PRESETS for method in METHODS for strategy in STRATEGIES]
+    used = {record for config in presets for record in records_in(replace(config, warm_start=warm_start("fast")))}
+    assert len(used) >= 15
+    assert used - set(tables) == set()
     row = r"| `bias` | number | `10` | strength lambda_b of the receiver-depth bias (4.26), 0 for none |"
     assert row in shown
     assert r"| `init` | mesh \| points \| random \| none | `none` |" in shown

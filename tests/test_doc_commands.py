@@ -46,7 +46,7 @@ OUTPUTS = ("--out", "--ply", "--mesh", "--speedplus", "--bop")
 
 SMALL = {  # options that a command gets, so that it is as small as can be
     "generate": {"--views": "2", "--test-views": "1", "--resolution": "24", "--spp": "1"},
-    "train": {"--preset": "demo", "--iterations": "8", "--init-count": "100"},
+    "train": {"--preset": "demo", "--iterations": "8", "--max-gaussians": "150"},
     "sweep": {"--frames": "2", "--size": "24"},
     "compose": {"--size": "24"},
     "view": {"--port": "0"},
@@ -331,7 +331,7 @@ def smaller(words: tuple[str, ...]) -> list[str]:
     """A command of spacesim at its smallest size."""
     wanted = dict(SMALL.get(words[0], {}))
     if {"nerf", "nerf-relight"} & set(words):  # has no Gaussians
-        wanted.pop("--init-count", None)
+        wanted.pop("--max-gaussians", None)
     if "--mesh" in words:
         wanted |= {"--voxel": "0.2", "--views": "3"}
     found = list(words)
@@ -409,7 +409,7 @@ def given(tiny_data, tmp_path_factory) -> dict[str, Path]:
     """What commands and blocks read: a dataset, one of two boxsats, a run of linear light with shadows, the scene file
     of docs/reference/composed-scenes.md, others."""
     folder = tmp_path_factory.mktemp("given")
-    words = "--method", "shadow-map", "--preset", "demo", "--iterations", 8, "--init-count", 200
+    words = "--method", "shadow-map", "--preset", "demo", "--iterations", 8, "--set", "init_count=200"
     small = "--set", "light.linear=true", "--set", "light.shadow.size=16"
     trained = call("train", tiny_data, "--out", folder / "runs/boxsat", *words, *small)
     assert trained.code == 0, trained.errors
@@ -487,7 +487,7 @@ SMALL_FACE = {  # of the six lines
 SMALL_BLOCKS = {  # in the Python of a document: what takes the place of what
     "README.md": SMALL_FACE,
     "index.md": SMALL_FACE,
-    "how-to/gradients.md": {"640, 480": "32, 24"},
+    "how-to/gradients.md": {"640, 480": "32, 24", "2000": "50"},
     "tutorials/first-model.md": {"256, 256": "24, 24"},
     "tutorials/torch.md": {"96, 400, 100": "24, 50, 3"},
     "tutorials/compose.md": {"frames = 48": "frames = 2", "size=128": "size=24"},
@@ -513,16 +513,13 @@ def shrunk(path: Path, text: str) -> str:
 
 @pytest.mark.parametrize("path", [path for path in DOCUMENTS if blocks(path, "python")], ids=name_of)
 def test_python_runs(path, given, tmp_path, monkeypatch, capsys):
-    """The blocks of a document one after the other, with what they take for given."""
-    from spacesim.splat.raster.gaussians import Gaussians
-
+    """The blocks of a document one after the other; only data and runs are given."""
     monkeypatch.chdir(tmp_path)
     desk = Desk(tmp_path, given, tmp_path, {})
     for name in ("runs/boxsat", *(("data", "run") if path.name not in ("README.md", "index.md") else ())):
         desk.put(name)
-    known: dict[str, Any] = {"gaussians": Gaussians.from_numpy(module_of("benchmarks/common.py").sphere_arrays(50))}
     text = shrunk(path, "\n".join(blocks(path, "python")))
-    exec(compile(text, path.name, "exec"), known)
+    exec(compile(text, path.name, "exec"), {})
     assert PRINTED.get(name_of(path), "") in capsys.readouterr().out
 
 

@@ -117,6 +117,15 @@ def test_names_of_generated_pages():
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=of)
+def test_the_reference_has_what_documents_import(document):
+    """Beside what `ss` gives."""
+    text = document.read_text(encoding="utf-8")
+    for module, names in re.findall(r"^from (spacesim\S*) import ([\w, ]+)$", text, re.MULTILINE):
+        for name in names.split(", "):
+            assert f"### {module}.{name}\n" in generated()["reference/api.md"]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=of)
 def test_python_blocks_parse(document):
     for block in re.findall(r"^```python\n(.*?)^```$", document.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
         ast.parse(block)

@@ -198,7 +198,7 @@ def test_what_is_finished_is_not_done_again(whole, monkeypatch):
 
 
 def test_a_folder_of_something_else_is_refused(whole, tmp_path):
-    with pytest.raises(InputError, match=r"^resume: expected with .*, which holds a reproduction"):
+    with pytest.raises(InputError, match="expected a new folder, found a reproduction; resume=True"):
         reproduce(whole, quiet, (), SMALLEST)
     with pytest.raises(InputError, match="expected a folder of the size 'full', found 'smallest'"):
         reproduce(whole, quiet, (), FULL, resume=True)

@@ -26,7 +26,7 @@ from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.train import train
 
 CONFIG = TrainConfig(preset="demo", iterations=40, init_count=200, checkpoint_every=10, sh_every=20)
-FEW = ("--preset", "demo", "--iterations", "8", "--init-count", "100")
+FEW = ("--preset", "demo", "--iterations", "8", "--set", "init_count=100")
 
 KILLED = """
 import os, signal, sys
@@ -122,7 +122,7 @@ def test_an_unfinished_run_is_refused(spacesim, tiny_run, tiny_data, tmp_path):
     ],
 )
 def test_ctrl_c_during_training(spacesim, tiny_data, tmp_path, program, number, ignored):
-    arguments = ("train", tiny_data, "--out", tmp_path / "run", "--preset", "demo", "--init-count", 200)
+    arguments = ("train", tiny_data, "--out", tmp_path / "run", "--preset", "demo", "--set", "init_count=200")
     command = [sys.executable, "-m", program, *map(str, arguments), "--iterations", "150"]
     before = {one: signal.signal(one, signal.SIG_IGN) for one in ignored}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -607,7 +607,8 @@ def test_resuming_on_other_data_is_refused(tiny_data, tmp_path):
 def test_more_than_fits_into_memory(spacesim, tiny_data, tmp_path):
     many = ("--resolution", 8, "--views", 10**17)
     assert spacesim("generate", "boxsat", "--out", tmp_path / "data", *many).is_refusal("views: expected at most")
-    failed = spacesim("train", tiny_data, "--out", tmp_path / "run", "--init", "random", "--init-count", 10**15)
+    most = "--max-gaussians", 10**15, "--set", f"init_count={10**15}"
+    failed = spacesim("train", tiny_data, "--out", tmp_path / "run", "--init", "random", *most)
     assert failed.code == 1
     assert len(failed.errors) == 1
     assert "memory" in failed.errors[0]

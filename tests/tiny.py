@@ -11,7 +11,7 @@ from pathlib import Path
 from spacesim.cli import main
 
 GENERATE = ("--views", "6", "--test-views", "2", "--resolution", "40", "--spp", "4")
-TRAIN = ("--preset", "demo", "--iterations", "50", "--init-count", "300")
+TRAIN = ("--preset", "demo", "--iterations", "50", "--set", "init_count=300")
 PROGRESS = re.compile(r"(generate|train|evaluate|sweep|compose|export): \d+/\d+ ")
 
 

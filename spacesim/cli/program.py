@@ -7,6 +7,7 @@ from spacesim import interrupts  # first: from here on Ctrl-C is told in a sente
 import argparse
 import errno
 import logging
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -120,10 +121,23 @@ def parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
 
 def in_flags(sentence: str, options: argparse.Namespace) -> str:
     """An error of the library, "iterations: expected ...", with the option in the place of the field that it begins
-    with: "--iterations: expected ...". Other sentences, and those that begin with a path, stay as they are."""
+    with: "--iterations: expected ...", and then also in that of words like test_views. In any sentence "resume=True"
+    becomes "--resume", and "sun=unknown" "--sun unknown", where there is such an option."""
+
+    def option(match: re.Match[str]) -> str:
+        flag = options.option_of(match[1], options) or options.flags.get(match[1])
+        if not flag:
+            return match[0]
+        return flag if match[2] == "True" else f"{flag}{'=' if ' ' in flag else ' '}{match[2]}"
+
+    sentence = re.sub(r"(?<![^ ])([a-z_]+(?:\.[a-z_]+)*)=([\w-]+)(?=[ ,;]|$)", option, sentence)
     field, colon, rest = sentence.partition(": ")
     typed = [value for option in vars(options).values() for value in (option if isinstance(option, list) else [option])]
     if not colon or field in {str(value) for value in typed if isinstance(value, str | Path)}:
         return sentence
     flag = options.option_of(field, options) or options.flags.get(field)
-    return f"{flag}: {rest}" if flag else sentence
+    if not flag or " " in flag:  # beside --set names of fields are what is typed
+        return f"{flag}: {rest}" if flag else sentence
+    expected, found, end = rest.partition(", found ")  # what was found stays as it was typed
+    names = re.sub(r"(?<![^ ])[a-z]+_[a-z_]+(?=[ ,;]|$)", lambda word: options.flags.get(word[0], word[0]), expected)
+    return f"{flag}: {names}{found}{end}"

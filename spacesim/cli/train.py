@@ -18,7 +18,6 @@ OPTIONS = {
     "--iterations": ("iterations", "N"),
     "--seed": ("seed", "N"),
     "--init": ("init", "NAME"),
-    "--init-count": ("init_count", "N"),
     "--max-gaussians": ("refinement.max_gaussians", "N"),
 }
 """Options with a value: the field that each sets, and what stands for its value. Every other field is for --set."""
@@ -68,22 +67,21 @@ def option_of(field: str, options: argparse.Namespace) -> str | None:
     from spacesim.nerf.config import NerfConfig
     from spacesim.splat.train.config import TrainConfig
 
-    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | {
-        "warm_start": "--warm-start",
-        "refine_poses": "--refine-poses",
-        "sun": "--sun",
+    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | {"sun": "--sun"}
+    keys = {text.partition("=")[0].strip() for text in options.set}  # of which some are no fields
+    switches = {"warm_start": "--warm-start", "refine_poses": "--refine-poses"}  # take no value
+    options_by_key |= {key: option for key, option in switches.items() if key not in keys}
+    known = {key.partition(".")[0] for key in keys} | {
+        *TrainConfig.__dataclass_fields__,
+        *NerfConfig.__dataclass_fields__,
     }
-    typed = {text.partition("=")[0].partition(".")[0].strip() for text in options.set}  # of which some are no fields
-    is_field = field.partition(".")[0] in typed | set(TrainConfig.__dataclass_fields__) | set(
-        NerfConfig.__dataclass_fields__
-    )
-    return options_by_key.get(field) or (f"--set {field}" if is_field else None)
+    return options_by_key.get(field) or (f"--set {field}" if field.partition(".")[0] in known else None)
 
 
 def run(options: argparse.Namespace) -> None:
     from spacesim.cli.fields import listing
     from spacesim.data.store import read_dataset
-    from spacesim.methods import preset, shortened, train, with_settings
+    from spacesim.methods import preset, train, with_settings
     from spacesim.progress import report_training, show_progress
     from spacesim.splat.train.config import TrainConfig, warm_start
 
@@ -96,7 +94,6 @@ def run(options: argparse.Namespace) -> None:
             config = replace(config, warm_start=warm_start(options.preset))
     elif others := [*(["warm_start"] if options.warm_start else []), *(key for key in chosen if key not in _OF_BOTH)]:
         raise InputError(f"{others[0]}: expected with a method of Gaussians, found with {options.method}")
-    config = shortened(config, options.iterations)
     try:
         config = with_settings(config, chosen | dict(map(parse_setting, options.set)))
     except InputError as error:
@@ -136,6 +133,8 @@ def _advice(sentence: str) -> str:
     field, _, rest = sentence.partition(": ")
     if rest.startswith(("expected light to be there", "expected light.shadow to be there")):
         return "; try --method shadow-map"
+    if field == "warm_start" or rest.startswith("expected warm_start to be there"):
+        return "; add --warm-start"
     is_unknown = f"found {field.rpartition('.')[2]!r}" in rest
     return "; see spacesim train --fields" if is_unknown and "did you mean" not in rest else ""
 

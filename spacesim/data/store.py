@@ -229,9 +229,7 @@ class DatasetWriter(FrameWriter):
 
     def _check_resumable(self, scene: Mapping[str, Any], resume: bool) -> None:
         if not resume:
-            raise InputError(
-                f"resume: expected with {self.root}, which holds a dataset, or a new folder, found neither"
-            )
+            raise InputError(f"{self.root}: expected a new folder, found a dataset; resume=True goes on with it")
         path = self.root / "scene.json"
         existing = read_json(path, MAX_LIST_BYTES)
         existing = existing if isinstance(existing, dict) else {}

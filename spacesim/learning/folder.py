@@ -130,7 +130,7 @@ def describe_data(dataset: Dataset) -> dict[str, Any]:
 
 def _check_resumable(out: Path, described: dict[str, Any], resume: bool, read_config: ReadConfig) -> None:
     if not resume:
-        raise InputError(f"resume: expected with {out}, which holds a run already, or a new folder, found neither")
+        raise InputError(f"{out}: expected a new folder, found a run; resume=True goes on with it")
     config, data = read_config(out / "config.json")
     data["path"] = described["data"]["path"]  # it may have moved
     if same_digest(str(data.get("digest")), described["data"]["digest"]):

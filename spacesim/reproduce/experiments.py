@@ -152,8 +152,10 @@ def figure_fixed_sun(size: Size) -> list[Work]:
 def telescope(size: Size) -> Experiment:
     """Figure 6.2, on the schedule of section 6.2.2."""
     made = _trained(size, "thesis", "shadow-map", parts=("own", "suns"))
-    stop = {"iterations": size.telescope_iterations, "refinement.refine_stop": size.telescope_iterations * 4 // 5}
-    return replace(made, name=TELESCOPE, data="telescope", config=with_settings(made.config, stop))
+    iterations = size.telescope_iterations
+    refinement = replace(made.config.refinement, refine_stop=iterations * 4 // 5)
+    config = replace(made.config, iterations=iterations, refinement=refinement)
+    return replace(made, name=TELESCOPE, data="telescope", config=config)
 
 
 def curves(size: Size) -> list[Curve]:

@@ -96,7 +96,7 @@ def _open(out: Path, size: Size, resume: bool) -> None:
         write_json(marker, this)
         return
     if not resume:
-        raise InputError(f"resume: expected with {out}, which holds a reproduction, or a new folder, found neither")
+        raise InputError(f"{out}: expected a new folder, found a reproduction; resume=True goes on with it")
     there = read_json(marker)
     there = there if isinstance(there, dict) else {}
     for key, value in this.items():

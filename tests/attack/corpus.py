@@ -21,7 +21,7 @@ from spacesim.splat.train.train import train
 
 SIDE = 16  #: pixels of pictures
 TINY = ("--views", "3", "--test-views", "1", "--suns", "2", "--resolution", str(SIDE), "--spp", "1")
-FEW = ("--preset", "demo", "--init-count", "40")
+FEW = ("--preset", "demo", "--set", "init_count=40")
 ONE = ("--views", "1", "--test-views", "0", "--resolution", "8", "--spp", "1")
 SCENE = """
 [[objects]]
@@ -141,7 +141,7 @@ KINDS = (
         "checkpoint",
         ("half/checkpoints/step_00000010.safetensors", "half/checkpoints/seconds.json", "half/config.json"),
         (m.of_safetensors, m.of_json, m.of_bytes, m.other_file),
-        _words("train data --out half --iterations 12 --resume --warm-start --preset demo --init-count 40"),
+        _words("train data --out half --iterations 12 --resume --warm-start --preset demo --set init_count=40"),
     ),
     Kind(
         "metrics.json", ("eval/metrics.json",), (m.of_json, m.of_json, m.of_json, m.of_bytes, m.other_file),
@@ -222,7 +222,13 @@ _SETTINGS = (
     *("prior", "random_background", "light.field.inputs", "light.bounce", "light.linear", "light.tone"),
     *("light.exposure", "light.shadow.bias", "light.shadow.grazing", "light.shadow.method"),
     *("light.shadow.method.filter", "light.shadow.method.sun_radius_deg", "light.shadow.size"),
-    *("light.shadow.method.gradients", "light.shadow.refine", "visibility_weight", "refinement.prune_opacity"),
+    *(
+        "init_count",
+        "light.shadow.method.gradients",
+        "light.shadow.refine",
+        "visibility_weight",
+        "refinement.prune_opacity",
+    ),
     *("refinement.split_screen_size", "strategy", "strategy.growth", "warm_start", "light", "rates"),
 )
 _LINES = (
@@ -230,7 +236,7 @@ _LINES = (
      ("--suns", "--sun", "--distance", "--exposure", "--seed", "--units", "--up", "--fov", "--test-suns",
       "--known-test-views", "--shared-test-views", "--resolution", "--resume", "--estimate", "--print", "--workers")),
     (_TRAIN,
-     ("--method", "--strategy", "--init", "--init-count", "--warm-start", "--preset", "--seed", "--resume", "--fields",
+     ("--method", "--strategy", "--init", "--warm-start", "--preset", "--seed", "--resume", "--fields",
       "--max-gaussians", "--method relight", "--method shadow-map", "--method shadow-splat", "--init random", "--set",
       *(f"--set {key}={{}}" for key in _SETTINGS))),
     ("render run --camera camera.json --out {out}.png",

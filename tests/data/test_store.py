@@ -240,7 +240,7 @@ def test_a_killed_writer_leaves_whole_frames_only(tmp_path):
 
 
 def test_writer_refuses_what_is_not_its_own(root, tmp_path):
-    with pytest.raises(InputError, match=r"resume: expected with .* which holds a dataset"):
+    with pytest.raises(InputError, match="expected a new folder, found a dataset; resume=True"):
         DatasetWriter(root, SCENE)
     with pytest.raises(InputError, match="'seed' differs"):
         DatasetWriter(root, {**SCENE, "seed": 4}, resume=True)

@@ -104,7 +104,7 @@ train(read_dataset(Path({str(dataset.root)!r})), Path({str(tmp_path / "run")!r})
     ]
     with pytest.raises(InputError, match="training has not ended"):
         load_run(tmp_path / "run")
-    with pytest.raises(InputError, match="holds a run already"):
+    with pytest.raises(InputError, match="expected a new folder, found a run"):
         train(dataset, tmp_path / "run", CONFIG)
     with pytest.raises(InputError, match="was started with seed 0"):
         train(dataset, tmp_path / "run", replace(CONFIG, seed=5), resume=True)
@@ -260,7 +260,6 @@ def test_the_commands(spacesim, tiny_data, tmp_path):
     [
         (["--strategy", "mcmc"], "--strategy: expected with a method of Gaussians, found 'mcmc' with nerf"),
         (["--init", "mesh"], "--init: expected with a method of Gaussians, found with nerf"),
-        (["--init-count", "5"], "--init-count: expected with a method of Gaussians"),
         (["--max-gaussians", "5"], "--max-gaussians: expected with a method of Gaussians"),
         (["--warm-start"], "--warm-start: expected with a method of Gaussians"),
         (["--sun", "unknown"], "--sun: expected with a method of Gaussians"),

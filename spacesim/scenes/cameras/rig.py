@@ -94,7 +94,7 @@ class RigConfig(ABC):
             expect(possible, "sun", expected, (azimuth, elevation))
         if self.sun:
             fits = self.suns in (type(self).suns, len(self.sun))
-            expect(fits, "suns", f"{len(self.sun)} as in sun", self.suns)
+            expect(fits, "suns", f"{len(self.sun)}, one for each direction given", self.suns)
         if self.known_test_views and not self.test_suns:
             expected = "0 without test_suns, where test_views are of the training Suns"
             expect(False, "known_test_views", expected, self.known_test_views)

@@ -80,7 +80,7 @@ class TrainConfig:
     iterations: int = 7_000  #: steps of training
     seed: int = 0  #: random seed: same seed, same bits
     views_per_step: int = 1  #: views whose mean gradient a step follows; the thesis takes one
-    init_count: int = 20_000  #: Gaussians at the start, at most
+    init_count: int = 20_000  #: Gaussians at the start, at most, and no more than refinement.max_gaussians
     splatfacto_start: bool = False  #: turned at random; `random` fills 10 scene scales, in greys: as splatfacto starts
     sh_degree: int = 3  #: of spherical harmonics, of `vanilla`; 0 to 3
     sh_every: int = 1_000  #: iterations after which one more degree of spherical harmonics joins
@@ -273,10 +273,12 @@ def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConf
     """`config` with fields set by their dotted names: {"light.shadow.bias": 5, "light.shadow.refine": "none"}.
 
     A value is what config.json has for such a field; "none" is None where a field can be that, and the name of an
-    alternative, as in {"light.field.inputs": "directions"}, stands for it with its defaults. Raises InputError
+    alternative, as in {"light.field.inputs": "directions"}, stands for it with its defaults. Fewer `iterations` shorten
+    the schedule, see `shortened`; other fields of it are put in after that. Raises InputError
     "light.shadow.bias: expected ..., found ..." for a name or a value that cannot be.
     """
-    values = config.to_json()
+    iterations = settings.get("iterations")
+    values = (shortened(config, iterations) if type(iterations) is int else config).to_json()
     for name in sorted(settings, key=lambda name: name.count(".")):  # what is chosen first, then what it has
         keys = name.split(".")
         table = values
@@ -285,19 +287,18 @@ def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConf
             if not isinstance(inner, dict):
                 first = ".".join(keys[:depth])
                 if inner is None:
-                    raise InputError(
-                        f"{name}: expected {first} to be there, found none under the method {config.method}"
-                    )
+                    why = f" under the method {config.method}" if keys[0] == "light" else ""
+                    raise InputError(f"{name}: expected {first} to be there, found none{why}")
                 raise InputError(f"{name}: expected {first} alone, which has no fields, found {name}")
             table = inner
         table[keys[-1]] = _put(table.get(keys[-1]), settings[name])
     result = structure(TrainConfig, Document("", values, {}), Rules(none="none"))
-    if isinstance(result.strategy, McmcConfig):
-        for name in settings:
-            first, _, key = name.partition(".")
-            if first == "refinement" and key and key not in McmcConfig.reads:
-                found = "mcmc, which moves and copies"
-                raise InputError(f"{name}: expected a strategy that prunes and splits, found {found}")
+    reads: tuple[str, ...] | None = getattr(result.strategy, "reads", None)
+    for name in settings:
+        first, _, key = name.partition(".")
+        if reads is not None and first == "refinement" and key and key not in reads:
+            found = f"{result.strategy.kind}, which reads {', '.join(reads)} alone"
+            raise InputError(f"{name}: expected a strategy that reads it, found {found}")
     return result
 
 

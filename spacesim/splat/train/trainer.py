@@ -61,7 +61,8 @@ class Trainer(TrainingLoop):
         self.pictures = LearnedPictures(dataset, config, first_suns, poses)
         self.scene_scale = scene_scale(dataset)
         features = config.light.features if config.light else 0
-        start = config.init_count, config.sh_degree, config.seed, features, config.init_box, config.splatfacto_start
+        count = min(config.init_count, config.refinement.max_gaussians)
+        start = count, config.sh_degree, config.seed, features, config.init_box, config.splatfacto_start
         self.gaussians = initial_gaussians(dataset, config.init, *start)
         self.optimizer = Adam(self.gaussians.rows())
         self.light = self._initial_light(dataset)

@@ -366,5 +366,5 @@ def test_wrong_kinds_and_options(tmp_path, caplog):
 def test_training_takes_what_was_imported(spacesim, tmp_path):
     done = spacesim("import", "blender", blender(tmp_path / "src"), "--out", tmp_path / "data")
     assert done.code == 0, done.errors
-    few = "--preset", "demo", "--iterations", 2, "--init-count", 20
+    few = "--preset", "demo", "--iterations", 2, "--set", "init_count=20"
     assert spacesim("train", tmp_path / "data", "--out", tmp_path / "run", *few).code == 0

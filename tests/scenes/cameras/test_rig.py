@@ -365,7 +365,7 @@ def test_scenes_say_their_rig(tmp_path):
         (FibonacciRig, {"views": 0}, "views: expected at least 1, found 0"),
         (FibonacciRig, {"distance": 0.0}, "distance: expected metres from 1e-09 to 1e\\+12, found 0.0"),
         (FibonacciRig, {"distance": float("nan")}, "distance: "),
-        (FibonacciRig, {"sun": ((1.0, 2.0),), "suns": 2}, "suns: expected 1 as in sun, found 2"),
+        (FibonacciRig, {"sun": ((1.0, 2.0),), "suns": 2}, "suns: expected 1, one for each direction given, found 2"),
         (PolarArcRig, {"arc_deg": 361.0}, "arc_deg: expected an angle above 0, up to 360 degrees, found 361.0"),
         (PolarArcRig, {"arc_azimuth_deg": float("inf")}, "arc_azimuth_deg: "),
         (RandomRig, {"near": -1.0}, "near: expected metres from 1e-09 to 1e\\+12, found -1.0"),

@@ -196,7 +196,7 @@ def test_bad_scene_folder_and_camera_are_refused(made, tmp_path):
     with pytest.raises(InputError, match="workers: expected at least 1, found 0"):
         generate(boxsat(), tmp_path / "b", workers=0)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(InputError, match="resume: expected"):
+    with pytest.raises(InputError, match="expected a new folder, found a dataset"):
         generate(boxsat(), made)
     with pytest.raises(InputError, match="'spp' differs"):
         generate(boxsat(spp=5), made, resume=True)

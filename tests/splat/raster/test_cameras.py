@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from splats import random_splats
 
+import spacesim as ss
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
@@ -371,3 +372,23 @@ def test_order_holds_however_far_the_camera_is(distance):
     output = render(Gaussians.from_numpy(arrays), Pinhole.of(view), features=list(np.eye(8, dtype=np.float32)))
     shares = output.image("features")[4, 4]
     np.testing.assert_array_equal(np.argsort(-shares), np.argsort(arrays["means"][:, 1]))
+
+
+def test_the_public_render_takes_a_motion_and_a_camera_of_arrays():
+    """Along a gradient by the twist the picture changes as it says; a camera of arrays gives the record's picture."""
+    model, view = Gaussians.from_numpy(wide_splats()), record("perspective")
+
+    def brightness(twist) -> ad.Float:
+        return dr.mean(ss.render(model, view, twist=twist).alpha)
+
+    twist = dr.zeros(ad.Float, 6)
+    dr.enable_grad(twist)
+    dr.backward(brightness(twist))
+    gradient = np.array(dr.grad(twist), np.float64)
+    assert np.linalg.norm(gradient) > 1e-3
+    step = 1e-2 * gradient / np.linalg.norm(gradient)
+    ahead, behind = (float(brightness(upload(sign * step))[0]) for sign in (1, -1))
+    np.testing.assert_allclose((ahead - behind) / 2e-2, np.linalg.norm(gradient), rtol=1e-2)
+    np.testing.assert_array_equal(
+        ss.render(model, Pinhole.of(view)).image("color"), ss.render(model, view).image("color")
+    )

@@ -145,7 +145,7 @@ train(read_dataset(Path({str(small_dataset.root)!r})), Path({str(tmp_path / "run
     assert died.returncode == -9, died.stderr
     with pytest.raises(InputError, match="resume"):
         load_run(tmp_path / "run")
-    with pytest.raises(InputError, match="holds a run already"):
+    with pytest.raises(InputError, match="expected a new folder, found a run; resume=True"):
         train(small_dataset, tmp_path / "run", CONFIG)
     with pytest.raises(InputError, match="seed"):
         train(small_dataset, tmp_path / "run", replace(CONFIG, seed=5), resume=True)
@@ -352,6 +352,13 @@ def test_opaque_pictures_are_trained_over_black(opaque_dataset):
     assert not trainer.background(3, trainer.views[0]).any()
     trainer.run(lambda progress: None, lambda: None)
     assert psnr(trainer.gaussians, opaque_dataset) > 20
+
+
+@pytest.mark.parametrize("init", ["points", "random"])
+def test_training_starts_with_no_more_gaussians_than_it_may_ever_have(small_dataset, init):
+    config = replace(CONFIG, init=init, init_count=60, refinement=replace(REFINEMENT, max_gaussians=25))
+    trainer = Trainer(small_dataset, config)
+    assert (trainer.gaussians.count, len(trainer.strategy.state["seen"])) == (25, 25)
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs processor affinity")

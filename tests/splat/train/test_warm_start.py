@@ -420,7 +420,7 @@ def test_a_training_that_ends_before_the_warm_start_does_is_told(spacesim, tiny_
     """`demo` gathers for 500 and fades over 500; `remark` begins at their sum."""
     table = WarmStartConfig(steps=20, decay=10)
     assert [bool(table.remark(iterations)) for iterations in (5, 20, 30, 31)] == [True, True, True, False]
-    line = ["train", tiny_data, "--preset", "demo", "--init-count", "300", "--init", "random", "--warm-start"]
+    line = ["train", tiny_data, "--preset", "demo", "--set", "init_count=300", "--init", "random", "--warm-start"]
     done = spacesim(*line, "--out", tmp_path / "short", "--set", "iterations=3")  # --iterations shortens it
     assert done.code == 0
     told = [record.message for record in caplog.records if record.levelname == "WARNING"]

@@ -37,7 +37,7 @@ class RefinementConfig:
     refine_every: int = 100  #: iterations between two refinements (table 5.1)
     reset_every: int = 30  #: refinements between two opacity resets (table 5.1)
     pause_after_reset: int = 1000  #: iterations without refinement (table 5.1)
-    max_gaussians: int = 250_000  #: at most this many Gaussians (table 5.1)
+    max_gaussians: int = 250_000  #: at most this many Gaussians, at the start and ever (table 5.1)
     grow_gradient: float = 0.0008  #: grow above this absolute screen-space gradient, half images per unit of loss
     duplicate_scale: float = 0.01  #: of those that grow, larger ones are split, smaller ones duplicated
     refine_start: int = 500  #: iterations before the first refinement

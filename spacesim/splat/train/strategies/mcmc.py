@@ -32,6 +32,7 @@ class McmcConfig:
     `RefinementConfig`, whose other rules do not count here."""
 
     kind: ClassVar[str] = "mcmc"
+    #: of `RefinementConfig`; a strategy without this reads all
     reads: ClassVar[tuple[str, ...]] = ("refine_every", "max_gaussians", "refine_start", "refine_stop")
 
     min_opacity: float = 0.005  #: at most so opaque is dead
