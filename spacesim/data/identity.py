@@ -2,9 +2,10 @@
 by names of which no two are the same."""
 
 import hashlib
+import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -29,16 +30,14 @@ def frames_digest(root: Path, frames: Sequence[Frame]) -> str:
     root: their dataset's. Raises OSError where a picture is missing, InputError where it cannot be read.
     """
     heads = [(f.file_path, (root / f.file_path).stat().st_size, _numbers(f), f.sun and f.sun.angles) for f in frames]
-    manifest = _read_manifest(root)
-    written = (root / MANIFEST).stat().st_mtime_ns if manifest else 0
-
-    def content(frame: Frame) -> list[str | None]:
-        parts = frame.silhouette_path, frame.mask_path
-        picture = _content(root, frame.file_path, manifest, written)
-        return [picture, *(_part_content(root, path, manifest, written) for path in parts)]
-
-    with ThreadPoolExecutor(_THREADS) as pool:
-        contents = list(pool.map(content, frames))
+    digests = _content_digests(root, [p for f in frames for p in (f.file_path, f.silhouette_path, f.mask_path) if p])
+    contents = [
+        [
+            digests[f.file_path] or digest_of(root / f.file_path),
+            *(path and digests[path] for path in (f.silhouette_path, f.mask_path)),
+        ]
+        for f in frames
+    ]
     return "-".join(hashlib.sha256(repr(part).encode()).hexdigest()[:16] for part in (heads, contents))
 
 
@@ -47,25 +46,31 @@ def same_digest(one: str, other: str) -> bool:
     return all(a == b for a, b in zip(one.split("-"), other.split("-"), strict=False))
 
 
-def _read_manifest(root: Path) -> dict[str, str]:
+def _content_digests(root: Path, paths: Sequence[str]) -> dict[str, str | None]:
+    """SHA-256 of files, None of one that cannot be read: what SHA256SUMS says, of files that are not newer than it."""
     try:
-        return read_manifest(root)
-    except InputError:  # a broken one: files tell themselves
-        return {}
+        manifest = read_manifest(root)
+        written = (root / MANIFEST).stat().st_mtime_ns if manifest else 0
+    except (InputError, OSError):  # a broken one: files tell themselves
+        manifest, written = {}, 0
+    told = {path: manifest[path] for path in paths if path in manifest and _changed(root / path) <= written}
+    others = [path for path in dict.fromkeys(paths) if path not in told]
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return {**told, **dict(zip(others, pool.map(lambda path: _digest_of(root / path), others), strict=True))}
 
 
-def _content(root: Path, path: str, manifest: Mapping[str, str], written: int) -> str:
-    """SHA-256 of a file: what SHA256SUMS says of one that has not changed since that was `written` (nanoseconds)."""
-    if path in manifest and (root / path).stat().st_mtime_ns <= written:
-        return manifest[path]
-    return digest_of(root / path)
-
-
-def _part_content(root: Path, path: str | None, manifest: Mapping[str, str], written: int) -> str | None:
-    """None where there is none: what does not need it does not ask."""
+def _changed(path: Path) -> float:
+    """Nanoseconds."""
     try:
-        return None if path is None else _content(root, path, manifest, written)
-    except (OSError, InputError):
+        return path.stat().st_mtime_ns
+    except OSError:
+        return math.inf
+
+
+def _digest_of(path: Path) -> str | None:
+    try:
+        return digest_of(path)
+    except InputError:
         return None
 
 
