@@ -113,7 +113,7 @@ def rows_of(kind: str, size: str) -> Iterator[Row]:
     if kind == "thesis":
         configs = dict(shadows.configurations("thesis", size))
         yield Row("none", "none", configs["none"], "none")
-        for name in ("map", "splat", "park"):
+        for name in ("map", "splat", "baseline-park"):
             yield Row(name, name, configs[name], "others")
         for name in ("map", "splat"):
             yield Row(f"{name}-ratio", name, configs[name], "ratio")

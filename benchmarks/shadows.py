@@ -97,7 +97,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
             yield name, whole
             yield f"{name}, no bias", with_shadow(whole, bias=0.0)
             yield f"{name}, no refinement", with_shadow(whole, refine=None)
-        yield "park", replace(preset(size, "park"), antialiased=False, supersample=1)
+        yield "baseline-park", replace(preset(size, "baseline-park"), antialiased=False, supersample=1)
         return
     relit, mapped, splatted = (as_ours(preset(size, method)) for method in ("relight", "shadow-map", "shadow-splat"))
     yield "none, surface", relit
@@ -132,8 +132,8 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "splat, surface, refinement told the Sun", with_shadow(splatted, refine=told)
     yield "splat, surface, no bounce, refinement told the Sun", with_bounce(with_shadow(splatted, refine=told), 0)
     if splatted.supersample == 1:
-        yield "none, surface, pixels of four", replace(relit, supersample=2)
-        yield "splat, surface, pixels of four", replace(splatted, supersample=2)
+        yield "none, surface, 2x2 samples", replace(relit, supersample=2)
+        yield "splat, surface, 2x2 samples", replace(splatted, supersample=2)
     else:
         yield "none, surface, pixels of one", replace(relit, supersample=1)
         yield "splat, surface, pixels of one", replace(splatted, supersample=1)

@@ -95,7 +95,7 @@ def configurations(kind: str, options: argparse.Namespace) -> Iterator[tuple[str
         most = made().refinement
         yield "mcmc", made("mcmc", refinement=replace(most, max_gaussians=options.mcmc_gaussians))
     if kind == "ours":
-        yield "default, faint kept", made(refinement=replace(made().refinement, prune_opacity=0.005))
+        yield "default, prune_opacity 0.005", made(refinement=replace(made().refinement, prune_opacity=0.005))
         yield "default, discs", made(flatten_weight=1.0)
         yield "default, depth and normals", made(depth_weight=3.0, normal_weight=0.05)
         yield "default, mesh prior", made(depth_weight=3.0, normal_weight=0.05, prior="mesh")

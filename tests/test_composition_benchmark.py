@@ -18,7 +18,7 @@ def test_rows_by_kind_and_by_name():
     import composition
 
     names = [row.name for row in composition.chosen_rows("thesis,ours", "demo")]
-    assert names[:4] == ["none", "map", "splat", "park"]
+    assert names[:4] == ["none", "map", "splat", "baseline-park"]
     assert len(set(names)) == len(names)
     chosen = composition.chosen_rows("map-ratio,none", "demo")
     assert [(row.name, row.run, row.shadows) for row in chosen] == [

@@ -35,7 +35,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     meanings = {field.key: field for field in fields_of(TrainConfig(preset="fast"))}
     parser.usage = "spacesim train DATA --out RUN [options]"
     parser.formatter_class = _help
-    parser.epilog = "Which method, strategy and preset to take: docs/how-to/choose.md"
+    parser.epilog = "All fields: spacesim train --fields. Which to take: docs/how-to/choose.md, in the repository"
     parser.add_argument("data", type=Path, nargs="?" if lists else None, metavar="DATA", help="folder of the dataset")
     parser.add_argument("--out", type=Path, required=not lists, metavar="RUN", help="folder that the run is written to")
     for option, (key, value) in OPTIONS.items():

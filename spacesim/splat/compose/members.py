@@ -70,7 +70,7 @@ class Member:
     def cross_shadow_config(self) -> ShadowConfig:
         """How shadows of other models fall on it: as its own, but where the Sun's picture shows the others alone, a
         depth test must know how much of a pixel they cover, as a faint rim is no wall and a veil lets light through.
-        Neither bias nor lifted points are needed, as no surface is tested against itself."""
+        Neither bias nor offset points are needed, as no surface is tested against itself."""
         method = self.shadow.method
         if isinstance(method, MappingConfig) and method.filter in ("bilinear", "median"):
             method = replace(method, filter="percentage-closer", radius=0.5)

@@ -49,8 +49,8 @@ class ShadowConfig:
     method: MappingConfig | SplattingConfig = field(default_factory=MappingConfig)  #: shadow mapping or splatting (4.3)
     size: int = 512  #: pixels of each side of the Sun's picture, of which the thesis names none
     bias: float = 10.0  #: strength lambda_b of the receiver-depth bias (4.26), 0 for none
-    #: what holds at a grazing Sun, too, where the thesis's bias goes to 0: a bias (`grazing_bias`), lifted points
-    #: (`offset_receivers`), or both
+    #: what holds at a grazing Sun, too, where the thesis's bias goes to 0: a bias (`grazing_bias`), points offset
+    #: along the normals (`offset_receivers`), or both
     grazing: Literal["none", "bias", "lift", "both"] = "none"
     reach: float = 2.0  #: of `grazing_bias`, standard deviations
     softness: float = 1e-6  #: epsilon_s of 4.5 as a share of the farthest training camera's distance

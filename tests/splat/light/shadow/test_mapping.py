@@ -307,7 +307,7 @@ def test_bias_clears_a_wall_and_keeps_its_shadow(elevation):
 
 @pytest.mark.parametrize(("elevation", "most"), [(10, 0.05), (5, 0.2)])
 def test_grazing_suns(elevation, most):
-    """Where the thesis's bias leaves a wall dark, lifted points clear it, and a real shadow stays."""
+    """Where the thesis's bias leaves a wall dark, offset points clear it, and a real shadow stays."""
     assert share(elevation, "thesis") > 0.4
     assert share(elevation, "lifted") < most
     assert share(elevation, "grazing bias") < 0.85 * share(elevation, "thesis")
