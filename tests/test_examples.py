@@ -111,8 +111,11 @@ def test_refine_pose(data, run):
 
 
 def test_radiance_fields(data, tmp_path):
-    trained = example("07_radiance_fields").main(data, tmp_path / "field", tmp_path / "out", size=32, iterations=60)
+    text = (EXAMPLES / "07_radiance_fields.toml").read_text()
+    text = text.replace("../out/examples/field", "field").replace("[256, 256]", "[32, 32]")
+    (tmp_path / "scene.toml").write_text(text)
+    trained = example("07_radiance_fields").main(data, tmp_path / "field", tmp_path / "scene.toml", iterations=60)
     assert trained.gaussian_count is None
-    numbers = read_png(next((tmp_path / "out/id").glob("*.png")))
+    numbers = read_png(next((tmp_path / "fields/id").glob("*.png")))
     assert numbers.shape == (32, 32)
-    assert read_png(next((tmp_path / "out").glob("rgb/*.png"))).shape[:2] == (32, 32)
+    assert read_png(next((tmp_path / "fields").glob("rgb/*.png"))).shape[:2] == (32, 32)
