@@ -408,23 +408,15 @@ def test_lenient_culling_halves_the_opacity_threshold(kind):
         assert gaussians.count == left
 
 
+ONE_STEP = "--preset", "demo", "--iterations", 1, "--set", "init_count=50"
+
+
 def test_what_is_too_faint_is_an_option(spacesim, tiny_data, tmp_path):
     for least, left in ((0.05, 1), (0.03, 2), (0.005, 3)):
         gaussians = model([0.3, 0.3, 0.3], [0.9, 0.04, 0.02])
         refine(DefaultStrategy(RefinementConfig(prune_opacity=least), 1.0, 3), gaussians)
         assert gaussians.count == left
-    line = [
-        "train",
-        tiny_data,
-        "--preset",
-        "demo",
-        "--set",
-        "init_count=50",
-        "--iterations",
-        1,
-        "--out",
-        tmp_path / "run",
-    ]
+    line = ["train", tiny_data, "--out", tmp_path / "run", *ONE_STEP]
     for wrong in ("0", "0.5", "nan"):
         refused = spacesim(*line, "--set", f"refinement.prune_opacity={wrong}")
         assert refused.is_refusal("--set refinement.prune_opacity: expected", wrong)
@@ -437,18 +429,7 @@ def test_what_is_too_faint_is_an_option(spacesim, tiny_data, tmp_path):
 def test_what_is_too_wide_is_an_option(spacesim, tiny_data, tmp_path):
     """Methods of light split at a smaller size by themselves: a Gaussian has one visibility."""
     assert preset("fast", "shadow-map").refinement.split_screen_size < preset("fast").refinement.split_screen_size
-    line = [
-        "train",
-        tiny_data,
-        "--preset",
-        "demo",
-        "--set",
-        "init_count=50",
-        "--iterations",
-        1,
-        "--out",
-        tmp_path / "run",
-    ]
+    line = ["train", tiny_data, "--out", tmp_path / "run", *ONE_STEP]
     for wrong in ("0", "-0.1", "nan", "inf"):
         refused = spacesim(*line, "--set", f"refinement.split_screen_size={wrong}")
         assert refused.is_refusal("--set refinement.split_screen_size: expected", wrong)
