@@ -189,7 +189,7 @@ def test_everything_is_on_one_page(whole):
     splats, field = values["figures"]["figure-3.2"]["rows"]
     for row in (splats, field):
         assert row["frames"]["models"] == [1, 2, 3, 4, 5]
-        assert (row["frames"]["pixels"], row["frames"]["views"]) == ([24, 24], 5)
+        assert (row["frames"]["pixels"], row["frames"]["views"]) == ([24, 24], 6)
         assert min(row["frames"]["ms"]) > 0
     assert field["times"][4] == field["frames"]["ms"][4] / splats["frames"]["ms"][4]
     assert "around 400 ×" in text
@@ -227,7 +227,7 @@ def test_ratios_are_of_one_device(whole, tmp_path):
     (path / "frames.json").write_text(json.dumps(values))
     rows = Results(tmp_path, SMALLEST, 1).frames()
     assert rows[1]["times"] is None
-    assert "another" in frame_times(tmp_path, rows)
+    assert "; radiance field: 24 × 24 pixels, median of 6 views, another" in frame_times(tmp_path, rows)
     assert "radiance field / Gaussians" not in frame_times(tmp_path, rows)
 
 

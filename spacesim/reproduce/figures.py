@@ -124,16 +124,18 @@ def frame_times(_root: Path, rows: Sequence[Mapping[str, Any]]) -> str:
     if rows[-1]["times"]:
         lines.append(["radiance field / Gaussians", *(f"{times:,.0f} ×" for times in rows[-1]["times"])])
     lines.append(["the thesis's ratio", *([f"around {thesis().nerf_times:,.0f} ×"] * len(counts))])
-    conditions = {
+    conditions = [
         f"{frames['pixels'][0]} × {frames['pixels'][1]} pixels, median of {frames['views']} views, {frames['device']}"
         for frames in (row["frames"] for row in there)
-    }
+    ]
+    if len(set(conditions)) > 1:
+        conditions = [f"{names[row['name']]}: {words}" for row, words in zip(there, conditions, strict=True)]
     missing = [f"{names[row['name']]}: {row['state']}" for row in rows if row not in there]
     note = f'<p class="lead">{escape("; ".join(missing))}.</p>' if missing else ""
     head = ["", *("1 model" if count == 1 else f"{count} models" for count in counts)]
     return (
         f'<p class="key">{legend}</p><div class="charts" style="max-width: 36rem">{chart}</div>'
-        f"{table(escape('; '.join(sorted(conditions))), head, [('', lines)])}{note}"
+        f"{table('; '.join(dict.fromkeys(conditions)), head, [('', lines)])}{note}"
     )
 
 

@@ -23,20 +23,20 @@ if TYPE_CHECKING:
 #: of the models, in widths of the picture that one just fills: one in the middle, four around it that do not touch
 PLACES = ((0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0))
 FARTHER = 3.1  #: times: the distance from which one just fills the picture
-VIEWS = 5  #: frames of each scene, each from another test view; the median counts
+VIEWS = 9  #: frames of each scene, each from another test view; the median counts
+WARM_UP = 2  #: frames before these: kernels are compiled for the first one, and again for what the second finds changed
 
 
 def time_frames(run: "Run | NerfRun", dataset: Dataset, tell: Callable[[int, int, str], None]) -> dict[str, Any]:
     """{"models": [1, ...], "ms": [median of a frame, milliseconds], "pixels": [width, height], "views", "device",
-    "backend"}: of pictures as `predict` returns them, in the computer's memory. Each is drawn once before it is timed,
-    so that nothing is compiled within."""
+    "backend"}: of pictures as `predict` returns them, in the computer's memory."""
     frames = views(dataset)
     models = [PlacedRun(run, Pose(translation=place)) for place in places(dataset)]  # type: ignore[arg-type]
     compose: Any = Fields if isinstance(run, NerfRun) else Composition
     medians = []
     for count in range(1, len(models) + 1):
         scene = compose(models[:count], ComposeConfig("none"))
-        for frame in frames:
+        for frame in frames[:WARM_UP]:
             scene.predict(frame.camera, frame.sun)
         seconds = []
         for frame in frames:
