@@ -12,12 +12,15 @@ import pytest
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import look_at
+from spacesim.data.mesh import read_mesh
 from spacesim.data.records import Camera, Frame, Sun
-from spacesim.reproduce import perform
+from spacesim.data.store import read_dataset
+from spacesim.reproduce import frames, perform
 from spacesim.reproduce.experiments import Experiment, check_parts, datasets_for, experiments_for, parts_known
+from spacesim.reproduce.figures import frame_times
 from spacesim.reproduce.perform import depth_picture, is_fully_lit
 from spacesim.reproduce.reproduce import reproduce
-from spacesim.reproduce.results import value_of
+from spacesim.reproduce.results import Results, value_of
 from spacesim.reproduce.size import FULL, QUICK, REDUCED, Size
 from spacesim.reproduce.thesis import Column, best, holds, pairs, parse, thesis
 
@@ -26,11 +29,12 @@ SMALLEST = Size(
     **{"resolution": 24, "suns": 2, "views": 6, "known_test_views": 1, "test_suns": 1, "test_views": 1},
     **{"spp": 2, "test_spp": 4, "pair_views": 1, "one_sun_views": 6, "one_sun_test_views": 6},
     **{"telescope_suns": 2, "telescope_views": 2, "telescope_iterations": 5, "iterations": 5},
-    **{"figure_steps": 10, "figure_gaussians": 100, "light": "demo", "strategies": "demo"},
+    **{"figure_steps": 10, "figure_gaussians": 100, "light": "demo", "strategies": "demo", "nerf": "demo"},
     fully_lit_deg=(90.0, 45.0),
     settings={
         **{"init_count": 120, "refinement.max_gaussians": 300, "refinement.refine_start": 2},
         **{"light.field.features": 8, "light.field.width": 16, "light.shadow.size": 16},
+        **{"rays": 512, "samples": 4, "coarse.samples": 8, "fine.samples": 4, "occupancy": 8, "chunk": 512},
     },
     geometry=None,
 )
@@ -93,7 +97,7 @@ def test_tables_share_trainings(size):
     assert names("4.4") & names("5.4") >= {"thesis-shadow-map"}
     whole = experiments_for(size, parts_known(), 1)
     assert {one.name for one in whole} == set().union(*(names(part) for part in parts_known()))
-    assert len({one.name for one in whole}) == len(whole) == (19 if size is QUICK else 20)
+    assert len({one.name for one in whole}) == len(whole) == (20 if size is QUICK else 21)
     relit = next(one for one in whole if one.name == "thesis-relight")
     assert isinstance(relit, Experiment)
     assert set(relit.parts) == {"own", "pair", "suns", "one-sun"}
@@ -123,7 +127,7 @@ def test_the_quick_ones_have_its_settings_where_there_are_such_fields():
     for name, config in configs.items():
         for key in QUICK.settings if not name.startswith("figure") else ():
             first, _, last = key.rpartition(".")
-            record = getattr(config, first) if first else config
+            record = getattr(config, first, None) if first else config
             if hasattr(record, last):
                 found[key].add(getattr(record, last))
     assert found == {key: {value} for key, value in (QUICK.settings | {"refinement.refine_stop": 400}).items()}
@@ -172,7 +176,7 @@ def test_everything_is_on_one_page(whole):
         assert f"Table {table.number}" in text
         for row in table.rows:
             assert all(cell in text for cell in row.cells)
-    for name in ("4.2", "s 4.3 and 4.4", "5.5", "6.1", "6.2"):
+    for name in ("3.2", "4.2", "s 4.3 and 4.4", "5.5", "6.1", "6.2"):
         assert f"<h2>Figure{name if name.startswith('s') else f' {name}'}</h2>" in text
     assert "Not run" not in text
     assert "not run" not in text
@@ -182,14 +186,54 @@ def test_everything_is_on_one_page(whole):
     assert f"{cell['mean']:.4f}" in text
     lit = values["figures"]["figure-4.3"]["rows"][0]
     assert 0 < lit["frames"][0] < lit["frames"][1] == 6
+    splats, field = values["figures"]["figure-3.2"]["rows"]
+    for row in (splats, field):
+        assert row["frames"]["models"] == [1, 2, 3, 4, 5]
+        assert (row["frames"]["pixels"], row["frames"]["views"]) == ([24, 24], 6)
+        assert min(row["frames"]["ms"]) > 0
+    assert field["times"][4] == field["frames"]["ms"][4] / splats["frames"]["ms"][4]
+    assert "around 400 ×" in text
+    assert f"{field['frames']['ms'][4]:,.1f} ms" in text
     for curve in values["figures"]["figure-5.5"]["rows"]:
         assert curve["gaussians"] == SMALLEST.figure_gaussians
         assert [step for step, _ in curve["inside"]] == list(range(11))
 
 
+def test_all_models_of_figure_3_2_are_in_the_picture_and_apart(whole):
+    dataset = read_dataset(whole / "data/one-sun")
+    vertices, _ = read_mesh(dataset.root / dataset.mesh_path)
+    boxes = [(vertices.min(axis=0) + place, vertices.max(axis=0) + place) for place in frames.places(dataset)]
+    for one, (low, high) in enumerate(boxes):
+        assert all((low >= other[1]).any() or (high <= other[0]).any() for other in boxes[one + 1 :])
+    for frame, near in zip(frames.views(dataset), dataset.test, strict=False):
+        np.testing.assert_array_equal(frame.camera.world_from_camera[:3, :3], near.camera.world_from_camera[:3, :3])
+        for place in frames.places(dataset):
+            x, y, z = frame.camera.camera_from_world[:3] @ np.c_[vertices + place, np.ones(len(vertices))].T
+            assert z.min() > 0
+            assert max(abs(x / z).max(), abs(y / z).max()) * frame.camera.fx <= 12
+
+
+def test_ratios_are_of_one_device(whole, tmp_path):
+    for name in ("one-sun", "one-sun-nerf"):
+        (tmp_path / "experiments" / name).mkdir(parents=True)
+        (tmp_path / "experiments" / name / "frames").symlink_to(whole / "experiments" / name / "frames")
+    there = Results(tmp_path, SMALLEST, 1).frames()
+    assert there[0]["times"] == [1] * 5
+    path = tmp_path / "experiments/one-sun-nerf/frames"
+    values = json.loads((path / "frames.json").read_text()) | {"device": "another"}
+    path.unlink()
+    assert "radiance field: not run" in frame_times(tmp_path, Results(tmp_path, SMALLEST, 1).frames())
+    path.mkdir()
+    (path / "frames.json").write_text(json.dumps(values))
+    rows = Results(tmp_path, SMALLEST, 1).frames()
+    assert rows[1]["times"] is None
+    assert "; radiance field: 24 × 24 pixels, median of 6 views, another" in frame_times(tmp_path, rows)
+    assert "radiance field / Gaussians" not in frame_times(tmp_path, rows)
+
+
 def test_what_is_finished_is_not_done_again(whole, monkeypatch):
     before = {path: path.stat().st_mtime_ns for path in whole.glob("experiments/**/*") if path.is_file()}
-    for word in ("trained", "evaluated", "draw_suns", "follow"):
+    for word in ("trained", "evaluated", "draw_suns", "follow", "time_frames"):
         monkeypatch.setattr(perform, word, None)
     reproduce(whole, quiet, ["5.6", "figure-6.1"], SMALLEST, resume=True)
     assert {path: path.stat().st_mtime_ns for path in whole.glob("experiments/**/*") if path.is_file()} == before

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from spacesim import methods
 from spacesim.data.errors import InputError
 from spacesim.data.structure import did_you_mean
 from spacesim.reproduce.size import Size
@@ -16,6 +17,7 @@ Variant = Literal["thesis", "improved"]
 VARIANTS: tuple[Variant, ...] = ("thesis", "improved")  #: ours as the thesis has it, and as we have it
 
 FIGURES: Mapping[str, str] = {
+    "figure-3.2": "Rendering time comparison between NeRF and 3DGS methods.",
     "figure-4.2": "Appearance field-based dynamic relighting with a single 3DGS model.",
     "figure-4.3": "Photometric and spatial reconstruction, fixed-illumination-trained and relightable 3DGS models.",
     "figure-4.4": "Photometric and spatial reconstruction, fixed-illumination-trained and relightable 3DGS models.",
@@ -27,7 +29,7 @@ SUN = (45.0, 35.0)  #: azimuth and elevation, degrees, of tables 4.6 and 4.7
 PLACES = {"first": (0.0, 0.0, 0.0), "second": (-3.0, -3.0, -3.0)}  #: metres, of the pair (section 4.3.6)
 BOX = 10.0  #: sizes of the object, of the cube that figure 5.5 starts in
 NEVER = 10**9
-RELIGHTABLE, FIXED = "relight", "one-sun"
+RELIGHTABLE, FIXED, FIELD = "relight", "one-sun", "one-sun-nerf"
 VANILLA, FULLY_LIT, TELESCOPE = "vanilla", "vanilla-fully-lit", "telescope"
 
 
@@ -37,8 +39,9 @@ class Experiment:
 
     name: str
     data: str
-    config: TrainConfig
-    #: "own", "pair" and "one-sun" evaluate against these data, "suns" draws one view under many Suns
+    config: methods.Config
+    #: "own", "pair" and "one-sun" evaluate against these data, "suns" draws one view under many Suns, "frames" times
+    #: frames of several models
     parts: tuple[str, ...] = ()
     fully_lit: bool = False  #: trained on the views whose camera is near the Sun alone
 
@@ -115,6 +118,8 @@ def _of_part(size: Size, part: str, seeds: int) -> list[Work]:
             for variant in VARIANTS
             for row in table.rows
         ]
+    if part == "figure-3.2":
+        return figure_frames(size)
     if part == "figure-4.2":
         return figure_relighting(size)
     if part in ("figure-4.3", "figure-4.4"):
@@ -135,6 +140,13 @@ def experiment_of(size: Size, table: Table, row: Row, variant: Variant, seed: in
     return _trained(size, name, row.method, row.strategy, (table.scene,), seed)
 
 
+def figure_frames(size: Size) -> list[Work]:
+    """Figure 3.2: Gaussians and a radiance field, trained on the same data."""
+    config = methods.shortened(methods.preset(size.nerf, "nerf"), size.iterations)
+    field = Experiment(FIELD, "one-sun", _with_settings(size, config), ("frames",))
+    return [_fixed_sun(size, "frames"), field]
+
+
 def figure_relighting(size: Size) -> list[Work]:
     """Figure 4.2: what is told the Sun, what is not, and what is trained on views with the Sun behind them alone."""
     relit: list[Work] = [_trained(size, name, "relight", parts=("suns",)) for name in ("thesis", size.light)]
@@ -144,18 +156,15 @@ def figure_relighting(size: Size) -> list[Work]:
 
 def figure_fixed_sun(size: Size) -> list[Work]:
     """Figures 4.3 and 4.4: what is trained under one Sun, and what is told the Sun."""
-    fixed = replace(_trained(size, "thesis", "vanilla", parts=("one-sun",)), name=FIXED, data="one-sun")
     relit: list[Work] = [_trained(size, name, "relight", parts=("one-sun",)) for name in ("thesis", size.light)]
-    return [fixed, *relit]
+    return [_fixed_sun(size, "one-sun"), *relit]
 
 
 def telescope(size: Size) -> Experiment:
     """Figure 6.2, on the schedule of section 6.2.2."""
     made = _trained(size, "thesis", "shadow-map", parts=("own", "suns"))
-    iterations = size.telescope_iterations
-    refinement = replace(made.config.refinement, refine_stop=iterations * 4 // 5)
-    config = replace(made.config, iterations=iterations, refinement=refinement)
-    return replace(made, name=TELESCOPE, data="telescope", config=config)
+    stop = {"iterations": size.telescope_iterations, "refinement.refine_stop": size.telescope_iterations * 4 // 5}
+    return replace(made, name=TELESCOPE, data="telescope", config=methods.with_settings(made.config, stop))
 
 
 def curves(size: Size) -> list[Curve]:
@@ -186,13 +195,21 @@ def _trained(
     seed: int = 0,
 ) -> Experiment:
     """A training on the boxsat under many Suns."""
-    config = with_options(preset(name, method, strategy), iterations=size.iterations)
-    config = with_settings(config, {key: value for key, value in size.settings.items() if _has(config, key)})
+    config = _with_settings(size, with_options(preset(name, method, strategy), iterations=size.iterations))
     words = [name, method, *([] if strategy == "default" else [strategy]), *([f"seed-{seed}"] if seed else [])]
     return Experiment("-".join(words), "boxsat", replace(config, seed=config.seed + seed), parts)
 
 
-def _has(config: TrainConfig, key: str) -> bool:
+def _fixed_sun(size: Size, part: str) -> Experiment:
+    """Gaussians as the thesis has them, trained under one Sun."""
+    return replace(_trained(size, "thesis", "vanilla", parts=(part,)), name=FIXED, data="one-sun")
+
+
+def _with_settings(size: Size, config: methods.Config) -> methods.Config:
+    return methods.with_settings(config, {key: value for key, value in size.settings.items() if _has(config, key)})
+
+
+def _has(config: methods.Config, key: str) -> bool:
     """Whether there is the field of a dotted name: `vanilla` has no light, and each strategy has its own."""
     record: Any = config
     for name in key.split("."):

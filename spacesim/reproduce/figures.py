@@ -6,7 +6,9 @@ from typing import Any
 
 from spacesim.eval.report.charts import line_chart
 from spacesim.eval.report.html import SERIES, escape, picture, swatch, table
+from spacesim.reproduce.experiments import FIELD
 from spacesim.reproduce.perform import data_folder
+from spacesim.reproduce.thesis import thesis
 
 SIDE = 240  #: pixels of small pictures
 NOT_RUN = '<p class="lead">Not run.</p>'
@@ -106,6 +108,35 @@ def _strip(root: Path, rows: Sequence[Mapping[str, Any]], side: str) -> str:
             label = ("Truth" if truth else name_of(row["name"])) + (", depth" if kind == "depth" else "")
             figures.append(picture(path, label, escape(label), 320))
     return f'<div class="strip" style="grid-template-columns: repeat({len(rows) + 1}, 1fr)">{"".join(figures)}</div>'
+
+
+def frame_times(_root: Path, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Figure 3.2: a frame's time against the number of models, Gaussians and radiance field, and their ratio."""
+    there = [row for row in rows if row["frames"]]
+    if not there:
+        return NOT_RUN
+    names = {row["name"]: "radiance field" if row["name"] == FIELD else "Gaussians" for row in rows}
+    legend = "".join(f"<span>{swatch(i % SERIES)}{names[row['name']]}</span>" for i, row in enumerate(there))
+    series = [list(zip(row["frames"]["models"], row["frames"]["ms"], strict=True)) for row in there]
+    chart = line_chart("Time of a frame, ms", "models", series, log=True)
+    counts = there[0]["frames"]["models"]
+    lines = [[names[row["name"]], *(f"{ms:,.1f} ms" for ms in row["frames"]["ms"])] for row in there]
+    if rows[-1]["times"]:
+        lines.append(["radiance field / Gaussians", *(f"{times:,.0f} ×" for times in rows[-1]["times"])])
+    lines.append(["the thesis's ratio", *([f"around {thesis().nerf_times:,.0f} ×"] * len(counts))])
+    conditions = [
+        f"{frames['pixels'][0]} × {frames['pixels'][1]} pixels, median of {frames['views']} views, {frames['device']}"
+        for frames in (row["frames"] for row in there)
+    ]
+    if len(set(conditions)) > 1:
+        conditions = [f"{names[row['name']]}: {words}" for row, words in zip(there, conditions, strict=True)]
+    missing = [f"{names[row['name']]}: {row['state']}" for row in rows if row not in there]
+    note = f'<p class="lead">{escape("; ".join(missing))}.</p>' if missing else ""
+    head = ["", *("1 model" if count == 1 else f"{count} models" for count in counts)]
+    return (
+        f'<p class="key">{legend}</p><div class="charts" style="max-width: 36rem">{chart}</div>'
+        f"{table('; '.join(dict.fromkeys(conditions)), head, [('', lines)])}{note}"
+    )
 
 
 def inside(_root: Path, rows: Sequence[Mapping[str, Any]]) -> str:

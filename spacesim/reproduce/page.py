@@ -9,7 +9,7 @@ import numpy as np
 from spacesim.data.files import write_bytes
 from spacesim.eval.report.html import escape, page, section, table
 from spacesim.reproduce.experiments import FIGURES as FIGURE_TITLES
-from spacesim.reproduce.figures import density, fixed_sun, inside, relighting
+from spacesim.reproduce.figures import density, fixed_sun, frame_times, inside, relighting
 from spacesim.reproduce.thesis import Column, Table, best, thesis
 
 QUICK = (
@@ -19,6 +19,7 @@ QUICK = (
 NONE = '<span class="none">{}</span>'
 VERDICTS = {True: "holds", False: '<span class="best">fails</span>', None: NONE.format("–")}
 FIGURES: Mapping[str, Callable[[Path, Any], str]] = {
+    "figure-3.2": frame_times,
     "figure-4.2": relighting,
     "figure-4.3": fixed_sun,
     "figure-5.5": inside,
@@ -184,7 +185,7 @@ def _experiments(experiments: Sequence[Mapping[str, Any]]) -> str:
         links = [
             f'<a href="experiments/{one["name"]}/{part}/report.html">{part}</a>'
             for part in one["parts"]
-            if part not in ("suns", "curve") and one["state"] == "finished"
+            if part not in ("suns", "curve", "frames") and one["state"] == "finished"
         ]
         state = one["state"] + (f": {one['reason']}" if one["reason"] else "")
         gaussians = "–" if one["gaussians"] is None else f"{one['gaussians']:,}"

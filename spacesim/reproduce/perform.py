@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spacesim import methods
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import read_json, write_json
 from spacesim.data.geometry import angles_from_direction
@@ -25,6 +26,7 @@ from spacesim.eval.report.write import write_report
 from spacesim.eval.suns import known_suns, rounded_angles
 from spacesim.progress import report_training
 from spacesim.reproduce.experiments import PLACES, Curve, Experiment, Work
+from spacesim.reproduce.frames import time_frames
 from spacesim.reproduce.size import Size
 from spacesim.splat.compose import (
     ComposeConfig,
@@ -39,10 +41,10 @@ from spacesim.splat.compose import (
 from spacesim.splat.run import Run
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.prior import known_mesh
-from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 
 if TYPE_CHECKING:
+    from spacesim.nerf.run import NerfRun
     from spacesim.splat.run import Predictor
 
 Tell = Callable[[int, int, str], None]  #: told how much is done, of how much, and words about it
@@ -101,6 +103,8 @@ def _perform(root: Path, size: Size, work: Experiment, reporting: Reporting) -> 
         if part == "own":
             evaluated(run, dataset, folder / part, judge, title, reporting)
         elif part == "pair":
+            assert isinstance(run, Run)
+            assert isinstance(work.config, TrainConfig)
             pair = read_dataset(data_folder(root, part))
             scene = composed(run, folder / "pair.toml", shadows_between(work.config))
             evaluated(scene, pair, folder / part, replace(judge, geometry=None), title, reporting)
@@ -108,19 +112,22 @@ def _perform(root: Path, size: Size, work: Experiment, reporting: Reporting) -> 
             other = read_dataset(data_folder(root, part))
             _draw_depth(run, other, folder / part, size.fully_lit_deg)
             evaluated(run, other, folder / part, judge, title, reporting)
+        elif part == "frames":
+            with reporting(title, "scenes") as tell:
+                write_json(folder / _last_file(part), time_frames(run, dataset, tell))
         else:
             draw_suns(run, dataset, folder / part)
 
 
 def _last_file(part: str) -> str:
     """What a part of an experiment writes when all else of it is there."""
-    return "suns/suns.json" if part == "suns" else f"{part}/report.html"
+    return f"{part}/{part}.json" if part in ("suns", "frames") else f"{part}/report.html"
 
 
-def trained(folder: Path, dataset: Dataset, config: TrainConfig, name: str, reporting: Reporting) -> Run:
+def trained(folder: Path, dataset: Dataset, config: methods.Config, name: str, reporting: Reporting) -> "Run | NerfRun":
     """The run in a folder, trained to its end."""
     with reporting(f"train {name}", "iterations") as report:
-        return train(dataset, folder, config, resume=True, on_progress=report_training(report))
+        return methods.train(dataset, folder, config, resume=True, on_progress=report_training(report))
 
 
 def evaluated(

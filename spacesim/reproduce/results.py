@@ -18,6 +18,7 @@ from spacesim.reproduce.experiments import (
     curves,
     experiment_of,
     figure_fixed_sun,
+    figure_frames,
     figure_relighting,
     preset_of,
     telescope,
@@ -79,6 +80,7 @@ class Results:
         wanted = set(parts)
         tables = [self.table(table) for table in thesis().tables if table.number in wanted]
         makers = {
+            "figure-3.2": self.frames,
             "figure-4.2": lambda: self.relighting(figure_relighting(self.size)),
             "figure-4.3": self.fixed_sun,
             "figure-4.4": self.fixed_sun,
@@ -150,6 +152,19 @@ class Results:
         seeds = [mean for mean, _ in known]
         std = float(np.mean(stds)) if stds else None
         return {"mean": float(np.mean(seeds)), "std": std, "seeds": seeds, "state": "there"}
+
+    def frames(self) -> list[Values]:
+        """Of Gaussians, then of the radiance field: milliseconds a frame by the number of models, and how many times
+        what Gaussians take, where the same device drew both."""
+        works = figure_frames(self.size)
+        found = [(work, self.file(work, "frames/frames.json")) for work in works]
+        first = found[0][1]
+        rows = []
+        for work, frames in found:
+            same = first and frames and (first["device"], first["pixels"]) == (frames["device"], frames["pixels"])
+            times = [own / least for own, least in zip(frames["ms"], first["ms"], strict=True)] if same else None
+            rows.append({"name": work.name, "state": self.state(work), "frames": frames, "times": times})
+        return rows
 
     def relighting(self, works: Sequence[Work]) -> list[Values]:
         """Of each model: the view under many Suns, most Gaussians and those at the end, how good it is."""

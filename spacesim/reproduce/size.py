@@ -32,6 +32,7 @@ class Size:
     iterations: int | None = None  #: of all other trainings; none: of their presets
     light: str = "fine"  #: preset of what is improved in tables 4.4 to 4.7
     strategies: str = "fast"  #: preset of what is improved in tables 5.4 to 5.6
+    nerf: str = "thesis"  #: preset of figure 3.2's radiance field
     settings: Mapping[str, Any] = field(
         default_factory=dict
     )  #: fields of every training that has them, by dotted names
@@ -76,6 +77,7 @@ QUICK = Size(
     iterations=500,
     light="demo",
     strategies="demo",
+    nerf="demo",
     settings={
         "init_count": 3_000,
         "checkpoint_every": 100,

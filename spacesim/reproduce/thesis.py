@@ -116,6 +116,7 @@ class Thesis:
     """All that is shown beside ours."""
 
     conditions: Mapping[str, str]
+    nerf_times: float  #: what a frame of NeRFs takes as a multiple of one of Gaussians, "around" (figure 3.2)
     tables: tuple[Table, ...]
 
 
