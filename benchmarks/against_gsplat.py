@@ -29,12 +29,13 @@ from spacesim.data.images import load_image
 from spacesim.data.records import Camera
 from spacesim.data.store import read_dataset
 from spacesim.eval.metrics.image import psnr as psnr_of
+from spacesim.learning.folder import TrainingProgress
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import TrainConfig, preset, with_options
 from spacesim.splat.train.strategies.control import RefinementConfig
-from spacesim.splat.train.trainer import Trainer, TrainingProgress
+from spacesim.splat.train.trainer import Trainer
 
 try:
     import gsplat

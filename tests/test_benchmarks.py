@@ -720,7 +720,7 @@ def test_a_film_is_compared_with_its_own_frames(tmp_path):
     points = rng.normal(size=(7, 3))
     cloud = inside.points(points), np.zeros((7, 3), np.uint8)
     report = {"structure.json": b'{"pictures": 12, "reprojection_error_px": 0.5, "points": 7}'}
-    own = write_dataset(tmp_path / "own", imported, [], {}, cloud, report)
+    own = write_dataset(tmp_path / "own", imported, None, {}, cloud, report)
     row = video_import.compared(own, film)
     assert row["registered"] == pytest.approx(10 / 12)
     assert row["% largest"] == pytest.approx(0, abs=1e-9)

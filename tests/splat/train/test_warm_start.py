@@ -417,12 +417,12 @@ def test_presets_and_table_5_7():
 
 
 def test_a_training_that_ends_before_the_warm_start_does_is_told(spacesim, tiny_data, tmp_path, caplog):
-    """`demo` gathers for 500 and fades over 500; `remark` begins at their sum."""
+    """`remark` begins at the sum of what gathers and what fades. Fewer iterations shorten both, unless they are set."""
     table = WarmStartConfig(steps=20, decay=10)
     assert [bool(table.remark(iterations)) for iterations in (5, 20, 30, 31)] == [True, True, True, False]
     line = ["train", tiny_data, "--preset", "demo", "--set", "init_count=300", "--init", "random", "--warm-start"]
-    done = spacesim(*line, "--out", tmp_path / "short", "--set", "iterations=3")  # --iterations shortens it
-    assert done.code == 0
+    lengths = "--set", "warm_start.steps=500", "--set", "warm_start.decay=500"
+    assert spacesim(*line, "--out", tmp_path / "short", "--iterations", 3, *lengths).code == 0
     told = [record.message for record in caplog.records if record.levelname == "WARNING"]
     assert len(told) == 1
     for word in ("warm_start", "500 iterations", "more than 1000", "found 3"):
