@@ -88,7 +88,7 @@ def _trainer_from_shape(
         log.info("looking for the Suns of %d pictures by shape and shading", len(dataset.train))
         write_points(points, *surface_points(run.gaussians))
         distance = farthest_camera(dataset, focus_point(dataset))
-        write_tensors(path, first_suns(dataset, run.gaussians, run.antialiased, distance).tensors(), {})
+        write_tensors(path, first_suns(dataset, run.gaussians, distance).tensors(), {})
     suns = FirstSuns.of(read_tensors(path)[0], len(dataset.train), path)
     if config.init in (None, "random"):
         dataset = replace(dataset, ply_file_path=str(points.absolute()))

@@ -157,9 +157,12 @@ def surface_points(gaussians: Gaussians) -> tuple[Array, np.ndarray]:
     return arrays["means"][solid], np.rint(255 * np.clip(constant_colors(gaussians)[solid], 0, 1)).astype(np.uint8)
 
 
-def first_suns(dataset: Dataset, gaussians: Gaussians, antialiased: bool, distance: float) -> FirstSuns:
-    """By a model that was trained without light. distance: metres, of the farthest camera"""
-    search = ShapeSearch(gaussians, antialiased, distance)
+def first_suns(dataset: Dataset, gaussians: Gaussians, distance: float) -> FirstSuns:
+    """By a model that was trained without light. distance: metres, of the farthest camera
+
+    However it was trained, it is drawn with the anti-aliasing filter: pictures are far smaller here.
+    """
+    search = ShapeSearch(gaussians, True, distance)
     losses = search.losses([_small_picture(dataset, frame) for frame in dataset.train])
     best, order = losses.argmin(axis=1), time_order(dataset.train)
     if order is not None:

@@ -166,3 +166,22 @@ def test_training_warns_of_suns_that_may_be_far_off(untold, quick, tmp_path, cap
     with pytest.raises(StoppedError):
         train(untold, tmp_path / "run", CONFIG, on_progress=stop)
     assert any("they may be far off" in record.getMessage() for record in caplog.records)
+
+
+def test_first_suns_are_looked_for_with_the_anti_aliasing_filter(untold, monkeypatch):
+    """Small pictures of a model that was trained on large ones: 22.7 degrees off without it, 17.3 with it."""
+    told = []
+
+    class Search:
+        sphere = fibonacci_sphere(SPHERE)
+
+        def __init__(self, gaussians, antialiased, distance):
+            told.append(antialiased)
+
+        def losses(self, pictures):
+            return np.tile(np.arange(SPHERE, dtype=float), (len(pictures), 1))
+
+    monkeypatch.setattr(suns, "ShapeSearch", Search)
+    found = suns.first_suns(untold, None, 5.0)
+    assert told == [True]
+    np.testing.assert_array_equal(found.directions, np.tile(Search.sphere[0], (len(untold.train), 1)))
