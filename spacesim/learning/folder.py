@@ -5,7 +5,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, read_json, write_json
 from spacesim.data.identity import same_digest, training_digest
 from spacesim.data.records import Dataset
+from spacesim.data.structure import Rules, structure
+from spacesim.data.toml import Document
 
 KEEP_CHECKPOINTS = 2
 
@@ -76,6 +78,16 @@ def finished_model(path: Path) -> Path:
     if not (path / "model.safetensors").exists():
         raise InputError(f"{path}: training has not ended; complete it with `spacesim train ... --resume`")
     return path / "model.safetensors"
+
+
+def read_described(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(all of a run's config.json, what it says of the data: as `TrainingData`). Raises InputError where it is broken,
+    but for the configuration, which its own record reads."""
+    values = read_json(path)
+    if not isinstance(values, dict) or "data" not in values:
+        raise InputError(f"{path}: expected an object with the key data, found none")
+    data = structure(TrainingData, Document(f"{path}: data", values["data"], {}), Rules())
+    return values, asdict(data)
 
 
 class TrainingClock:

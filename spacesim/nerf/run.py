@@ -7,7 +7,7 @@ RUN/training.json      history, time, backend, versions
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,9 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
-from spacesim.data.structure import Rules, read_record, structure
-from spacesim.data.toml import Document
-from spacesim.learning.folder import TrainingData, finished_model
+from spacesim.data.structure import read_record
+from spacesim.learning.folder import finished_model, read_described
 from spacesim.learning.prediction import Prediction, Rendering, check_picture
 from spacesim.learning.tensors import read_tensors
 from spacesim.nerf.config import NerfConfig
@@ -140,8 +138,5 @@ def load_run(path: str | Path) -> NerfRun:
 
 def read_config(path: Path) -> tuple[NerfConfig, dict[str, Any]]:
     """(how a run is trained, what on: as `TrainingData`) by its config.json. Raises InputError where it is broken."""
-    values = read_json(path)
-    if not isinstance(values, dict) or "data" not in values:
-        raise InputError(f"{path}: expected an object with the key data, found none")
-    data = structure(TrainingData, Document(f"{path}: data", values["data"], {}), Rules())
-    return NerfConfig.from_json(values, str(path)), asdict(data)
+    values, data = read_described(path)
+    return NerfConfig.from_json(values, str(path)), data

@@ -8,7 +8,7 @@ RUN/cameras.json       poses and gains of the training pictures, where they were
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,11 +17,9 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_json
 from spacesim.data.records import Camera, Sun
-from spacesim.data.structure import Rules, read_record, structure
-from spacesim.data.toml import Document
-from spacesim.learning.folder import TrainingData, finished_model
+from spacesim.data.structure import read_record
+from spacesim.learning.folder import finished_model, read_described
 from spacesim.learning.prediction import Prediction, Rendering, check_picture
 from spacesim.splat.light.config import MAX_EXPOSURE
 from spacesim.splat.light.model import LightModel
@@ -304,8 +302,5 @@ def load_run(path: str | Path) -> Run:
 
 def read_config(path: Path) -> tuple[TrainConfig, dict[str, Any]]:
     """(how a run is trained, what on: as `TrainingData`) by its config.json. Raises InputError where it is broken."""
-    values = read_json(path)
-    if not isinstance(values, dict) or "data" not in values:
-        raise InputError(f"{path}: expected an object with the key data, found none")
-    data = structure(TrainingData, Document(f"{path}: data", values["data"], {}), Rules())
-    return TrainConfig.from_json(values, str(path)), asdict(data)
+    values, data = read_described(path)
+    return TrainConfig.from_json(values, str(path)), data
