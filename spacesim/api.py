@@ -4,7 +4,7 @@ Each function says in one call what the command of its name does; what is behind
 docs/explanation/architecture.md.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 from spacesim.backend import BackendError
 from spacesim.backend.arrays import Float
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
 from spacesim.data.store import load_truth
@@ -133,7 +134,7 @@ def train(
     preset: str | None = None,
     method: str | None = None,
     strategy: str | None = None,
-    settings: Mapping[str, Any] | None = None,
+    settings: JsonMapping | None = None,
     resume: bool = False,
     progress: ProgressCallback | None = None,
     **options: Any,
@@ -190,7 +191,7 @@ def evaluate(
     fit_gain: bool = False,
     align: str | Path | Dataset | None = None,
     progress: ProgressCallback | None = None,
-) -> dict[str, Any]:
+) -> JsonDict:
     """Evaluate a run against a dataset; write metrics.json, report.html and the frames' pictures into the folder `out`.
 
     run: a folder, a scene file, or what `train` or `load_run` returns;  split: "test", "train" or "all"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from spacesim import interrupts
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict
 from spacesim.data.structure import did_you_mean
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ def view_of(options: argparse.Namespace, run: "Run | NerfRun") -> "tuple[Camera,
     return frame.camera, frame.sun or estimated
 
 
-def _data_of(config: dict[str, Any]) -> Path:
+def _data_of(config: JsonDict) -> Path:
     path = Path(config["data"]["path"])
     if not path.exists():
         raise InputError(f"{path}: expected the data that the run was trained on, found nothing; name it with --data")

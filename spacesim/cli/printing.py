@@ -1,15 +1,15 @@
 """What several commands print."""
 
 from functools import partial
-from typing import Any
 
 from spacesim import interrupts
+from spacesim.data.files import JsonDict
 
 KNOWS_ONE_LIGHT = "the run knows the light that it was trained under only; --sun changes nothing"
 WANTS_FILTER = "the run is antialiased: viewers without Mip-Splatting's 2D filter draw thin splats wider"
 
 
-def print_headline(metrics: dict[str, Any]) -> None:
+def print_headline(metrics: JsonDict) -> None:
     """PSNR, SSIM and shadow errors in a line each."""
     show = partial(_mean, metrics)
     whole = metrics.get("image_region") == "frame"
@@ -34,7 +34,7 @@ def print_headline(metrics: dict[str, Any]) -> None:
         interrupts.print_output(f"note: {note}")
 
 
-def _shape_words(geometry: dict[str, Any]) -> str:
+def _shape_words(geometry: JsonDict) -> str:
     """The headline of metrics.json's "geometry"."""
     near, overlap = geometry["precision_recall"], geometry["iou"]
     words = f"shape: Chamfer {geometry['chamfer']:.3g} m2, Hausdorff-99 {geometry['hausdorff99']:.3g} m"
@@ -43,6 +43,6 @@ def _shape_words(geometry: dict[str, Any]) -> str:
     return words if floating is None else f"{words}, floaters {100 * floating:.2f} %"
 
 
-def _mean(metrics: dict[str, Any], group: str, name: str, digits: int) -> str:
+def _mean(metrics: JsonDict, group: str, name: str, digits: int) -> str:
     value = ((metrics.get(group) or {}).get(name) or {}).get("mean")
     return "null" if value is None else f"{value:.{digits}f}"

@@ -5,12 +5,20 @@ import json
 import os
 import stat
 import uuid
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Union
 
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError, WorkError
+
+JsonValue = Union[None, bool, int, float, str, Sequence["JsonValue"], Mapping[str, "JsonValue"]]  # noqa: UP007
+"""What JSON can hold: what is written is checked against it."""
+JsonDict = dict[str, Any]
+"""An object of JSON as `read_json` gives it: its values are whatever the file holds, until a reader has looked."""
+JsonMapping = Mapping[str, Any]
+"""The same, only read."""
 
 MAX_JSON_BYTES = 1 << 25  #: bytes of a record
 MAX_LIST_BYTES = 1 << 30  #: bytes of a record with an entry for each frame, of a million of them
@@ -159,12 +167,12 @@ def holds_files(folder: Path) -> bool:
         raise InputError(f"{folder}: cannot be read ({error.strerror or error})") from None
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: JsonValue) -> None:
     """Write `value` as indented JSON (no NaN: a missing number is null)."""
     write_bytes(path, json_bytes(value))
 
 
-def json_bytes(value: Any) -> bytes:
+def json_bytes(value: JsonValue) -> bytes:
     """What `write_json` writes."""
     return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
 

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import (
     MAX_LIST_BYTES,
+    JsonValue,
     flush_disks,
     json_bytes,
     read_json,
@@ -159,7 +160,9 @@ class DatasetWriter(FrameWriter):
     InputError where it holds anything else.
     """
 
-    def __init__(self, root: Path, scene: Mapping[str, Any], resume: bool = False, raw: Sequence[str] = ()) -> None:
+    def __init__(
+        self, root: Path, scene: Mapping[str, JsonValue], resume: bool = False, raw: Sequence[str] = ()
+    ) -> None:
         super().__init__(root, raw)
         scene = json.loads(json.dumps(scene, allow_nan=False))  # as it reads back
         if self.root.exists() and not self.root.is_dir():
@@ -227,7 +230,7 @@ class DatasetWriter(FrameWriter):
         if damaged:
             _log.warning("%s: %d files are damaged, %s the first; made again", self.root, len(damaged), damaged[0])
 
-    def _check_resumable(self, scene: Mapping[str, Any], resume: bool) -> None:
+    def _check_resumable(self, scene: Mapping[str, JsonValue], resume: bool) -> None:
         if not resume:
             raise InputError(f"{self.root}: expected a new folder, found a dataset; resume=True goes on with it")
         path = self.root / "scene.json"
@@ -312,7 +315,7 @@ def _read_label(path: Path, camera: Camera) -> None:
 
 def _describe_frames(
     train: Sequence[tuple[str, Camera, Sun]], test: Sequence[tuple[str, Camera, Sun]], distortion: Sequence[float]
-) -> dict[str, Any]:
+) -> dict[str, JsonValue]:
     """transforms.json: intrinsics stand at the top where all frames share them."""
     intrinsics = [intrinsics_of(camera) for _, camera, _ in (*train, *test)]
     shared = all(entry == intrinsics[0] for entry in intrinsics)

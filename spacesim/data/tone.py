@@ -1,12 +1,12 @@
 """The tone curve: from linear display values to the sRGB values of the 8-bit image."""
 
 import math
-from collections.abc import Mapping
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spacesim.data.files import JsonMapping
 from spacesim.data.images import srgb_from_linear
 
 Tone = Literal["srgb", "filmic"]
@@ -18,7 +18,7 @@ STANDARD_EXPOSURE = math.pi / 1361.0
 at 1 au, whose irradiance is 1361 W m^-2 (IAU 2015 B3), shows 1."""
 
 
-def tone_and_exposure(scene: Mapping[str, Any]) -> tuple[Tone, float] | None:
+def tone_and_exposure(scene: JsonMapping) -> tuple[Tone, float] | None:
     """(tone curve, exposure in EV) of a dataset's pictures, by its scene.json; None where that does not say."""
     try:
         tone = TONES[TONES.index(scene["config"]["camera"]["tone"])]

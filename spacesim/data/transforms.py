@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import MAX_LIST_BYTES, read_json
+from spacesim.data.files import MAX_LIST_BYTES, JsonValue, read_json
 from spacesim.data.geometry import OPENCV_FROM_OPENGL
 from spacesim.data.images import image_size
 from spacesim.data.integrity.manifest import NAME as DIGESTS
@@ -32,7 +32,7 @@ TRUTH_PATHS = ("gt_path", "shadow_path", "silhouette_path", "id_path", "depth_fi
 _HOLD_OUT = 8
 _SPLITS = ("train", "val", "test")
 
-Json = Mapping[str, Any]
+Json = Mapping[str, JsonValue]
 _log = logging.getLogger(__name__)
 
 
@@ -309,7 +309,7 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def _without_nulls(values: Json) -> dict[str, Any]:
+def _without_nulls(values: Json) -> dict[str, JsonValue]:
     """A key whose value is null counts as absent."""
     return {key: value for key, value in values.items() if value is not None}
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from spacesim.data.density import target_of
 from spacesim.data.errors import InputError
-from spacesim.data.files import MAX_LIST_BYTES, read_json
+from spacesim.data.files import MAX_LIST_BYTES, JsonValue, read_json
 from spacesim.data.geometry import Array, quaternion_from_rotation
 from spacesim.data.records import Dataset, Frame
 from spacesim.splat.compose.aligned import moved_frame
@@ -42,7 +42,7 @@ class Alignment:
     distance: float  #: metres, median of the true cameras from what they look at
     turn_deg: float  #: root mean square angle between the inliers' axes
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, JsonValue]:
         """As metrics.json has it."""
         return {
             "matched_by": self.matched_by,

@@ -18,7 +18,7 @@ import numpy as np
 
 from spacesim.data import density
 from spacesim.data.errors import InputError
-from spacesim.data.files import write_json
+from spacesim.data.files import JsonDict, write_json
 from spacesim.data.geometry import Array
 from spacesim.data.identity import frame_names, frames_digest
 from spacesim.data.records import Dataset, Frame
@@ -87,7 +87,7 @@ def evaluate(
     out: Path,
     config: EvaluateConfig | None = None,
     progress: EvaluationProgress | None = None,
-) -> dict[str, Any]:
+) -> JsonDict:
     """Evaluate every frame of the split and return what EVAL/metrics.json, written last, then holds.
 
     What a run does not know of a picture (`splat.fit.find_unknowns`) is fitted on one half of it and judged on the
@@ -194,7 +194,7 @@ class FrameResult:
     """A frame's numbers."""
 
     frame: Frame
-    record: dict[str, Any]  #: its values by group, and what it is
+    record: JsonDict  #: its values by group, and what it is
     source: str  #: where its silhouette is from
     has_known_sun: bool | None  #: whether training has seen its Sun
     ignored: float  #: share of its pixels that count nowhere
@@ -204,7 +204,7 @@ class FrameResult:
 
 def _evaluate_shapes(
     run: "Predictor", dataset: Dataset, objects: Mapping[int, str], config: GeometryConfig | None
-) -> tuple[ShapeResult, dict[int, dict[str, Any] | None]]:
+) -> tuple[ShapeResult, dict[int, JsonDict | None]]:
     """Of the whole, and of each object where models stand for them. A mesh that cannot be read, or a grid that does not
     fit, costs the shape's numbers and no others."""
     try:
@@ -248,7 +248,7 @@ def _evaluate_frame(
     photograph = is_photograph(frame, source)
     ignored = float(1 - view.valid.mean())
     write_pictures(folder, view, light, photograph)
-    named: dict[str, Any] = {
+    named: JsonDict = {
         "file_path": frame.file_path,
         "name": folder.name,
         "sun": rounded_angles(frame),
@@ -257,24 +257,24 @@ def _evaluate_frame(
     if unknowns:
         named["fitted"] = fitted
     groups = image_groups(view, network, source, photograph)
-    record: dict[str, Any] = named | groups | visibility_groups(light, view)
+    record: JsonDict = named | groups | visibility_groups(light, view)
     if objects:
         record["objects"] = object_groups(dataset, frame, objects, view, light, network)
     return FrameResult(frame, record, source, has_known_sun, ignored, tally_grazing(light, view), seconds)
 
 
-def _summaries(results: Sequence[FrameResult]) -> dict[str, Any]:
+def _summaries(results: Sequence[FrameResult]) -> JsonDict:
     """The groups over some frames."""
     groups = {group: summary(result.record[group] for result in results) for group in GROUPS}
     return {**groups, "by_grazing_angle": grazing.summary(result.grazing for result in results)}
 
 
 def _by_object(
-    results: Sequence[FrameResult], names: Mapping[int, str], shapes: Mapping[int, dict[str, Any] | None]
-) -> list[dict[str, Any]] | None:
+    results: Sequence[FrameResult], names: Mapping[int, str], shapes: Mapping[int, JsonDict | None]
+) -> list[JsonDict] | None:
     """Of each object that a frame shows: number, name, in how many frames, the groups over its pixels, its shape; None
     for data with one object."""
-    summaries: list[dict[str, Any]] = []
+    summaries: list[JsonDict] = []
     for number, name in names.items():
         records = [result.record["objects"][name] for result in results if name in result.record["objects"]]
         if records:
@@ -284,7 +284,7 @@ def _by_object(
     return summaries or None
 
 
-def _sun_group(results: Sequence[FrameResult]) -> dict[str, Any] | None:
+def _sun_group(results: Sequence[FrameResult]) -> JsonDict | None:
     """How many frames and Suns there are, and the groups over them; None where there is no frame."""
     if not results:
         return None
@@ -301,7 +301,7 @@ def _prepare(out: Path) -> None:
         raise InputError(f"{out}: expected a folder to write to ({error.strerror})") from None
 
 
-def summary(records: Iterable[Mapping[str, float | None] | None]) -> dict[str, Any] | None:
+def summary(records: Iterable[Mapping[str, float | None] | None]) -> JsonDict | None:
     """{metric: {"mean", "std" of the population, "count" of frames that have it}, None if no frame has}.
 
     Where records tell their `pixels`, measures over pixels have "pooled", too: over the pixels of all frames at once.
@@ -310,7 +310,7 @@ def summary(records: Iterable[Mapping[str, float | None] | None]) -> dict[str, A
     present = [record for record in records if record is not None]
     if not present:
         return None
-    result: dict[str, Any] = {metric: None for metric in present[0] if metric != "pixels"}
+    result: JsonDict = {metric: None for metric in present[0] if metric != "pixels"}
     for metric in result:
         pairs = [(value, record.get("pixels")) for record in present if (value := record[metric]) is not None]
         if pairs:
@@ -321,7 +321,7 @@ def summary(records: Iterable[Mapping[str, float | None] | None]) -> dict[str, A
     return result
 
 
-def _describe(dataset: Dataset, frames: Sequence[Frame], ignored: float) -> dict[str, Any]:
+def _describe(dataset: Dataset, frames: Sequence[Frame], ignored: float) -> JsonDict:
     """What the report says about the data: its size, and from scene.json how it was made."""
     return {
         "digest": _digest(dataset, frames),
@@ -343,7 +343,7 @@ def _digest(dataset: Dataset, frames: Sequence[Frame]) -> str | None:
         return None
 
 
-def _flatten(record: dict[str, Any]) -> dict[str, Any]:
+def _flatten(record: JsonDict) -> JsonDict:
     """A frame as the contract has it: values over the silhouette beside the name, others in their groups."""
     rest = {key: value for key, value in record.items() if key not in ("image", "shadow")}
     return {**rest, **record["image"], **(record["shadow"] or dict.fromkeys(metric.key for metric in SHADOW))}

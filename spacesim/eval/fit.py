@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spacesim.data.files import JsonDict
 from spacesim.data.records import Dataset, Frame, Sun
 from spacesim.eval.frame_metrics import frame_target
 from spacesim.splat.fit import Picture, PictureLight, Unknown, draw
@@ -24,7 +25,7 @@ class HalvesFit:
     """A frame's fit."""
 
     prediction: "Prediction"  #: each half drawn with what was fitted on the other
-    record: dict[str, Any] | None  #: as metrics.json has it, None where a half shows nothing to fit to
+    record: JsonDict | None  #: as metrics.json has it, None where a half shows nothing to fit to
     seconds: float  #: that drawing it once took
 
 
@@ -60,10 +61,10 @@ def _joined(left: "Prediction", right: "Prediction", is_left: np.ndarray) -> "Pr
     return replace(left, **planes)
 
 
-def _record(unknowns: Sequence[Unknown], middle: int, lights: Sequence[PictureLight]) -> dict[str, Any]:
+def _record(unknowns: Sequence[Unknown], middle: int, lights: Sequence[PictureLight]) -> JsonDict:
     """What was found on the left half, then on the right half; embeddings are left out."""
     names = {unknown.name for unknown in unknowns}
-    record: dict[str, Any] = {"from_column": middle}
+    record: JsonDict = {"from_column": middle}
     if "gain" in names:
         record["gain"] = [light.gain for light in lights]
     if "sun" in names:

@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+from spacesim.data.files import JsonDict
 from spacesim.eval.labels import GROUPS
 from spacesim.splat.fit import Unknown
 
@@ -16,7 +16,7 @@ _STAND_INS = {
 }
 
 
-def explain(records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips: str | None, method: str) -> list[str]:
+def explain(records: Sequence[JsonDict], sources: Sequence[str], no_lpips: str | None, method: str) -> list[str]:
     """Sentences about the frames `records`: {group: {metric: value or None} or None}.
 
     sources: where each silhouette is from ("truth", "alpha" or "frame");  no_lpips: why there is none at all
@@ -46,7 +46,7 @@ def explain(records: Sequence[dict[str, Any]], sources: Sequence[str], no_lpips:
     return notes + _explain_kinds(records)
 
 
-def explain_fit(unknowns: Sequence[Unknown], records: Sequence[dict[str, Any]], whole: bool = False) -> list[str]:
+def explain_fit(unknowns: Sequence[Unknown], records: Sequence[JsonDict], whole: bool = False) -> list[str]:
     """Sentences about what was fitted to the pictures. whole: no silhouette is known"""
     if not unknowns:
         return []
@@ -96,7 +96,7 @@ def explain_light(
 
 def explain_objects(
     names: Mapping[int, str],
-    records: Sequence[dict[str, Any]],
+    records: Sequence[JsonDict],
     models: Sequence[str] | None,
     nearest: Sequence[int] = (),
 ) -> list[str]:
@@ -137,7 +137,7 @@ def _explain_suns(known_suns: Sequence[bool | None], untold: str) -> list[str]:
     return notes
 
 
-def _explain_kinds(records: Sequence[dict[str, Any]]) -> list[str]:
+def _explain_kinds(records: Sequence[JsonDict]) -> list[str]:
     """A sentence for each kind of shadow that no frame shows, where visibility is evaluated at all."""
     if all(record["shadow_mask"] is None for record in records):
         return []
@@ -153,7 +153,7 @@ def _explain_kinds(records: Sequence[dict[str, Any]]) -> list[str]:
     ]
 
 
-def _explain_group(records: Sequence[dict[str, Any]], group: str, no_lpips: bool) -> list[str]:
+def _explain_group(records: Sequence[JsonDict], group: str, no_lpips: bool) -> list[str]:
     """A sentence for each metric that is null in frames which show the object."""
     where, metrics = GROUPS[group]
     values = [record[group] for record in records if record[group] is not None and _shows_object(record)]
@@ -166,5 +166,5 @@ def _explain_group(records: Sequence[dict[str, Any]], group: str, no_lpips: bool
     return notes
 
 
-def _shows_object(record: dict[str, Any]) -> bool:
+def _shows_object(record: JsonDict) -> bool:
     return record["image"]["mae"] is not None

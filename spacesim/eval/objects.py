@@ -3,12 +3,13 @@ and by its shape."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.exporters.objects import labelled_objects
+from spacesim.data.files import JsonDict
 from spacesim.data.images import read_png
 from spacesim.data.records import Dataset, Frame
 from spacesim.eval.frame_metrics import FrameImages, FrameLight, image_groups, visibility_groups
@@ -41,7 +42,7 @@ def object_groups(
     view: FrameImages,
     light: FrameLight,
     network: lpips.Lpips | None,
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, JsonDict]:
     """{name: {group: metrics}} of the objects that the frame shows; {} where it has no picture of their numbers."""
     ids = _ids(dataset, frame, light) if names else None
     if ids is None:
@@ -51,7 +52,7 @@ def object_groups(
         mask = (ids == number) & view.valid
         if mask.any():
             alone = replace(view, silhouette=mask, valid=mask)
-            record: dict[str, Any] = {**image_groups(alone, network), **visibility_groups(light, alone)}
+            record: JsonDict = {**image_groups(alone, network), **visibility_groups(light, alone)}
             groups[name] = {group: record[group] for group in GROUPS}
     return groups
 
@@ -77,7 +78,7 @@ def swapped_order(run: "Predictor", dataset: Dataset) -> list[int]:
 
 def compare_object_shapes(
     run: "Predictor", dataset: Dataset, names: Mapping[int, str], config: GeometryConfig | None
-) -> dict[int, dict[str, Any] | None]:
+) -> dict[int, JsonDict | None]:
     """{number: "geometry" as metrics.json has it} of a composed scene's models, each alone against its object's part of
     the true mesh; {} of a run, whose Gaussians belong to no object, and where models or mesh cannot be told apart.
 

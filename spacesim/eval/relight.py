@@ -6,10 +6,11 @@ EVAL/relight/prediction_KK.png, visibility_KK.png where the method predicts it, 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from spacesim.data.files import JsonDict
 from spacesim.data.geometry import degrees_between
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame
@@ -75,7 +76,7 @@ def phase_deg(camera: Camera, lit_as: Frame) -> float:
 
 def write_sweep(
     run: "Predictor", dataset: Dataset, frames: Sequence[Frame], trained: Sequence[Frame], out: Path
-) -> tuple[dict[str, Any] | None, str]:
+) -> tuple[JsonDict | None, str]:
     """Write the pictures below `out`, in place of earlier ones. What metrics.json says of them, None where there are
     none, and then a sentence why. trained: the frames that the run was trained on"""
     _forget(out / "relight")
@@ -89,7 +90,7 @@ def write_sweep(
     steps = []
     for index, frame in enumerate(sweep.lit_as):
         truth, prediction = sweep.truths[index], predictions[index]
-        step: dict[str, Any] = {
+        step: JsonDict = {
             "sun": rounded_angles(frame),
             "phase_deg": round(phase_deg(sweep.view.camera, frame), 2),
             "known_sun": known_sun[index],

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError, check_ranges
+from spacesim.data.files import JsonMapping
 from spacesim.data.structure import Rules
 
 SCHEMA = 1
@@ -142,7 +143,7 @@ class FrameRecord:
     bias: float | None = None
     boundary_mae: float | None = None
     sharpness_ratio: float | None = None
-    fitted: Mapping[str, Any] | None = None  #: what was fitted to it, of a run with `Metrics.fitted`
+    fitted: JsonMapping | None = None  #: what was fitted to it, of a run with `Metrics.fitted`
 
     def __post_init__(self) -> None:
         if Path(self.name).name != self.name:
@@ -216,8 +217,8 @@ class DatasetFacts:
     ignored: float | None = None  #: share of their pixels that count nowhere
     truth: bool | None = None  #: whether it was path-traced
     scene: str | None = None
-    config: Mapping[str, Any] | None = None
-    versions: Mapping[str, Any] | None = None
+    config: JsonMapping | None = None
+    versions: JsonMapping | None = None
 
 
 @dataclass(frozen=True)
@@ -258,7 +259,7 @@ class Metrics(Groups):
     model: ModelFacts = field(kw_only=True)
     notes: tuple[str, ...] = field(kw_only=True)
     dataset: DatasetFacts = field(kw_only=True)
-    config: Mapping[str, Any] = field(kw_only=True)
+    config: JsonMapping = field(kw_only=True)
     training: TrainingFacts = field(kw_only=True)
     versions: Mapping[str, str] = field(kw_only=True)
     frames: tuple[FrameRecord, ...] = field(kw_only=True)

@@ -1,6 +1,6 @@
 """Which evaluated frames are lit by a Sun that training has seen."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonMapping
 from spacesim.data.identity import same_digest, training_digest
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import read_dataset
@@ -27,7 +28,7 @@ class TrainedOn:
     other: Path | None = None  #: their folder, where they are not those of the dataset asked for
 
 
-def training_frames(config: Mapping[str, Any], dataset: Dataset) -> TrainedOn:
+def training_frames(config: JsonMapping, dataset: Dataset) -> TrainedOn:
     """The frames that a run was trained on: those of `dataset` if it is the run's own, else those of the dataset that
     the run names. config: the run's
     """

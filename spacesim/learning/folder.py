@@ -15,7 +15,7 @@ import numpy as np
 import spacesim
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.files import holds_files, read_json, write_json
+from spacesim.data.files import JsonDict, holds_files, read_json, write_json
 from spacesim.data.identity import same_digest, training_digest
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
@@ -25,7 +25,7 @@ KEEP_CHECKPOINTS = 2
 
 log = logging.getLogger(__name__)
 
-ReadConfig = Callable[[Path], tuple[Any, dict[str, Any]]]
+ReadConfig = Callable[[Path], tuple[Any, JsonDict]]
 """config.json to (configuration, with `to_json`; what it says of the data, as `TrainingData`)."""
 
 
@@ -54,7 +54,7 @@ class TrainingProgress:
         return f"loss {self.loss:.4f}" + ("" if self.gaussian_count is None else f", {self.gaussian_count} Gaussians")
 
 
-def check_folder(out: Path, described: dict[str, Any], resume: bool, read_config: ReadConfig) -> None:
+def check_folder(out: Path, described: JsonDict, resume: bool, read_config: ReadConfig) -> None:
     """Raises InputError where a run that is so described cannot be written to `out`, or completed in it. read_config:
     of the method"""
     if (out / "config.json").exists():
@@ -80,7 +80,7 @@ def finished_model(path: Path) -> Path:
     return path / "model.safetensors"
 
 
-def read_described(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_described(path: Path) -> tuple[JsonDict, JsonDict]:
     """(all of a run's config.json, what it says of the data: as `TrainingData`). Raises InputError where it is broken,
     but for the configuration, which its own record reads."""
     values = read_json(path)
@@ -130,7 +130,7 @@ def device() -> str:
     return f"{platform.machine()} CPU, {os.cpu_count()} cores"
 
 
-def describe_data(dataset: Dataset) -> dict[str, Any]:
+def describe_data(dataset: Dataset) -> JsonDict:
     """What a run remembers of its data: enough to find it again and to notice another one in its place."""
     return {
         "path": str(dataset.root.resolve()),
@@ -140,7 +140,7 @@ def describe_data(dataset: Dataset) -> dict[str, Any]:
     }
 
 
-def _check_resumable(out: Path, described: dict[str, Any], resume: bool, read_config: ReadConfig) -> None:
+def _check_resumable(out: Path, described: JsonDict, resume: bool, read_config: ReadConfig) -> None:
     if not resume:
         raise InputError(f"{out}: expected a new folder, found a run; resume=True goes on with it")
     config, data = read_config(out / "config.json")
@@ -154,7 +154,7 @@ def _check_resumable(out: Path, described: dict[str, Any], resume: bool, read_co
         raise InputError(f"{out}: was started with {key} {old!r}, expected the same to resume it, found {new!r}")
 
 
-def _first_difference(old: dict[str, Any], new: dict[str, Any], within: str = "") -> tuple[str, Any, Any] | None:
+def _first_difference(old: JsonDict, new: JsonDict, within: str = "") -> tuple[str, Any, Any] | None:
     """(key, old value, new value) of the first key of `new` that `old` has otherwise; "light.field.width" within
     others."""
     for key, value in new.items():

@@ -4,7 +4,6 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -12,17 +11,17 @@ from safetensors.numpy import save
 
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
-from spacesim.data.files import open_regular, write_bytes
+from spacesim.data.files import JsonDict, JsonMapping, open_regular, write_bytes
 
 
-def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], header: Mapping[str, Any], form: str) -> None:
+def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], header: JsonMapping, form: str) -> None:
     """Write named arrays and a JSON header to `path`, atomically. form: the word by which `read_tensors` knows it."""
     metadata = {"spacesim": json.dumps({"format": form, **header}, sort_keys=True)}
     contiguous = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     write_bytes(path, save(contiguous, metadata=metadata))
 
 
-def read_tensors(path: Path, form: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_tensors(path: Path, form: str) -> tuple[dict[str, np.ndarray], JsonDict]:
     """(arrays, header) of a file that `write_tensors` wrote. Raises InputError for anything else, and for arrays of
     other numbers than floating-point ones."""
     with open_regular(path, "a model") as file:

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from spacesim import methods
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict
 from spacesim.data.structure import did_you_mean
 from spacesim.reproduce.size import Size
 from spacesim.reproduce.thesis import Row, Table, thesis
@@ -73,7 +74,7 @@ def check_parts(wanted: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in known if not wanted or name in wanted)
 
 
-def data_of(size: Size) -> dict[str, tuple[str, dict[str, Any]]]:
+def data_of(size: Size) -> dict[str, tuple[str, JsonDict]]:
     """{name of a dataset: (scene, options of `read_scene`)}."""
     common = {"resolution": size.resolution, "spp": size.spp, "test_spp": size.test_spp}
     suns = {"suns": size.suns, "views": size.views, "test_suns": size.test_suns, "test_views": size.test_views}

@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+from spacesim.data.files import JsonMapping
 from spacesim.eval.report.charts import line_chart
 from spacesim.eval.report.html import SERIES, escape, picture, swatch, table
 from spacesim.reproduce.experiments import FIELD
@@ -31,7 +31,7 @@ def name_of(experiment: str) -> str:
     return NAMES.get(experiment, f"relightable, improved ({experiment.removesuffix('-relight')})")
 
 
-def relighting(root: Path, rows: Sequence[Mapping[str, Any]]) -> str:
+def relighting(root: Path, rows: Sequence[JsonMapping]) -> str:
     """Figures 4.2 and 6.2: a row a model, a column a Sun, the truth above; how many Gaussians are left."""
     drawn = [row for row in rows if row["sweep"]]
     if not drawn:
@@ -65,12 +65,12 @@ def relighting(root: Path, rows: Sequence[Mapping[str, Any]]) -> str:
     return strip + table("Test views under all Suns; a model that collapses loses its Gaussians", head, [("", lines)])
 
 
-def _sun_cell(root: Path, row: Mapping[str, Any], kind: str, index: int, caption: str) -> str:
+def _sun_cell(root: Path, row: JsonMapping, kind: str, index: int, caption: str) -> str:
     path = root / "experiments" / row["name"] / "suns" / f"{kind}_{index:02d}.png"
     return picture(path, f"{kind}, Sun {index + 1}, {row['name']}", caption, SIDE)
 
 
-def fixed_sun(root: Path, rows: Sequence[Mapping[str, Any]]) -> str:
+def fixed_sun(root: Path, rows: Sequence[JsonMapping]) -> str:
     """Figures 4.3 and 4.4: metrics over fully lit and over all views, shapes, depth of a lit and a shadowed side."""
     there = [row for row in rows if "all" in row]
     waiting = [[escape(name_of(row["name"])), escape(row["state"])] for row in rows if row not in there]
@@ -93,7 +93,7 @@ def fixed_sun(root: Path, rows: Sequence[Mapping[str, Any]]) -> str:
     return "".join(parts)
 
 
-def _strip(root: Path, rows: Sequence[Mapping[str, Any]], side: str) -> str:
+def _strip(root: Path, rows: Sequence[JsonMapping], side: str) -> str:
     """Truth and models of a view: pictures, then depth."""
     view = Path(rows[0]["views"]["chosen"][side]).stem
     figures: list[str] = []
@@ -110,7 +110,7 @@ def _strip(root: Path, rows: Sequence[Mapping[str, Any]], side: str) -> str:
     return f'<div class="strip" style="grid-template-columns: repeat({len(rows) + 1}, 1fr)">{"".join(figures)}</div>'
 
 
-def frame_times(_root: Path, rows: Sequence[Mapping[str, Any]]) -> str:
+def frame_times(_root: Path, rows: Sequence[JsonMapping]) -> str:
     """Figure 3.2: a frame's time against the number of models, Gaussians and radiance field, and their ratio."""
     there = [row for row in rows if row["frames"]]
     if not there:
@@ -139,7 +139,7 @@ def frame_times(_root: Path, rows: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def inside(_root: Path, rows: Sequence[Mapping[str, Any]]) -> str:
+def inside(_root: Path, rows: Sequence[JsonMapping]) -> str:
     """Figure 5.5: the share of Gaussians inside the true mesh."""
     there = [row for row in rows if "inside" in row]
     if not there:

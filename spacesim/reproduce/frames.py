@@ -10,6 +10,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.density import target_of
+from spacesim.data.files import JsonValue
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset, Frame
 from spacesim.learning.folder import device
@@ -27,7 +28,7 @@ VIEWS = 9  #: frames of each scene, each from another test view; the median coun
 WARM_UP = 2  #: frames before these: kernels are compiled for the first one, and again for what the second finds changed
 
 
-def time_frames(run: "Run | NerfRun", dataset: Dataset, tell: Callable[[int, int, str], None]) -> dict[str, Any]:
+def time_frames(run: "Run | NerfRun", dataset: Dataset, tell: Callable[[int, int, str], None]) -> dict[str, JsonValue]:
     """{"models": [1, ...], "ms": [median of a frame, milliseconds], "pixels": [width, height], "views", "device",
     "backend"}: of pictures as `predict` returns them, in the computer's memory."""
     frames = views(dataset)

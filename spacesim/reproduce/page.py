@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from spacesim.data.files import write_bytes
+from spacesim.data.files import JsonMapping, write_bytes
 from spacesim.eval.report.html import escape, page, section, table
 from spacesim.reproduce.experiments import FIGURES as FIGURE_TITLES
 from spacesim.reproduce.figures import density, fixed_sun, frame_times, inside, relighting
@@ -27,7 +27,7 @@ FIGURES: Mapping[str, Callable[[Path, Any], str]] = {
 }
 
 
-def write_page(root: Path, values: Mapping[str, Any]) -> Path:
+def write_page(root: Path, values: JsonMapping) -> Path:
     """Write the page about what reproduce.json has; returns its path."""
     done = sum(one["state"] == "finished" for one in values["experiments"])
     body = [_header(values, done), section("How large", _conditions(values), "What the thesis had, and what this is.")]
@@ -54,7 +54,7 @@ def write_page(root: Path, values: Mapping[str, Any]) -> Path:
     return path
 
 
-def _header(values: Mapping[str, Any], done: int) -> str:
+def _header(values: JsonMapping, done: int) -> str:
     total = len(values["experiments"])
     failed = sum(one["state"] == "failed" for one in values["experiments"])
     state = f"{done} of {total} experiments are finished" + (f", {failed} failed" if failed else "") + "."
@@ -67,7 +67,7 @@ def _header(values: Mapping[str, Any], done: int) -> str:
     )
 
 
-def _conditions(values: Mapping[str, Any]) -> str:
+def _conditions(values: JsonMapping) -> str:
     """What the thesis had and what this run has."""
     size, theirs = values["conditions"], thesis().conditions
     devices = sorted({one["device"] for one in values["experiments"] if one["device"]})
@@ -106,7 +106,7 @@ def _conditions(values: Mapping[str, Any]) -> str:
     return f'<div class="facts">{table("Data and trainings", ["", "Thesis", "Here"], [("", cells)])}</div>'
 
 
-def _iterations(values: Mapping[str, Any], preset: str) -> str:
+def _iterations(values: JsonMapping, preset: str) -> str:
     """Of the trainings of tables, by preset."""
     found = {
         one["preset"]: f"{one['iterations']:,} ({one['preset']})"
@@ -118,7 +118,7 @@ def _iterations(values: Mapping[str, Any], preset: str) -> str:
     return ", ".join(found.values()) or "none"
 
 
-def _table(known: Table, values: Mapping[str, Any], seeds: int) -> str:
+def _table(known: Table, values: JsonMapping, seeds: int) -> str:
     """A table of the thesis, metric by metric; what of its order holds; causes of differences."""
     keys = ["printed", *values["presets"]]
     head = ["", "Thesis", *_headings(values["presets"])]
@@ -156,7 +156,7 @@ def _headings(presets: Mapping[str, str]) -> list[str]:
     return found
 
 
-def _cell(column: Column, cell: Mapping[str, Any], is_best: bool, seeds: int) -> str:
+def _cell(column: Column, cell: JsonMapping, is_best: bool, seeds: int) -> str:
     """HTML of a mean and its standard deviation, as the thesis prints them; the spread over seeds below."""
     if cell["mean"] is None:
         return NONE.format({"null": "–"}.get(cell["state"], cell["state"]))
@@ -167,7 +167,7 @@ def _cell(column: Column, cell: Mapping[str, Any], is_best: bool, seeds: int) ->
     return text
 
 
-def _orderings(values: Mapping[str, Any]) -> str:
+def _orderings(values: JsonMapping) -> str:
     """Whether what the thesis's numbers say holds of ours."""
     presets = values["presets"]
     rows = [[escape(one["text"]), *(VERDICTS[one["holds"][key]] for key in presets)] for one in values["orderings"]]
@@ -178,7 +178,7 @@ def _orderings(values: Mapping[str, Any]) -> str:
     return f'<div class="dense">{table("What the thesis says, and whether ours does", head, [("", rows)])}</div>'
 
 
-def _experiments(experiments: Sequence[Mapping[str, Any]]) -> str:
+def _experiments(experiments: Sequence[JsonMapping]) -> str:
     head = ["", "State", "Data", "Preset", "Iterations", "Gaussians", "Training", "Reports"]
     rows = []
     for one in experiments:

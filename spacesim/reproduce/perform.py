@@ -10,7 +10,7 @@ import numpy as np
 
 from spacesim import methods
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.files import read_json, write_json
+from spacesim.data.files import JsonDict, read_json, write_json
 from spacesim.data.geometry import angles_from_direction
 from spacesim.data.images import write_png
 from spacesim.data.mesh import SignedDistance
@@ -132,10 +132,10 @@ def trained(folder: Path, dataset: Dataset, config: methods.Config, name: str, r
 
 def evaluated(
     run: "Predictor", dataset: Dataset, folder: Path, judge: EvaluateConfig, name: str, reporting: Reporting
-) -> dict[str, Any]:
+) -> JsonDict:
     """What metrics.json of an evaluation and its report hold."""
     if (folder / "report.html").exists():
-        known: dict[str, Any] = read_json(folder / "metrics.json")
+        known: JsonDict = read_json(folder / "metrics.json")
         return known
     with reporting(f"evaluate {name}", "frames") as report:
         metrics = evaluate(run, dataset, folder, judge, report)
@@ -182,7 +182,7 @@ def draw_suns(run: "Predictor", dataset: Dataset, folder: Path) -> None:
     steps = []
     for index, (frame, truth) in enumerate(zip(sweep.lit_as, sweep.truths, strict=True)):
         prediction = run.predict(sweep.view.camera, frame.sun)
-        step: dict[str, Any] = {"sun": rounded_angles(frame), "psnr": None}
+        step: JsonDict = {"sun": rounded_angles(frame), "psnr": None}
         if truth is not None:
             view, _ = frame_images(dataset, truth, prediction)
             step["psnr"] = image.psnr(view.prediction, view.truth, view.silhouette)
@@ -218,7 +218,7 @@ def depth_picture(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     return as_bytes(np.where(depth > 0, np.clip(bright, DARKEST, 1), 0))
 
 
-def follow(folder: Path, dataset: Dataset, config: TrainConfig, steps: int, tell: Tell) -> dict[str, Any]:
+def follow(folder: Path, dataset: Dataset, config: TrainConfig, steps: int, tell: Tell) -> JsonDict:
     """{"gaussians": N, "inside": [[step, share of their centres inside the true mesh]]} over the first steps of a
     training (figure 5.5); the folder keeps a checkpoint and what was counted until then."""
     surface = SignedDistance.of(dataset.root / known_mesh(dataset, "the figure"))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from spacesim.data.files import MAX_LIST_BYTES, read_json
+from spacesim.data.files import MAX_LIST_BYTES, JsonDict, JsonMapping, read_json
 from spacesim.reproduce.experiments import (
     FIGURES,
     VARIANTS,
@@ -29,7 +29,7 @@ from spacesim.reproduce.thesis import Column, Row, Table, best, holds, pairs, th
 
 PICTURES = ("psnr", "ssim", "lpips", "mae")
 SHAPE = ("chamfer", "hausdorff99", "iou")
-Values = dict[str, Any]
+Values = JsonDict
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class Results:
         return [{"name": work.name, "state": self.state(work), **(curve or {})} for work, curve in found]
 
 
-def value_of(metrics: Mapping[str, Any], table: Table, path: str, suns: str) -> tuple[float, float | None] | None:
+def value_of(metrics: JsonMapping, table: Table, path: str, suns: str) -> tuple[float, float | None] | None:
     """Mean and, over frames, standard deviation of a metric; None where it is null."""
     group, name = path.split(".")
     if group in ("model", "geometry"):
@@ -221,7 +221,7 @@ def value_of(metrics: Mapping[str, Any], table: Table, path: str, suns: str) -> 
     return None if found is None else (found["mean"], found["std"])
 
 
-def _model_value(metrics: Mapping[str, Any], name: str) -> float:
+def _model_value(metrics: JsonMapping, name: str) -> float:
     model = metrics["model"]
     seconds = max(model["render_ms"], 1e-6) / 1e3
     found = {
@@ -233,12 +233,12 @@ def _model_value(metrics: Mapping[str, Any], name: str) -> float:
     return float(found[name])
 
 
-def _mean(metrics: Mapping[str, Any], group: str, name: str) -> float | None:
+def _mean(metrics: JsonMapping, group: str, name: str) -> float | None:
     found = (metrics.get(group) or {}).get(name)
     return None if found is None else float(found["mean"])
 
 
-def _over(frames: Sequence[Mapping[str, Any]], name: str) -> dict[str, float] | None:
+def _over(frames: Sequence[JsonMapping], name: str) -> dict[str, float] | None:
     """Mean and standard deviation over frames that have the metric, None where none has."""
     values = [frame[name] for frame in frames if frame.get(name) is not None]
     return {"mean": float(np.mean(values)), "std": float(np.std(values))} if values else None

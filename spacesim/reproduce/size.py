@@ -1,9 +1,8 @@
 """How large a reproduction is: the full one, a reduced one that says most of it, a quick one that says that it runs."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
+from spacesim.data.files import JsonMapping
 from spacesim.eval.metrics.geometry import GeometryConfig
 
 
@@ -33,9 +32,7 @@ class Size:
     light: str = "fine"  #: preset of what is improved in tables 4.4 to 4.7
     strategies: str = "fast"  #: preset of what is improved in tables 5.4 to 5.6
     nerf: str = "thesis"  #: preset of figure 3.2's radiance field
-    settings: Mapping[str, Any] = field(
-        default_factory=dict
-    )  #: fields of every training that has them, by dotted names
+    settings: JsonMapping = field(default_factory=dict)  #: fields of every training that has them, by dotted names
     geometry: GeometryConfig | None = field(default_factory=GeometryConfig)  #: how shapes are compared
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from spacesim.data.errors import InputError, expect
+from spacesim.data.files import JsonDict
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.rig import FibonacciRig, RigConfig, kinds_with, rig_kind
@@ -137,7 +138,7 @@ class SceneConfig:
             raise InputError("background: expected an [earth] in the scene for placement fixed, found none")
         expect(0 <= self.seed <= MAX_SEED, "seed", f"0 to {MAX_SEED}", self.seed)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonDict:
         """Plain JSON values, without the folder: a dataset does not depend on where its scene file lay."""
         values = {key: value for key, value in asdict(replace(self, folder=None)).items() if key != "folder"}
         rig = {key: value for key, value in values["rig"].items() if value or key not in _UNLESS_ASKED_FOR}
@@ -153,7 +154,7 @@ def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
 
     Raises InputError for a name that this scene's rig does not know, or a value out of range.
     """
-    changes: dict[str, dict[str, Any]] = {"": {}, "rig": {}, "camera": {}, "quality": {}}
+    changes: dict[str, JsonDict] = {"": {}, "rig": {}, "camera": {}, "quality": {}}
     owners = {
         part: {f.name for f in fields(getattr(scene, part))} if part else {"name", "seed", "background"}
         for part in changes

@@ -17,6 +17,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import read_record
 from spacesim.learning.folder import finished_model, read_described
@@ -62,11 +63,11 @@ class Predictor(Protocol):
         """The run's folder, or the scene's file."""
 
     @property
-    def config(self) -> dict[str, Any]:
+    def config(self) -> JsonDict:
         """How it was trained, or composed; "method" names the method or all of them."""
 
     @property
-    def training(self) -> dict[str, Any]:
+    def training(self) -> JsonDict:
         """How training went, see `TrainingRecord`; {} of a scene."""
 
     @property
@@ -135,8 +136,8 @@ class Run:
     """
 
     path: Path  #: the folder
-    config: dict[str, Any]  #: what config.json says
-    training: dict[str, Any]  #: what training.json says, see docs/reference/runs.md
+    config: JsonDict  #: what config.json says
+    training: JsonDict  #: what training.json says, see docs/reference/runs.md
     gaussians: Gaussians  #: the model
     model_bytes: int  #: size of the model's file
     light: LightModel | None = None  #: None of a method without light
@@ -300,7 +301,7 @@ def load_run(path: str | Path) -> Run:
     return Run(path, config, training, gaussians, model_path.stat().st_size, light)
 
 
-def read_config(path: Path) -> tuple[TrainConfig, dict[str, Any]]:
+def read_config(path: Path) -> tuple[TrainConfig, JsonDict]:
     """(how a run is trained, what on: as `TrainingData`) by its config.json. Raises InputError where it is broken."""
     values, data = read_described(path)
     return TrainConfig.from_json(values, str(path)), data

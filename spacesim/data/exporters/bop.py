@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -21,7 +20,7 @@ from scipy.spatial.distance import cdist
 
 from spacesim.data.errors import InputError
 from spacesim.data.exporters.objects import ExportProgress, LabelledObject, labelled_objects, new_folder, opaque_picture
-from spacesim.data.files import write_bytes, write_json
+from spacesim.data.files import JsonDict, write_bytes, write_json
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
@@ -84,7 +83,7 @@ def write_bop(
 
 def _write_frame(
     scene: Path, image: int, dataset: Dataset, frame: Frame, targets: list[LabelledObject], find: Outline
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+) -> tuple[JsonDict, list[JsonDict]]:
     """Write the pictures of a frame; returns its entries of scene_camera.json and scene_gt_info.json."""
     truth = load_truth(dataset, frame)
     picture = opaque_picture(dataset, frame)
@@ -133,7 +132,7 @@ def bounding_box(pixels: np.ndarray, origin: tuple[int, int] = (0, 0)) -> tuple[
     return x + origin[0], y + origin[1], int(columns[-1]) - x + 1, int(rows[-1]) - y + 1
 
 
-def _pose(camera: Camera, target: LabelledObject, model: int) -> dict[str, Any]:
+def _pose(camera: Camera, target: LabelledObject, model: int) -> JsonDict:
     pose = target.camera_from_object(camera)
     return {
         "cam_R_m2c": pose[:3, :3].ravel().tolist(),
@@ -200,7 +199,7 @@ def _diameter(points: np.ndarray) -> float:
     return max(float(cdist(points[i : i + 1000], points).max()) for i in range(0, len(points), 1000))
 
 
-def _test_targets(infos: dict[str, list[dict[str, Any]]], models: list[int]) -> list[dict[str, int]]:
+def _test_targets(infos: dict[str, list[JsonDict]], models: list[int]) -> list[dict[str, int]]:
     """How many instances of each model are to be found in each test image."""
     entries_found = []
     for image, entries in infos.items():

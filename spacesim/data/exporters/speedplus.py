@@ -13,7 +13,6 @@ utilities project it so. Pixels are as everywhere here: the image spans [0, Nu] 
 
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from spacesim.data.exporters.objects import (
     opaque_picture,
     select_object,
 )
-from spacesim.data.files import MAX_LIST_BYTES, read_json, write_json
+from spacesim.data.files import MAX_LIST_BYTES, JsonDict, read_json, write_json
 from spacesim.data.geometry import camera_that_sees, quaternion_from_rotation
 from spacesim.data.identity import frame_names
 from spacesim.data.images import write_png
@@ -66,7 +65,7 @@ def write_speedplus(
     return target
 
 
-def _kept_labels(dataset: Dataset) -> dict[str, dict[str, Any]]:
+def _kept_labels(dataset: Dataset) -> dict[str, JsonDict]:
     """What transforms.json keeps of an import's labels, by the paths of images; {} where a frame has none."""
     try:
         entries = read_json(dataset.root / "transforms.json", MAX_LIST_BYTES)["frames"]
@@ -76,7 +75,7 @@ def _kept_labels(dataset: Dataset) -> dict[str, dict[str, Any]]:
     return labels if all(frame.file_path in labels for frame in dataset.frames) else {}
 
 
-def _label(name: str, frame: Frame, target: LabelledObject, kept: dict[str, Any] | None = None) -> dict[str, Any]:
+def _label(name: str, frame: Frame, target: LabelledObject, kept: JsonDict | None = None) -> JsonDict:
     """kept: written as it is, where it says the frame's pose"""
     pose = target.camera_from_object(frame.camera)
     if kept is not None:
@@ -91,7 +90,7 @@ def _label(name: str, frame: Frame, target: LabelledObject, kept: dict[str, Any]
     }
 
 
-def _camera(frames: Sequence[Frame]) -> dict[str, Any]:
+def _camera(frames: Sequence[Frame]) -> JsonDict:
     """camera.json of what all frames share."""
     first = frames[0]
     for frame in frames:

@@ -9,7 +9,7 @@ import io
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_bytes
+from spacesim.data.files import JsonMapping, read_bytes
 from spacesim.data.images import read_png
 from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.lenses import LENS_MODELS, Lens, LensModel
@@ -84,7 +84,7 @@ def import_blender(src: Path, out: Path, *, progress: Progress | None = None) ->
     return _write(dataset_of_pair(root, train, test), extras, out, source, progress)
 
 
-def _take_extras(path: Path, meta: Mapping[str, Any], extras: _Extras, unit: float | None) -> Mapping[str, Any]:
+def _take_extras(path: Path, meta: JsonMapping, extras: _Extras, unit: float | None) -> JsonMapping:
     """`meta` without what goes to `extras`. What is malformed stays, for `data.transforms` to complain of."""
     frames = meta.get("frames")
     if unit is not None and not (math.isfinite(unit) and unit > 0):
@@ -119,7 +119,7 @@ def _is_number(value: Any) -> bool:
     return not isinstance(value, bool) and isinstance(value, int | float) and abs(value) < 1e30
 
 
-def _unit(path: Path, name: str, values: Mapping[str, Any]) -> float:
+def _unit(path: Path, name: str, values: JsonMapping) -> float:
     """Metres a step of a frame's depth."""
     key = next((key for key in _UNITS if key in values), None)
     if key is None:
@@ -129,9 +129,7 @@ def _unit(path: Path, name: str, values: Mapping[str, Any]) -> float:
     return float(values[key])
 
 
-def _write(
-    dataset: Dataset, extras: _Extras, out: Path, source: Mapping[str, Any], progress: Progress | None
-) -> Dataset:
+def _write(dataset: Dataset, extras: _Extras, out: Path, source: JsonMapping, progress: Progress | None) -> Dataset:
     assert source["masked"] in MASKED
     maker, depths = FrameMaker(source["masked"]), _DepthReader()
     paths = _below_one_folder(dataset.root, [frame.file_path for frame in dataset.frames])

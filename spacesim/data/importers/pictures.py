@@ -11,6 +11,7 @@ import numpy as np
 
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonValue
 from spacesim.data.geometry import Array
 from spacesim.data.images import Resampling, Undistortion, has_alpha, image_size, read_png, resample
 from spacesim.data.importers.lenses import Lens
@@ -37,7 +38,7 @@ class View:
     sun: Sun | None = None
     silhouette: Path | None = None  #: other than 0 = object
     depth: Callable[[], np.ndarray] | None = None  #: makes uint16 [H, W], millimetres along the optical axis
-    keys: Mapping[str, Any] = field(default_factory=dict)  #: as of `ImportedFrame`
+    keys: Mapping[str, JsonValue] = field(default_factory=dict)  #: as of `ImportedFrame`
 
 
 @dataclass

@@ -18,13 +18,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from PIL import Image as PillowImage
 
 from spacesim.data.errors import InputError, expect
-from spacesim.data.files import MAX_LIST_BYTES, read_json
+from spacesim.data.files import MAX_LIST_BYTES, JsonDict, read_json
 from spacesim.data.geometry import Array, camera_that_sees
 from spacesim.data.images import image_size, read_png
 from spacesim.data.importers.importer import Importer, Option
@@ -185,7 +184,7 @@ def _read_labels(path: Path) -> list[_Label]:
     return sorted((_read_label(path, entry) for entry in entries), key=lambda label: label.filename)
 
 
-def _read_label(path: Path, entry: dict[str, Any]) -> _Label:
+def _read_label(path: Path, entry: JsonDict) -> _Label:
     name = entry.get("filename")
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or "\0" in str(name) or ".." in parts or PurePosixPath(str(name)).is_absolute():
@@ -203,7 +202,7 @@ def _read_label(path: Path, entry: dict[str, Any]) -> _Label:
     return _Label(str(name), quaternion, position)
 
 
-def _numbers(entry: dict[str, Any], keys: Sequence[str], count: int) -> list[float]:
+def _numbers(entry: JsonDict, keys: Sequence[str], count: int) -> list[float]:
     """The finite numbers under the first of `keys` that is there."""
     value = next((entry[key] for key in keys if key in entry), None)
     try:

@@ -6,13 +6,14 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.files import (
     MAX_LIST_BYTES,
+    JsonDict,
+    JsonMapping,
     flush_disks,
     holds_files,
     json_bytes,
@@ -50,14 +51,14 @@ class ImportedFrame:
     silhouette: Picture | None = None  #: 255 object, 0 none: a pixel without is empty
     mask: Picture | None = None  #: 255 counts, 0: ignore this pixel, nothing is known of it
     depth: Picture | None = None  #: 16 bits, millimetres along the optical axis, 0 none
-    keys: Mapping[str, Any] = field(default_factory=dict)  #: that transforms.json has of the frame besides
+    keys: JsonMapping = field(default_factory=dict)  #: that transforms.json has of the frame besides
 
 
 def write_dataset(
     out: str | Path,
     train: Sequence[ImportedFrame],
     test: Sequence[ImportedFrame] | None,
-    source: Mapping[str, Any],
+    source: JsonMapping,
     points: tuple[np.ndarray, np.ndarray] | None = None,
     files: Mapping[str, bytes] | None = None,
     progress: Progress | None = None,
@@ -88,7 +89,7 @@ def write_dataset(
                     paths.append(_write(out, picture, entry[key]))
             if progress is not None:
                 progress(number, len(frames), frame.name)
-        meta: dict[str, Any] = {"camera_model": "OPENCV", "frames": entries}
+        meta: JsonDict = {"camera_model": "OPENCV", "frames": entries}
         if test is not None:
             names = [entry["file_path"] for entry in entries]
             meta |= {"train_filenames": names[: len(train)], "test_filenames": names[len(train) :]}
@@ -107,7 +108,7 @@ def write_dataset(
     return read_dataset(out)
 
 
-def _check_names(source: str, entries: Sequence[Mapping[str, Any]]) -> None:
+def _check_names(source: str, entries: Sequence[JsonMapping]) -> None:
     """Raises InputError where two frames would be written to one file, before anything is."""
     for key in ("file_path", *_PARTS.values()):
         for path, count in Counter(entry[key] for entry in entries if key in entry).items():
@@ -134,7 +135,7 @@ def frame_names(paths: Sequence[str]) -> list[str]:
     return names if len(set(names)) == len(names) else ended
 
 
-def check_free(out: Path, source: Mapping[str, Any]) -> bool:
+def check_free(out: Path, source: JsonMapping) -> bool:
     """Whether the folder `out` holds an unfinished import of `source`. Raises InputError where it holds anything else:
     what takes long asks before."""
     if out.exists() and not out.is_dir():
@@ -149,7 +150,7 @@ def check_free(out: Path, source: Mapping[str, Any]) -> bool:
     return False
 
 
-def _claim(out: Path, source: Mapping[str, Any]) -> None:
+def _claim(out: Path, source: JsonMapping) -> None:
     """Write import.json into a new folder, or into that of an import that has not ended."""
     if check_free(out, source):
         remove_leftovers(out)
@@ -157,10 +158,10 @@ def _claim(out: Path, source: Mapping[str, Any]) -> None:
         write_json(out / SOURCE, dict(source))
 
 
-def _entry(frame: ImportedFrame) -> dict[str, Any]:
+def _entry(frame: ImportedFrame) -> JsonDict:
     """Of transforms.json."""
     camera, suffix = frame.camera, frame.picture.suffix.lower() if isinstance(frame.picture, Path) else ".png"
-    entry: dict[str, Any] = {
+    entry: JsonDict = {
         "file_path": f"images/{frame.name}{suffix}",
         "transform_matrix": camera.opengl.tolist(),
         "w": camera.width,

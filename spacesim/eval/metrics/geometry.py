@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict
 from spacesim.data.geometry import Array
 from spacesim.data.mesh import SignedDistance, read_mesh
 from spacesim.data.records import Camera, Dataset
@@ -62,7 +63,7 @@ class Shape:
 class Comparison:
     """Two surfaces compared."""
 
-    values: dict[str, Any]  #: as metrics.json has them
+    values: JsonDict  #: as metrics.json has them
     truth: Shape  #: samples with their distances
     predicted: Shape  #: samples with their distances
     size: float  #: metres, the diagonal of the box around the truth
@@ -72,7 +73,7 @@ class Comparison:
 class ShapeResult:
     """The shape of a run against the truth."""
 
-    values: dict[str, Any] | None  #: metrics.json's "geometry", or None
+    values: JsonDict | None  #: metrics.json's "geometry", or None
     note: str  #: a sentence where it, or a part of it, is None, else ""
     #: None where the surfaces cannot be compared; truth, found: both surfaces, None where there is none
     comparison: Comparison | None = None

@@ -7,10 +7,10 @@ are pooled: a mean over frames would weigh a bin's few pixels in one frame as it
 
 from collections.abc import Iterable
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
+from spacesim.data.files import JsonValue
 from spacesim.data.geometry import Array
 from spacesim.data.records import Truth
 from spacesim.data.store import SHADOW_SELF_CAST
@@ -42,7 +42,7 @@ def tally(
     return np.stack([np.bincount(bins, row, len(EDGES_DEG) - 1) for row in weights])
 
 
-def summary(tallies: Iterable[Array | None]) -> list[dict[str, Any]] | None:
+def summary(tallies: Iterable[Array | None]) -> list[dict[str, JsonValue]] | None:
     """A record for each bin, None where no frame has a tally.
 
     from_deg, to_deg; pixels; luminance_mae; visibility_mae; error_rate: share of pixels on the wrong side of one half;

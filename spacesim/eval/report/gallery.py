@@ -1,10 +1,10 @@
 """The report's pictures: best, median and worst frames as truth, prediction, error and shadow masks."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
+from spacesim.data.files import JsonMapping
 from spacesim.eval.pictures import (
     ERROR_SCALE,
     LIT,
@@ -37,11 +37,11 @@ MISTAKES = {
 def gallery(runs: Sequence[Evaluation]) -> str:
     """HTML of the frames chosen by PSNR."""
 
-    def psnr(frame: Mapping[str, Any]) -> float | None:
+    def psnr(frame: JsonMapping) -> float | None:
         value: float | None = frame["psnr"]
         return value
 
-    def words(frame: Mapping[str, Any]) -> str:
+    def words(frame: JsonMapping) -> str:
         return "" if frame["psnr"] is None else f"PSNR {frame['psnr']:.2f} dB"
 
     stops = ", ".join(css(color) for color in error_colors(np.linspace(0, 1, 17)))
@@ -62,8 +62,8 @@ def strips(
     runs: Sequence[Evaluation],
     panels: Panels,
     score_panel: str,
-    score: Callable[[Mapping[str, Any]], float | None],
-    words: Callable[[Mapping[str, Any]], str],
+    score: Callable[[JsonMapping], float | None],
+    words: Callable[[JsonMapping], str],
 ) -> str:
     """HTML of the best, the median and the worst frame: the same ones for all runs where these share frames, else each
     run's own.
@@ -94,7 +94,7 @@ def strips(
     return "".join(parts)
 
 
-def sun_of(frame: Mapping[str, Any]) -> str:
+def sun_of(frame: JsonMapping) -> str:
     """Where a frame's Sun is, and whether training has never seen it; "" where that is not known."""
     if frame["sun"] is None:
         return ""

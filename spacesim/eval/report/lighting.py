@@ -1,10 +1,11 @@
 """The report about light: one view under many Suns, true and predicted shadow masks, errors by grazing angle."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.eval.labels import LOWER
 from spacesim.eval.pictures import ATTACHED, ATTACHED_LIT, LIT, OTHER_CAST, SELF_CAST, SHADOWED
 from spacesim.eval.report.charts import bar_chart
@@ -81,13 +82,13 @@ def _sweep(runs: Sequence[Evaluation], titled: bool) -> str:
     )
 
 
-def _sun_words(step: Mapping[str, Any]) -> str:
+def _sun_words(step: JsonMapping) -> str:
     azimuth, elevation = step["sun"]
     kind = {True: "known", False: "unseen", None: ""}[step["known_sun"]]
     return f"{azimuth:.0f}°, {elevation:.0f}°<br><small>{kind}</small>"
 
 
-def _cell(run: Evaluation, name: str, index: int, step: Mapping[str, Any], caption: str) -> str:
+def _cell(run: Evaluation, name: str, index: int, step: JsonMapping, caption: str) -> str:
     azimuth, elevation = step["sun"]
     alt = f"{name} under the Sun at {azimuth:.1f}°, {elevation:.1f}°, {run.name}"
     return picture(run.folder / "relight" / f"{name}_{index:02d}.png", alt, caption, 240)
@@ -102,11 +103,11 @@ def shadow_masks(runs: Sequence[Evaluation]) -> str:
     frames = [frame for run in predicting for frame in run.frames.values() if frame["shadow_mask"] is not None]
     least = MIN_PIXEL_SHARE * float(np.median([_rate(frame, "pixels") or 0 for frame in frames]))
 
-    def score(frame: Mapping[str, Any]) -> float | None:
+    def score(frame: JsonMapping) -> float | None:
         value = _rate(frame, "balanced_error_rate")
         return None if value is None or (_rate(frame, "pixels") or 0) < least else -value
 
-    def words(frame: Mapping[str, Any]) -> str:
+    def words(frame: JsonMapping) -> str:
         value = _rate(frame, "balanced_error_rate")
         return "" if value is None else f"balanced error rate {value:.4f}"
 
@@ -116,7 +117,7 @@ def shadow_masks(runs: Sequence[Evaluation]) -> str:
     return keys + shown + "".join(_pairs(run, named=len(runs) > 1) for run in predicting)
 
 
-def _rate(frame: Mapping[str, Any], key: str) -> float | None:
+def _rate(frame: JsonMapping, key: str) -> float | None:
     """Of a frame's shadow mask; None where it has none."""
     value: float | None = (frame["shadow_mask"] or {}).get(key)
     return value
@@ -157,7 +158,7 @@ def by_grazing_angle(runs: Sequence[Evaluation]) -> str:
     with_bins = [run for run in runs if run.metrics.get("by_grazing_angle")]
     if not with_bins:
         return ""
-    bins: list[list[dict[str, Any]]] = [run.metrics["by_grazing_angle"] for run in with_bins]
+    bins: list[list[JsonDict]] = [run.metrics["by_grazing_angle"] for run in with_bins]
     present = [key for key in _BIN_COLUMNS if any(entry[key] is not None for part in bins for entry in part)]
     labels = [_range(entry) for entry in bins[0]]
     charts = [
@@ -176,10 +177,10 @@ def by_grazing_angle(runs: Sequence[Evaluation]) -> str:
     return f'{legend(runs)}<div class="charts three">{"".join(charts)}</div>{table("By grazing angle", head, bodies)}'
 
 
-def _bin_row(entry: Mapping[str, Any], columns: Sequence[str]) -> list[str]:
+def _bin_row(entry: JsonMapping, columns: Sequence[str]) -> list[str]:
     values = [_NULL if entry[key] is None else f"{entry[key]:.4f}" for key in columns]
     return [_range(entry), f"{entry['pixels']:,}", *values]
 
 
-def _range(entry: Mapping[str, Any]) -> str:
+def _range(entry: JsonMapping) -> str:
     return f"{entry['from_deg']:g}–{entry['to_deg']:g}°"

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import MAX_LIST_BYTES
+from spacesim.data.files import MAX_LIST_BYTES, JsonDict
 from spacesim.data.identity import same_digest
 from spacesim.data.structure import read_record
 from spacesim.eval.report.html import escape, swatch
@@ -20,7 +19,7 @@ class Evaluation:
     folder: Path
     index: int  #: place in the report
     name: str  #: the run's, unique there
-    metrics: dict[str, Any]  #: what metrics.json holds
+    metrics: JsonDict  #: what metrics.json holds
 
     @property
     def label(self) -> str:
@@ -28,7 +27,7 @@ class Evaluation:
         return swatch(self.index) + escape(self.name)
 
     @property
-    def frames(self) -> dict[str, dict[str, Any]]:
+    def frames(self) -> dict[str, JsonDict]:
         """The evaluated frames by the names of their folders."""
         return {frame["name"]: frame for frame in self.metrics["frames"]}
 
@@ -53,7 +52,7 @@ class Evaluation:
         value = self.summary(group, metric)
         return None if value is None else value["mean"]
 
-    def summary(self, group: str, metric: str, suns: str = "") -> dict[str, Any] | None:
+    def summary(self, group: str, metric: str, suns: str = "") -> JsonDict | None:
         """Mean, spread and count of a metric; None where it is null. suns: "" all frames, or "known_suns" or
         "unseen_suns": those frames alone."""
         where = self.metrics.get(suns) if suns else self.metrics
@@ -103,11 +102,11 @@ def legend(runs: Sequence[Evaluation]) -> str:
     return f'<p class="key">{"".join(f"<span>{run.label}</span>" for run in runs)}</p>'
 
 
-def _read_metrics(folder: Path) -> dict[str, Any]:
+def _read_metrics(folder: Path) -> JsonDict:
     return read_record(folder / "metrics.json", Metrics, RULES, MAX_LIST_BYTES)[1]
 
 
-def _unique_names(contents: Sequence[dict[str, Any]], folders: Sequence[Path]) -> list[str]:
+def _unique_names(contents: Sequence[JsonDict], folders: Sequence[Path]) -> list[str]:
     """The runs' last path components if these differ, else the runs' paths, else those of the folders."""
     for names in (
         [Path(metrics["run"]).name for metrics in contents],

@@ -1,10 +1,10 @@
 """The report about shape: the numbers and what they mean, both surfaces coloured by their distance from each other."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
+from spacesim.data.files import JsonMapping
 from spacesim.eval.labels import HIGHER, LOWER, Metric
 from spacesim.eval.report.gallery import css
 from spacesim.eval.report.html import escape, picture, table
@@ -75,7 +75,7 @@ def _table(runs: Sequence[Evaluation]) -> str:
     return "".join(parts)
 
 
-def _groups(runs: Sequence[Evaluation]) -> list[tuple[str, list[tuple[str, Mapping[str, Any]]]]]:
+def _groups(runs: Sequence[Evaluation]) -> list[tuple[str, list[tuple[str, JsonMapping]]]]:
     """(title, rows), rows: (a run's label, its numbers), first of the whole, then of each object that has a shape."""
     scene_rows = [(run.label, run.metrics["geometry"]) for run in runs]
     entries = [
@@ -89,7 +89,7 @@ def _groups(runs: Sequence[Evaluation]) -> list[tuple[str, list[tuple[str, Mappi
     return [("All models" if objects else "", scene_rows), *objects]
 
 
-def _rows(group: Sequence[tuple[str, Mapping[str, Any]]], metrics: Sequence[Metric], factor: float) -> list[list[str]]:
+def _rows(group: Sequence[tuple[str, JsonMapping]], metrics: Sequence[Metric], factor: float) -> list[list[str]]:
     """A row of HTML for each (label, numbers)."""
     columns = [best_in_bold(metric, [_cell(geometry, metric, factor) for _, geometry in group]) for metric in metrics]
     return [[label, *row] for (label, _), *row in zip(group, *columns, strict=True)]
@@ -101,7 +101,7 @@ def _heading(metric: Metric, unit: str) -> str:
     return f"{escape(metric.label)}{f' <small>[{escape(unit)}]</small>' if unit else ''} {metric.goal}"
 
 
-def _cell(geometry: Mapping[str, Any], metric: Metric, factor: float) -> Cell:
+def _cell(geometry: JsonMapping, metric: Metric, factor: float) -> Cell:
     value = value_of(geometry, metric.key)
     if value is None:
         return None, '<span class="none" title="null: see the notes">–</span>', ""
@@ -112,7 +112,7 @@ def _cell(geometry: Mapping[str, Any], metric: Metric, factor: float) -> Cell:
     return value, f"{shown:.{metric.digits}f}", ""
 
 
-def value_of(geometry: Mapping[str, Any], key: str) -> float | None:
+def value_of(geometry: JsonMapping, key: str) -> float | None:
     """A number of metrics.json's "geometry", also of the groups in it; None where it is null."""
     group = {"precision": "precision_recall", "recall": "precision_recall", "f": "precision_recall"}.get(key)
     group = "floaters" if key in ("outside", "inside") else group
@@ -149,7 +149,7 @@ def _pictures(run: Evaluation, named: bool) -> str:
     return "".join(parts)
 
 
-def _distance(geometry: Mapping[str, Any], factor: float, unit: str) -> str:
+def _distance(geometry: JsonMapping, factor: float, unit: str) -> str:
     """The named distance in words."""
     within = (geometry["precision_recall"] or geometry["floaters"] or {"distance": 0.0})["distance"]
     return f"{within * factor:.3g} {unit}, {100 * within / geometry['size']:.2g} % of the object's size"

@@ -1,8 +1,8 @@
 """The report's tables of numbers: a row for each run, the best of each column in bold."""
 
 from collections.abc import Sequence
-from typing import Any
 
+from spacesim.data.files import JsonDict
 from spacesim.eval.labels import GROUPS, IMAGE, RECALL, SHADOW, SHADOW_KIND, SHADOW_MASK, Metric, metric_of
 from spacesim.eval.metrics.shadow import KINDS
 from spacesim.eval.report.html import escape, table
@@ -97,7 +97,7 @@ def summary_cell(run: Evaluation, group: str, metric: Metric, suns: str = "") ->
     return _cell(run.summary(group, metric.key, suns), metric)
 
 
-def _cell(value: dict[str, Any] | None, metric: Metric) -> Cell:
+def _cell(value: JsonDict | None, metric: Metric) -> Cell:
     if value is None:
         return None, _NONE, ""
     spread = f"± {value['std']:.{metric.digits}f}"

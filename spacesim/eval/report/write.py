@@ -3,13 +3,12 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from spacesim.data import density
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_bytes, write_bytes
+from spacesim.data.files import JsonDict, JsonMapping, read_bytes, write_bytes
 from spacesim.eval.labels import IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric, metric_of
 from spacesim.eval.report.charts import column_histograms, histogram, line_chart, shared_edges
 from spacesim.eval.report.gallery import gallery
@@ -211,7 +210,7 @@ def _by_sun(run: Evaluation) -> dict[tuple[float, ...], list[float]]:
     return groups
 
 
-def _sun_key(frame: Mapping[str, Any]) -> tuple[float, ...]:
+def _sun_key(frame: JsonMapping) -> tuple[float, ...]:
     return tuple(round(angle, 1) for angle in frame["sun"] or ())
 
 
@@ -254,7 +253,7 @@ def _camera_density(runs: Sequence[Evaluation]) -> str:
 
 def _making(runs: Sequence[Evaluation]) -> str:
     """Tables of data, configuration and software, a column for each run; rows that differ stand out."""
-    tables: list[tuple[str, Callable[[Evaluation], Mapping[str, Any]]]] = [
+    tables: list[tuple[str, Callable[[Evaluation], JsonMapping]]] = [
         ("Data", _data_facts),
         ("Model and time", _model_facts),
         ("Training configuration", lambda run: run.metrics["config"]),
@@ -274,7 +273,7 @@ def _making(runs: Sequence[Evaluation]) -> str:
     return "".join(parts)
 
 
-def _data_facts(run: Evaluation) -> dict[str, Any]:
+def _data_facts(run: Evaluation) -> JsonDict:
     data = run.metrics["dataset"]
     width, height = data["resolution"]
     facts = {
@@ -287,7 +286,7 @@ def _data_facts(run: Evaluation) -> dict[str, Any]:
     return facts | {key: value for key, value in (data.get("config") or {}).items() if key not in facts}
 
 
-def _model_facts(run: Evaluation) -> dict[str, Any]:
+def _model_facts(run: Evaluation) -> JsonDict:
     model, training = run.metrics["model"], run.metrics["training"]
     seconds = training.get("seconds")
     return {
@@ -314,7 +313,7 @@ def _facts_table(caption: str, runs: Sequence[Evaluation], facts: Sequence[Mappi
     return table(caption, head, [("", rows)])
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+def _flat(values: JsonMapping, prefix: str = "") -> dict[str, str]:
     """Nested mappings as {"outer.inner": text}; what is None or empty is left out."""
     flat: dict[str, str] = {}
     for key, value in values.items():

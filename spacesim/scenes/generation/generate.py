@@ -7,13 +7,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
 from spacesim import backend
 from spacesim.data.errors import InputError, expect
-from spacesim.data.files import MAX_LIST_BYTES, read_json, write_json
+from spacesim.data.files import MAX_LIST_BYTES, JsonValue, read_json, write_json
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import DatasetWriter
@@ -74,7 +73,7 @@ def generate(
         return writer.finish(*listed, points, colors, sweep.scene.mesh, lens, lambda d: write_overview(d.root, d))
 
 
-def _open(root: Path, described: dict[str, Any], resume: bool, sweep: "_DatasetPlan") -> DatasetWriter:
+def _open(root: Path, described: dict[str, JsonValue], resume: bool, sweep: "_DatasetPlan") -> DatasetWriter:
     """The writer of the folder. Only scene.json tells which scene frames are of. Where it is broken, nothing is
     resumed; where it is gone, resuming says that they are of the scene asked for, and it is written again."""
     path = root / "scene.json"
@@ -164,7 +163,7 @@ def plan_views(scene: Scene, config: SceneConfig) -> tuple[NamedViews, NamedView
     )
 
 
-def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedViews) -> dict[str, Any]:
+def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedViews) -> dict[str, JsonValue]:
     """scene.json: all that is needed to render the same dataset again."""
     return {
         "schema": SCHEMA,

@@ -14,7 +14,7 @@ import numpy as np
 
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_bytes
+from spacesim.data.files import JsonDict, read_bytes
 from spacesim.scenes.meshes.gltf_surface import UV_SET, Surfaces
 from spacesim.scenes.meshes.parts import RawPart
 from spacesim.scenes.meshes.textures import MAX_FILE_BYTES, Folder, Notes, decode_data_uri
@@ -52,7 +52,7 @@ def read_gltf(path: Path, notes: Notes) -> list[RawPart]:
     return parts
 
 
-def _document(path: Path) -> tuple[dict[str, Any], bytes | None]:
+def _document(path: Path) -> tuple[JsonDict, bytes | None]:
     """(JSON document, binary chunk or None) of a glb (4.4) or gltf file."""
     data = read_bytes(path)
     body = None
@@ -99,7 +99,7 @@ def _index(value: Any) -> int:
 class _File:
     """Buffers, views and accessors (3.6) of a document."""
 
-    def __init__(self, document: dict[str, Any], body: bytes | None, folder: Folder) -> None:
+    def __init__(self, document: JsonDict, body: bytes | None, folder: Folder) -> None:
         self.document, self.folder = document, folder
         self._body = body
         self._buffers: dict[int, bytes] = {}
@@ -163,7 +163,7 @@ class _File:
             return np.maximum(values.astype(np.float64) / np.iinfo(dtype).max, -1.0)
         return values
 
-    def _fill_sparse(self, values: np.ndarray, sparse: dict[str, Any]) -> None:
+    def _fill_sparse(self, values: np.ndarray, sparse: JsonDict) -> None:
         count, where, what = _index(sparse["count"]), sparse["indices"], sparse["values"]
         kind = np.dtype(_DTYPES[where["componentType"]])
         rows = _strided(self.view(where["bufferView"]), _index(where.get("byteOffset", 0)), 0, count, 1, kind)
@@ -181,7 +181,7 @@ def _strided(data: bytes, start: int, stride: int, count: int, width: int, dtype
     return np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize))
 
 
-def _placed_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, np.ndarray]]:
+def _placed_nodes(document: JsonDict) -> Iterator[tuple[JsonDict, str, np.ndarray]]:
     """(node, name, scene_from_node [4, 4]) of the scene's nodes that have a mesh, in the file's order (3.5)."""
     nodes = document.get("nodes", [])
     scenes = document.get("scenes", [])
@@ -204,7 +204,7 @@ def _placed_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], st
             yield node, str(node.get("name", "")), transform
 
 
-def _local(node: dict[str, Any]) -> np.ndarray:
+def _local(node: JsonDict) -> np.ndarray:
     """parent_from_node [4, 4]: a matrix (column by column) or translation, rotation (x, y, z, w) and scale (3.5.3)."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
@@ -224,9 +224,7 @@ def _local(node: dict[str, Any]) -> np.ndarray:
     return local
 
 
-def _part(
-    file: _File, surfaces: Surfaces, primitive: dict[str, Any], transform: np.ndarray, notes: Notes
-) -> RawPart | None:
+def _part(file: _File, surfaces: Surfaces, primitive: JsonDict, transform: np.ndarray, notes: Notes) -> RawPart | None:
     """A primitive in the scene's axes; None (and a note) for points and lines."""
     mode = primitive.get("mode", 4)
     if mode not in (4, 5, 6):
@@ -268,7 +266,7 @@ def _part(
     return RawPart("", vertices, faces, uv, surface, normals)
 
 
-def _normals(file: _File, attributes: dict[str, Any], transform: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+def _normals(file: _File, attributes: JsonDict, transform: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     """[F, 3, 3] normals at the corners of faces in the scene's axes, None where not every vertex has one."""
     stored = file.accessor(attributes["NORMAL"], (3,)).astype(np.float64)
     if faces.max(initial=-1) >= len(stored):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict
 from spacesim.scenes.meshes.textures import Folder, Notes, Surface, clip_to_unit, decode_data_uri, decode_image
 
 UV_SET = "TEXCOORD_{}"
@@ -33,7 +34,7 @@ class UvSet:
 class Surfaces:
     """The materials of a document, each read once. view: reads a buffer view."""
 
-    def __init__(self, document: dict[str, Any], view: Callable[[Any], bytes], folder: Folder, notes: Notes) -> None:
+    def __init__(self, document: JsonDict, view: Callable[[Any], bytes], folder: Folder, notes: Notes) -> None:
         self._document, self._view, self._folder, self._notes = document, view, folder, notes
         self._known: dict[int, tuple[Surface, UvSet]] = {}
         self._pictures: dict[int, np.ndarray | None] = {}
@@ -56,7 +57,7 @@ class Surfaces:
             self._known[index] = self._surface(entry, name)
         return self._known[index]
 
-    def _note_the_unused(self, entry: dict[str, Any], name: str) -> None:
+    def _note_the_unused(self, entry: JsonDict, name: str) -> None:
         if any(clip_to_unit(c, 0.0) > 0 for c in entry.get("emissiveFactor", ())):
             self._notes.drop("surfaces do not glow, emission is not used", name)
         if "occlusionTexture" in entry:
@@ -67,7 +68,7 @@ class Surfaces:
             if extension != "KHR_materials_pbrSpecularGlossiness":
                 self._notes.drop(f"{str(extension)[:60]} is not used", name)
 
-    def _surface(self, entry: dict[str, Any], name: str) -> tuple[Surface, UvSet]:
+    def _surface(self, entry: JsonDict, name: str) -> tuple[Surface, UvSet]:
         plain = entry.get("pbrMetallicRoughness", {})
         old = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
         if old is not None and "pbrMetallicRoughness" not in entry:
@@ -96,7 +97,7 @@ class Surfaces:
         surface = Surface(name, (red, green, blue), metallic, roughness, pictures, used.wrap)
         return surface, used.uv or UvSet(0, np.eye(2, 3))
 
-    def picture(self, texture: dict[str, Any], name: str) -> np.ndarray | None:
+    def picture(self, texture: JsonDict, name: str) -> np.ndarray | None:
         """[H, W, 3] uint8 of a texture, None (and a note) where it cannot be had."""
         source = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source", texture.get("source"))
         if source is None:
@@ -106,7 +107,7 @@ class Surfaces:
             self._pictures[source] = self._picture(self._document["images"][source], source)
         return self._pictures[source]
 
-    def _picture(self, image: dict[str, Any], source: int) -> np.ndarray | None:
+    def _picture(self, image: JsonDict, source: int) -> np.ndarray | None:
         what = str(image.get("name") or f"image {source}")[:80]
         try:
             uri = str(image.get("uri", ""))
@@ -119,7 +120,7 @@ class Surfaces:
             return None
         return decode_image(data, what, self._notes)
 
-    def wrap(self, texture: dict[str, Any]) -> str:
+    def wrap(self, texture: JsonDict) -> str:
         """How a texture continues outside of [0, 1]: "repeat", "clamp" or "mirror"."""
         if "sampler" not in texture:
             return "repeat"
@@ -130,7 +131,7 @@ class Surfaces:
             return "repeat"
         return modes.pop()
 
-    def texture(self, info: dict[str, Any]) -> dict[str, Any]:
+    def texture(self, info: JsonDict) -> JsonDict:
         """The texture that a material refers to."""
         return self._document["textures"][info["index"]]
 
@@ -147,7 +148,7 @@ class _MaterialTextures:
         self.uv: UvSet | None = None
         self.wrap = "repeat"
 
-    def take(self, info: dict[str, Any] | None, what: str) -> np.ndarray | None:
+    def take(self, info: JsonDict | None, what: str) -> np.ndarray | None:
         """The picture of a texture reference, None without one or where it cannot be had."""
         if info is None:
             return None
@@ -162,7 +163,7 @@ class _MaterialTextures:
         return picture
 
 
-def _uv_of(info: dict[str, Any]) -> UvSet:
+def _uv_of(info: JsonDict) -> UvSet:
     """Set and transform of a texture reference. KHR_texture_transform: scale, then turn, then shift; the turn's sign is
     that of the extension's example (its matrix, read as rows)."""
     extension = info.get("extensions", {}).get("KHR_texture_transform", {})

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Frame, Sun
 from spacesim.splat.compose.members import Ensemble, Member
 from spacesim.splat.compose.pose import Pose
@@ -27,12 +27,12 @@ class AlignedRun:
         return self.run.path
 
     @property
-    def config(self) -> dict[str, Any]:
+    def config(self) -> JsonDict:
         """How it was trained."""
         return self.run.config
 
     @property
-    def training(self) -> dict[str, Any]:
+    def training(self) -> JsonDict:
         """How training went."""
         return self.run.training
 

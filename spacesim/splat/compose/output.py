@@ -21,7 +21,7 @@ import numpy as np
 
 from spacesim import __version__, backend
 from spacesim.data.errors import InputError
-from spacesim.data.files import holds_files, read_json, remove_leftovers, write_bytes, write_json
+from spacesim.data.files import JsonValue, holds_files, read_json, remove_leftovers, write_bytes, write_json
 from spacesim.data.images import read_png, write_exr, write_png
 from spacesim.data.integrity.whole import is_whole
 from spacesim.data.lock import lock_folder
@@ -145,10 +145,10 @@ def _forget(out: Path, frames: int) -> None:
                 (out / kind / f"{frame.stem}{suffix}").unlink(missing_ok=True)
 
 
-def _describe_frame(frame: SceneFrame, exposure: float | None) -> dict[str, Any]:
+def _describe_frame(frame: SceneFrame, exposure: float | None) -> dict[str, JsonValue]:
     """What a frame shows: as shots/*.json has it, with a digest of all that the pictures depend on."""
     camera = frame.camera
-    values: dict[str, Any] = {
+    values: dict[str, JsonValue] = {
         "time": frame.time,
         "transform_matrix": camera.opengl.tolist(),
         **intrinsics_of(camera),
@@ -171,7 +171,7 @@ def _describe_frame(frame: SceneFrame, exposure: float | None) -> dict[str, Any]
     return {"digest": hashlib.sha256(text.encode()).hexdigest(), **values}
 
 
-def _is_up_to_date(out: Path, index: int, what: dict[str, Any]) -> bool:
+def _is_up_to_date(out: Path, index: int, what: dict[str, JsonValue]) -> bool:
     path = out / SHOTS / f"{index:04d}.json"
     try:
         record = read_json(path)
@@ -185,7 +185,7 @@ def _is_up_to_date(out: Path, index: int, what: dict[str, Any]) -> bool:
     return all(kind in tuple(PICTURES) and is_whole(out / kind / f"{index:04d}{PICTURES[kind]}") for kind in kinds)
 
 
-def _write(out: Path, index: int, frame: SceneFrame, what: dict[str, Any], exposure: float | None) -> None:
+def _write(out: Path, index: int, frame: SceneFrame, what: dict[str, JsonValue], exposure: float | None) -> None:
     """The pictures of a frame, then its shots/*.json; while they are written, an earlier one is gone."""
     record = out / SHOTS / f"{index:04d}.json"
     record.unlink(missing_ok=True)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose.scene import ComposedPrediction, Composition
 from spacesim.splat.compose.scenefile import load_scene
@@ -48,7 +49,7 @@ class ComposedRun:
 
     composition: Composition
     path: Path  #: the scene file's
-    training: dict[str, Any] = field(default_factory=dict)  #: nothing, as no training has seen the scene
+    training: JsonDict = field(default_factory=dict)  #: nothing, as no training has seen the scene
 
     @property
     def parts(self) -> tuple[PlacedPart, ...]:
@@ -86,7 +87,7 @@ class ComposedRun:
         return self.composition.antialiased
 
     @cached_property
-    def config(self) -> dict[str, Any]:
+    def config(self) -> JsonDict:
         """The methods, the shadows between models, and each model's run and pose."""
         models = self.composition.models
         methods = list(dict.fromkeys(str(model.run.config.get("method")) for model in models))

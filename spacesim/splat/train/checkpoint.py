@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from spacesim.data.errors import check_ranges
+from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.learning import tensors as files
 
 FORMAT = "spacesim-gaussians-1"
@@ -35,11 +35,11 @@ class CheckpointHeader:
         check_ranges(self, iteration=(0, 2**53), adam_steps=(0, 2**53))
 
 
-def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
+def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], header: JsonMapping) -> None:
     """Write a model or a checkpoint of Gaussians; see `learning.tensors`."""
     files.write_tensors(path, tensors, header, FORMAT)
 
 
-def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], JsonDict]:
     """The inverse of `write_tensors`. Raises InputError for another file."""
     return files.read_tensors(path, FORMAT)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from spacesim.data.errors import InputError, check_ranges
+from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.structure import Rules, alternatives, check_choices, did_you_mean, plain, structure
 from spacesim.data.toml import Document, read_document
 from spacesim.splat.light.config import LightConfig
@@ -162,13 +163,13 @@ class TrainConfig:
         """How many pixels of a picture make one, on a side, at `step`, the first of which is 0 (as splatfacto)."""
         return 1 << max(self.num_downscales - step // self.resolution_schedule, 0)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonDict:
         """Plain values for config.json."""
-        values: dict[str, Any] = plain(self)
+        values: JsonDict = plain(self)
         return values
 
     @staticmethod
-    def from_json(values: Mapping[str, Any], name: str = "config.json") -> "TrainConfig":
+    def from_json(values: JsonMapping, name: str = "config.json") -> "TrainConfig":
         """The inverse of `to_json`; missing keys have their defaults, and the key data, which a run's config.json has
         besides, is passed over. name: of the file, for messages. Raises InputError for a key that is not known and for
         a value that cannot be."""
@@ -204,12 +205,12 @@ def warm_start(name: str) -> WarmStartConfig:
 
 
 @cache
-def _sections(name: str) -> Mapping[str, Any]:
+def _sections(name: str) -> JsonMapping:
     """The tables of a preset's file."""
     return read_document(ASSETS / f"{name}.toml").values
 
 
-def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+def merged(first: JsonMapping, second: JsonMapping) -> JsonDict:
     """Both tables in one: what only one has, and what both have as the second has it; tables within are merged, too."""
     result = dict(first)
     for key, value in second.items():
@@ -238,7 +239,7 @@ def shortened(config: TrainConfig, iterations: int) -> TrainConfig:
     if not 0 < share < 1:
         return replace(config, iterations=iterations)
 
-    def beginning(record: Any, *names: str) -> dict[str, Any]:
+    def beginning(record: Any, *names: str) -> JsonDict:
         lengths = {name: getattr(record, name) for name in names}
         return {name: max(round(share * n), min(n, iterations // 20), min(n, 1)) for name, n in lengths.items()}
 
@@ -269,7 +270,7 @@ def shortened(config: TrainConfig, iterations: int) -> TrainConfig:
     )
 
 
-def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConfig:
+def with_settings(config: TrainConfig, settings: JsonMapping) -> TrainConfig:
     """`config` with fields set by their dotted names: {"light.shadow.bias": 5, "light.shadow.refine": "none"}.
 
     A value is what config.json has for such a field; "none" is None where a field can be that, and the name of an

@@ -1,13 +1,14 @@
 """config.json of runs that were trained before the configuration had alternatives: in today's layout."""
 
 from collections.abc import Mapping
-from typing import Any
+
+from spacesim.data.files import JsonDict, JsonMapping
 
 ALIASES = {"park": "baseline-park"}  #: words that methods had: today's
 _STRATEGIES = ("mesh-aware", "support-aware", "mcmc")
 
 
-def in_this_layout(values: Mapping[str, Any]) -> dict[str, Any]:
+def in_this_layout(values: JsonMapping) -> JsonDict:
     """The fields of a TrainConfig, plain values; those in today's layout stay as they are, and so does what is neither:
     whoever reads it says what is wrong."""
     values = dict(values)
@@ -21,7 +22,7 @@ def in_this_layout(values: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-def _light(light: dict[str, Any]) -> dict[str, Any]:
+def _light(light: JsonDict) -> JsonDict:
     field, shadow = light.get("field"), light.get("shadow")
     if isinstance(field, Mapping) and isinstance(field.get("surface"), bool):
         field = dict(field)

@@ -15,7 +15,7 @@ from PIL import Image
 from scipy import ndimage
 
 from spacesim.data.errors import InputError, expect
-from spacesim.data.files import json_bytes
+from spacesim.data.files import JsonValue, json_bytes
 from spacesim.data.images import read_png, write_png
 from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.masks import MASKED, MaskFolder, read_mask
@@ -82,7 +82,7 @@ def import_video(
                 f"{src}: expected at least {LEAST} frames that differ, found {len(chosen)} of {len(seen.motion)}: "
                 "nothing moves"
             )
-        keys: dict[str, dict[str, Any]] = {}
+        keys: dict[str, dict[str, JsonValue]] = {}
         size: tuple[int, ...] | None = None
         for number, frame in enumerate(read_frames(src, again=True)):
             if number in set(chosen.tolist()):
@@ -127,12 +127,12 @@ def _import(
     src: Path,
     out: Path,
     folder: Path,
-    keys: Mapping[str, Mapping[str, Any]],
+    keys: Mapping[str, Mapping[str, JsonValue]],
     ordered: bool,
     asked: Wishes,
-    source: dict[str, Any],
+    source: dict[str, JsonValue],
     tell: "_Teller",
-    facts: dict[str, Any],
+    facts: dict[str, JsonValue],
 ) -> Dataset:
     """Of pictures in folder/pictures, all of one size. keys: of each picture by its name, what transforms.json has of
     it besides"""
@@ -208,7 +208,7 @@ def _hide_background(folder: Path, names: Sequence[str]) -> Path:
 
 
 def _frames(
-    folder: Path, model: Model, has_masks: bool, masked: str, keys: Mapping[str, Mapping[str, Any]]
+    folder: Path, model: Model, has_masks: bool, masked: str, keys: Mapping[str, Mapping[str, JsonValue]]
 ) -> Iterator[ImportedFrame]:
     distortion = (model.k1, 0.0, 0.0, 0.0, 0.0)
     for name, pose in zip(model.names, model.world_from_camera, strict=True):
@@ -230,7 +230,7 @@ def _frames(
         )
 
 
-def _source(kind: str, src: Path, asked: Wishes, **more: Any) -> dict[str, Any]:
+def _source(kind: str, src: Path, asked: Wishes, **more: Any) -> dict[str, JsonValue]:
     options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(asked).items()}
     return {"kind": kind, "source": str(src), **more, **options}
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonValue
 from spacesim.data.geometry import Array, normalize
 
 EXTENT = 0.5, 99.5  #: percentiles of points along the longest axis between which an object's length lies
@@ -86,7 +86,7 @@ def placed(model: Model, length: float | None = None, distance: float | None = N
     return replace(model, world_from_camera=poses, points=scale * offsets @ rotation.T)
 
 
-def report_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
+def report_of(model: Model, names: Sequence[str]) -> dict[str, JsonValue]:
     """What import tells of it. names: of all pictures."""
     tracks = [len(frames) for frames in model.seen_by]
     centres = np.linalg.norm(model.positions, axis=1)

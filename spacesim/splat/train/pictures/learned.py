@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.backend.arrays import Float
+from spacesim.data.files import JsonValue
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset
 from spacesim.data.store import intrinsics_of
@@ -109,13 +110,13 @@ class LearnedPictures:
         if self.suns:
             self.suns.restore(tensors)
 
-    def cameras(self) -> dict[str, Any] | None:
+    def cameras(self) -> dict[str, JsonValue] | None:
         """For RUN/cameras.json: the training pictures' cameras and gains, in the form of transforms.json; None where
         none were learned."""
         if not self._learned():
             return None
         gains = self.exposures.all_gains() if self.exposures else None
-        frames: list[dict[str, Any]] = []
+        frames: list[dict[str, JsonValue]] = []
         for picture, frame in enumerate(self.frames):
             camera = self.poses.camera(picture) if self.poses else frame.camera
             frames.append({"file_path": frame.file_path, "transform_matrix": camera.opengl.tolist()})

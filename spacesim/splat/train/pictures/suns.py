@@ -14,12 +14,12 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from spacesim.backend.arrays import Float
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonValue
 from spacesim.data.geometry import Array, degrees_between
 from spacesim.data.images import load_image
 from spacesim.data.records import Dataset, Frame, Sun
@@ -106,7 +106,7 @@ class SunEstimation:
         self.numbers.values = found
         self.numbers.first[:] = 0
 
-    def described(self, picture: int) -> dict[str, Any]:
+    def described(self, picture: int) -> dict[str, JsonValue]:
         """Of cameras.json: as transforms.json names a Sun, and how sure it is."""
         sun = Sun(self.direction(picture))
         azimuth, elevation = sun.angles
