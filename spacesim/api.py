@@ -86,7 +86,7 @@ def generate(
     resume: bool = False,
     workers: int = 1,
     progress: ProgressCallback | None = None,
-    **options: Any,
+    **options: object,
 ) -> Dataset:
     """Path-trace a dataset with its truth into the folder `out` (docs/reference/dataset.md).
 
@@ -109,7 +109,7 @@ def generate(
 
 
 def import_dataset(
-    kind: str, src: str | Path, out: str | Path, *, progress: ProgressCallback | None = None, **options: Any
+    kind: str, src: str | Path, out: str | Path, *, progress: ProgressCallback | None = None, **options: object
 ) -> Dataset:
     """Write pictures from elsewhere as a dataset into the folder `out` (docs/reference/dataset.md#data-from-elsewhere).
 

@@ -18,7 +18,7 @@ _constants: dict[int, tuple[Any, Any]] = {}  # frozen dataclasses without arrays
 _leaves: set[type] = set()  # types of arguments that Dr.Jit is left to look into
 
 
-def elements_of_first(arrays: list[Any], *_: Any, **__: Any) -> int:
+def elements_of_first(arrays: list[Any], *_: object, **__: object) -> int:
     """How many elements the first of a call's arrays has; 1 where it has no arrays."""
     import drjit as dr
 
@@ -140,7 +140,7 @@ class _Names(dict[Any, str]):
     def __init__(self) -> None:
         self._numbers = itertools.count()
 
-    def __missing__(self, told: Any) -> str:
+    def __missing__(self, told: object) -> str:
         if len(self) >= MAX_KEYS:
             self.clear()
         name = self[told] = str(next(self._numbers))
@@ -226,7 +226,7 @@ def _joined(value: Any, arrays: Iterator[Any]) -> Any:
 
 
 @cache
-def _names(kind: Any) -> tuple[str, ...] | None:
+def _names(kind: object) -> tuple[str, ...] | None:
     """Of a dataclass's fields; None for any other type."""
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else None
 

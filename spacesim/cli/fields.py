@@ -55,7 +55,7 @@ def meanings(cls: Any) -> dict[str, str]:
     return {f.name: result.get(f.name, "") for f in fields(cls)}
 
 
-def fields_of(record: Any, at: str = "") -> Iterator[Field]:
+def fields_of(record: object, at: str = "") -> Iterator[Field]:
     """Every field of a record, and of the records in it, with the values that it has."""
     cls: Any = type(record)
     hints, said = get_type_hints(cls), meanings(cls)
@@ -68,7 +68,7 @@ def fields_of(record: Any, at: str = "") -> Iterator[Field]:
             yield Field(key, type_words(hints[f.name]), _literal(value), said[f.name])
 
 
-def type_words(hint: Any) -> str:
+def type_words(hint: object) -> str:
     """An annotation in words."""
     inner = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     words = [*alternatives(hint)] or [*choices(hint)]
@@ -77,7 +77,7 @@ def type_words(hint: Any) -> str:
     return " | ".join([*words, *(["none"] if NoneType in inner else [])])
 
 
-def listing(config: Any) -> str:
+def listing(config: object) -> str:
     """A line for each field of a configuration: key, default, type, meaning."""
     rows = list(fields_of(config))
     key, default = max(len(row.key) for row in rows), max(len(row.default) for row in rows)
@@ -88,7 +88,7 @@ def listing(config: Any) -> str:
     return "\n".join(lines)
 
 
-def reference(config: Any = TrainConfig) -> str:
+def reference(config: object = TrainConfig) -> str:
     """Markdown: a table for each record of a configuration, with the defaults of the record itself, and where it is
     found."""
     parts = []
@@ -109,7 +109,7 @@ def reference(config: Any = TrainConfig) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _records(cls: Any, at: str = "") -> dict[Any, list[str]]:
+def _records(cls: object, at: str = "") -> dict[Any, list[str]]:
     """{record: keys under which it stands}, outer ones first."""
     result: dict[Any, list[str]] = {cls: [at]}
     for name, hint in get_type_hints(cls).items():
@@ -121,7 +121,7 @@ def _records(cls: Any, at: str = "") -> dict[Any, list[str]]:
     return result
 
 
-def _literal(value: Any) -> str:
+def _literal(value: object) -> str:
     if value is None:
         return "none"
     return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)

@@ -36,7 +36,7 @@ class Parser(argparse.ArgumentParser):
         else:
             super()._print_message(message, file)
 
-    def _check_value(self, action: argparse.Action, value: Any) -> None:
+    def _check_value(self, action: argparse.Action, value: object) -> None:
         if action.choices is not None and value not in action.choices:
             words = ", ".join(map(str, action.choices))
             raise argparse.ArgumentError(

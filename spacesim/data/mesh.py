@@ -81,7 +81,7 @@ class MeshFolderResolver(trimesh.resolvers.Resolver):
         """No listing: files are asked for by name."""
         return ()
 
-    def write(self, name: str, data: Any) -> None:
+    def write(self, name: str, data: object) -> None:
         """Nothing is written."""
         raise PermissionError(name)
 

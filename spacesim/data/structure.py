@@ -51,7 +51,7 @@ def read_record(
     return structure(cls, Document(str(path), values, {}), rules or Rules()), values
 
 
-def plain(record: Any) -> Any:
+def plain(record: object) -> Any:
     """The inverse of `structure`: a record as tables, lists and values that JSON has. The alternatives of a union say
     which one they are under the key `kind`."""
     if is_dataclass(record) and not isinstance(record, type):
@@ -68,7 +68,7 @@ def kind_of(cls: Any) -> str | None:
     return tag if isinstance(tag, str) and all(f.name != "kind" for f in fields(cls)) else None
 
 
-def alternatives(hint: Any) -> dict[str, type]:
+def alternatives(hint: object) -> dict[str, type]:
     """{kind: class} of an annotation that is a union of records, each with a class variable `kind`; {} of another."""
     inner = get_args(hint) if get_origin(hint) in (Union, UnionType) else ()
     return {
@@ -78,7 +78,7 @@ def alternatives(hint: Any) -> dict[str, type]:
     }
 
 
-def choices(hint: Any) -> tuple[str, ...]:
+def choices(hint: object) -> tuple[str, ...]:
     """What an annotation `Literal[...]`, or one with None beside it, allows; () of another."""
     if get_origin(hint) is Literal:
         return get_args(hint)
@@ -86,7 +86,7 @@ def choices(hint: Any) -> tuple[str, ...]:
     return next((get_args(member) for member in inner if get_origin(member) is Literal), ())
 
 
-def check_choices(record: Any) -> None:
+def check_choices(record: object) -> None:
     """Raise InputError "field: expected one of ..., found ..." unless every field of `record` that is annotated with
     `Literal[...]` holds one of these words."""
     cls: Any = type(record)
@@ -162,7 +162,7 @@ class _Reader:
                 self._refuse((*at, f.name), _noun(hints[f.name]), None)
         return self._construct(cls, settings, at)
 
-    def value(self, hint: Any, value: Any, at: Keys) -> Any:
+    def value(self, hint: object, value: object, at: Keys) -> Any:
         """`value` as its annotation `hint` wants it."""
         origin, inner = get_origin(hint), get_args(hint)
         if hint is Any:
@@ -192,7 +192,7 @@ class _Reader:
             return self.table(hint, value, at)
         return self._plain(hint, value, at)
 
-    def _read_list(self, hint: Any, value: Any, at: Keys) -> tuple[Any, ...]:
+    def _read_list(self, hint: object, value: object, at: Keys) -> tuple[Any, ...]:
         inner = get_args(hint)
         is_open, may_spread = inner[-1] is Ellipsis, at[-1] in self._rules.spread
         if may_spread and type(value) in (int, float):
@@ -233,12 +233,12 @@ class _Reader:
             hint = f"; kind {' and '.join(others)} know{'s' * (len(others) == 1)} it"
         self._refuse((*at, key), f"one of {', '.join(expected)}", key, hint)
 
-    def _refuse(self, at: Keys, expected: str, found: Any, hint: str = "") -> NoReturn:
+    def _refuse(self, at: Keys, expected: str, found: object, hint: str = "") -> NoReturn:
         what = "none" if found is None else _short(found)
         raise InputError(f"{self._document.label(at)}: expected {expected}, found {what}{hint}")
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     if isinstance(value, Mapping):
         return "a table"
     text = repr(value)

@@ -211,7 +211,7 @@ def _dump_lines(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str
             yield from _dump_lines(item, (*path, key))
 
 
-def _is_tables(value: Any) -> bool:
+def _is_tables(value: object) -> bool:
     return isinstance(value, list | tuple) and len(value) > 0 and all(isinstance(item, Mapping) for item in value)
 
 
@@ -219,7 +219,7 @@ def _quoted_key(key: str) -> str:
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _literal(key)
 
 
-def _literal(value: Any) -> str:
+def _literal(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):

@@ -16,7 +16,6 @@ import math
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
@@ -281,7 +280,7 @@ def _split(
     return tuple(f for f in frames if f.file_path in train), tuple(f for f in frames if f.file_path in test)
 
 
-def _listed(source: Path, names: Any, paths: list[str], missing: tuple[str, ...]) -> set[str]:
+def _listed(source: Path, names: object, paths: list[str], missing: tuple[str, ...]) -> set[str]:
     """The file paths of a list such as `train_filenames`, each of which must be one of a frame, without those that are
     missing."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):

@@ -359,7 +359,7 @@ def _versions() -> dict[str, str]:
     return versions
 
 
-def _without_nan(value: Any) -> Any:
+def _without_nan(value: object) -> Any:
     """`value` with None for numbers that JSON has no word for."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -74,7 +73,7 @@ def _digest(dataset: Dataset) -> str | None:
         return None
 
 
-def _same(digest: str | None, told: Any) -> bool:
+def _same(digest: str | None, told: object) -> bool:
     return digest is not None and same_digest(digest, str(told))
 
 

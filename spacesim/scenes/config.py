@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
 
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import JsonDict
@@ -147,7 +146,7 @@ class SceneConfig:
         return {**values, "rig": {"kind": rig_kind(self.rig), **rig}}
 
 
-def with_options(scene: SceneConfig, **options: Any) -> SceneConfig:
+def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
     """`scene` with its name or seed, or fields of its rig, camera or quality changed by name; None changes nothing.
     `resolution` may be one number, of a square. `sun` takes the place of the rig's own arrangement, whatever the number
     of its Suns, and `suns` alone that of `sun`. `background` is a `BackgroundConfig` or the words of one.

@@ -26,7 +26,7 @@ RULES = Rules(
 )
 
 
-def read_scene(source: str | Path, **options: Any) -> SceneConfig:
+def read_scene(source: str | Path, **options: object) -> SceneConfig:
     """The scene that is built in under the name `source`, that the TOML file `source` describes, or that shows the mesh
     file `source` alone.
 
@@ -114,7 +114,7 @@ def _from_here(mesh: Path) -> str:
     return str(absolute.relative_to(Path.cwd()) if absolute.is_relative_to(Path.cwd()) else absolute)
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     """Plain values of a dataclass, for TOML: what is None, "" or an empty table is left out."""
     if not is_dataclass(value):
         if isinstance(value, Mapping):

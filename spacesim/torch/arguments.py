@@ -93,7 +93,7 @@ def check_shapes(
     return count, cameras
 
 
-def check_device(name: str, tensor: Tensor, device: Any) -> None:
+def check_device(name: str, tensor: Tensor, device: object) -> None:
     """Raises ValueError for a tensor elsewhere."""
     if tensor.device != device:
         raise ValueError(f"{name}: expected a tensor on {device}, found one on {tensor.device}")

@@ -25,7 +25,7 @@ _TYPES: dict[Any, Any] = {float: (float, int), int: int, str: str, bool: bool, P
 
 
 def import_dataset(
-    kind: str, src: str | Path, out: str | Path, progress: Progress | None = None, **options: Any
+    kind: str, src: str | Path, out: str | Path, progress: Progress | None = None, **options: object
 ) -> Dataset:
     """Write what lies at `src` as a dataset into the folder `out`; returns it. options: those of the kind.
 
@@ -43,7 +43,7 @@ def import_dataset(
     return importer.function(Path(src), Path(out), progress=progress, **given)
 
 
-def _value(option: Option, value: Any) -> Any:
+def _value(option: Option, value: object) -> Any:
     """Of an option, which may be text as on the command line. Raises InputError for one of another type."""
     wanted = _TYPES.get(option.type, object)
     try:

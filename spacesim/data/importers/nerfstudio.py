@@ -115,7 +115,7 @@ def _take_extras(path: Path, meta: JsonMapping, extras: _Extras, unit: float | N
     return {**meta, "frames": kept}
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
     return not isinstance(value, bool) and isinstance(value, int | float) and abs(value) < 1e30
 
 

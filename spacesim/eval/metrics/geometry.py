@@ -3,7 +3,7 @@ overlap of what they fill, and how much of the run floats beside the object (the
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -109,7 +109,7 @@ def compare_geometry(run: "Predictor", dataset: Dataset, config: GeometryConfig 
 
 
 def compare_shape(
-    model: "Gaussians", antialiased: Any, cameras: Sequence[Camera], truth: Mesh, config: GeometryConfig
+    model: "Gaussians", antialiased: object, cameras: Sequence[Camera], truth: Mesh, config: GeometryConfig
 ) -> ShapeResult:
     """The shape of Gaussians, as `cameras` see it, against a true mesh. antialiased: see `project`
 

@@ -169,7 +169,7 @@ def _task_resources(ray: ModuleType, share: float) -> tuple[float, float, int]:
     return cpus, share, max(1, min(places, int(total["GPU"] / share)))
 
 
-def _result(ray: ModuleType, done: Any) -> Any:
+def _result(ray: ModuleType, done: object) -> Any:
     """What a task has returned. Raises its error, InputError and WorkError as they are."""
     try:
         return ray.get(done)
@@ -188,7 +188,7 @@ def _first_line(error: object) -> str:
     return str(error).strip().split("\n")[0]
 
 
-def _do(key: str, order: list[Any], parcel: Any) -> Any:
+def _do(key: str, order: list[Any], parcel: object) -> Any:
     """A task: runs in a process of the cluster. order: a reference, followed once in each process."""
     if key not in _loaded:
         import ray

@@ -187,7 +187,7 @@ def connect_to_parent(connection: Connection) -> tuple[queue.SimpleQueue[Any], C
             except (EOFError, OSError):
                 os._exit(0)
 
-    def tell(message: Any) -> None:
+    def tell(message: object) -> None:
         try:
             connection.send(message)
         except OSError:

@@ -8,7 +8,6 @@ import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -89,7 +88,7 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
     return chunks[b"JSON"], chunks.get(b"BIN\0")
 
 
-def _index(value: Any) -> int:
+def _index(value: object) -> int:
     """A non-negative integer: Python's negative indices would read from the end."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise InputError(f"expected an index, found {str(value)[:40]!r}")
@@ -130,7 +129,7 @@ class _File:
             self._buffers[index] = data
         return self._buffers[index]
 
-    def view(self, index: Any) -> bytes:
+    def view(self, index: object) -> bytes:
         """The bytes of buffer view `index`."""
         entry = self.document["bufferViews"][_index(index)]
         if _COMPRESSIONS & set(entry.get("extensions", {})):
@@ -141,7 +140,7 @@ class _File:
             raise InputError(f"buffer view {index}: expected {size:,} bytes, found {len(data):,}")
         return data
 
-    def accessor(self, index: Any, widths: tuple[int, ...]) -> np.ndarray:
+    def accessor(self, index: object, widths: tuple[int, ...]) -> np.ndarray:
         """[count, width] values of accessor `index`, normalised integers as float; InputError for other widths."""
         entry = self.document["accessors"][_index(index)]
         dtype, width = np.dtype(_DTYPES[entry["componentType"]]), _WIDTHS.get(entry["type"], 0)

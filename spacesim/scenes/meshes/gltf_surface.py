@@ -39,15 +39,15 @@ class Surfaces:
         self._known: dict[int, tuple[Surface, UvSet]] = {}
         self._pictures: dict[int, np.ndarray | None] = {}
 
-    def of(self, index: Any) -> Surface | None:
+    def of(self, index: object) -> Surface | None:
         """The surface of material `index`; None where there is none."""
         return None if index is None else self._read(index)[0]
 
-    def uv_set(self, index: Any) -> UvSet:
+    def uv_set(self, index: object) -> UvSet:
         """The texture coordinates of material `index`."""
         return self._read(index)[1]
 
-    def _read(self, index: Any) -> tuple[Surface, UvSet]:
+    def _read(self, index: object) -> tuple[Surface, UvSet]:
         if isinstance(index, bool) or not isinstance(index, int) or index < 0:
             raise InputError(f"expected the index of a material, found {str(index)[:40]!r}")
         if index not in self._known:

@@ -178,7 +178,7 @@ def _surface(mesh: trimesh.Trimesh, files: _Files, notes: Notes) -> Surface | No
     return _obj_surface(name, values, image, files, notes)
 
 
-def _obj_surface(name: str, values: JsonMapping, image: Any, files: _Files, notes: Notes) -> Surface:
+def _obj_surface(name: str, values: JsonMapping, image: object, files: _Files, notes: Notes) -> Surface:
     """A material of an mtl file. Kd is taken as linear; gloss: refractive index 1.5, its roughness from Ns as Walter et
     al. 2007 compare Blinn-Phong with microfacets, alpha^2 = 2 / (Ns + 2), or Pr where that is given."""
     for key in sorted(set(values) & set(_UNUSED)):

@@ -62,7 +62,7 @@ def _sentence(kind: str, subjects: list[str]) -> str:
     return f"{kind}: {', '.join(named[:5])}{others}"
 
 
-def plain_name(name: Any) -> str:
+def plain_name(name: object) -> str:
     """`name` in ASCII letters, digits and "_", "-": accents are taken off, all else becomes "_"; "" can result."""
     text = unicodedata.normalize("NFKD", str(name)[:200])
     text = "".join(c for c in text if not unicodedata.combining(c))
@@ -184,7 +184,7 @@ class Surface:
         return replace(self, pictures={})
 
 
-def clip_to_unit(value: Any, default: float = 1.0) -> float:
+def clip_to_unit(value: object, default: float = 1.0) -> float:
     """`value` clipped to [0, 1]; `default` where it is no finite number."""
     number = float(value) if isinstance(value, (int, float, np.number)) else math.nan
     return min(max(number, 0.0), 1.0) if math.isfinite(number) else default

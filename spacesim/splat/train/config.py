@@ -239,7 +239,7 @@ def shortened(config: TrainConfig, iterations: int) -> TrainConfig:
     if not 0 < share < 1:
         return replace(config, iterations=iterations)
 
-    def beginning(record: Any, *names: str) -> JsonDict:
+    def beginning(record: object, *names: str) -> JsonDict:
         lengths = {name: getattr(record, name) for name in names}
         return {name: max(round(share * n), min(n, iterations // 20), min(n, 1)) for name, n in lengths.items()}
 
@@ -303,7 +303,7 @@ def with_settings(config: TrainConfig, settings: JsonMapping) -> TrainConfig:
     return result
 
 
-def _put(before: Any, value: Any) -> Any:
+def _put(before: object, value: object) -> Any:
     """What takes the place of the plain value `before` where `value` is asked for."""
     if not isinstance(before, dict):
         return value

@@ -45,7 +45,7 @@ _PHASES, _BUTTONS = ("start", "update", "end"), ("left", "middle", "right")
 _log = logging.getLogger(__name__)
 
 
-def is_allowed(message: Any) -> bool:
+def is_allowed(message: object) -> bool:
     """Whether a message is one of those that the viewer's controls send, with values that can be."""
     check = _CHECKS.get(type(message).__name__)
     try:
@@ -75,7 +75,7 @@ def _is_valid_update(message: Any) -> bool:
     )
 
 
-def _is_valid_value(value: Any) -> bool:
+def _is_valid_value(value: object) -> bool:
     if isinstance(value, list | tuple):
         return len(value) <= 4 and all(_is_valid_value(item) and not isinstance(item, list | tuple) for item in value)
     if isinstance(value, str):
@@ -114,14 +114,14 @@ def _is_valid_modifier(message: Any) -> bool:
     return message.modifier is None or _is_valid_text(message.modifier)
 
 
-def _are_valid_numbers(values: Any, count: int) -> bool:
+def _are_valid_numbers(values: object, count: int) -> bool:
     """A tuple of finite numbers no larger than a place may be."""
     if not isinstance(values, list | tuple) or len(values) != count:
         return False
     return all(type(value) in (int, float) and abs(value) <= MAX_COORDINATE for value in values)
 
 
-def _is_valid_text(value: Any) -> bool:
+def _is_valid_text(value: object) -> bool:
     return isinstance(value, str) and len(value) <= MAX_TEXT_LENGTH
 
 
@@ -141,7 +141,7 @@ def filter_messages(handler: Any) -> None:
     failure over one ends in the log."""
     inner: Callable[[Any, Any], Coroutine[Any, Any, None]] = handler._handle_incoming_message
 
-    async def handle(client: Any, message: Any) -> None:
+    async def handle(client: object, message: object) -> None:
         if not is_allowed(message):
             return
         try:
@@ -206,7 +206,7 @@ def guard_server(names: AllowedHosts) -> Iterator[None]:
     served, ready = threading.Event(), threading.Event()
     refused: set[str] = set()
 
-    def guarded_serve(*arguments: Any, process_request: Callable[[Any, Any], Any], **named: Any) -> Any:
+    def guarded_serve(*arguments: object, process_request: Callable[[Any, Any], Any], **named: object) -> Any:
         def process(client: Any, request: Any) -> Any:
             reason = refusal_reason(request.headers, request.path, names)
             if reason is not None:

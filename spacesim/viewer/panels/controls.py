@@ -66,7 +66,7 @@ class ModelControls:
         reset.on_click(self._reset)
 
         @self.handles.on_update
-        async def _(_event: Any) -> None:
+        async def _(_event: object) -> None:
             gizmos.show(bool(self.handles.value))
             if sun is not None:
                 sun.show(bool(self.handles.value))
@@ -83,7 +83,7 @@ class ModelControls:
 
         return scaled
 
-    async def _reset(self, _event: Any) -> None:
+    async def _reset(self, _event: object) -> None:
         poses = self._start.poses
         self._shared.change(lambda state: SceneState(poses, state.sun))
         for k, pose in enumerate(poses):
@@ -157,7 +157,7 @@ class ClientControls:
 def _call(action: Callable[[], None]) -> Callable[[Any], Any]:
     """A callback that awaits nothing: those of a client happen in the order in which it acted."""
 
-    async def called(_event: Any) -> None:
+    async def called(_event: object) -> None:
         action()
 
     return called

@@ -191,7 +191,7 @@ def add_frusta(scene: Any, dataset: Dataset, size: float, jump: Callable[[int], 
 
 
 def _on_click(number: int, jump: Callable[[int], None]) -> Callable[[Any], Any]:
-    async def clicked(_event: Any) -> None:
+    async def clicked(_event: object) -> None:
         jump(number)
 
     return clicked

@@ -128,7 +128,7 @@ def _run(colmap: ModuleType, work: Callable[[Any], Any], poll: Callable[[], None
 
 
 def _find_features(
-    colmap: ModuleType, database: Path, folder: Path, names: Sequence[str], reader: Any, report: Progress
+    colmap: ModuleType, database: Path, folder: Path, names: Sequence[str], reader: object, report: Progress
 ) -> None:
     options = colmap.FeatureExtractionOptions()
     options.use_gpu = False
