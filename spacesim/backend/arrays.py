@@ -4,7 +4,7 @@ A type checker and an editor read Dr.Jit's own stubs, in which `dr.gather(ad.Flo
 a `Bool`. At run time the names stand for anything, and neither Dr.Jit nor a backend is loaded for them.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from drjit.auto.ad import (
@@ -15,11 +15,29 @@ if TYPE_CHECKING:
         ArrayXf,
         Bool,
         Float,
+        Int32,
         TensorXf,
         UInt32,
         UInt64,
     )
 else:
-    Array2f = Array3f = Array4f = Array4u = ArrayXf = Bool = Float = TensorXf = UInt32 = UInt64 = Any
+    Array2f = Array3f = Array4f = Array4u = ArrayXf = Bool = Float = Int32 = TensorXf = UInt32 = UInt64 = Any
 
-__all__ = ["Array2f", "Array3f", "Array4f", "Array4u", "ArrayXf", "Bool", "Float", "TensorXf", "UInt32", "UInt64"]
+ArrayT = TypeVar("ArrayT", Float, Array3f)  #: the same type in and out
+NumberT = TypeVar("NumberT", Float, UInt32, Int32)  #: the same type in and out, of one dimension
+
+__all__ = [
+    "Array2f",
+    "Array3f",
+    "Array4f",
+    "Array4u",
+    "ArrayT",
+    "ArrayXf",
+    "Bool",
+    "Float",
+    "Int32",
+    "NumberT",
+    "TensorXf",
+    "UInt32",
+    "UInt64",
+]

@@ -5,7 +5,7 @@ direction of the Sun, enters the first layer as one vector: its products are mad
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import numpy as np
@@ -45,7 +45,7 @@ class MlpShape:
         return sum(rows * columns + rows for rows, columns in self.sizes) + self.sizes[0][0] * self.shared
 
 
-def sigmoid(value: Any) -> Float:
+def sigmoid(value: Float) -> Float:
     """1 / (1 + e^-x)."""
     return dr.rcp(1 + dr.exp(-value))
 
@@ -69,19 +69,19 @@ class PartialLayer:
     """What the first layer makes of the first `inputs` inputs, values: TensorXf [B, width, m]: where only the others
     change from call to call, it is computed once."""
 
-    values: Any
+    values: TensorXf
     inputs: int
 
 
 def first_layer_part(shape: MlpShape, weights: list[Float], items: TensorXf, inputs: int) -> PartialLayer:
     """Of the first `inputs` inputs, items: TensorXf [B, `round_up_rows(inputs)`, m], 0 in the rows that fill them
     up."""
-    return PartialLayer(dr.matmul(_matrix(shape, weights, 0, 0, inputs), items), inputs)
+    return PartialLayer(_product(_matrix(shape, weights, 0, 0, inputs), items), inputs)
 
 
 def forward(
     shape: MlpShape, weights: list[Float], items: TensorXf, shared: Float, first_layer: PartialLayer | None = None
-) -> tuple[TensorXf, list[Any]]:
+) -> tuple[TensorXf, list[TensorXf]]:
     """(outputs [B, outputs, m], the tape that `backward` wants): ReLU between layers, nothing after the last.
 
     weights: as `initial_weights` orders them, Float each;  items: TensorXf [B, `shape.rows`, m], finite everywhere;
@@ -90,13 +90,13 @@ def forward(
     """
     first = first_layer.inputs if first_layer else 0
     tape = [items]
-    value: Any = items
+    value = items
     for i, (rows, _) in enumerate(shape.sizes):
-        bias: Any = ad.TensorXf(weights[2 + 2 * i], (rows, 1))
+        bias = ad.TensorXf(weights[2 + 2 * i], (rows, 1))
         if i == 0:
             common = ad.TensorXf(weights[0], (rows, shape.shared))
-            bias = bias + dr.matmul(common, ad.TensorXf(shared, (shape.shared, 1)))
-        value = dr.matmul(_matrix(shape, weights, i, first if i == 0 else 0), value) + bias
+            bias = bias + _product(common, ad.TensorXf(shared, (shape.shared, 1)))
+        value = _product(_matrix(shape, weights, i, first if i == 0 else 0), value) + bias
         if first_layer and i == 0:
             value += first_layer.values
         if i < shape.layers - 1:
@@ -106,7 +106,7 @@ def forward(
 
 
 def backward(
-    shape: MlpShape, weights: list[Float], tape: list[Any], shared: Float, grad_output: TensorXf
+    shape: MlpShape, weights: list[Float], tape: list[TensorXf], shared: Float, grad_output: TensorXf
 ) -> tuple[list[Float], TensorXf]:
     """(gradients of the weights, gradient of the items [B, `shape.rows`, m]) from grad_output: TensorXf
     [B, outputs, m].
@@ -114,22 +114,22 @@ def backward(
     Sums over N are sums over the columns of each matrix, all at once, then over the matrices, each in a fixed order:
     the same bits in every run.
     """
-    gradients: list[Any] = [None] * len(weights)
-    grad_values: Any = grad_output
+    gradients: dict[int, Float] = {}
+    grad_values = grad_output
     for i in reversed(range(shape.layers)):
         rows, columns = shape.sizes[i]
         grad_bias = _over_matrices(dr.block_reduce(dr.ReduceOp.Add, grad_values.array, grad_values.shape[2]), rows)
-        products: Any = dr.matmul(grad_values, tape[i], Bt=True)
+        products = _product(grad_values, tape[i], Bt=True)
         grad_matrix = _over_matrices(products.array, rows * tape[i].shape[1])
         gradients[1 + 2 * i] = _columns(grad_matrix, rows, tape[i].shape[1], columns)
         gradients[2 + 2 * i] = grad_bias
         if i == 0:
-            outer: Any = ad.TensorXf(grad_bias, (rows, 1)) * ad.TensorXf(shared, (1, shape.shared))
+            outer = ad.TensorXf(grad_bias, (rows, 1)) * ad.TensorXf(shared, (1, shape.shared))
             gradients[0] = outer.array
-        grad_values = dr.matmul(_matrix(shape, weights, i), grad_values, At=True)
+        grad_values = _product(_matrix(shape, weights, i), grad_values, At=True)
         if i > 0:
             grad_values = dr.select(tape[i] > 0, grad_values, 0)
-    return gradients, grad_values
+    return [gradients[i] for i in range(len(weights))], grad_values
 
 
 def shared_gradient(shape: MlpShape, weights: list[Float], gradients: list[Float]) -> Float:
@@ -137,12 +137,12 @@ def shared_gradient(shape: MlpShape, weights: list[Float], gradients: list[Float
     enters where the bias of the first layer does."""
     rows = shape.sizes[0][0]
     grad_bias = ad.TensorXf(gradients[2], (rows, 1))
-    by_shared: Any = dr.matmul(ad.TensorXf(weights[0], (rows, shape.shared)), grad_bias, At=True)
+    by_shared = _product(ad.TensorXf(weights[0], (rows, shape.shared)), grad_bias, At=True)
     return by_shared.array
 
 
-def _matrix(shape: MlpShape, weights: list[Float], i: int, first: int = 0, count: int | None = None) -> Any:
-    """TensorXf [rows, columns] of layer i, or of `count` of its columns from `first` on; that of the first layer has
+def _matrix(shape: MlpShape, weights: list[Float], i: int, first: int = 0, count: int | None = None) -> TensorXf:
+    """[rows, columns] of layer i, or of `count` of its columns from `first` on; that of the first layer has
     columns of 0, too, where rows fill the items up."""
     rows, columns = shape.sizes[i]
     count = columns - first if count is None else count
@@ -150,7 +150,7 @@ def _matrix(shape: MlpShape, weights: list[Float], i: int, first: int = 0, count
     return ad.TensorXf(_columns(weights[1 + 2 * i], rows, columns, row_count, first, count), (rows, row_count))
 
 
-def _columns(matrix: Any, rows: int, stored: int, row_count: int, first: int = 0, count: int | None = None) -> Any:
+def _columns(matrix: Float, rows: int, stored: int, row_count: int, first: int = 0, count: int | None = None) -> Float:
     """Float [rows * wanted] of [rows * stored]: `count` columns from `first` on, all by default, then columns of 0."""
     count = stored if count is None else count
     if stored == row_count == count:
@@ -160,10 +160,15 @@ def _columns(matrix: Any, rows: int, stored: int, row_count: int, first: int = 0
     return dr.gather(ad.Float, matrix, row * stored + first + column, column < count)
 
 
-def _over_matrices(numbers: Any, size: int) -> Any:
+def _product(left: TensorXf, right: TensorXf, At: bool = False, Bt: bool = False) -> TensorXf:
+    """`dr.matmul` of two tensors, which it says to give an object."""
+    return cast(TensorXf, dr.matmul(left, right, At=At, Bt=Bt))
+
+
+def _over_matrices(numbers: Float, size: int) -> Float:
     """Float [size]: sum of B times `size` numbers."""
     count = dr.width(numbers) // size
-    total: Any = dr.matmul(dr.full(ad.TensorXf, 1, (1, count)), ad.TensorXf(numbers, (count, size)))
+    total = _product(dr.full(ad.TensorXf, 1, (1, count)), ad.TensorXf(numbers, (count, size)))
     return total.array
 
 

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from spacesim.backend.arrays import Float
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Image, Sun
@@ -167,7 +168,7 @@ class _Drawing:
         sunlight = run.light.sunlight(run.gaussians, direction) if run.light else None
         return _Drawing(run, direction, sunlight)
 
-    def shade(self, camera: Camera) -> list[Any] | None:
+    def shade(self, camera: Camera) -> list[Float] | None:
         """Colours [N] three times as seen by a camera; None of harmonics, which are summed while drawing."""
         if self.run.light is None:
             return None
@@ -176,7 +177,7 @@ class _Drawing:
         colors, _ = light.shade_picture(model, Pinhole.of(camera), self.sun, sunlight=self.sunlight)
         return colors
 
-    def draw(self, camera: Camera, colors: list[Any] | None) -> np.ndarray:
+    def draw(self, camera: Camera, colors: list[Float] | None) -> np.ndarray:
         """[H, W, 4] float32: sRGB values over black, alpha."""
         output = self.output(camera, colors)
         rgb = output.image("color" if colors is None else "features")
@@ -184,7 +185,7 @@ class _Drawing:
             rgb = adjust_exposure(rgb, self.run.curve[0])
         return np.concatenate([rgb, output.image("alpha")[..., None]], axis=-1)
 
-    def output(self, camera: Camera, colors: list[Any] | None, *outputs: str) -> RenderOutput:
+    def output(self, camera: Camera, colors: list[Float] | None, *outputs: str) -> RenderOutput:
         """As `Run.predict` draws it. outputs: their names, beside the colours"""
         run = self.run
         names = outputs if colors is not None else ("color", *outputs)
@@ -326,7 +327,7 @@ class _Level:
                 return _State(camera, gain, best, taken, first < CONVERGED)
         return _State(camera, gain, best, most)
 
-    def aligned(self, camera: Camera, colors: list[Any] | None, gain: float) -> tuple[Camera, float]:
+    def aligned(self, camera: Camera, colors: list[Float] | None, gain: float) -> tuple[Camera, float]:
         """The camera panned and tilted to where the model best covers the picture, and the sum of squares of errors
         there, less that of the picture: by correlation, at whole pixels."""
         picture, (height, width) = self._picture(camera, colors), self.target.shape[:2]
@@ -390,10 +391,10 @@ class _Level:
         numbers = [number / factor for number in (camera.fx, camera.fy, camera.cx, camera.cy)]
         return Camera(camera.world_from_camera, camera.width // factor, camera.height // factor, *numbers)
 
-    def _shade(self, camera: Camera) -> list[Any] | None:
+    def _shade(self, camera: Camera) -> list[Float] | None:
         return self.drawing.shade(self._scaled(camera))
 
-    def _picture(self, camera: Camera, colors: list[Any] | None) -> np.ndarray:
+    def _picture(self, camera: Camera, colors: list[Float] | None) -> np.ndarray:
         return self.drawing.draw(self._scaled(camera), colors)
 
     def _errors(self, picture: np.ndarray, gain: float) -> np.ndarray:
@@ -406,7 +407,7 @@ class _Level:
         return self._blurred(shown - self.target)
 
     def _derivatives(
-        self, camera: Camera, picture: np.ndarray, colors: list[Any] | None, gain: float, wide: float = 1.0
+        self, camera: Camera, picture: np.ndarray, colors: list[Float] | None, gain: float, wide: float = 1.0
     ) -> np.ndarray:
         """[7, h, w, C] of the errors by the unknowns: central differences of drawn pictures, over `wide` steps."""
         columns = []

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from spacesim.backend import ad
+from spacesim.backend.arrays import Float
 from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.project import Splats
@@ -119,7 +120,7 @@ def _gradient_tensors(found: Any, tensors: Sequence[Any]) -> list[Tensor | None]
     return results
 
 
-def _matrix(numbers: list[Any], places: Sequence[int], size: int) -> Tensor:
+def _matrix(numbers: list[Float], places: Sequence[int], size: int) -> Tensor:
     """[size, size] with these numbers at these places, row by row, else 0."""
     flat = dr.zeros(ad.Float, size * size)
     for place, number in zip(places, numbers, strict=True):
@@ -196,7 +197,7 @@ class Blend(torch.autograd.Function):
         return pack(_stack(grad_means2d), drawing.visible), _stack(grad_table), colors, None
 
 
-def _plane_gradients(grad_pictures: Any, grad_alphas: Any, camera: int, channels: int) -> tuple[list[Any], Any]:
+def _plane_gradients(grad_pictures: Any, grad_alphas: Any, camera: int, channels: int) -> tuple[list[Float], Any]:
     """(gradients by the picture's planes, by the light that passes) of one camera, Floats [H * W]."""
     known = grad_pictures if grad_pictures is not None else grad_alphas
     pixels = known.shape[1] * known.shape[2]
@@ -215,13 +216,13 @@ def _zeros(count: int) -> Any:
 
 
 def _blend_back(
-    splats: Splats, lists: TileLists, passes: Any, grad_planes: list[Any], grad_light: Any, drawing: Drawing
-) -> tuple[list[Any], list[Any]]:
+    splats: Splats, lists: TileLists, passes: Any, grad_planes: list[Float], grad_light: Any, drawing: Drawing
+) -> tuple[list[Float], list[Float]]:
     """(gradients by x, y, a, b, c, opacity, and where they are wanted the absolute ones by x and y; by the features)
     of all passes of one camera. passes: (what blending keeps, its channels) of each."""
     size, absolute = (drawing.width, drawing.height), drawing.target is not None
-    sums: list[Any] = []
-    features: list[Any] = []
+    sums: list[Float] = []
+    features: list[Float] = []
     for blended, channels in passes:
         own, grad_planes = grad_planes[:channels], grad_planes[channels:]
         if sums:
@@ -234,7 +235,7 @@ def _blend_back(
     return sums, features
 
 
-def _color_gradients(by_camera: list[list[Any]], shape: Any) -> Tensor:
+def _color_gradients(by_camera: list[list[Float]], shape: Any) -> Tensor:
     """In the shape of the colours; of those that all cameras share the sum."""
     count, channels = shape[-2:]
     if len(shape) == 2:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from spacesim.backend import ad
+from spacesim.backend.arrays import Float, NumberT
 
 ALIGNED = 64  #: bytes to a multiple of which torch allocates
 WIDEST = 16  #: numbers of a row that a kernel stores at once
@@ -26,13 +27,13 @@ def column(flat: Any, index: int, size: int, count: int) -> Any:
     return dr.gather(ad.Float, flat, rows * size + index, mode=dr.ReduceMode.Permute)
 
 
-def columns(tensor: Tensor) -> list[Any]:
+def columns(tensor: Tensor) -> list[Float]:
     """The columns of a tensor [count, size], Floats; not evaluated."""
     flat, size = to_floats(tensor), tensor.shape[-1]
     return [column(flat, i, size, len(tensor)) for i in range(size)]
 
 
-def rows(values: list[Any], size: int, count: int, room: int | None = None) -> Any:
+def rows(values: list[NumberT], size: int, count: int, room: int | None = None) -> NumberT:
     """A flat array [room * size] whose first `count` rows are `values` (at least one column, at most `size`) side by
     side; what is missing of a row is 0. One kernel writes it, in packets of at most WIDEST numbers that divide a row;
     `dr.concat` would launch one for each column.
@@ -46,7 +47,7 @@ def rows(values: list[Any], size: int, count: int, room: int | None = None) -> A
     length = size * (count if room is None else room)
     target = dr.empty(kind, length) if whole else dr.zeros(kind, length)
     place = dr.arange(ad.UInt32, count) * packets
-    values = [*values, *[kind(0)] * (-len(values) % packet)]
+    values = values + [kind(0)] * (-len(values) % packet)
     for first in range(0, len(values), packet):
         own = values[first : first + packet]
         stored = (ad.ArrayXi if kind is ad.Int32 else ad.ArrayXf)(own) if packet > 1 else own[0]

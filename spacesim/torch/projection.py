@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, recorded
+from spacesim.backend.arrays import Float
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic, Pinhole, Projection
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Footprints, Splats, project_ellipsoids
@@ -54,7 +55,7 @@ class ProjectedSplats:
 
     splats: Splats
     footprints: Footprints
-    colors: list[Any]  #: of harmonics, three Floats [N]; else none
+    colors: list[Float]  #: of harmonics, three Floats [N]; else none
     means2d: Any  #: rows x, y, pixels; room for N at least
     table: Any  #: rows of `TABLE` numbers: a, b, c of `Splats`, opacity, depth, and colours or 0
     radii: Any  #: Int32, rows of two, pixels, 0 of what is not drawn
@@ -78,7 +79,7 @@ class _NearFarPlanes(Projection):
     """Between a near and a far plane, metres. `values` stay unread: to put numbers that are computed side by side takes
     a kernel each."""
 
-    numbers: list[Any] = field(default_factory=list)  #: those of `values`
+    numbers: list[Float] = field(default_factory=list)  #: those of `values`
     near: float = 0.0
     far: float = 0.0
     #: of the camera, an Array3f; harmonics are asked for in directions from there, which gsplat does of orthographic
@@ -109,19 +110,19 @@ class _NearFarOrthographic(_NearFarPlanes, Orthographic):
 class _Inputs:
     """What a camera's splats depend on, as columns [N] and numbers of width 1."""
 
-    means: list[Any]
-    quats: list[Any]
-    scales: list[Any]
-    opacities: list[Any]  #: one
-    harmonics: list[Any]  #: none, or three times (degree + 1)^2
-    viewmat: list[Any]  #: 16 numbers, row by row
-    intrinsics: list[Any]  #: fx, fy, cx, cy
+    means: list[Float]
+    quats: list[Float]
+    scales: list[Float]
+    opacities: list[Float]  #: one
+    harmonics: list[Float]  #: none, or three times (degree + 1)^2
+    viewmat: list[Float]  #: 16 numbers, row by row
+    intrinsics: list[Float]  #: fx, fy, cx, cy
 
     @staticmethod
     def of(leaves: Leaves, degree: int | None) -> "_Inputs":
         """degree: of the harmonics that are used."""
         count = dr.width(leaves.opacities)
-        sh: list[Any] = []
+        sh: list[Float] = []
         if leaves.harmonics is not None and degree is not None:
             stored = dr.width(leaves.harmonics) // count
             sh = [column(leaves.harmonics, i, stored, count) for i in range(3 * (degree + 1) ** 2)]
@@ -183,7 +184,7 @@ def project_back(
     return LeafGradients(**found)
 
 
-def _splats_of(inputs: _Inputs, settings: RasterSettings) -> tuple[Splats, Footprints, list[Any]]:
+def _splats_of(inputs: _Inputs, settings: RasterSettings) -> tuple[Splats, Footprints, list[Float]]:
     """(splats, footprints, colours of harmonics or none)."""
     (opacity,) = inputs.opacities
     camera = _camera(inputs, settings)
@@ -238,7 +239,7 @@ def _camera(inputs: _Inputs, settings: RasterSettings) -> Projection:
     return camera
 
 
-def _camera_position(matrix: list[Any]) -> Any:
+def _camera_position(matrix: list[Float]) -> Any:
     """Where the camera stands: what the inverse of a matrix [16] makes of the origin, three numbers over the fourth, so
     that it depends on the last row as the inverse does."""
     rotation = [ad.Array3f(matrix[i : i + 3]) for i in (0, 4, 8)]

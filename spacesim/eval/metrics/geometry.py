@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from spacesim.backend.arrays import Bool
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict
 from spacesim.data.geometry import Array
@@ -109,7 +110,7 @@ def compare_geometry(run: "Predictor", dataset: Dataset, config: GeometryConfig 
 
 
 def compare_shape(
-    model: "Gaussians", antialiased: object, cameras: Sequence[Camera], truth: Mesh, config: GeometryConfig
+    model: "Gaussians", antialiased: "Bool | bool", cameras: Sequence[Camera], truth: Mesh, config: GeometryConfig
 ) -> ShapeResult:
     """The shape of Gaussians, as `cameras` see it, against a true mesh. antialiased: see `project`
 

@@ -8,12 +8,12 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad, recorded
+from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array
 from spacesim.splat.compose.pose import Pose
@@ -37,7 +37,7 @@ class Member:
     """A run as it takes part in scenes; its frame is the model's."""
 
     run: Run
-    rows: list[Any]  #: 11 Floats [N], `Gaussians.shape_rows`
+    rows: list[Float]  #: 11 Floats [N], `Gaussians.shape_rows`
     centre: Array  #: [3] metres
     radius: float  #: metres, of a sphere about the centre that holds every Gaussian to three standard deviations
     shadow: ShadowConfig  #: its own kind of shadows
@@ -91,7 +91,7 @@ class Member:
         light = self.run.light
         return None if light is None else light.sunlight(self.run.gaussians, sun)
 
-    def shade(self, camera: Pinhole, sun: Array | None, sunlight: Sunlight | None) -> tuple[list[Any], Any]:
+    def shade(self, camera: Pinhole, sun: Array | None, sunlight: Sunlight | None) -> tuple[list[Float], Float | None]:
         """(colours, three Floats [N], visibility of the Sun [N] or None) as the run alone has them. camera, sun: in the
         model's frame, the latter unused by a run that knows one light;  sunlight: `sunlight` of this Sun"""
         run = self.run
@@ -118,7 +118,7 @@ class Ensemble:
         return sum(member.count for member in self.members)
 
     @cached_property
-    def rows(self) -> list[Any]:
+    def rows(self) -> list[Float]:
         """11 Floats [N], each member's in its own frame."""
         if len(self.members) == 1:
             return self.members[0].rows
@@ -127,41 +127,41 @@ class Ensemble:
         return rows
 
     @cached_property
-    def owner(self) -> Any:
+    def owner(self) -> UInt32:
         """UInt32 [N]: whose each Gaussian is."""
         numbers = [np.full(member.count, k, np.uint32) for k, member in enumerate(self.members)]
         return upload(np.concatenate(numbers), ad.UInt32)
 
     @cached_property
-    def indices(self) -> list[Any]:
+    def indices(self) -> list[UInt32]:
         """UInt32 of each member: where its Gaussians stand in the set."""
         pairs = zip(self.starts, self.members, strict=True)
         return [upload(np.arange(start, start + member.count), ad.UInt32) for start, member in pairs]
 
     @cached_property
-    def shares(self) -> list[Any]:
+    def shares(self) -> list[Float]:
         """Float [N] of each member: 1 for its Gaussians, else 0."""
         if len(self.members) == 1:
             return [dr.opaque(ad.Float, 1, self.count)]
         return [self._share(k) for k in range(len(self.members))]
 
-    def _share(self, k: int) -> Any:
+    def _share(self, k: int) -> Float:
         share = dr.select(self.owner == dr.opaque(ad.UInt32, k), ad.Float(1), 0)
         dr.eval(share)
         return share
 
     @cached_property
-    def own(self) -> list[Any]:
+    def own(self) -> list[Bool]:
         """Bool [N] of each member: is a Gaussian its?"""
         return self._masks([share > 0.5 for share in self.shares])
 
     @cached_property
-    def others(self) -> list[Any]:
+    def others(self) -> list[Bool]:
         """Bool [N] of each member: is a Gaussian another's?"""
         return self._masks([share < 0.5 for share in self.shares])
 
     @cached_property
-    def antialiased(self) -> Any:
+    def antialiased(self) -> Bool | bool:
         """Whether Gaussians are drawn with the anti-aliasing filter: one for all, or Bool [N] where runs differ."""
         flags = [member.run.antialiased for member in self.members]
         if len(set(flags)) < 2:
@@ -184,26 +184,26 @@ class Ensemble:
         table = ad.Float([float(number) for row in numbers for number in row])
         return Gaussians.from_rows([*_placed(self.rows[:10], self.owner, table), self.rows[10]])
 
-    def joined(self, parts: Sequence[Sequence[Any]]) -> list[Any]:
+    def joined(self, parts: Sequence[Sequence[Float]]) -> list[Float]:
         """Floats [N] of each member's, row by row. parts: of each member the same number of Floats."""
         return list(parts[0]) if len(parts) == 1 else [dr.concat(list(row)) for row in zip(*parts, strict=True)]
 
     @staticmethod
-    def _masks(masks: list[Any]) -> list[Any]:
+    def _masks(masks: list[Bool]) -> list[Bool]:
         dr.eval(masks)
         return masks
 
 
 def display_colors(
-    colors: list[Any], model_curve: tuple[str, float] | None, scene_curve: tuple[str, float] | None
-) -> list[Any]:
+    colors: list[Float], model_curve: tuple[str, float] | None, scene_curve: tuple[str, float] | None
+) -> list[Float]:
     """Colours as they are blended: linear ones become sRGB values first where not all are alike. model_curve,
     scene_curve: `curve` of the member and of the ensemble"""
     return [tone_map(color, model_curve[0]) for color in colors] if model_curve and not scene_curve else colors
 
 
 @recorded
-def _placed(rows: list[Any], owner: Any, table: Any) -> list[Any]:
+def _placed(rows: list[Float], owner: UInt32, table: Float) -> list[Float]:
     """The first 10 of `Gaussians.shape_rows`, each by its owner's numbers: R (9), t (3), s, ln s, quaternion (4)."""
     of = [dr.gather(ad.Float, table, owner * _NUMBERS + i) for i in range(_NUMBERS)]
     x, y, z = rows[:3]
@@ -220,7 +220,7 @@ def _placed(rows: list[Any], owner: Any, table: Any) -> list[Any]:
 
 
 @recorded
-def _harmonic_colors(rows: list[Any], camera: Pinhole) -> Any:
+def _harmonic_colors(rows: list[Float], camera: Pinhole) -> Array3f:
     return view_colors(Gaussians.from_rows(rows), camera)
 
 

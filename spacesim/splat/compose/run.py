@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from spacesim.backend.arrays import Bool
 from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose.scene import ComposedPrediction, Composition
@@ -82,7 +82,7 @@ class ComposedRun:
         return self.composition.in_world()
 
     @property
-    def antialiased(self) -> Any:
+    def antialiased(self) -> Bool | bool:
         """Whether they are drawn with the anti-aliasing filter: one for all, or of each."""
         return self.composition.antialiased
 

@@ -1,11 +1,10 @@
 """A relightable model under one Sun as plain Gaussians with spherical harmonics, which every splat viewer draws."""
 
-from typing import Any
-
 import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
+from spacesim.backend.arrays import Float
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
@@ -16,7 +15,7 @@ VIEWS = 64  #: directions that the harmonics are fitted to, four times as many a
 
 
 def bake(
-    gaussians: Gaussians, light: LightModel, sun: np.ndarray | None, degree: int = 3, others: Any | None = None
+    gaussians: Gaussians, light: LightModel, sun: np.ndarray | None, degree: int = 3, others: Float | None = None
 ) -> Gaussians:
     """The Gaussians with the colours, shadows included, that they have under a Sun in the direction `sun` [3], or None
     for a model that is not told.

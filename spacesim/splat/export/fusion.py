@@ -8,13 +8,13 @@ Each voxel is a lane of its own and takes the views in their order: the same inp
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import prod
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
 from spacesim.backend import ad
+from spacesim.backend.arrays import Array2f, Bool, Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
@@ -121,10 +121,10 @@ def check_memory(grid: Grid) -> None:
 class _Batch:
     """Views on the device."""
 
-    numbers: Any  #: Float [18 V], of each view camera_from_world rows (12), fx, fy, cx, cy, width, height
-    start: Any  #: UInt32 [V], its first pixel in `depth`
-    depth: Any  #: Float
-    count: Any  #: UInt32, V
+    numbers: Float  #: [18 V], of each view camera_from_world rows (12), fx, fy, cx, cy, width, height
+    start: UInt32  #: [V], its first pixel in `depth`
+    depth: Float
+    count: UInt32  #: V
 
 
 def _upload(views: Sequence[DepthView]) -> _Batch:
@@ -145,7 +145,9 @@ def _upload(views: Sequence[DepthView]) -> _Batch:
     )
 
 
-def _add(sums: tuple[Any, Any], batch: _Batch, lattice: tuple[Any, Any], limits: Any, count: int) -> tuple[Any, Any]:
+def _add(
+    sums: tuple[Float, Float], batch: _Batch, lattice: tuple[Float, UInt32], limits: Float, count: int
+) -> tuple[Float, Float]:
     """The sums of (weight x distance, weight) over the views so far and those of `batch`."""
     place, side = lattice
     truncation, step = (dr.gather(ad.Float, limits, ad.UInt32(i)) for i in range(2))
@@ -157,11 +159,11 @@ def _add(sums: tuple[Any, Any], batch: _Batch, lattice: tuple[Any, Any], limits:
     point = ad.Array3f(x, y, z) + voxel * cells
     last = dr.gather(ad.UInt32, batch.count, ad.UInt32(0))
 
-    def has_more(view: Any, _total: Any, _weight: Any) -> Any:
+    def has_more(view: UInt32, _total: object, _weight: object) -> Bool:
         return view < last
 
-    def look(view: Any, total: Any, weight: Any) -> tuple[Any, Any, Any]:
-        def number(i: int) -> Any:
+    def look(view: UInt32, total: Float, weight: Float) -> tuple[UInt32, Float, Float]:
+        def number(i: int) -> Float:
             return dr.gather(ad.Float, batch.numbers, 18 * view + i)
 
         at = ad.Array3f(
@@ -179,7 +181,8 @@ def _add(sums: tuple[Any, Any], batch: _Batch, lattice: tuple[Any, Any], limits:
         ahead, slope = _signed_distance(cell, ad.Array2f(at.x, at.y) * scale, at.z, focal, truncation)
         share = slope * dr.minimum(2 * (1 + ahead / truncation), 1)  # deep behind the surface is guessed
         share = dr.select(inside & (ahead > -truncation), share, 0)
-        return view + 1, total + share * dr.minimum(dr.maximum(ahead / truncation, -1), 1), weight + share
+        above = dr.maximum(ahead / truncation, -1)
+        return view + 1, total + share * dr.minimum(above, 1), weight + share
 
     state = dr.zeros(ad.UInt32, count), *sums
     _, total, weight = dr.while_loop(state, has_more, look, mode="symbolic", label="fuse")
@@ -191,13 +194,13 @@ def _add(sums: tuple[Any, Any], batch: _Batch, lattice: tuple[Any, Any], limits:
 class _Cell:
     """What the four pixels around a place show."""
 
-    depth: Any  #: of the surface in front, metres, 0 where none has any
-    rise: Any  #: Array2f, its change by a column and by a row
-    share: Any  #: bilinear, of the pixels that show it, 1 for all
-    back: Any  #: depth of the others, infinite without surface
+    depth: Float  #: of the surface in front, metres, 0 where none has any
+    rise: Array2f  #: its change by a column and by a row
+    share: Float  #: bilinear, of the pixels that show it, 1 for all
+    back: Float  #: depth of the others, infinite without surface
 
 
-def _signed_distance(cell: _Cell, ray: Any, z: Any, focal: Any, truncation: Any) -> tuple[Any, Any]:
+def _signed_distance(cell: _Cell, ray: Array2f, z: Float, focal: Array2f, truncation: Float) -> tuple[Float, Float]:
     """How far a voxel at depth `z` on the ray (x, y, 1) lies before the surface that a view sees, metres, and the
     weight of that.
 
@@ -217,8 +220,8 @@ def _signed_distance(cell: _Cell, ray: Any, z: Any, focal: Any, truncation: Any)
     return ahead, slope
 
 
-def _cell(depth: Any, start: Any, width: Any, height: Any, pixel: Any, inside: Any, step: Any) -> _Cell:
-    """The four pixels whose centres are around `pixel` (Array2f)."""
+def _cell(depth: Float, start: UInt32, width: Float, height: Float, pixel: Array2f, inside: Bool, step: Float) -> _Cell:
+    """The four pixels whose centres are around `pixel` ."""
     stride = ad.UInt32(width)
     left, top = dr.clip(pixel.x - 0.5, 0, width - 1), dr.clip(pixel.y - 0.5, 0, height - 1)
     x0, y0 = dr.minimum(dr.floor(left), dr.maximum(width - 2, 0)), dr.minimum(dr.floor(top), dr.maximum(height - 2, 0))
@@ -229,8 +232,9 @@ def _cell(depth: Any, start: Any, width: Any, height: Any, pixel: Any, inside: A
         dr.gather(ad.Float, depth, corner + offset, inside) for offset in (ad.UInt32(0), right, down, right + down)
     ]
     weights = [(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy]
-    near: list[Any] = [dr.select(pixel_depth > 0, pixel_depth, dr.inf) for pixel_depth in depths]
-    lowest = dr.minimum(dr.minimum(near[0], near[1]), dr.minimum(near[2], near[3]))
+    near = [dr.select(pixel_depth > 0, pixel_depth, dr.inf) for pixel_depth in depths]
+    upper, lower = dr.minimum(near[0], near[1]), dr.minimum(near[2], near[3])
+    lowest = dr.minimum(upper, lower)
     share, mean, back = ad.Float(0), ad.Float(0), ad.Float(dr.inf)
     for pixel_depth, weight in zip(near, weights, strict=True):
         front = pixel_depth - lowest <= step

@@ -5,7 +5,6 @@ Only what a view has seen is surface: where voxels were never in sight, the mesh
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import igl
@@ -13,6 +12,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from spacesim.backend.arrays import Bool
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, fibonacci_sphere, look_at
 from spacesim.data.records import Camera
@@ -74,7 +74,7 @@ def mesh_of(
     model: Gaussians,
     cameras: Sequence[Camera],
     config: MeshConfig | None = None,
-    antialiased: Any = False,
+    antialiased: Bool | bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RunMesh:
     """The surface of Gaussians as `cameras` see it. antialiased: see `project`;  progress: called with the steps done
@@ -141,7 +141,7 @@ def cameras_around(model: Gaussians, count: int) -> list[Camera]:
     return [Camera.from_fov(pose, SIDE, SIDE, FOV_DEG) for pose in poses]
 
 
-def depth_of(model: Gaussians, camera: Camera, kind: str = "surface", antialiased: Any = False) -> np.ndarray:
+def depth_of(model: Gaussians, camera: Camera, kind: str = "surface", antialiased: Bool | bool = False) -> np.ndarray:
     """[H, W] float32, metres, of one of `KINDS`: where the picture is opaque, else 0."""
     if model.count == 0:
         return np.zeros((camera.height, camera.width), np.float32)

@@ -21,10 +21,12 @@ from spacesim.splat.light.padded_batch import PaddedBatch
 
 AGREES = 2e-3  #: difference to single precision up to which `is_usable` accepts a network's sigmoid
 
+PackedNetwork = list["nn.MatrixView"]  #: matrix, bias, matrix, bias, ..., see `pack`
+
 log = logging.getLogger(__name__)
 
 
-def pack(shape: MlpShape, weights: list[Float]) -> list[Any]:
+def pack(shape: MlpShape, weights: list[Float]) -> PackedNetwork:
     """Matrix and bias of each layer as `forward` reads them, half precision in the device's order, from weights as
     `mlp.initial_weights` orders them. What is shared stands before the other inputs."""
     parts = []
@@ -38,7 +40,7 @@ def pack(shape: MlpShape, weights: list[Float]) -> list[Any]:
     return list(views)
 
 
-def forward(shape: MlpShape, packed: list[Any], rows: list[Float], shared: Float) -> list[Float]:
+def forward(shape: MlpShape, packed: PackedNetwork, rows: list[Float], shared: Float) -> list[Float]:
     """Outputs, Floats [M], of inputs `rows`, Floats [M] or of width 1.  packed: see `pack`;  shared: Float [shared]"""
     shared_inputs = [dr.gather(ad.Float, shared, ad.UInt32(i)) for i in range(shape.shared)]
     value: Any = nn.CoopVec([ad.Float16(row) for row in [*shared_inputs, *rows]])

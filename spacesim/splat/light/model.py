@@ -8,7 +8,6 @@ as given, and so do shadows, as in the literature, unless `ShadowConfig.gradient
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -78,7 +77,7 @@ class Shading:
 
     colors: list[Float]  #: 3 arrays [N], display values that visibility has dimmed (4.17)
     #: Float [N] in [0, 1] as pictures show it, so times `sun_facing`, which colours do without, or None
-    visibility: Any
+    visibility: Float | None
     shadows: Shadows | None  #: raw, or None
     inputs: ShadingInputs  #: what `LightModel.adjoint` wants
     batch: PaddedBatch  #: what `LightModel.adjoint` wants
@@ -90,9 +89,9 @@ class Shading:
 class _PictureCache:
     """What pictures of one model have in common."""
 
-    read: list[Any]  #: the arrays that it was made of
+    read: list[Float]  #: the arrays that it was made of
     first_layer: mlp.PartialLayer | None  #: what the field's first layer makes of the features
-    packed: list[Any]  #: the field's network for `cooperative`, [] where `first_layer` serves
+    packed: cooperative.PackedNetwork  #: the field's network for `cooperative`, [] where `first_layer` serves
     embedding: list[Float]  #: the mean one, Float [E] in a list, or nothing
 
 
@@ -187,7 +186,7 @@ class LightModel:
         sun: np.ndarray | None,
         sunlight: Sunlight | None = None,
         embedding: np.ndarray | None = None,
-    ) -> tuple[list[Float], Any]:
+    ) -> tuple[list[Float], Float | None]:
         """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. sunlight: `sunlight` of this
         Sun, of an earlier picture;  embedding: [E] of the picture, None: the mean one. What the field's first layer
         makes of the features does not change with Sun or camera and stays for the next picture: as many numbers for
@@ -195,7 +194,7 @@ class LightModel:
         light = self.sunlight(gaussians, sun) if sunlight is None else sunlight
         of_any_size = replace(camera, width=1, height=1)  # directions do not depend on it: one recording for all sizes
         batch = PaddedBatch.of(gaussians.count, still=True)
-        cache = self._picture_cache(gaussians.features, batch)
+        cache = self._picture_cache(_features(gaussians), batch)
         told = cache.embedding if embedding is None else [upload(np.asarray(embedding, np.float64))]
         inputs = self._inputs(gaussians, of_any_size, self._told(sun, told), None)
         of_field, _ = split_weights(self.config, self.weights)
@@ -206,7 +205,7 @@ class LightModel:
         return shown[:3], shown[3] if visibility else None
 
     def adjoint(
-        self, shading: Shading, grad_color: list[Float], grad_visibility: Any = None, by_sun: bool = False
+        self, shading: Shading, grad_color: list[Float], grad_visibility: Float | None = None, by_sun: bool = False
     ) -> "LightGradients":
         """From the gradients of the dimmed colours (3 arrays [N]) and, where visibility is seen on its own, of the
         visibility [N]. by_sun: also the gradient of the Sun's direction"""
@@ -289,7 +288,7 @@ class LightModel:
         rotations_and_scales = gaussians.quaternions, gaussians.log_scales
         logits = gaussians.logit_opacities
         return ShadingInputs(
-            gaussians.features,
+            _features(gaussians),
             gaussians.means,
             rotations_and_scales,
             logits,
@@ -320,3 +319,9 @@ class LightModel:
         terms = SunEncoding(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun))
         dr.eval(terms)
         return terms
+
+
+def _features(gaussians: Gaussians) -> Float:
+    """Float [F * N], which Gaussians of a model of light have."""
+    assert gaussians.features is not None, "a model of light reads features"
+    return gaussians.features

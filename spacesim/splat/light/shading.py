@@ -58,8 +58,8 @@ class ShadingInputs:
 class ShadingTape:
     """What the adjoint needs of the forward pass."""
 
-    field: list[Any]
-    refine: list[Any]
+    field: list[TensorXf]
+    refine: list[TensorXf]
     colors: list[Float]  #: 3 arrays [M] before they are dimmed
     occlusion: list[Float]  #: the refined one [M] in a list, or nothing
     faces: list[Float]  #: of `sun_facing`, or nothing
@@ -100,7 +100,7 @@ def shade_picture(
     inputs: ShadingInputs,
     batch: PaddedBatch,
     first_layer: mlp.PartialLayer | None,
-    packed: list[Any],
+    packed: cooperative.PackedNetwork,
     visibility: list[Float],
     bounced: list[Float],
 ) -> list[Float]:
@@ -161,7 +161,7 @@ def _picture_visibility(visibility: Float, faces: list[Float]) -> Float:
 
 def _refine_occlusion(
     config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
-) -> tuple[list[Float], list[Float]]:
+) -> tuple[list[Float], list[TensorXf]]:
     """([refined occlusion [M]] or [], tape of the refinement)."""
     occlusion = [batch.pad_zeros(row) for row in inputs.raw_shadows[:1]]
     if not config.refine:

@@ -10,7 +10,7 @@ splat's slots in order. No two tiles write to one address, so the gradients are 
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
@@ -55,8 +55,8 @@ class SplatGradients:
 
     splats: Splats
     features: list[Float]
-    absolute_x: Any  #: sum over pixels of |d / d x|, per pixel of screen (Ye et al. 2024, AbsGS)
-    absolute_y: Any
+    absolute_x: Float  #: sum over pixels of |d / d x|, per pixel of screen (Ye et al. 2024, AbsGS)
+    absolute_y: Float
 
 
 @recorded
@@ -85,10 +85,10 @@ def by_tiles(
     slots = [dr.zeros(ad.Float, size * lists.capacity) for size in sizes]
     records, start = blended.records, dr.gather(ad.UInt32, lists.start, lane.tile)
 
-    def remaining(k: UInt32, _transmittance: Any, _behind: Any) -> Bool:
+    def remaining(k: UInt32, _transmittance: object, _behind: object) -> Bool:
         return k > start
 
-    def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> Any:
+    def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> tuple[UInt32, list[Float], list[Float]]:
         k = k - 1
         record = load(records, k, lists.capacity)
         dx, dy = lane.x - record[0], lane.y - record[1]
@@ -136,7 +136,7 @@ class Moments:
         self.dx, self.dy = dx, dy
         self.columns: dict[int, list[Float]] = {}
 
-    def add(self, column: int, row: int, g: Float) -> Any:
+    def add(self, column: int, row: int, g: Float) -> Float:
         """A pixel's g. Returns g dy."""
         dy = self.dy + row
         g_dy = g * dy
@@ -212,7 +212,7 @@ def by_buckets(
     records = [_record(blended, buckets, i, lists.capacity) for i in range(bucket)]
     until = dr.select(buckets.live, ad.UInt32(pixels), ad.UInt32(0))
 
-    def has_more(q: UInt32, _sums: Any) -> Bool:
+    def has_more(q: UInt32, _sums: object) -> Bool:
         return q < until
 
     def visit(q: UInt32, sums: list[list[Float]]) -> tuple[UInt32, list[list[Float]]]:
@@ -349,10 +349,10 @@ def gather_slots(
     position = dr.gather(ad.UInt32, lists.first_slot, splat)
     end = position + dr.gather(ad.UInt32, lists.slot_count, splat)
 
-    def remaining(position: UInt32, _sums: Any) -> Bool:
+    def remaining(position: UInt32, _sums: object) -> Bool:
         return position < end
 
-    def add(position: UInt32, sums: list[Float]) -> Any:
+    def add(position: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
         values = load(slots, lists.sum_of_slot(position), lists.capacity)
         return position + 1, [total + value for total, value in zip(sums, values, strict=True)]
 
@@ -360,7 +360,7 @@ def gather_slots(
     state = position, [ad.Float(0) for _ in range(numbers)]
     _, sums = dr.while_loop(state, remaining, add, mode="symbolic", label="gather slots")
     s0, sx, sy, sxx, sxy, syy, *rest = sums
-    none: Any = None
+    none = cast(Float, None)  # nothing reads them
     grad_splats = Splats(
         x=dr.fma(splats.a, sx, splats.b * sy),
         y=dr.fma(splats.b, sx, splats.c * sy),
@@ -370,7 +370,7 @@ def gather_slots(
         opacity=s0 * dr.rcp(dr.maximum(splats.opacity, 1e-30)),
         depth=none,
     )
-    absolute_x, absolute_y = [value / LOG2_E for value in rest[:2]] if absolute else (None, None)
+    absolute_x, absolute_y = [value / LOG2_E for value in rest[:2]] if absolute else (none, none)
     grad_features = rest[2 : 2 + channels] if absolute else rest[:channels]
     result = SplatGradients(grad_splats, grad_features, absolute_x, absolute_y)
     dr.eval(result)

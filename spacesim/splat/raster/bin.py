@@ -278,7 +278,7 @@ def _stable_order(keys: UInt32, bits: int) -> UInt32:
     goes through all 32 bits."""
     passes = -(-bits // DIGIT_BITS)
     digit_bits = -(-bits // passes)
-    order: Any = None
+    order: Any = None  # `block_mkperm` and `gather`
     for i in range(passes):
         digit, last = (keys >> (i * digit_bits)) & ((1 << digit_bits) - 1), i == passes - 1
         dr.eval(digit, order, None if last else keys)

@@ -7,7 +7,7 @@ costs a twentieth of what the adjoint gains; on a CPU it costs more than that (d
 """
 
 from functools import reduce
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
@@ -66,10 +66,12 @@ def blend_lists(
     start = dr.gather(ad.UInt32, lists.start, lane.tile)
     snapshots = _Checkpoints(lists, bucket, channels, lane.place, start) if bucket else None
 
-    def alive(k: UInt32, end: UInt32, transmittance: list[Float], _sums: Any, _last: Any) -> Bool:
+    def alive(k: UInt32, end: UInt32, transmittance: list[Float], _sums: object, _last: object) -> Bool:
         return (k < end) & (reduce(dr.maximum, transmittance) > TRANSMITTANCE_MIN)
 
-    def blend(k: UInt32, end: UInt32, transmittance: list[Float], sums: list[list[Float]], last: list[UInt32]) -> Any:
+    def blend(
+        k: UInt32, end: UInt32, transmittance: list[Float], sums: list[list[Float]], last: list[UInt32]
+    ) -> tuple[UInt32, UInt32, list[Float], list[list[Float]], list[UInt32]]:
         if snapshots:
             snapshots.keep(k, transmittance, sums)
         transmittance, last, sums = list(transmittance), list(last), [list(pixel) for pixel in sums]
@@ -176,8 +178,7 @@ class _Rasterize(dr.CustomOp):
         return [*self.blended.features, self.blended.transmittance]
 
     def backward(self) -> None:
-        gradients: Any = self.grad_out()
-        *grad_features, grad_transmittance = gradients
+        *grad_features, grad_transmittance = cast(list[Float], self.grad_out())
         result = backward(self.splats, self.blended, self.lists, self.size, grad_features, grad_transmittance, False)
         result.splats.depth = dr.opaque(ad.Float, 0, dr.width(self.splats.x))
         self.set_grad_in("splats", result.splats)

@@ -6,7 +6,7 @@ gradients with respect to the pose and the intrinsics are those of the array.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import drjit as dr
 import numpy as np
@@ -138,10 +138,10 @@ class Projection(ABC):
             (second * wx * wy + first * wz, 1 - second * (wx * wx + wz * wz), second * wy * wz - first * wx),
             (second * wx * wz - first * wy, second * wy * wz + first * wx, 1 - second * (wx * wx + wy * wy)),
         )
-        numbers = []
+        numbers: list[Float] = []
         for i in range(3):
             for j in range(4):
-                value: Any = sum(turn[i][k] * self[4 * k + j] for k in range(3))
+                value = sum((turn[i][k] * self[4 * k + j] for k in (1, 2)), turn[i][0] * self[j])
                 numbers.append(value + translation[i] if j == 3 else value)
         rest = dr.gather(ad.Float, self.values, dr.arange(ad.UInt32, dr.width(self.values) - 12) + 12)
         return replace(self, values=dr.concat([*numbers, rest]))

@@ -6,13 +6,12 @@ network reads of each Gaussian, its features, is one packed array: hundreds of r
 """
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Array3f, Array4f, ArrayXf, Float, UInt32
+from spacesim.backend.arrays import Array3f, Array4f, ArrayXf, Float, NumberT, UInt32
 from spacesim.backend.upload import upload, upload_rows
 
 SH_C0 = 0.28209479177387814  #: Y_00, the constant spherical harmonic
@@ -39,7 +38,7 @@ class Gaussians:
         quaternions: Array4f,
         logit_opacities: Float,
         sh: ArrayXf,
-        features: Any = None,
+        features: Float | None = None,
     ) -> None:
         self.means = means
         self.log_scales = log_scales
@@ -63,7 +62,7 @@ class Gaussians:
         """F."""
         return 0 if self.features is None else int(dr.width(self.features)) // self.count
 
-    def parameters(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, Array3f | Array4f | Float | ArrayXf]:
         """{name: array} of what a Gaussian is drawn by, in a fixed order; features are not among them."""
         return {name: getattr(self, name) for name in NAMES}
 
@@ -150,12 +149,12 @@ class Gaussians:
         )
 
 
-def stack_rows(rows: Iterable[Any]) -> np.ndarray:
+def stack_rows(rows: Iterable[Float]) -> np.ndarray:
     """[K, N] of K Floats [N]. Dr.Jit's own way compiles a kernel for each N, for it writes the rows as one array."""
     return np.stack([np.array(row) for row in rows])
 
 
-def gather_entries(row: Float, index: UInt32, count: int) -> Any:
+def gather_entries(row: NumberT, index: UInt32, count: int) -> NumberT:
     """Entries index [M] of a row [count], or of each of the C rows of a packed one: [C * count] to [C * M]."""
     copies, chosen = dr.width(row) // count, dr.width(index)
     if copies == 1:

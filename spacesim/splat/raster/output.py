@@ -1,12 +1,11 @@
 """What rendering gives: the planes of a picture, and what blended values are for its pixels."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from spacesim.backend.arrays import Float
+from spacesim.backend.arrays import Array3f, Float
 
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal")
 
@@ -15,14 +14,16 @@ OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal")
 class RenderOutput:
     """What was asked for; the rest is None. Planes are [height * width], row by row; `image` gives them their shape."""
 
-    color: Any  #: Array3f, premultiplied (over black), sRGB values
-    alpha: Float  #: Float in [0, 1]
-    depth: Any  #: Float, expected depth: mean z of the centres by blending weight, metres; 0 where alpha is 0
+    color: Array3f | None  #: premultiplied (over black), sRGB values
+    alpha: Float  #: in [0, 1]
+    depth: Float | None  #: expected depth: mean z of the centres by blending weight, metres; 0 where alpha is 0
     width: int  #: pixels
     height: int  #: pixels
-    median_depth: Any = None  #: Float, z at which the transmittance falls below 1/2, metres; 0 where it does not
-    normal: Any = None  #: Array3f, world axes: direction of the blended normals, unit length; 0 where there are none
-    features: Any = None  #: the user's channels, blended like colour: sum of weight x value, so 0 where alpha is 0
+    median_depth: Float | None = None  #: z at which the transmittance falls below 1/2, metres; 0 where it does not
+    normal: Array3f | None = None  #: world axes: direction of the blended normals, unit length; 0 where there are none
+    features: list[Float] | None = (
+        None  #: the user's channels, blended like colour: sum of weight x value, so 0 where alpha is 0
+    )
 
     def image(self, name: str) -> np.ndarray:
         """One output by name: [H, W], or [H, W, C] of colour, normal and features; float32.
@@ -49,8 +50,8 @@ class RenderOutput:
                 raise ValueError(f"outputs: expected color and depth for to_numpy, found no {name}")
         return self.image("color"), self.image("alpha"), self.image("depth")
 
-    def over(self, background: Any) -> Any:
-        """Array3f: the picture over a background colour (Array3f) or picture.
+    def over(self, background: Array3f) -> Array3f:
+        """The picture over a background colour or picture.
 
         Raises ValueError where `outputs` left the colour out.
         """
@@ -59,7 +60,7 @@ class RenderOutput:
         return self.color + (1 - self.alpha) * background
 
 
-def over_alpha(weighted: Float, alpha: Float) -> Any:
+def over_alpha(weighted: Float, alpha: Float) -> Float:
     """Blended values divided by the alpha; 0 where that is 0."""
     covered = alpha > 0
     return dr.select(covered, weighted / dr.select(covered, alpha, 1), 0)

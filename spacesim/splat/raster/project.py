@@ -5,7 +5,7 @@ camera's reach, not finite, absurdly large, too faint) is marked invisible and g
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
@@ -44,7 +44,7 @@ class Footprints:
     order: UInt32  #: [N] UInt32 below 2^31, grows with depth; whatever its sign, and however far away the camera is
 
 
-def project(gaussians: Gaussians, camera: Projection, antialiased: Any = False) -> tuple[Splats, Footprints]:
+def project(gaussians: Gaussians, camera: Projection, antialiased: Bool | bool = False) -> tuple[Splats, Footprints]:
     """Project N Gaussians. Returns `Splats` (differentiable) and `Footprints`, all [N].
 
     antialiased: splats are spread by a pixel's own width (`PIXEL`) and not to a pixel's (`DILATION`), and what that
@@ -74,8 +74,8 @@ def project_ellipsoids(
     opacity: Float,
     sane: Bool,
     camera: Projection,
-    spread: Any,
-    compensated: Any,
+    spread: Float | float,
+    compensated: Bool | bool,
 ) -> tuple[Splats, Footprints]:
     """`project` of Gaussians with these means, standard deviations (Array3f [3, N], metres), rotations and opacities.
 
@@ -125,7 +125,7 @@ def project_ellipsoids(
     return splats, _footprints(splats, xx, yy, order, sane, camera)
 
 
-def _spread(antialiased: Any) -> Any:
+def _spread(antialiased: Bool | bool) -> Float | float:
     """pixels^2, a number or Float [N]."""
     if isinstance(antialiased, bool):
         return PIXEL if antialiased else DILATION
@@ -135,14 +135,14 @@ def _spread(antialiased: Any) -> Any:
 def _compensation(ratio: Float) -> Float:
     """sqrt(det Sigma / det(Sigma + PIXEL I)) [N]; 0 with no gradient where the splat would be invisible anyway."""
     positive = dr.detach(ratio) > 1e-10
-    factor: Any = dr.select(positive, dr.sqrt(dr.select(positive, ratio, 1)), 0)
-    return factor
+    root = dr.sqrt(dr.select(positive, ratio, 1))
+    return dr.select(positive, root, 0)
 
 
 def _sortable(depth: Float) -> UInt32:
     """UInt32 [N] below 2^31 in the order of finite floats `depth` [N]; equal where only the last bit differs."""
-    bits: Any = dr.reinterpret_array(ad.UInt32, depth)
-    ordered: Any = dr.select(bits >> 31 == 0, bits | 0x80000000, ~bits)
+    bits = cast(UInt32, dr.reinterpret_array(ad.UInt32, depth))
+    ordered = dr.select(bits >> 31 == 0, bits | 0x80000000, ~bits)
     return ordered >> 1
 
 

@@ -2,12 +2,12 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
 from spacesim.backend import ad, select
-from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.arrays import ArrayXf, Bool, Float, NumberT, UInt32
 from spacesim.splat.raster.project import ALPHA_MIN, Splats
 from spacesim.splat.raster.tiles import TileLists, TileShape
 
@@ -74,7 +74,7 @@ def packet_sizes(numbers: int) -> list[int]:
     return [8] * (numbers // 8) + ([] if rest == 0 else [2] if rest <= 2 else [4] if rest <= 4 else [8])
 
 
-def packets(values: list[Any]) -> list[list[Float]]:
+def packets(values: list[Float]) -> list[list[Float]]:
     """Values by `packet_sizes`, the last filled up with zeros."""
     filled, done = [], 0
     for size in packet_sizes(len(values)):
@@ -84,7 +84,7 @@ def packets(values: list[Any]) -> list[list[Float]]:
     return filled
 
 
-def store(values: list[Any], index: UInt32, size: int) -> Any:
+def store(values: list[NumberT], index: UInt32, size: int) -> NumberT:
     """A flat array [size * len(values)] in which `values` of lane i stand at index i, by one packet scatter."""
     array_type = type(values[0])
     target = dr.empty(array_type, len(values) * size)
@@ -92,7 +92,7 @@ def store(values: list[Any], index: UInt32, size: int) -> Any:
     return target
 
 
-def packet(values: list[Any]) -> Any:
+def packet(values: list[Float]) -> ArrayXf:
     """Values of an entry as one array, to be stored or added at once."""
     kinds = {2: ad.Array2f, 4: ad.Array4f}
     return kinds.get(len(values), ad.ArrayXf)(values)
@@ -137,7 +137,6 @@ def exp2(power: Float) -> Float:
     value = ad.Float(_EXP2[-1])
     for coefficient in _EXP2[-2::-1]:
         value = dr.fma(value, fraction, coefficient)
-    bits: Any = dr.reinterpret_array(ad.UInt32, shifted)
-    scaled: Any = dr.reinterpret_array(ad.UInt32, value)
-    result: Any = dr.reinterpret_array(ad.Float, scaled + (bits << 23))
-    return result
+    bits = cast(UInt32, dr.reinterpret_array(ad.UInt32, shifted))
+    scaled = cast(UInt32, dr.reinterpret_array(ad.UInt32, value))
+    return cast(Float, dr.reinterpret_array(ad.Float, scaled + (bits << 23)))

@@ -5,12 +5,11 @@ What a picture shows beside colour is blended as features of the Gaussians: `ble
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Array3f, Bool, Float
+from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float
 from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.blend import rasterize
 from spacesim.splat.raster.cameras import Projection
@@ -28,8 +27,8 @@ def render(
     camera: Projection,
     sh_degree: int | None = None,
     outputs: Sequence[str] = ("color", "alpha", "depth"),
-    features: Any = None,
-    antialiased: Any = False,
+    features: ArrayXf | Sequence[Float] | None = None,
+    antialiased: Bool | bool = False,
 ) -> RenderOutput:
     """Render; differentiable with respect to every parameter of `gaussians`, `camera.values` (or `camera.moved`) and
     `features` that has gradients enabled.
@@ -56,7 +55,7 @@ def render(
         groups["features"] = _clean_features(feature_list, gaussians.count)
 
     blended = blend(splats, footprints, [f for group in groups.values() for f in group], camera)
-    planes, drawn = iter(blended.planes), dict[str, list[Any]]()
+    planes, drawn = iter(blended.planes), dict[str, list[Float]]()
     for name, group in groups.items():
         drawn[name] = [next(planes) for _ in group]
     alpha, depth, normal = _finish(blended.transmittance, drawn.get("depth", []), drawn.get("normal", []))
@@ -74,7 +73,7 @@ def render(
 
 @recorded
 def _prepare(
-    rows: list[Float], camera: Projection, sh_degree: int | None, outputs: tuple[str, ...], antialiased: Any
+    rows: list[Float], camera: Projection, sh_degree: int | None, outputs: tuple[str, ...], antialiased: Bool | bool
 ) -> tuple[Splats, Footprints, dict[str, list[Float]]]:
     """(splats, footprints, features to blend by output) of the Gaussians with these `rows`."""
     gaussians = Gaussians.from_rows(rows)
@@ -102,7 +101,9 @@ def _clean(features: list[Float]) -> list[Float]:
 
 
 @recorded
-def _finish(transmittance: Float, depth: list[Float], normal: list[Float]) -> tuple[Any, Any, Any]:
+def _finish(
+    transmittance: Float, depth: list[Float], normal: list[Float]
+) -> tuple[Float, Float | None, Array3f | None]:
     """(alpha, expected depth, unit normals) of blended planes, None for those that were not blended."""
     alpha = 1 - transmittance
     expected = over_alpha(depth[0], alpha) if depth else None
@@ -118,17 +119,17 @@ class BlendedPlanes:
     lists: TileLists  #: of the tiles
 
 
-def blend(splats: Splats, footprints: Footprints, features: Sequence[Any], camera: Projection) -> BlendedPlanes:
+def blend(splats: Splats, footprints: Footprints, features: Sequence[Float], camera: Projection) -> BlendedPlanes:
     """Stages 2 and 3 for any number of features (Floats [N]) and any sign of depth. Differentiable."""
     lists = bin_splats(splats, footprints, camera.width, camera.height, few_sizes=True)
     passes = [list(features[i : i + FEATURES_PER_PASS]) for i in range(0, len(features), FEATURES_PER_PASS)] or [[]]
     planes: list[Float] = []
-    transmittance: Any = None
+    passed: list[Float] = []
     for group in passes:
-        group_planes, passed = rasterize(splats, group, lists, camera.width, camera.height)
+        group_planes, transmittance = rasterize(splats, group, lists, camera.width, camera.height)
         planes += group_planes
-        transmittance = passed if transmittance is None else transmittance
-    return BlendedPlanes(planes, transmittance, lists)
+        passed.append(transmittance)
+    return BlendedPlanes(planes, passed[0], lists)
 
 
 def median_depth(splats: Splats, lists: TileLists, camera: Projection) -> Float:
@@ -140,17 +141,17 @@ def median_depth(splats: Splats, lists: TileLists, camera: Projection) -> Float:
 def _empty_output(camera: Projection, outputs: Sequence[str], channels: int | None) -> RenderOutput:
     """The picture of no Gaussians."""
     zero = dr.zeros(ad.Float, camera.width * camera.height)
-    empty: dict[str, Any] = {name: zero for name in ("depth", "median_depth") if name in outputs}
-    empty |= {name: ad.Array3f(zero, zero, zero) for name in ("color", "normal") if name in outputs}
+    empty: dict[str, Float] = {name: zero for name in ("depth", "median_depth") if name in outputs}
+    colors = {name: ad.Array3f(zero, zero, zero) for name in ("color", "normal") if name in outputs}
     features = None if channels is None else [zero] * channels
     return RenderOutput(
-        color=empty.get("color"),
+        color=colors.get("color"),
         alpha=zero,
         depth=empty.get("depth"),
         width=camera.width,
         height=camera.height,
         median_depth=empty.get("median_depth"),
-        normal=empty.get("normal"),
+        normal=colors.get("normal"),
         features=features,
     )
 

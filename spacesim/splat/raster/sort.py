@@ -8,12 +8,12 @@ an entry then looks for its place in the other chunks of its run of `RUN` by bis
 other runs. Of a list of L that takes CHUNK + RUN / CHUNK log2 CHUNK + L / RUN log2 RUN steps an entry.
 """
 
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Array4u, Bool, UInt32
+from spacesim.backend.arrays import Array4u, Bool, UInt32, UInt64
 
 CHUNK = 64  #: entries that are compared each with each, a power of two; 128 and 256 took longer on an H100
 RUN = 4096  #: entries within which chunks are searched, a power of two: lists of pictures are shorter
@@ -21,7 +21,7 @@ COMPARED = 2  #: entries compared in a turn of the loop
 LONG_LANES = 2**16  #: that share the entries of lists beyond RUN: as many as fill a large device
 
 
-def segment_ids(segment_ends: Any, slot: UInt32, count: int) -> UInt32:
+def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32, count: int) -> UInt32:
     """Which of `count` segments each slot [P] belongs to, where segment i has those from segment_ends[i - 1] to
     segment_ends[i]; `count` for slots that nobody has."""
     number, wide = type(segment_ends), type(segment_ends)(slot)
@@ -46,7 +46,7 @@ def ordered_lists(
     """
     chunk_size, run_size = runs
     lengths = dr.zeros(ad.UInt32, lists)
-    place: Any = dr.scatter_inc(lengths, members, members < lists)
+    place = cast(UInt32, dr.scatter_inc(lengths, members, members < lists))
     dr.eval(place, lengths, members, numbers, keys)
     end = dr.prefix_reduce(dr.ReduceOp.Add, lengths, exclusive=False)
     start, longest = end - lengths, dr.max(lengths)

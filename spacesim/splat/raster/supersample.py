@@ -7,12 +7,11 @@ sRGB value, not 0.5. So the values of the square are decoded (IEC 61966-2-1), av
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.arrays import Array3f, Float, UInt32
 from spacesim.data.errors import InputError
 from spacesim.data.records import MAX_PIXELS, Camera
 from spacesim.splat.raster.cameras import Pinhole
@@ -117,7 +116,7 @@ def _reduced(
     return alpha, result
 
 
-def _listed(planes: Any) -> list[Float]:
+def _listed(planes: Array3f | list[Float] | None) -> list[Float]:
     return [] if planes is None else list(planes)
 
 

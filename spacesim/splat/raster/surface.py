@@ -1,12 +1,12 @@
 """Geometry from Gaussians: normals as features to blend, the median depth of a pixel, the surface there."""
 
 from functools import reduce
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, UInt32
+from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, UInt32, UInt64
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 from spacesim.splat.raster.project import Splats
@@ -60,15 +60,18 @@ def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: in
     """`median_splat` as a part of recordings. capacity: room for the N splats"""
     records, lane, pixels = list_records(splats, [], lists, capacity), lane_pixels(lists), lists.shape.pixels
 
-    def undecided(k: UInt32, end: UInt32, transmittance: list[Float], _place: Any) -> Bool:
+    def undecided(k: UInt32, end: UInt32, transmittance: list[Float], _place: object) -> Bool:
         return (k < end) & (reduce(dr.maximum, transmittance) >= 0.5)
 
-    def pass_splat(k: UInt32, end: UInt32, transmittance: list[Float], place: list[UInt32]) -> Any:
+    def pass_splat(
+        k: UInt32, end: UInt32, transmittance: list[Float], place: list[UInt32]
+    ) -> tuple[UInt32, UInt32, list[Float], list[UInt32]]:
         transmittance, place = list(transmittance), list(place)
         powers = exponents(load(records, k, lists.capacity), lane.x, lane.y, lists.shape)
         for p in range(pixels):
             passing = transmittance[p] >= 0.5
-            alpha: Any = dr.select(powers[p] >= POWER_MIN, dr.minimum(exp2(powers[p]), ALPHA_MAX), 0)
+            drawn = dr.minimum(exp2(powers[p]), ALPHA_MAX)
+            alpha = dr.select(powers[p] >= POWER_MIN, drawn, 0)
             transmittance[p] -= alpha * transmittance[p]
             place[p] = dr.select(passing & (transmittance[p] < 0.5), k, place[p])
         return k + 1, end, transmittance, place
@@ -126,7 +129,7 @@ def surface_depth(gaussians: Gaussians, splats: Splats, index: UInt32, camera: P
 
 
 class _Gather(dr.CustomOp):
-    def eval(self, values: Float, index: UInt32) -> Any:
+    def eval(self, values: Float, index: UInt32) -> Float:
         self.index, self.count = index, dr.width(values)
         return dr.gather(ad.Float, values, index, index < self.count)
 
@@ -136,10 +139,10 @@ class _Gather(dr.CustomOp):
         gradient = dr.select(dr.isfinite(gradient), gradient, 0)
         unit_of_sum = dr.maximum(dr.max(dr.abs(gradient)), 1e-300) * (dr.width(self.index) / 2.0**61)
         parts = dr.reinterpret_array(ad.UInt64, ad.Int64(dr.round(gradient / unit_of_sum)))  # CUDA adds unsigned ones
-        total: Any = dr.zeros(ad.UInt64, self.count)
+        total = dr.zeros(ad.UInt64, self.count)
         dr.scatter_reduce(dr.ReduceOp.Add, total, parts, self.index, self.index < self.count)
-        total = ad.Float64(dr.reinterpret_array(ad.Int64, total))
-        self.set_grad_in("values", ad.Float(total * unit_of_sum))
+        sums = ad.Float64(cast(UInt64, dr.reinterpret_array(ad.Int64, total)))
+        self.set_grad_in("values", ad.Float(sums * unit_of_sum))
 
     def name(self) -> str:
         return "pick"

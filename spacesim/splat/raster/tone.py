@@ -4,18 +4,19 @@ A model's linear colours are shares of what its tone curve makes white (`spacesi
 where light bounces. What is brighter than white is clipped.
 """
 
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import numpy as np
 
+from spacesim.backend.arrays import ArrayT
 from spacesim.data.images import srgb_from_linear
 from spacesim.data.tone import WHITES, filmic
 
 _LINEAR_END, _ENCODED_END = 0.0031308, 0.04045
 
 
-def tone_map(light: Any, tone: str) -> Any:
+def tone_map(light: ArrayT, tone: str) -> ArrayT:
     """sRGB values in [0, 1] of linear colours, shares of white, by a tone curve. Arrays of any shape."""
     if tone == "srgb":
         return encode_srgb(light)
@@ -23,7 +24,7 @@ def tone_map(light: Any, tone: str) -> Any:
     return encode_srgb(v * dr.fma(2.51, v, 0.03) / dr.fma(v, dr.fma(2.43, v, 0.59), 0.14))  # `filmic`
 
 
-def inverse_tone_map(values: Any, tone: str) -> Any:
+def inverse_tone_map(values: ArrayT, tone: str) -> ArrayT:
     """The inverse: linear colours, shares of white, of sRGB values in [0, 1]."""
     t = decode_srgb(values)
     if tone == "srgb":
@@ -40,30 +41,35 @@ def adjust_exposure(light: np.ndarray, tone: str, stops: float = 0.0) -> np.ndar
     return srgb_from_linear(filmic(v) if tone == "filmic" else v)
 
 
-def encode_srgb(linear: Any) -> Any:
+def encode_srgb(linear: ArrayT) -> ArrayT:
     """sRGB values in [0, 1] of linear ones, clipped to [0, 1]. Arrays of any shape."""
     return encode_srgb_unclipped(dr.clip(linear, 0, 1))
 
 
-def encode_srgb_unclipped(linear: Any) -> Any:
+def encode_srgb_unclipped(linear: ArrayT) -> ArrayT:
     """sRGB values of linear ones, 0 or more, beyond 1 by the same curve. Arrays of any shape."""
-    curve = 1.055 * dr.power(dr.maximum(linear, _LINEAR_END), 1 / 2.4) - 0.055
+    curve = 1.055 * _power(dr.maximum(linear, _LINEAR_END), 1 / 2.4) - 0.055
     return dr.select(linear <= _LINEAR_END, 12.92 * linear, curve)
 
 
-def encode_srgb_slope(linear: Any) -> Any:
+def encode_srgb_slope(linear: ArrayT) -> ArrayT:
     """d `encode_srgb_unclipped`. Arrays of any shape."""
-    curve = 1.055 / 2.4 * dr.power(dr.maximum(linear, _LINEAR_END), 1 / 2.4 - 1)
+    curve = 1.055 / 2.4 * _power(dr.maximum(linear, _LINEAR_END), 1 / 2.4 - 1)
     return dr.select(linear <= _LINEAR_END, 12.92, curve)
 
 
-def decode_srgb_slope(values: Any) -> Any:
+def decode_srgb_slope(values: ArrayT) -> ArrayT:
     """d `decode_srgb`. Arrays of any shape."""
-    curve = 2.4 / 1.055 * dr.power((dr.maximum(values, _ENCODED_END) + 0.055) / 1.055, 1.4)
+    curve = 2.4 / 1.055 * _power((dr.maximum(values, _ENCODED_END) + 0.055) / 1.055, 1.4)
     return dr.select(values <= _ENCODED_END, 1 / 12.92, curve)
 
 
-def decode_srgb(values: Any) -> Any:
+def decode_srgb(values: ArrayT) -> ArrayT:
     """Linear values of sRGB ones in [0, 1]. Arrays of any shape."""
-    curve = dr.power((dr.maximum(values, _ENCODED_END) + 0.055) / 1.055, 2.4)
+    curve = _power((dr.maximum(values, _ENCODED_END) + 0.055) / 1.055, 2.4)
     return dr.select(values <= _ENCODED_END, values / 12.92, curve)
+
+
+def _power(values: ArrayT, exponent: float) -> ArrayT:
+    """`dr.power`, which says to give an object."""
+    return cast(ArrayT, dr.power(values, exponent))

@@ -4,15 +4,14 @@ Pictures stay packed and whole where they are kept; squares are averaged where t
 size of any picture takes memory. Rows and columns that fill no square are left out, as splatfacto leaves them.
 """
 
-from typing import Any
-
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
+from spacesim.backend.arrays import Array3f, ArrayT, Bool, Float, UInt32
 from spacesim.data.records import Camera
 from spacesim.splat.raster.supersample import mean_light
 from spacesim.splat.raster.tone import inverse_tone_map
+from spacesim.splat.train.views import Truth
 
 
 def downscaled_camera(camera: Camera, times: int) -> Camera:
@@ -64,13 +63,13 @@ def valid_squares(valid: Bool, size: tuple[int, int], times: int) -> Bool:
     return found
 
 
-def truth_of_squares(truth: dict[str, list[Any]], size: tuple[int, int], times: int) -> dict[str, list[Any]]:
+def truth_of_squares(truth: Truth, size: tuple[int, int], times: int) -> Truth:
     """What the planes of `TargetImage.truth` say of squares, in the form that the loss compares with what is blended:
     visibility that is seen in a square (below 0 where there is no surface), so times alpha; the mean depth and the mean
     normal, of unit length, of what surface there is; foreground where half of a square is."""
     if times == 1:
         return truth
-    places, found = _places(size, times), dict[str, list[Any]]()
+    places, found = _places(size, times), Truth()
     for name, planes in truth.items():
         if name == "foreground":
             shares = [dr.select(dr.gather(ad.Bool, planes[0], place), ad.Float(1), 0) for place in places]
@@ -87,12 +86,12 @@ def truth_of_squares(truth: dict[str, list[Any]], size: tuple[int, int], times: 
             counts = [dr.select(value[0] > 0, ad.Float(1), 0) for value in values]
             found[name] = [_sum([value[0] for value in values]) / dr.maximum(_sum(counts), 1)]
         else:
-            total = ad.Array3f(_sum(values))
+            total = ad.Array3f(sum(values[1:], values[0]))
             found[name] = list(total * dr.rcp(dr.maximum(dr.norm(total), 1e-6)))
     return found
 
 
-def _sum(values: list[Any]) -> Any:
+def _sum(values: list[ArrayT]) -> ArrayT:
     return sum(values[1:], values[0])
 
 

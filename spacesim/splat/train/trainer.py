@@ -122,7 +122,7 @@ class Trainer(TrainingLoop):
             dr.sync_thread()
             self.refinement_seconds += time.perf_counter() - start
 
-    def _forward_backward(self, rows: list[Any], degree: int, number: int) -> ViewResult:
+    def _forward_backward(self, rows: list[Float], degree: int, number: int) -> ViewResult:
         """Forward, loss, backward for one view, `number` of the training."""
         view, view_pass = self.pictures.shown(self.views.at_step(number)), self._view_pass
         watched = self.strategy.observes_step(self.iteration + 1) and not self._warming(self.iteration)
@@ -169,7 +169,7 @@ class Trainer(TrainingLoop):
         views = [result.take_gradients() for result in results]
         self._update(self.gaussians, self.optimizer, degree, views, factors, self._penalties())
 
-    def _penalties(self) -> dict[str, Any]:
+    def _penalties(self) -> dict[str, Float]:
         """{name: weight of each Gaussian's share} of the penalties on Gaussians that the configuration has."""
         config, count, unit = self.config, self.gaussians.count, self.scene_scale
         weights = {

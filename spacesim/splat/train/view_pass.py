@@ -4,10 +4,10 @@ Stages of fixed shape (project, loss) are recorded once and replayed without tra
 change length from step to step, stand between them.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 from spacesim.backend import ad, recorded
+from spacesim.backend.arrays import Bool, Float
 from spacesim.data.records import Camera
 from spacesim.splat.light.model import LightModel, Shading
 from spacesim.splat.raster.adjoint import SplatGradients
@@ -40,12 +40,12 @@ class RenderedView:
 
     camera: Pinhole  #: with as many pixels as are blended
     downscale: int  #: pixels of the view on a side of each pixel that is compared
-    radii: Any  #: of `screen_radii`, or None where refinement does not watch
+    radii: Float | None  #: of `screen_radii`, or None where refinement does not watch
     channels: dict[str, int]  #: how many planes each name has
     shading: Shading | None  #: its light, of a method of light
     tape: BlendTape | None  #: until the way back has read it
 
-    def group(self, values: list[Any], name: str) -> list[Any]:
+    def group(self, values: list[Float], name: str) -> list[Float]:
         """Of what was blended, or its gradients, what has that name."""
         return _group_by_name(values, self.channels).get(name, [])
 
@@ -60,10 +60,10 @@ class RenderedView:
 class ViewLoss:
     """The loss of a view, and its gradients."""
 
-    value: Any  #: Float of width 1
-    grad_planes: list[Any]  #: gradients by the blended planes, in their order
-    grad_transmittance: Any  #: plane
-    grad_gains: Any = None  #: Float [3] by the target's gains, if it has some
+    value: Float  #: of width 1
+    grad_planes: list[Float]  #: gradients by the blended planes, in their order
+    grad_transmittance: Float  #: plane
+    grad_gains: Float | None = None  #: [3] by the target's gains, if it has some
 
 
 @dataclass
@@ -71,9 +71,9 @@ class ViewResult:
     """What a step has learned from one view: for the Gaussians, and for the networks."""
 
     gradients: ViewGradients | None
-    loss: Any
-    by_networks: Any = None  #: by their weights, then by the pictures' embeddings
-    by_sun: Any = None  #: Float [3], by its direction, of pictures whose Suns are unknown
+    loss: Float
+    by_networks: list[Float] = field(default_factory=list)  #: by their weights, then by the pictures' embeddings
+    by_sun: Float | None = None  #: [3], by its direction, of pictures whose Suns are unknown
 
     def take_gradients(self) -> ViewGradients:
         """The gradients, which are not held any longer."""
@@ -105,7 +105,7 @@ class ViewPass:
     def forward(
         self,
         gaussians: Gaussians,
-        rows: list[Any],
+        rows: list[Float],
         light: LightModel | None,
         view: TrainingView,
         degree: int,
@@ -122,7 +122,7 @@ class ViewPass:
         shading = light.shade(gaussians, camera, view.sun, picture=view.index) if light else None
         if shading:
             values["color"] = shading.colors
-            if config.visibility_weight > 0:
+            if config.visibility_weight > 0 and shading.visibility is not None:
                 values["visibility"] = [shading.visibility]
         lists = bin_splats(splats, footprints, camera.width, camera.height, training=True)
         planes = [value for group in values.values() for value in group]
@@ -148,8 +148,9 @@ class ViewPass:
             tape.splats, tape.blended, tape.lists, size, loss.grad_planes, loss.grad_transmittance, absolute=absolute
         )
 
-    def watched(self, drawn: RenderedView, grad_splats: SplatGradients) -> tuple[Any, Any, Any]:
+    def watched(self, drawn: RenderedView, grad_splats: SplatGradients) -> tuple[Float, Float, Bool]:
         """What refinement watches of a view, see `on_screen`."""
+        assert drawn.radii is not None, "radii are there where refinement watches"
         width, height = drawn.camera.width, drawn.camera.height
         sizes = ad.Float([0.5 * width, 0.5 * height, max(width, height)])
         gradient, radius, seen = self._on_screen((grad_splats.absolute_x, grad_splats.absolute_y), drawn.radii, sizes)
@@ -161,7 +162,7 @@ class ViewPass:
         loss: ViewLoss,
         grad_splats: SplatGradients,
         light: LightModel | None,
-        grad_rows: list[Any],
+        grad_rows: list[Float],
     ) -> ViewResult:
         """What the view teaches, back through its light. grad_rows: gradients of the Gaussians' first rows that come
         from elsewhere, none at all or some"""
@@ -179,13 +180,13 @@ class ViewPass:
         return ViewResult(gradients, loss.value, learned, grad_light.sun[0] if by_sun else None)
 
 
-def _group_by_name(values: list[Any], counts: dict[str, int]) -> dict[str, list[Any]]:
+def _group_by_name(values: list[Float], counts: dict[str, int]) -> dict[str, list[Float]]:
     """So many of the values, one after another, under each name."""
     rest = iter(values)
     return {name: [next(rest) for _ in range(count)] for name, count in counts.items()}
 
 
-def _sum_rows(first: list[Any], second: list[Any]) -> list[Any]:
+def _sum_rows(first: list[Float], second: list[Float]) -> list[Float]:
     """Rows added up, those that only one has as they are."""
     longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
     return [row + addend for row, addend in zip(longer, shorter, strict=False)] + longer[len(shorter) :]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.backend import ad, free_memory, main_memory
+from spacesim.backend.arrays import Bool, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
@@ -20,6 +21,8 @@ log = logging.getLogger(__name__)
 CACHE_BYTES = 6 * 2**30  #: of decoded pictures, at most
 DEVICE_BYTES = 2 * 2**30  #: of pictures that stay on the device, at most: 512 of 1024 x 1024
 SHARES = 4, 8  #: a fourth and an eighth of the memory that is free are not exceeded
+
+Truth = dict[str, list[Any]]  #: on the device: Floats [H * W] by name; of "foreground" a Bool [H * W] and its weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +81,12 @@ class TrainingViews:
         epoch, place = divmod(step, len(self))
         return self[int(self._order(epoch)[place])]
 
-    def pixels(self, view: TrainingView) -> tuple[Any, Any, dict[str, list[Any]]]:
+    def pixels(self, view: TrainingView) -> tuple[UInt32, Bool, Truth]:
         """(rgba UInt32 [H * W], valid Bool [H * W] or of width 1, truth as Floats [H * W]) of a view."""
-        pixels: tuple[Any, Any, dict[str, list[Any]]] = self._device_cache(view.index)
+        pixels: tuple[UInt32, Bool, Truth] = self._device_cache(view.index)
         return pixels
 
-    def _upload(self, index: int) -> tuple[Any, Any, dict[str, list[Any]]]:
+    def _upload(self, index: int) -> tuple[UInt32, Bool, Truth]:
         view = self[index]
         valid = ad.Bool(True) if view.valid is None else upload(view.valid, ad.Bool)
         truth = {name: [upload(plane) for plane in planes] for name, planes in view.truth.items()}

@@ -117,7 +117,7 @@ def drawable_mask(means: Array3f, log_scales: Array3f, quaternions: Array4f, log
     return drawn & (opacities(dr.select(drawn, logits, 0)) >= ALPHA_MIN)
 
 
-def _camera(light: Float, middle: Array3f, bounds: list[tuple[Any, Any]], size: int) -> Orthographic:
+def _camera(light: Float, middle: Array3f, bounds: list[tuple[Float, Float]], size: int) -> Orthographic:
     """Camera whose depths count from `middle` (Array3f, world) and whose image spans `bounds` (low, high in x and y,
     metres from there) and the margin (thesis 4.33 to 4.35)."""
     if size < 4:

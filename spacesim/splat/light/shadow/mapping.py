@@ -279,7 +279,7 @@ class _Window:
         left, top = dr.floor(self.x - half_x), dr.floor(self.y - half_y)
         light = self.light
 
-        def has_more(k: UInt32, _sums: Any) -> Bool:
+        def has_more(k: UInt32, _sums: object) -> Bool:
             return k < side * side
 
         def add(k: UInt32, sums: list[Float]) -> Any:

@@ -190,7 +190,7 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[UInt32, UInt32], c
     mode = reduce_mode(8 * lists.capacity, shape)
     end = dr.gather(ad.UInt32, lists.end, lane.tile)
 
-    def remaining(k: UInt32, _transmittance: Any, _last: Any) -> Bool:
+    def remaining(k: UInt32, _transmittance: object, _last: object) -> Bool:
         return k < end
 
     def take(k: UInt32, transmittance: list[Float], last: list[UInt32]) -> Any:
@@ -237,7 +237,7 @@ def _sum_slots(slots: Float, lists: TileLists, capacity: int) -> Array2f:
     position = dr.gather(ad.UInt32, lists.first_slot, index)
     end = position + dr.gather(ad.UInt32, lists.slot_count, index)
 
-    def remaining(position: UInt32, _total: Any) -> Bool:
+    def remaining(position: UInt32, _total: object) -> Bool:
         return position < end
 
     def add(position: UInt32, total: Any) -> Any:
@@ -268,7 +268,7 @@ def _replay(
     mode = reduce_mode(32 * lists.capacity, shape)
     start = dr.gather(ad.UInt32, lists.start, lane.tile)
 
-    def remaining(k: UInt32, _transmittance: Any, _behind: Any) -> Bool:
+    def remaining(k: UInt32, _transmittance: object, _behind: object) -> Bool:
         return k > start
 
     def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> Any:

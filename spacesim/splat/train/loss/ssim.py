@@ -6,13 +6,13 @@ kernel reads neighbours of the other axis just as it read these.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Float
+from spacesim.backend.arrays import Array3f, Float
 
 RADIUS = 5  #: 11 x 11 window
 SIGMA = 1.5  #: pixels
@@ -23,7 +23,7 @@ _WEIGHTS = np.exp(-0.5 * (_OFFSETS / SIGMA) ** 2)
 WINDOW: list[float] = (_WEIGHTS / _WEIGHTS.sum()).tolist()
 
 
-def ssim(prediction: Any, target: Any, width: int, height: int) -> Any:
+def ssim(prediction: Array3f, target: Array3f, width: int, height: int) -> Float:
     """Mean structural similarity of two pictures (thesis 2.19), Float of width 1; differentiable in `prediction`.
 
     prediction, target: Array3f [3, height * width]. Gaussian window of 11 x 11 pixels, sigma 1.5, data range 1; beyond
@@ -33,7 +33,7 @@ def ssim(prediction: Any, target: Any, width: int, height: int) -> Any:
 
 
 class _Ssim(dr.CustomOp):
-    def eval(self, prediction: Any, target: Any, width: int, height: int) -> Any:
+    def eval(self, prediction: Array3f, target: Array3f, width: int, height: int) -> Float:
         self.pair = list(prediction), list(target)
         self.down = down = _Strips(width, height, width)
         self.across = across = _Strips(height, width, down.stride)
@@ -45,7 +45,7 @@ class _Ssim(dr.CustomOp):
             products = [x * y for x, y in zip(xs, ys, strict=True)]
             planes += [down.write(_blur(values)) for values in (xs, ys, squares, products)]
         dr.eval(planes)
-        total: Any = ad.Float(0)
+        total = ad.Float(0)
         self.partials: list[Float] = []
         for c in range(3):
             moments = [_blur(across.read(plane)) for plane in planes[4 * c : 4 * c + 4]]
@@ -61,7 +61,7 @@ class _Ssim(dr.CustomOp):
         down = _Strips(self.across.extent, self.down.extent, self.across.stride)
         planes = [down.write(_blur(down.read(partial))) for partial in self.partials]
         dr.eval(planes)
-        gradient: Any = self.grad_out()
+        gradient = cast(Float, self.grad_out())
         scale, across = gradient * self.scale, self.across
         gradients = []
         for c, (x, y) in enumerate(zip(*self.pair, strict=True)):
@@ -80,7 +80,7 @@ class _Ssim(dr.CustomOp):
         return "ssim"
 
 
-def _similarity(mx: Float, my: Float, squares: Any, product: Float) -> tuple[Any, Any, Any, Any]:
+def _similarity(mx: Float, my: Float, squares: Float, product: Float) -> tuple[Float, Float, Float, Float]:
     """SSIM of a pixel from the means of x, y, x^2 + y^2 and x y under its window, and its derivatives by those of x,
     x^2 and x y (the first with the window's other means held)."""
     mxy, mm = mx * my, dr.fma(mx, mx, my * my)
@@ -92,7 +92,7 @@ def _similarity(mx: Float, my: Float, squares: Any, product: Float) -> tuple[Any
     return value, grad_mean, -value * r2, 2 * a1 * inverse
 
 
-def _blur(values: Sequence[Any]) -> list[Float]:
+def _blur(values: Sequence[Float]) -> list[Float]:
     """Of ROWS + 2 RADIUS neighbours, the blurred ROWS in the middle."""
     result = []
     for j in range(ROWS):
@@ -123,13 +123,13 @@ class _Strips:
             values.append(dr.gather(ad.Float, plane, ad.UInt32(along * self.step + ad.Int32(self.cross)), inside))
         return values
 
-    def write(self, values: Sequence[Any]) -> Any:
+    def write(self, values: Sequence[Float]) -> Float:
         """A plane in which neighbours along the axis lie next to each other, lines of them `stride` apart."""
         plane = dr.empty(ad.Float, self.crossing * self.stride)
         dr.scatter(plane, ad.ArrayXf(list(values)), self._packet)
         return plane
 
-    def tight(self, plane: Float) -> Any:
+    def tight(self, plane: Float) -> Float:
         """What `write` has written, without the space between lines."""
         if self.stride == self.extent:
             return plane
@@ -137,7 +137,7 @@ class _Strips:
         return dr.gather(ad.Float, plane, (pixel // self.extent) * self.stride + pixel % self.extent)
 
 
-def gaussian_blur(plane: Float, width: int, height: int) -> Any:
+def gaussian_blur(plane: Float, width: int, height: int) -> Float:
     """A plane [height * width] under the window of SSIM, zero beyond the border."""
     down = _Strips(width, height, width)
     across = _Strips(height, width, down.stride)

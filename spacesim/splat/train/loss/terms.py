@@ -1,7 +1,5 @@
 """What training minimises: L1 and structural dissimilarity (thesis 2.8), on planes of pixels."""
 
-from typing import Any
-
 import drjit as dr
 
 from spacesim.backend.arrays import Array3f, Bool, Float
@@ -11,7 +9,7 @@ from spacesim.splat.train.loss.ssim import ssim
 ROUND = 1e-4  #: of a Gaussian's mean scale
 
 
-def photometric_loss(prediction: Any, target: Any, width: int, height: int, ssim_weight: float = 0.2) -> Float:
+def photometric_loss(prediction: Array3f, target: Array3f, width: int, height: int, ssim_weight: float = 0.2) -> Float:
     """(1 - w) mean |p - t| + w (1 - SSIM(p, t)), thesis 2.8 with D-SSIM = 1 - SSIM as gsplat takes it.
 
     prediction, target: Array3f [3, height * width];  returns a Float of width 1.
@@ -23,27 +21,33 @@ def photometric_loss(prediction: Any, target: Any, width: int, height: int, ssim
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(prediction, target, width, height))
 
 
-def visibility_loss(prediction: Any, truth: Any, valid: Bool) -> Float:
+def visibility_loss(prediction: Float, truth: Float, valid: Bool) -> Float:
     """Mean |blended visibility - path-traced visibility| over the object's pixels, planes [height * width], as a share
     of all pixels. truth: below 0 where there is no surface;  valid: Bool, pixels that count."""
     counts = valid & (truth >= 0)
-    return dr.sum(dr.select(counts, dr.abs(prediction - truth), 0)) / dr.width(truth)
+    error = dr.abs(prediction - truth)
+    return dr.sum(_where(counts, error)) / dr.width(truth)
 
 
-def depth_loss(blended: Any, transmittance: Float, truth: Any, valid: Bool) -> Float:
+def depth_loss(blended: Float, transmittance: Float, truth: Float, valid: Bool) -> Float:
     """Mean |sum_i w_i (z_i - z)| over the surface's pixels, as a share of all pixels: the expected depth's error, times
     alpha. blended: plane of sum_i w_i z_i;  truth: plane of z, 0 where there is no surface;  both in one unit"""
     counts = valid & (truth > 0)
     error = dr.abs(blended - (1 - transmittance) * truth)
-    return dr.sum(dr.select(counts, error, 0)) / dr.width(truth)
+    return dr.sum(_where(counts, error)) / dr.width(truth)
 
 
-def normal_loss(blended: Any, transmittance: Float, truth: Any, valid: Bool) -> Float:
+def normal_loss(blended: Array3f, transmittance: Float, truth: Array3f, valid: Bool) -> Float:
     """Mean of sum_i w_i (1 - n_i . n) over the surface's pixels, as a share of all pixels (Huang et al. 2024, 2DGS,
     with the true normal). blended: Array3f of sum_i w_i n_i;  truth: Array3f, unit, 0 where there is no surface"""
     counts = valid & (dr.squared_norm(truth) > 0.25)
     error = 1 - transmittance - dr.dot(blended, truth)
-    return dr.sum(dr.select(counts, error, 0)) / dr.width(truth)
+    return dr.sum(_where(counts, error)) / dr.width(truth)
+
+
+def _where(counts: Bool, error: Float) -> Float:
+    """The error of what counts, else 0."""
+    return dr.select(counts, error, 0)
 
 
 def penalty(name: str, gaussians: Gaussians) -> Float:

@@ -8,7 +8,6 @@ reads and writes those of its Gaussian by packets, which costs no more than plai
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -124,7 +123,7 @@ def release(before: int, after: int) -> None:
         dr.flush_malloc_cache()
 
 
-def _gather(array: Any, index: UInt32, size: int) -> list[Float]:
+def _gather(array: Float, index: UInt32, size: int) -> list[Float]:
     """A packet of `size` numbers."""
     if size == 8:
         return list(dr.gather(ad.ArrayXf, array, index, shape=(size, dr.width(index))))

@@ -7,7 +7,6 @@ slower on a CPU.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import drjit as dr
 
@@ -23,7 +22,7 @@ from spacesim.splat.train.optimizer.adam import OWN, Adam
 from spacesim.splat.train.optimizer.packing import PackedArray, load, store
 from spacesim.splat.train.stages import mean, shape_values
 
-Packed = tuple[list[Any], tuple[PackedArray, ...]]  #: moments of a part and how they lie, see `packing`
+Packed = tuple[list[Float], tuple[PackedArray, ...]]  #: moments of a part and how they lie, see `packing`
 
 
 @dataclass
@@ -34,7 +33,7 @@ class ViewGradients:
     camera: Pinhole
     grad_splats: Splats
     grad_values: dict[str, list[Float]]
-    grad_features: Any = None  #: Float [F * N], of a method of light
+    grad_features: Float | None = None  #: [F * N], of a method of light
     grad_rows: list[Float] = field(default_factory=list)  #: of the first rows, beside what the splats give them
 
 
@@ -56,7 +55,7 @@ class Update:
         degree: int,
         views: list[ViewGradients],
         factors: Float,
-        penalties: Mapping[str, Any],
+        penalties: Mapping[str, Float],
     ) -> None:
         """Replace the parameters and their moments, part by part.
 
@@ -68,7 +67,8 @@ class Update:
         how = degree, factors, penalties, self.antialiased, self.scale
         rows = [ad.Float(row) for row in gaussians.rows()]  # a row taken from an array keeps all of that array
         means, packed = rows[:3], (optimizer.arrays[0], optimizer.layouts[0])
-        cameras, grad_features = [view.camera for view in views], [view.grad_features for view in views]
+        cameras = [view.camera for view in views]
+        grad_features = [view.grad_features for view in views if view.grad_features is not None]
         of_own = [_without_features(view) for view in views]
         views.clear()
         grad_sums, *moved = self._own(rows, optimizer.slices[0].stop, packed, of_own, *how)
@@ -107,7 +107,7 @@ def _move_own(
     views: list[tuple[Pinhole, Splats, dict[str, list[Float]], list[Float]]],
     degree: int,
     factors: Float,
-    penalties: Mapping[str, Any],
+    penalties: Mapping[str, Float],
     antialiased: bool,
     scale: float,
 ) -> tuple[list[list[Float]], list[Float], list[Float]]:
@@ -118,7 +118,7 @@ def _move_own(
     shape_rows = [ad.Float(row) for row in rows[:OWN]]
     dr.enable_grad(shape_rows)
     gaussians = Gaussians.from_rows([*shape_rows, *rows[OWN:]])
-    along: Any = ad.Float(0)
+    along = ad.Float(0)
     grad_sums: list[list[Float]] = []
     for camera, grad_splats, grad_values, grad_rows in views:
         splats, _ = project(gaussians, camera, antialiased)
@@ -168,7 +168,7 @@ def _move_harmonics(
 
 
 def _move_features(
-    row: Any, moments: list[Float], grad_features: list[Float], factors: Float
+    row: Float, moments: list[Float], grad_features: list[Float], factors: Float
 ) -> tuple[Float, list[Float]]:
     """A step of the features, one packed row."""
     first, second = moments
@@ -188,7 +188,7 @@ def _step(
     return moved, store(first_moments, second_moments, layout)
 
 
-def _numbers(factors: Float, first: int, count: int) -> tuple[tuple[Any, Any], list[Float]]:
+def _numbers(factors: Float, first: int, count: int) -> tuple[tuple[Float, Float], list[Float]]:
     """Adam's two corrections, and the step sizes of `count` rows from number `first` on."""
     indices = 0, 1, *range(2 + first, 2 + first + count)
     first_correction, second_correction, *rates = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in indices]

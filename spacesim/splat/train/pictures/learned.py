@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -73,9 +72,9 @@ class LearnedPictures:
         if self.exposures and loss.grad_gains is not None:
             self.exposures.learn(view.index, step, loss.grad_gains)
 
-    def learn_sun(self, step: int, view: TrainingView, gradient: Any) -> None:
+    def learn_sun(self, step: int, view: TrainingView, gradient: Float | None) -> None:
         """gradient: Float [3] by the direction of the view's Sun, of Suns that are unknown"""
-        if self.suns:
+        if self.suns and gradient is not None:
             self.suns.learn(view.index, step, gradient)
 
     def find_suns(self, steps: int, gaussians: Gaussians, light: LightModel) -> None:

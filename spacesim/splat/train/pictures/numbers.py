@@ -5,10 +5,10 @@ stay in main memory in double precision, and gradients are read when a later ste
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 
+from spacesim.backend.arrays import Float
 from spacesim.data.geometry import Array
 from spacesim.learning.adam import EPSILON
 
@@ -23,7 +23,7 @@ class PictureNumbers:
         self.values, self.first, self.second = (np.zeros((pictures, count)) for _ in range(3))
         self.steps = np.zeros(pictures)
         self._slope = slope or (lambda picture, gradient: gradient)
-        self._pending: list[tuple[int, Any, float]] = []
+        self._pending: list[tuple[int, Float, float]] = []
 
     def of(self, picture: int) -> Array:
         """[K] of a picture, which has followed all that it has taught."""
@@ -32,7 +32,7 @@ class PictureNumbers:
         numbers: Array = self.values[picture]
         return numbers
 
-    def learn(self, picture: int, gradient: Any, rate: float) -> None:
+    def learn(self, picture: int, gradient: Float, rate: float) -> None:
         """gradient: Float, which need not be there yet;  rate: step size of each number"""
         self.follow()  # what an earlier view has taught is there by now
         self._pending.append((picture, gradient, rate))

@@ -23,7 +23,6 @@ and of shifts per distance) stays as it was, by a correction every `GAUGE_EVERY`
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -164,7 +163,7 @@ def pose_gradient(
     dr.enable_grad(rows[:3], rows[6:10])
     gaussians = Gaussians.from_rows(rows)
     splats, _ = project(gaussians, camera, antialiased)
-    along: Any = ad.Float(0)
+    along = ad.Float(0)
     for name in WAYS:
         along += getattr(splats, name) * getattr(grad_splats, name)
     for gradient in grad_depth:

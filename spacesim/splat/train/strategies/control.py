@@ -6,7 +6,7 @@ Where the table is silent the values are those of Nerfstudio's splatfacto, which
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import drjit as dr
 import numpy as np
@@ -106,7 +106,7 @@ class DensityControl(Strategy):
         seen = {name: values for name, values in self.state.items() if name not in self.unseen}
         self.state |= self._observed(seen, gradient, radius, visible)
 
-    def _observation(self, state: dict[str, Float], gradient: Float, radius: Float, visible: Bool) -> dict[str, Any]:
+    def _observation(self, state: dict[str, Float], gradient: Float, radius: Float, visible: Bool) -> dict[str, Float]:
         """The state with an observation more."""
         state = dict(state)
         state["gradient"] = state["gradient"] + dr.select(visible, gradient, 0)

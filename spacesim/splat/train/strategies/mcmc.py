@@ -5,7 +5,7 @@ penalties that belong to it are the loss's: `TrainConfig.opacity_weight` and `sc
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 import numpy as np
@@ -64,7 +64,7 @@ class McmcStrategy(Strategy):
 
     def __init__(self, schedule: RefinementConfig, mcmc: McmcConfig, scene_scale: float) -> None:
         self.schedule, self.mcmc, self.scene_scale = schedule, mcmc, scene_scale
-        self.state: dict[str, Any] = {}
+        self.state: dict[str, Float] = {}
 
     def observes_step(self, step: int) -> bool:
         return False
