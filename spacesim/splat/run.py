@@ -114,7 +114,7 @@ class TrainingRecord:
     seconds: float  #: of training
     gaussians: int  #: at the end
     backend: str  #: that trained
-    refinement_seconds: float = 0.0  #: the part of `seconds` that refinement took
+    refinement_seconds: float = 0.0  #: the part of `seconds` that densification took
     device: str | None = None  #: that trained
     command: str | None = None  #: the command line, or None of another caller
     versions: Mapping[str, str] = field(default_factory=dict)  #: of libraries

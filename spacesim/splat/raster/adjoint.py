@@ -51,7 +51,7 @@ class PlaneGradients:
 
 @dataclass
 class SplatGradients:
-    """Gradients of a scalar with respect to the splats, [N] each (depths have none), and what refinement asks for."""
+    """Gradients of a scalar by the splats, [N] each (depths have none), and what densification asks for."""
 
     splats: Splats
     features: list[Float]

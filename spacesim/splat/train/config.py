@@ -101,7 +101,7 @@ class TrainConfig:
     depth_weight: float = 0.0  #: weight: mean error of the depth, per scene scale
     normal_weight: float = 0.0  #: weight: 1 less the cosine between normals
     prior: Literal["truth", "mesh"] = "truth"  #: whose depth and normals these compare with: traced ones, or mesh.ply's
-    warm_start: WarmStartConfig | None = None  #: pull Gaussians to the foreground before refinement (thesis 5.3)
+    warm_start: WarmStartConfig | None = None  #: pull Gaussians to the foreground before densification (thesis 5.3)
     init_box: float | None = None  #: side of the cube that `random` fills, in sizes of the object
     checkpoint_every: int = 1_000  #: iterations between two checkpoints
     #: where the pictures' Suns come from: the data, or estimated with the model
@@ -228,12 +228,12 @@ def with_options(config: TrainConfig, **options: Any) -> TrainConfig:
 def shortened(config: TrainConfig, iterations: int) -> TrainConfig:
     """`config` with so many iterations; where they are fewer, what waits for iterations waits for less.
 
-    The end of refinement keeps its share of the training, so that what it leaves is trained. What comes at the start
-    (first refinement, pauses, harmonics, coarse pictures, warm start, what strategies wait for) shrinks by the same
-    share, or to a twentieth of the training where that is longer. Learning rates follow the training's length by
-    themselves, but for `means_steps`. Refinements and opacity resets are as far apart as they were: both take the steps
-    that they take. Where screen sizes cull nothing, being over with the pause after the first reset, they go on culling
-    nothing. In a longer training nothing changes but for the steps that come last.
+    The end of densification keeps its share of the training, so that what it leaves is trained. What comes at the start
+    (first densification step, pauses, harmonics, coarse pictures, warm start, what strategies wait for) shrinks by the
+    same share, or to a twentieth of the training where that is longer. Learning rates follow the training's length by
+    themselves, but for `means_steps`. Densification steps and opacity resets are as far apart as they were: both take
+    the steps that they take. Where screen sizes cull nothing, being over with the pause after the first reset, they go
+    on culling nothing. In a longer training nothing changes but for the steps that come last.
     """
     share = iterations / config.iterations
     if not 0 < share < 1:

@@ -11,7 +11,7 @@ from spacesim.backend.arrays import Array3f, ArrayT, Bool, Float, UInt32
 from spacesim.data.records import Camera
 from spacesim.splat.raster.supersample import mean_light
 from spacesim.splat.raster.tone import inverse_tone_map
-from spacesim.splat.train.views import Truth
+from spacesim.splat.train.loss.terms import Truth
 
 
 def downscaled_camera(camera: Camera, times: int) -> Camera:

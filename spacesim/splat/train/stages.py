@@ -16,8 +16,7 @@ from spacesim.splat.raster.supersample import pixel_means
 from spacesim.splat.raster.surface import normals
 from spacesim.splat.raster.tone import inverse_tone_map, tone_map
 from spacesim.splat.train.downscale import covered_color, truth_of_squares, valid_squares
-from spacesim.splat.train.loss.terms import depth_loss, normal_loss, photometric_loss, visibility_loss
-from spacesim.splat.train.views import Truth
+from spacesim.splat.train.loss.terms import Truth, depth_loss, normal_loss, photometric_loss, visibility_loss
 from spacesim.splat.train.warm_start import foreground_loss
 
 
@@ -142,8 +141,8 @@ def picture_loss(
 
 
 def on_screen(absolute: tuple[Float, Float], radii: Float, sizes: Float) -> tuple[Float, Float, Bool]:
-    """What refinement watches, [N] each: the norm of the absolute gradient by half a picture, the radius as a share of
-    the picture's longer side, and who is in the picture. absolute: by x and y, a pixel;  radii: of `screen_radii`;
+    """What densification watches, [N] each: the norm of the absolute gradient by half a picture, the radius as a share
+    of the picture's longer side, and who is in the picture. absolute: by x and y, a pixel;  radii: of `screen_radii`;
     sizes: Float [3], half the picture's width and height, its longer side"""
     half_width, half_height, longer = (dr.gather(ad.Float, sizes, ad.UInt32(i)) for i in range(3))
     gradient = dr.sqrt(dr.square(absolute[0] * half_width) + dr.square(absolute[1] * half_height))

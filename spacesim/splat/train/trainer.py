@@ -86,7 +86,7 @@ class Trainer(TrainingLoop):
         return self.gaussians.count
 
     def step(self) -> Any:
-        """One update from one view or several, refinement if it is time. Returns the mean loss, Float of width 1."""
+        """One update from one view or several, densification if it is time. Returns the mean loss, Float of width 1."""
         config, index, count = self.config, self.iteration, self.config.views_per_step
         degree = min(config.sh_degree, index // config.sh_every)
         rows = self.gaussians.rows()
@@ -113,7 +113,7 @@ class Trainer(TrainingLoop):
             return
         timed = done % self.config.refinement.refine_every == 0
         if timed:
-            dr.sync_thread()  # what the steps before have left to compute is not refinement's
+            dr.sync_thread()  # what the steps before have left to compute is not densification's
         start = time.perf_counter()
         rng = np.random.default_rng([self.config.seed, 2, done])
         leniency = 1.0 if warm is None else warm.config.leniency(done)
@@ -140,7 +140,7 @@ class Trainer(TrainingLoop):
         return result
 
     def _warming(self, index: int) -> bool:
-        """Whether the warm start keeps refinement off in step number `index`, the first of which is 0."""
+        """Whether the warm start keeps densification off in step number `index`, the first of which is 0."""
         return self.warm_start is not None and self.warm_start.active(index)
 
     def _attraction(self, view: TrainingView) -> Attraction | None:

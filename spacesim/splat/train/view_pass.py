@@ -40,7 +40,7 @@ class RenderedView:
 
     camera: Pinhole  #: with as many pixels as are blended
     downscale: int  #: pixels of the view on a side of each pixel that is compared
-    radii: Float | None  #: of `screen_radii`, or None where refinement does not watch
+    radii: Float | None  #: of `screen_radii`, or None where densification does not watch
     channels: dict[str, int]  #: how many planes each name has
     shading: Shading | None  #: its light, of a method of light
     tape: BlendTape | None  #: until the way back has read it
@@ -113,7 +113,7 @@ class ViewPass:
         watched: bool,
     ) -> RenderedView:
         """Draw a view. rows: `gaussians.rows()`;  light: of a method of light;  degree: of the harmonics;  downscale:
-        see `RenderedView`;  watched: whether refinement wants to know of it"""
+        see `RenderedView`;  watched: whether densification wants to know of it"""
         config = self.config
         camera = Pinhole.of(upsampled_camera(downscaled_camera(view.camera, downscale), config.supersample))
         splats, footprints, values, radii = self._project(
@@ -149,7 +149,7 @@ class ViewPass:
         )
 
     def watched(self, drawn: RenderedView, grad_splats: SplatGradients) -> tuple[Float, Float, Bool]:
-        """What refinement watches of a view, see `on_screen`."""
+        """What densification watches of a view, see `on_screen`."""
         assert drawn.radii is not None, "radii are there where refinement watches"
         width, height = drawn.camera.width, drawn.camera.height
         sizes = ad.Float([0.5 * width, 0.5 * height, max(width, height)])

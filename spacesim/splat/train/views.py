@@ -4,7 +4,6 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -15,14 +14,13 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
+from spacesim.splat.train.loss.terms import Truth
 
 log = logging.getLogger(__name__)
 
 CACHE_BYTES = 6 * 2**30  #: of decoded pictures, at most
 DEVICE_BYTES = 2 * 2**30  #: of pictures that stay on the device, at most: 512 of 1024 x 1024
 SHARES = 4, 8  #: a fourth and an eighth of the memory that is free are not exceeded
-
-Truth = dict[str, list[Any]]  #: on the device: Floats [H * W] by name; of "foreground" a Bool [H * W] and its weight
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,5 @@
 """Warm start by foreground attraction (thesis 5.3, 5.23 to 5.31, table 5.7): Gaussians that start anywhere are pulled
-towards what the training pictures show, before refinement begins to prune.
+towards what the training pictures show, before densification begins to prune.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from spacesim.splat.train.views import DEVICE_BYTES, TrainingView, TrainingViews
 class WarmStartConfig:
     """Gaussians that start anywhere are pulled to what pictures show. Steps count from the start of training."""
 
-    steps: int = 2_000  #: table 5.7, T_ws: full strength, no refinement
+    steps: int = 2_000  #: table 5.7, T_ws: full strength, no densification
     decay: int = 2_000  #: table 5.7, T_decay: steps in which it fades
     weight: float = 0.5  #: table 5.7, lambda_ws, of the foreground loss
     alpha_mask: bool = True  #: the foreground of pictures with transparency is their alpha; false: 5.24 of all
@@ -76,7 +76,7 @@ class WarmStartConfig:
 
     def means_rate(self, step: int, usual: float, radius: float) -> float:
         """Step size of the means, metres: so that they can cross `travel` times the `radius` of the start, metres,
-        while refinement waits; falls back to the usual one as the attraction does, by powers."""
+        while densification waits; falls back to the usual one as the attraction does, by powers."""
         fast = max(self.travel * radius / max(self.steps, 1), usual)
         share = self.strength(step) / self.weight if self.weight > 0 else 0.0
         return float(usual * (fast / usual) ** share)
@@ -156,7 +156,7 @@ class WarmStart:
         self._cached = lru_cache(maxsize=max(1, DEVICE_BYTES // (2 * views.most_pixels)))(self._attraction)
 
     def active(self, step: int) -> bool:
-        """Whether refinement waits, and the unseen are rescued, at step number `step`, the first of which is 0."""
+        """Whether densification waits, and the unseen are rescued, at step number `step`, the first of which is 0."""
         return step < self.config.steps
 
     def attraction(self, view: TrainingView) -> Attraction:
@@ -168,7 +168,7 @@ class WarmStart:
         self, rows: list[Float], camera: Pinhole, attraction: Attraction, step: int
     ) -> list[Float]:
         """Gradients of the projected foreground loss by the means, as it counts at `step`: 3 Floats [N]. Counts who is
-        in the picture while refinement waits. rows: of the Gaussians, the first 3 count"""
+        in the picture while densification waits. rows: of the Gaussians, the first 3 count"""
         numbers = ad.Float([self.config.strength(step) * self.config.projection_weight])
         gradients, framed = _pull(
             rows[:3], camera, attraction.image, attraction.size, self.config.downsampling, numbers

@@ -1,5 +1,7 @@
 """What training minimises: L1 and structural dissimilarity (thesis 2.8), on planes of pixels."""
 
+from typing import Any
+
 import drjit as dr
 
 from spacesim.backend.arrays import Array3f, Bool, Float
@@ -7,6 +9,7 @@ from spacesim.splat.raster.gaussians import Gaussians, opacities
 from spacesim.splat.train.loss.ssim import ssim
 
 ROUND = 1e-4  #: of a Gaussian's mean scale
+Truth = dict[str, list[Any]]  #: on the device: Floats [H * W] by name; of "foreground" a Bool [H * W] and its weight
 
 
 def photometric_loss(prediction: Array3f, target: Array3f, width: int, height: int, ssim_weight: float = 0.2) -> Float:

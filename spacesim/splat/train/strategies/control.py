@@ -21,7 +21,7 @@ from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.strategies.densify import RefinementCounts, append_copies, grow, limit_opacities, prune
 from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD, Strategy
 
-WINDOW = ("gradient", "seen", "radius")  #: statistics since the last refinement
+WINDOW = ("gradient", "seen", "radius")  #: statistics since the last densification step
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class RefinementConfig:
     prune_screen_size: float = 0.05  #: wider ones are pruned, a share of the picture (table 5.1)
     split_screen_size: float = 0.01  #: wider ones are split, a share of the picture (table 5.1)
     split_screen: Literal["all", "growing"] = "all"  #: which of these: all, as gsplat, or what grows by gradient (5.17)
-    refine_every: int = 100  #: iterations between two refinements (table 5.1)
-    reset_every: int = 30  #: refinements between two opacity resets (table 5.1)
-    pause_after_reset: int = 1000  #: iterations without refinement (table 5.1)
+    refine_every: int = 100  #: iterations between two densification steps (table 5.1)
+    reset_every: int = 30  #: densification steps between two opacity resets (table 5.1)
+    pause_after_reset: int = 1000  #: iterations without densification (table 5.1)
     max_gaussians: int = 250_000  #: at most this many Gaussians, at the start and ever (table 5.1)
     grow_gradient: float = 0.0008  #: grow above this absolute screen-space gradient, half images per unit of loss
     duplicate_scale: float = 0.01  #: of those that grow, larger ones are split, smaller ones duplicated
-    refine_start: int = 500  #: iterations before the first refinement
+    refine_start: int = 500  #: iterations before the first densification step
     refine_stop: int = 15_000  #: iterations; three quarters of a training of no more; a reset's pause is over by then
     screen_size_stop: int = 15_000  #: iterations; until then screen sizes split and, after the first reset, prune
 
@@ -66,14 +66,15 @@ class RefinementConfig:
 
 @dataclass(frozen=True, eq=False)
 class GaussianStatistics:
-    """What a refinement knows of each Gaussian, [N] each."""
+    """What a densification step knows of each Gaussian, [N] each."""
 
     step: int  #: how many are finished
-    gradient: np.ndarray  #: mean over the views since the last refinement that showed it, half images per unit of loss
+    #: mean over the views since the last densification step that showed it, half images per unit of loss
+    gradient: np.ndarray
     radius: np.ndarray  #: largest since then, fraction of the image's longer side
     opacity: np.ndarray  #: in (0, 1)
     scale: np.ndarray  #: standard deviation along the longest axis, metres
-    #: {name: [N]} of the state that outlives refinements, and what a strategy adds of its own
+    #: {name: [N]} of the state that outlives densification steps, and what a strategy adds of its own
     kept: dict[str, np.ndarray]
 
     def at(self, index: np.ndarray) -> "GaussianStatistics":
@@ -89,7 +90,7 @@ class DensityControl(Strategy):
     which ones are copied where too few are left (`_parents`).
 
     State, [N] each: sum of gradient norms, number of steps in which a Gaussian was seen, largest radius, all since the
-    last refinement; and what a subclass adds, which outlives refinements.
+    last densification step; and what a subclass adds, which outlives densification steps.
     """
 
     unseen: tuple[str, ...] = ()  #: of the state, what no observation changes
@@ -131,7 +132,7 @@ class DensityControl(Strategy):
         return done
 
     def _accumulate(self, state: dict[str, Float], gradient: Float, radius: Float, visible: Bool) -> None:
-        """Add an observation to what of the state outlives refinements. Recorded: it depends on nothing else."""
+        """Add an observation to what of the state is kept. Recorded: it depends on nothing else."""
 
     @abstractmethod
     def _thresholds(self, gaussians: Gaussians, statistics: GaussianStatistics) -> np.ndarray:
@@ -142,7 +143,7 @@ class DensityControl(Strategy):
         """[N] bool: those of the weak ones, [N] bool, that nothing protects (5.5, 5.14)."""
 
     def _outside_is_due(self, step: int) -> bool:
-        """Whether Gaussians are pruned at this refinement for where they are."""
+        """Whether Gaussians are pruned at this densification step for where they are."""
         return False
 
     def _outside(self, gaussians: Gaussians, statistics: GaussianStatistics) -> np.ndarray:

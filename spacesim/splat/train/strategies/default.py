@@ -11,7 +11,7 @@ from spacesim.splat.train.strategies.control import DensityControl, GaussianStat
 
 @dataclass(frozen=True)
 class DefaultStrategyConfig:
-    """Nothing beside the refinement of every strategy."""
+    """Nothing beside the densification of every strategy."""
 
     kind: ClassVar[str] = "default"
 

@@ -1,4 +1,4 @@
-"""The moves that refinement is made of: duplicate, split, prune, reset. Numpy decides, Dr.Jit moves the rows."""
+"""The moves that densification is made of: duplicate, split, prune, reset. Numpy decides, Dr.Jit moves the rows."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ SPLIT_COUNT = 2
 
 @dataclass(frozen=True)
 class RefinementCounts:
-    """What a refinement did, in numbers of Gaussians."""
+    """What a densification step did, in numbers of Gaussians."""
 
     duplicated: int = 0
     split: int = 0

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def make_strategy(config: "TrainConfig", dataset: Dataset, scene_scale: float, count: int) -> Strategy:
-    """For `count` Gaussians at the start. What refinement leaves is trained: it ends before the training does.
+    """For `count` Gaussians at the start. What densification leaves is trained: it ends before the training does.
 
     Raises InputError where the dataset lacks the mesh that it needs, or has one that is out of place."""
     stop, iterations = config.refinement.refine_stop, config.iterations

@@ -1,4 +1,4 @@
-"""What every strategy of refinement is: it watches steps, and now and then changes the set of Gaussians.
+"""What every strategy of densification is: it watches steps, and now and then changes the set of Gaussians.
 
 It knows nothing of pictures, losses or cameras: a trainer tells it gradients and radii on the screen, and hands it
 Gaussians and the optimizer whose moments have to follow them.
@@ -18,8 +18,8 @@ MAX_THRESHOLD = 1e6  #: of any threshold or length that is configured
 
 
 class Strategy(ABC):
-    """state: {name: Float [N]}, all that the next refinement depends on beside the Gaussians themselves; goes into
-    checkpoints and follows every Gaussian that is duplicated, split or pruned."""
+    """state: {name: Float [N]}, all that the next densification step depends on beside the Gaussians themselves; goes
+    into checkpoints and follows every Gaussian that is duplicated, split or pruned."""
 
     state: dict[str, Float]
 

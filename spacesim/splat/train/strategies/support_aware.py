@@ -28,7 +28,7 @@ class SupportAwareConfig:
     gradient_weight: float = 0.75  #: table 5.3, of gradients in it
     radius_weight: float = 0.25  #: table 5.3, of sizes on the screen in it
     protect_support: float = 0.55  #: table 5.3, tau_s: with less support faint Gaussians are pruned
-    warm_up: int = 500  #: table 5.3, steps from the first refinement until support protects, or eases growth
+    warm_up: int = 500  #: table 5.3, steps from the first densification step until support protects, or eases growth
     ease_support: float = 0.95  #: table 5.3, tau_D: from such a support on growth is eased
     ease: float = 0.3  #: table 5.3, lambda_S, factor of the growth threshold
     min_gaussians: int = 20_000  #: table 5.3: where fewer are left, some are copied
@@ -106,11 +106,11 @@ class SupportAwareStrategy(DensityControl):
     def __init__(
         self, config: RefinementConfig, support: SupportAwareConfig, scene_scale: float, count: int, warm_start: int = 0
     ) -> None:
-        """warm_start: steps of a warm start, which keeps refinement off"""
+        """warm_start: steps of a warm start, which keeps densification off"""
         super().__init__(config, scene_scale, count, kept=SUPPORT_STATISTICS)
         self.support = support
-        #: the first step whose refinement knows support: the thesis names no step to count from, and counted from the
-        #: start it is over when table 5.1's pause ends, and long over after table 5.7's warm start
+        #: the first step whose densification knows support: the thesis names no step to count from, and counted from
+        #: the start it is over when table 5.1's pause ends, and long over after table 5.7's warm start
         self.protects_from = _first_refinement(config, warm_start) + support.warm_up
 
     def _accumulate(self, state: dict[str, Float], gradient: Float, radius: Float, visible: Bool) -> None:
@@ -148,7 +148,7 @@ class SupportAwareStrategy(DensityControl):
         return select_parents(rank, eligible.eligible & ~remove, missing, rng)
 
     def _scaled(self, statistics: GaussianStatistics) -> list[np.ndarray]:
-        """Normalised averages, [N] each; made once in a refinement, and copied where Gaussians are."""
+        """Normalised averages, [N] each; made once in a densification step, and copied where Gaussians are."""
         names = [f"scaled_{name}" for name in SUPPORT_STATISTICS]
         if names[0] not in statistics.kept:
             statistics.kept.update({f"scaled_{name}": normalise(statistics.kept[name]) for name in SUPPORT_STATISTICS})
