@@ -10,9 +10,13 @@ from scipy.linalg import expm
 from spacesim import RefinedPose, refine_pose
 from spacesim.data.errors import InputError
 from spacesim.data.records import Camera, Image
-from spacesim.splat import pose as module
 from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.pose import moved, twist_between
+from spacesim.splat.pose.covariance import sums_of_blocks
+from spacesim.splat.pose.motion import Pivot
+from spacesim.splat.pose.picture import Drawing
+from spacesim.splat.pose.refine import _find_starts
+from spacesim.splat.pose.solver import REACH, Level
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.reference import render_reference
 from spacesim.splat.run import Run
@@ -122,21 +126,21 @@ def test_the_same_seed_gives_the_same_bits(run):
     np.testing.assert_array_equal(one.covariance, other.covariance)
     assert (one.gain, one.error, one.iterations) == (other.gain, other.error, other.iterations)
     level = level_of(run, picture(run, off(1)))
-    searched = [module._searched(level, 1.0, 3, seed)[1].world_from_camera for seed in (5, 5, 6)]
+    searched = [_find_starts(level, 1.0, 3, seed)[1].world_from_camera for seed in (5, 5, 6)]
     np.testing.assert_array_equal(searched[0], searched[1])
     assert not np.allclose(searched[0], searched[2])
     assert isinstance(third, RefinedPose)
 
 
-def pivot_of(run: Run, camera: Camera = CAMERA) -> module._Pivot:
-    return module._Pivot.of(module._Drawing.of(run, None), camera, (5.0, 0.05))
+def pivot_of(run: Run, camera: Camera = CAMERA) -> Pivot:
+    return Pivot.of(Drawing.of(run, None), camera, (5.0, 0.05))
 
 
-def level_of(run: Run, target: np.ndarray, camera: Camera = CAMERA, blur: float = 0.0) -> module._Level:
+def level_of(run: Run, target: np.ndarray, camera: Camera = CAMERA, blur: float = 0.0) -> Level:
     """Of the whole picture; black is the background of three channels."""
     target, background = target.astype(np.float32), np.zeros(3, np.float32) if target.shape[2] == 3 else None
     counts = np.ones((*target.shape[:2], 1), np.float32)
-    return module._Level(module._Drawing.of(run, None), pivot_of(run, camera), target, counts, background, 1, blur)
+    return Level(Drawing.of(run, None), pivot_of(run, camera), target, counts, background, 1, blur)
 
 
 def test_how_far_off_a_camera_is(run):
@@ -158,7 +162,7 @@ def test_a_camera_is_panned_to_the_best_whole_pixel(run, alpha):
     target = np.dstack([drawn.rgb, drawn.alpha[..., None]]) if alpha else drawn.rgb
     target = np.roll(target, (3, -5), (0, 1))
     level = level_of(run, target)
-    shown = level._picture(CAMERA, None)[..., : target.shape[2]]
+    shown = level.picture(CAMERA, None)[..., : target.shape[2]]
     costs = {}
     for row in range(-8, 9):
         for column in range(-8, 9):
@@ -181,16 +185,16 @@ def test_what_is_wrong_or_at_the_bound_is_not_converged(run):
     far = moved(CAMERA, [0, 0, np.radians(12), 0, 0, 0])
     pose = refine_pose(run, picture(run), far)
     assert not pose.converged
-    assert pivot_of(run, far).reach(pose.camera) <= module.REACH
+    assert pivot_of(run, far).reach(pose.camera) <= REACH
     assert refine_pose(run, picture(run), far, within=(12, 0.05)).converged
 
 
 def test_derivatives_are_those_of_the_twin(run, known_gaussians):
     """Against the same central differences of its float64 pictures."""
     target, counts = np.zeros((SIZE, SIZE, 4), np.float32), np.ones((SIZE, SIZE, 1), np.float32)
-    drawing = module._Drawing.of(run, None)
-    level = module._Level(drawing, pivot_of(run), target, counts, None, 1, 0.0)
-    found = level._derivatives(CAMERA, level._picture(CAMERA, None), None, 1.0)
+    drawing = Drawing.of(run, None)
+    level = Level(drawing, pivot_of(run), target, counts, None, 1, 0.0)
+    found = level.derivatives(CAMERA, level.picture(CAMERA, None), None, 1.0)
 
     def twin(step: np.ndarray) -> np.ndarray:
         drawn = render_reference(known_gaussians, level._stepped(CAMERA, step))
@@ -204,11 +208,11 @@ def test_derivatives_are_those_of_the_twin(run, known_gaussians):
 
 
 def test_unknowns_are_the_twists_that_they_say(run):
-    drawing, blank = module._Drawing.of(run, None), np.zeros((SIZE, SIZE, 3), np.float32)
-    level = module._Level(drawing, pivot_of(run), blank, np.ones((SIZE, SIZE, 1), np.float32), blank[0, 0], 1, 0.0)
+    drawing, blank = Drawing.of(run, None), np.zeros((SIZE, SIZE, 3), np.float32)
+    level = Level(drawing, pivot_of(run), blank, np.ones((SIZE, SIZE, 1), np.float32), blank[0, 0], 1, 0.0)
     for k, way in enumerate(np.eye(6)):
         small = twist_between(CAMERA, level._stepped(CAMERA, 1e-5 * way)) / 1e-5
-        np.testing.assert_allclose(small, level._twists(CAMERA)[:, k], atol=1e-6)
+        np.testing.assert_allclose(small, level.twists(CAMERA)[:, k], atol=1e-6)
 
 
 def over_grey(run: Run, camera: Camera, rng: np.random.Generator) -> np.ndarray:
@@ -236,7 +240,7 @@ def test_sums_over_blocks_are_those_of_their_pixels():
     rng = np.random.default_rng(2)
     columns, errors = rng.normal(size=(7, 20, 12, 3)), rng.normal(size=(20, 12, 3))
     weights = rng.uniform(0.2, 1, (20, 12))
-    scores, normals = module._of_blocks(columns, errors, weights)
+    scores, normals = sums_of_blocks(columns, errors, weights)
     assert scores.shape == (3 * 2, 7)
     parts = [np.s_[top : top + 8, left : left + 8] for top in (0, 8, 16) for left in (0, 8)]
     for part, score, normal in zip(parts, scores, normals, strict=True):
