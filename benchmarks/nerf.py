@@ -1,0 +1,139 @@
+"""Radiance fields: a training step, a whole training, frames of one and of three models; beside nerfacc's instant-ngp.
+
+    python benchmarks/nerf.py --out OUT [--data DATA] [--preset fast] [--rays 4096] [--iterations N] [--pixels 512]
+                              [--peers nerfacc] [--json]
+
+boxsat, one Sun, 100 views of 256 pixels, or a dataset of yours. A step is timed once trained, so that rays skip what is
+empty: the median of 100. PSNR is of test views, over whole pictures and over the silhouette. Frames are what `predict`
+returns, in the computer's memory, of test views drawn at so many pixels. --peers trains the recipe of nerfacc's
+train_ngp_nerf_occ.py for the same iterations on the same rays' number; that needs CUDA, torch, nerfacc and tinycudann.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import common
+import drjit as dr
+import numpy as np
+from rasterizer import load_peer
+
+from spacesim import backend, methods
+from spacesim.data.records import Dataset, Frame
+from spacesim.data.store import read_dataset
+from spacesim.eval.frame_metrics import frame_images
+from spacesim.eval.metrics import image
+from spacesim.learning.folder import TrainingProgress
+from spacesim.learning.prediction import Prediction
+from spacesim.nerf.compose import Composition
+from spacesim.nerf.run import NerfRun
+from spacesim.nerf.train.train import train
+from spacesim.nerf.train.trainer import Trainer
+from spacesim.reproduce.frames import places, views
+from spacesim.splat.compose import ComposeConfig, PlacedRun, Pose
+
+SCENE = {"sun": [(45.0, 35.0)], "test_suns": 0, "views": 100, "test_views": 20, "resolution": 256}
+SAMPLES = {"spp": 64, "test_spp": 256}
+STEPS = 100  #: that are timed
+MODELS = 1, 3  #: of a frame
+
+
+def main() -> None:
+    parser = common.arguments(__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="where data and runs are, or are made")
+    parser.add_argument("--data", type=Path, help="a dataset in place of its own")
+    parser.add_argument("--preset", default="thesis")
+    parser.add_argument("--rays", type=common.positive, default=4096, help="of a step")
+    parser.add_argument("--iterations", type=common.positive, help="default: the preset's")
+    parser.add_argument("--pixels", type=common.positive, default=512, help="of a frame's side")
+    parser.add_argument("--peers", choices=["nerfacc"], help="measured beside ours; needs CUDA and the peer")
+    options = parser.parse_args()
+    name = backend.select(options.backend)
+    data = read_dataset(options.data or common.generated("boxsat", options.out / "data", **SCENE, **SAMPLES))
+    config = methods.shortened(methods.preset(options.preset, "nerf"), options.iterations)
+    config = replace(config, rays=options.rays)  # type: ignore[type-var]
+    run, took = trained(data, options.out / "run", config)
+    rows = [{"": f"spacesim, {options.preset}", **trained_row(step_time(data, run), took, run, data)}]
+    peer = load_peer(options.peers, name, "peer_nerfacc")
+    if peer is not None:
+        theirs = peer.Training(data, options.rays, config.iterations)
+        start = time.perf_counter()
+        theirs.run()
+        took = time.perf_counter() - start
+        rows.append({"": "nerfacc", **trained_row(step_timing(theirs.step, 2), took, theirs, data)})
+    frames = list(frame_rows(run, data, options.pixels))
+    tables = {"Training": rows, f"A frame of {options.pixels} pixels": frames}
+    common.emit({"training": rows, "frames": frames}, tables, options)
+
+
+def trained(data: Dataset, folder: Path, config: Any) -> tuple[NerfRun, float]:
+    """(the run, seconds that its training took)."""
+    from spacesim.progress import report_training, show_progress
+
+    with show_progress("train nerf", "iterations") as report:
+        tell: Callable[[TrainingProgress], None] = report_training(report)
+        run = train(data, folder, config, True, tell)
+    return run, float(run.training["seconds"])
+
+
+def step_time(data: Dataset, run: NerfRun) -> common.Timing:
+    """Of a step of the trained model, in turns of `proposals_every`, whose steps differ."""
+    trainer = Trainer(data, replace(run.networks.config, occupancy_every=10**6))
+    trainer.parameters = [value + 0 for value in run.parameters]
+    trainer.filled = run.filled + 0
+    dr.eval(trainer.parameters, trainer.filled)
+    trainer.iteration = trainer.proposal_steps = trainer.config.warm_up
+    return step_timing(trainer.step, trainer.config.proposals_every)
+
+
+def step_timing(step: Callable[[], Any], turn: int) -> common.Timing:
+    """Of `step`, called so that the device is never idle between the steps of a turn."""
+
+    def several() -> None:
+        for _ in range(turn):
+            step()
+
+    return common.Timing.of(np.array(common.seconds({"": several}, max(STEPS // turn, 1), 5)[""]) / turn)
+
+
+def trained_row(step: common.Timing, took: float, model: Any, data: Dataset) -> common.Row:
+    whole, inside = [], []
+    for frame in data.test:
+        found, _ = frame_images(data, frame, model.predict(frame.camera))
+        whole.append(image.psnr(found.prediction, found.truth))
+        inside.append(image.psnr(found.prediction, found.truth, found.silhouette))
+    quality = {"PSNR": _mean(whole), "over the silhouette": _mean(inside)}
+    return {"step, ms": step.median, "training, s": took, **quality}
+
+
+def frame_rows(run: NerfRun, data: Dataset, pixels: int) -> Iterator[common.Row]:
+    """Of one model as cameras of the data see it, and of some from where all of them fit."""
+    for count in MODELS:
+        placed = [PlacedRun(run, Pose(translation=place)) for place in places(data)[:count]]
+        scene = run if count == 1 else Composition(placed, ComposeConfig("none"))
+        frames = data.test[:9] if count == 1 else views(data)
+        seconds = [_timed(scene, _sized(frame, pixels)) for frame in (*frames[:2], *frames)][2:]
+        yield {"models": count, "frame, ms": 1e3 * float(np.median(seconds))}
+
+
+def _timed(scene: Any, frame: Frame) -> float:
+    start = time.perf_counter()
+    drawn: Prediction = scene.predict(frame.camera, frame.sun)
+    assert np.isfinite(drawn.rgb).all()
+    return time.perf_counter() - start
+
+
+def _sized(frame: Frame, pixels: int) -> Frame:
+    camera, scale = frame.camera, pixels / frame.camera.width
+    lens = {name: getattr(camera, name) * scale for name in ("fx", "fy", "cx", "cy")}
+    return replace(frame, camera=replace(camera, width=pixels, height=round(camera.height * scale), **lens))
+
+
+def _mean(values: list[float | None]) -> float:
+    return float(np.mean([value for value in values if value is not None]))
+
+
+if __name__ == "__main__":
+    common.told(main)
