@@ -5,6 +5,8 @@ That ray is sampled as a camera's is: from the first to the last filled cell tha
 density. Visibility counts as given, as in the literature: nothing is differentiated.
 """
 
+from typing import Any
+
 import drjit as dr
 import numpy as np
 
@@ -33,8 +35,8 @@ def transmittance(
     in the box's coordinates, along N = `count` rays, a multiple of 512, of so many `samples` of the field. May be part
     of a recording.
 
-    filled: see `Occupancy.filled`;  extent: Float [3], of the box;  bias: sides of the box, by which a ray begins nearer
-    to the Sun than its point
+    filled: see `Occupancy.filled`;  extent: Float [3], of the box;  bias: sides of the box, by which a ray begins
+    nearer to the Sun than its point
     """
     towards = sun + dr.zeros(ad.Array3f, count)
     near, far = box_interval(point, towards, extent)
@@ -50,10 +52,11 @@ def transmittance(
 
 
 def _whole(edges: Float, count: int, samples: int) -> Float:
-    """Edges [N (S + 1)] with the first at 0 and the last at 1: `resample` leaves out half a sample's share at both ends,
-    which a picture need not see but light has to come through."""
-    k = dr.arange(ad.UInt32, count * (samples + 1)) % (samples + 1)
-    return dr.select(k == 0, 0, dr.select(k == samples, 1, edges))
+    """Edges [N (S + 1)] with the first at 0 and the last at 1: `resample` leaves out half a sample's share at both
+    ends, which a picture need not see but light has to come through."""
+    k: Any = dr.arange(ad.UInt32, count * (samples + 1)) % (samples + 1)
+    result: Float = dr.select(k == 0, 0, dr.select(k == samples, 1, edges))
+    return result
 
 
 _transmittance = recorded(transmittance)
