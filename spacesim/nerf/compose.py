@@ -12,7 +12,7 @@ out.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -29,7 +29,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
 from spacesim.learning.prediction import ComposedPrediction, check_picture
-from spacesim.nerf.draw import Samples, sample_field, shown, unit_normals
+from spacesim.nerf.draw import Samples, chunks, sample_field, shown, unit_normals
 from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks
 from spacesim.nerf.run import NerfRun
@@ -119,9 +119,11 @@ def draw_chunk(
     pixel: UInt32,
     width: UInt32,
     count: int,
+    normals: bool,
 ) -> Float:
-    """[C R] planes, packed, of `count` pixels: colour (3), opacity, expected and median depth (metres), normals (3),
-    then the share of each model in the opacity.  which: number, among the networks, of each model's"""
+    """[C R] planes, packed, of `count` pixels: colour (3), opacity, expected and median depth (metres), the share of
+    each model in the opacity, then normals (3) where they are asked for.  which: number, among the networks, of each
+    model's"""
     models, tapes = [], []
     across = Rays(ad.Array3f(0), ad.Array3f(0), ad.Float(0), ad.Float(0), ad.Float(0))
     for number, model in zip(which, placed, strict=True):
@@ -131,11 +133,12 @@ def draw_chunk(
         dr.eval(rays.origin, rays.direction, rays.near, rays.far, rays.across)
         samples = field.config.samples
         seen = sample_field(field, own, rays, count, model.sun)
-        index = dr.arange(ad.UInt32, count * samples) // samples
-        point, _ = rays.at(index, 0.5 * (seen.low + seen.high))
-        _, tape = field.density_tape(own, point)
-        slopes = field.field.density.slopes(field.of_round(own, 2)[: field.field.split], tape)
-        tapes.append(_turned(model.turn, slopes) / (model.unit * model.unit))
+        if normals:
+            index = dr.arange(ad.UInt32, count * samples) // samples
+            point, _ = rays.at(index, 0.5 * (seen.low + seen.high))
+            _, tape = field.density_tape(own, point)
+            slopes = field.field.density.slopes(field.of_round(own, 2)[: field.field.split], tape)
+            tapes.append(_turned(model.turn, slopes) / (model.unit * model.unit))
         in_world = Samples(seen.low * model.unit, seen.high * model.unit, seen.density / model.unit, seen.color)
         dr.eval(in_world.low, in_world.high, in_world.density, in_world.color, tapes)
         models.append((in_world, samples))
@@ -143,14 +146,15 @@ def draw_chunk(
     merged, segments = merge(models, count)
     made = volume_weights(merged.density * (merged.high - merged.low), segments)
     planes = shown(made, Samples(merged.low, merged.high, merged.density, merged.color), across, segments)
-    normal: Any = ad.Array3f(0)
-    shares = []
-    for there, slopes, interval in zip(merged.densities, tapes, merged.intervals, strict=True):
-        normal += dr.select(there > 0, dr.gather(ad.Array3f, slopes, interval), 0)
+    for there in merged.densities:
         share = dr.select(there > 0, there * dr.rcp(dr.maximum(merged.density, 1e-30)), 0)
-        shares.append(sum_rays(made.weights * share, segments))
-    planes += [sum_rays(made.weights * normal[i], segments) for i in range(3)]
-    return dr.concat([*planes, *shares])
+        planes.append(sum_rays(made.weights * share, segments))
+    if normals:
+        normal: Any = ad.Array3f(0)
+        for there, slopes, interval in zip(merged.densities, tapes, merged.intervals, strict=True):
+            normal += dr.select(there > 0, dr.gather(ad.Array3f, slopes, interval), 0)
+        planes += [sum_rays(made.weights * normal[i], segments) for i in range(3)]
+    return dr.concat(planes)
 
 
 def find_crossing(
@@ -232,9 +236,15 @@ class Composition:
         return Composition(models, self.config, self.path)
 
     def predict(
-        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
+        self,
+        camera: Camera,
+        sun: Sun | None = None,
+        normals: bool = False,
+        exposure: float | None = None,
+        on_chunk: Callable[[], None] | None = None,
     ) -> ComposedPrediction:
-        """Render one view. Raises InputError where the Sun matters and none is told, and for an exposure."""
+        """Render one view. on_chunk: see `draw.chunks`. Raises InputError where the Sun matters and none is told, and
+        for an exposure."""
         self.stops(exposure)
         if sun is None and self.relightable:
             raise InputError("sun: expected its direction for a scene that it changes, found none")
@@ -249,17 +259,16 @@ class Composition:
             for first in range(0, size, count)
         )
         pixels = np.flatnonzero(np.concatenate([np.array(part, bool) for part in seen])[:size]).astype(np.uint32)
-        planes = np.zeros((9 + len(self.models), size), np.float32)
+        planes = np.zeros((6 + len(self.models) + 3 * normals, size), np.float32)
         parameters = [run.parameters for run in self._runs]
-        for start in range(0, len(pixels), count):
-            part = pixels[start : start + count]
-            padded = upload(np.concatenate([part, np.repeat(part[-1:], count - len(part))]), ad.UInt32)
-            packed = _draw_chunk(networks, parameters, filled, self._which, placed, padded, width, count)
-            planes[:, part] = np.array(packed).reshape(-1, count)[:, : len(part)]
+        for part, padded in chunks(pixels, count, on_chunk):
+            rays = dr.width(padded)
+            packed = _draw_chunk(networks, parameters, filled, self._which, placed, padded, width, rays, normals)
+            planes[:, part] = np.array(packed).reshape(-1, rays)[:, : len(part)]
         pictures = planes.reshape(-1, camera.height, camera.width)
-        alpha, shares = pictures[3].copy(), pictures[9:]
+        alpha, shares = pictures[3].copy(), pictures[6 : 6 + len(self.models)]
         number = np.where(alpha >= COVERED, shares.argmax(axis=0) + 1, 0).astype(np.int32)
-        normal = unit_normals(np.moveaxis(pictures[6:9], 0, -1)) if normals else None
+        normal = unit_normals(np.moveaxis(pictures[-3:], 0, -1)) if normals else None
         rgb = np.ascontiguousarray(np.moveaxis(pictures[:3], 0, -1))
         return ComposedPrediction(rgb, alpha, pictures[4].copy(), None, normal, number)
 
