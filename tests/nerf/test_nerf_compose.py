@@ -16,8 +16,9 @@ from spacesim.data.images import read_png
 from spacesim.data.records import Camera, Dataset
 from spacesim.data.store import read_dataset
 from spacesim.methods import load_scene
-from spacesim.nerf.compose import Composition, merge
+from spacesim.nerf.compose import Composition
 from spacesim.nerf.draw import Samples
+from spacesim.nerf.partition import merge
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.sampling.render import sum_rays, volume_weights
 from spacesim.nerf.train.train import train
@@ -123,7 +124,7 @@ def run(dataset, tmp_path_factory) -> NerfRun:
     return train(dataset, tmp_path_factory.mktemp("nerf") / "run", CONFIG)
 
 
-def scene(*models: tuple[NerfRun, Pose], shadows: str = "trained") -> Composition:
+def scene(*models: tuple[NerfRun, Pose], shadows: str = "none") -> Composition:
     placed = [PlacedRun(run, pose, f"model-{i}") for i, (run, pose) in enumerate(models)]  # type: ignore[arg-type]
     return Composition(placed, ComposeConfig(shadows))
 
@@ -186,6 +187,10 @@ position = [-3, 0, 0]
 run = "{run.path}"
 scale = 0.5
 position = [3, 0, 0]
+
+[sun]
+azimuth_deg = 0
+elevation_deg = 10
 
 [camera]
 position = [0, -16, 3]
