@@ -7,7 +7,7 @@ tile's list of Gaussians is walked once more, together with it. All is blended a
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +28,12 @@ from spacesim.nerf.draw import chunks, unit_normals
 from spacesim.nerf.partition import PlacedFields, partition
 from spacesim.nerf.run import NerfRun
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.compose.scene import COVERED, ComposeConfig, LitGaussians, PlacedRun
+from spacesim.splat.compose.scene import COVERED, ComposeConfig, LitGaussians
 from spacesim.splat.compose.scene import Composition as Splats
 from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.output import RenderOutput, over_alpha
+from spacesim.splat.raster.project import Footprints
 from spacesim.splat.raster.project import Splats as Projected
 from spacesim.splat.raster.render import blend, median_depth, prepare
 from spacesim.splat.raster.supersample import render_supersampled, upsampled_camera
@@ -98,6 +99,15 @@ class Composition:
         return self._in_order([centre for centre, _ in self._fields.spheres], self._splats.places)
 
     @property
+    def spheres(self) -> list[tuple[np.ndarray, float]]:
+        """(centre [3], radius) of each model, metres, world."""
+        return self._in_order(self._fields.spheres, self._splats.spheres)
+
+    def field_alone(self, index: int) -> Fields:
+        """The scene of model `index`, a radiance field, alone."""
+        return self._fields.field_alone(self._of_fields.index(index))
+
+    @property
     def supersample(self) -> int:
         """Places on a side of each pixel of what is predicted: the most that a model was trained with."""
         return self._splats.supersample
@@ -157,8 +167,12 @@ class Composition:
     def surface_depth(self, camera: Camera) -> np.ndarray:
         """[H, W] float32: depth in metres along the optical axis at which half of the light is gone, 0 where it is
         not, whatever the Sun."""
-        drawn = self._draw(camera, Sun(np.array([0.0, 0.0, 1.0])), False, True, None)
+        drawn = self._unshaded._draw(camera, Sun(np.array([0.0, 0.0, 1.0])), False, True, None)
         return drawn.image("median_depth")
+
+    @cached_property
+    def _unshaded(self) -> "Composition":
+        return Composition(self.models, replace(self.config, shadows="none"), self.path)
 
     @property
     def _order(self) -> list[int]:
@@ -228,7 +242,8 @@ def _blend_splats(
     size, gaussians = camera.width * camera.height, lit.gaussians
     if gaussians.count == 0:
         none = ad.Float([])
-        lists = bin_splats(Projected(*[none] * 7), None, camera.width, camera.height)  # type: ignore[arg-type]
+        nowhere = Footprints(none, none, ad.Bool([]), ad.UInt32([]))
+        lists = bin_splats(Projected(*[none] * 7), nowhere, camera.width, camera.height)
         planes = np.zeros((3 + COMMON + 3 * normals + len(lit.shares), size), np.float32)
         planes[0] = 1
         return ListedSplats([], lists, COMMON + 3 * normals + len(lit.shares)), planes
@@ -245,8 +260,8 @@ def _blend_splats(
 
 @recorded(elements=None)
 def _segments(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, normals: bool) -> Segments:
-    """Of the rays through `count` pixels. features: colour (3), visibility, the density's gradient (3) where normals are
-    asked for, the share of each model."""
+    """Of the rays through `count` pixels. features: colour (3), visibility, the density's gradient (3) where normals
+    are asked for, the share of each model."""
     seen = partition(fields, pixel, width, count, normals)
     merged, index = seen.merged, dr.arange(ad.UInt32, count * fields.segments) // fields.segments
     across: Any = dr.gather(ad.Float, seen.across, index)

@@ -124,7 +124,7 @@ def blend_segments(
         depth = dr.fma(weight, dr.select(is_segment, 0.5 * (low + high), 0), depth)
 
         # the splat
-        alpha = dr.select(blends, dr.minimum(exp2(power), ALPHA_MAX), 0)
+        alpha: Any = dr.select(blends, dr.minimum(exp2(power), ALPHA_MAX), 0)
         taken = alpha * behind
         left = behind - taken
         median = dr.select((behind >= 0.5) & (left < 0.5), z, median)

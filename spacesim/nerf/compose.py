@@ -13,7 +13,7 @@ out.
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -120,6 +120,19 @@ class Composition:
         return [digests[number] for number in self._which]
 
     @property
+    def gaussian_count(self) -> None:
+        """There are none."""
+
+    @property
+    def places(self) -> list[Array]:
+        """Where the middle of each model's box is, world, [3] metres."""
+        return [centre for centre, _ in self.spheres]
+
+    def field_alone(self, index: int) -> "Composition":
+        """The scene of model `index` alone."""
+        return Composition([self.models[index]], self.config, self.path)
+
+    @property
     def chunk(self) -> int:
         """Rays that are drawn at once."""
         return self._runs[0].networks.config.chunk
@@ -160,20 +173,18 @@ class Composition:
     def surface_depth(self, camera: Camera) -> np.ndarray:
         """[H, W] float32: depth in metres along the optical axis at which half of the light is gone, 0 where it is
         not, whatever the Sun."""
-        planes = self._draw(camera, Sun(np.array([0.0, 0.0, 1.0])), False, None)
+        unshaded = Composition(self.models, replace(self.config, shadows="none"), self.path)
+        planes = unshaded._draw(camera, Sun(np.array([0.0, 0.0, 1.0])), False, None)
         return np.where(planes[3] >= COVERED, planes[5], np.float32(0)).reshape(camera.height, camera.width)
 
     def check_sun(self, sun: Sun | None) -> None:
         """Raise InputError where the Sun matters and none is told."""
         if sun is None and self.relightable:
             raise InputError(
-                "sun: expected its direction for a scene that it changes (shadows other than none, or runs that are told "
-                "it), found none"
+                f"{self.path or 'sun'}: expected the Sun's direction for a scene that it changes, found none"
             )
 
-    def _draw(
-        self, camera: Camera, sun: Sun | None, normals: bool, on_chunk: Callable[[], None] | None
-    ) -> np.ndarray:
+    def _draw(self, camera: Camera, sun: Sun | None, normals: bool, on_chunk: Callable[[], None] | None) -> np.ndarray:
         """[C, H W] planes of `draw_chunk`."""
         fields, width = self.placed(camera, sun), dr.opaque(ad.UInt32, camera.width)
         count = 6 + len(self.models) + 3 * normals + self._shades
@@ -187,9 +198,7 @@ class Composition:
     def crossing(self, fields: PlacedFields, camera: Camera) -> np.ndarray:
         """Numbers, row by row, of the pixels whose rays cross what a model fills."""
         size, count, width = camera.width * camera.height, self.chunk, dr.opaque(ad.UInt32, camera.width)
-        seen = (
-            _find_crossing(fields, dr.opaque(ad.UInt32, first), width, count) for first in range(0, size, count)
-        )
+        seen = (_find_crossing(fields, dr.opaque(ad.UInt32, first), width, count) for first in range(0, size, count))
         return np.flatnonzero(np.concatenate([np.array(part, bool) for part in seen])[:size]).astype(np.uint32)
 
     def placed(self, camera: Camera, sun: Sun | None, beside: Sequence[Any] = ()) -> PlacedFields:
@@ -198,7 +207,7 @@ class Composition:
         if sun is not None and (self._shades or beside):
             spheres = self.spheres
             casters = [
-                tuple(j for j, one in enumerate(spheres) if j != k and self._shades and may_shade(one, own, sun.direction))
+                tuple(j for j, one in enumerate(spheres) if j != k and may_shade(one, own, sun.direction))
                 for k, own in enumerate(spheres)
             ]
             towards = [upload(model.pose.direction_in_model(sun.direction)) for model in self.models]
@@ -224,7 +233,7 @@ class Composition:
 
     def sun_visibility(self, points: Array, sun: Sun) -> Array:
         """[N] share of the Sun's light that comes through the models to points [N, 3] of the world, metres."""
-        seen = np.ones(len(points), np.float32)
+        seen: Array = np.ones(len(points))
         for model, (centre, radius) in zip(self.models, self.spheres, strict=True):
             offset = centre - points
             ahead = offset @ sun.direction

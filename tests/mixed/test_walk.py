@@ -18,7 +18,9 @@ from spacesim.splat.raster.records import ALPHA_MAX
 CAMERA = seen_from([3.0, -2.0, 1.5])
 
 
-def twin(x: float, y: float, splats: dict, features: np.ndarray, edges: np.ndarray, density: np.ndarray, own: np.ndarray):
+def twin(
+    x: float, y: float, splats: dict, features: np.ndarray, edges: np.ndarray, density: np.ndarray, own: np.ndarray
+):
     """(transmittance, sum of depths, median depth, sums [C]) at a place of the picture: splats one by one, before each
     what of the segments lies before its depth. features: [N, C] of splats;  edges: [K + 1];  own: [K, C]"""
     left, depth, median, sums = 1.0, 0.0, 0.0, np.zeros(features.shape[1])
@@ -54,8 +56,8 @@ def twin(x: float, y: float, splats: dict, features: np.ndarray, edges: np.ndarr
 
 
 def drawn(edges: np.ndarray, density: np.ndarray, own: np.ndarray, count: int = 60):
-    """(`Blended` over the whole picture, splats as arrays, their features [N, 3]) of random Gaussians and segments: edges
-    [R, K + 1], densities [R, K], features [R, K, 3]"""
+    """(`Blended` over the whole picture, splats as arrays, their features [N, 3]) of random Gaussians and segments:
+    edges [R, K + 1], densities [R, K], features [R, K, 3]"""
     gaussians, rng = Gaussians.from_numpy(random_splats(count, 5, 0)), np.random.default_rng(3)
     splats, footprints = project(gaussians, Pinhole.of(CAMERA))
     lists = bin_splats(splats, footprints, CAMERA.width, CAMERA.height)

@@ -242,6 +242,12 @@ class Composition:
         return [placed.pose.points(m.centre) for placed, m in zip(self.models, self._members, strict=True)]
 
     @property
+    def spheres(self) -> list[tuple[Array, float]]:
+        """(centre [3], radius) of each model, metres, world: around its Gaussians to three standard deviations."""
+        reaches = [model.pose.scale * m.radius for model, m in zip(self.models, self._members, strict=True)]
+        return list(zip(self.places, reaches, strict=True))
+
+    @property
     def placed(self) -> list[PlacedRun]:
         """The models that have Gaussians, in the order in which these stand in the set."""
         return [self.models[i] for i in self._order()]
