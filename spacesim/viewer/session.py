@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from spacesim.viewer.drawing.frames import STEPS, Frame, ResolutionControl, draw_frame
-from spacesim.viewer.drawing.loop import Abandoned, RenderLoop, RenderRequest
+from spacesim.viewer.drawing.loop import AbandonedError, RenderLoop, RenderRequest
 from spacesim.viewer.drawing.paint import Bytes, compare_pictures, paint
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.state import DisplaySettings, SceneState, SharedScene, ViewerCamera
@@ -158,7 +158,7 @@ class Session:
                 if full:
                     self._loop.give_way(self)
                 if self._is_stale(view, state, settings, full):
-                    raise Abandoned
+                    raise AbandonedError
 
             frame = draw_frame(self._renderer, state, view, settings, share, on_chunk if progressive else None)
             height, width = frame.picture.shape[:2]
@@ -192,7 +192,7 @@ class Session:
         return now != (view, settings.mode, settings.side) or not state.same(self._shared.state)
 
     def _reusable_frame(self, view: ViewerCamera, state: SceneState, settings: DisplaySettings) -> Frame | None:
-        """The last picture that was kept, if it is this one but for its resolution and the comparison with the truth."""
+        """The last picture kept, if it is this one but for its resolution and the comparison with the truth."""
         last = self._last_frame  # which `close` may take away at any moment
         if last is None:
             return None

@@ -31,7 +31,7 @@ class RenderRequest:
     draw: Callable[[bool], Any]
 
 
-class Abandoned(Exception):
+class AbandonedError(Exception):
     """A picture that nobody waits for any more."""
 
 
@@ -106,10 +106,10 @@ class RenderLoop:
 
     def give_way(self, client: Hashable = None) -> None:
         """Called on the render thread within a long picture of a client: does the next work, and draws for the next
-        of the other clients that has moved. Raises Abandoned where the loop shall end."""
+        of the other clients that has moved. Raises AbandonedError where the loop shall end."""
         with self._changed:
             if not self._running:
-                raise Abandoned
+                raise AbandonedError
             other = next((one for one in self._requests if one != client), None)
             tasks = [self._next_work()] if self._work else []
             tasks += [] if other is None else [self._next_request(other)]
@@ -173,7 +173,7 @@ class RenderLoop:
 def _perform(task: Callable[[], Any]) -> None:
     try:
         task()
-    except Abandoned:
+    except AbandonedError:
         pass
     except Exception as error:  # one picture that fails must not end all others
         _log.warning("viewer: a picture failed (%s)", " ".join(str(error).split()) or type(error).__name__)

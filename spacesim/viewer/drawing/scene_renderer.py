@@ -49,8 +49,7 @@ class SceneRenderer:
         self.backend = composition.backend
         names = _unique_names([placed.name or placed.run.path.resolve().name for placed in composition.models])
         self.models = tuple(
-            Model(name, *_bounds(placed.run))
-            for name, placed in zip(names, composition.models, strict=True)
+            Model(name, *_bounds(placed.run)) for name, placed in zip(names, composition.models, strict=True)
         )
 
     def bounds(self, state: SceneState) -> tuple[Array, float]:
@@ -72,9 +71,7 @@ class SceneRenderer:
         parts = [f"{self.gaussian_count:,} Gaussians in {models} model(s)"] * (models > 0)
         return ", ".join([*parts, *[f"{fields} radiance field{'s' * (fields > 1)}"] * (fields > 0)])
 
-    def draw(
-        self, state: SceneState, camera: Camera, mode: str, on_chunk: Callable[[], None] | None = None
-    ) -> Planes:
+    def draw(self, state: SceneState, camera: Camera, mode: str, on_chunk: Callable[[], None] | None = None) -> Planes:
         """The planes that a mode needs, and alpha. on_chunk: called now and then within a picture of a `progressive`
         scene, which an exception ends. Raises InputError where the Sun matters and none is told."""
         scene = self.composition.posed(state.poses)
