@@ -35,14 +35,16 @@ class SceneRenderer:
     """A composed scene to be drawn. composition: with the poses that the viewer starts with, of Gaussians, or another
     that predicts as `nerf.compose.Composition` does
 
-    gaussian_count: of all models;  progressive: whether a picture takes so long that it comes in steps, of radiance
+    gaussian_count: of all models;  content: what there is, in words;  progressive: whether a picture takes so long that it comes in steps, of radiance
     fields;  modes: of `MODES`, those that there can be;  relightable: whether the Sun changes the picture;  backend:
     that draws
     """
 
     def __init__(self, composition: Any) -> None:
         self.composition = composition
-        self.gaussian_count = sum(placed.run.gaussian_count or 0 for placed in composition.models)
+        counts = [placed.run.gaussian_count for placed in composition.models]
+        self.gaussian_count = sum(count or 0 for count in counts)
+        self.content = _describe(counts)
         self.progressive = not isinstance(composition, Composition)
         self.modes = tuple(mode for mode in MODES if mode != "ellipsoids" or not self.progressive)
         self.relightable = composition.relightable
@@ -62,14 +64,6 @@ class SceneRenderer:
         high = np.max([centre + radius for centre, radius in spheres], axis=0)
         centre = spheres[0][0] if len(spheres) == 1 else 0.5 * (low + high)
         return centre, max(float(np.linalg.norm(at - centre) + radius) for at, radius in spheres)
-
-    @property
-    def content(self) -> str:
-        """What there is, in words."""
-        fields = sum(placed.run.gaussian_count is None for placed in self.composition.models)
-        models = len(self.models) - fields
-        parts = [f"{self.gaussian_count:,} Gaussians in {models} model(s)"] * (models > 0)
-        return ", ".join([*parts, *[f"{fields} radiance field{'s' * (fields > 1)}"] * (fields > 0)])
 
     def draw(self, state: SceneState, camera: Camera, mode: str, on_chunk: Callable[[], None] | None = None) -> Planes:
         """The planes that a mode needs, and alpha. on_chunk: called now and then within a picture of a `progressive`
@@ -97,6 +91,14 @@ class SceneRenderer:
         if plane == "visibility":
             return "no model here predicts shadows (the methods shadow-map, shadow-splat and baseline-park do)"
         return f"no model here predicts {plane}"
+
+
+def _describe(counts: Sequence[int | None]) -> str:
+    """counts: Gaussians of each model, None of a field"""
+    fields = counts.count(None)
+    models = len(counts) - fields
+    parts = [f"{sum(count or 0 for count in counts):,} Gaussians in {models} model(s)"] * (models > 0)
+    return ", ".join([*parts, *[f"{fields} radiance field{'s' * (fields > 1)}"] * (fields > 0)])
 
 
 def _bounds(run: Any) -> tuple[Array, float]:
