@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,11 @@ def test_what_a_scene_of_fields_has(fields, state):
 @pytest.mark.parametrize("mode", MODES)
 def test_modes(fields, state, mode):
     frame = draw_frame(fields, state, view_from(-5, 0), DisplaySettings(mode, side=256), 0.25)
+    if mode == "visibility":
+        single = SceneRenderer(Composition(fields.composition.models[:1], ComposeConfig()))  # nothing else shades it
+        alone = replace(state, poses=state.poses[:1])
+        assert frame.picture.any()
+        frame = draw_frame(single, alone, view_from(-5, 0), DisplaySettings(mode, side=256), 0.25)
     if mode in ("visibility", "ellipsoids"):
         assert frame.note.startswith(f"no {mode} to be seen: ")
         assert not frame.picture.any()
