@@ -1,12 +1,12 @@
 """Radiance fields: a training step, a whole training, frames of one and of three models; beside nerfacc's instant-ngp.
 
-    python benchmarks/nerf.py --out OUT [--data DATA] [--preset fast] [--rays 4096] [--iterations N] [--pixels 512]
+    python benchmarks/nerf.py --out OUT [--data DATA] [--preset thesis] [--rays 4096] [--iterations N] [--pixels 512]
                               [--peers nerfacc] [--json]
 
 boxsat, one Sun, 100 views of 256 pixels, or a dataset of yours. A step is timed once trained, so that rays skip what is
-empty: the median of 100. PSNR is of test views, over whole pictures and over the silhouette. Frames are what `predict`
-returns, in the computer's memory, of test views drawn at so many pixels. --peers trains the recipe of nerfacc's
-train_ngp_nerf_occ.py for the same iterations on the same rays' number; that needs CUDA, torch, nerfacc and tinycudann.
+empty. PSNR is of test views, over whole pictures and over the silhouette. Frames are what `predict` returns, in the
+computer's memory, of test views drawn at so many pixels. --peers trains the recipe of nerfacc's train_ngp_nerf_occ.py
+for as many iterations of as many rays; that needs CUDA, torch, nerfacc and tinycudann.
 """
 
 import time
@@ -36,7 +36,6 @@ from spacesim.splat.compose import ComposeConfig, PlacedRun, Pose
 
 SCENE = {"sun": [(45.0, 35.0)], "test_suns": 0, "views": 100, "test_views": 20, "resolution": 256}
 SAMPLES = {"spp": 64, "test_spp": 256}
-STEPS = 100  #: that are timed
 MODELS = 1, 3  #: of a frame
 
 
@@ -55,14 +54,14 @@ def main() -> None:
     config = methods.shortened(methods.preset(options.preset, "nerf"), options.iterations)
     config = replace(config, rays=options.rays)  # type: ignore[type-var]
     run, took = trained(data, options.out / "run", config)
-    rows = [{"": f"spacesim, {options.preset}", **trained_row(step_time(data, run), took, run, data)}]
+    rows = [{"": f"spacesim, {options.preset}", **trained_row(step_time(data, run, options.repeats), took, run, data)}]
     peer = load_peer(options.peers, name, "peer_nerfacc")
     if peer is not None:
         theirs = peer.Training(data, options.rays, config.iterations)
         start = time.perf_counter()
         theirs.run()
         took = time.perf_counter() - start
-        rows.append({"": "nerfacc", **trained_row(step_timing(theirs.step, 2), took, theirs, data)})
+        rows.append({"": "nerfacc", **trained_row(step_timing(theirs.step, 2, options.repeats), took, theirs, data)})
     frames = list(frame_rows(run, data, options.pixels))
     tables = {"Training": rows, f"A frame of {options.pixels} pixels": frames}
     common.emit({"training": rows, "frames": frames}, tables, options)
@@ -78,24 +77,24 @@ def trained(data: Dataset, folder: Path, config: Any) -> tuple[NerfRun, float]:
     return run, float(run.training["seconds"])
 
 
-def step_time(data: Dataset, run: NerfRun) -> common.Timing:
+def step_time(data: Dataset, run: NerfRun, repeats: int) -> common.Timing:
     """Of a step of the trained model, in turns of `proposals_every`, whose steps differ."""
     trainer = Trainer(data, replace(run.networks.config, occupancy_every=10**6))
     trainer.parameters = [value + 0 for value in run.parameters]
     trainer.filled = run.filled + 0
     dr.eval(trainer.parameters, trainer.filled)
     trainer.iteration = trainer.proposal_steps = trainer.config.warm_up
-    return step_timing(trainer.step, trainer.config.proposals_every)
+    return step_timing(trainer.step, trainer.config.proposals_every, repeats)
 
 
-def step_timing(step: Callable[[], Any], turn: int) -> common.Timing:
+def step_timing(step: Callable[[], Any], turn: int, repeats: int) -> common.Timing:
     """Of `step`, called so that the device is never idle between the steps of a turn."""
 
     def several() -> None:
         for _ in range(turn):
             step()
 
-    return common.Timing.of(np.array(common.seconds({"": several}, max(STEPS // turn, 1), 5)[""]) / turn)
+    return common.Timing.of(np.array(common.seconds({"": several}, repeats)[""]) / turn)
 
 
 def trained_row(step: common.Timing, took: float, model: Any, data: Dataset) -> common.Row:

@@ -63,10 +63,10 @@ def load_peer(wanted: str | None, name: str, module: str = "peer_gsplat") -> Any
         return None
     try:
         if name != "cuda":
-            raise ImportError("gsplat runs on CUDA alone")
+            raise ImportError(f"{wanted} runs on CUDA alone")
         return importlib.import_module(module)
-    except ImportError as error:
-        print(f"gsplat: not measured here ({error})", file=sys.stderr)
+    except (ImportError, OSError) as error:  # OSError: compiled for another device
+        print(f"{wanted}: not measured here ({error})", file=sys.stderr)
         return None
 
 

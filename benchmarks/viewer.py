@@ -41,7 +41,7 @@ from spacesim.viewer.drawing.memory import give_back
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.load import load_setup
 from spacesim.viewer.server import Viewer, ViewerSetup
-from spacesim.viewer.state import MODES, SIDES, DisplaySettings, SceneState, ViewerCamera
+from spacesim.viewer.state import SIDES, DisplaySettings, SceneState, ViewerCamera
 
 EVERY = 2.0  #: seconds between two readings of the memory
 PATIENCE = 90.0  #: seconds that clients may take beyond their time
@@ -70,8 +70,9 @@ def main() -> None:
     rows = draws(show, options.side, options.repeats)
     viewer = Viewer(show, port=0)
     viewer.start()
+    modes = ("colour", "depth", "ellipsoids")
     try:
-        rates = [rate(viewer, mode, options.side, options.moving) for mode in ("colour", "depth", "ellipsoids")]
+        rates = [rate(viewer, mode, options.side, options.moving) for mode in modes if mode in show.renderer.modes]
         soak = look_around(viewer, options.seconds, options.clients, options.side) if options.seconds > 0 else {}
     finally:
         viewer.stop()
@@ -131,7 +132,7 @@ def draws(show: ViewerSetup, side: int, repeats: int) -> list[common.Row]:
         f"{mode}, another camera": lambda mode=mode: draw_frame(
             show.renderer, show.state, replace(still, world_from_camera=next(camera)), replace(settings, mode=mode)
         )
-        for mode in MODES
+        for mode in show.renderer.modes
     }
     works["colour, another Sun"] = lambda: draw_frame(
         show.renderer, replace(show.state, sun=next(sun)), still, settings

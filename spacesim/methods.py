@@ -85,11 +85,10 @@ def load_run(path: str | Path) -> "Run | NerfRun":
 
 
 def load_scene(path: str | Path) -> "PosedScene":
-    """The scene that a TOML file describes, of Gaussians or of radiance fields. Raises InputError with file, line and
-    key, and where it has both."""
+    """The scene that a TOML file describes, of runs of any method. Raises InputError with file, line and key."""
     from spacesim.splat.compose.scenefile import load_scene as load
 
-    return load(path, load_run, _compose)
+    return load(path, load_run, compose)
 
 
 def load_predictor(path: Path) -> "Predictor":
@@ -97,21 +96,19 @@ def load_predictor(path: Path) -> "Predictor":
     if path.suffix != ".toml":
         return load_run(path)
     from spacesim.splat.compose import ComposedRun
-    from spacesim.splat.compose.scene import Composition
 
-    composition = load_scene(path).posed_at(0.0)
-    if not isinstance(composition, Composition):
-        raise InputError(f"{path}: expected a run, or a scene of Gaussians, found a scene of radiance fields")
-    return ComposedRun(composition, path)
+    return ComposedRun(load_scene(path).posed_at(0.0), path)
 
 
-def _compose(models: Sequence[Any], config: Any, path: Path) -> Any:
-    """What draws posed runs of one family."""
+def compose(models: Sequence[Any], config: Any = None, path: Path | None = None) -> Any:
+    """What draws posed runs: `splat.compose.Composition`, of fields `nerf.compose.Composition`, of both
+    `mixed.scene.Composition`."""
+    from spacesim.mixed.scene import Composition as Mixed
     from spacesim.nerf.compose import Composition as Fields
     from spacesim.nerf.run import NerfRun
-    from spacesim.splat.compose.scene import Composition
+    from spacesim.splat.compose.scene import ComposeConfig
+    from spacesim.splat.compose.scene import Composition as Splats
 
     fields = [isinstance(model.run, NerfRun) for model in models]
-    if any(fields) and not all(fields):
-        raise InputError(f"{path}: expected runs of Gaussians, or of radiance fields, found both in one scene")
-    return Fields(models, config, path) if all(fields) else Composition(models, config, path)
+    kind: Any = Fields if fields and all(fields) else Mixed if any(fields) else Splats
+    return kind(models, config or ComposeConfig(), path)

@@ -486,6 +486,23 @@ def test_frames_count_from_when_the_kernels_are_there():
         dataset.milliseconds_a_frame(iter("abcd"), skipped=3)
 
 
+@smallest(
+    "nerf.py --backend llvm --out OUT --data DATA --preset demo --iterations 8 --rays 512 --pixels 24 --repeats 2"
+    " --peers nerfacc --json"
+)
+def test_a_radiance_field_is_trained_and_drawn_without_its_peer(command, place, tiny_data):
+    (place / "DATA").symlink_to(tiny_data)
+    done = ended(command)
+    assert done.code == 0, done.errors
+    assert "nerfacc: not measured here (nerfacc runs on CUDA alone)" in done.errors
+    report = json.loads(done.output)
+    (row,) = report["training"]
+    assert row["step, ms"] > 0
+    assert 5 < row["over the silhouette"] < row["PSNR"] < 60
+    assert [frame["models"] for frame in report["frames"]] == [1, 3]
+    assert all(frame["frame, ms"] > 0 for frame in report["frames"])
+
+
 @smallest("pose.py --backend llvm --out OUT --data DATA --run RUN --views 2 --starts 1 --json")
 def test_pose_tells_errors_before_and_after(command, tiny_data, tiny_run, place):
     (place / "DATA").symlink_to(tiny_data)

@@ -11,7 +11,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 # What a file may not import at all, by the folder or module in which it stands.
 TOP = ("cli", "demo", "doctor", "api", "methods", "reproduce")  #: over all folders
-ABOVE = ("data", "learning", "scenes", "splat", "nerf", "eval", "viewer", *TOP)  #: over `backend`
+ABOVE = ("data", "learning", "scenes", "splat", "nerf", "mixed", "eval", "viewer", *TOP)  #: over `backend`
 FORBIDDEN = {
     "backend": (*(f"spacesim.{top}" for top in ABOVE), "numpy"),
     "backend.upload": tuple(f"spacesim.{top}" for top in ABOVE),  # what else the package does goes without numpy
@@ -20,12 +20,13 @@ FORBIDDEN = {
         "mitsuba",
         "drjit",
         *(f"spacesim.backend.{name}" for name in ("ad", "selection", "llvm", "recording", "select", "mitsuba")),
-        *(f"spacesim.{top}" for top in ("learning", "scenes", "splat", "nerf", "eval", "viewer", *TOP)),
+        *(f"spacesim.{top}" for top in ("learning", "scenes", "splat", "nerf", "mixed", "eval", "viewer", *TOP)),
     ),
-    "learning": tuple(f"spacesim.{top}" for top in ("scenes", "splat", "nerf", "eval", "viewer", *TOP)),
-    "scenes": tuple(f"spacesim.{top}" for top in ("learning", "splat", "nerf", "eval", "viewer", *TOP)),
-    "splat": tuple(f"spacesim.{top}" for top in ("scenes", "nerf", "eval", "viewer", *TOP)),
-    "nerf": tuple(f"spacesim.{top}" for top in ("scenes", "splat", "eval", "viewer", *TOP)),
+    "learning": tuple(f"spacesim.{top}" for top in ("scenes", "splat", "nerf", "mixed", "eval", "viewer", *TOP)),
+    "scenes": tuple(f"spacesim.{top}" for top in ("learning", "splat", "nerf", "mixed", "eval", "viewer", *TOP)),
+    "splat": tuple(f"spacesim.{top}" for top in ("scenes", "nerf", "mixed", "eval", "viewer", *TOP)),
+    "nerf": tuple(f"spacesim.{top}" for top in ("scenes", "splat", "mixed", "eval", "viewer", *TOP)),
+    "mixed": tuple(f"spacesim.{top}" for top in ("scenes", "eval", "viewer", *TOP)),
     "eval": tuple(f"spacesim.{top}" for top in ("viewer", *TOP)),
     "viewer": ("spacesim.cli", "spacesim.demo", "spacesim.doctor", "spacesim.reproduce"),
     "reproduce": ("spacesim.viewer", "spacesim.cli", "spacesim.demo", "spacesim.doctor", "spacesim.api"),

@@ -14,7 +14,7 @@ from spacesim.data.images import read_png
 from spacesim.data.records import Dataset, Frame
 from spacesim.eval.frame_metrics import FrameImages, FrameLight, image_groups, visibility_groups
 from spacesim.eval.metrics import lpips
-from spacesim.eval.metrics.geometry import GeometryConfig, compare_shape
+from spacesim.eval.metrics.geometry import GeometryConfig, compare_depths, compare_shape
 from spacesim.splat.export.mesh import cameras_around
 
 if TYPE_CHECKING:
@@ -95,6 +95,9 @@ def compare_object_shapes(
         turn, shift = target.world_from_object[:3, :3], target.world_from_object[:3, 3]
         truth = target.vertices @ turn.T + shift, target.faces
         model = part.gaussians
+        if model is None:
+            shapes[target.id] = compare_depths(part, truth, config).values
+            continue
         cameras = cameras_around(model, config.mesh.views)
         shapes[target.id] = compare_shape(model, part.antialiased, cameras, truth, config).values
     return shapes

@@ -12,8 +12,8 @@ out.
 """
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,150 +23,46 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Array3f, Float, UInt32
+from spacesim.backend.arrays import Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
 from spacesim.learning.prediction import ComposedPrediction, check_picture
-from spacesim.nerf.draw import Samples, sample_field, shown, unit_normals
-from spacesim.nerf.fields.field import Parameters
-from spacesim.nerf.fields.model import Networks
+from spacesim.nerf.draw import Samples, chunks, shown, unit_normals
+from spacesim.nerf.partition import PlacedField, PlacedFields, Shading, model_rays, partition
 from spacesim.nerf.run import NerfRun
-from spacesim.nerf.sampling.rays import Rays, camera_rows, pixel_rays
+from spacesim.nerf.sampling.box import SceneBox
+from spacesim.nerf.sampling.rays import Rays, camera_rows
 from spacesim.nerf.sampling.render import sum_rays, volume_weights
-from spacesim.nerf.sampling.sampler import count_below
+from spacesim.nerf.shadow import sun_visibility
 
 COVERED = 0.5  #: alpha from which on a pixel shows a model
-SHADOWS = ("trained", "none")  #: of models on each other, as scene files have it: fields know none
 
 
-@dataclass
-class Merged:
-    """R rays in K segments each, sorted by t."""
-
-    low: Float  #: [R K] t
-    high: Float  #: [R K] t
-    densities: list[Float]  #: [R K] of each model, per unit of t
-    density: Float  #: [R K] their sum (3.6)
-    color: list[Float]  #: 3 times [R K], mean by density; 0 where there is none
-    intervals: list[UInt32]  #: [R K] of each model, which of its R S intervals a segment lies in; any where in none
-
-
-def merge(models: Sequence[tuple[Samples, int]], rays: int) -> tuple[Merged, int]:
-    """(the merged partition, its segments a ray) of models' (samples, intervals a ray) (3.2 to 3.6). A model's
-    intervals abut; where they end, it has nothing."""
-    edges = [_edges(samples, count, rays) for samples, count in models]
-    total = sum(count + 1 for _, count in models)
-    boundaries = dr.empty(ad.Float, rays * total)
-    for number, (own, (_, count)) in enumerate(zip(edges, models, strict=True)):
-        index = dr.arange(ad.UInt32, rays * (count + 1))
-        ray, rank = index // (count + 1), index % (count + 1)
-        for other, (values, (_, others)) in enumerate(zip(edges, models, strict=True)):
-            if other != number:  # of equal boundaries the first model's comes first
-                rank += count_below(values, ray * (others + 1), others + 1, own, equal=other < number)
-        dr.scatter(boundaries, own, ray * total + rank, mode=dr.ReduceMode.Permute)
-    dr.eval(boundaries)
-    segments = total - 1
-    index = dr.arange(ad.UInt32, rays * segments)
-    ray = index // segments
-    low, high = dr.gather(ad.Float, boundaries, index + ray), dr.gather(ad.Float, boundaries, index + ray + 1)
-    middle = 0.5 * (low + high)
-    density: Any = ad.Float(0)
-    color: Any = [ad.Float(0)] * 3
-    densities, intervals = [], []
-    for own, (samples, count) in zip(edges, models, strict=True):
-        passed: Any = count_below(own, ray * (count + 1), count + 1, middle, equal=True)
-        inside = (passed > 0) & (passed <= count)
-        interval = ray * count + dr.minimum(dr.maximum(passed, 1), count) - 1
-        there = dr.gather(ad.Float, samples.density, interval, inside)
-        density = density + there
-        color = [
-            c + there * dr.gather(ad.Float, s, interval, inside) for c, s in zip(color, samples.color, strict=True)
-        ]
-        densities.append(there)
-        intervals.append(interval)
-    share = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-30)), 0)
-    return Merged(low, high, densities, density, [c * share for c in color], intervals), segments
-
-
-def _edges(samples: Samples, count: int, rays: int) -> Float:
-    """[R (S + 1)] boundaries of intervals that abut."""
-    index = dr.arange(ad.UInt32, rays * (count + 1))
-    ray, k = index // (count + 1), index % (count + 1)
-    place = ray * count + dr.minimum(k, count - 1)
-    low, high = dr.gather(ad.Float, samples.low, place), dr.gather(ad.Float, samples.high, place)
-    return dr.select(k < count, low, high)
-
-
-@dataclass
-class PlacedField:
-    """What is drawn of a model: arrays that change with camera, pose and Sun."""
-
-    camera: Float  #: [16] see `rays.camera_rows`, in the model's frame
-    extent: Float  #: [3] of its box
-    unit: Float  #: of width 1, metres of the world for a side of its box
-    turn: Float  #: [9] world_from_model, rotation by rows
-    sun: Float | None  #: [3] towards it in the model's axes, of a field that is told
-
-
-def draw_chunk(
-    networks: tuple[Networks, ...],
-    parameters: list[Parameters],
-    filled: list[Float],
-    which: tuple[int, ...],
-    placed: list[PlacedField],
-    pixel: UInt32,
-    width: UInt32,
-    count: int,
-) -> Float:
-    """[C R] planes, packed, of `count` pixels: colour (3), opacity, expected and median depth (metres), normals (3),
-    then the share of each model in the opacity.  which: number, among the networks, of each model's"""
-    models, tapes = [], []
-    across = Rays(ad.Array3f(0), ad.Array3f(0), ad.Float(0), ad.Float(0), ad.Float(0))
-    for number, model in zip(which, placed, strict=True):
-        field, own = networks[number], parameters[number]
-        rays, crosses = field.occupancy.clip(_rays(model, pixel, width), filled[number])
-        rays.far = dr.select(crosses, rays.far, rays.near)
-        dr.eval(rays.origin, rays.direction, rays.near, rays.far, rays.across)
-        samples = field.config.samples
-        seen = sample_field(field, own, rays, count, model.sun)
-        index = dr.arange(ad.UInt32, count * samples) // samples
-        point, _ = rays.at(index, 0.5 * (seen.low + seen.high))
-        _, tape = field.density_tape(own, point)
-        slopes = field.field.density.slopes(field.of_round(own, 2)[: field.field.split], tape)
-        tapes.append(_turned(model.turn, slopes) / (model.unit * model.unit))
-        in_world = Samples(seen.low * model.unit, seen.high * model.unit, seen.density / model.unit, seen.color)
-        dr.eval(in_world.low, in_world.high, in_world.density, in_world.color, tapes)
-        models.append((in_world, samples))
-        across = rays
-    merged, segments = merge(models, count)
+def draw_chunk(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, normals: bool) -> Float:
+    """[C R] planes, packed, of `count` pixels: colour (3), opacity, expected and median depth (metres), the share of
+    each model in the opacity, then normals (3) where they are asked for, and the visibility of the Sun in a scene with
+    shadows. Arguments as of `partition`."""
+    seen = partition(fields, pixel, width, count, normals)
+    merged, segments = seen.merged, fields.segments
     made = volume_weights(merged.density * (merged.high - merged.low), segments)
-    planes = shown(made, Samples(merged.low, merged.high, merged.density, merged.color), across, segments)
-    normal: Any = ad.Array3f(0)
-    shares = []
-    for there, slopes, interval in zip(merged.densities, tapes, merged.intervals, strict=True):
-        normal += dr.select(there > 0, dr.gather(ad.Array3f, slopes, interval), 0)
-        share = dr.select(there > 0, there * dr.rcp(dr.maximum(merged.density, 1e-30)), 0)
-        shares.append(sum_rays(made.weights * share, segments))
-    planes += [sum_rays(made.weights * normal[i], segments) for i in range(3)]
-    return dr.concat([*planes, *shares])
+    rays = Rays(ad.Array3f(0), ad.Array3f(0), ad.Float(0), ad.Float(0), seen.across)
+    planes = shown(made, Samples(merged.low, merged.high, merged.density, merged.color), rays, segments)
+    planes += [sum_rays(made.weights * share, segments) for share in seen.shares]
+    if seen.slopes is not None:
+        planes += [sum_rays(made.weights * seen.slopes[i], segments) for i in range(3)]
+    if seen.visibility is not None:
+        planes.append(sum_rays(made.weights * seen.visibility, segments))
+    return dr.concat(planes)
 
 
-def find_crossing(
-    networks: tuple[Networks, ...],
-    filled: list[Float],
-    which: tuple[int, ...],
-    placed: list[PlacedField],
-    first: UInt32,
-    width: UInt32,
-    count: int,
-) -> UInt32:
+def find_crossing(fields: PlacedFields, first: UInt32, width: UInt32, count: int) -> UInt32:
     """[R] 1 where the ray through a pixel, number `first` and the following, crosses what a model fills."""
     pixel = dr.arange(ad.UInt32, count) + first
     result: Any = dr.zeros(ad.UInt32, count)
-    for number, model in zip(which, placed, strict=True):
-        _, crosses = networks[number].occupancy.clip(_rays(model, pixel, width), filled[number])
+    for number, model in zip(fields.which, fields.models, strict=True):
+        _, crosses = fields.networks[number].occupancy.clip(model_rays(model, pixel, width), fields.filled[number])
         result |= dr.select(crosses, ad.UInt32(1), ad.UInt32(0))
     return result
 
@@ -185,16 +81,14 @@ class Placed(Protocol):
 class Composition:
     """Posed radiance fields under one Sun; in scene files what `splat.compose.Composition` is to Gaussians.
 
-    models: at least one;  config: its `shadows` is one of `SHADOWS`. One model with no pose gives what its run gives
-    alone, but for rounding. Raises InputError for other shadows.
+    models: at least one;  config: how they shade each other: `shadows` is "none", or else by transmittance towards the
+    Sun, which multiplies: the ratio of (4.15) is that of the others alone. One model with no pose gives what its run
+    gives alone, but for rounding.
     """
 
     def __init__(self, models: Sequence[Any], config: Any, path: Path | None = None) -> None:
         if not models:
             raise InputError("models: expected at least one, found none")
-        if config.shadows not in SHADOWS:
-            expected = f"expected {' or '.join(SHADOWS)} in a scene of radiance fields, which know no shadows"
-            raise InputError(f"shadows: {expected}, found {config.shadows}")
         self.models, self.config, self.path = tuple(models), config, path
         self._runs: list[NerfRun] = list({id(model.run): model.run for model in self.models}.values())
         self._which = tuple(self._runs.index(model.run) for model in self.models)
@@ -212,13 +106,36 @@ class Composition:
     @property
     def relightable(self) -> bool:
         """Whether the Sun's direction changes what is predicted."""
-        return any(run.relightable for run in self._runs)
+        return self._shades or any(run.relightable for run in self._runs)
+
+    @property
+    def _shades(self) -> bool:
+        """Whether models may shade each other."""
+        return len(self.models) > 1 and self.config.shadows != "none"
 
     @cached_property
     def contents(self) -> list[str]:
         """A digest of what each model is made of, in their order."""
         digests = [hashlib.sha256((run.path / "model.safetensors").read_bytes()).hexdigest() for run in self._runs]
         return [digests[number] for number in self._which]
+
+    @property
+    def gaussian_count(self) -> None:
+        """There are none."""
+
+    @property
+    def places(self) -> list[Array]:
+        """Where the middle of each model's box is, world, [3] metres."""
+        return [centre for centre, _ in self.spheres]
+
+    def field_alone(self, index: int) -> "Composition":
+        """The scene of model `index` alone."""
+        return Composition([self.models[index]], self.config, self.path)
+
+    @property
+    def chunk(self) -> int:
+        """Rays that are drawn at once."""
+        return self._runs[0].networks.config.chunk
 
     def stops(self, exposure: float | None) -> float:
         """0: colours are sRGB values. Raises InputError for an exposure."""
@@ -232,59 +149,125 @@ class Composition:
         return Composition(models, self.config, self.path)
 
     def predict(
-        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
+        self,
+        camera: Camera,
+        sun: Sun | None = None,
+        normals: bool = False,
+        exposure: float | None = None,
+        on_chunk: Callable[[], None] | None = None,
     ) -> ComposedPrediction:
-        """Render one view. Raises InputError where the Sun matters and none is told, and for an exposure."""
+        """Render one view. on_chunk: see `draw.chunks`. Raises InputError where the Sun matters and none is told, and
+        for an exposure."""
         self.stops(exposure)
-        if sun is None and self.relightable:
-            raise InputError("sun: expected its direction for a scene that it changes, found none")
+        self.check_sun(sun)
         check_picture(camera)
-        size, count = camera.width * camera.height, self._runs[0].networks.config.chunk
-        placed = [self._placed(model, camera, sun) for model in self.models]
-        networks = tuple(run.networks for run in self._runs)
-        filled = [run.filled for run in self._runs]
-        width = dr.opaque(ad.UInt32, camera.width)
-        seen = (
-            _find_crossing(networks, filled, self._which, placed, dr.opaque(ad.UInt32, first), width, count)
-            for first in range(0, size, count)
-        )
-        pixels = np.flatnonzero(np.concatenate([np.array(part, bool) for part in seen])[:size]).astype(np.uint32)
-        planes = np.zeros((9 + len(self.models), size), np.float32)
-        parameters = [run.parameters for run in self._runs]
-        for start in range(0, len(pixels), count):
-            part = pixels[start : start + count]
-            padded = upload(np.concatenate([part, np.repeat(part[-1:], count - len(part))]), ad.UInt32)
-            packed = _draw_chunk(networks, parameters, filled, self._which, placed, padded, width, count)
-            planes[:, part] = np.array(packed).reshape(-1, count)[:, : len(part)]
-        pictures = planes.reshape(-1, camera.height, camera.width)
-        alpha, shares = pictures[3].copy(), pictures[9:]
+        planes = self._draw(camera, sun, normals, on_chunk).reshape(-1, camera.height, camera.width)
+        rest, alpha = iter(planes[6:]), planes[3].copy()
+        shares = np.stack([next(rest) for _ in self.models])
         number = np.where(alpha >= COVERED, shares.argmax(axis=0) + 1, 0).astype(np.int32)
-        normal = unit_normals(np.moveaxis(pictures[6:9], 0, -1)) if normals else None
-        rgb = np.ascontiguousarray(np.moveaxis(pictures[:3], 0, -1))
-        return ComposedPrediction(rgb, alpha, pictures[4].copy(), None, normal, number)
+        normal = unit_normals(np.stack([next(rest) for _ in range(3)], axis=-1)) if normals else None
+        visibility = over_alpha(next(rest), alpha) if self._shades else None
+        rgb = np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1))
+        return ComposedPrediction(rgb, alpha, planes[4].copy(), visibility, normal, number)
 
-    def _placed(self, model: Placed, camera: Camera, sun: Sun | None) -> PlacedField:
-        run, pose = model.run, model.pose
-        towards = None
-        if run.relightable and sun is not None:
-            towards = upload(pose.direction_in_model(sun.direction))
-        turn: Array = np.asarray(pose.rotation, np.float64)
-        return PlacedField(
-            upload(camera_rows([pose.camera_in_model(camera)], run.box)),
-            upload(run.box.extent),
-            dr.opaque(ad.Float, pose.scale * run.box.side),
-            upload(turn),
-            towards,
+    def surface_depth(self, camera: Camera) -> np.ndarray:
+        """[H, W] float32: depth in metres along the optical axis at which half of the light is gone, 0 where it is
+        not, whatever the Sun."""
+        unshaded = Composition(self.models, replace(self.config, shadows="none"), self.path)
+        planes = unshaded._draw(camera, Sun(np.array([0.0, 0.0, 1.0])), False, None)
+        return np.where(planes[3] >= COVERED, planes[5], np.float32(0)).reshape(camera.height, camera.width)
+
+    def check_sun(self, sun: Sun | None) -> None:
+        """Raise InputError where the Sun matters and none is told."""
+        if sun is None and self.relightable:
+            raise InputError(
+                f"{self.path or 'sun'}: expected the Sun's direction for a scene that it changes, found none"
+            )
+
+    def _draw(self, camera: Camera, sun: Sun | None, normals: bool, on_chunk: Callable[[], None] | None) -> np.ndarray:
+        """[C, H W] planes of `draw_chunk`."""
+        fields, width = self.placed(camera, sun), dr.opaque(ad.UInt32, camera.width)
+        count = 6 + len(self.models) + 3 * normals + self._shades
+        planes = np.zeros((count, camera.width * camera.height), np.float32)
+        for part, padded in chunks(self.crossing(fields, camera), self.chunk, on_chunk):
+            rays = dr.width(padded)
+            packed = _draw_chunk(fields, padded, width, rays, normals)
+            planes[:, part] = np.array(packed).reshape(-1, rays)[:, : len(part)]
+        return planes
+
+    def crossing(self, fields: PlacedFields, camera: Camera) -> np.ndarray:
+        """Numbers, row by row, of the pixels whose rays cross what a model fills."""
+        size, count, width = camera.width * camera.height, self.chunk, dr.opaque(ad.UInt32, camera.width)
+        seen = (_find_crossing(fields, dr.opaque(ad.UInt32, first), width, count) for first in range(0, size, count))
+        return np.flatnonzero(np.concatenate([np.array(part, bool) for part in seen])[:size]).astype(np.uint32)
+
+    def placed(self, camera: Camera, sun: Sun | None, beside: Sequence[Any] = ()) -> PlacedFields:
+        """The models as a camera sees them. beside: what else shades each, see `Shading`"""
+        shading = None
+        if sun is not None and (self._shades or beside):
+            spheres = self.spheres
+            casters = [
+                tuple(j for j, one in enumerate(spheres) if j != k and may_shade(one, own, sun.direction))
+                for k, own in enumerate(spheres)
+            ]
+            towards = [upload(model.pose.direction_in_model(sun.direction)) for model in self.models]
+            eye = upload(camera_rows([camera], SceneBox(np.zeros(3), np.ones(3)))) if beside else None
+            shading = Shading(towards, tuple(casters), eye, list(beside) or [None] * len(self.models))
+        return PlacedFields(
+            tuple(run.networks for run in self._runs),
+            [run.parameters for run in self._runs],
+            [run.filled for run in self._runs],
+            self._which,
+            [_place(model, camera, sun) for model in self.models],
+            shading,
         )
 
+    @property
+    def spheres(self) -> list[tuple[Array, float]]:
+        """(centre [3], radius) of each model, metres, world: around its box."""
+        boxes = [(model.pose, model.run.box) for model in self.models]
+        return [
+            (pose.points(box.low + 0.5 * box.size), 0.5 * pose.scale * float(np.linalg.norm(box.size)))
+            for pose, box in boxes
+        ]
 
-def _rays(model: PlacedField, pixel: UInt32, width: UInt32) -> Rays:
-    across = dr.maximum(width, 1)
-    x, y = ad.Float(pixel % across) + 0.5, ad.Float(pixel // across) + 0.5
-    return pixel_rays(model.camera, dr.zeros(ad.UInt32, dr.width(pixel)), x, y, model.extent)
+    def sun_visibility(self, points: Array, sun: Sun) -> Array:
+        """[N] share of the Sun's light that comes through the models to points [N, 3] of the world, metres."""
+        seen: Array = np.ones(len(points))
+        for model, (centre, radius) in zip(self.models, self.spheres, strict=True):
+            offset = centre - points
+            ahead = offset @ sun.direction
+            aside = np.linalg.norm(offset - ahead[:, None] * sun.direction, axis=1)
+            reached = np.flatnonzero((ahead > -radius) & (aside < radius))  # others have nothing of it before the Sun
+            if len(reached):
+                run, pose = model.run, model.pose
+                own = pose.inverse().points(points[reached]), pose.direction_in_model(sun.direction)
+                seen[reached] *= sun_visibility(run.networks, run.parameters, run.filled, run.box, *own, bias=0.0)
+        return seen
 
 
-def _turned(turn: Float, vectors: Array3f) -> Array3f:
-    numbers = [dr.gather(ad.Float, turn, ad.UInt32(i)) for i in range(9)]
-    rows = [sum((numbers[3 * i + k] * vectors[k] for k in range(3)), ad.Float(0)) for i in range(3)]
-    return ad.Array3f(*rows)
+def may_shade(caster: tuple[Array, float], receiver: tuple[Array, float], sun: Array) -> bool:
+    """Could anything of one sphere, (centre, radius), be before the Sun for anything of another?"""
+    reach, offset = caster[1] + receiver[1], caster[0] - receiver[0]
+    ahead = float(offset @ sun)
+    return ahead > -reach and float(np.linalg.norm(offset - ahead * sun)) < reach
+
+
+def over_alpha(blended: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Blended values by the alpha; 0 where that is 0."""
+    return np.divide(blended, alpha, out=np.zeros_like(alpha), where=alpha > 0)
+
+
+def _place(model: Placed, camera: Camera, sun: Sun | None) -> PlacedField:
+    run, pose = model.run, model.pose
+    towards = None
+    if run.relightable and sun is not None:
+        towards = upload(pose.direction_in_model(sun.direction))
+    turn: Array = np.asarray(pose.rotation, np.float64)
+    return PlacedField(
+        upload(camera_rows([pose.camera_in_model(camera)], run.box)),
+        upload(run.box.extent),
+        dr.opaque(ad.Float, pose.scale * run.box.side),
+        upload(turn),
+        towards,
+    )

@@ -47,6 +47,17 @@ class ProposalConfig:
 
 
 @dataclass(frozen=True)
+class ShadowConfig:
+    """How a field shadows itself: by what it lets through towards the Sun, along a second ray from each surface."""
+
+    samples: int = 0  #: of that ray, of the field itself; 0: no shadows, what is told of the Sun has to do
+    bias: float = 0.01  #: of the box's longest side: where that ray begins, so that a surface does not shadow itself
+
+    def __post_init__(self) -> None:
+        check_ranges(self, samples=(0, MAX_SAMPLES), bias=(0, 1))
+
+
+@dataclass(frozen=True)
 class NerfConfig:
     """Everything that decides a trained radiance field, apart from the data and the backend."""
 
@@ -61,6 +72,7 @@ class NerfConfig:
     color_layers: int = 3  #: matrix products of the colour network
     harmonics: int = 3  #: degree of spherical harmonics of the view's direction
     sun_harmonics: int = 1  #: of the Sun's, of `nerf-relight`: more of them tell training's few Suns apart by heart
+    shadow: ShadowConfig = field(default_factory=ShadowConfig)  #: of `nerf-relight`
     grid: GridConfig = field(default_factory=GridConfig)  #: what the field knows of places
     coarse: ProposalConfig = field(default_factory=ProposalConfig)  #: first round: reads evenly spaced samples
     fine: ProposalConfig = field(default_factory=lambda: ProposalConfig(16))  #: second: where the first saw density
@@ -97,6 +109,11 @@ class NerfConfig:
     def knows_sun(self) -> bool:
         """Whether colours are told the Sun."""
         return self.method == "nerf-relight"
+
+    @property
+    def casts_shadows(self) -> bool:
+        """Whether colours are dimmed by what stands before the Sun."""
+        return self.knows_sun and self.shadow.samples > 0
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for config.json."""

@@ -1,5 +1,6 @@
 """Pictures of a radiance field: rays of a chunk at a time, and of these only such as cross what is filled."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import drjit as dr
@@ -9,12 +10,14 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.records import Camera
+from spacesim.nerf.config import CHUNK
 from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks, places
 from spacesim.nerf.sampling.box import SceneBox
 from spacesim.nerf.sampling.rays import Rays, camera_rows, pixel_rays
 from spacesim.nerf.sampling.render import Weights, expected_depth, median_depth, sum_rays, volume_weights
 
+INTERRUPTIBLE = 2_048  #: rays of a chunk, at most, of a picture that may be given up after any
 PLANES = {"rgb": 3, "alpha": 1, "depth": 1, "median_depth": 1, "normal": 3}
 """Of a picture, in this order: colours over black, opacity, depths (sides of the box, along the ray), and the sum of
 density gradients by weight, which points inwards."""
@@ -119,9 +122,7 @@ def draw(
     )[:size]
     pixels = np.flatnonzero(crossing).astype(np.uint32)
     planes = np.zeros((sum(PLANES[name] for name in names), size), np.float32)
-    for start in range(0, len(pixels), chunk):
-        part = pixels[start : start + chunk]
-        padded = upload(np.concatenate([part, np.repeat(part[-1:], chunk - len(part))]), ad.UInt32)
+    for part, padded in chunks(pixels, chunk):
         packed = _draw_chunk(networks, parameters, filled, cameras, padded, width, extent, towards, normals)
         planes[:, part] = np.array(packed).reshape(-1, chunk)[:, : len(part)]
     result, row = {}, 0
@@ -135,6 +136,25 @@ def draw(
     if normals:
         result["normal"] = unit_normals(result["normal"])
     return result
+
+
+def chunks(
+    pixels: np.ndarray, most: int, on_chunk: Callable[[], None] | None = None
+) -> Iterator[tuple[np.ndarray, UInt32]]:
+    """(some of the pixels, these filled up with the last one to a number that occurs often), at most `most` at a time.
+
+    on_chunk: called before each; an exception that it raises ends the picture. Chunks are smaller then, and the last
+    one filled up by less: who waits for a picture wants it soon, or given up soon
+    """
+    if on_chunk is not None:
+        most = min(most, INTERRUPTIBLE)
+    for start in range(0, len(pixels), most):
+        part, count = pixels[start : start + most], most
+        if on_chunk is not None:
+            on_chunk()
+            while count % (2 * CHUNK) == 0 and count // 2 >= len(part):
+                count //= 2
+        yield part, upload(np.concatenate([part, np.repeat(part[-1:], count - len(part))]), ad.UInt32)
 
 
 def unit_normals(slopes: np.ndarray) -> np.ndarray:

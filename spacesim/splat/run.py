@@ -43,11 +43,11 @@ class Part(Protocol):
 
     @property
     def centre(self) -> np.ndarray:
-        """[3] metres, world: the middle of its Gaussians."""
+        """[3] metres, world: the middle of its Gaussians, or of its box."""
 
     @property
-    def gaussians(self) -> Gaussians:
-        """Its Gaussians, in the world's axes."""
+    def gaussians(self) -> Gaussians | None:
+        """Its Gaussians, in the world's axes; None of a radiance field."""
 
     @property
     def antialiased(self) -> bool:
@@ -72,7 +72,7 @@ class Predictor(Protocol):
 
     @property
     def gaussians(self) -> Gaussians | None:
-        """All Gaussians, in the world's axes; None of a radiance field."""
+        """All Gaussians, in the world's axes; None of a radiance field, and of a scene with one."""
 
     @property
     def gaussian_count(self) -> int | None:

@@ -46,7 +46,7 @@ class Client:
         self._closed = False
         self.session = Session(renderer, shared, loop, self, truth)
         frames = len(dataset.frames) if dataset else 0
-        self.controls = ClientControls(handle.gui, self.session, self, facts, frames)
+        self.controls = ClientControls(handle.gui, self.session, self, facts, frames, renderer.modes)
 
     def begin(self) -> None:
         """Draw for it from now on."""
@@ -122,7 +122,8 @@ class Client:
             return
         scale = min(1.0, MAX_PICTURE_SIDE / max(view.width, view.height))
         width, height = (max(1, round(scale * side)) for side in (view.width, view.height))
-        _, picture, depths, _ = draw_mode(self._renderer, self._shared.state, view.camera(width, height), mode)
+        camera, give_way = view.camera(width, height), self._loop.give_way
+        _, picture, depths, _ = draw_mode(self._renderer, self._shared.state, camera, mode, give_way)
         file = io.BytesIO()
         Image.fromarray(add_color_bar(picture, depths) if depths else picture).save(file, "PNG")
         if not self._closed:

@@ -1,21 +1,23 @@
 """From what the command line names to what is shown."""
 
 from pathlib import Path
+from typing import Any
 
 from spacesim.data.errors import InputError
 from spacesim.data.records import Dataset, Sun
 from spacesim.data.store import read_dataset
 from spacesim.methods import load_run, load_scene
+from spacesim.nerf.compose import Composition as Fields
 from spacesim.nerf.run import NerfRun
 from spacesim.splat.compose import Composition, PlacedRun
 from spacesim.splat.compose.path import PosedScene
+from spacesim.splat.compose.scene import ComposeConfig
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.path import path_from_scene
 from spacesim.viewer.server import ViewerSetup, import_viser
 from spacesim.viewer.state import SceneState
 from spacesim.viewer.truth.source import dataset_folder
 
-VIEWED = "a run, or a scene of runs, of Gaussians"
 SUN = (45.0, 30.0)  #: azimuth and elevation at first, degrees, where no data say
 
 
@@ -51,22 +53,15 @@ def load_setup(path: Path, data: Path | None = None, out: Path | None = None) ->
 
 def _scene(path: Path) -> PosedScene:
     if path.suffix == ".toml":
-        return _of_gaussians(load_scene(path), path)
+        return load_scene(path)
     if not path.exists():
         raise InputError(f"{path}: expected the folder of a run or a scene file (.toml), found nothing")
     run = load_run(path)
-    if isinstance(run, NerfRun):
-        raise InputError(f"{path}: expected {VIEWED}, found a radiance field; `spacesim render` draws it")
     folder = path.resolve()
     name = folder.parent.name if folder.name == "run" else folder.name
-    return PosedScene(Composition([PlacedRun(run, name=name)]))
-
-
-def _of_gaussians(scene: PosedScene, path: Path) -> PosedScene:
-    """The scene. Raises InputError for one of radiance fields."""
-    if not isinstance(scene.composition, Composition):
-        raise InputError(f"{path}: expected {VIEWED}, found radiance fields; `spacesim compose` draws them")
-    return scene
+    placed: list[Any] = [PlacedRun(run, name=name)]  # type: ignore[arg-type]
+    composition: Any = Fields(placed, ComposeConfig()) if isinstance(run, NerfRun) else Composition(placed)
+    return PosedScene(composition)
 
 
 def _initial_sun(dataset: Dataset | None) -> Sun:

@@ -148,7 +148,7 @@ class Viewer:
     async def _on_connect(self, handle: Any) -> None:
         setup = self.setup
         facts = [
-            f"{setup.renderer.gaussian_count:,} Gaussians in {len(setup.renderer.models)} model(s)",
+            setup.renderer.content,
             _backend_fact(setup.renderer),
         ]
         client = Client(handle, setup.renderer, self.shared, self.loop, self._truth, setup.dataset, self._sun, facts)

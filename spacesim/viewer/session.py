@@ -5,8 +5,8 @@ import time
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from spacesim.viewer.drawing.frames import Frame, ResolutionControl, draw_frame
-from spacesim.viewer.drawing.loop import RenderLoop, RenderRequest
+from spacesim.viewer.drawing.frames import STEPS, Frame, ResolutionControl, draw_frame
+from spacesim.viewer.drawing.loop import AbandonedError, RenderLoop, RenderRequest
 from spacesim.viewer.drawing.paint import Bytes, compare_pictures, paint
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.state import DisplaySettings, SceneState, SharedScene, ViewerCamera
@@ -64,13 +64,12 @@ class Session:
         self._lock = threading.RLock()
         self._view: ViewerCamera | None = None
         self._settings = DisplaySettings()
-        self._resolution = ResolutionControl()
+        self._resolution = ResolutionControl.of(renderer)
         self._truth: Truth | None = None
         self._pending_request: int | None = None  # number of answers that are awaited
         self._truth_status = ""  # about the truth
-        self._last_full_frame: tuple[ViewerCamera, SceneState, DisplaySettings, Frame] | None = (
-            None  # in full resolution
-        )
+        #: in full resolution, or a step there
+        self._last_frame: tuple[ViewerCamera, SceneState, DisplaySettings, Frame] | None = None
         self._rate, self._shown_at, self._reported_at = 0.0, 0.0, 0.0
         self._closed = False
 
@@ -129,7 +128,7 @@ class Session:
         """The client has gone."""
         with self._lock:
             self._closed = True
-            self._last_full_frame = None
+            self._last_frame = None
             self._drop_truth()
         self._loop.forget(self)
 
@@ -144,32 +143,57 @@ class Session:
 
     # ---- on the render thread ----
 
-    def _draw(self, full: bool) -> None:
+    def _draw(self, full: bool) -> bool:
+        """Whether the picture is but a step to the one in full resolution."""
         with self._lock:
             view, settings, closed = self._view, self._settings, self._closed
-            share = 1.0 if full else self._resolution.share
         if view is None or closed:
-            return
-        state = self._shared.state
-        frame = self._reusable_frame(view, state, settings) if share == 1 else None
-        if frame is None:
-            frame = draw_frame(self._renderer, state, view, settings, share)
+            return False
+        state, progressive = self._shared.state, self._renderer.progressive
+        frame = self._reusable_frame(view, state, settings)
+        share = self._next_share(frame, full)
+        if frame is None or frame.share != share:
+
+            def on_chunk() -> None:
+                if full:
+                    self._loop.give_way(self)
+                if self._is_stale(view, state, settings, full):
+                    raise AbandonedError
+
+            frame = draw_frame(self._renderer, state, view, settings, share, on_chunk if progressive else None)
             height, width = frame.picture.shape[:2]
             self._resolution.record_time(share, (width, height), frame.seconds)
-        if share == 1:
-            self._last_full_frame = view, state, settings, replace(frame, planes=None)  # which are six times as large
+        if share == 1 or progressive:
+            self._last_frame = view, state, settings, replace(frame, planes=None)  # which are six times as large
         picture = (
             self._with_truth(frame, view, state, settings) if full and settings.compare != "off" else frame.picture
         )
         with self._lock:
             if self._closed:
-                return
+                return False
         self._screen.show(picture, full)
         self._report(frame, full)
+        return full and share < 1 and not frame.note  # which more pixels would say again
+
+    def _next_share(self, last: Frame | None, full: bool) -> float:
+        """Of the full resolution. last: of the same view, if there is one"""
+        if not self._renderer.progressive:
+            return 1.0 if full else self._resolution.share
+        if last is None:
+            return self._resolution.share
+        return next((share for share in STEPS if share > last.share), last.share) if full else last.share
+
+    def _is_stale(self, view: ViewerCamera, state: SceneState, settings: DisplaySettings, full: bool) -> bool:
+        """Whether nobody waits for a picture any more: its client has gone, or, of one at rest, sees another one."""
+        with self._lock:
+            if self._closed or not full:
+                return self._closed
+            now = self._view, self._settings.mode, self._settings.side
+        return now != (view, settings.mode, settings.side) or not state.same(self._shared.state)
 
     def _reusable_frame(self, view: ViewerCamera, state: SceneState, settings: DisplaySettings) -> Frame | None:
-        """The last picture in full resolution, if it is this one but for the comparison with the truth."""
-        last = self._last_full_frame  # which `close` may take away at any moment
+        """The last picture kept, if it is this one but for its resolution and the comparison with the truth."""
+        last = self._last_frame  # which `close` may take away at any moment
         if last is None:
             return None
         last_view, last_state, last_settings, frame = last

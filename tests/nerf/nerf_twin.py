@@ -1,6 +1,7 @@
 """Slow twins of the radiance field's parts, float64 numpy, one ray or one point at a time."""
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -81,3 +82,34 @@ def merge(
         densities.append(total)
         colors.append(color / total if total > 0 else color)
     return boundaries, np.array(densities), np.array(colors).reshape(-1, 3)
+
+
+def network(shape: object, weights: list[np.ndarray], items: np.ndarray) -> np.ndarray:
+    """[N, outputs] of inputs [N, inputs], with ReLU between layers. weights: as `mlp.initial_weights` orders them; what
+    points share is 1"""
+    value = items
+    for i, (rows, columns) in enumerate(shape.sizes):
+        value = value @ weights[1 + 2 * i].reshape(rows, columns).T + weights[2 + 2 * i]
+        value = value + weights[0] if i == 0 else value
+        value = np.maximum(value, 0) if i < shape.layers - 1 else value
+    return value
+
+
+def transmittance(
+    density: Callable[[np.ndarray], np.ndarray],
+    extent: np.ndarray,
+    point: np.ndarray,
+    sun: np.ndarray,
+    bias: float,
+    samples: int,
+) -> float:
+    """Share of the light that reaches a point [3] from `sun` [3] through what is in the box: midpoints of even
+    intervals. density: of points [N, 3]"""
+    ends = np.stack([np.zeros(3), extent]) - point
+    with np.errstate(divide="ignore"):
+        ends = ends / sun
+    near, far = max(ends.min(axis=0).max(), bias), ends.max(axis=0).min()
+    if far <= near:
+        return 1.0
+    t = near + (far - near) * (np.arange(samples) + 0.5) / samples
+    return float(np.exp(-density(point + t[:, None] * sun).sum() * (far - near) / samples))

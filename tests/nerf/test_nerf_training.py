@@ -21,7 +21,6 @@ from spacesim.nerf.run import NerfRun, load_run
 from spacesim.nerf.sampling.box import scene_box
 from spacesim.nerf.train.train import train
 from spacesim.nerf.train.trainer import FORMAT, Trainer
-from spacesim.viewer.load import _scene as scene_to_view
 
 GRID = GridConfig(4, 8, 48, 12)
 CONFIG = NerfConfig(
@@ -247,8 +246,6 @@ def test_the_commands(spacesim, tiny_data, tmp_path):
     assert (done.code, "predicts none" in done.errors[0]) == (2, True)
     done = spacesim("sweep", run, "--out", tmp_path / "sweep")
     assert (done.code, "expected a run that the Sun relights" in done.errors[0]) == (2, True)
-    with pytest.raises(InputError, match="found a radiance field; `spacesim render` draws it"):
-        scene_to_view(run)
     done = spacesim("export", run, "--ply", tmp_path / "no.ply")
     assert (done.code, "a radiance field; --mesh takes it" in done.errors[0]) == (2, True)
     done = spacesim("export", run, "--mesh", tmp_path / "mesh.ply", "--views", 6, "--voxel", 0.2)

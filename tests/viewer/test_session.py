@@ -72,8 +72,8 @@ def test_a_move_gives_a_coarse_picture_and_then_a_sharp_one(made):
     session.on_camera_moved(view_from(0, 5))
     assert (at_rest(screen, 2) != picture).any()
     assert screen.told[-1].width == 256
-    assert session._last_full_frame[3].picture.shape == (256, 256, 3)
-    assert session._last_full_frame[3].planes is None  # memory that each client would take
+    assert session._last_frame[3].picture.shape == (256, 256, 3)
+    assert session._last_frame[3].planes is None  # memory that each client would take
 
 
 def test_a_change_of_the_scene_is_drawn(made):

@@ -3,7 +3,7 @@ overlap of what they fill, and how much of the run floats beside the object (the
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from spacesim.eval.metrics.exterior import Samples, exterior_samples
 from spacesim.eval.metrics.solid import filled_beyond, filled_voxels
 from spacesim.nerf.run import NerfRun
 from spacesim.splat.export.fusion import Grid
-from spacesim.splat.export.mesh import MeshConfig, RunMesh, cameras_around, mesh_of, mesh_of_depths
+from spacesim.splat.export.mesh import MeshConfig, RunMesh, cameras_around, cameras_on_sphere, mesh_of, mesh_of_depths
 
 if TYPE_CHECKING:
     from spacesim.splat.raster.gaussians import Gaussians
@@ -103,7 +103,7 @@ def compare_geometry(run: "Predictor", dataset: Dataset, config: GeometryConfig 
     if isinstance(run, NerfRun):
         return _compare_surface(mesh_of_depths(run.surface_depth, cameras, config.mesh), None, "median", truth, config)
     if model is None:
-        return ShapeResult(None, "Geometry is null: a composed scene of radiance fields has no cameras of its own.")
+        return compare_depths(run, truth, config)
     if run.parts:  # trained on other data: what this dataset looks at says nothing
         cameras = cameras_around(model, config.mesh.views)
     return compare_shape(model, run.antialiased, cameras, truth, config)
@@ -118,6 +118,14 @@ def compare_shape(
     """
     mesh = mesh_of(model, cameras, config.mesh, antialiased)
     return _compare_surface(mesh, model, config.mesh.depth, truth, config)
+
+
+def compare_depths(scene: Any, truth: Mesh, config: GeometryConfig) -> ShapeResult:
+    """The shape of a scene with radiance fields, or of one of its fields, against a true mesh: see its `surface_depth`,
+    from around its `sphere`. Raises as `compare_shape` does."""
+    centre, radius = scene.sphere
+    cameras = cameras_on_sphere(centre, radius, config.mesh.views)
+    return _compare_surface(mesh_of_depths(scene.surface_depth, cameras, config.mesh), None, "median", truth, config)
 
 
 def _compare_surface(

@@ -94,19 +94,25 @@ class Networks:
         return result
 
     def sample(
-        self, parameters: Parameters, rays: Rays, count: int, key: UInt32 | None, anneal: Float | None = None
+        self,
+        parameters: Parameters,
+        rays: Rays,
+        count: int,
+        key: UInt32 | None,
+        anneal: Float | None = None,
+        samples: int | None = None,
     ) -> tuple[Float, list[Round]]:
         """(edges [R (S + 1)] of the field's samples of `count` rays, the two rounds that found them).
 
         key: of the random shifts, None: in the middle, as pictures are drawn;  anneal: Float of width 1, the power that
-        proposals' weights are raised to
+        proposals' weights are raised to;  samples: of the field, None: those of pictures
         """
         ray = dr.arange(ad.UInt32, count)
 
         def jitter(stream: int) -> Float:
             return dr.full(ad.Float, 0.5, count) if key is None else random(key, ray, stream)
 
-        wanted = [self.config.fine.samples, self.config.samples]
+        wanted = [self.config.fine.samples, samples or self.config.samples]
         edges = uniform_edges(count, self.config.coarse.samples, jitter(0))
         rounds = []
         for number, (proposal, config) in enumerate(zip(self.proposals, self.rounds, strict=True)):

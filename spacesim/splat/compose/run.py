@@ -1,8 +1,10 @@
-"""A composed scene in the place of a run (tables 4.6 and 4.7)."""
+"""A composed scene in the place of a run (tables 4.6 and 4.7): of Gaussians, or of whatever has the words of their
+`Composition` (radiance fields, both)."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,35 +21,51 @@ from spacesim.splat.run import Predictor, load_run
 class PlacedPart:
     """Model number `index` of a composition, see `Part`."""
 
-    composition: Composition
+    composition: Any  #: see `ComposedRun`
     index: int
 
     @property
     def name(self) -> str:
         """As the scene calls it."""
-        return self.composition.models[self.index].name
+        return str(self.composition.models[self.index].name)
 
     @property
     def centre(self) -> np.ndarray:
-        """[3] metres, world: the middle of its Gaussians."""
-        return self.composition.places[self.index]
+        """[3] metres, world: the middle of its Gaussians, or of its box."""
+        return np.asarray(self.composition.places[self.index])
 
     @property
-    def gaussians(self) -> Gaussians:
-        """Its Gaussians where they stand, colours left out."""
-        return self.composition.alone(self.index)
+    def gaussians(self) -> Gaussians | None:
+        """Its Gaussians where they stand, colours left out; None of a radiance field."""
+        placed = self.composition.models[self.index]
+        return Composition([placed]).in_world() if placed.run.gaussians is not None else None
 
     @property
     def antialiased(self) -> bool:
         """Whether it is drawn with the anti-aliasing filter."""
-        return self.composition.models[self.index].run.antialiased
+        return bool(self.composition.models[self.index].run.antialiased)
+
+    @property
+    def sphere(self) -> tuple[np.ndarray, float]:
+        """(centre [3], radius) metres, world: around a radiance field."""
+        centre, radius = self._alone.spheres[0]
+        return np.asarray(centre), float(radius)
+
+    def surface_depth(self, camera: Camera) -> np.ndarray:
+        """[H, W] of a radiance field where it stands, see `NerfRun.surface_depth`."""
+        return np.asarray(self._alone.surface_depth(camera))
+
+    @cached_property
+    def _alone(self) -> Any:
+        composition = self.composition
+        return composition.field_alone(self.index)
 
 
 @dataclass(frozen=True, eq=False)
 class ComposedRun:
     """Models that were trained apart, evaluated as one."""
 
-    composition: Composition
+    composition: Any  #: a `Composition`, or what has its words
     path: Path  #: the scene file's
     training: JsonDict = field(default_factory=dict)  #: nothing, as no training has seen the scene
 
@@ -57,34 +75,48 @@ class ComposedRun:
         return tuple(PlacedPart(self.composition, index) for index in range(len(self.composition.models)))
 
     @property
-    def gaussian_count(self) -> int:
-        """Of all models."""
-        return self.composition.gaussian_count
+    def gaussian_count(self) -> int | None:
+        """Of all models; None where all are radiance fields."""
+        count: int | None = self.composition.gaussian_count
+        return count
 
     @property
     def model_bytes(self) -> int:
         """Of the models' files, each counted once."""
-        return self.composition.model_bytes
+        return int(self.composition.model_bytes)
 
     @property
     def backend(self) -> str:
         """The backend that renders now."""
-        return self.composition.backend
+        return str(self.composition.backend)
 
     @property
     def relightable(self) -> bool:
         """Whether the Sun's direction changes what is predicted."""
-        return self.composition.relightable
+        return bool(self.composition.relightable)
 
     @property
-    def gaussians(self) -> Gaussians:
-        """All models' Gaussians where they stand, colours left out."""
-        return self.composition.in_world()
+    def gaussians(self) -> Gaussians | None:
+        """All models' Gaussians where they stand, colours left out; None where some are none."""
+        return self.composition.in_world() if isinstance(self.composition, Composition) else None
 
     @property
     def antialiased(self) -> Bool | bool:
         """Whether they are drawn with the anti-aliasing filter: one for all, or of each."""
-        return self.composition.antialiased
+        return self.composition.antialiased if isinstance(self.composition, Composition) else False
+
+    @property
+    def sphere(self) -> tuple[np.ndarray, float]:
+        """(centre [3], radius) metres, world: around a scene with radiance fields."""
+        spheres = self.composition.spheres
+        low = np.min([centre - radius for centre, radius in spheres], axis=0)
+        high = np.max([centre + radius for centre, radius in spheres], axis=0)
+        return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+
+    def surface_depth(self, camera: Camera) -> np.ndarray:
+        """[H, W] float32 of a scene with radiance fields: depth in metres along the optical axis at which half of the
+        light is gone, 0 where it is not."""
+        return np.asarray(self.composition.surface_depth(camera))
 
     @cached_property
     def config(self) -> JsonDict:
@@ -110,7 +142,8 @@ class ComposedRun:
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> ComposedPrediction:
         """See `Composition.predict`."""
-        return self.composition.predict(camera, sun, normals, exposure)
+        prediction: ComposedPrediction = self.composition.predict(camera, sun, normals, exposure)
+        return prediction
 
 
 def load_predictor(path: Path) -> Predictor:

@@ -11,13 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
 from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
@@ -99,6 +100,27 @@ class DrawnView:
         return np.where(alpha >= COVERED, numbers[np.argmax(np.stack(planes), axis=0)], 0)
 
 
+class Beside(Protocol):
+    """What is no Gaussian and stands in the Sun's way."""
+
+    @property
+    def key(self) -> bytes:
+        """Another one wherever it lets other light through."""
+
+    def sun_visibility(self, points: Array, sun: Sun) -> Array:
+        """[N] share of the Sun's light that comes through to points [N, 3] of the world, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class LitGaussians:
+    """All Gaussians of a scene in the world, in the order of `Composition.placed`, as a camera sees them lit."""
+
+    gaussians: Gaussians  #: colours left out
+    colors: list[Any]  #: three Floats [N], sRGB display values
+    visibility: Any  #: Float [N] share of the Sun that each sees, or None of a scene without shadows
+    shares: list[Any]  #: Float [N] of each model: 1 for its Gaussians, else 0
+
+
 class Composition:
     """Posed models under one Sun. What does not change with poses, Sun and camera is kept, also by what `moved` makes.
 
@@ -117,6 +139,7 @@ class Composition:
         self._members = [members[id(model.run)] for model in self.models]
         self._ensemble = Ensemble(sorted((m for m in self._members if m.count), key=lambda member: member.key))
         self._cache = _Cache()
+        self._beside: Beside | None = None
         _log_choices(self.models, self._ensemble)
 
     # ---- what a run is asked for, too ----
@@ -175,6 +198,11 @@ class Composition:
         return max(model.run.supersample for model in self.models)
 
     @property
+    def has_shadows(self) -> bool:
+        """Whether a model's method knows visibility."""
+        return any(member.has_shadows for member in self._members)
+
+    @property
     def contents(self) -> list[str]:
         """A digest of what each model is made of, in their order."""
         return [member.key for member in self._members]
@@ -193,6 +221,7 @@ class Composition:
         other.models = tuple(replace(m, pose=pose) for m, pose in zip(self.models, poses, strict=True))
         other.config, other.path = self.config, self.path
         other._members, other._ensemble, other._cache = self._members, self._ensemble, self._cache
+        other._beside = self._beside
         return other
 
     def shaded(self, config: ComposeConfig) -> "Composition":
@@ -201,10 +230,22 @@ class Composition:
         other.config, other._cache = config, _Cache()
         return other
 
+    def shaded_by(self, beside: Beside) -> "Composition":
+        """The scene in the shadow of something else, too."""
+        other = self.posed([model.pose for model in self.models])
+        other._beside = beside
+        return other
+
     @property
     def places(self) -> list[Array]:
         """Where the middle of each model is, world, [3] metres."""
         return [placed.pose.points(m.centre) for placed, m in zip(self.models, self._members, strict=True)]
+
+    @property
+    def spheres(self) -> list[tuple[Array, float]]:
+        """(centre [3], radius) of each model, metres, world: around its Gaussians to three standard deviations."""
+        reaches = [model.pose.scale * m.radius for model, m in zip(self.models, self._members, strict=True)]
+        return list(zip(self.places, reaches, strict=True))
 
     @property
     def placed(self) -> list[PlacedRun]:
@@ -262,16 +303,22 @@ class Composition:
     def lit_gaussians(self, camera: Camera, sun: Sun | None) -> tuple[Gaussians, list[Any]]:
         """(the set in the world, its colours seen from the camera: three Floats [N], sRGB display values), to draw it
         in another way. Raises InputError where the Sun matters and none is told."""
-        poses = [self.models[i].pose for i in self._order()]
-        colors, _ = self._shade_members(poses, camera, sun)
-        return self._ensemble.placed(poses), display_colors(colors, self._ensemble.curve, None)
+        lit = self.lit(camera, sun)
+        return lit.gaussians, lit.colors
+
+    def lit(self, camera: Camera, sun: Sun | None) -> LitGaussians:
+        """`lit_gaussians` with visibility and owners."""
+        poses = [model.pose for model in self.placed]
+        colors, visibility = self._shade_members(poses, camera, sun)
+        shown = display_colors(colors, self._ensemble.curve, None)
+        return LitGaussians(self._ensemble.placed(poses), shown, visibility, self._ensemble.shares if poses else [])
 
     # ---- light ----
 
     @property
     def _shades(self) -> bool:
         """Whether models may shade each other."""
-        return len(self.models) > 1 and self.config.shadows != "none"
+        return (len(self.models) > 1 or self._beside is not None) and self.config.shadows != "none"
 
     def _order(self) -> list[int]:
         """Which model is each member of the ensemble; models of one run stand in the order of their poses."""
@@ -319,11 +366,27 @@ class Composition:
         if not self._shades:
             return [None] * len(poses)
         assert sun is not None, "a scene with such shadows asks for a Sun first"
-        key = (b"".join(pose.key for pose in poses), sun.tobytes(), self.config.shadows)
-        visibility: list[Any] = self._cache.get(
-            "between", key, lambda: [self._compute_cross_visibility(poses, sun, k) for k in range(len(poses))]
-        )
+        others = b"" if self._beside is None else self._beside.key
+        key = (b"".join(pose.key for pose in poses), sun.tobytes(), self.config.shadows, others)
+
+        def compute() -> list[Any]:
+            between = [self._compute_cross_visibility(poses, sun, k) for k in range(len(poses))]
+            return between if self._beside is None else self._behind(self._beside, poses, sun, between)
+
+        visibility: list[Any] = self._cache.get("between", key, compute)
         return visibility
+
+    def _behind(self, beside: Beside, poses: Sequence[Pose], sun: Array, between: list[Any]) -> list[Any]:
+        """v_inter `between` with what `beside` lets through to the Gaussians' centres: light that comes through both is
+        the product, so that the ratio of 4.15 is what the others let through."""
+        means = np.array(self._ensemble.placed(poses).means, np.float64).T
+        seen = beside.sun_visibility(means, Sun(sun))
+        result = []
+        for member, start, share in zip(self._ensemble.members, self._ensemble.starts, between, strict=True):
+            own = upload(seen[start : start + member.count])
+            result.append(own if share is None else own * share)
+        dr.eval(result)
+        return result
 
     def _compute_cross_visibility(self, poses: Sequence[Pose], sun: Array, k: int) -> Any:
         """v_inter of 4.15 for member k, in its own frame: what is seen of the Sun depends neither on where all stands

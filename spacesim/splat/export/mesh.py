@@ -135,7 +135,11 @@ def cameras_around(model: Gaussians, count: int) -> list[Camera]:
     if len(points) == 0:
         return []
     low, high = np.quantile(points, (0.005, 0.995), axis=0)
-    centre, radius = 0.5 * (low + high), 0.6 * float(np.linalg.norm(high - low)) + 1e-3
+    return cameras_on_sphere(0.5 * (low + high), 0.6 * float(np.linalg.norm(high - low)) + 1e-3, count)
+
+
+def cameras_on_sphere(centre: Array, radius: float, count: int) -> list[Camera]:
+    """`count` cameras on a Fibonacci sphere that see all of a smaller one. centre: [3] metres;  radius: metres"""
     distance = radius / np.sin(np.radians(0.5 * FOV_DEG))
     poses = (look_at(centre + distance * direction, centre) for direction in fibonacci_sphere(count))
     return [Camera.from_fov(pose, SIDE, SIDE, FOV_DEG) for pose in poses]

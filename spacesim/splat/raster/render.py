@@ -50,7 +50,7 @@ def render(
         return _empty_output(camera, outputs, None if features is None else len(feature_list))
 
     rows = gaussians.rows()
-    splats, footprints, groups = _prepare(rows, camera, sh_degree, tuple(outputs), antialiased)
+    splats, footprints, groups = prepare(rows, camera, sh_degree, tuple(outputs), antialiased)
     if features is not None:
         groups["features"] = _clean_features(feature_list, gaussians.count)
 
@@ -72,7 +72,7 @@ def render(
 
 
 @recorded
-def _prepare(
+def prepare(
     rows: list[Float], camera: Projection, sh_degree: int | None, outputs: tuple[str, ...], antialiased: Bool | bool
 ) -> tuple[Splats, Footprints, dict[str, list[Float]]]:
     """(splats, footprints, features to blend by output) of the Gaussians with these `rows`."""

@@ -2,7 +2,8 @@
 
 Dr.Jit is called from this thread alone. A client that moves gets coarse pictures as fast as they come; once nothing new
 is asked for during REST seconds, one in full resolution. A newer request of a client takes the place of an older one,
-so nothing queues up, and clients take turns.
+so nothing queues up, and clients take turns. A picture in full resolution that takes long may come in steps, and give
+way to others within each (`give_way`).
 """
 
 import logging
@@ -25,7 +26,13 @@ _log = logging.getLogger(__name__)
 class RenderRequest:
     """A picture that a client wants."""
 
-    draw: Callable[[bool], Any]  #: told whether in full resolution, makes and delivers it, on the render thread
+    #: told whether in full resolution, makes and delivers it, on the render thread; says, of one in full resolution,
+    #: whether it is but a step there
+    draw: Callable[[bool], Any]
+
+
+class AbandonedError(Exception):
+    """A picture that nobody waits for any more."""
 
 
 class RenderLoop:
@@ -95,11 +102,19 @@ class RenderLoop:
                 if not self._running:
                     return
             assert task is not None
-            try:
-                task()
-            except Exception as error:  # one picture that fails must not end all others
-                _log.warning("viewer: a picture failed (%s)", " ".join(str(error).split()) or type(error).__name__)
-                _log.debug("traceback", exc_info=error)
+            _perform(task)
+
+    def give_way(self, client: Hashable = None) -> None:
+        """Called on the render thread within a long picture of a client: does the next work, and draws for the next
+        of the other clients that has moved. Raises AbandonedError where the loop shall end."""
+        with self._changed:
+            if not self._running:
+                raise AbandonedError
+            other = next((one for one in self._requests if one != client), None)
+            tasks = [self._next_work()] if self._work else []
+            tasks += [] if other is None else [self._next_request(other)]
+        for task in tasks:
+            _perform(task)
 
     def _next(self) -> Callable[[], Any] | None:
         """What to do now, None for nothing. The lock is held."""
@@ -109,12 +124,24 @@ class RenderLoop:
         now = time.monotonic()
         task = self._due_tidying(now - self._every) or self._due_full_resolution(now - PATIENCE)
         if task is None and self._requests:
-            client, (request, moving) = self._requests.popitem(last=False)
-            if moving:
-                self._resting[client] = (now + self._rest, request)
-            task = self._schedule_tidying(partial(request.draw, not moving))
+            task = self._next_request(next(iter(self._requests)))
         task = task or self._due_full_resolution(now) or self._due_tidying(now)
         return task or (self._next_work() if self._work else None)
+
+    def _next_request(self, client: Hashable) -> Callable[[], Any]:
+        """The picture that a client wants. The lock is held."""
+        request, moving = self._requests.pop(client)
+        if moving:
+            self._resting[client] = (time.monotonic() + self._rest, request)
+            return self._schedule_tidying(partial(request.draw, False))
+        return self._schedule_tidying(partial(self._draw_full_resolution, client, request))
+
+    def _draw_full_resolution(self, client: Hashable, request: RenderRequest) -> None:
+        """A step, and the next one when others had their turn."""
+        if request.draw(True):
+            with self._changed:
+                if client not in self._requests:
+                    self._resting[client] = (time.monotonic(), request)
 
     def _next_work(self) -> Callable[[], Any]:
         """The first that is no picture. The lock is held."""
@@ -126,7 +153,7 @@ class RenderLoop:
         for client, (moment, request) in self._resting.items():
             if moment <= now:
                 del self._resting[client]
-                return self._schedule_tidying(partial(request.draw, True))
+                return self._schedule_tidying(partial(self._draw_full_resolution, client, request))
         return None
 
     def _schedule_tidying(self, draw: Callable[[], Any]) -> Callable[[], Any]:
@@ -141,3 +168,13 @@ class RenderLoop:
             return None
         self._tidy_at = None
         return self._tidy
+
+
+def _perform(task: Callable[[], Any]) -> None:
+    try:
+        task()
+    except AbandonedError:
+        pass
+    except Exception as error:  # one picture that fails must not end all others
+        _log.warning("viewer: a picture failed (%s)", " ".join(str(error).split()) or type(error).__name__)
+        _log.debug("traceback", exc_info=error)

@@ -5,8 +5,9 @@ Dr.Jit for anything at all, be it the length of an array, would wait for it for 
 that others ask of a `SceneRenderer` is therefore found out when it is made.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from spacesim.splat.compose import Composition
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.viewer.drawing.ellipsoids import draw_ellipsoids
 from spacesim.viewer.drawing.paint import NEEDED, Planes
-from spacesim.viewer.state import SceneState
+from spacesim.viewer.state import MODES, SceneState
 
 MIN_RADIUS = 1e-6  #: metres of a model, where all its Gaussians are in one place
 
@@ -26,25 +27,31 @@ class Model:
     """What handles and cameras need of a model."""
 
     name: str  #: unlike the others'
-    centre: Array  #: [3] and radius of its Gaussians, its own frame, metres
+    centre: Array  #: [3] and radius of its Gaussians, or of its box, its own frame, metres
     radius: float
 
 
 class SceneRenderer:
-    """A composed scene to be drawn. composition: with the poses that the viewer starts with
+    """A composed scene to be drawn. composition: with the poses that the viewer starts with, of Gaussians, or another
+    that predicts as `nerf.compose.Composition` does
 
-    gaussians: how many there are;  relightable: whether the Sun changes the picture;  backend: that draws
+    gaussian_count: of all models;  content: what there is, in words;  progressive: whether a picture takes so long that
+    it comes in steps, of radiance fields;  modes: of `MODES`, those that there can be;  relightable: whether the Sun
+    changes the picture;  backend: that draws
     """
 
-    def __init__(self, composition: Composition) -> None:
+    def __init__(self, composition: Any) -> None:
         self.composition = composition
-        self.gaussian_count = composition.gaussian_count
+        counts = [placed.run.gaussian_count for placed in composition.models]
+        self.gaussian_count = sum(count or 0 for count in counts)
+        self.content = _describe(counts)
+        self.progressive = not isinstance(composition, Composition)
+        self.modes = tuple(mode for mode in MODES if mode != "ellipsoids" or not self.progressive)
         self.relightable = composition.relightable
         self.backend = composition.backend
         names = _unique_names([placed.name or placed.run.path.resolve().name for placed in composition.models])
         self.models = tuple(
-            Model(name, *_bounds(placed.run.gaussians.to_numpy()))
-            for name, placed in zip(names, composition.models, strict=True)
+            Model(name, *_bounds(placed.run)) for name, placed in zip(names, composition.models, strict=True)
         )
 
     def bounds(self, state: SceneState) -> tuple[Array, float]:
@@ -58,9 +65,13 @@ class SceneRenderer:
         centre = spheres[0][0] if len(spheres) == 1 else 0.5 * (low + high)
         return centre, max(float(np.linalg.norm(at - centre) + radius) for at, radius in spheres)
 
-    def draw(self, state: SceneState, camera: Camera, mode: str) -> Planes:
-        """The planes that a mode needs, and alpha. Raises InputError where the Sun matters and none is told."""
+    def draw(self, state: SceneState, camera: Camera, mode: str, on_chunk: Callable[[], None] | None = None) -> Planes:
+        """The planes that a mode needs, and alpha. on_chunk: called now and then within a picture of a `progressive`
+        scene, which an exception ends. Raises InputError where the Sun matters and none is told."""
         scene = self.composition.posed(state.poses)
+        if self.progressive:
+            seen = scene.predict(camera, state.sun, normals=NEEDED[mode] == "normal", on_chunk=on_chunk)
+            return Planes(seen.alpha, seen.rgb, seen.depth, seen.visibility, seen.normal, seen.id)
         if mode == "ellipsoids":
             gaussians, colors = scene.lit_gaussians(camera, state.sun)
             blended = draw_ellipsoids(gaussians, colors, Pinhole.of(camera))
@@ -82,9 +93,19 @@ class SceneRenderer:
         return f"no model here predicts {plane}"
 
 
-def _bounds(arrays: dict[str, np.ndarray]) -> tuple[Array, float]:
-    """(centre [3], radius) of the Gaussians but for the farthest 1 %, metres."""
-    means = arrays["means"].astype(np.float64)
+def _describe(counts: Sequence[int | None]) -> str:
+    """counts: Gaussians of each model, None of a field"""
+    fields = counts.count(None)
+    models = len(counts) - fields
+    parts = [f"{sum(count or 0 for count in counts):,} Gaussians in {models} model(s)"] * (models > 0)
+    return ", ".join([*parts, *[f"{fields} radiance field{'s' * (fields > 1)}"] * (fields > 0)])
+
+
+def _bounds(run: Any) -> tuple[Array, float]:
+    """(centre [3], radius) of a field's box, or of the Gaussians but for the farthest 1 %, metres."""
+    if run.gaussian_count is None:
+        return run.box.low + 0.5 * run.box.size, 0.5 * float(np.linalg.norm(run.box.size))
+    means = run.gaussians.to_numpy()["means"].astype(np.float64)
     means = means[np.isfinite(means).all(axis=1)]
     if not len(means):
         return np.zeros(3), 1.0

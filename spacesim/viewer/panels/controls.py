@@ -107,11 +107,19 @@ class Actions(Protocol):
 class ClientControls:
     """A client's own part of the panel, and its statistics."""
 
-    def __init__(self, gui: Any, session: Session, actions: Actions, facts: Sequence[str], frames: int) -> None:
+    def __init__(
+        self,
+        gui: Any,
+        session: Session,
+        actions: Actions,
+        facts: Sequence[str],
+        frames: int,
+        modes: tuple[str, ...] = MODES,
+    ) -> None:
         self._facts = facts
         self._session = session
         with gui.add_folder("View", order=1):
-            self.mode = gui.add_dropdown("Mode", MODES, initial_value=MODES[0])
+            self.mode = gui.add_dropdown("Mode", modes, initial_value=MODES[0])
             self.scale = gui.add_html("", visible=False)
             sizes = tuple(map(str, SIDES))
             side = gui.add_dropdown("Resolution", sizes, initial_value="1024", hint="most pixels a side, at rest")

@@ -155,6 +155,9 @@ def _mean_shadow_map(splats: Splats, lists: TileLists, camera: Orthographic, squ
     return ShadowMap(alpha, depth, square[0] if squares else None, camera.width, camera.height)
 
 
+_drawn = recorded(_mean_shadow_map)
+
+
 def _median_shadow_map(
     gaussians: Gaussians, splats: Splats, lists: TileLists, camera: Orthographic, capacity: int
 ) -> ShadowMap:
@@ -173,12 +176,25 @@ def _prepare(rows: list[Float], camera: Orthographic, antialiased: bool) -> tupl
 
 
 def _look_up(test: _Receivers, light: ShadowMap, camera: Orthographic, config: MappingConfig) -> Float:
-    gaussians, bias, softness = Gaussians.from_rows(test.rows), test.bias, test.softness
+    gaussians = Gaussians.from_rows(test.rows)
     visible = drawable_mask(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
     center = camera.transform(gaussians.means if test.points is None else test.points)
+    return _occlusion_at(center, visible, test.bias, test.softness, light, camera, config)
+
+
+def _occlusion_at(
+    center: Array3f,
+    visible: Bool | bool,
+    bias: Float,
+    softness: Float,
+    light: ShadowMap,
+    camera: Orthographic,
+    config: MappingConfig,
+) -> Float:
+    """[N] of points in the light camera's axes."""
     screen = camera.screen(center)
     x, y = screen.x, screen.y
-    seen = visible & camera.in_reach(center) & (x >= 0) & (x < light.width) & (y >= 0) & (y < light.height)
+    seen = camera.in_reach(center) & visible & (x >= 0) & (x < light.width) & (y >= 0) & (y < light.height)
     window = _Window(dr.select(seen, x, 0), dr.select(seen, y, 0), light, seen)
     depth = dr.select(seen, center.z - dr.select(dr.isfinite(bias), bias, 0), 0)
     if config.filter == "bilinear":
@@ -188,6 +204,35 @@ def _look_up(test: _Receivers, light: ShadowMap, camera: Orthographic, config: M
     else:
         occlusion = _percentage_closer(window, depth, softness, camera, config)
     return dr.select(seen, occlusion, 0)
+
+
+@dataclass
+class SunView:
+    """What the Sun sees of some Gaussians, to be asked of points that are none."""
+
+    light: ShadowMap
+    camera: Orthographic
+    softness: Float  #: epsilon_s of 4.5, metres
+    config: MappingConfig
+
+    @staticmethod
+    def of(casters: Gaussians, camera: Orthographic, softness: float, config: MappingConfig) -> "SunView | None":
+        """Of `casters`, as `occlusion_by_mapping` draws them; None where the image shows none. config: of another
+        filter than `median`"""
+        rows = [dr.detach(row) for row in casters.shape_rows()]
+        if casters.count == 0:
+            return None
+        splats, footprints = _prepare(rows, camera, config.antialiased)
+        lists = bin_splats(splats, footprints, camera.width, camera.height)
+        if lists.capacity == 0:
+            return None
+        light = _drawn(splats, lists, camera, config.filter == "variance", round_capacity(dr.width(splats.x)))
+        return SunView(light, camera, dr.opaque(ad.Float, max(softness, 1e-20)), config)
+
+    def visibility(self, points: Array3f) -> Float:
+        """[N] share of the Sun's light that reaches points [3, N], world, metres; 1 outside of the image."""
+        center = self.camera.transform(points)
+        return 1 - _occlusion_at(center, True, ad.Float(0), self.softness, self.light, self.camera, self.config)
 
 
 def _interpolate(window: "_Window", depth: Float, softness: Float) -> Float:

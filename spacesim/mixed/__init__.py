@@ -1,0 +1,1 @@
+"""Gaussians and radiance fields in one scene."""
