@@ -130,7 +130,7 @@ def draw_chunk(
         rays.far = dr.select(crosses, rays.far, rays.near)
         dr.eval(rays.origin, rays.direction, rays.near, rays.far, rays.across)
         samples = field.config.samples
-        seen = sample_field(field, own, rays, count, model.sun)
+        seen = sample_field(field, own, filled[number], model.extent, rays, count, model.sun)
         index = dr.arange(ad.UInt32, count * samples) // samples
         point, _ = rays.at(index, 0.5 * (seen.low + seen.high))
         _, tape = field.density_tape(own, point)

@@ -71,7 +71,10 @@ class NerfConfig:
     features: int = 15  #: numbers that the density network tells the colour network of a point
     color_layers: int = 3  #: matrix products of the colour network
     harmonics: int = 3  #: degree of spherical harmonics of the view's direction
-    sun_harmonics: int = 1  #: of the Sun's, of `nerf-relight`: more of them tell training's few Suns apart by heart
+    #: what colours of `nerf-relight` are told of Sun and view: their directions, or cosines about a normal that each
+    #: place learns (`learning.reflectance`), which serve Suns never seen
+    inputs: Literal["directions", "surface"] = "directions"
+    sun_harmonics: int = 1  #: of the Sun's direction: more of them tell training's few Suns apart by heart
     shadow: ShadowConfig = field(default_factory=ShadowConfig)  #: of `nerf-relight`
     grid: GridConfig = field(default_factory=GridConfig)  #: what the field knows of places
     coarse: ProposalConfig = field(default_factory=ProposalConfig)  #: first round: reads evenly spaced samples
@@ -109,6 +112,11 @@ class NerfConfig:
     def knows_sun(self) -> bool:
         """Whether colours are told the Sun."""
         return self.method == "nerf-relight"
+
+    @property
+    def has_normals(self) -> bool:
+        """Whether each place learns a normal."""
+        return self.knows_sun and self.inputs == "surface"
 
     @property
     def casts_shadows(self) -> bool:

@@ -17,7 +17,7 @@ from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks, places
 from spacesim.nerf.sampling.box import SceneBox
 from spacesim.nerf.sampling.rays import Rays, box_interval
-from spacesim.nerf.sampling.render import sum_rays
+from spacesim.nerf.sampling.render import Weights, expected_depth, median_depth, sum_rays
 
 
 def transmittance(
@@ -49,6 +49,32 @@ def transmittance(
     between, _ = rays.at(ray, t)
     density, _ = networks.density_tape(parameters, between)
     return dr.select(crosses, dr.exp(-sum_rays(density * lengths, samples)), 1)
+
+
+def ray_visibility(
+    networks: Networks,
+    parameters: Parameters,
+    filled: Float,
+    extent: Float,
+    rays: Rays,
+    made: Weights,
+    low: Float,
+    high: Float,
+    sun: Array3f,
+) -> Float:
+    """[R] `transmittance` to where half of the light of each ray is gone, or to its mean depth where more than half
+    gets through: what stands along a ray is mostly one surface, so one second ray does for all of its samples.
+
+    made, low, high: [R S] of the field's samples, t;  sun: [3, R] or [3]
+    """
+    config, count = networks.config, dr.width(rays.near)
+    samples = dr.width(low) // count
+    median = median_depth(made, low, high, samples)
+    depth = dr.select(median > 0, median, expected_depth(made.weights, 0.5 * (low + high), samples))
+    point = dr.fma(rays.direction, dr.maximum(depth, rays.near), rays.origin)
+    dr.eval(point)
+    shadow = config.shadow
+    return transmittance(networks, parameters, filled, extent, point, sun, shadow.bias, count, shadow.samples)
 
 
 def _whole(edges: Float, count: int, samples: int) -> Float:
