@@ -154,7 +154,7 @@ class Composition:
         number = np.where(alpha >= COVERED, np.array(self._order)[shares.argmax(axis=-1)] + 1, 0).astype(np.int32)
         covered = alpha > 0
         visibility = np.divide(planes[..., 3], alpha, out=np.zeros_like(alpha), where=covered)
-        knows = self._shades or self._splats.has_shadows
+        knows = self._shades or self._splats.has_shadows or self._fields.has_shadows
         return ComposedPrediction(
             np.ascontiguousarray(planes[..., :3]),
             alpha,

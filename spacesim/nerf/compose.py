@@ -113,6 +113,11 @@ class Composition:
         """Whether models may shade each other."""
         return len(self.models) > 1 and self.config.shadows != "none"
 
+    @property
+    def has_shadows(self) -> bool:
+        """Whether there is anything that casts them: one model on another, or on itself."""
+        return self._shades or any(run.networks.config.casts_shadows for run in self._runs)
+
     @cached_property
     def contents(self) -> list[str]:
         """A digest of what each model is made of, in their order."""
@@ -166,7 +171,7 @@ class Composition:
         shares = np.stack([next(rest) for _ in self.models])
         number = np.where(alpha >= COVERED, shares.argmax(axis=0) + 1, 0).astype(np.int32)
         normal = unit_normals(np.stack([next(rest) for _ in range(3)], axis=-1)) if normals else None
-        visibility = over_alpha(next(rest), alpha) if self._shades else None
+        visibility = over_alpha(next(rest), alpha) if self.has_shadows else None
         rgb = np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1))
         return ComposedPrediction(rgb, alpha, planes[4].copy(), visibility, normal, number)
 
@@ -187,7 +192,7 @@ class Composition:
     def _draw(self, camera: Camera, sun: Sun | None, normals: bool, on_chunk: Callable[[], None] | None) -> np.ndarray:
         """[C, H W] planes of `draw_chunk`."""
         fields, width = self.placed(camera, sun), dr.opaque(ad.UInt32, camera.width)
-        count = 6 + len(self.models) + 3 * normals + self._shades
+        count = 6 + len(self.models) + 3 * normals + self.has_shadows
         planes = np.zeros((count, camera.width * camera.height), np.float32)
         for part, padded in chunks(self.crossing(fields, camera), self.chunk, on_chunk):
             rays = dr.width(padded)

@@ -50,8 +50,8 @@ class ProposalConfig:
 class ShadowConfig:
     """How a field shadows itself: by what it lets through towards the Sun, along a second ray from each surface."""
 
-    samples: int = 0  #: of that ray, of the field itself; 0: no shadows, what is told of the Sun has to do
-    bias: float = 0.01  #: of the box's longest side: where that ray begins, so that a surface does not shadow itself
+    samples: int = 16  #: of that ray, of the field itself; 0: no shadows, what is told of the Sun has to do
+    bias: float = 0.03  #: of the box's longest side: where that ray begins, so that a surface does not shadow itself
 
     def __post_init__(self) -> None:
         check_ranges(self, samples=(0, MAX_SAMPLES), bias=(0, 1))
@@ -71,7 +71,10 @@ class NerfConfig:
     features: int = 15  #: numbers that the density network tells the colour network of a point
     color_layers: int = 3  #: matrix products of the colour network
     harmonics: int = 3  #: degree of spherical harmonics of the view's direction
-    sun_harmonics: int = 1  #: of the Sun's, of `nerf-relight`: more of them tell training's few Suns apart by heart
+    #: what colours of `nerf-relight` are told of Sun and view: their directions, or cosines about a normal that each
+    #: place learns (`learning.reflectance`), which serve Suns never seen
+    inputs: Literal["directions", "surface"] = "surface"
+    sun_harmonics: int = 1  #: of "directions", of the Sun's: more of them tell training's few Suns apart by heart
     shadow: ShadowConfig = field(default_factory=ShadowConfig)  #: of `nerf-relight`
     grid: GridConfig = field(default_factory=GridConfig)  #: what the field knows of places
     coarse: ProposalConfig = field(default_factory=ProposalConfig)  #: first round: reads evenly spaced samples
@@ -111,9 +114,19 @@ class NerfConfig:
         return self.method == "nerf-relight"
 
     @property
+    def has_normals(self) -> bool:
+        """Whether each place learns a normal."""
+        return self.knows_sun and self.inputs == "surface"
+
+    @property
     def casts_shadows(self) -> bool:
         """Whether colours are dimmed by what stands before the Sun."""
         return self.knows_sun and self.shadow.samples > 0
+
+    @property
+    def sun_samples(self) -> int:
+        """Of a ray towards the Sun: of a field without shadows of its own as many as of any ray."""
+        return self.shadow.samples if self.casts_shadows else self.samples
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for config.json."""

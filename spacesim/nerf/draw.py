@@ -15,12 +15,14 @@ from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks, places
 from spacesim.nerf.sampling.box import SceneBox
 from spacesim.nerf.sampling.rays import Rays, camera_rows, pixel_rays
-from spacesim.nerf.sampling.render import Weights, expected_depth, median_depth, sum_rays, volume_weights
+from spacesim.nerf.sampling.render import Weights, expected_depth, median_depth, spread, sum_rays, volume_weights
+from spacesim.nerf.shadow import ray_visibility
 
 INTERRUPTIBLE = 2_048  #: rays of a chunk, at most, of a picture that may be given up after any
-PLANES = {"rgb": 3, "alpha": 1, "depth": 1, "median_depth": 1, "normal": 3}
-"""Of a picture, in this order: colours over black, opacity, depths (sides of the box, along the ray), and the sum of
-density gradients by weight, which points inwards."""
+PLANES = {"rgb": 3, "alpha": 1, "depth": 1, "median_depth": 1, "visibility": 1, "normal": 3}
+"""Of a picture, in this order: colours over black, opacity, depths (sides of the box, along the ray), the share of the
+Sun that is seen, where the field casts shadows, by weight, and the sum of density gradients by weight, which points
+inwards."""
 
 
 @dataclass
@@ -31,27 +33,55 @@ class Samples:
     high: Float  #: [R S] t
     density: Float  #: [R S] per unit of t
     color: list[Float]  #: 3 times [R S]
+    visibility: Float | None = None  #: [R S] of the Sun, by which colours are dimmed, where the field casts shadows
 
 
-def sample_field(networks: Networks, parameters: Parameters, rays: Rays, count: int, sun: Float | None) -> Samples:
-    """Intervals of the field's own samples of `count` rays, and what it has there. sun: Float [3], towards it"""
-    samples = networks.config.samples
+def sample_field(
+    networks: Networks,
+    parameters: Parameters,
+    filled: Float,
+    extent: Float,
+    rays: Rays,
+    count: int,
+    sun: Float | None,
+) -> Samples:
+    """Intervals of the field's own samples of `count` rays, and what it has there.
+
+    filled: see `Occupancy.filled`;  extent: Float [3], of the box;  sun: Float [3], towards it
+    """
+    samples, towards = networks.config.samples, _towards(sun)
     edges, _ = networks.sample(parameters, rays, count, None)
     t, lengths, index = places(rays, edges, count, samples)
     point, direction = rays.at(index, t)
     own = networks.of_round(parameters, 2)
-    density, color, _ = networks.field.look_up(own, point, networks.field.directions(direction, _towards(sun)))
-    return Samples(t - 0.5 * lengths, t + 0.5 * lengths, density, color)
+    low, high = t - 0.5 * lengths, t + 0.5 * lengths
+    density, color, _ = networks.field.look_up(own, point, direction, towards)
+    if not networks.config.casts_shadows:
+        return Samples(low, high, density, color)
+    assert towards is not None, "a field that is told the Sun"
+    made = volume_weights(density * lengths, samples)
+    seen = ray_visibility(networks, parameters, filled, extent, rays, made, low, high, towards)
+    visibility = spread(seen, samples)
+    return Samples(low, high, density, [c * visibility for c in color], visibility)
 
 
 def draw_rays(
-    networks: Networks, parameters: Parameters, rays: Rays, count: int, sun: Float | None, normals: bool
+    networks: Networks,
+    parameters: Parameters,
+    filled: Float,
+    extent: Float,
+    rays: Rays,
+    count: int,
+    sun: Float | None,
+    normals: bool,
 ) -> Float:
     """[C R] planes of `PLANES`, packed, of `count` rays, with the normals or without."""
     samples = networks.config.samples
-    seen = sample_field(networks, parameters, rays, count, sun)
+    seen = sample_field(networks, parameters, filled, extent, rays, count, sun)
     made = volume_weights(seen.density * (seen.high - seen.low), samples)
     planes = shown(made, seen, rays, samples)
+    if seen.visibility is not None:
+        planes.append(sum_rays(made.weights * seen.visibility, samples))
     if normals:
         index = dr.arange(ad.UInt32, count * samples) // samples
         point, _ = rays.at(index, 0.5 * (seen.low + seen.high))
@@ -83,7 +113,7 @@ def draw_chunk(
     """`draw_rays` of pixels [R], row by row, of a camera."""
     rays, _ = networks.occupancy.clip(_rays(cameras, pixel, width, extent), filled)
     dr.eval(rays.origin, rays.direction, rays.near, rays.far, rays.across)
-    return draw_rays(networks, parameters, rays, networks.config.chunk, sun, normals)
+    return draw_rays(networks, parameters, filled, extent, rays, networks.config.chunk, sun, normals)
 
 
 def find_crossing(
@@ -109,7 +139,8 @@ def draw(
 ) -> dict[str, np.ndarray]:
     """Planes of a picture by name, [H, W] or [H, W, 3] float32, depths in metres. Memory on the device is that of a
     chunk of rays. sun: [3] towards it, of a field that is told"""
-    names = [name for name in PLANES if name != "normal" or normals]
+    left_out = {"normal": not normals, "visibility": not networks.config.casts_shadows}
+    names = [name for name in PLANES if not left_out.get(name)]
     size, chunk = camera.width * camera.height, networks.config.chunk
     cameras, extent = upload(camera_rows([camera], box)), upload(box.extent)
     width = dr.opaque(ad.UInt32, camera.width)
@@ -133,6 +164,9 @@ def draw(
         row += count
     for name in ("depth", "median_depth"):
         result[name] *= np.float32(box.side)
+    if "visibility" in result:
+        alpha = result["alpha"]
+        result["visibility"] = np.divide(result["visibility"], alpha, out=np.zeros_like(alpha), where=alpha > 0)
     if normals:
         result["normal"] = unit_normals(result["normal"])
     return result

@@ -119,6 +119,11 @@ class PlacedFields:
         """K, of a ray that all models are merged on."""
         return sum(self.networks[number].config.samples + 1 for number in self.which) - 1
 
+    @property
+    def self_shadows(self) -> bool:
+        """Whether some model casts shadows on itself."""
+        return any(field.config.casts_shadows for field in self.networks)
+
 
 @dataclass
 class Partition:
@@ -127,7 +132,7 @@ class Partition:
     merged: Merged
     shares: list[Float]  #: [R K] of each model in the density
     slopes: Array3f | None  #: [3, R K] gradient of the density, world axes; None where no normals are asked for
-    visibility: Float | None  #: [R K] share of the Sun's light that there is; None of a scene without shadows
+    visibility: Float | None  #: [R K] share of the Sun's light that there is; None where nothing casts shadows
     across: Float  #: [R] depth along the optical axis of a point, per t
 
 
@@ -139,15 +144,16 @@ def partition(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, no
         rays, crosses = field.occupancy.clip(model_rays(model, pixel, width), fields.filled[number])
         rays.far = dr.select(crosses, rays.far, rays.near)
         dr.eval(rays.origin, rays.direction, rays.near, rays.far, rays.across)
-        seen = sample_field(field, own, rays, count, model.sun)
+        seen = sample_field(field, own, fields.filled[number], model.extent, rays, count, model.sun)
         if normals:
             index = dr.arange(ad.UInt32, count * field.config.samples) // field.config.samples
             point, _ = rays.at(index, 0.5 * (seen.low + seen.high))
             _, tape = field.density_tape(own, point)
             slopes = field.field.density.slopes(field.of_round(own, 2)[: field.field.split], tape)
             slopes_of.append(_turned(model.turn, slopes) / (model.unit * model.unit))
-        in_world = Samples(seen.low * model.unit, seen.high * model.unit, seen.density / model.unit, seen.color)
-        dr.eval(in_world.low, in_world.high, in_world.density, in_world.color, slopes_of)
+        low, high, density = seen.low * model.unit, seen.high * model.unit, seen.density / model.unit
+        in_world = Samples(low, high, density, seen.color, seen.visibility)
+        dr.eval(low, high, density, in_world.color, in_world.visibility, slopes_of)
         rays_of.append(rays)
         samples_of.append(in_world)
     counts = [fields.networks[number].config.samples for number in fields.which]
@@ -166,9 +172,13 @@ def partition(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, no
         for there, slopes, interval in zip(merged.densities, slopes_of, merged.intervals, strict=True):
             slope += dr.select(there > 0, dr.gather(ad.Array3f, slopes, interval), 0)
     seen_sun: Any = None
-    if fields.shading is not None:
-        parts = zip(shares, lit, strict=True)
-        seen_sun = sum((share * (1 if v is None else spread(v, segments)) for share, v in parts), ad.Float(0))
+    if fields.shading is not None or fields.self_shadows:
+        seen_sun = ad.Float(0)
+        for share, others, samples, interval in zip(shares, lit, samples_of, merged.intervals, strict=True):
+            own_light: Any = share if others is None else share * spread(others, segments)
+            if samples.visibility is not None:
+                own_light *= dr.gather(ad.Float, samples.visibility, interval)
+            seen_sun += own_light
     return Partition(merged, shares, slope, seen_sun, rays_of[0].across)
 
 
@@ -202,7 +212,7 @@ def _visibilities(
                 towards,
                 0.0,
                 count,
-                field.config.shadow.samples or field.config.samples,
+                field.config.sun_samples,
             )
         if beside is not None:
             rays = _rays_of(shading.camera, fields.models[k].extent, pixel, width)

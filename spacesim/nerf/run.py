@@ -95,7 +95,7 @@ class NerfRun:
         sRGB values."""
         self._check(sun, exposure)
         drawn = self._draw(camera, sun, normals)
-        return Prediction(drawn["rgb"], drawn["alpha"], drawn["depth"], None, drawn.get("normal"))
+        return Prediction(drawn["rgb"], drawn["alpha"], drawn["depth"], drawn.get("visibility"), drawn.get("normal"))
 
     def surface_depth(self, camera: Camera) -> np.ndarray:
         """[H, W] float32: depth in metres along the optical axis at which half of the light is gone, 0 where it is

@@ -17,7 +17,7 @@ from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks, places
 from spacesim.nerf.sampling.box import SceneBox
 from spacesim.nerf.sampling.rays import Rays, box_interval
-from spacesim.nerf.sampling.render import sum_rays
+from spacesim.nerf.sampling.render import Weights, expected_depth, median_depth, sum_rays
 
 
 def transmittance(
@@ -51,6 +51,32 @@ def transmittance(
     return dr.select(crosses, dr.exp(-sum_rays(density * lengths, samples)), 1)
 
 
+def ray_visibility(
+    networks: Networks,
+    parameters: Parameters,
+    filled: Float,
+    extent: Float,
+    rays: Rays,
+    made: Weights,
+    low: Float,
+    high: Float,
+    sun: Array3f,
+) -> Float:
+    """[R] `transmittance` to where half of the light of each ray is gone, or to its mean depth where more than half
+    gets through: what stands along a ray is mostly one surface, so one second ray does for all of its samples.
+
+    made, low, high: [R S] of the field's samples, t;  sun: [3, R] or [3]
+    """
+    config, count = networks.config, dr.width(rays.near)
+    samples = dr.width(low) // count
+    median = median_depth(made, low, high, samples)
+    depth = dr.select(median > 0, median, expected_depth(made.weights, 0.5 * (low + high), samples))
+    point = dr.fma(rays.direction, dr.maximum(depth, rays.near), rays.origin)
+    dr.eval(point)
+    shadow = config.shadow
+    return transmittance(networks, parameters, filled, extent, point, sun, shadow.bias, count, shadow.samples)
+
+
 def _whole(edges: Float, count: int, samples: int) -> Float:
     """Edges [N (S + 1)] with the first at 0 and the last at 1: `resample` leaves out half a sample's share at both
     ends, which a picture need not see but light has to come through."""
@@ -78,7 +104,7 @@ def sun_visibility(
     pictures, where that has no shadows). Memory is that of a chunk of rays.
     """
     config = networks.config
-    chunk, samples = config.chunk, samples or config.shadow.samples or config.samples
+    chunk, samples = config.chunk, samples or config.sun_samples
     shift = dr.opaque(ad.Float, config.shadow.bias if bias is None else bias / box.side)
     extent, towards = upload(box.extent), ad.Array3f(*(dr.opaque(ad.Float, float(x)) for x in sun))
     result = np.ones(len(points), np.float32)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import spacesim as ss
+from spacesim import methods
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image, read_png
 from spacesim.data.records import Dataset
@@ -21,6 +22,7 @@ from spacesim.nerf.run import NerfRun, load_run
 from spacesim.nerf.sampling.box import scene_box
 from spacesim.nerf.train.train import train
 from spacesim.nerf.train.trainer import FORMAT, Trainer
+from spacesim.splat.compose import ComposeConfig, PlacedRun
 
 GRID = GridConfig(4, 8, 48, 12)
 CONFIG = NerfConfig(
@@ -193,10 +195,29 @@ def test_a_field_that_is_told_the_sun(dataset, tmp_path):
     one, other = (run.render(camera, sun=angles) for angles in ((40, 25), (220, 40)))
     assert np.abs(one.rgb - other.rgb).max() > 1e-3
     np.testing.assert_array_equal(one.alpha, other.alpha)
+    assert one.visibility.shape == one.alpha.shape
+    assert 0 <= one.visibility.min() < 0.9 < one.visibility.max() <= 1 + 1e-5
+    assert np.abs(one.visibility - other.visibility).max() > 0.1
+    composed = methods.compose([PlacedRun(run)], ComposeConfig(), None).predict(camera, ss.Sun.from_angles(40, 25))
+    np.testing.assert_allclose(composed.visibility, one.visibility, atol=2e-3)
+    np.testing.assert_allclose(composed.rgb, one.rgb, atol=2e-3)
     with pytest.raises(InputError, match="sun: expected its direction for a run of nerf-relight, found none"):
         run.predict(camera)
     with pytest.raises(InputError, match="exposure"):
         run.predict(camera, ss.Sun.from_angles(0, 0), exposure=1.0)
+
+
+def test_shadows_and_normals_resume_to_the_same_bits(dataset, tmp_path):
+    config = replace(CONFIG, method="nerf-relight", iterations=90, checkpoint_every=70)
+
+    def stop(progress):
+        if progress.iteration >= 80:
+            raise KeyboardInterrupt
+
+    whole = train(dataset, tmp_path / "whole", config)
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, tmp_path / "cut", config, on_progress=stop)
+    assert model_bytes(train(dataset, tmp_path / "cut", config, resume=True)) == model_bytes(whole)
 
 
 def test_what_asks_for_gaussians_says_so(dataset, finished, tmp_path):

@@ -14,6 +14,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float, TensorXf
 from spacesim.learning import mlp
 from spacesim.learning.mlp import MlpShape, round_up_rows, sigmoid
+from spacesim.learning.reflectance import COSINES, surface_cosines
 from spacesim.nerf.config import CHUNK, GridConfig, NerfConfig
 from spacesim.nerf.fields.hashgrid import HashGrid
 
@@ -87,26 +88,33 @@ class FieldTape:
     density: DensityTape
     layers: list[Any]  #: of the colour network
     color: list[Float]  #: [N] each
+    normal: Array3f | None  #: [3, N] of any length, where there are some
+    view: Array3f  #: [3, N]
+    sun: Array3f | None  #: [3, N], where the field is told
 
 
 @dataclass(frozen=True)
 class Field:
-    """Density and colour of a radiance field; the colour is told the direction of the view, and of the Sun where the
-    method is."""
+    """Density and colour of a radiance field. The colour is told the direction of the view, and of the Sun where the
+    method is, or in place of both the cosines about a normal, which is three of the density network's numbers."""
 
     density: DensityField
     color: MlpShape
+    features: int  #: numbers of a place that the colour network reads
     harmonics: int  #: degree, of the view's direction
     sun_harmonics: int | None  #: degree, of the Sun's; None of a field that is not told
+    has_normals: bool  #: the colour is told cosines
 
     @staticmethod
     def of(config: NerfConfig) -> "Field":
         """Of a configuration."""
-        density = DensityField.of(config.grid, config.width, config.features)
+        has_normals = config.has_normals
+        density = DensityField.of(config.grid, config.width, config.features + 3 * has_normals)
         of_sun = config.sun_harmonics if config.knows_sun else None
         terms = (config.harmonics + 1) ** 2 + (0 if of_sun is None else (of_sun + 1) ** 2)
-        shape = MlpShape(config.features + terms, 1, 3, config.width, config.color_layers)
-        return Field(density, shape, config.harmonics, of_sun)
+        told = COSINES if has_normals else terms
+        shape = MlpShape(config.features + told, 1, 3, config.width, config.color_layers)
+        return Field(density, shape, config.features, config.harmonics, of_sun, has_normals)
 
     @property
     def split(self) -> int:
@@ -126,23 +134,46 @@ class Field:
         return [ad.Float(term) for term in terms]
 
     def look_up(
-        self, parameters: Parameters, point: Array3f, directions: list[Float]
+        self, parameters: Parameters, point: Array3f, view: Array3f, sun: Array3f | None
     ) -> tuple[Float, list[Float], FieldTape]:
-        """(density [N] per side, colour, 3 Floats [N] in 0 to 1, tape) at points [3, N] seen along `directions`."""
+        """(density [N] per side, colour, 3 Floats [N] in 0 to 1, tape) at points [3, N].
+
+        view, sun: [3, N] unit, from the camera and towards the Sun; None of a field that is not told
+        """
         density, output, tape = self.density.look_up(parameters[: self.split], point)
         features = [row(output, 1 + i) for i in range(output.shape[1] - 1)]
-        items = to_matrix([*features, *directions])
+        normal = None
+        if self.has_normals:
+            assert sun is not None, "a field that is told the Sun"
+            normal = ad.Array3f(*features[self.features :])
+            told = surface_cosines(normal, view, sun)
+        else:
+            told = self.directions(view, sun)
+        items = to_matrix([*features[: self.features], *told])
         raw, layers = mlp.forward(self.color, parameters[self.split :], items, _one())
         color = [sigmoid(row(raw, i)) for i in range(3)]
-        return density, color, FieldTape(tape, layers, color)
+        return density, color, FieldTape(tape, layers, color, normal, view, sun)
 
     def adjoint(self, parameters: Parameters, tape: FieldTape, by_density: Float, by_color: list[Float]) -> Parameters:
         """Gradients by the parameters, from those [N] by density and colour."""
         by_raw = [gradient * c * (1 - c) for gradient, c in zip(by_color, tape.color, strict=True)]
         by_raw_matrix = to_matrix(by_raw, exact=True)
         colors, by_items = mlp.backward(self.color, parameters[self.split :], tape.layers, _one(), by_raw_matrix)
-        by_features = [row(by_items, i) for i in range(self.density.shape.outputs - 1)]
+        by_features = [row(by_items, i) for i in range(self.features)]
+        if tape.normal is not None:
+            by_features += _cosines_adjoint(tape, [row(by_items, self.features + i) for i in range(COSINES)])
         return self.density.adjoint(parameters[: self.split], tape.density, by_density, by_features) + colors
+
+
+def _cosines_adjoint(tape: FieldTape, gradients: list[Float]) -> list[Float]:
+    """Three Floats [N], gradient by the normals, from those [N] by the cosines."""
+    assert tape.normal is not None, "a field with normals"
+    assert tape.sun is not None, "a field that is told the Sun"
+    normal = ad.Array3f(tape.normal)
+    dr.enable_grad(normal)
+    cosines = surface_cosines(normal, tape.view, tape.sun)
+    dr.backward(sum((c * g for c, g in zip(cosines, gradients, strict=True)), ad.Float(0)))
+    return list(dr.grad(normal))
 
 
 def to_matrix(rows: list[Float], exact: bool = False) -> TensorXf:

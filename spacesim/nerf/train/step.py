@@ -14,6 +14,7 @@ from spacesim.nerf.sampling.losses import distortion, interlevel
 from spacesim.nerf.sampling.rays import pixel_rays
 from spacesim.nerf.sampling.render import spread, sum_rays, volume_weights, weights_adjoint
 from spacesim.nerf.sampling.sampler import random, random_below
+from spacesim.nerf.shadow import ray_visibility
 from spacesim.nerf.train.pixels import Pixels
 
 RAY, BACKGROUND = 8, 9  #: streams of random numbers
@@ -81,14 +82,18 @@ def loss_and_gradients(
     edges, rounds = networks.sample(parameters, rays, count, numbers.key, numbers.anneal)
     t, lengths, index = places(rays, edges, count, samples)
     point, direction = rays.at(index, t)
-    sun = None
-    if config.knows_sun:
-        towards = ad.Array3f([dr.gather(ad.Float, pixels.suns, view * 3 + i) for i in range(3)])
-        sun = dr.gather(ad.Array3f, towards, index)
+    towards = ad.Array3f([dr.gather(ad.Float, pixels.suns, view * 3 + i) for i in range(3)])
+    sun = dr.gather(ad.Array3f, towards, index) if config.knows_sun else None
     own = networks.of_round(parameters, 2)
-    density, color, tape = networks.field.look_up(own, point, networks.field.directions(direction, sun))
+    density, color, tape = networks.field.look_up(own, point, direction, sun)
     made = volume_weights(density * lengths, samples)
     weights = made.weights
+    visible: Any = ad.Float(1)
+    if config.casts_shadows:
+        low, high = t - 0.5 * lengths, t + 0.5 * lengths
+        seen = ray_visibility(networks, parameters, filled, pixels.extent, rays, made, low, high, towards)
+        visible = spread(dr.select(numbers.skips > 0, seen, 1), samples)  # at first all is fog
+        color = [c * visible for c in color]
 
     background = [_background(config.random_background, numbers.key, 3 * ray + i) for i in range(3)]
     truth = dr.gather(ad.UInt32, pixels.color, chosen)
@@ -104,7 +109,7 @@ def loss_and_gradients(
         error = shown - wanted
         loss += dr.sum(error * error) * scale
         by_shown = spread(2 * scale * error, samples)
-        by_color.append(by_shown * weights)
+        by_color.append(by_shown * weights * visible)
         by_weights += by_shown * (color[i] - spread(background[i], samples))
     if config.distortion_weight > 0:
         _, by_distortion = distortion(edges, weights, count, samples)

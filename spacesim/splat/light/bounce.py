@@ -12,7 +12,7 @@ import drjit as dr
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.learning.mlp import sigmoid
-from spacesim.splat.light.field import unit_normals
+from spacesim.learning.reflectance import unit_normals
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.gaussians import opacities
 from spacesim.splat.raster.records import load, packets, store

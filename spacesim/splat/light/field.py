@@ -9,13 +9,12 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, TensorXf
 from spacesim.data.errors import check_ranges
 from spacesim.learning.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape
+from spacesim.learning.reflectance import COSINES, points_away, seen_side_normals, surface_cosines
 from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.surface import shortest_axis
 
-LOBES = (8, 32, 128, 512)  #: exponents of n . h, from satin to mirror: each is the one before to the fourth
-COSINES = 4 + len(LOBES)  #: numbers that `surface_cosines` gives
 TURNED = 0.2  #: a surface with n . s of at most -TURNED is turned away from the Sun (docs/research/shadows.md)
 
 
@@ -184,50 +183,14 @@ def sun_adjoint(
 
 def is_back_side_seen(config: FieldConfig, inputs: FieldInputs, batch: PaddedBatch) -> Bool:
     """Bool [M]: is the side seen to which the learned normal does not point?"""
-    return _points_away(_normals(config, inputs, batch), inputs.camera.directions_to(batch.repeat_last(inputs.means)))
-
-
-def surface_cosines(normals: Array3f, direction: Array3f, sun: Array3f) -> list[Float]:
-    """n . s, max(n . s, 0), n . v, n . h, and powers of the last: what a reflectance model of an isotropic surface
-    depends on (Blinn 1977), [M] each. A network of few units makes no lobe as narrow as a glint out of n . h alone.
-
-    normals: Array3f [3, M], of any length; the side that is seen counts, n . v >= 0;  direction: Array3f [3, M], unit,
-    from the camera;  sun: Array3f, unit, towards the Sun;  h: halfway between the Sun and the viewer, v = -direction
-    """
-    seen = _seen_side_normals(unit_normals(normals), direction)
-    half = sun - direction
-    half2 = dr.squared_norm(half)
-    per_length: Any = dr.select(half2 > 1e-12, dr.rsqrt(dr.maximum(half2, 1e-12)), 0)
-    half *= per_length
-    lambert = dr.dot(seen, sun)
-    halfway = dr.maximum(dr.dot(seen, half), 0)
-    lobes = [dr.square(dr.square(dr.square(halfway)))]
-    for _ in LOBES[1:]:
-        lobes.append(dr.square(dr.square(lobes[-1])))
-    return [lambert, dr.maximum(lambert, 0), -dr.dot(seen, direction), halfway, *lobes]
-
-
-def unit_normals(normals: Array3f) -> Array3f:
-    """Array3f [3, M] of unit length; (0, 0, 1) in place of what has no direction."""
-    length2 = dr.squared_norm(normals)
-    has_direction = dr.detach(length2) > 1e-12
-    return dr.select(has_direction, normals, ad.Array3f(0, 0, 1)) * dr.rsqrt(dr.select(has_direction, length2, 1))
+    return points_away(_normals(config, inputs, batch), inputs.camera.directions_to(batch.repeat_last(inputs.means)))
 
 
 def _faces(lambert: Float, inputs: FieldInputs, batch: PaddedBatch) -> Any:
     """Of n . s of the learned normals."""
     axis = shortest_axis(*(batch.repeat_last(dr.detach(turn)) for turn in inputs.rotations_and_scales))
-    axis = _seen_side_normals(axis, inputs.camera.directions_to(batch.repeat_last(inputs.means)))
+    axis = seen_side_normals(axis, inputs.camera.directions_to(batch.repeat_last(inputs.means)))
     return dr.clip(1 + dr.maximum(lambert, dr.dot(axis, inputs.sun)) / TURNED, 0, 1)
-
-
-def _seen_side_normals(normals: Array3f, direction: Array3f) -> Any:
-    """Normals of the side that is seen. direction: from the camera"""
-    return dr.select(_points_away(normals, direction), -normals, normals)
-
-
-def _points_away(normals: Array3f, direction: Array3f) -> Bool:
-    return dr.detach(dr.dot(normals, direction)) > 0
 
 
 def _normals(config: FieldConfig, inputs: FieldInputs, batch: PaddedBatch) -> Array3f:
