@@ -85,6 +85,8 @@ class NerfConfig:
     occupancy_every: int = 25  #: steps between two looks at these
     interlevel_weight: float = 1.0  #: in the loss: proposals that miss what the field has (Barron et al. 2022)
     distortion_weight: float = 0.002  #: in the loss: weights of a ray that lie apart (Barron et al. 2022)
+    #: in the loss: normals that places learn against the slope of density (Verbin et al. 2022, equation 11)
+    normal_weight: float = 0.01
     random_background: bool = True  #: each ray over another colour, by alpha; false: over black
     rate: float = 1e-2  #: Adam's step size at the start
     rate_final: float = 1e-3  #: at the end; it falls exponentially
@@ -100,7 +102,9 @@ class NerfConfig:
             self, features=(1, 256), color_layers=(2, 8), harmonics=(0, 6), sun_harmonics=(1, 6), occupancy=(4, 512)
         )
         check_ranges(self, proposals_every=(1, MAX_STEPS), warm_up=(0, MAX_STEPS), occupancy_every=(1, MAX_STEPS))
-        check_ranges(self, interlevel_weight=(0, 1e6), distortion_weight=(0, 1e6), margin=(0, 10))
+        check_ranges(
+            self, interlevel_weight=(0, 1e6), distortion_weight=(0, 1e6), normal_weight=(0, 1e6), margin=(0, 10)
+        )
         check_ranges(self, rate=(0, 10), rate_final=(0, 10))
         if self.occupancy % 8:
             raise InputError(f"occupancy: expected a multiple of 8, found {self.occupancy}")

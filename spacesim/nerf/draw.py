@@ -16,7 +16,7 @@ from spacesim.nerf.fields.model import Networks, places
 from spacesim.nerf.sampling.box import SceneBox
 from spacesim.nerf.sampling.rays import Rays, camera_rows, pixel_rays
 from spacesim.nerf.sampling.render import Weights, expected_depth, median_depth, spread, sum_rays, volume_weights
-from spacesim.nerf.shadow import ray_visibility
+from spacesim.nerf.shadow import mix, ray_visibility
 
 INTERRUPTIBLE = 2_048  #: rays of a chunk, at most, of a picture that may be given up after any
 PLANES = {"rgb": 3, "alpha": 1, "depth": 1, "median_depth": 1, "visibility": 1, "normal": 3}
@@ -62,7 +62,7 @@ def sample_field(
     made = volume_weights(density * lengths, samples)
     seen = ray_visibility(networks, parameters, filled, extent, rays, made, low, high, towards)
     visibility = spread(seen, samples)
-    return Samples(low, high, density, [c * visibility for c in color], visibility)
+    return Samples(low, high, density, mix(color, visibility), visibility)
 
 
 def draw_rays(

@@ -77,6 +77,11 @@ def ray_visibility(
     return transmittance(networks, parameters, filled, extent, point, sun, shadow.bias, count, shadow.samples)
 
 
+def mix(color: list[Float], visibility: Float) -> list[Float]:
+    """Three Floats [N], of a colour in the Sun and one in the shade, 3 Floats [N] each. visibility: [N]"""
+    return [visibility * lit + (1 - visibility) * shaded for lit, shaded in zip(color[:3], color[3:], strict=True)]
+
+
 def _whole(edges: Float, count: int, samples: int) -> Float:
     """Edges [N (S + 1)] with the first at 0 and the last at 1: `resample` leaves out half a sample's share at both
     ends, which a picture need not see but light has to come through."""

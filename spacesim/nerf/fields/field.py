@@ -113,7 +113,7 @@ class Field:
         of_sun = config.sun_harmonics if config.knows_sun else None
         terms = (config.harmonics + 1) ** 2 + (0 if of_sun is None else (of_sun + 1) ** 2)
         told = COSINES if has_normals else terms
-        shape = MlpShape(config.features + told, 1, 3, config.width, config.color_layers)
+        shape = MlpShape(config.features + told, 1, 6 if config.casts_shadows else 3, config.width, config.color_layers)
         return Field(density, shape, config.features, config.harmonics, of_sun, has_normals)
 
     @property
@@ -136,7 +136,8 @@ class Field:
     def look_up(
         self, parameters: Parameters, point: Array3f, view: Array3f, sun: Array3f | None
     ) -> tuple[Float, list[Float], FieldTape]:
-        """(density [N] per side, colour, 3 Floats [N] in 0 to 1, tape) at points [3, N].
+        """(density [N] per side, colour, 3 Floats [N] in 0 to 1, tape) at points [3, N]; of a field that casts shadows
+        colour in the Sun, then in the shade, 6 Floats.
 
         view, sun: [3, N] unit, from the camera and towards the Sun; None of a field that is not told
         """
@@ -151,29 +152,37 @@ class Field:
             told = self.directions(view, sun)
         items = to_matrix([*features[: self.features], *told])
         raw, layers = mlp.forward(self.color, parameters[self.split :], items, _one())
-        color = [sigmoid(row(raw, i)) for i in range(3)]
+        color = [sigmoid(row(raw, i)) for i in range(self.color.outputs)]
         return density, color, FieldTape(tape, layers, color, normal, view, sun)
 
-    def adjoint(self, parameters: Parameters, tape: FieldTape, by_density: Float, by_color: list[Float]) -> Parameters:
-        """Gradients by the parameters, from those [N] by density and colour."""
+    def adjoint(
+        self,
+        parameters: Parameters,
+        tape: FieldTape,
+        by_density: Float,
+        by_color: list[Float],
+        by_normal: Array3f | None = None,
+    ) -> Parameters:
+        """Gradients by the parameters, from those [N] by density and colour, and [3, N] by the normal."""
         by_raw = [gradient * c * (1 - c) for gradient, c in zip(by_color, tape.color, strict=True)]
         by_raw_matrix = to_matrix(by_raw, exact=True)
         colors, by_items = mlp.backward(self.color, parameters[self.split :], tape.layers, _one(), by_raw_matrix)
         by_features = [row(by_items, i) for i in range(self.features)]
         if tape.normal is not None:
-            by_features += _cosines_adjoint(tape, [row(by_items, self.features + i) for i in range(COSINES)])
+            slopes = _cosines_adjoint(tape, [row(by_items, self.features + i) for i in range(COSINES)])
+            by_features += list(slopes if by_normal is None else slopes + by_normal)
         return self.density.adjoint(parameters[: self.split], tape.density, by_density, by_features) + colors
 
 
-def _cosines_adjoint(tape: FieldTape, gradients: list[Float]) -> list[Float]:
-    """Three Floats [N], gradient by the normals, from those [N] by the cosines."""
+def _cosines_adjoint(tape: FieldTape, gradients: list[Float]) -> Array3f:
+    """[3, N] gradient by the normals, from those [N] by the cosines."""
     assert tape.normal is not None, "a field with normals"
     assert tape.sun is not None, "a field that is told the Sun"
     normal = ad.Array3f(tape.normal)
     dr.enable_grad(normal)
     cosines = surface_cosines(normal, tape.view, tape.sun)
     dr.backward(sum((c * g for c, g in zip(cosines, gradients, strict=True)), ad.Float(0)))
-    return list(dr.grad(normal))
+    return dr.grad(normal)
 
 
 def to_matrix(rows: list[Float], exact: bool = False) -> TensorXf:

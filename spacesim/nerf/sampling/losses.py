@@ -1,9 +1,11 @@
 """What training minimises beside the error of colours, each with its gradient by hand; sums are made in fixed order."""
 
+from typing import Any
+
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Float
+from spacesim.backend.arrays import Array3f, Float
 from spacesim.nerf.sampling.render import spread, sum_rays
 from spacesim.nerf.sampling.sampler import count_below, intervals
 
@@ -44,6 +46,15 @@ def interlevel(
         by_bound, ray * samples, after, samples
     )
     return loss, dr.select(until > after, gradient, 0)
+
+
+def normal_slope(normal: Array3f, slope: Array3f, weights: Float) -> Array3f:
+    """[3, N] gradient by normals [3, N], of any length, of the sum of weights |n / |n| + slope / |slope||^2 (Verbin et
+    al. 2022, equation 11): normals point against the slope of density, which is not asked to follow them."""
+    per_length: Any = dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12))
+    unit = normal * per_length
+    wanted = slope * -dr.rsqrt(dr.maximum(dr.squared_norm(slope), 1e-12))
+    return (unit * dr.dot(unit, wanted) - wanted) * (2 * weights * per_length)
 
 
 def _sum_before(sums: Float, first: dr.ArrayBase, count: dr.ArrayBase, most: int) -> Float:

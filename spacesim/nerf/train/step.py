@@ -10,11 +10,11 @@ from spacesim.backend.arrays import Float, UInt32
 from spacesim.learning.adam import adam_step
 from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks, places
-from spacesim.nerf.sampling.losses import distortion, interlevel
+from spacesim.nerf.sampling.losses import distortion, interlevel, normal_slope
 from spacesim.nerf.sampling.rays import pixel_rays
 from spacesim.nerf.sampling.render import spread, sum_rays, volume_weights, weights_adjoint
 from spacesim.nerf.sampling.sampler import random, random_below
-from spacesim.nerf.shadow import ray_visibility
+from spacesim.nerf.shadow import mix, ray_visibility
 from spacesim.nerf.train.pixels import Pixels
 
 RAY, BACKGROUND = 8, 9  #: streams of random numbers
@@ -93,7 +93,7 @@ def loss_and_gradients(
         low, high = t - 0.5 * lengths, t + 0.5 * lengths
         seen = ray_visibility(networks, parameters, filled, pixels.extent, rays, made, low, high, towards)
         visible = spread(dr.select(numbers.skips > 0, seen, 1), samples)  # at first all is fog
-        color = [c * visible for c in color]
+        color = mix(color, visible)
 
     background = [_background(config.random_background, numbers.key, 3 * ray + i) for i in range(3)]
     truth = dr.gather(ad.UInt32, pixels.color, chosen)
@@ -109,13 +109,19 @@ def loss_and_gradients(
         error = shown - wanted
         loss += dr.sum(error * error) * scale
         by_shown = spread(2 * scale * error, samples)
-        by_color.append(by_shown * weights * visible)
+        by_color.append(by_shown * weights)
         by_weights += by_shown * (color[i] - spread(background[i], samples))
+    if config.casts_shadows:
+        by_color = [g * visible for g in by_color] + [g * (1 - visible) for g in by_color]
     if config.distortion_weight > 0:
         _, by_distortion = distortion(edges, weights, count, samples)
         by_weights += config.distortion_weight / count * by_distortion
     by_density = weights_adjoint(made, by_weights, samples) * lengths
-    of_field = networks.field.adjoint(own, tape, by_density, by_color)
+    by_normal = None
+    if tape.normal is not None and config.normal_weight > 0:
+        slopes = networks.field.density.slopes(own[: networks.field.split], tape.density)
+        by_normal = normal_slope(tape.normal, slopes, config.normal_weight / count * weights)
+    of_field = networks.field.adjoint(own, tape, by_density, by_color, by_normal)
 
     of_proposals: Parameters = []
     if proposals_learn:
