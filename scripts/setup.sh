@@ -115,16 +115,10 @@ make_runtime
 make_backend
 if [ "$WANTED" = test ]; then
     install --no-build-isolation -e '.[dev]'
-    install --no-build-isolation -e '.[cluster]' 2>/dev/null ||
-        say "ray cannot be had here; the test that needs it is skipped"
-    install --no-build-isolation -e '.[video]' 2>/dev/null ||
-        say "PyAV cannot be had here; the tests that need it (videos) are skipped"
-    install --no-build-isolation -e '.[sfm]' 2>/dev/null ||
-        say "pycolmap cannot be had here; the tests that need it (structure from motion) are skipped"
-    install --no-build-isolation -e '.[viewer]' 2>/dev/null ||
-        say "viser cannot be had here; the tests that need it (the viewer) are skipped"
-    install --no-build-isolation -e '.[docs]' 2>/dev/null ||
-        say "mkdocs-material cannot be had here; the test that builds the documentation site is skipped"
+    for extra in cluster docs sfm spice video viewer webdataset; do
+        install --no-build-isolation -e ".[$extra]" 2>/dev/null ||
+            say "what the extra '$extra' needs cannot be had here; its tests are skipped"
+    done
     install torch 2>/dev/null || install --retries 1 --extra-index-url "$TORCH_CPU" torch 2>/dev/null ||
         say "torch's CPU build cannot be had here; the tests that need it (LPIPS) are skipped"
 fi
