@@ -12,7 +12,21 @@ from tiny import GENERATE, TRAIN, Outcome, call
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-LONGEST = ("test_attack", "test_benchmarks", "test_robustness", "test_refine_pose", "test_workers", "test_doc_commands")
+LONGEST = (
+    "test_reproduce",
+    "test_attack",
+    "test_benchmarks",
+    "test_interrupts",
+    "test_robustness",
+    "test_browser",
+    "test_torch",
+    "test_attack_viewer",
+    "test_doc_commands",
+    "test_workers",
+    "test_picture_suns",
+    "test_examples",
+    "test_cli",
+)
 """Files of tests that take long, the longest first: what is left at the end is short, and processes end together."""
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw
-from scipy.spatial import cKDTree
 
 from spacesim.data.geometry import Array, angles_from_direction, direction_from_angles, fibonacci_sphere
 from spacesim.data.images import write_png
@@ -72,6 +71,8 @@ def density(directions: Array, points: Array) -> Array:
     """
     weights = np.ones(len(directions))
     if len(directions) > _MAX_KERNELS:
+        from scipy.spatial import cKDTree  # a third of a second
+
         lattice = fibonacci_sphere(_MAX_KERNELS)
         weights = np.bincount(cKDTree(lattice).query(directions)[1], minlength=len(lattice)).astype(np.float64)
         directions = lattice

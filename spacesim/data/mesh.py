@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
@@ -36,6 +35,8 @@ def load_trimesh(path: Path, kind: str | None = None) -> Any:
     """What trimesh makes of one of the READ formats by itself: a mesh, or points; files beside it, such as textures,
     are not opened. kind: one of READ, by default the ending of the name. Raises InputError where it cannot be read,
     MemoryError where it does not fit into memory."""
+    import trimesh  # here and below: half a second, that whoever reads no mesh need not wait
+
     path = Path(path)
     content, kind = read_bytes(path, "a mesh"), kind or path.suffix.lower()
     if kind not in READ:
@@ -64,8 +65,8 @@ def load_trimesh(path: Path, kind: str | None = None) -> Any:
     return loaded
 
 
-class MeshFolderResolver(trimesh.resolvers.Resolver):
-    """The files that a mesh file names, in its own folder and below."""
+class MeshFolderResolver:
+    """The files that a mesh file names, in its own folder and below, as trimesh asks for them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.resolve()
@@ -76,6 +77,10 @@ class MeshFolderResolver(trimesh.resolvers.Resolver):
         if not path.is_relative_to(self.folder):
             raise InputError(f"{key[:80]!r} lies outside of the mesh's folder")
         return read_bytes(path, "a part of a mesh")
+
+    def __getitem__(self, key: str) -> bytes:
+        """As `get`."""
+        return self.get(key)
 
     def keys(self) -> tuple[str, ...]:
         """No listing: files are asked for by name."""
@@ -141,6 +146,8 @@ def mesh_suffix(path: Path) -> str:
 def write_mesh(path: Path, vertices: Array, faces: np.ndarray) -> None:
     """Write vertices [V, 3] metres and faces [F, 3] as PLY, OBJ, STL or glTF (.glb), by the file's name. World axes; in
     glTF y is up, and it is turned to that. Raises InputError for another name and where it cannot be written."""
+    import trimesh
+
     suffix = mesh_suffix(path)
     if suffix == ".glb":
         vertices = np.stack([vertices[:, 0], vertices[:, 2], -vertices[:, 1]], axis=1)

@@ -12,10 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError, WorkError
@@ -35,6 +34,9 @@ from spacesim.data.integrity.whole import is_whole
 from spacesim.data.mesh import check_points, load_trimesh
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
 from spacesim.data.transforms import dataset_of, read_dataset
+
+if TYPE_CHECKING:
+    import trimesh
 
 __all__ = [
     "SHADOW_ATTACHED",
@@ -184,7 +186,7 @@ class DatasetWriter(FrameWriter):
         test: Sequence[tuple[str, Camera, Sun]],
         points: np.ndarray,
         colors: np.ndarray,
-        mesh: trimesh.Trimesh,
+        mesh: "trimesh.Trimesh",
         distortion: Sequence[float] = (),
         overview: Callable[[Dataset], None] | None = None,
     ) -> Dataset:

@@ -18,7 +18,7 @@ import numpy as np
 
 from spacesim.data import density
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonDict, write_json
+from spacesim.data.files import JsonDict, remove_leftovers, write_json
 from spacesim.data.geometry import Array
 from spacesim.data.identity import frame_names, frames_digest
 from spacesim.data.records import Dataset, Frame
@@ -297,6 +297,7 @@ def _prepare(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
         for name in ("metrics.json", density.NAME):
             (out / name).unlink(missing_ok=True)
+        remove_leftovers(out)
     except OSError as error:
         raise InputError(f"{out}: expected a folder to write to ({error.strerror})") from None
 

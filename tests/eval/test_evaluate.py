@@ -141,6 +141,15 @@ def test_layout(make_run, dataset, tmp_path):
         assert {path.stem for path in folder.glob("*.png")} == names
 
 
+def test_what_a_killed_call_left_behind_goes(make_run, dataset, tmp_path):
+    left = tmp_path / "eval" / "frames" / "test_00000" / ".0123.part"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"half a picture")
+    evaluate(make_run(shifted), dataset, tmp_path / "eval")
+    assert left.parent.is_dir()
+    assert not left.exists()
+
+
 def test_same_run_same_bytes(make_run, dataset, tmp_path):
     def written():
         metrics = evaluate(make_run(shifted), dataset, tmp_path / "eval")

@@ -1,8 +1,6 @@
 """Where Gaussians start: on a mesh, at points, or at random."""
 
 import numpy as np
-import trimesh
-from scipy.spatial import cKDTree
 
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
@@ -64,6 +62,8 @@ def initial_gaussians(
 def surface_normals(means: np.ndarray) -> np.ndarray:
     """[N, 3] unit normals of the surface on which points [N, 3] lie, of either sign: the direction in which the
     `NEIGHBOURS` nearest points spread least (Hoppe et al. 1992)."""
+    from scipy.spatial import cKDTree  # a third of a second
+
     count = min(NEIGHBOURS, len(means))
     near = means[cKDTree(means).query(means, k=count)[1].reshape(len(means), count)]
     centred = near - near.mean(axis=1, keepdims=True)
@@ -73,6 +73,8 @@ def surface_normals(means: np.ndarray) -> np.ndarray:
 def spacing(means: np.ndarray) -> np.ndarray:
     """[N] metres: the mean distance of each of points [N, 3] to its three nearest neighbours, 1e-6 at least; 0.01 of a
     single one (Kerbl et al. 2023)."""
+    from scipy.spatial import cKDTree
+
     count = len(means)
     neighbours = min(4, count)
     if neighbours < 2:
@@ -156,6 +158,8 @@ def _from_points(dataset: Dataset, count: int, rng: np.random.Generator) -> tupl
 def _from_mesh(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     if dataset.mesh_path is None or not (dataset.root / dataset.mesh_path).exists():
         raise InputError(f"{dataset.root}: init mesh expects a mesh.ply, found none")
+    import trimesh
+
     mesh = trimesh.Trimesh(*read_mesh(dataset.root / dataset.mesh_path), process=False)
     points, _ = trimesh.sample.sample_surface(mesh, count, seed=rng)
     return np.asarray(points), np.full((count, 3), 0.5)

@@ -9,7 +9,6 @@ from typing import ClassVar
 
 import drjit as dr
 import numpy as np
-from scipy.special import comb
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Bool, Float, UInt64
@@ -50,6 +49,8 @@ def compute_relocation(opacity: np.ndarray, scales: np.ndarray, copies: np.ndarr
     o' = 1 - (1 - o)^(1/n), s' = s o / sum_{i=1}^n sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1).
 
     The sum over i is C(n, k+1): hockey sticks of Pascal's triangle."""
+    from scipy.special import comb
+
     copies = np.minimum(copies, MAX_COPIES)
     opacity = np.minimum(np.asarray(opacity, np.float64), 1 - 1e-6)
     each = -np.expm1(np.log1p(-opacity) / copies)
