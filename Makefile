@@ -11,7 +11,7 @@ demo: .venv/base.done
 	$(BIN)/spacesim demo --out out/demo
 
 test: export PYTHONDONTWRITEBYTECODE = # byte code is kept: tests start the program a hundred times
-test: lint
+test: .venv/test.done
 	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 lint: .venv/test.done

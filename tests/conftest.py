@@ -24,6 +24,7 @@ LONGEST = (
     "test_doc_commands",
     "test_workers",
     "test_picture_suns",
+    "test_lint",
     "test_examples",
     "test_cli",
 )
