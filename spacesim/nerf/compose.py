@@ -60,7 +60,7 @@ def draw_chunk(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, n
 def find_crossing(fields: PlacedFields, first: UInt32, width: UInt32, count: int) -> UInt32:
     """[R] 1 where the ray through a pixel, number `first` and the following, crosses what a model fills."""
     pixel = dr.arange(ad.UInt32, count) + first
-    result: Any = dr.zeros(ad.UInt32, count)
+    result = dr.zeros(ad.UInt32, count)
     for number, model in zip(fields.which, fields.models, strict=True):
         _, crosses = fields.networks[number].occupancy.clip(model_rays(model, pixel, width), fields.filled[number])
         result |= dr.select(crosses, ad.UInt32(1), ad.UInt32(0))

@@ -53,8 +53,8 @@ def merge(models: Sequence[tuple[Samples, int]], rays: int) -> tuple[Merged, int
     ray = index // segments
     low, high = dr.gather(ad.Float, boundaries, index + ray), dr.gather(ad.Float, boundaries, index + ray + 1)
     middle = 0.5 * (low + high)
-    density: Any = ad.Float(0)
-    color: Any = [ad.Float(0)] * 3
+    density = ad.Float(0)
+    color = [ad.Float(0)] * 3
     densities, intervals = [], []
     for own, (samples, count) in zip(edges, models, strict=True):
         passed: Any = count_below(own, ray * (count + 1), count + 1, middle, equal=True)
@@ -67,7 +67,7 @@ def merge(models: Sequence[tuple[Samples, int]], rays: int) -> tuple[Merged, int
         ]
         densities.append(there)
         intervals.append(interval)
-    share = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-30)), 0)
+    share: Any = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-30)), 0)
     return Merged(low, high, densities, density, [c * share for c in color], intervals), segments
 
 
@@ -197,10 +197,10 @@ def _visibilities(
             result.append(None)
             continue
         t = surface(own, fields.networks[fields.which[k]].config.samples)
-        seen: Any = dr.full(ad.Float, 1, count)
+        seen = dr.full(ad.Float, 1, count)
         for caster in shading.casters[k]:
             number, model, rays = fields.which[caster], fields.models[caster], rays_of[caster]
-            point: Any = dr.fma(rays.direction, t / model.unit, rays.origin)
+            point = dr.fma(rays.direction, t / model.unit, rays.origin)
             towards = ad.Array3f([dr.gather(ad.Float, shading.towards[caster], ad.UInt32(i)) for i in range(3)])
             field = fields.networks[number]
             seen *= transmittance(
@@ -229,7 +229,7 @@ def surface(samples: Samples, count: int) -> Float:
     dr.eval(made.weights)
     passed = dr.block_prefix_sum(made.weights, count, exclusive=False)
     half = 0.5 * spread(sum_rays(made.weights, count), count)
-    before: Any = sum_rays(dr.select(passed < half, ad.UInt32(1), ad.UInt32(0)), count)
+    before = sum_rays(dr.select(passed < half, ad.UInt32(1), ad.UInt32(0)), count)
     ray = dr.arange(ad.UInt32, dr.width(before))
     place = ray * count + dr.minimum(before, count - 1)
     low, high, weight, until, wanted = (

@@ -50,11 +50,11 @@ class Occupancy:
         step = 0.5 / n
         first, last = ad.Float(dr.inf), ad.Float(-dr.inf)
         count = dr.maximum(dr.ceil((rays.far - rays.near) / step), 0)
-        k: Any = dr.zeros(ad.Float, dr.width(rays.near))
+        k = dr.zeros(ad.Float, dr.width(rays.near))
 
         def look(k: Any, first: Any, last: Any) -> Any:
             t = rays.near + (k + 0.5) * step
-            place: Any = dr.fma(rays.direction, t, rays.origin) * n
+            place = dr.fma(rays.direction, t, rays.origin) * n
             cell = ad.Array3u(dr.clip(place, 0, n - 1))
             hit = dr.gather(ad.Float, filled, (cell.z * n + cell.y) * n + cell.x) > 0
             first = dr.select(hit, dr.minimum(first, t), first)

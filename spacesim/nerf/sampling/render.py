@@ -57,7 +57,7 @@ def expected_depth(weights: Float, middles: Float, samples: int) -> Float:
 def median_depth(made: Weights, low: Float, high: Float, samples: int) -> Float:
     """[R] t at which half of the light is gone, exact where densities are constant in intervals; 0 where more than
     half gets through. low, high: [R S] t"""
-    passed: Any = sum_rays(dr.select(made.behind > 0.5, ad.UInt32(1), ad.UInt32(0)), samples)
+    passed = sum_rays(dr.select(made.behind > 0.5, ad.UInt32(1), ad.UInt32(0)), samples)
     found = passed < samples
     place: UInt32 = dr.arange(ad.UInt32, dr.width(passed)) * samples + dr.minimum(passed, samples - 1)
     first, last, tau = (dr.gather(ad.Float, value, place) for value in (low, high, made.tau))

@@ -11,7 +11,7 @@ import numpy as np
 
 from spacesim.data import toml
 from spacesim.data.errors import InputError
-from spacesim.data.files import write_bytes
+from spacesim.data.files import JsonDict, write_bytes
 from spacesim.data.geometry import OPENCV_FROM_OPENGL, Array, look_at
 from spacesim.data.records import Camera, Sun, check_size
 from spacesim.data.structure import Rules, did_you_mean, structure
@@ -51,7 +51,7 @@ class PoseEntry:
 
     def pose(self, base: Pose) -> Pose:
         """`base` with what is said. Raises InputError that begins with the key."""
-        rotation: Any = base.quaternion if self.rotation_wxyz is None else self.rotation_wxyz
+        rotation = base.quaternion if self.rotation_wxyz is None else np.array(self.rotation_wxyz)
         if self.axis is not None and self.angle_deg is not None:
             rotation = rotation_about(self.axis, self.angle_deg)
         position = base.translation if self.position is None else self.position
@@ -244,7 +244,7 @@ def save_scene(path: Path, scene: PosedScene) -> None:
     """Write a scene as a TOML file from which `load_scene` makes the same one: numbers are written in full, so pictures
     are the same to the bit. Runs are named relative to the file where they lie beside or below its folder."""
     path = Path(path)
-    values: dict[str, Any] = {}
+    values: JsonDict = {}
     if scene.composition.config.shadows != ComposeConfig.shadows:
         values["shadows"] = scene.composition.config.shadows
     if scene.frames != 1 or scene.keyframes or scene.orbit:
@@ -376,7 +376,7 @@ def _relative(run: Path, folder: Path) -> str:
     return os.path.relpath(there, here) if near_by else str(there)
 
 
-def _pose_values(pose: Pose) -> dict[str, Any]:
+def _pose_values(pose: Pose) -> JsonDict:
     return {
         "position": pose.translation.tolist(),
         "rotation_wxyz": pose.quaternion.tolist(),
@@ -384,15 +384,15 @@ def _pose_values(pose: Pose) -> dict[str, Any]:
     }
 
 
-def _sun_values(sun: Sun) -> dict[str, Any]:
+def _sun_values(sun: Sun) -> JsonDict:
     azimuth, elevation = (round(angle, 9) for angle in sun.angles)  # as they were typed, where that means the same
     if np.array_equal(Sun.from_angles(azimuth, elevation).direction, sun.direction):
         return {"azimuth_deg": azimuth, "elevation_deg": elevation}
     return {"direction": sun.direction.tolist()}
 
 
-def _view_values(view: CameraView) -> dict[str, Any]:
-    values: dict[str, Any] = {"transform_matrix": (view.world_from_camera @ OPENCV_FROM_OPENGL).tolist()}
+def _view_values(view: CameraView) -> JsonDict:
+    values: JsonDict = {"transform_matrix": (view.world_from_camera @ OPENCV_FROM_OPENGL).tolist()}
     position = view.world_from_camera[:3, 3]
     if view.target is not None and np.array_equal(look_at(position, view.target, view.up), view.world_from_camera):
         values = {"position": position.tolist(), "look_at": view.target.tolist()}
@@ -401,8 +401,8 @@ def _view_values(view: CameraView) -> dict[str, Any]:
     return values | ({} if view.focal is None else {"focal": [float(length) for length in view.focal]})
 
 
-def _camera_values(camera: Camera, orbit: Orbit | None) -> dict[str, Any]:
-    values: dict[str, Any] = {
+def _camera_values(camera: Camera, orbit: Orbit | None) -> JsonDict:
+    values: JsonDict = {
         "resolution": [camera.width, camera.height],
         "focal": [float(camera.fx), float(camera.fy)],
         "principal": [float(camera.cx), float(camera.cy)],
@@ -420,8 +420,8 @@ def _camera_values(camera: Camera, orbit: Orbit | None) -> dict[str, Any]:
     }
 
 
-def _keyframe_values(key: Keyframe) -> dict[str, Any]:
-    values: dict[str, Any] = {"time": float(key.time)}
+def _keyframe_values(key: Keyframe) -> JsonDict:
+    values: JsonDict = {"time": float(key.time)}
     if key.sun is not None:
         values["sun"] = _sun_values(key.sun)
     if key.view is not None:

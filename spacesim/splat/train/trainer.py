@@ -17,6 +17,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
@@ -314,7 +315,7 @@ def _learned(light: LightModel | None) -> list[Float]:
     return [*light.weights, *light.embeddings] if light else []
 
 
-def _restore_state(names: Iterable[str], tensors: Mapping[str, np.ndarray], owner: str, count: int) -> dict[str, Any]:
+def _restore_state(names: Iterable[str], tensors: Mapping[str, np.ndarray], owner: str, count: int) -> JsonDict:
     """{name: Float [count]} of a checkpoint's statistics. Raises KeyError, or ValueError for another size."""
     state = {name: tensors[f"{owner}.{name}"] for name in names}
     for name, values in state.items():
