@@ -264,7 +264,7 @@ def _segments(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, no
     are asked for, the share of each model."""
     seen = partition(fields, pixel, width, count, normals)
     merged, index = seen.merged, dr.arange(ad.UInt32, count * fields.segments) // fields.segments
-    across: Any = dr.gather(ad.Float, seen.across, index)
+    across = dr.gather(ad.Float, seen.across, index)
     lit = dr.full(ad.Float, 1, count * fields.segments) if seen.visibility is None else seen.visibility
     features = [*merged.color, lit, *(seen.slopes if seen.slopes is not None else []), *seen.shares]
     return Segments(merged.low * across, merged.high * across, merged.density / across, features)
