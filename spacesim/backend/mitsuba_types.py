@@ -6,7 +6,7 @@ variant late (`backend.mitsuba`). Its numbers, `Float`, `UInt32` and `Bool`, are
 (`backend.arrays`).
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
     from drjit.auto.ad import Array2f as Point2f
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
         DirectionSample3f,
         Interaction3f,
         Mesh,
-        RayDifferential3f,
         Scene,
         ShapePtr,
     )
 
-    SurfaceInteraction3f = Any
+    RayDifferential3f: TypeAlias = Any
+    SurfaceInteraction3f: TypeAlias = Any
 else:
     BSDF = Color3f = DirectionSample3f = Interaction3f = Mesh = Point2f = Point3f = RayDifferential3f = Any
     Scene = ShapePtr = SurfaceInteraction3f = Vector3f = Any

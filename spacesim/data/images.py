@@ -276,7 +276,12 @@ class Undistortion(Resampling):
         super().__init__(columns, rows, inside)
 
 
-def distort_points(x: Any, y: Any, distortion: Sequence[Any]) -> tuple[Any, Any]:
+Coordinate = Any  #: numbers, or arrays of numpy or of Dr.Jit, of one shape
+
+
+def distort_points(
+    x: Coordinate, y: Coordinate, distortion: Sequence[Coordinate] | Sequence[float]
+) -> tuple[Coordinate, Coordinate]:
     """Where the lens images the direction (x, y, 1), on the plane at depth 1: any arrays, of numpy or of Dr.Jit.
 
     distortion: k1, k2, p1, p2, k3 of the Brown-Conrady model (D. C. Brown, "Close-range camera calibration",
@@ -288,7 +293,9 @@ def distort_points(x: Any, y: Any, distortion: Sequence[Any]) -> tuple[Any, Any]
     return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
 
-def undistort_points(u: Any, v: Any, distortion: Sequence[Any], steps: int = 8) -> tuple[Any, Any]:
+def undistort_points(
+    u: Coordinate, v: Coordinate, distortion: Sequence[Coordinate] | Sequence[float], steps: int = 8
+) -> tuple[Coordinate, Coordinate]:
     """The direction (x, y, 1) that the lens images at (u, v): the inverse of `distort_points`, by Newton's method.
 
     From (u, v) it goes straight to the solution, also near a fold: along a radius the map is concave for barrel

@@ -4,12 +4,12 @@ tau is density times length of an interval. Sums along rays are made in a fixed 
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar
 
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.arrays import Array3f, Float, UInt32
 
 LN2 = 0.6931471805599453
 
@@ -37,12 +37,15 @@ def weights_adjoint(made: Weights, gradient: Float, samples: int) -> Float:
     return made.behind * gradient - later
 
 
-def sum_rays(values: Any, samples: int) -> Any:
+SumT = TypeVar("SumT", Float, UInt32, Array3f)  #: the same type in and out
+
+
+def sum_rays(values: SumT, samples: int) -> SumT:
     """[R] sums over the intervals of each ray, of an array [R S] or nested ones."""
     return dr.block_reduce(dr.ReduceOp.Add, values, samples, mode="evaluated")
 
 
-def spread(values: Any, samples: int) -> Any:
+def spread(values: SumT, samples: int) -> SumT:
     """[R S] a ray's value for each of its intervals."""
     size = dr.width(values) * samples
     return dr.gather(type(values), values, dr.arange(ad.UInt32, size) // samples)

@@ -15,7 +15,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -164,7 +163,7 @@ def _describe_frame(frame: SceneFrame, exposure: float | None) -> dict[str, Json
         ],
     }
     composition = frame.composition
-    made_by: list[Any] = [__version__, backend.select(), composition.config.shadows, composition.contents]
+    made_by: list[object] = [__version__, backend.select(), composition.config.shadows, composition.contents]
     if exposure is not None:
         made_by.append(exposure)
     text = json.dumps([values, made_by], sort_keys=True)

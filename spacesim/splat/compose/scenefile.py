@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -212,6 +212,9 @@ class SceneEntry:
         ComposeConfig(self.shadows)
 
 
+T = TypeVar("T")
+
+
 def load_scene(
     path: str | Path, load: Callable[[Path], Any] | None = None, compose: Callable[..., Any] = Composition
 ) -> PosedScene:
@@ -300,8 +303,7 @@ def _camera(entry: CameraEntry, folder: Path, document: toml.Document) -> Camera
         if not 0 <= entry.frame < len(frames):
             label = document.label(("camera", "frame"))
             raise InputError(f"{label}: expected 0 to {len(frames) - 1}, found {entry.frame}")
-        camera: Camera = frames[entry.frame].camera
-        return camera
+        return frames[entry.frame].camera
     width, height = entry.resolution or RESOLUTION
     view = entry.view(width) or (
         entry.orbit.view(0) if entry.orbit else CameraView(look_at((0.0, -5.0, 2.0), (0, 0, 0)))
@@ -312,7 +314,7 @@ def _camera(entry: CameraEntry, folder: Path, document: toml.Document) -> Camera
     return Camera(view.world_from_camera, width, height, fx, fy, cx, cy)
 
 
-def _read_entry(document: toml.Document, key: str, read: Any) -> Any:
+def _read_entry(document: toml.Document, key: str, read: Callable[[], T]) -> T:
     try:
         return read()
     except InputError as error:

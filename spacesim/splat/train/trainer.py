@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -86,7 +85,7 @@ class Trainer(TrainingLoop):
         """At this iteration."""
         return self.gaussians.count
 
-    def step(self) -> Any:
+    def step(self) -> Float:
         """One update from one view or several, densification if it is time. Returns the mean loss, Float of width 1."""
         config, index, count = self.config, self.iteration, self.config.views_per_step
         degree = min(config.sh_degree, index // config.sh_every)

@@ -4,7 +4,6 @@ They share no code with the kernels: covariances are matrices, windows are measu
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -149,7 +148,7 @@ def _variance(picture: ReferenceOutput, share: Array, receiver: float, softness:
     return float((1 - passes) * covered / (4 * config.radius**2))
 
 
-def _shadowed(gap: Any, softness: float) -> Any:
+def _shadowed(gap: Array, softness: float) -> Array:
     return 1 / (1 + np.exp(np.clip(gap / softness, -60, 60)))
 
 
