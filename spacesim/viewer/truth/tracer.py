@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from spacesim.data.images.tone import display_values
 from spacesim.data.records import Camera, Sun
-from spacesim.data.tone import display_values
 from spacesim.scenes.config import CameraConfig, SceneConfig
 from spacesim.scenes.generation.workers import connect_to_parent, select_backend
 from spacesim.viewer.drawing.paint import Planes

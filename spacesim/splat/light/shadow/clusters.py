@@ -66,7 +66,7 @@ def occlusion_in_clusters(
     if gaussians.count == 0:
         return dr.zeros(ad.Float, 0)
     camera, coverage = _fitted(_shapes(gaussians), light_rows(direction), size, crop)
-    occlusion = occlude(gaussians, camera)
+    occlusion: Any = occlude(gaussians, camera)
     if _is_one_camera_enough(coverage, least_scale):
         return occlusion
     axes = light_axes(direction)
@@ -74,14 +74,13 @@ def occlusion_in_clusters(
     camera_of = np.zeros(gaussians.count, np.uint32)
     for k, members in enumerate(receivers):
         camera_of[members] = k
-    chosen = upload(camera_of, ad.UInt32)
-    result: Any = None
+    chosen, occlusion = upload(camera_of, ad.UInt32), None
     for k, record in enumerate(cameras):
         seen = occlude(gaussians, Orthographic.of(record))
         served = chosen == dr.opaque(ad.UInt32, k)
-        result = seen if result is None else dr.select(served, seen, result)
-        dr.eval(result)
-    return result
+        occlusion = seen if occlusion is None else dr.select(served, seen, occlusion)
+        dr.eval(occlusion)
+    return occlusion
 
 
 @dataclass(frozen=True, eq=False)
