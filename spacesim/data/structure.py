@@ -97,13 +97,13 @@ def check_choices(record: object) -> None:
 
 
 @lru_cache
-def _hints(cls: Any) -> JsonDict:
+def _hints(cls: Any) -> dict[str, Any]:
     """Annotations of the fields of a dataclass."""
     hints = get_type_hints(cls)
     return {f.name: hints[f.name] for f in fields(cls)}
 
 
-def keys_of(cls: type, rules: Rules) -> JsonDict:
+def keys_of(cls: type, rules: Rules) -> dict[str, Any]:
     """The keys of a table that gives a `cls`, with their annotations."""
     hints = get_type_hints(cls)
     hidden = {name for owner, name in rules.hidden if issubclass(cls, owner)}
@@ -190,7 +190,7 @@ class _Reader:
             return self.table(hint, value, at)
         return self._plain(hint, value, at)
 
-    def _read_list(self, hint: object, value: object, at: Keys) -> tuple[Any, ...]:
+    def _read_list(self, hint: object, value: object, at: Keys) -> tuple[object, ...]:
         inner = get_args(hint)
         is_open, may_spread = inner[-1] is Ellipsis, at[-1] in self._rules.spread
         if may_spread and type(value) in (int, float):

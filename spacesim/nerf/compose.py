@@ -30,7 +30,7 @@ from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
 from spacesim.learning.prediction import ComposedPrediction, check_picture
 from spacesim.nerf.draw import Samples, chunks, shown, unit_normals
-from spacesim.nerf.partition import PlacedField, PlacedFields, Shading, model_rays, partition
+from spacesim.nerf.partition import Beside, PlacedField, PlacedFields, Shading, model_rays, partition
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.sampling.box import SceneBox
 from spacesim.nerf.sampling.rays import Rays, camera_rows
@@ -73,7 +73,7 @@ _draw_chunk, _find_crossing = recorded(draw_chunk, elements=None), recorded(find
 class Placed(Protocol):
     """A run and where it stands, as scene files have them."""
 
-    run: Any  #: a `NerfRun`
+    run: NerfRun
     pose: Any  #: see `splat.compose.pose.Pose`
     name: str
 
@@ -206,7 +206,7 @@ class Composition:
         seen = (_find_crossing(fields, dr.opaque(ad.UInt32, first), width, count) for first in range(0, size, count))
         return np.flatnonzero(np.concatenate([np.array(part, bool) for part in seen])[:size]).astype(np.uint32)
 
-    def placed(self, camera: Camera, sun: Sun | None, beside: Sequence[Any] = ()) -> PlacedFields:
+    def placed(self, camera: Camera, sun: Sun | None, beside: Sequence[Beside | None] = ()) -> PlacedFields:
         """The models as a camera sees them. beside: what else shades each, see `Shading`"""
         shading = None
         if sun is not None and (self._shades or beside):

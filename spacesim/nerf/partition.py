@@ -7,7 +7,7 @@ through to its surface, which in each pixel is where half of the light that it s
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 
@@ -91,6 +91,13 @@ class PlacedField:
     sun: Float | None  #: [3] towards it in the model's axes, of a field that is told
 
 
+class Beside(Protocol):
+    """What is no field and stands in the Sun's way."""
+
+    def visibility(self, points: Array3f) -> Float:
+        """[N] share of sunlight that comes through to points [3, N] of the world."""
+
+
 @dataclass
 class Shading:
     """What stands between the Sun and the models."""
@@ -98,9 +105,7 @@ class Shading:
     towards: list[Float]  #: [3] of each model: towards the Sun in its axes
     casters: tuple[tuple[int, ...], ...]  #: of each model, the others that may shade it
     camera: Float | None  #: [16] see `rays.camera_rows`, world, metres; None where there are only fields
-    #: of each model, what there is beside fields: its `visibility` is the share of sunlight, Float [N], that it lets
-    #: through to points [3, N] of the world; or None
-    beside: list[Any]
+    beside: list[Beside | None]  #: of each model, what there is beside fields
 
 
 @dataclass

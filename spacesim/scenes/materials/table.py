@@ -8,11 +8,11 @@ perfectly smooth, because a mirror never meets a directional Sun.
 import importlib
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -278,13 +278,13 @@ def customise_preset(
     return replace(row, source=source, **changes)
 
 
-def _check_unit(what: str, values: Any) -> None:
+def _check_unit(what: str, values: Iterable[float]) -> None:
     if not all(0.0 <= x <= 1.0 for x in values):
         found = ", ".join(f"{x:g}" for x in values)
         raise InputError(f"{what}: expected numbers from 0 to 1, found {found}")
 
 
-def _color(values: Any) -> Color:
+def _color(values: Iterable[float]) -> Color:
     red, green, blue = (float(x) for x in values)
     return red, green, blue
 

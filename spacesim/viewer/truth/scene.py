@@ -123,7 +123,7 @@ def _with_absolute_mesh(item: ObjectConfig, path: Path) -> ObjectConfig:
     return replace(item, mesh=str(place.resolve()))
 
 
-def _without_nulls(value: Any) -> Any:
+def _without_nulls(value: object) -> Any:
     if isinstance(value, Mapping):
         return {key: _without_nulls(item) for key, item in value.items() if item is not None}
     return [_without_nulls(item) for item in value] if isinstance(value, list) else value
