@@ -84,6 +84,11 @@ def test_folders_of_splat_know_nothing_of_what_is_built_on_them(folder, forbidde
     assert [(path.name, found) for path in paths if (found := offences(path, forbidden))] == []
 
 
+def test_references_are_for_tests_alone():
+    paths = [path for path in SOURCES if not name_of(path).startswith("splat.reference")]
+    assert [(name_of(path), found) for path in paths if (found := offences(path, ("spacesim.splat.reference",)))] == []
+
+
 def modules_imported(path: Path, known: set[str]) -> set[str]:
     """Modules of the package, "splat.run", that a file imports when it is imported itself."""
     found = set()

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -285,7 +286,7 @@ def find_unreadable_files(path: Path) -> list[str]:
         return [str(error)]
     problems = [f"{dataset.root / name}: expected an image file, found none" for name in dataset.missing]
 
-    def check(load: Callable[..., object], *arguments: object) -> None:
+    def check(load: Any, *arguments: Any) -> None:
         try:
             load(*arguments)
         except InputError as error:

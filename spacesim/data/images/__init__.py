@@ -3,7 +3,7 @@
 from spacesim.data.images.color import linear_from_srgb, luminance, srgb_from_linear
 from spacesim.data.images.exr import read_exr, walk_exr_header, write_exr
 from spacesim.data.images.lens import Resampling, Undistortion, distort_points, undistort_points
-from spacesim.data.images.load import load_image, read_labels, resample
+from spacesim.data.images.load import load_image, read_labels, resample, undistort
 from spacesim.data.images.png import has_alpha, image_size, read_png, write_png
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "read_png",
     "resample",
     "srgb_from_linear",
+    "undistort",
     "undistort_points",
     "walk_exr_header",
     "write_exr",

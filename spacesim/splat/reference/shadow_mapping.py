@@ -10,7 +10,7 @@ import numpy as np
 from spacesim.data.geometry import Array, rotation_from_quaternion
 from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
-from spacesim.splat.raster.reference import ReferenceOutput, render_reference
+from spacesim.splat.reference.rasterizer import ReferenceOutput, render_reference
 
 
 def camera_record(camera: Orthographic) -> OrthographicCamera:
