@@ -1,4 +1,4 @@
-"""The slow twin of `splat.light.shadow.splatting`: every receiver against every blocker on every pixel, in float64 numpy. For tests.
+"""The slow twin of shadow splatting: every receiver against every blocker on every pixel, in float64 numpy. For tests.
 
 It sorts nothing, walks no lists and ends no pixel early: the products of 4.8 are formed as the thesis writes them.
 """
