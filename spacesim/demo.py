@@ -7,11 +7,10 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.files import holds_files, read_json, write_json
+from spacesim.data.files import JsonDict, holds_files, read_json, write_json
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report.write import write_report
 from spacesim.progress import Reporter, report_training
@@ -36,7 +35,7 @@ DATA = {
 TRAINING = preset("demo", "shadow-map")
 
 
-def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Reporter]]) -> dict[str, Any]:
+def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Reporter]]) -> JsonDict:
     """Generate, train, evaluate and report into `out`; what an earlier call of the same demo has finished is kept.
 
     Returns {"report": path, "metrics": metrics.json, "seconds": {part: s}}. Raises InputError where `out` holds other

@@ -5,17 +5,17 @@ import importlib.metadata
 import platform
 import sys
 from collections.abc import Callable
-from typing import Any
 
 from spacesim import __version__, backend
+from spacesim.data.files import JsonDict
 
 _PACKAGES = ("mitsuba", "drjit", "numpy", "torch")
 _TITLES = {"python": "Python", "cuda": "CUDA", "llvm": "LLVM", "lpips": "LPIPS"}
 
-Finding = dict[str, Any]
+Finding = JsonDict
 
 
-def report() -> dict[str, Any]:
+def report() -> JsonDict:
     """Findings as JSON values.
 
     "versions": {package: version or null}; "backend": the one that runs by default, or null; and an entry
@@ -31,7 +31,7 @@ def report() -> dict[str, Any]:
     }
 
 
-def describe(report: dict[str, Any]) -> str:
+def describe(report: JsonDict) -> str:
     """Plain lines of a `report()`, the verdict last."""
     versions = [f"{name} {version}" for name, version in report["versions"].items() if version is not None]
     lines = [f"{'versions':<10}{', '.join(versions)}"]

@@ -3,12 +3,12 @@
 Which family a method is of is told by its name, and of a run by the method that its config.json names.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_json
+from spacesim.data.files import JsonMapping, read_json
 from spacesim.data.records import Dataset
 from spacesim.data.structure import did_you_mean
 from spacesim.nerf import config as nerf
@@ -46,7 +46,7 @@ def shortened(config: Config, iterations: int | None) -> Config:
     return nerf.shortened(config, iterations) if isinstance(config, NerfConfig) else splat.shortened(config, iterations)
 
 
-def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
+def with_settings(config: Config, settings: JsonMapping) -> Config:
     """`config` with fields set by their dotted names. Raises InputError for a name or a value that cannot be."""
     if isinstance(config, NerfConfig):
         return nerf.with_settings(config, settings)
@@ -110,5 +110,5 @@ def compose(models: Sequence[Any], config: Any = None, path: Path | None = None)
     from spacesim.splat.compose.scene import Composition as Splats
 
     fields = [isinstance(model.run, NerfRun) for model in models]
-    kind: Any = Fields if fields and all(fields) else Mixed if any(fields) else Splats
+    kind = Fields if fields and all(fields) else Mixed if any(fields) else Splats
     return kind(models, config or ComposeConfig(), path)

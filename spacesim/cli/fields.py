@@ -17,7 +17,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from spacesim.data.structure import alternatives, choices, kind_of
 from spacesim.splat.train.config import TrainConfig
 
-_WORDS: dict[Any, str] = {int: "whole number", float: "number", bool: "true or false", str: "text"}
+_WORDS: dict[object, str] = {int: "whole number", float: "number", bool: "true or false", str: "text"}
 
 
 @dataclass(frozen=True)

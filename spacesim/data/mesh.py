@@ -47,9 +47,7 @@ def load_trimesh(path: Path, kind: str | None = None) -> Any:
         force = None if kind == ".ply" else "mesh"
         options = {"skip_materials": True} if kind in (".ply", ".obj") else {}
         beside = MeshFolderResolver(path.parent)
-        loaded: Any = trimesh.load(
-            io.BytesIO(content), kind[1:], resolver=beside, force=force, process=False, **options
-        )
+        loaded = trimesh.load(io.BytesIO(content), kind[1:], resolver=beside, force=force, process=False, **options)
         if not isinstance(loaded, trimesh.Trimesh | trimesh.PointCloud):
             empty = not getattr(loaded, "geometry", True)
             raise InputError("there is nothing in it" if empty else f"found {type(loaded).__name__}")

@@ -1,14 +1,14 @@
 """What a dataset is made of: frozen records with units in their fields' docs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonMapping
 from spacesim.data.geometry import (
     OPENCV_FROM_OPENGL,
     Array,
@@ -184,7 +184,7 @@ class Dataset:
     test: tuple[Frame, ...]  #: for evaluation
     ply_file_path: str | None = None  #: points to start from
     mesh_path: str | None = None  #: the ground-truth mesh, world frame, metres
-    scene: Mapping[str, Any] = field(default_factory=dict)  #: scene.json, {} for data from elsewhere
+    scene: JsonMapping = field(default_factory=dict)  #: scene.json, {} for data from elsewhere
     #: images that transforms.json names and that are not there: their frames are left out
     missing: tuple[str, ...] = ()
 

@@ -10,7 +10,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import MAX_JSON_BYTES, read_json
+from spacesim.data.files import MAX_JSON_BYTES, JsonDict, JsonMapping, read_json
 from spacesim.data.toml import Document, Keys, dotted
 
 T = TypeVar("T")
@@ -30,7 +30,7 @@ class Rules:
     none: str | None = None  #: the word that stands for None, where annotations have it
 
 
-def structure(cls: type[T], document: Document, rules: Rules, defaults: Mapping[str, Any] | None = None) -> T:
+def structure(cls: type[T], document: Document, rules: Rules, defaults: JsonMapping | None = None) -> T:
     """The `cls` that `document` says; defaults: of keys of the outermost table.
 
     Raises InputError with file, line and key for a key that is not known, a value of a wrong type or an impossible one.
@@ -38,9 +38,7 @@ def structure(cls: type[T], document: Document, rules: Rules, defaults: Mapping[
     return _Reader(document, rules, cls).table(cls, document.values, (), defaults or {})
 
 
-def read_record(
-    path: Path, cls: type[T], rules: Rules | None = None, most: int = MAX_JSON_BYTES
-) -> tuple[T, dict[str, Any]]:
+def read_record(path: Path, cls: type[T], rules: Rules | None = None, most: int = MAX_JSON_BYTES) -> tuple[T, JsonDict]:
     """(the `cls` that a JSON file says, its values as they stand there). null is allowed where an annotation has None.
 
     Raises InputError where the file cannot be read, is no JSON object, or as `structure` does.
@@ -134,12 +132,12 @@ class _Reader:
         self._rules = rules
         self._root = root
 
-    def table(self, cls: Any, values: Any, at: Keys, defaults: Mapping[str, Any] | None = None) -> Any:
+    def table(self, cls: Any, values: Any, at: Keys, defaults: JsonMapping | None = None) -> Any:
         """The dataclass `cls`, or the one that `kind` chooses, from a table."""
         return self._read_record(cls, self._rules.kinds.get(cls, {}), values, at, defaults)
 
     def _read_record(
-        self, cls: Any, kinds: Mapping[str, type], values: Any, at: Keys, defaults: Mapping[str, Any] | None = None
+        self, cls: Any, kinds: Mapping[str, type], values: Any, at: Keys, defaults: JsonMapping | None = None
     ) -> Any:
         if not isinstance(values, Mapping):
             self._refuse(at, "a table", values)
@@ -192,7 +190,7 @@ class _Reader:
             return self.table(hint, value, at)
         return self._plain(hint, value, at)
 
-    def _read_list(self, hint: object, value: object, at: Keys) -> tuple[Any, ...]:
+    def _read_list(self, hint: object, value: object, at: Keys) -> tuple[object, ...]:
         inner = get_args(hint)
         is_open, may_spread = inner[-1] is Ellipsis, at[-1] in self._rules.spread
         if may_spread and type(value) in (int, float):
@@ -214,7 +212,7 @@ class _Reader:
             self._refuse(at, "text without a null character", value)
         return number
 
-    def _construct(self, cls: Any, settings: Mapping[str, Any], at: Keys) -> Any:
+    def _construct(self, cls: Any, settings: JsonMapping, at: Keys) -> Any:
         """`cls` with the fields `settings`; its own InputError, which begins with a field's name, gets file and
         line."""
         try:

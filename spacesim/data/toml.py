@@ -12,10 +12,9 @@ from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_bytes
+from spacesim.data.files import JsonMapping, read_bytes
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -33,7 +32,7 @@ class Document:
     """A TOML file."""
 
     name: str  #: of the file, for messages
-    values: Mapping[str, Any]
+    values: JsonMapping
     lines: Mapping[Keys, int]  #: of keys, tables and what is in lists, counted from 1
 
     def place(self, keys: Keys) -> str:
@@ -191,13 +190,13 @@ class _Scanner:
         self._at = match.end()
 
 
-def dump(values: Mapping[str, Any]) -> str:
+def dump(values: JsonMapping) -> str:
     """`values` as TOML: numbers, strings, booleans, lists, tables and lists of tables. Raises InputError for what TOML
     cannot say."""
     return "\n".join(_dump_lines(values, ())).strip("\n") + "\n"
 
 
-def _dump_lines(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
+def _dump_lines(table: JsonMapping, path: tuple[str, ...]) -> Iterator[str]:
     later = {key: value for key, value in table.items() if isinstance(value, Mapping) or _is_tables(value)}
     for key, value in table.items():
         if key not in later:

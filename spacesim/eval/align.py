@@ -7,10 +7,10 @@ video's frames were taken one after another.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -175,7 +175,10 @@ def _candidate_pairs(count: int) -> list[tuple[int, int]]:
     return [every[k] for k in np.random.default_rng(0).choice(len(every), PAIRS, replace=False)]
 
 
-def _pairs(own: Mapping[Any, Frame], truth: Mapping[Any, Frame]) -> list[Match]:
+K = TypeVar("K", bound=Hashable)
+
+
+def _pairs(own: Mapping[K, Frame], truth: Mapping[K, Frame]) -> list[Match]:
     return [(frame, truth[key]) for key, frame in own.items() if key in truth]
 
 

@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 
 from spacesim.data.images import srgb_from_linear
+from spacesim.data.images.tone import as_bytes
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT
-from spacesim.data.tone import as_bytes
 from spacesim.eval.metrics.image import Mask
 from spacesim.eval.metrics.shadow import KINDS
 from spacesim.learning.pictures import LIT, SHADOWED

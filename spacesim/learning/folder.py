@@ -154,7 +154,7 @@ def _check_resumable(out: Path, described: JsonDict, resume: bool, read_config: 
         raise InputError(f"{out}: was started with {key} {old!r}, expected the same to resume it, found {new!r}")
 
 
-def _first_difference(old: JsonDict, new: JsonDict, within: str = "") -> tuple[str, Any, Any] | None:
+def _first_difference(old: JsonDict, new: JsonDict, within: str = "") -> tuple[str, object, object] | None:
     """(key, old value, new value) of the first key of `new` that `old` has otherwise; "light.field.width" within
     others."""
     for key, value in new.items():

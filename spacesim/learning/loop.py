@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
+from spacesim.backend.arrays import Float
 from spacesim.data.errors import WorkError
 from spacesim.learning.folder import TrainingProgress
 
@@ -19,7 +20,7 @@ class TrainingLoop(ABC):
     history: list[dict[str, float]]  #: iteration and loss now and then, of Gaussians their number
 
     @abstractmethod
-    def step(self) -> Any:
+    def step(self) -> Float:
         """One update. Returns the loss, Float of width 1."""
 
     @property

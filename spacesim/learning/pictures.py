@@ -6,7 +6,7 @@ import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import write_exr, write_png
-from spacesim.data.tone import as_bytes
+from spacesim.data.images.tone import as_bytes
 from spacesim.learning.prediction import Prediction
 
 LIT, SHADOWED = (222, 222, 216), (58, 64, 82)  #: sRGB colours of visibility 1 and 0

@@ -9,14 +9,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import UInt32
+from spacesim.backend.arrays import Bool, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.records import Camera, Sun
@@ -30,6 +30,7 @@ from spacesim.nerf.run import NerfRun
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.compose.scene import COVERED, ComposeConfig, LitGaussians
 from spacesim.splat.compose.scene import Composition as Splats
+from spacesim.splat.light.shadow.mapping import SunView
 from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.output import RenderOutput, over_alpha
@@ -40,6 +41,9 @@ from spacesim.splat.raster.supersample import render_supersampled, upsampled_cam
 from spacesim.splat.raster.tiles import TileLists
 
 COMMON = 4  #: features that both have: colour, visibility
+
+
+T = TypeVar("T")
 
 
 class Composition:
@@ -112,7 +116,7 @@ class Composition:
         """Places on a side of each pixel of what is predicted: the most that a model was trained with."""
         return self._splats.supersample
 
-    def _in_order(self, of_fields: Sequence[Any], of_splats: Sequence[Any]) -> list[Any]:
+    def _in_order(self, of_fields: Sequence[T], of_splats: Sequence[T]) -> list[T]:
         both = dict(zip(self._of_fields, of_fields, strict=True)) | dict(zip(self._of_splats, of_splats, strict=True))
         return [both[k] for k in range(len(self.models))]
 
@@ -224,9 +228,9 @@ class Composition:
 class _SunViews:
     """`sun_views` of the last Sun and poses: a camera that moves leaves shadows as they are."""
 
-    kept: list[tuple[bytes, list[Any]]] = field(default_factory=list)
+    kept: list[tuple[bytes, list[SunView | None]]] = field(default_factory=list)
 
-    def of(self, splats: Splats, fields: Fields, lit: LitGaussians, sun: Sun) -> list[Any]:
+    def of(self, splats: Splats, fields: Fields, lit: LitGaussians, sun: Sun) -> list[SunView | None]:
         """One of each field."""
         key = b"".join([sun.direction.tobytes(), *(model.pose.key for model in (*splats.models, *fields.models))])
         if not self.kept or self.kept[0][0] != key:
@@ -235,7 +239,7 @@ class _SunViews:
 
 
 def _blend_splats(
-    lit: LitGaussians, camera: Pinhole, antialiased: Any, normals: bool, median: bool
+    lit: LitGaussians, camera: Pinhole, antialiased: Bool | bool, normals: bool, median: bool
 ) -> tuple[ListedSplats, np.ndarray]:
     """(the splats by tiles, planes [C, H W] of the picture without fields: transmittance, sum of depths, median depth,
     colour, visibility, normals where they are asked for, the share of each model)."""
@@ -264,7 +268,7 @@ def _segments(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, no
     are asked for, the share of each model."""
     seen = partition(fields, pixel, width, count, normals)
     merged, index = seen.merged, dr.arange(ad.UInt32, count * fields.segments) // fields.segments
-    across: Any = dr.gather(ad.Float, seen.across, index)
+    across = dr.gather(ad.Float, seen.across, index)
     lit = dr.full(ad.Float, 1, count * fields.segments) if seen.visibility is None else seen.visibility
     features = [*merged.color, lit, *(seen.slopes if seen.slopes is not None else []), *seen.shares]
     return Segments(merged.low * across, merged.high * across, merged.density / across, features)

@@ -3,7 +3,6 @@ centres, of Gaussians on fields by the depth test that runs without shadows of t
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -36,7 +35,7 @@ class FieldsBeside:
         return self.fields.sun_visibility(points, sun)
 
 
-def sun_views(casters: Gaussians, fields: Fields, sun: Sun) -> list[Any]:
+def sun_views(casters: Gaussians, fields: Fields, sun: Sun) -> "list[SunView | None]":
     """What the Sun sees of Gaussians, of each field over its box: `SunView`, or None where they cannot shade it."""
     axes, views = light_axes(sun.direction), []
     for corners in box_corners(fields):

@@ -90,7 +90,7 @@ def blend_segments(
     first = dr.arange(ad.UInt32, rays) * count
     sizes = common, splats.features - common, len(segments.features) - common
 
-    def goes_on(k: UInt32, end: UInt32, j: UInt32, _reached: Any, transmittance: Float, *_: Any) -> Bool:
+    def goes_on(k: UInt32, end: UInt32, j: UInt32, _reached: Float, transmittance: Float, *_: object) -> Bool:
         return ((k < end) & (transmittance > TRANSMITTANCE_MIN)) | (j < count)
 
     def take_next(

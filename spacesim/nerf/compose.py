@@ -30,7 +30,7 @@ from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
 from spacesim.learning.prediction import ComposedPrediction, check_picture
 from spacesim.nerf.draw import Samples, chunks, shown, unit_normals
-from spacesim.nerf.partition import PlacedField, PlacedFields, Shading, model_rays, partition
+from spacesim.nerf.partition import Beside, PlacedField, PlacedFields, Shading, model_rays, partition
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.sampling.box import SceneBox
 from spacesim.nerf.sampling.rays import Rays, camera_rows
@@ -60,7 +60,7 @@ def draw_chunk(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, n
 def find_crossing(fields: PlacedFields, first: UInt32, width: UInt32, count: int) -> UInt32:
     """[R] 1 where the ray through a pixel, number `first` and the following, crosses what a model fills."""
     pixel = dr.arange(ad.UInt32, count) + first
-    result: Any = dr.zeros(ad.UInt32, count)
+    result = dr.zeros(ad.UInt32, count)
     for number, model in zip(fields.which, fields.models, strict=True):
         _, crosses = fields.networks[number].occupancy.clip(model_rays(model, pixel, width), fields.filled[number])
         result |= dr.select(crosses, ad.UInt32(1), ad.UInt32(0))
@@ -73,7 +73,7 @@ _draw_chunk, _find_crossing = recorded(draw_chunk, elements=None), recorded(find
 class Placed(Protocol):
     """A run and where it stands, as scene files have them."""
 
-    run: Any  #: a `NerfRun`
+    run: NerfRun
     pose: Any  #: see `splat.compose.pose.Pose`
     name: str
 
@@ -206,7 +206,7 @@ class Composition:
         seen = (_find_crossing(fields, dr.opaque(ad.UInt32, first), width, count) for first in range(0, size, count))
         return np.flatnonzero(np.concatenate([np.array(part, bool) for part in seen])[:size]).astype(np.uint32)
 
-    def placed(self, camera: Camera, sun: Sun | None, beside: Sequence[Any] = ()) -> PlacedFields:
+    def placed(self, camera: Camera, sun: Sun | None, beside: Sequence[Beside | None] = ()) -> PlacedFields:
         """The models as a camera sees them. beside: what else shades each, see `Shading`"""
         shading = None
         if sun is not None and (self._shades or beside):

@@ -1,12 +1,12 @@
 """How a radiance field is trained: one frozen record, its presets (assets/presets/nerf.toml), settings by name."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from spacesim.data.errors import InputError, check_ranges
+from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.structure import Rules, check_choices, did_you_mean, plain, structure
 from spacesim.data.toml import Document, read_document
 
@@ -132,13 +132,13 @@ class NerfConfig:
         """Of a ray towards the Sun: of a field without shadows of its own as many as of any ray."""
         return self.shadow.samples if self.casts_shadows else self.samples
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonDict:
         """Plain values for config.json."""
-        values: dict[str, Any] = plain(self)
+        values: JsonDict = plain(self)
         return values
 
     @staticmethod
-    def from_json(values: Mapping[str, Any], name: str = "config.json") -> "NerfConfig":
+    def from_json(values: JsonMapping, name: str = "config.json") -> "NerfConfig":
         """The inverse of `to_json`; the key data, which a run's config.json has besides, is passed over. Raises
         InputError for a key that is not known and for a value that cannot be."""
         settings = {key: value for key, value in values.items() if key != "data"}
@@ -156,7 +156,7 @@ def preset(name: str, method: str = "nerf") -> NerfConfig:
 
 
 @cache
-def _sections() -> Mapping[str, Any]:
+def _sections() -> JsonMapping:
     return read_document(ASSET).values
 
 
@@ -166,7 +166,7 @@ def shortened(config: NerfConfig, iterations: int) -> NerfConfig:
     return replace(config, iterations=iterations, warm_up=round(share * config.warm_up))
 
 
-def with_settings(config: NerfConfig, settings: Mapping[str, Any]) -> NerfConfig:
+def with_settings(config: NerfConfig, settings: JsonMapping) -> NerfConfig:
     """`config` with fields set by their dotted names: {"grid.levels": 12}. Fewer `iterations` shorten the warm-up.
     Raises InputError "grid.levels: expected ..., found ..." for a name or a value that cannot be."""
     iterations = settings.get("iterations")

@@ -7,7 +7,7 @@ through to its surface, which in each pixel is where half of the light that it s
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 
@@ -53,8 +53,8 @@ def merge(models: Sequence[tuple[Samples, int]], rays: int) -> tuple[Merged, int
     ray = index // segments
     low, high = dr.gather(ad.Float, boundaries, index + ray), dr.gather(ad.Float, boundaries, index + ray + 1)
     middle = 0.5 * (low + high)
-    density: Any = ad.Float(0)
-    color: Any = [ad.Float(0)] * 3
+    density = ad.Float(0)
+    color = [ad.Float(0)] * 3
     densities, intervals = [], []
     for own, (samples, count) in zip(edges, models, strict=True):
         passed: Any = count_below(own, ray * (count + 1), count + 1, middle, equal=True)
@@ -67,7 +67,7 @@ def merge(models: Sequence[tuple[Samples, int]], rays: int) -> tuple[Merged, int
         ]
         densities.append(there)
         intervals.append(interval)
-    share = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-30)), 0)
+    share: Any = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-30)), 0)
     return Merged(low, high, densities, density, [c * share for c in color], intervals), segments
 
 
@@ -91,6 +91,13 @@ class PlacedField:
     sun: Float | None  #: [3] towards it in the model's axes, of a field that is told
 
 
+class Beside(Protocol):
+    """What is no field and stands in the Sun's way."""
+
+    def visibility(self, points: Array3f) -> Float:
+        """[N] share of sunlight that comes through to points [3, N] of the world."""
+
+
 @dataclass
 class Shading:
     """What stands between the Sun and the models."""
@@ -98,9 +105,7 @@ class Shading:
     towards: list[Float]  #: [3] of each model: towards the Sun in its axes
     casters: tuple[tuple[int, ...], ...]  #: of each model, the others that may shade it
     camera: Float | None  #: [16] see `rays.camera_rows`, world, metres; None where there are only fields
-    #: of each model, what there is beside fields: its `visibility` is the share of sunlight, Float [N], that it lets
-    #: through to points [3, N] of the world; or None
-    beside: list[Any]
+    beside: list[Beside | None]  #: of each model, what there is beside fields
 
 
 @dataclass
@@ -197,10 +202,10 @@ def _visibilities(
             result.append(None)
             continue
         t = surface(own, fields.networks[fields.which[k]].config.samples)
-        seen: Any = dr.full(ad.Float, 1, count)
+        seen = dr.full(ad.Float, 1, count)
         for caster in shading.casters[k]:
             number, model, rays = fields.which[caster], fields.models[caster], rays_of[caster]
-            point: Any = dr.fma(rays.direction, t / model.unit, rays.origin)
+            point = dr.fma(rays.direction, t / model.unit, rays.origin)
             towards = ad.Array3f([dr.gather(ad.Float, shading.towards[caster], ad.UInt32(i)) for i in range(3)])
             field = fields.networks[number]
             seen *= transmittance(
@@ -229,7 +234,7 @@ def surface(samples: Samples, count: int) -> Float:
     dr.eval(made.weights)
     passed = dr.block_prefix_sum(made.weights, count, exclusive=False)
     half = 0.5 * spread(sum_rays(made.weights, count), count)
-    before: Any = sum_rays(dr.select(passed < half, ad.UInt32(1), ad.UInt32(0)), count)
+    before = sum_rays(dr.select(passed < half, ad.UInt32(1), ad.UInt32(0)), count)
     ray = dr.arange(ad.UInt32, dr.width(before))
     place = ray * count + dr.minimum(before, count - 1)
     low, high, weight, until, wanted = (

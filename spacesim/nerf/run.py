@@ -9,7 +9,6 @@ RUN/training.json      history, time, backend, versions
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -19,6 +18,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import read_record
 from spacesim.learning.folder import finished_model, read_described
@@ -52,8 +52,8 @@ class NerfRun:
     """A trained radiance field with its history; a `Predictor` without Gaussians."""
 
     path: Path  #: the folder
-    config: dict[str, Any]  #: what config.json says
-    training: dict[str, Any]  #: what training.json says
+    config: JsonDict  #: what config.json says
+    training: JsonDict  #: what training.json says
     networks: Networks  #: the field and its proposals, without their numbers
     parameters: Parameters  #: their numbers
     filled: Float  #: see `Occupancy.filled`
@@ -136,7 +136,7 @@ def load_run(path: str | Path) -> NerfRun:
     return NerfRun(path, config, training, networks, parameters, filled, box, model_path.stat().st_size)
 
 
-def read_config(path: Path) -> tuple[NerfConfig, dict[str, Any]]:
+def read_config(path: Path) -> tuple[NerfConfig, JsonDict]:
     """(how a run is trained, what on: as `TrainingData`) by its config.json. Raises InputError where it is broken."""
     values, data = read_described(path)
     return NerfConfig.from_json(values, str(path)), data

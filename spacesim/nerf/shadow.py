@@ -85,7 +85,7 @@ def mix(color: list[Float], visibility: Float) -> list[Float]:
 def _whole(edges: Float, count: int, samples: int) -> Float:
     """Edges [N (S + 1)] with the first at 0 and the last at 1: `resample` leaves out half a sample's share at both
     ends, which a picture need not see but light has to come through."""
-    k: Any = dr.arange(ad.UInt32, count * (samples + 1)) % (samples + 1)
+    k = dr.arange(ad.UInt32, count * (samples + 1)) % (samples + 1)
     covering: Any = dr.select(k == 0, 0, dr.select(k == samples, 1, edges))
     return covering
 

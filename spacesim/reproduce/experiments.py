@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 from spacesim import methods
 from spacesim.data.errors import InputError
@@ -212,7 +212,7 @@ def _with_settings(size: Size, config: methods.Config) -> methods.Config:
 
 def _has(config: methods.Config, key: str) -> bool:
     """Whether there is the field of a dotted name: `vanilla` has no light, and each strategy has its own."""
-    record: Any = config
+    record = config
     for name in key.split("."):
         if not hasattr(record, name):
             return False

@@ -4,7 +4,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,7 +33,7 @@ def time_frames(run: "Run | NerfRun", dataset: Dataset, tell: Callable[[int, int
     "backend"}: of pictures as `predict` returns them, in the computer's memory."""
     frames = views(dataset)
     models = [PlacedRun(run, Pose(translation=place)) for place in places(dataset)]  # type: ignore[arg-type]
-    compose: Any = Fields if isinstance(run, NerfRun) else Composition
+    compose = Fields if isinstance(run, NerfRun) else Composition
     medians = []
     for count in range(1, len(models) + 1):
         scene = compose(models[:count], ComposeConfig("none"))

@@ -13,10 +13,10 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonDict, read_json, write_json
 from spacesim.data.geometry import angles_from_direction
 from spacesim.data.images import write_png
+from spacesim.data.images.tone import as_bytes
 from spacesim.data.mesh import SignedDistance
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import load_truth, read_dataset
-from spacesim.data.tone import as_bytes
 from spacesim.eval import pictures
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.frame_metrics import frame_images

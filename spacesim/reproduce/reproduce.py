@@ -11,10 +11,9 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from spacesim import backend
 from spacesim.data.errors import InputError, WorkError, expect
@@ -145,7 +144,7 @@ def _here(out: Path, size: Size, left: Sequence[Work], total: int, reporting: Re
     for index, one in enumerate(left):
         number = total - len(left) + index + 1
 
-        def numbered(title: str, unit: str, number: int = number) -> Any:
+        def numbered(title: str, unit: str, number: int = number) -> AbstractContextManager[object]:
             return reporting(f"{number} of {total}, {title}", unit)
 
         perform(out, size, one, numbered)

@@ -214,7 +214,7 @@ def value_of(metrics: JsonMapping, table: Table, path: str, suns: str) -> tuple[
     if group in ("model", "geometry"):
         number = _model_value(metrics, name) if group == "model" else (metrics["geometry"] or {}).get(name)
         return None if number is None else (float(number), None)
-    where: Any = metrics.get(suns) if suns else metrics
+    where = metrics.get(suns) if suns else metrics
     if table.scene == "pair":
         where = next((one for one in metrics["objects"] or [] if one["name"] == "second"), None)
     found = ((where or {}).get(group) or {}).get(name)

@@ -6,13 +6,16 @@ on the pixels next to these, many directions are; as long as that finds more of 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
+from spacesim.backend.arrays import Bool, Float, UInt32
 from spacesim.backend.upload import upload
+from spacesim.data.files import JsonMapping
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_NONE, SHADOW_SELF_CAST
 from spacesim.scenes.cameras.kernel_camera import RADIUS, KernelCamera, record_on_cuda
@@ -48,19 +51,19 @@ class Labeller:
         return labels
 
     def _trace_centres(
-        self, scene: Any, parts: "PartTable", view: KernelCamera, sun: Any, disc: Disc
-    ) -> tuple[Any, ...]:
+        self, scene: mt.Scene, parts: "PartTable", view: KernelCamera, sun: mt.Vector3f, disc: Disc
+    ) -> tuple[Float, UInt32, "_Points"]:
         """(labels that are numbers, one after another; labels that are bytes, packed; surface points)."""
         mi = backend.mitsuba()
         pixel = dr.arange(mi.UInt32, view.width * view.height)
         ray, before = view.rays(pixel, mi.Point2f(0.5), self._distortion)
-        surface = scene.ray_intersect(ray)
+        surface: mt.SurfaceInteraction3f = scene.ray_intersect(ray)
         hit = surface.is_valid()
         normal = dr.select(dr.dot(surface.n, ray.d) > 0, -surface.n, surface.n)
         cosine = dr.select(hit, dr.dot(normal, sun), 0.0)
         object_id, part_id = parts.ids(surface.shape, hit)
         distance = dr.select(hit, (before + surface.t) * view.metre, 0.0)
-        numbers: list[Any] = [
+        numbers: list[Float | mt.Vector3f] = [
             distance * dr.dot(ray.d, view.forward),
             distance,
             cosine,
@@ -70,8 +73,8 @@ class Labeller:
         points = _Points(surface.p + OFFSET * normal, normal, object_id)
         dr.eval(numbers, part_id, points)  # in one kernel
         faces_sun = cosine > 0
-        visibility, shadow = _sun_visibility(scene, parts, disc, points, faces_sun)
-        shadow = dr.select(hit, dr.select(faces_sun, shadow, SHADOW_ATTACHED), SHADOW_NONE)
+        visibility, classes = _sun_visibility(scene, parts, disc, points, faces_sun)
+        shadow: Any = dr.select(hit, dr.select(faces_sun, classes, SHADOW_ATTACHED), SHADOW_NONE)
         flat: list[Any] = [dr.ravel(values) for values in (*numbers, visibility)]
         return dr.concat(flat), object_id | (part_id << 8) | (shadow << 16), points
 
@@ -105,8 +108,15 @@ class Labeller:
         return visibility, shadow.astype(np.uint8)
 
     def _trace_penumbrae(
-        self, scene: Any, parts: "PartTable", disc: Disc, points: "_Points", indices: Any, count: Any, capacity: int
-    ) -> Any:
+        self,
+        scene: mt.Scene,
+        parts: "PartTable",
+        disc: Disc,
+        points: "_Points",
+        indices: UInt32,
+        count: UInt32,
+        capacity: int,
+    ) -> Float:
         """Visibility, then shadow classes, of the points `indices` [capacity]; those from `count` on are not asked."""
         mi = backend.mitsuba()
         origin, normal = (
@@ -117,7 +127,9 @@ class Labeller:
         return dr.concat([visibility, mi.Float(shadow)])
 
 
-def _sun_visibility(scene: Any, parts: "PartTable", disc: Disc, points: "_Points", active: Any) -> tuple[Any, Any]:
+def _sun_visibility(
+    scene: mt.Scene, parts: "PartTable", disc: Disc, points: "_Points", active: Bool
+) -> tuple[Float, UInt32]:
     """(visibility, shadow classes), [N], of points; 0 and a cast shadow where not `active`."""
     mi = backend.mitsuba()
     free, hidden, shape = disc.seen(scene, points.origin, points.normal, active)
@@ -142,27 +154,26 @@ def _dilate(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 class _Points:
     """Surface points: where their shadow rays start, their normals on the camera's side [3, N], and object ids [N]."""
 
-    origin: Any
-    normal: Any
-    object_id: Any
+    origin: mt.Vector3f
+    normal: mt.Vector3f
+    object_id: UInt32
 
 
 @dataclass(frozen=True)
 class PartTable:
     """Labels of parts, each indexed by the number that Dr.Jit knows a shape by; inputs of kernels."""
 
-    objects: Any
-    parts: Any
-    albedos: Any
-    textured: Any  #: whose albedo varies over them, None where no part's does
+    objects: UInt32
+    parts: UInt32
+    albedos: Float
+    textured: Bool | None  #: whose albedo varies over them, None where no part's does
 
     @classmethod
-    def of(cls, scene: Scene, loaded: Any) -> "PartTable":
+    def of(cls, scene: Scene, loaded: mt.Scene) -> "PartTable":
         mi = backend.mitsuba()
         shapes: dict[str, int] = {}
         for shape in loaded.shapes():
-            number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
-            shapes[shape.id()] = int(number[0])
+            shapes[shape.id()] = int(_numbers(mi.ShapePtr(shape))[0])
         size = max(shapes.values()) + 1
         objects, parts = np.zeros((2, size), np.uint32)
         albedos, textured = np.zeros((size, 3), np.float32), np.zeros(size, bool)
@@ -173,16 +184,16 @@ class PartTable:
         varied = upload(textured, mi.Bool) if textured.any() else None
         return cls(upload(objects, mi.UInt32), upload(parts, mi.UInt32), upload(albedos), varied)
 
-    def ids(self, shape: Any, active: Any) -> tuple[Any, Any]:
+    def ids(self, shape: mt.ShapePtr, active: Bool) -> tuple[UInt32, UInt32]:
         """(object id, part id) of shape pointers, 0 where not `active`."""
         mi = backend.mitsuba()
-        index: Any = dr.reinterpret_array(mi.UInt32, shape)
+        index = _numbers(shape)
         return dr.gather(mi.UInt32, self.objects, index, active), dr.gather(mi.UInt32, self.parts, index, active)
 
-    def albedo(self, surface: Any, active: Any) -> Any:
+    def albedo(self, surface: mt.SurfaceInteraction3f, active: Bool) -> mt.Color3f:
         """RGB where rays met the scene, 0 where not `active`."""
         mi = backend.mitsuba()
-        index: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
+        index = _numbers(surface.shape)
         albedo = dr.gather(mi.Color3f, self.albedos, index, active)
         if self.textured is None:
             return albedo
@@ -190,14 +201,19 @@ class PartTable:
         return dr.select(varied, surface.bsdf().eval_diffuse_reflectance(surface, varied), albedo)
 
 
-def _has_color_image(bsdf: Mapping[str, Any]) -> bool:
+def _numbers(shapes: mt.ShapePtr) -> UInt32:
+    """By which Dr.Jit knows shapes."""
+    return cast("UInt32", dr.reinterpret_array(backend.mitsuba().UInt32, shapes))
+
+
+def _has_color_image(bsdf: JsonMapping) -> bool:
     """Conductors have no diffuse reflectance to look up."""
     if bsdf.get("type") in ("bitmap", "roughconductor", "conductor"):
         return bsdf["type"] == "bitmap" and not bsdf.get("raw", False)
     return any(_has_color_image(value) for value in bsdf.values() if isinstance(value, Mapping))
 
 
-def _images(numbers: Any, ids: Any, camera: Camera) -> dict[str, np.ndarray]:
+def _images(numbers: Float, ids: UInt32, camera: Camera) -> dict[str, np.ndarray]:
     """Labels as [H, W] or [H, W, 3], float32 or uint8, from what `Labeller._trace_centres` returns.
 
     Copies: arrays over Dr.Jit's memory that another thread lets go of can stop the whole process for good.

@@ -11,12 +11,13 @@ frame.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
+from spacesim.backend.arrays import Float, UInt32
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes.cameras.kernel_camera import KernelCamera, record_on_cuda
@@ -95,7 +96,7 @@ class Renderer:
         self._loaded.point(sun)
         return self._labeller.labels(camera, sun)
 
-    def _launch_passes(self, scene: Any, camera: Camera, seed: Sequence[int], spp: int) -> list[Any]:
+    def _launch_passes(self, scene: mt.Scene, camera: Camera, seed: Sequence[int], spp: int) -> list[Float]:
         """Sums over samples, as `_trace_paths` returns them, of each pass; the device may still be at work on them."""
         uint, view = backend.mitsuba().UInt32, KernelCamera.of(camera, self._loaded.units)
         passes = min(spp, -(-spp * view.width * view.height // MAX_WAVEFRONT))
@@ -106,7 +107,7 @@ class Renderer:
             for i in range(passes)
         ]
 
-    def _trace_paths(self, scene: Any, view: KernelCamera, noise: "_Noise", spp: int) -> Any:
+    def _trace_paths(self, scene: mt.Scene, view: KernelCamera, noise: "_Noise", spp: int) -> Float:
         """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]."""
         mi = backend.mitsuba()
         samples = spp * view.width * view.height
@@ -131,7 +132,7 @@ class Renderer:
         index = dr.arange(mi.UInt32, len(positions) * len(_DIRECTIONS))
         direction = _gather(_DIRECTIONS, index % len(_DIRECTIONS))
         origin = _gather(self._loaded.units.points(positions), index // len(_DIRECTIONS))
-        surface = self._loaded.labelled.ray_intersect(mi.Ray3f(origin, direction))
+        surface: mt.SurfaceInteraction3f = self._loaded.labelled.ray_intersect(mi.Ray3f(origin, direction))
         back = surface.is_valid() & (dr.dot(surface.n, direction) > 0)
         return back.numpy().reshape(len(positions), -1).mean(axis=1) > 0.1
 
@@ -146,26 +147,26 @@ class Renderer:
         origin = _gather(self._loaded.units.points(points) + OFFSET * normals, index // len(_DIRECTIONS))
         direction = _gather(_DIRECTIONS, index % len(_DIRECTIONS)) + 1.001 * normal  # cosine-weighted
         free = ~self._loaded.labelled.ray_test(mi.Ray3f(origin, dr.normalize(direction)))
-        return free.numpy().reshape(len(points), -1).any(axis=1)
+        return np.any(free.numpy().reshape(len(points), -1), axis=1)
 
 
 @dataclass(frozen=True)
 class _Noise:
     """Of one pass, inputs of kernels."""
 
-    sampler: Any  #: seeds
-    shift: Any  #: seeds
-    first: Any  #: number of the pass's first sample
+    sampler: UInt32  #: seeds
+    shift: UInt32  #: seeds
+    first: UInt32  #: number of the pass's first sample
 
 
-def _mean_radiance(sums: Sequence[Any], camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray]:
+def _mean_radiance(sums: Sequence[Float], camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray]:
     """Radiance from one source [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
     total: np.ndarray = sum(values.numpy() for values in sums) / np.float32(spp)
     shape = camera.height, camera.width
     return total[: -math.prod(shape)].reshape(*shape, 3), total[-math.prod(shape) :].reshape(shape)
 
 
-def _pixel_offsets(pixel: Any, sample: Any, seed: Any) -> Any:
+def _pixel_offsets(pixel: UInt32, sample: UInt32, seed: UInt32) -> mt.Point2f:
     """Where in its pixel a sample lies, in [0, 1)^2: the R2 sequence, shifted at random for each pixel, so
     that few samples cover it evenly."""
     mi = backend.mitsuba()
@@ -174,7 +175,7 @@ def _pixel_offsets(pixel: Any, sample: Any, seed: Any) -> Any:
     return mi.Point2f(*(mi.Float(fraction) * 2.0**-24 for fraction in fractions))
 
 
-def _gather(vectors: Array, index: Any) -> Any:
+def _gather(vectors: Array, index: UInt32) -> mt.Vector3f:
     """Rows `index` of `vectors` [N, 3]."""
     vector = backend.mitsuba().Vector3f
     return dr.gather(vector, vector(np.ascontiguousarray(np.asarray(vectors, np.float32).T)), index)

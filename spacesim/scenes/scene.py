@@ -4,20 +4,21 @@ import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import trimesh
 from scipy.spatial import QhullError
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict
 from spacesim.data.geometry import Array, normalize
 from spacesim.data.records import Sun
 from spacesim.scenes.cameras.kernel_camera import Units
 from spacesim.scenes.lights.earth import EarthConfig
-from spacesim.scenes.lights.emitters import earthshine, solar_disc
+from spacesim.scenes.lights.emitters import Source, earthshine, solar_disc
 from spacesim.scenes.lights.sun import SunConfig
 from spacesim.scenes.materials.table import Material
 from spacesim.scenes.spacecraft import Part, Spacecraft
@@ -107,7 +108,7 @@ class Scene:
             centre = centre + (points[np.linalg.norm(points - centre, axis=1).argmax()] - centre) / (i + 1)
         return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> JsonDict:
         """Objects, parts and materials as plain JSON values."""
         return {
             "scene": self.name,
@@ -155,7 +156,7 @@ def _is_same_material(first: Material, second: Material) -> bool:
     return first.tile == second.tile and _describe_material(first) == _describe_material(second)
 
 
-def _describe_material(material: Material) -> dict[str, Any]:
+def _describe_material(material: Material) -> JsonDict:
     digests = {name: hashlib.sha256(image.tobytes()).hexdigest() for name, image in material.images.items()}
     described = {"albedo": list(material.albedo), "bsdf": material.bsdf, "source": material.source}
     return {**described, "images": digests} if digests else described
@@ -166,11 +167,11 @@ class MitsubaScene:
     """A scene in Mitsuba. sunlit and earthlit (None without an Earth) hold the same shapes, and one emitter each."""
 
     units: Units  #: of all three
-    labelled: Any  #: the shapes without light, and no ray slips between two triangles of them
-    sunlit: Any
-    sun: Any
-    earthlit: Any = None
-    earth: Any = None
+    labelled: mt.Scene  #: the shapes without light, and no ray slips between two triangles of them
+    sunlit: mt.Scene
+    sun: Source
+    earthlit: mt.Scene | None = None
+    earth: Source | None = None
 
     def point(self, sun: Sun) -> None:
         """Move the Sun; the Earth's phase follows."""
@@ -196,7 +197,7 @@ def load(scene: Scene) -> MitsubaScene:
     return MitsubaScene(units, labelled, sunlit, sun, mi.load_dict({"type": "scene", "earth": earth, **shapes}), earth)
 
 
-def _mitsuba_mesh(placed: PlacedPart, units: Units, bsdf: Any) -> Any:
+def _mitsuba_mesh(placed: PlacedPart, units: Units, bsdf: mt.BSDF) -> mt.Mesh:
     mi = backend.mitsuba()
     vertices, faces, normals = units.points(placed.mesh.vertices), placed.mesh.faces, placed.normals
     uv, at_corners = _texture_coordinates(placed)
@@ -237,11 +238,11 @@ def box_projection(mesh: trimesh.Trimesh) -> Array:
     return np.take_along_axis(mesh.triangles, across[:, None, :], axis=2).reshape(-1, 2)
 
 
-def _mitsuba_bsdf(material: Material, both_sides: bool) -> Any:
+def _mitsuba_bsdf(material: Material, both_sides: bool) -> mt.BSDF:
     """A closed part shows its outside alone; an open one is the same on both sides."""
     mi = backend.mitsuba()
 
-    def resolved(value: Any) -> Any:
+    def resolved(value: object) -> object:
         if not isinstance(value, Mapping):
             return value
         if "image" not in value:

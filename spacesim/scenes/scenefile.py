@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 
 from spacesim.data import toml
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.structure import Rules, did_you_mean, keys_of, structure
 from spacesim.scenes.cameras.rig import RIGS, RigConfig
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
@@ -39,7 +40,7 @@ def read_scene(source: str | Path, **options: object) -> SceneConfig:
     chosen = {name: value for name, value in options.items() if value is not None}
     if str(source) in BUILT_IN_SCENES:
         path = SCENES / f"{source}.toml"
-    reading: dict[str, Any] = {name: chosen.pop(name) for name in ("units", "up", "two_sided") if name in chosen}
+    reading: JsonDict = {name: chosen.pop(name) for name in ("units", "up", "two_sided") if name in chosen}
     if path.suffix.lower() != ".toml":
         return with_options(_mesh_scene(path, str(source), reading), **chosen)
     for name in reading:
@@ -55,7 +56,7 @@ def scene_text(scene: SceneConfig) -> str:
     return toml.dump(_plain(replace(scene, objects=objects)))
 
 
-def _mesh_scene(path: Path, source: str, reading: Mapping[str, Any]) -> SceneConfig:
+def _mesh_scene(path: Path, source: str, reading: JsonMapping) -> SceneConfig:
     """A mesh file alone, which `reading` says how to read."""
     if os.path.isfile(path):  # which, unlike Path.is_file, takes any name
         return SceneConfig(path.stem, (ObjectConfig(mesh=path.name, **reading),), folder=path.parent)

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.exporters import LabelledObject, Silhouette
@@ -27,7 +27,7 @@ def silhouette_finder(targets: Sequence[LabelledObject]) -> Callable[[Camera], l
     return find
 
 
-def _load(target: LabelledObject) -> Any:
+def _load(target: LabelledObject) -> mt.Scene:
     placed = target.vertices @ target.world_from_object[:3, :3].T + target.world_from_object[:3, 3]
     world = placed.astype(np.float32)
     faces = drawable_faces(world.astype(np.float64), target.faces)
@@ -42,7 +42,7 @@ def _load(target: LabelledObject) -> Any:
     return mi.load_dict({"type": "scene", "mesh": mesh})
 
 
-def _silhouette(scene: Any, target: LabelledObject, camera: Camera) -> Silhouette:
+def _silhouette(scene: mt.Scene, target: LabelledObject, camera: Camera) -> Silhouette:
     width, height = camera.width, camera.height
     if _is_within(target, camera):
         mask = _hits(scene, camera)
@@ -63,7 +63,7 @@ def _is_within(target: LabelledObject, camera: Camera) -> bool:
     return bool((pixels.min(axis=0) >= 0).all() and (pixels.max(axis=0) <= (camera.width, camera.height)).all())
 
 
-def _hits(scene: Any, camera: Camera) -> np.ndarray:
+def _hits(scene: mt.Scene, camera: Camera) -> np.ndarray:
     """[H, W] bool: which pixels' centres show the object."""
     mi = backend.mitsuba()
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx

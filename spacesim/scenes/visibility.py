@@ -5,12 +5,13 @@ The same directions for every point, so the truth has no noise.
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
+from spacesim.backend.arrays import Bool
 from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
 from spacesim.scenes.lights.emitters import Limb
@@ -26,10 +27,12 @@ class Disc:
     """Directions to points of the Sun's disc, inputs of kernels."""
 
     count: int
-    directions: Any  #: `count` unit vectors
+    directions: mt.Vector3f  #: `count` unit vectors
     limb: Limb | None  #: of the Earth, which can hide the Sun too, or None
 
-    def seen(self, scene: Any, origin: Any, normal: Any, active: Any) -> tuple[Any, Any, Any]:
+    def seen(
+        self, scene: mt.Scene, origin: mt.Vector3f, normal: mt.Vector3f, active: Bool
+    ) -> tuple[Bool, Bool, mt.ShapePtr]:
         """From points [3, N] with their `normal` on the lit side; `active` says which of them are asked.
 
         Returns for each point and direction, [N count], neighbouring lanes taking the same point: whether the Sun is

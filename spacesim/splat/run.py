@@ -11,11 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend.arrays import Bool
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
@@ -87,7 +88,7 @@ class Predictor(Protocol):
         """The backend that renders now."""
 
     @property
-    def antialiased(self) -> Any:
+    def antialiased(self) -> Bool | bool:
         """Whether Gaussians are drawn with the anti-aliasing filter: one bool for all, or Bool [N]."""
 
     @property

@@ -11,7 +11,6 @@ as brightness tells the angle: too large an albedo would put all Suns too low.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -301,9 +300,9 @@ class ShapeSearch:
         shares = [upload(np.full(self.gaussians.count, 1e-9 * i, np.float32)) for i in range(len(planes))]
         dr.enable_grad(shares)
         camera = Pinhole.of(picture.camera)
-        drawn: Any = render(self.gaussians, camera, outputs=(), features=shares, antialiased=self.antialiased)
+        drawn = render(self.gaussians, camera, outputs=(), features=shares, antialiased=self.antialiased)
         total = ad.Float(0)
-        for blended, plane in zip(drawn.features, planes, strict=True):
+        for blended, plane in zip(drawn.features or (), planes, strict=True):
             total += dr.sum(blended * upload(np.ascontiguousarray(plane.ravel())))
         dr.backward(total)
         return np.array([np.array(dr.grad(share)) for share in shares])

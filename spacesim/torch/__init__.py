@@ -8,7 +8,7 @@ Tensors on a CUDA device run on CUDA, others on the CPU, one of the two in a pro
 spinning and take cores from the kernels: `torch.set_num_threads(1)`.
 """
 
-from typing import Any
+from typing import TypedDict
 
 try:
     import torch
@@ -20,7 +20,28 @@ from spacesim import backend
 from spacesim.torch import arguments
 from spacesim.torch.autograd import DEPTH, OPACITY, Blend, Drawing, Project, pack
 
-Results = tuple[Tensor, Tensor, dict[str, Any]]
+
+class Meta(TypedDict):
+    """What `rasterization` returns beside pictures and alphas; shapes: see there."""
+
+    batch_ids: Tensor | None
+    camera_ids: Tensor | None
+    gaussian_ids: Tensor | None
+    radii: Tensor
+    means2d: Tensor
+    depths: Tensor
+    conics: Tensor
+    opacities: Tensor
+    tile_width: int
+    tile_height: int
+    width: int
+    height: int
+    tile_size: int
+    n_batches: int
+    n_cameras: int
+
+
+Results = tuple[Tensor, Tensor, Meta]
 
 MIN_ALPHA = 1e-10  #: by which "ED" divides at least, as gsplat
 
@@ -57,8 +78,8 @@ def rasterization(
     radial_coeffs: Tensor | None = None,
     tangential_coeffs: Tensor | None = None,
     thin_prism_coeffs: Tensor | None = None,
-    ftheta_coeffs: Any = None,
-    rolling_shutter: Any = None,
+    ftheta_coeffs: object = None,
+    rolling_shutter: object = None,
     viewmats_rs: Tensor | None = None,
 ) -> Results:
     """Render N Gaussians with C cameras, differentiable by every tensor that requires gradients.
@@ -148,7 +169,7 @@ def rasterization(
     pictures, alphas = Blend.apply(means2d, table, colors if colored and not harmonic else None, drawing)
     pictures = _finish_picture(pictures, alphas, backgrounds, render_mode)
     own = pack(table, visible)
-    meta = {
+    meta: Meta = {
         "batch_ids": None if gaussian_ids is None else torch.zeros_like(gaussian_ids),
         "camera_ids": camera_ids,
         "gaussian_ids": gaussian_ids,

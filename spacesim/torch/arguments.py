@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 from torch import Tensor
 
@@ -43,7 +42,7 @@ def raster_settings(
     return RasterSettings(width, height, near, far, radius_clip, eps2d, antialiased, ortho, degree)
 
 
-def check_unsupported(arguments: Mapping[str, Any]) -> None:
+def check_unsupported(arguments: Mapping[str, object]) -> None:
     """Raises ValueError for the first argument that asks for something: each is False or None where it does not."""
     for name, value in arguments.items():
         if name == "rolling_shutter":

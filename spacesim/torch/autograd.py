@@ -12,16 +12,27 @@ from typing import Any
 import drjit as dr
 import torch
 from torch import Tensor
+from torch.autograd.function import FunctionCtx
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float
 from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.project import Splats
+from spacesim.splat.raster.records import BlendResult
 from spacesim.splat.raster.render import FEATURES_PER_PASS
 from spacesim.splat.raster.tiles import TileLists, round_capacity
 from spacesim.torch.convert import column, columns, rows, to_floats, to_table, to_tensor
-from spacesim.torch.projection import INTRINSICS, TABLE, Leaves, ProjectedSplats, Wanted, project, project_back
+from spacesim.torch.projection import (
+    INTRINSICS,
+    TABLE,
+    LeafGradients,
+    Leaves,
+    ProjectedSplats,
+    Wanted,
+    project,
+    project_back,
+)
 
 OPACITY, DEPTH = 3, 4  #: columns of the table
 GAUSSIANS = 4  #: arguments of `Project` that all cameras share: those before the harmonics
@@ -45,7 +56,7 @@ class Project(torch.autograd.Function):
     `ProjectedSplats`), see there."""
 
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> Any:
+    def forward(ctx: FunctionCtx, *arguments: Any) -> tuple[Any, ...]:
         """means, quats, scales, opacities, harmonics [(C,) N, K, 3] or None, viewmats, Ks;  `RasterSettings`."""
         *tensors, settings = arguments
         ctx.set_materialize_grads(False)
@@ -61,7 +72,7 @@ class Project(torch.autograd.Function):
         return means2d, table, radii, found
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Any) -> Any:
+    def backward(ctx: FunctionCtx, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         """Gradients of the tensors."""
         grad_means2d, grad_table = gradients[:2]
         tensors = ctx.saved_tensors
@@ -83,7 +94,7 @@ class Project(torch.autograd.Function):
         return (*results, None)
 
 
-def _leaves(tensors: Sequence[Any]) -> list[Leaves]:
+def _leaves(tensors: Sequence[Tensor]) -> list[Leaves]:
     """Of each camera."""
     means, quats, scales, opacities = (to_floats(tensor) for tensor in tensors[:GAUSSIANS])
     harmonic, viewmats, intrinsics = tensors[GAUSSIANS:]
@@ -103,7 +114,7 @@ def _leaves(tensors: Sequence[Any]) -> list[Leaves]:
     ]
 
 
-def _gradient_tensors(found: Any, tensors: Sequence[Any]) -> list[Tensor | None]:
+def _gradient_tensors(found: LeafGradients, tensors: Sequence[Tensor]) -> list[Tensor | None]:
     """Gradients of one camera in the shapes of `Project`'s tensors, None of those that were not wanted."""
     means, quats, scales, opacities, harmonic, *_ = tensors
     results: list[Tensor | None] = []
@@ -132,7 +143,7 @@ class Blend(torch.autograd.Function):
     """Splats to (pictures [C, H, W, D], alphas [C, H, W, 1])."""
 
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> Any:
+    def forward(ctx: FunctionCtx, *arguments: Any) -> tuple[Any, ...]:
         """means2d and table of `Project`, colours [(C,) N, D] or None;  `Drawing`, in which the same splats are."""
         _, _, colors, drawing = arguments
         ctx.set_materialize_grads(False)
@@ -167,7 +178,7 @@ class Blend(torch.autograd.Function):
         return _stack(pictures), _stack(alphas)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Any) -> Any:
+    def backward(ctx: FunctionCtx, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         """Gradients of means2d, table and colours."""
         grad_pictures, grad_alphas = gradients
         if grad_pictures is None and grad_alphas is None:
@@ -176,7 +187,7 @@ class Blend(torch.autograd.Function):
         grad_means2d, grad_table, grad_colors, absolute = [], [], [], []
         for camera, (splats, lists, passes) in enumerate(ctx.passes):
             grad_planes, grad_light = _plane_gradients(
-                grad_pictures, grad_alphas, camera, sum(size for _, size in passes)
+                grad_pictures, grad_alphas, drawing, camera, sum(size for _, size in passes)
             )
             numbers, features = _blend_back(splats, lists, passes, grad_planes, grad_light, drawing)
             x, y, a, b, c, opacity, *absolutes = numbers
@@ -197,10 +208,11 @@ class Blend(torch.autograd.Function):
         return pack(_stack(grad_means2d), drawing.visible), _stack(grad_table), colors, None
 
 
-def _plane_gradients(grad_pictures: Any, grad_alphas: Any, camera: int, channels: int) -> tuple[list[Float], Any]:
+def _plane_gradients(
+    grad_pictures: Tensor | None, grad_alphas: Tensor | None, drawing: Drawing, camera: int, channels: int
+) -> tuple[list[Float], Float]:
     """(gradients by the picture's planes, by the light that passes) of one camera, Floats [H * W]."""
-    known = grad_pictures if grad_pictures is not None else grad_alphas
-    pixels = known.shape[1] * known.shape[2]
+    pixels = drawing.width * drawing.height
     if grad_pictures is None:
         grad_planes = [_zeros(pixels) for _ in range(channels)]
     else:
@@ -210,13 +222,18 @@ def _plane_gradients(grad_pictures: Any, grad_alphas: Any, camera: int, channels
     return grad_planes, grad_light
 
 
-def _zeros(count: int) -> Any:
+def _zeros(count: int) -> Float:
     """No literal: it would fold gradients away."""
     return dr.opaque(ad.Float, 0, count)
 
 
 def _blend_back(
-    splats: Splats, lists: TileLists, passes: Any, grad_planes: list[Float], grad_light: Any, drawing: Drawing
+    splats: Splats,
+    lists: TileLists,
+    passes: Sequence[tuple[BlendResult, int]],
+    grad_planes: list[Float],
+    grad_light: Float,
+    drawing: Drawing,
 ) -> tuple[list[Float], list[Float]]:
     """(gradients by x, y, a, b, c, opacity, and where they are wanted the absolute ones by x and y; by the features)
     of all passes of one camera. passes: (what blending keeps, its channels) of each."""
@@ -235,7 +252,7 @@ def _blend_back(
     return sums, features
 
 
-def _color_gradients(by_camera: list[list[Float]], shape: Any) -> Tensor:
+def _color_gradients(by_camera: list[list[Float]], shape: torch.Size) -> Tensor:
     """In the shape of the colours; of those that all cameras share the sum."""
     count, channels = shape[-2:]
     if len(shape) == 2:

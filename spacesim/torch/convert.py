@@ -1,26 +1,24 @@
 """Tensors to Dr.Jit's arrays and back, without a copy where memory allows."""
 
-from typing import Any
-
 import drjit as dr
 import torch
 from torch import Tensor
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Float, NumberT
+from spacesim.backend.arrays import Float, Int32, NumberT
 
 ALIGNED = 64  #: bytes to a multiple of which torch allocates
 WIDEST = 16  #: numbers of a row that a kernel stores at once
 
 
-def to_floats(tensor: Tensor) -> Any:
+def to_floats(tensor: Tensor) -> Float:
     """A tensor of float32 as one flat Float, without a copy where it is contiguous and aligned as torch allocates:
     elsewhere a kernel on LLVM could read beyond its last page, see `spacesim.backend.upload`."""
     flat = tensor.detach().reshape(-1)
     return ad.Float(flat if flat.is_cuda or flat.data_ptr() % ALIGNED == 0 else flat.clone())
 
 
-def column(flat: Any, index: int, size: int, count: int) -> Any:
+def column(flat: Float, index: int, size: int, count: int) -> Float:
     """Column `index` of a flat array [count * size], in memory of Dr.Jit's own: what torch has may lie otherwise, and
     each way to lie is recorded anew."""
     rows = dr.arange(ad.UInt32, count)
@@ -55,12 +53,12 @@ def rows(values: list[NumberT], size: int, count: int, room: int | None = None) 
     return target
 
 
-def to_table(flat: Any, count: int, size: int) -> Tensor:
+def to_table(flat: Float | Int32, count: int, size: int) -> Tensor:
     """The first `count` rows of a flat array of at least as many rows of `size`: a tensor [count, size]."""
     return to_tensor(flat).as_strided((count, size), (size, 1))
 
 
-def to_tensor(flat: Any) -> Tensor:
+def to_tensor(flat: Float | Int32) -> Tensor:
     """A flat array as a tensor that shares its memory."""
     tensor: Tensor = torch.from_dlpack(dr.detach(flat))
     return tensor

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Float
+from spacesim.backend.arrays import Array3f, Bool, Float, Int32
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic, Pinhole, Projection
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Footprints, Splats, project_ellipsoids
@@ -27,13 +27,13 @@ WIDEST_SPLAT = 2**30  #: pixels: an int32 holds no more
 class Leaves:
     """Flat arrays of a call: [N * size] of the Gaussians, and one camera's."""
 
-    means: Any
-    quats: Any
-    scales: Any
-    opacities: Any
-    harmonics: Any  #: three times K a Gaussian, K at least (degree + 1)^2; or None
-    viewmat: Any  #: world to camera, row by row, 16 numbers
-    intrinsics: Any  #: row by row, 9 numbers
+    means: Float
+    quats: Float
+    scales: Float
+    opacities: Float
+    harmonics: Float | None  #: three times K a Gaussian, K at least (degree + 1)^2; or None
+    viewmat: Float  #: world to camera, row by row, 16 numbers
+    intrinsics: Float  #: row by row, 9 numbers
 
 
 @dataclass(frozen=True)
@@ -56,22 +56,22 @@ class ProjectedSplats:
     splats: Splats
     footprints: Footprints
     colors: list[Float]  #: of harmonics, three Floats [N]; else none
-    means2d: Any  #: rows x, y, pixels; room for N at least
-    table: Any  #: rows of `TABLE` numbers: a, b, c of `Splats`, opacity, depth, and colours or 0
-    radii: Any  #: Int32, rows of two, pixels, 0 of what is not drawn
+    means2d: Float  #: rows x, y, pixels; room for N at least
+    table: Float  #: rows of `TABLE` numbers: a, b, c of `Splats`, opacity, depth, and colours or 0
+    radii: Int32  #: rows of two, pixels, 0 of what is not drawn
 
 
 @dataclass
 class LeafGradients:
     """Gradients of `Leaves`, flat, of the Gaussians with room for N at least; None of those that were not wanted."""
 
-    means: Any = None
-    quats: Any = None
-    scales: Any = None
-    opacities: Any = None
-    harmonics: Any = None
-    viewmat: Any = None  #: a list of 16 numbers
-    intrinsics: Any = None  #: a list of fx, fy, cx, cy
+    means: Float | None = None
+    quats: Float | None = None
+    scales: Float | None = None
+    opacities: Float | None = None
+    harmonics: Float | None = None
+    viewmat: list[Float] | None = None  #: 16 numbers
+    intrinsics: list[Float] | None = None  #: fx, fy, cx, cy
 
 
 @dataclass
@@ -82,17 +82,17 @@ class _NearFarPlanes(Projection):
     numbers: list[Float] = field(default_factory=list)  #: those of `values`
     near: float = 0.0
     far: float = 0.0
-    #: of the camera, an Array3f; harmonics are asked for in directions from there, which gsplat does of orthographic
+    #: of the camera; harmonics are asked for in directions from there, which gsplat does of orthographic
     #: cameras, too
-    place: Any = None
+    place: Array3f = field(default_factory=lambda: ad.Array3f(0))
 
-    def __getitem__(self, index: int) -> Any:
+    def __getitem__(self, index: int) -> Float:
         return self.numbers[index]
 
-    def in_reach(self, center: Any) -> Any:
+    def in_reach(self, center: Array3f) -> Bool:
         return (center.z > self.near) & (center.z < self.far) & (dr.max(dr.abs(center)) < MAX_MAGNITUDE)
 
-    def rays_to(self, points: Any) -> Any:
+    def rays_to(self, points: Array3f) -> Array3f:
         return points - self.place
 
 
@@ -156,7 +156,12 @@ def project(leaves: Leaves, settings: RasterSettings, room: int) -> ProjectedSpl
 
 @recorded(elements=lambda arrays, *_rest, **_named: dr.width(arrays[0]) // 3)
 def project_back(
-    leaves: Leaves, settings: RasterSettings, wanted: Wanted, grad_means2d: Any, grad_table: Any, room: int
+    leaves: Leaves,
+    settings: RasterSettings,
+    wanted: Wanted,
+    grad_means2d: Float | None,
+    grad_table: Float | None,
+    room: int,
 ) -> LeafGradients:
     """The adjoint of `project`. grad_means2d [N * 2], grad_table [N * TABLE]: gradients of these, None of one that is
     all zeros;  room: as there"""
@@ -239,7 +244,7 @@ def _camera(inputs: _Inputs, settings: RasterSettings) -> Projection:
     return camera
 
 
-def _camera_position(matrix: list[Float]) -> Any:
+def _camera_position(matrix: list[Float]) -> Array3f:
     """Where the camera stands: what the inverse of a matrix [16] makes of the origin, three numbers over the fourth, so
     that it depends on the last row as the inverse does."""
     rotation = [ad.Array3f(matrix[i : i + 3]) for i in (0, 4, 8)]

@@ -3,7 +3,7 @@
 import io
 import threading
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
@@ -21,6 +21,9 @@ from spacesim.viewer.session import Session, Statistics
 from spacesim.viewer.state import SharedScene, ViewerCamera, parse_viewer_camera
 from spacesim.viewer.truth.source import TruthService
 
+if TYPE_CHECKING:
+    import viser
+
 QUALITY, QUALITY_AT_REST = 75, 95  #: of JPEG
 MAX_PICTURE_SIDE = 4096  #: pixels a side of a picture that is saved
 
@@ -30,7 +33,7 @@ class Client:
 
     def __init__(
         self,
-        handle: Any,
+        handle: "viser.ClientHandle",
         renderer: SceneRenderer,
         shared: SharedScene,
         loop: RenderLoop,
@@ -41,7 +44,7 @@ class Client:
     ) -> None:
         self.handle, self._renderer, self._shared, self._loop, self._dataset = handle, renderer, shared, loop, dataset
         self._sun = sun
-        self._frusta: list[Any] = []
+        self._frusta: list[viser.CameraFrustumHandle] = []
         self._lock = threading.Lock()
         self._closed = False
         self.session = Session(renderer, shared, loop, self, truth)
@@ -130,10 +133,10 @@ class Client:
             name = f"{mode.replace(' ', '-')}.png"
             self.handle.send_file_download(name, file.getvalue(), save_immediately=True)
 
-    async def _moved(self, camera: Any) -> None:
+    async def _moved(self, camera: "viser.CameraHandle") -> None:
         self._on_camera(camera)
 
-    def _on_camera(self, camera: Any) -> None:
+    def _on_camera(self, camera: "viser.CameraHandle") -> None:
         pose = camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height
         view = parse_viewer_camera(*pose)
         if view is not None:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,6 +29,10 @@ from spacesim.viewer.panels.paths import FileControls, PathControls
 from spacesim.viewer.path import CameraPath
 from spacesim.viewer.state import SceneState, SharedScene
 from spacesim.viewer.truth.source import TruthService
+
+if TYPE_CHECKING:
+    import viser
+    from viser.infra import WebsockClientConnection
 
 INSTALL = "pip install 'spacesim[viewer]'"
 FOV = np.radians(40.0)  #: vertical, where no data say
@@ -145,7 +149,7 @@ class Viewer:
         for client in clients:
             client.session.on_scene_changed()
 
-    async def _on_connect(self, handle: Any) -> None:
+    async def _on_connect(self, handle: "viser.ClientHandle") -> None:
         setup = self.setup
         facts = [
             setup.renderer.content,
@@ -157,7 +161,7 @@ class Viewer:
         client.begin()
         _log.debug("viewer: client %d has come", handle.client_id)
 
-    async def _on_disconnect(self, handle: Any) -> None:
+    async def _on_disconnect(self, handle: "viser.ClientHandle") -> None:
         with self._lock:
             client = self.clients.pop(handle.client_id, None)
         self.paths.forget(handle.client_id)
@@ -198,7 +202,7 @@ def import_viser() -> ModuleType:
     return viser
 
 
-def _serve(host: str, port: int) -> Any:
+def _serve(host: str, port: int) -> "viser.ViserServer":
     """viser's server, which lets through what `gate` does and says nothing."""
     viser = import_viser()
     for name in ("websockets.server", "asyncio"):
@@ -212,7 +216,7 @@ def _serve(host: str, port: int) -> Any:
         filter_messages(inner)
         make_sends_thread_safe(inner)
 
-        async def admit(connection: Any) -> None:
+        async def admit(connection: "WebsockClientConnection") -> None:
             filter_messages(connection)
             make_sends_thread_safe(connection)
 

@@ -25,8 +25,8 @@ from test_cameras import (
 from spacesim.backend import ad
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
 from spacesim.splat.raster.output import OUTPUTS
-from spacesim.splat.raster.reference import render_reference
 from spacesim.splat.raster.render import render
+from spacesim.splat.reference.rasterizer import render_reference
 
 INTRINSICS = {"perspective": ("fx", "fy", "cx", "cy"), "orthographic": ("scale_x", "scale_y", "cx", "cy")}
 

@@ -13,7 +13,7 @@ from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera, Dataset
 from spacesim.data.store import read_dataset, write_points
 from spacesim.splat.raster.gaussians import SH_C0
-from spacesim.splat.raster.reference import render_reference
+from spacesim.splat.reference.rasterizer import render_reference
 
 VIEWS, TESTS, SIZE = 8, 2, 32
 

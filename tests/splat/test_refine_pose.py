@@ -18,7 +18,7 @@ from spacesim.splat.pose.picture import Drawing
 from spacesim.splat.pose.refine import _find_starts
 from spacesim.splat.pose.solver import REACH, Level
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.reference import render_reference
+from spacesim.splat.reference.rasterizer import render_reference
 from spacesim.splat.run import Run
 from spacesim.splat.train.config import preset
 

@@ -11,9 +11,9 @@ from spacesim.data.errors import InputError, expect
 from spacesim.data.files import holds_files
 from spacesim.data.geometry import Array
 from spacesim.data.images import read_exr, read_png
+from spacesim.data.images.tone import TONES, as_bytes, display_values
 from spacesim.data.mesh import MAX_COORDINATE, check_points, load_trimesh
 from spacesim.data.records import Camera, Dataset, Frame
-from spacesim.data.tone import TONES, as_bytes, display_values
 
 ExportProgress = Callable[[int, int, str], None]  #: frames done, frames in all, name of the frame
 

@@ -1,7 +1,6 @@
 """The kinds of source that can be imported, and the one function that imports them all."""
 
 from pathlib import Path
-from typing import Any
 
 from spacesim.data.errors import InputError
 from spacesim.data.importers import colmap, nerfstudio, speedplus
@@ -21,7 +20,7 @@ KINDS: dict[str, Importer] = {
 }
 """By their names on the command line."""
 
-_TYPES: dict[Any, Any] = {float: (float, int), int: int, str: str, bool: bool, Path: Path}
+_TYPES: dict[object, type | tuple[type, ...]] = {float: (float, int), int: int, str: str, bool: bool, Path: Path}
 
 
 def import_dataset(
@@ -43,7 +42,7 @@ def import_dataset(
     return importer.function(Path(src), Path(out), progress=progress, **given)
 
 
-def _value(option: Option, value: object) -> Any:
+def _value(option: Option, value: object) -> object:
     """Of an option, which may be text as on the command line. Raises InputError for one of another type."""
     wanted = _TYPES.get(option.type, object)
     try:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
@@ -207,7 +206,9 @@ def _read_npy(path: Path) -> np.ndarray:
         shape, by_columns, dtype = head(file)
         if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content) - file.tell():
             raise ValueError("its header promises another size")
-        values: Any = np.frombuffer(content, dtype, offset=file.tell()).reshape(shape, order="F" if by_columns else "C")
+        values: np.ndarray = np.frombuffer(content, dtype, offset=file.tell()).reshape(
+            shape, order="F" if by_columns else "C"
+        )
     except Exception as error:  # NumPy documents none of what it raises
         raise InputError(f"{path}: expected an array of NumPy's, found another file ({error})") from None
     if values.ndim == 3 and values.shape[2] == 1:

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -47,8 +46,8 @@ class FrameMaker:
     camera in its middle, and what it does not image is unknown."""
 
     masked: str = "empty"  #: what black in a mask means, see `masks.MASKED`
-    _resampling: Any = field(init=False)  # of a lens: two are kept
-    _seen_share: Any = field(init=False)
+    _resampling: Callable[[Lens], Resampling] = field(init=False)  # of a lens: two are kept
+    _seen_share: Callable[[Lens], float] = field(init=False)
     _warned: set[Lens] = field(init=False, default_factory=set)
 
     def __post_init__(self) -> None:

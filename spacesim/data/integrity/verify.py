@@ -1,9 +1,9 @@
 """Every file of a dataset, held against its digest and decoded: what `spacesim verify` looks at."""
 
 from pathlib import Path
-from typing import Any
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonMapping
 from spacesim.data.images import read_png
 from spacesim.data.importers.writing import SOURCE
 from spacesim.data.integrity.manifest import NAME, check_manifest, read_manifest
@@ -76,7 +76,7 @@ def _faulty_pictures(dataset: Dataset) -> list[str]:
     return problems
 
 
-def _raw_suffixes(scene: Any) -> tuple[str, ...]:
+def _raw_suffixes(scene: JsonMapping) -> tuple[str, ...]:
     """Of the names of a sensor's pictures, by scene.json; () where it knows of no sensor."""
     try:
         return RAW_MONOCHROME if scene["config"]["camera"]["sensor"]["monochrome"] else RAW_COLOR

@@ -1,7 +1,6 @@
 """Points on the part of a surface that can be seen from outside: what is compared of two shapes (thesis 5.2.3)."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -9,6 +8,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
+from spacesim.backend.arrays import Bool, Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array, fibonacci_sphere
 
@@ -156,10 +157,10 @@ class ExteriorView:
         last = mi.UInt32([len(self.directions)])
         table = upload(self.directions)
 
-        def hidden(k: Any, side: Any) -> Any:
+        def hidden(k: UInt32, side: Float) -> Bool:
             return (k < dr.gather(mi.UInt32, last, mi.UInt32(0))) & (side == 0)
 
-        def look(k: Any, side: Any) -> tuple[Any, Any]:
+        def look(k: UInt32, side: Float) -> tuple[UInt32, Float]:
             towards = dr.gather(mi.Vector3f, table, k)
             facing = dr.select(dr.dot(normal, towards) >= 0, mi.Float(1), mi.Float(-1))
             free = ~self.scene.ray_test(mi.Ray3f(start + LIFT * facing * normal, towards))
@@ -170,7 +171,7 @@ class ExteriorView:
         return np.array(side).astype(np.int8)
 
 
-def _scene(corners: Array) -> Any:
+def _scene(corners: Array) -> mt.Scene:
     """Mitsuba's scene of triangles [F, 3, 3]."""
     mi = backend.mitsuba()
     mesh = mi.Mesh("surface", 3 * len(corners), len(corners))

@@ -10,13 +10,16 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from safetensors.numpy import load as load_tensors
 
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_bytes
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 MAX_WEIGHTS_BYTES = 1 << 30  #: bytes: those of AlexNet take 244 MB
 
@@ -52,7 +55,7 @@ for _index, (_place, _shape, *_rest) in enumerate(_LAYERS):
 class Lpips:
     """The network."""
 
-    weights: Mapping[str, Any]  #: torch tensors by their names in the published files
+    weights: "Mapping[str, Tensor]"  #: by their names in the published files
 
     def __call__(self, prediction: np.ndarray, truth: np.ndarray) -> float | None:
         """Distance of pictures [H, W, 3] of sRGB values in [0, 1]; None if a side is below `MIN_SIDE`."""
@@ -65,7 +68,7 @@ class Lpips:
             total += float(((_unit(a) - _unit(b)).square() * linear).sum(dim=1).mean())
         return total
 
-    def _features(self, picture: np.ndarray) -> list[Any]:
+    def _features(self, picture: np.ndarray) -> "list[Tensor]":
         """Activations [1, C, h, w] after each of the five rectified convolutions."""
         import torch
         from torch.nn.functional import conv2d, max_pool2d, relu
@@ -117,7 +120,7 @@ def load(path: Path | None = None) -> tuple[Lpips | None, str]:
         return None, sentence
     import torch
 
-    arrays: Mapping[str, Any]
+    arrays: Mapping[str, np.ndarray | Tensor]
     if location.is_file():
         arrays = _read_safetensors(location)
         sources = dict.fromkeys(_SHAPES, location)
@@ -140,7 +143,7 @@ def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
         raise InputError(f"{path}: expected a safetensors file, found another ({error})") from None
 
 
-def _read_pth(path: Path) -> dict[str, Any]:
+def _read_pth(path: Path) -> "dict[str, Tensor]":
     import torch
 
     try:
@@ -161,6 +164,6 @@ def _torch_cache() -> Path:
     return Path(os.environ.get("TORCH_HOME") or Path(cache) / "torch") / "hub" / "checkpoints"
 
 
-def _unit(features: Any) -> Any:
+def _unit(features: "Tensor") -> "Tensor":
     """Features [1, C, h, w] divided by their length over the channels."""
     return features / (features.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)

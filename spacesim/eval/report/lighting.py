@@ -1,7 +1,6 @@
 """The report about light: one view under many Suns, true and predicted shadow masks, errors by grazing angle."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -40,7 +39,7 @@ _NULL = '<span class="none">–</span>'
 
 def relighting(runs: Sequence[Evaluation]) -> str:
     """HTML of the strips: a column a Sun; runs with the same view and Suns below one row of truth. "" without any."""
-    groups: dict[tuple[Any, ...], list[Evaluation]] = {}
+    groups: dict[tuple[object, ...], list[Evaluation]] = {}
     for run in runs:
         if sweep := run.metrics.get("relight"):
             suns = tuple((*step["sun"], step["truth"]) for step in sweep["suns"])

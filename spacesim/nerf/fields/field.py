@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Array3f, Float, TensorXf
+from spacesim.backend.arrays import Array3f, Float, TensorXf, UInt32
 from spacesim.learning import mlp
 from spacesim.learning.mlp import MlpShape, round_up_rows, sigmoid
 from spacesim.learning.reflectance import COSINES, surface_cosines
@@ -202,7 +202,7 @@ def row(matrix: TensorXf, i: int) -> Float:
     return dr.gather(ad.Float, matrix.array, _place(column, i, matrix.shape[1]))
 
 
-def _place(column: Any, i: int, height: int) -> Any:
+def _place(column: UInt32, i: int, height: int) -> UInt32:
     return ((column // CHUNK) * height + i) * CHUNK + column % CHUNK
 
 

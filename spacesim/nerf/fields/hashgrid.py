@@ -9,7 +9,7 @@ what rounds to 0 is not added.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import numpy as np
@@ -71,7 +71,7 @@ class HashGrid:
         """`outputs` Floats [N] at points [3, N] in [0, 1]^3."""
         rows: list[Float] = []
         for level in self.levels:
-            found: Any = ad.Array2f(0)
+            found = ad.Array2f(0)
             for vertex, weight, _ in _corners(level, point):
                 found = dr.fma(dr.gather(ad.Array2f, table, vertex), weight, found)
             rows += list(found)
@@ -103,7 +103,7 @@ class HashGrid:
 
     def slopes(self, table: Float, point: Array3f, gradients: list[Float]) -> Array3f:
         """[3, N] gradient by the points, from those [N] by the outputs."""
-        result: Any = ad.Array3f(0)
+        result = ad.Array3f(0)
         for i, level in enumerate(self.levels):
             for vertex, _, slope in _corners(level, point):
                 value = dr.gather(ad.Array2f, table, vertex)
@@ -113,14 +113,13 @@ class HashGrid:
 
 def _power_of_two(value: Float) -> Float:
     """The largest power of two that is at most `value`, a positive number: products with it are exact."""
-    bits: Any = dr.reinterpret_array(ad.UInt32, value)
-    power: Any = dr.reinterpret_array(ad.Float, bits & ad.UInt32(0x7F800000))
-    return power
+    bits = cast("UInt32", dr.reinterpret_array(ad.UInt32, value))
+    return cast("Float", dr.reinterpret_array(ad.Float, bits & ad.UInt32(0x7F800000)))
 
 
 def _corners(level: Level, point: Array3f) -> Iterator[tuple[UInt32, Float, Array3f]]:
     """(place in the table, weight, gradient of the weight by the point) of the 8 vertices around points."""
-    scaled: Any = dr.clip(point, 0, 1) * level.cells
+    scaled = dr.clip(point, 0, 1) * level.cells
     cell = dr.minimum(ad.Array3u(scaled), level.cells - 1)
     share = scaled - ad.Array3f(cell)
     for corner in range(8):

@@ -9,9 +9,9 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.arrays import Array3f, Float, UInt32
 from spacesim.backend.upload import upload
-from spacesim.nerf.config import NerfConfig
+from spacesim.nerf.config import NerfConfig, ProposalConfig
 from spacesim.nerf.fields.field import DensityField, DensityTape, Field, Parameters
 from spacesim.nerf.sampling.occupancy import Occupancy
 from spacesim.nerf.sampling.rays import Rays
@@ -26,7 +26,7 @@ class Round:
     edges: Float  #: [R (S + 1)] shares of the ray's part in the box
     made: Weights  #: [R S]
     lengths: Float  #: [R S] of intervals
-    tape: Any  #: of the field that was asked
+    tape: DensityTape  #: of the field that was asked
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Networks:
         return tuple(DensityField.of(round_.grid, round_.width) for round_ in self.rounds)
 
     @property
-    def rounds(self) -> tuple[Any, ...]:
+    def rounds(self) -> tuple[ProposalConfig, ProposalConfig]:
         """The proposals' configurations."""
         return self.config.coarse, self.config.fine
 
@@ -132,7 +132,7 @@ class Networks:
         density, _, tape = field.look_up(parameters, point)
         return Round(edges, volume_weights(density * lengths, samples), lengths, tape)
 
-    def density_tape(self, parameters: Parameters, point: Any) -> tuple[Float, DensityTape]:
+    def density_tape(self, parameters: Parameters, point: Array3f) -> tuple[Float, DensityTape]:
         """(density [N] of the field per side, tape) at points [3, N]."""
         density, _, tape = self.field.density.look_up(self.of_round(parameters, 2)[: self.field.split], point)
         return density, tape

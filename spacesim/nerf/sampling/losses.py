@@ -1,7 +1,5 @@
 """What training minimises beside the error of colours, each with its gradient by hand; sums are made in fixed order."""
 
-from typing import Any
-
 import drjit as dr
 
 from spacesim.backend import ad
@@ -51,7 +49,7 @@ def interlevel(
 def normal_slope(normal: Array3f, slope: Array3f, weights: Float) -> Array3f:
     """[3, N] gradient by normals [3, N], of any length, of the sum of weights |n / |n| + slope / |slope||^2 (Verbin et
     al. 2022, equation 11): normals point against the slope of density, which is not asked to follow them."""
-    per_length: Any = dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12))
+    per_length = dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12))
     unit = normal * per_length
     wanted = slope * -dr.rsqrt(dr.maximum(dr.squared_norm(slope), 1e-12))
     return (unit * dr.dot(unit, wanted) - wanted) * (2 * weights * per_length)

@@ -1,12 +1,11 @@
 """Which cells of the box hold anything: rays are sampled from the first to the last of these that they cross."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Array3f, Float, UInt32
+from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.nerf.sampling.rays import Rays
 from spacesim.nerf.sampling.sampler import random
 
@@ -43,25 +42,25 @@ class Occupancy:
             most = dr.maximum(most, dr.gather(ad.Float, state, ad.UInt32((near[2] * n + near[1]) * n + near[0])))
         return dr.select(1 - dr.exp(-most / n) > FILLED, ad.Float(1), ad.Float(0))
 
-    def clip(self, rays: Rays, filled: Float) -> tuple[Rays, Any]:
+    def clip(self, rays: Rays, filled: Float) -> tuple[Rays, Bool]:
         """(rays with near and far around the filled cells that they cross, whether they cross any). Looks at every half
         cell; `filled` has a margin of a cell."""
         n = self.cells
         step = 0.5 / n
         first, last = ad.Float(dr.inf), ad.Float(-dr.inf)
         count = dr.maximum(dr.ceil((rays.far - rays.near) / step), 0)
-        k: Any = dr.zeros(ad.Float, dr.width(rays.near))
+        k = dr.zeros(ad.Float, dr.width(rays.near))
 
-        def look(k: Any, first: Any, last: Any) -> Any:
+        def look(k: Float, first: Float, last: Float) -> tuple[Float, Float, Float]:
             t = rays.near + (k + 0.5) * step
-            place: Any = dr.fma(rays.direction, t, rays.origin) * n
+            place = dr.fma(rays.direction, t, rays.origin) * n
             cell = ad.Array3u(dr.clip(place, 0, n - 1))
             hit = dr.gather(ad.Float, filled, (cell.z * n + cell.y) * n + cell.x) > 0
             first = dr.select(hit, dr.minimum(first, t), first)
             last = dr.select(hit, dr.maximum(last, t), last)
             return k + 1, first, last
 
-        def goes_on(k: Any, first: Any, last: Any) -> Any:
+        def goes_on(k: Float, first: Float, last: Float) -> Bool:
             return k < count
 
         _, first, last = dr.while_loop((k, first, last), goes_on, look)

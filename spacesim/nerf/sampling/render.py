@@ -4,12 +4,12 @@ tau is density times length of an interval. Sums along rays are made in a fixed 
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar
 
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.arrays import Array3f, Float, UInt32
 
 LN2 = 0.6931471805599453
 
@@ -37,12 +37,15 @@ def weights_adjoint(made: Weights, gradient: Float, samples: int) -> Float:
     return made.behind * gradient - later
 
 
-def sum_rays(values: Any, samples: int) -> Any:
+SumT = TypeVar("SumT", Float, UInt32, Array3f)  #: the same type in and out
+
+
+def sum_rays(values: SumT, samples: int) -> SumT:
     """[R] sums over the intervals of each ray, of an array [R S] or nested ones."""
     return dr.block_reduce(dr.ReduceOp.Add, values, samples, mode="evaluated")
 
 
-def spread(values: Any, samples: int) -> Any:
+def spread(values: SumT, samples: int) -> SumT:
     """[R S] a ray's value for each of its intervals."""
     size = dr.width(values) * samples
     return dr.gather(type(values), values, dr.arange(ad.UInt32, size) // samples)
@@ -57,7 +60,7 @@ def expected_depth(weights: Float, middles: Float, samples: int) -> Float:
 def median_depth(made: Weights, low: Float, high: Float, samples: int) -> Float:
     """[R] t at which half of the light is gone, exact where densities are constant in intervals; 0 where more than
     half gets through. low, high: [R S] t"""
-    passed: Any = sum_rays(dr.select(made.behind > 0.5, ad.UInt32(1), ad.UInt32(0)), samples)
+    passed = sum_rays(dr.select(made.behind > 0.5, ad.UInt32(1), ad.UInt32(0)), samples)
     found = passed < samples
     place: UInt32 = dr.arange(ad.UInt32, dr.width(passed)) * samples + dr.minimum(passed, samples - 1)
     first, last, tau = (dr.gather(ad.Float, value, place) for value in (low, high, made.tau))

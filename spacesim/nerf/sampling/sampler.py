@@ -74,7 +74,7 @@ def last_at_most(values: Float, first: UInt32, count: int, target: Float) -> UIn
 
 def count_below(values: Float, first: UInt32, count: int, target: Float, equal: bool = False) -> UInt32:
     """[N] how many of `count` rising values from `first` [N] on are below `target` [N], or also equal to it."""
-    found: Any = dr.zeros(ad.UInt32, dr.width(target))
+    found = dr.zeros(ad.UInt32, dr.width(target))
     step = 1 << (count.bit_length() - 1)
     while step:
         place = found + step

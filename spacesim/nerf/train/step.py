@@ -1,7 +1,6 @@
 """A step of training, traced once: rays, samples, colours, losses, the adjoint of all that, Adam."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
@@ -88,7 +87,7 @@ def loss_and_gradients(
     density, color, tape = networks.field.look_up(own, point, direction, sun)
     made = volume_weights(density * lengths, samples)
     weights = made.weights
-    visible: Any = ad.Float(1)
+    visible = ad.Float(1)
     if config.casts_shadows:
         low, high = t - 0.5 * lengths, t + 0.5 * lengths
         seen = ray_visibility(networks, parameters, filled, pixels.extent, rays, made, low, high, towards)
@@ -100,8 +99,8 @@ def loss_and_gradients(
     alpha = ad.Float(truth >> 24) / 255
     opacity = sum_rays(weights, samples)
     scale = 1 / (3 * count)
-    loss: Any = ad.Float(0)
-    by_weights: Any = dr.zeros(ad.Float, count * samples)
+    loss = ad.Float(0)
+    by_weights = dr.zeros(ad.Float, count * samples)
     by_color = []
     for i in range(3):
         shown = sum_rays(weights * color[i], samples) + (1 - opacity) * background[i]

@@ -2,7 +2,6 @@
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -68,7 +67,7 @@ class Trainer(TrainingLoop):
         self.history: list[dict[str, float]] = []
         self._step, self._look_around = recorded(step), recorded(look_around)
 
-    def step(self) -> Any:
+    def step(self) -> Float:
         """One update. Returns the mean squared error of colours, Float of width 1."""
         config, index = self.config, self.iteration
         warm = index >= config.warm_up

@@ -17,12 +17,13 @@ al., "Spatial and temporal distribution of clouds observed by MODIS", IEEE TGRS 
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
+from spacesim.backend.arrays import Float, UInt32
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
 from spacesim.scenes.background.noise import octaves
@@ -86,7 +87,9 @@ class Globe:
         count = math.prod(shape)
         return values[: 3 * count].reshape(*shape, 3), values[3 * count :].reshape(shape)
 
-    def _shade(self, view: KernelCamera, inputs: Any, irradiance: Any, seed: Any) -> Any:
+    def _shade(
+        self, view: KernelCamera, inputs: tuple[Float | mt.Vector3f, ...], irradiance: mt.Vector3f, seed: UInt32
+    ) -> Float:
         """RGB, then cover, of each pixel, [3 H W + H W]."""
         mi = backend.mitsuba()
         centre, distance, *axes, sun = inputs
@@ -129,8 +132,8 @@ class Globe:
         return dr.concat([dr.ravel(color), cover])
 
 
-def albedo(point: Any, width: Any, seed: Any) -> Any:
-    """Albedo, a Color3f, of the globe at unit vectors `point`, the pole at +z; width: of a pixel there, in radii."""
+def albedo(point: mt.Point3f, width: Float, seed: UInt32) -> mt.Color3f:
+    """Albedo of the globe at unit vectors `point`, the pole at +z; width: of a pixel there, in radii."""
     mi = backend.mitsuba()
     latitude = dr.abs(point.z)  # its sine
     warp = octaves(point, seed, 3, 1.7, 0.5, width)
@@ -154,18 +157,21 @@ def albedo(point: Any, width: Any, seed: Any) -> Any:
     return _mix(surface, CLOUD, 1 - (1 - sheets) * (1 - heaps))
 
 
-def _mix(first: Any, second: Any, share: Any) -> Any:
+Colors = mt.Color3f | tuple[float, float, float]  #: of each point, or one of all
+
+
+def _mix(first: Colors, second: Colors, share: Float) -> mt.Color3f:
     """Of two colours, by the share of the second."""
     color = backend.mitsuba().Color3f
     one, other = (color(*value) if isinstance(value, tuple) else value for value in (first, second))
     return dr.lerp(one, other, share)
 
 
-def _smoothstep(x: Any, low: float, high: float) -> Any:
+def _smoothstep(x: Float, low: float, high: float) -> Float:
     t = dr.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
 
 
-def _rayleigh_phase(cosine: Any) -> Any:
+def _rayleigh_phase(cosine: Float) -> Float:
     """Rayleigh's, of mean 1 over the sphere; cosine: of the angle between the ray from the camera and the Sun."""
     return 0.75 * (1 + cosine * cosine)

@@ -1,28 +1,28 @@
 """Gradient noise on Dr.Jit: sums of octaves, each left out where a pixel is wider than its cells."""
 
-from typing import Any
-
 import drjit as dr
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
+from spacesim.backend.arrays import Bool, Float, UInt32
 
 _PRIMES = (0x8DA6B343, 0xD8163841, 0xCB1AB31F)  # spread the coordinates of a cell's corner over 32 bits
 LACUNARITY = 2.17  #: frequency of an octave over that of the one before: cells of two octaves do not line up
 
 
-def octaves(point: Any, seed: Any, count: int, frequency: float, gain: float, width: Any) -> Any:
-    """The sum of at most `count` octaves of noise, three independent ones (Vector3f), about -1 to 1.
+def octaves(point: mt.Point3f, seed: UInt32, count: int, frequency: float, gain: float, width: Float) -> mt.Vector3f:
+    """The sum of at most `count` octaves of noise, three independent ones, about -1 to 1.
 
-    point: Point3f; seed: UInt32; frequency: cells a unit of the first octave; gain: amplitude of each octave over that
+    frequency: cells a unit of the first octave; gain: amplitude of each octave over that
     of the one before; width: of a pixel at the point, in units of `point`: octaves fade out from half a cell a pixel on
     (A. Apodaca, L. Gritz, "Advanced RenderMan", 2000, 11.3: clamping).
     """
     mi = backend.mitsuba()
 
-    def within(k: Any, scale: Any, *_: Any) -> Any:
+    def within(k: UInt32, scale: Float, *_: object) -> Bool:
         return (k < count) & (scale * width < 1)
 
-    def add(k: Any, scale: Any, weight: Any, total: Any) -> tuple[Any, ...]:
+    def add(k: UInt32, scale: Float, weight: Float, total: mt.Vector3f) -> tuple[UInt32, Float, Float, mt.Vector3f]:
         shown = dr.clip(2 - 2 * scale * width, 0, 1)
         value = gradient_noise(point * scale, seed + k * 0x9E3779B9)
         return k + 1, scale * LACUNARITY, weight * gain, total + weight * shown * value
@@ -31,8 +31,8 @@ def octaves(point: Any, seed: Any, count: int, frequency: float, gain: float, wi
     return dr.while_loop(start, within, add, labels=("k", "scale", "weight", "total"))[3]
 
 
-def gradient_noise(point: Any, seed: Any) -> Any:
-    """Three independent noises at `point`, a Vector3f, from -1 to 1: 0 at the corners of the cells of side 1, where
+def gradient_noise(point: mt.Point3f, seed: UInt32) -> mt.Vector3f:
+    """Three independent noises at `point`, from -1 to 1: 0 at the corners of the cells of side 1, where
     each has a gradient drawn at random (K. Perlin, "Improving noise", 2002, with his fifth-degree blend)."""
     mi = backend.mitsuba()
     cell = dr.floor(point)
@@ -57,14 +57,14 @@ def gradient_noise(point: Any, seed: Any) -> Any:
     return total
 
 
-def _scramble(key: Any) -> Any:
+def _scramble(key: UInt32) -> UInt32:
     """A permutation of 32 bits (C. Wellons' "lowbias32", 2018)."""
     key = (key ^ (key >> 16)) * 0x7FEB352D
     key = (key ^ (key >> 15)) * 0x846CA68B
     return key ^ (key >> 16)
 
 
-def _vector(key: Any) -> Any:
+def _vector(key: UInt32) -> mt.Vector3f:
     """A vector in the cube from -1 to 1, of 30 of the bits."""
     mi = backend.mitsuba()
     return mi.Vector3f(*(mi.Float((key >> shift) & 1023) * (2 / 1023) - 1 for shift in (0, 10, 20)))

@@ -8,8 +8,8 @@ import numpy as np
 from spacesim.data.errors import InputError, expect
 from spacesim.data.geometry import Array
 from spacesim.data.images import distort_points, undistort_points
+from spacesim.data.images.tone import TONES
 from spacesim.data.records import Camera, check_size
-from spacesim.data.tone import TONES
 from spacesim.scenes.cameras.sensor import SensorConfig
 from spacesim.scenes.lights.sun import EXPOSURE
 from spacesim.scenes.materials.spectra import WHITE_BALANCES

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spacesim.data.tone import as_bytes, display_values
+from spacesim.data.images.tone import as_bytes, display_values
 from spacesim.scenes.cameras.camera import CameraConfig
 
 _NOISE = 2  # stream of random numbers

@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import ParamSpec, TypeVar
 
 import drjit as dr
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
+from spacesim.backend.arrays import Float, UInt32
 from spacesim.data.geometry import Array
 from spacesim.data.images import undistort_points
 from spacesim.data.records import Camera
@@ -49,14 +51,14 @@ class KernelCamera:
 
     width: int
     height: int
-    right: Any
-    down: Any
-    forward: Any
-    start: Any  #: where the axis meets that plane
-    near: Any
-    metre: Any  #: of the unit of length
-    focal: Any
-    centre: Any
+    right: mt.Vector3f
+    down: mt.Vector3f
+    forward: mt.Vector3f
+    start: mt.Vector3f  #: where the axis meets that plane
+    near: Float
+    metre: Float  #: of the unit of length
+    focal: list[Float]
+    centre: list[Float]
 
     @classmethod
     def of(cls, camera: Camera, units: Units) -> "KernelCamera":
@@ -69,7 +71,9 @@ class KernelCamera:
         focal, centre = ([kernel_input(x) for x in pair] for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
         return cls(camera.width, camera.height, right, down, forward, start, *lengths, focal, centre)
 
-    def rays(self, pixel: Any, offset: Any, distortion: Sequence[float]) -> tuple[Any, Any]:
+    def rays(
+        self, pixel: UInt32, offset: mt.Point2f, distortion: Sequence[float]
+    ) -> tuple[mt.RayDifferential3f, Float]:
         """Rays through pixels (index row by row), each at an `offset` in [0, 1)^2 from the pixel's upper left; and how
         far from the camera they start."""
         mi = backend.mitsuba()
@@ -83,7 +87,11 @@ class KernelCamera:
         return mi.RayDifferential3f(mi.Ray3f(start, (aside + self.forward) / length)), self.near * length
 
 
-def record_on_cuda(function: Callable[..., Any]) -> Callable[..., Any]:
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def record_on_cuda(function: Callable[P, R]) -> Callable[P, R]:
     """`function`, recorded once and replayed on CUDA. On LLVM it is traced anew, which takes 5 % of a frame there:
     whatever Embree scene or numpy array somebody lets go of in the middle of a recording would end the process."""
     return backend.recorded(function, limit=RECORDINGS, elements=None) if backend.select() == "cuda" else function

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from spacesim.data import density, sheet
-from spacesim.data.images import read_png, write_png
+from spacesim.data import density
+from spacesim.data.images import read_png, sheet, write_png
+from spacesim.data.images.sheet import Tile
 from spacesim.data.records import Dataset, Frame
-from spacesim.data.sheet import Tile
 
 MAX_TILES = 60
 

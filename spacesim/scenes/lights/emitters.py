@@ -6,12 +6,14 @@ Which directions shine, and how brightly, are inputs of the compiled kernels: tu
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
+from spacesim.backend.arrays import Bool, Float
 from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
 from spacesim.scenes.lights.earth import EarthConfig
@@ -32,17 +34,26 @@ def kernel_input(value: float | Array) -> Any:
 class Limb:
     """The Earth's outline, as seen from the scene: what lies behind it is hidden. An input of kernels."""
 
-    centre: Any
-    cosine: Any
+    centre: mt.Vector3f
+    cosine: Float
 
     @classmethod
     def of(cls, earth: EarthConfig) -> "Limb":
         """The outline of `earth`."""
         return cls(kernel_input(earth.direction), kernel_input(math.cos(earth.angular_radius)))
 
-    def hides(self, direction: Any) -> Any:
+    def hides(self, direction: mt.Vector3f) -> Bool:
         """Does the Earth fill the sky in unit `direction`?"""
         return dr.dot(direction, self.centre) > self.cosine
+
+
+class Source(Protocol):
+    """A Mitsuba emitter that follows the Sun."""
+
+    limb: Limb | None  #: of the Earth, where it hides or reflects sunlight
+
+    def point(self, sun: Sun) -> None:
+        """Move the Sun."""
 
 
 @cache
@@ -58,10 +69,12 @@ def _classes() -> tuple[type, type]:
             self.m_flags = mi.EmitterFlags.Infinite
             self.reach = kernel_input(1e7)  # metres: beyond any scene, so that every part between casts a shadow
 
-        def eval(self, si: Any, active: Any = True) -> Any:
+        def eval(self, si: mt.SurfaceInteraction3f, active: Bool | bool = True) -> mt.Color3f:
             return dr.select(active, self.shines(-si.wi), 0)
 
-        def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
+        def sample_direction(
+            self, it: mt.Interaction3f, sample: mt.Point2f, active: Bool | bool = True
+        ) -> tuple[mt.DirectionSample3f, mt.Color3f]:
             ds = dr.zeros(mi.DirectionSample3f, dr.width(it.p))
             ds.d = self.draw(sample)
             ds.dist, ds.n, ds.uv, ds.time = self.reach, -ds.d, sample, it.time
@@ -69,10 +82,12 @@ def _classes() -> tuple[type, type]:
             ds.pdf, ds.delta, ds.emitter = self.density, False, mi.EmitterPtr(self)
             return ds, dr.select(active, self.shines(ds.d, drawn=True) / self.density, 0)
 
-        def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+        def pdf_direction(self, it: mt.Interaction3f, ds: mt.DirectionSample3f, active: Bool | bool = True) -> Float:
             return dr.select(active & self.covers(ds.d), self.density, 0)
 
-        def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+        def eval_direction(
+            self, it: mt.Interaction3f, ds: mt.DirectionSample3f, active: Bool | bool = True
+        ) -> mt.Color3f:
             return dr.select(active, self.shines(ds.d), 0)
 
     class SolarDisc(Distant):
@@ -93,17 +108,17 @@ def _classes() -> tuple[type, type]:
             """Move the Sun."""
             self.direction = kernel_input(sun.direction)
 
-        def covers(self, direction: Any) -> Any:
+        def covers(self, direction: mt.Vector3f) -> Bool:
             offset = direction - self.direction
             return dr.dot(offset, offset) <= self.chord
 
-        def shines(self, direction: Any, drawn: bool = False) -> Any:
+        def shines(self, direction: mt.Vector3f, drawn: bool = False) -> mt.Color3f:
             lit = mi.Bool(True) if drawn else self.covers(direction)
             if self.limb is not None:
                 lit &= ~self.limb.hides(direction)
             return dr.select(lit, self.radiance, 0)
 
-        def draw(self, sample: Any) -> Any:
+        def draw(self, sample: mt.Point2f) -> mt.Vector3f:
             disc = self.sine * mi.warp.square_to_uniform_disk_concentric(sample)
             local = mi.Vector3f(disc.x, disc.y, dr.safe_sqrt(1 - dr.dot(disc, disc)))
             return mi.Frame3f(self.direction).to_world(local)
@@ -124,27 +139,27 @@ def _classes() -> tuple[type, type]:
             """Move the Sun: the phase changes."""
             self.sun = kernel_input(sun.direction)
 
-        def covers(self, direction: Any) -> Any:
+        def covers(self, direction: mt.Vector3f) -> Bool:
             return self.limb.hides(direction)
 
-        def shines(self, direction: Any, drawn: bool = False) -> Any:
+        def shines(self, direction: mt.Vector3f, drawn: bool = False) -> mt.Color3f:
             along = self.distance * dr.dot(direction, self.centre)  # lengths are in Earth radii
             ahead = along - dr.safe_sqrt(along * along - self.distance * self.distance + 1)
             normal = ahead * direction - self.distance * self.centre
             lit = mi.Bool(True) if drawn else self.covers(direction)
             return dr.select(lit, self.full * dr.maximum(dr.dot(normal, self.sun), 0), 0)
 
-        def draw(self, sample: Any) -> Any:
+        def draw(self, sample: mt.Point2f) -> mt.Vector3f:
             return mi.Frame3f(self.centre).to_world(mi.warp.square_to_uniform_cone(sample, self.limb.cosine))
 
     return SolarDisc, Earthshine
 
 
-def solar_disc(sun: SunConfig, earth: EarthConfig | None = None) -> Any:
-    """The Sun as a Mitsuba emitter with a method `point(Sun)`; the Earth hides it where it is before it."""
+def solar_disc(sun: SunConfig, earth: EarthConfig | None = None) -> Source:
+    """The Sun as a Mitsuba emitter; the Earth hides it where it is before it."""
     return _classes()[0](sun, earth)
 
 
-def earthshine(earth: EarthConfig, sun: SunConfig) -> Any:
-    """The Earth as a Mitsuba emitter with a method `point(Sun)`."""
+def earthshine(earth: EarthConfig, sun: SunConfig) -> Source:
+    """The Earth as a Mitsuba emitter."""
     return _classes()[1](earth, sun)

@@ -8,15 +8,16 @@ perfectly smooth, because a mirror never meets a directional Sun.
 import importlib
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.scenes.materials import textures
 
@@ -44,14 +45,14 @@ class Material:
 
     name: str
     albedo: Color  #: mean linear camera RGB reflectance, diffuse or (metals) specular
-    bsdf: Mapping[str, Any]  #: Mitsuba's description
+    bsdf: JsonMapping  #: Mitsuba's description
     source: str  #: where the numbers are from
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
     tile: float | None = None  #: metres that one repeat of the images covers where a part has no uv of its own
     reflectance: tuple[tuple[float, float], ...] = ()  #: (wavelength nm, reflectance); the albedo follows from it
 
 
-def _rgb(color: Color) -> dict[str, Any]:
+def _rgb(color: Color) -> JsonDict:
     return {"type": "rgb", "value": list(color)}
 
 
@@ -133,7 +134,7 @@ def principled(
         if key in images:
             lowest = SMOOTHEST if key == "roughness" else 0.0
             images[key] = np.round(np.maximum(factor * images[key], 255 * lowest)).astype(np.uint8)
-    bsdf: dict[str, Any] = {
+    bsdf: JsonDict = {
         "type": "principled",
         "base_color": _bitmap("base_color", raw=False) if "base_color" in images else _rgb(base_color),
         "metallic": _bitmap("metallic") if "metallic" in images else metallic,
@@ -199,7 +200,7 @@ def _table() -> dict[str, MaterialPreset]:
     }
 
 
-def _material_preset(name: str, values: Mapping[str, Any]) -> MaterialPreset:
+def _material_preset(name: str, values: JsonMapping) -> MaterialPreset:
     """The row called `name`; InputError where its kind is none of `Kind`."""
     if values.get("kind") not in get_args(Kind):
         kinds = ", ".join(get_args(Kind))
@@ -255,7 +256,7 @@ def customise_preset(
     """The row `base` with other numbers, as `customise` takes them, for a material called `name`; itself where all are
     None. Raises InputError as `customise` does."""
     row = material_preset(base)
-    changes: dict[str, Any] = {}
+    changes: JsonDict = {}
     if albedo is not None:
         _check_unit(f"material {name}: albedo", albedo)
         if row.kind == "coated" and max(albedo) > WHITEST:
@@ -277,22 +278,22 @@ def customise_preset(
     return replace(row, source=source, **changes)
 
 
-def _check_unit(what: str, values: Any) -> None:
+def _check_unit(what: str, values: Iterable[float]) -> None:
     if not all(0.0 <= x <= 1.0 for x in values):
         found = ", ".join(f"{x:g}" for x in values)
         raise InputError(f"{what}: expected numbers from 0 to 1, found {found}")
 
 
-def _color(values: Any) -> Color:
+def _color(values: Iterable[float]) -> Color:
     red, green, blue = (float(x) for x in values)
     return red, green, blue
 
 
-def _bitmap(key: str, raw: bool = True) -> dict[str, Any]:
+def _bitmap(key: str, raw: bool = True) -> JsonDict:
     """A texture in a BSDF, its pixels in `Material.images[key]`."""
     return {"type": "bitmap", "image": key, "raw": raw}
 
 
-def _with_normals(bsdf: Mapping[str, Any], key: str) -> dict[str, Any]:
+def _with_normals(bsdf: JsonMapping, key: str) -> JsonDict:
     """`bsdf` with the normals of the image `key` (tangent space)."""
     return {"type": "normalmap", "normalmap": _bitmap(key), "bsdf": dict(bsdf)}

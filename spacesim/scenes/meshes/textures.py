@@ -17,7 +17,7 @@ from PIL import Image
 
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_bytes
+from spacesim.data.files import JsonMapping, read_bytes
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.scenes.materials.table import SMOOTHEST, WHITEST, Color, Material, lambertian, material, principled
 
@@ -250,7 +250,7 @@ def _tinted_picture(picture: np.ndarray, factor: Color, most: float) -> tuple[np
     return tinted, (mean[0] / pixels, mean[1] / pixels, mean[2] / pixels)
 
 
-def _with_wrap_mode(bsdf: Mapping[str, Any], wrap: str) -> Mapping[str, Any]:
+def _with_wrap_mode(bsdf: JsonMapping, wrap: str) -> JsonMapping:
     """`bsdf` with the wrap mode of its bitmaps, where it is not Mitsuba's own, "repeat"."""
     if wrap == "repeat":
         return bsdf

@@ -15,7 +15,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,11 +22,11 @@ from spacesim import __version__, backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonValue, holds_files, read_json, remove_leftovers, write_bytes, write_json
 from spacesim.data.images import read_png, write_exr, write_png
+from spacesim.data.images.sheet import DARK_PAGE, Tile, contact_sheet, fit_picture
+from spacesim.data.images.tone import as_bytes
 from spacesim.data.integrity.whole import is_whole
 from spacesim.data.lock import lock_folder
-from spacesim.data.sheet import DARK_PAGE, Tile, contact_sheet, fit_picture
 from spacesim.data.store import intrinsics_of
-from spacesim.data.tone import as_bytes
 from spacesim.learning.pictures import write_picture
 from spacesim.splat.compose.path import PosedScene, SceneFrame
 from spacesim.splat.compose.scene import ComposedPrediction
@@ -164,7 +163,7 @@ def _describe_frame(frame: SceneFrame, exposure: float | None) -> dict[str, Json
         ],
     }
     composition = frame.composition
-    made_by: list[Any] = [__version__, backend.select(), composition.config.shadows, composition.contents]
+    made_by: list[object] = [__version__, backend.select(), composition.config.shadows, composition.contents]
     if exposure is not None:
         made_by.append(exposure)
     text = json.dumps([values, made_by], sort_keys=True)

@@ -7,17 +7,18 @@ Then its Gaussians go to the world (3.11 to 3.13).
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol, TypeVar, cast
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
 from spacesim.backend import ad
+from spacesim.backend.arrays import Bool, Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
@@ -39,6 +40,9 @@ SHADOWS = ("trained", "others", "ratio", "none")
 MIN_SCALE_SHARE = 0.25  #: least light pixels over a model's extent as a share of the picture's size: half of training's
 RATIO_EPSILON = 1e-3  #: epsilon of 4.15, for which the thesis names no number
 COVERED = 0.5  #: alpha from which on a pixel shows an object
+
+Light = tuple[list[Float], Float | None]  #: (three colours, visibility or None of a run without shadows), [N] each
+T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +78,7 @@ class DrawnView:
     #: alpha, depth, ... and `features`, of which `planes` says what they are: "rgb" (3, premultiplied, linear where
     #: there is a `curve`), "visibility" (1, premultiplied), "id" (one a model, in the order of `order`)
     output: RenderOutput
-    planes: dict[str, list[Any]]
+    planes: dict[str, list[Float]]
     order: list[int]
     curve: tuple[str, float] | None
 
@@ -116,9 +120,9 @@ class LitGaussians:
     """All Gaussians of a scene in the world, in the order of `Composition.placed`, as a camera sees them lit."""
 
     gaussians: Gaussians  #: colours left out
-    colors: list[Any]  #: three Floats [N], sRGB display values
-    visibility: Any  #: Float [N] share of the Sun that each sees, or None of a scene without shadows
-    shares: list[Any]  #: Float [N] of each model: 1 for its Gaussians, else 0
+    colors: list[Float]  #: three [N], sRGB display values
+    visibility: Float | None  #: [N] share of the Sun that each sees; None of a scene without shadows
+    shares: list[Float]  #: [N] of each model: 1 for its Gaussians, else 0
 
 
 class Composition:
@@ -188,7 +192,7 @@ class Composition:
         )
 
     @property
-    def antialiased(self) -> Any:
+    def antialiased(self) -> Bool | bool:
         """Whether Gaussians are drawn with the anti-aliasing filter: one for all, or Bool [N] where runs differ."""
         return self._ensemble.antialiased
 
@@ -260,7 +264,7 @@ class Composition:
         """Model `index` where it stands, colours left out."""
         return Ensemble([self._members[index]]).placed([self.models[index].pose])
 
-    def cross_visibility(self, sun: Sun | None) -> list[Any]:
+    def cross_visibility(self, sun: Sun | None) -> list[Float | None]:
         """Of each model, in the order of `placed`, the share of sunlight that the others let through, v_inter of 4.15:
         Float [N of it], or None where no other can be before the Sun."""
         return self._cross_visibilities([model.pose for model in self.placed], None if sun is None else sun.direction)
@@ -275,7 +279,7 @@ class Composition:
         if unknown:
             raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
         poses = [model.pose for model in self.placed]
-        planes: dict[str, list[Any]] = {}
+        planes: dict[str, list[Float]] = {}
         if "rgb" in outputs or "visibility" in outputs:
             colors, visibility = self._shade_members(poses, camera, sun)
             if "rgb" in outputs:
@@ -300,7 +304,7 @@ class Composition:
         images = {name: [next(drawn) for _ in group] for name, group in planes.items()}
         return DrawnView(output, images, self._order(), ensemble.curve)
 
-    def lit_gaussians(self, camera: Camera, sun: Sun | None) -> tuple[Gaussians, list[Any]]:
+    def lit_gaussians(self, camera: Camera, sun: Sun | None) -> tuple[Gaussians, list[Float]]:
         """(the set in the world, its colours seen from the camera: three Floats [N], sRGB display values), to draw it
         in another way. Raises InputError where the Sun matters and none is told."""
         lit = self.lit(camera, sun)
@@ -325,7 +329,7 @@ class Composition:
         drawn = [i for i, member in enumerate(self._members) if member.count]
         return sorted(drawn, key=lambda i: (self._members[i].key, self.models[i].pose.key))
 
-    def _shade_members(self, poses: Sequence[Pose], camera: Camera, sun: Sun | None) -> tuple[list[Any], Any]:
+    def _shade_members(self, poses: Sequence[Pose], camera: Camera, sun: Sun | None) -> Light:
         """(colours as blended, three Floats [N], visibility Float [N] or None)."""
         if sun is None and self.relightable:
             source = self.path or self.models[0].run.path
@@ -349,19 +353,16 @@ class Composition:
         ]
         return joined, self._ensemble.joined([[plane] for plane in seen])[0]
 
-    def _member_colors(self, k: int, pose: Pose, camera: Camera, sun: Array | None) -> tuple[list[Any], Any]:
+    def _member_colors(self, k: int, pose: Pose, camera: Camera, sun: Array | None) -> Light:
         """(colours, visibility or None) of member k as it is alone."""
         member = self._ensemble.members[k]
         near, towards = pose.camera_in_model(camera), None if sun is None else pose.direction_in_model(sun)
         light = _bytes(towards)
         sunlight = self._cache.get(("sunlight", k), light, lambda: member.sunlight(towards))
         key = near.world_from_camera.tobytes(), light
-        part: tuple[list[Any], Any] = self._cache.get(
-            ("light", k), key, lambda: member.shade(Pinhole.of(near), towards, sunlight)
-        )
-        return part
+        return self._cache.get(("light", k), key, lambda: member.shade(Pinhole.of(near), towards, sunlight))
 
-    def _cross_visibilities(self, poses: Sequence[Pose], sun: Array | None) -> list[Any]:
+    def _cross_visibilities(self, poses: Sequence[Pose], sun: Array | None) -> list[Float | None]:
         """Of each member v_inter, Float [N of it], or None where no other can be before the Sun."""
         if not self._shades:
             return [None] * len(poses)
@@ -369,14 +370,15 @@ class Composition:
         others = b"" if self._beside is None else self._beside.key
         key = (b"".join(pose.key for pose in poses), sun.tobytes(), self.config.shadows, others)
 
-        def compute() -> list[Any]:
+        def compute() -> list[Float | None]:
             between = [self._compute_cross_visibility(poses, sun, k) for k in range(len(poses))]
             return between if self._beside is None else self._behind(self._beside, poses, sun, between)
 
-        visibility: list[Any] = self._cache.get("between", key, compute)
-        return visibility
+        return self._cache.get("between", key, compute)
 
-    def _behind(self, beside: Beside, poses: Sequence[Pose], sun: Array, between: list[Any]) -> list[Any]:
+    def _behind(
+        self, beside: Beside, poses: Sequence[Pose], sun: Array, between: list[Float | None]
+    ) -> list[Float | None]:
         """v_inter `between` with what `beside` lets through to the Gaussians' centres: light that comes through both is
         the product, so that the ratio of 4.15 is what the others let through."""
         means = np.array(self._ensemble.placed(poses).means, np.float64).T
@@ -388,7 +390,7 @@ class Composition:
         dr.eval(result)
         return result
 
-    def _compute_cross_visibility(self, poses: Sequence[Pose], sun: Array, k: int) -> Any:
+    def _compute_cross_visibility(self, poses: Sequence[Pose], sun: Array, k: int) -> Float | None:
         """v_inter of 4.15 for member k, in its own frame: what is seen of the Sun depends neither on where all stands
         nor on how it is turned, and softness, bias and pixels are those of its training."""
         ensemble, members = self._ensemble, self._ensemble.members
@@ -402,7 +404,7 @@ class Composition:
         alone = (member.shadow.between if named == "trained" else named) == "others"
         shadow = member.cross_shadow_config if alone else member.shadow
 
-        def seen(casts: Any) -> Any:
+        def seen(casts: Bool) -> Float:
             between = CrossShadow(scene, casts, member.run.gaussians, ensemble.own[k], ensemble.indices[k])
             return 1 - cast_cross_shadows(between, direction, shadow, member.distance, least)
 
@@ -420,16 +422,16 @@ class _Cache:
     """What the last picture has computed and the next may use again, each with what it depends on: where only a model
     moves, the light of the others; where only the camera moves, the shadows."""
 
-    values: dict[Any, tuple[Any, Any]] = field(default_factory=dict)
+    values: dict[Hashable, tuple[Hashable, object]] = field(default_factory=dict)
 
-    def get(self, name: Any, key: Any, make: Any) -> Any:
+    def get(self, name: Hashable, key: Hashable, make: Callable[[], T]) -> T:
         if name not in self.values or self.values[name][0] != key:
             self.values.pop(name, None)  # room for the next
             self.values[name] = key, make()
-        return self.values[name][1]
+        return cast("T", self.values[name][1])
 
 
-def _dim(part: tuple[list[Any], Any], share: Any) -> tuple[list[Any], Any]:
+def _dim(part: Light, share: Float | None) -> Light:
     """Colours and visibility in the shadows of others (4.16, 4.17). share: v_inter, or None where there are none"""
     colors, visibility = part
     if share is None:

@@ -5,13 +5,13 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from spacesim.data import toml
 from spacesim.data.errors import InputError
-from spacesim.data.files import write_bytes
+from spacesim.data.files import JsonDict, write_bytes
 from spacesim.data.geometry import OPENCV_FROM_OPENGL, Array, look_at
 from spacesim.data.records import Camera, Sun, check_size
 from spacesim.data.structure import Rules, did_you_mean, structure
@@ -51,7 +51,7 @@ class PoseEntry:
 
     def pose(self, base: Pose) -> Pose:
         """`base` with what is said. Raises InputError that begins with the key."""
-        rotation: Any = base.quaternion if self.rotation_wxyz is None else self.rotation_wxyz
+        rotation = base.quaternion if self.rotation_wxyz is None else np.array(self.rotation_wxyz)
         if self.axis is not None and self.angle_deg is not None:
             rotation = rotation_about(self.axis, self.angle_deg)
         position = base.translation if self.position is None else self.position
@@ -212,6 +212,9 @@ class SceneEntry:
         ComposeConfig(self.shadows)
 
 
+T = TypeVar("T")
+
+
 def load_scene(
     path: str | Path, load: Callable[[Path], Any] | None = None, compose: Callable[..., Any] = Composition
 ) -> PosedScene:
@@ -244,7 +247,7 @@ def save_scene(path: Path, scene: PosedScene) -> None:
     """Write a scene as a TOML file from which `load_scene` makes the same one: numbers are written in full, so pictures
     are the same to the bit. Runs are named relative to the file where they lie beside or below its folder."""
     path = Path(path)
-    values: dict[str, Any] = {}
+    values: JsonDict = {}
     if scene.composition.config.shadows != ComposeConfig.shadows:
         values["shadows"] = scene.composition.config.shadows
     if scene.frames != 1 or scene.keyframes or scene.orbit:
@@ -300,8 +303,7 @@ def _camera(entry: CameraEntry, folder: Path, document: toml.Document) -> Camera
         if not 0 <= entry.frame < len(frames):
             label = document.label(("camera", "frame"))
             raise InputError(f"{label}: expected 0 to {len(frames) - 1}, found {entry.frame}")
-        camera: Camera = frames[entry.frame].camera
-        return camera
+        return frames[entry.frame].camera
     width, height = entry.resolution or RESOLUTION
     view = entry.view(width) or (
         entry.orbit.view(0) if entry.orbit else CameraView(look_at((0.0, -5.0, 2.0), (0, 0, 0)))
@@ -312,7 +314,7 @@ def _camera(entry: CameraEntry, folder: Path, document: toml.Document) -> Camera
     return Camera(view.world_from_camera, width, height, fx, fy, cx, cy)
 
 
-def _read_entry(document: toml.Document, key: str, read: Any) -> Any:
+def _read_entry(document: toml.Document, key: str, read: Callable[[], T]) -> T:
     try:
         return read()
     except InputError as error:
@@ -376,7 +378,7 @@ def _relative(run: Path, folder: Path) -> str:
     return os.path.relpath(there, here) if near_by else str(there)
 
 
-def _pose_values(pose: Pose) -> dict[str, Any]:
+def _pose_values(pose: Pose) -> JsonDict:
     return {
         "position": pose.translation.tolist(),
         "rotation_wxyz": pose.quaternion.tolist(),
@@ -384,15 +386,15 @@ def _pose_values(pose: Pose) -> dict[str, Any]:
     }
 
 
-def _sun_values(sun: Sun) -> dict[str, Any]:
+def _sun_values(sun: Sun) -> JsonDict:
     azimuth, elevation = (round(angle, 9) for angle in sun.angles)  # as they were typed, where that means the same
     if np.array_equal(Sun.from_angles(azimuth, elevation).direction, sun.direction):
         return {"azimuth_deg": azimuth, "elevation_deg": elevation}
     return {"direction": sun.direction.tolist()}
 
 
-def _view_values(view: CameraView) -> dict[str, Any]:
-    values: dict[str, Any] = {"transform_matrix": (view.world_from_camera @ OPENCV_FROM_OPENGL).tolist()}
+def _view_values(view: CameraView) -> JsonDict:
+    values: JsonDict = {"transform_matrix": (view.world_from_camera @ OPENCV_FROM_OPENGL).tolist()}
     position = view.world_from_camera[:3, 3]
     if view.target is not None and np.array_equal(look_at(position, view.target, view.up), view.world_from_camera):
         values = {"position": position.tolist(), "look_at": view.target.tolist()}
@@ -401,8 +403,8 @@ def _view_values(view: CameraView) -> dict[str, Any]:
     return values | ({} if view.focal is None else {"focal": [float(length) for length in view.focal]})
 
 
-def _camera_values(camera: Camera, orbit: Orbit | None) -> dict[str, Any]:
-    values: dict[str, Any] = {
+def _camera_values(camera: Camera, orbit: Orbit | None) -> JsonDict:
+    values: JsonDict = {
         "resolution": [camera.width, camera.height],
         "focal": [float(camera.fx), float(camera.fy)],
         "principal": [float(camera.cx), float(camera.cy)],
@@ -420,8 +422,8 @@ def _camera_values(camera: Camera, orbit: Orbit | None) -> dict[str, Any]:
     }
 
 
-def _keyframe_values(key: Keyframe) -> dict[str, Any]:
-    values: dict[str, Any] = {"time": float(key.time)}
+def _keyframe_values(key: Keyframe) -> JsonDict:
+    values: JsonDict = {"time": float(key.time)}
     if key.sun is not None:
         values["sun"] = _sun_values(key.sun)
     if key.view is not None:

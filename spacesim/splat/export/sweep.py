@@ -17,9 +17,18 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, write_bytes
 from spacesim.data.geometry import direction_from_angles
 from spacesim.data.images import write_png
+from spacesim.data.images.sheet import (
+    DARK_PAGE,
+    DETAIL,
+    LABEL_HEIGHT,
+    MIN_TILE_WIDTH,
+    Tile,
+    contact_sheet,
+    fit_picture,
+    font,
+)
+from spacesim.data.images.tone import as_bytes
 from spacesim.data.records import MAX_SIDE, Camera, Sun, check_size
-from spacesim.data.sheet import DARK_PAGE, DETAIL, LABEL_HEIGHT, MIN_TILE_WIDTH, Tile, contact_sheet, fit_picture, font
-from spacesim.data.tone import as_bytes
 from spacesim.learning.pictures import shadow_colors
 from spacesim.splat.export.video import INSTALL, Video, encoder
 from spacesim.splat.run import Predictor

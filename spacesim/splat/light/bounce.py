@@ -5,7 +5,6 @@ sees. A field that is told the cosines of one Gaussian cannot know which of its 
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
@@ -72,13 +71,13 @@ def irradiance(scatterers: Scatterers, emitters: int, visibility: list[Float], b
     return list(sums)
 
 
-def add_irradiance(color: Float, light: Any, linear: bool) -> Float:
+def add_irradiance(color: Float, light: Float, linear: bool) -> Float:
     """A colour with more light on it, `light` linear. linear: of the colour, which is an sRGB value else, and may get
     beyond 1 as one"""
     return color + light if linear else encode_srgb_unclipped(decode_srgb(color) + light)
 
 
-def add_irradiance_slopes(color: Float, light: Any, linear: bool) -> tuple[Float, Float]:
+def add_irradiance_slopes(color: Float, light: Float, linear: bool) -> tuple[Float, Float]:
     """d `add_irradiance` by colour and by light."""
     if linear:
         return ad.Float(1), ad.Float(1)

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 from spacesim.data.errors import InputError
+from spacesim.data.images.tone import Tone
 from spacesim.data.structure import check_choices
-from spacesim.data.tone import Tone
 from spacesim.splat.light.field import FieldConfig
 from spacesim.splat.light.shadow.cast import ShadowConfig
 from spacesim.splat.light.shadow.refine import RefineConfig

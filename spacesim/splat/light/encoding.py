@@ -1,13 +1,15 @@
 """Unit directions and points as the numbers that networks read (psi of thesis 4.2)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Float
+from spacesim.backend.arrays import Array3f, Float
 from spacesim.data.errors import check_ranges
+from spacesim.data.geometry import Array
 from spacesim.data.structure import check_choices
 
 
@@ -32,8 +34,8 @@ class Encoding:
         """How many numbers."""
         return (self.degree + 1) ** 2 if self.kind == "harmonics" else 3 + 6 * self.degree
 
-    def __call__(self, vectors: Any) -> list[Float]:
-        """`size` Floats [N] of vectors Array3f [3, N]."""
+    def __call__(self, vectors: Array3f) -> list[Float]:
+        """`size` Floats [N] of vectors [3, N]."""
         if self.kind == "harmonics":
             return list(dr.sh_eval(vectors, self.degree))
         terms = list(vectors)
@@ -42,7 +44,7 @@ class Encoding:
                 terms += dr.sincos(value * (2**k * dr.pi))
         return terms
 
-    def of_one(self, vector: Any) -> Float:
+    def of_one(self, vector: Sequence[float] | Array) -> Float:
         """Float [size] of one vector, three numbers. They are no constants of a kernel: others compile nothing."""
         numbers = ad.Float([float(number) for number in vector])  # no numpy array: see `backend.recorded`
         point = ad.Array3f([dr.gather(ad.Float, numbers, ad.UInt32(i)) for i in range(3)])

@@ -1,7 +1,7 @@
 """The appearance field: colour of each Gaussian by its features, the Sun and the view (thesis 4.1, 4.2, table 4.1)."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 
@@ -138,8 +138,8 @@ def sun_facing(config: FieldConfig, inputs: FieldInputs, views: list[Float], bat
 
 def normals_adjoint(
     config: FieldConfig, inputs: FieldInputs, grad_items: TensorXf, grad_facing: list[Float], batch: PaddedBatch
-) -> Any:
-    """TensorXf [B, 3, m]: gradient of the normals, from that of the network's items and, if any, of `sun_facing`."""
+) -> TensorXf:
+    """[B, 3, m]: gradient of the normals, from that of the network's items and, if any, of `sun_facing`."""
     normals = _normals(config, inputs, batch)
     dr.enable_grad(normals)
     direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
@@ -186,7 +186,7 @@ def is_back_side_seen(config: FieldConfig, inputs: FieldInputs, batch: PaddedBat
     return points_away(_normals(config, inputs, batch), inputs.camera.directions_to(batch.repeat_last(inputs.means)))
 
 
-def _faces(lambert: Float, inputs: FieldInputs, batch: PaddedBatch) -> Any:
+def _faces(lambert: Float, inputs: FieldInputs, batch: PaddedBatch) -> Float:
     """Of n . s of the learned normals."""
     axis = shortest_axis(*(batch.repeat_last(dr.detach(turn)) for turn in inputs.rotations_and_scales))
     axis = seen_side_normals(axis, inputs.camera.directions_to(batch.repeat_last(inputs.means)))

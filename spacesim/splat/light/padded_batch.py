@@ -68,7 +68,7 @@ class PaddedBatch:
         is_real = lane < self.count
         return [dr.select(is_real, dr.gather(ad.Float, row, lane), like) for row in rows]
 
-    def pack(self, parts: list[tuple[Any, int, int]], like: Float) -> Float:
+    def pack(self, parts: list[tuple[TensorXf, int, int]], like: Float) -> Float:
         """Float [C * N], packed, of parts (TensorXf [B, R, m], first row, rows), one under another. like: an array."""
         place = dr.arange(ad.UInt32, dr.width(like))
         row, lane = place // self.count, place % self.count

@@ -4,7 +4,6 @@ Each kernel is recorded once for all Gaussians in columns of few sizes (`PaddedB
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
@@ -208,7 +207,7 @@ def adjoint(
         grad_sun = [sun_adjoint(config.field, _field_inputs(inputs), grad_items, grad_facing, by_told[0], batch)]
     if config.field.surface:
         parts.append((normals_adjoint(config.field, _field_inputs(inputs), grad_items, grad_facing, batch), 0, 3))
-    grad_occlusion: Any = -sum(
+    grad_occlusion = -sum(
         (g * c for g, c in pairs), sum((_picture_visibility(g, tape.faces) for g in grad_shown), ad.Float(0))
     )
     if config.refine:

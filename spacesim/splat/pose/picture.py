@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +11,7 @@ from spacesim.backend.arrays import Float
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Image, Sun
-from spacesim.splat.light.model import LightModel
+from spacesim.splat.light.model import LightModel, Sunlight
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import RenderOutput, render
@@ -29,7 +28,7 @@ class Drawing:
 
     run: Run
     sun: Array | None  #: [3], towards it
-    sunlight: Any  #: `LightModel.sunlight` of it, None of a run without light
+    sunlight: Sunlight | None  #: None of a run without light
 
     @staticmethod
     def of(run: Run, sun: Sun | None) -> "Drawing":

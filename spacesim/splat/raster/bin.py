@@ -278,11 +278,11 @@ def _stable_order(keys: UInt32, bits: int) -> UInt32:
     goes through all 32 bits."""
     passes = -(-bits // DIGIT_BITS)
     digit_bits = -(-bits // passes)
-    order: Any = None  # `block_mkperm` and `gather`
+    order: Any = None
     for i in range(passes):
         digit, last = (keys >> (i * digit_bits)) & ((1 << digit_bits) - 1), i == passes - 1
         dr.eval(digit, order, None if last else keys)
-        plain: Any = dr.detach(digit)
+        plain: Any = dr.detach(digit)  # `block_mkperm` is said to take other arrays
         moved = ad.UInt32(dr.detail.block_mkperm(plain, dr.width(keys), 1 << digit_bits))
         order = moved if order is None else dr.gather(ad.UInt32, order, moved)
         if not last:

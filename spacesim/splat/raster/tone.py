@@ -1,7 +1,7 @@
 """Linear light to sRGB values and back in Dr.Jit, differentiable: for colours that are blended in linear light.
 
-A model's linear colours are shares of what its tone curve makes white (`spacesim.data.tone.WHITES`): at most 1 but
-where light bounces. What is brighter than white is clipped.
+A model's linear colours are shares of what its tone curve makes white (`spacesim.data.images.tone.WHITES`): at most 1
+but where light bounces. What is brighter than white is clipped.
 """
 
 from typing import cast
@@ -11,7 +11,7 @@ import numpy as np
 
 from spacesim.backend.arrays import ArrayT
 from spacesim.data.images import srgb_from_linear
-from spacesim.data.tone import WHITES, filmic
+from spacesim.data.images.tone import WHITES, filmic
 
 _LINEAR_END, _ENCODED_END = 0.0031308, 0.04045
 

@@ -303,7 +303,7 @@ def with_settings(config: TrainConfig, settings: JsonMapping) -> TrainConfig:
     return result
 
 
-def _put(before: object, value: object) -> Any:
+def _put(before: object, value: object) -> object:
     """What takes the place of the plain value `before` where `value` is asked for."""
     if not isinstance(before, dict):
         return value

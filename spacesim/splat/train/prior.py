@@ -1,12 +1,12 @@
 """Depth and normals of a mesh as a camera sees it: what training may be told of a shape that is known."""
 
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
 from spacesim.data.errors import InputError
 from spacesim.data.mesh import SignedDistance, drawable_faces, read_mesh
 from spacesim.data.records import Camera, Dataset
@@ -28,7 +28,7 @@ class MeshPrior:
         parameters["vertex_positions"] = single.ravel()
         parameters["faces"] = faces.astype(np.uint32).ravel()
         parameters.update()
-        self._scene: Any = mi.load_dict({"type": "scene", "mesh": mesh})
+        self._scene: mt.Scene = mi.load_dict({"type": "scene", "mesh": mesh})
 
     @staticmethod
     def of(dataset: Dataset) -> "MeshPrior":

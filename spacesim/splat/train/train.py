@@ -11,10 +11,10 @@ import numpy as np
 from spacesim import backend, interrupts
 from spacesim.data.errors import InputError
 from spacesim.data.files import remove_leftovers, write_json
+from spacesim.data.images.tone import tone_and_exposure
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Dataset
 from spacesim.data.store import write_points
-from spacesim.data.tone import tone_and_exposure
 from spacesim.learning.cameras import farthest_camera, focus_point
 from spacesim.learning.folder import (
     TrainingClock,

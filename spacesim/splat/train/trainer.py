@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -17,6 +16,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonDict
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
@@ -85,7 +85,7 @@ class Trainer(TrainingLoop):
         """At this iteration."""
         return self.gaussians.count
 
-    def step(self) -> Any:
+    def step(self) -> Float:
         """One update from one view or several, densification if it is time. Returns the mean loss, Float of width 1."""
         config, index, count = self.config, self.iteration, self.config.views_per_step
         degree = min(config.sh_degree, index // config.sh_every)
@@ -314,7 +314,7 @@ def _learned(light: LightModel | None) -> list[Float]:
     return [*light.weights, *light.embeddings] if light else []
 
 
-def _restore_state(names: Iterable[str], tensors: Mapping[str, np.ndarray], owner: str, count: int) -> dict[str, Any]:
+def _restore_state(names: Iterable[str], tensors: Mapping[str, np.ndarray], owner: str, count: int) -> JsonDict:
     """{name: Float [count]} of a checkpoint's statistics. Raises KeyError, or ValueError for another size."""
     state = {name: tensors[f"{owner}.{name}"] for name in names}
     for name, values in state.items():

@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
+from spacesim.backend.arrays import Float
 from spacesim.splat.raster.blend import ALPHA_MAX
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians, opacities
@@ -31,7 +32,7 @@ _OUTER = math.sqrt(2 * math.log(AMPLITUDE / ALPHA_MIN))  # and up to which it is
 _HALF = math.sqrt(2 * math.log(0.5 / ALPHA_MIN))  # up to which a splat of opacity 1/2 is
 
 
-def draw_ellipsoids(gaussians: Gaussians, colors: Any, camera: Projection) -> BlendedPlanes:
+def draw_ellipsoids(gaussians: Gaussians, colors: list[Float], camera: Projection) -> BlendedPlanes:
     """Red, green and blue as planes, premultiplied, lit from the camera: |n . v| of each Gaussian's shortest axis.
 
     colors: 3 Floats [N], display values

@@ -13,7 +13,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 REST = 0.2  #: seconds without a new request after which a view is at rest
 PATIENCE = 0.5  #: seconds that a view at rest waits for others that move
@@ -28,7 +27,7 @@ class RenderRequest:
 
     #: told whether in full resolution, makes and delivers it, on the render thread; says, of one in full resolution,
     #: whether it is but a step there
-    draw: Callable[[bool], Any]
+    draw: Callable[[bool], object]
 
 
 class AbandonedError(Exception):
@@ -39,12 +38,12 @@ class RenderLoop:
     """Draws what clients ask for, until `stop`. tidy: called now and then after pictures, on the render thread: every
     `every` seconds where there is a pause, or after twice as many where there is none"""
 
-    def __init__(self, rest: float = REST, tidy: Callable[[], Any] | None = None, every: float = TIDY) -> None:
+    def __init__(self, rest: float = REST, tidy: Callable[[], object] | None = None, every: float = TIDY) -> None:
         self._rest, self._tidy, self._every = rest, tidy, every
         self._tidy_at: float | None = None  # None where nothing was drawn since the last time
         self._requests: OrderedDict[Hashable, tuple[RenderRequest, bool]] = OrderedDict()
         self._resting: dict[Hashable, tuple[float, RenderRequest]] = {}
-        self._work: OrderedDict[Hashable, Callable[[], Any]] = OrderedDict()
+        self._work: OrderedDict[Hashable, Callable[[], object]] = OrderedDict()
         self._worked = False  # since the last picture
         self._changed = threading.Condition()
         self._running, self._busy = True, False
@@ -67,7 +66,7 @@ class RenderLoop:
             self._requests.pop(client, None)
             self._resting.pop(client, None)
 
-    def submit(self, work: Callable[[], Any], kind: Hashable = None) -> None:
+    def submit(self, work: Callable[[], object], kind: Hashable = None) -> None:
         """Call `work` on the render thread, before the next picture but one, instead of what was to be done before of
         the same kind, if that is not None."""
         with self._changed:
@@ -116,7 +115,7 @@ class RenderLoop:
         for task in tasks:
             _perform(task)
 
-    def _next(self) -> Callable[[], Any] | None:
+    def _next(self) -> Callable[[], object] | None:
         """What to do now, None for nothing. The lock is held."""
         if self._work and not self._worked:
             return self._next_work()
@@ -128,7 +127,7 @@ class RenderLoop:
         task = task or self._due_full_resolution(now) or self._due_tidying(now)
         return task or (self._next_work() if self._work else None)
 
-    def _next_request(self, client: Hashable) -> Callable[[], Any]:
+    def _next_request(self, client: Hashable) -> Callable[[], object]:
         """The picture that a client wants. The lock is held."""
         request, moving = self._requests.pop(client)
         if moving:
@@ -143,12 +142,12 @@ class RenderLoop:
                 if client not in self._requests:
                     self._resting[client] = (time.monotonic(), request)
 
-    def _next_work(self) -> Callable[[], Any]:
+    def _next_work(self) -> Callable[[], object]:
         """The first that is no picture. The lock is held."""
         self._worked = True
         return self._work.popitem(last=False)[1]
 
-    def _due_full_resolution(self, now: float) -> Callable[[], Any] | None:
+    def _due_full_resolution(self, now: float) -> Callable[[], object] | None:
         """A picture in full resolution that was due before `now`. The lock is held."""
         for client, (moment, request) in self._resting.items():
             if moment <= now:
@@ -156,13 +155,13 @@ class RenderLoop:
                 return self._schedule_tidying(partial(self._draw_full_resolution, client, request))
         return None
 
-    def _schedule_tidying(self, draw: Callable[[], Any]) -> Callable[[], Any]:
+    def _schedule_tidying(self, draw: Callable[[], object]) -> Callable[[], object]:
         """A picture, after which there may be something to tidy up. The lock is held."""
         if self._tidy is not None and self._tidy_at is None:
             self._tidy_at = time.monotonic() + self._every
         return draw
 
-    def _due_tidying(self, now: float) -> Callable[[], Any] | None:
+    def _due_tidying(self, now: float) -> Callable[[], object] | None:
         """Tidying that was due before `now`. The lock is held."""
         if self._tidy_at is None or self._tidy_at > now:
             return None
@@ -170,7 +169,7 @@ class RenderLoop:
         return self._tidy
 
 
-def _perform(task: Callable[[], Any]) -> None:
+def _perform(task: Callable[[], object]) -> None:
     try:
         task()
     except AbandonedError:

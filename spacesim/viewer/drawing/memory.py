@@ -6,8 +6,8 @@ lists, are compiled in between, and holes grow by tens of megabytes within minut
 """
 
 import ctypes
+from collections.abc import Callable
 from functools import cache
-from typing import Any
 
 import drjit as dr
 
@@ -22,7 +22,7 @@ def give_back() -> None:
 
 
 @cache
-def _trim() -> Any:
+def _trim() -> Callable[[int], int] | None:
     """glibc's malloc_trim; None where the C library is another one, whose allocator does so by itself."""
     try:
         trim = ctypes.CDLL(None).malloc_trim

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from spacesim.data.sheet import font
+from spacesim.data.images.sheet import font
 from spacesim.eval.pictures import error_colors
 from spacesim.learning.pictures import LIT, SHADOWED
 

@@ -13,13 +13,19 @@ import logging
 import math
 import socket
 import threading
-from collections.abc import Callable, Coroutine, Iterator
-from typing import Any
+from collections.abc import Awaitable, Callable, Iterator
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
 from spacesim.data.errors import InputError
 from spacesim.viewer.network.address import AllowedHosts, parse_host
 from spacesim.viewer.state import MAX_COORDINATE, parse_viewer_camera
+
+if TYPE_CHECKING:
+    from viser.infra import WebsockClientConnection, WebsockMessageHandler
+    from websockets.asyncio.server import ServerConnection
+    from websockets.datastructures import Headers
+    from websockets.http11 import Request, Response
 
 MAX_TEXT_LENGTH = 200  #: characters that a field takes
 MAX_MESSAGE_BYTES = (
@@ -42,6 +48,8 @@ _FORBIDDEN_PARAMETERS = {
 _PORTS = {"http": 80, "https": 443}
 _PHASES, _BUTTONS = ("start", "update", "end"), ("left", "middle", "right")
 
+Message = Any  #: one of viser's, of whichever kind
+
 _log = logging.getLogger(__name__)
 
 
@@ -54,7 +62,7 @@ def is_allowed(message: object) -> bool:
         return False
 
 
-def _is_valid_camera(message: Any) -> bool:
+def _is_valid_camera(message: Message) -> bool:
     vectors = (
         _are_valid_numbers(message.look_at, 3)
         and _are_valid_numbers(message.up_direction, 3)
@@ -65,7 +73,7 @@ def _is_valid_camera(message: Any) -> bool:
     return vectors and depths and parse_viewer_camera(*pose) is not None
 
 
-def _is_valid_update(message: Any) -> bool:
+def _is_valid_update(message: Message) -> bool:
     updates = message.updates
     return (
         _is_valid_text(message.uuid)
@@ -83,7 +91,7 @@ def _is_valid_value(value: object) -> bool:
     return isinstance(value, int | float) and math.isfinite(value) and abs(value) <= 1e12
 
 
-def _is_valid_handle(message: Any) -> bool:
+def _is_valid_handle(message: Message) -> bool:
     turn = _are_valid_numbers(message.wxyz, 4) and 0.5 < math.hypot(*message.wxyz) < 2
     return (
         turn
@@ -93,24 +101,24 @@ def _is_valid_handle(message: Any) -> bool:
     )
 
 
-def _is_valid_handle_event(message: Any) -> bool:
+def _is_valid_handle_event(message: Message) -> bool:
     return _is_valid_text(message.name) and _is_valid_text(message.owner)
 
 
-def _is_valid_click(message: Any) -> bool:
+def _is_valid_click(message: Message) -> bool:
     index = message.instance_index is None or isinstance(message.instance_index, int)
     rays = _are_valid_numbers(message.ray_origin, 3) and _are_valid_numbers(message.ray_direction, 3)
     return index and rays and _is_valid_handle_event(message) and _is_valid_modifier(message)
 
 
-def _is_valid_drag(message: Any) -> bool:
+def _is_valid_drag(message: Message) -> bool:
     places = _are_valid_numbers(message.start_position, 3) and _are_valid_numbers(message.end_position, 3)
     how = message.phase in _PHASES and message.button in _BUTTONS and _is_valid_modifier(message)
     index = message.instance_index is None or isinstance(message.instance_index, int)
     return places and how and index and _is_valid_handle_event(message)
 
 
-def _is_valid_modifier(message: Any) -> bool:
+def _is_valid_modifier(message: Message) -> bool:
     return message.modifier is None or _is_valid_text(message.modifier)
 
 
@@ -125,7 +133,7 @@ def _is_valid_text(value: object) -> bool:
     return isinstance(value, str) and len(value) <= MAX_TEXT_LENGTH
 
 
-_CHECKS: dict[str, Callable[[Any], bool]] = {
+_CHECKS: dict[str, Callable[[Message], bool]] = {
     "ViewerCameraMessage": _is_valid_camera,
     "GuiUpdateMessage": _is_valid_update,
     "TransformControlsUpdateMessage": _is_valid_handle,
@@ -136,10 +144,10 @@ _CHECKS: dict[str, Callable[[Any], bool]] = {
 }
 
 
-def filter_messages(handler: Any) -> None:
+def filter_messages(handler: "WebsockMessageHandler") -> None:
     """From now on a server's or a connection's `handler` of messages (viser's infra) sees only allowed ones, and a
     failure over one ends in the log."""
-    inner: Callable[[Any, Any], Coroutine[Any, Any, None]] = handler._handle_incoming_message
+    inner: Callable[[object, object], Awaitable[None]] = handler._handle_incoming_message
 
     async def handle(client: object, message: object) -> None:
         if not is_allowed(message):
@@ -164,13 +172,13 @@ class _ThreadSafeEvent(asyncio.Event):
         super().set()
 
 
-def make_sends_thread_safe(handler: Any) -> None:
+def make_sends_thread_safe(handler: "WebsockMessageHandler") -> None:
     """From now on other threads may send through a server or a connection (viser's infra), one that nothing was sent
     through yet, without harm to its event loop."""
     handler.get_message_buffer().message_event = _ThreadSafeEvent()
 
 
-def refusal_reason(headers: Any, path: str, names: AllowedHosts) -> str | None:
+def refusal_reason(headers: "Headers", path: str, names: AllowedHosts) -> str | None:
     """Why a request is refused, None for one that is not. headers: of websockets;  path: with its query;  names: of
     this server"""
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
@@ -206,8 +214,12 @@ def guard_server(names: AllowedHosts) -> Iterator[None]:
     served, ready = threading.Event(), threading.Event()
     refused: set[str] = set()
 
-    def guarded_serve(*arguments: object, process_request: Callable[[Any, Any], Any], **named: object) -> Any:
-        def process(client: Any, request: Any) -> Any:
+    def guarded_serve(
+        *arguments: object,
+        process_request: Callable[["ServerConnection", "Request"], "Response | None"],
+        **named: object,
+    ) -> object:
+        def process(client: "ServerConnection", request: "Request") -> "Response | None":
             reason = refusal_reason(request.headers, request.path, names)
             if reason is not None:
                 origin = ", ".join(f"{key} {request.headers.get_all(key)!a:.200}" for key in ("Host", "Origin"))
@@ -223,7 +235,7 @@ def guard_server(names: AllowedHosts) -> Iterator[None]:
             return response
 
         served.set()
-        bounds: dict[str, Any] = {
+        bounds: dict[str, object] = {
             "max_size": MAX_MESSAGE_BYTES,
             "max_queue": WAITING_FRAMES,
             "open_timeout": HANDSHAKE_TIMEOUT,
@@ -241,13 +253,13 @@ def guard_server(names: AllowedHosts) -> Iterator[None]:
     ready.set()
 
 
-def _bounded_connection(kind: Any) -> Any:
+def _bounded_connection(kind: Any) -> "type[ServerConnection]":
     """A connection of websockets (`kind`) of which nothing piles up without bound."""
 
     class Bounded(kind):
         _fragments = _answers = _asked = 0
 
-        def connection_made(self, transport: Any) -> None:
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
             """One too many takes the place of the oldest that is no client."""
             super().connection_made(transport)
             milliseconds = round(1000 * SEND_TIMEOUT)
@@ -278,7 +290,7 @@ def _bounded_connection(kind: Any) -> Any:
             if self._fragments > MAX_FRAGMENTS or self._answers > MAX_PONG_BYTES:
                 self.transport.abort()
 
-        async def recv(self, decode: bool | None = None) -> Any:
+        async def recv(self, decode: bool | None = None) -> str | bytes:
             """The next message, once all has been done about the one before; other clients come in between."""
             await asyncio.sleep(0)
             return await super().recv(decode)
@@ -286,7 +298,7 @@ def _bounded_connection(kind: Any) -> Any:
     return Bounded
 
 
-def has_pending_files(connection: Any) -> bool:
+def has_pending_files(connection: "WebsockClientConnection") -> bool:
     """Whether parts of files wait to be sent to a client (a connection of viser's infra). Of all other messages, newer
     ones take the place of older."""
     buffer = connection.get_message_buffer()

@@ -1,8 +1,8 @@
 """The panel: what all clients share (Sun, models), and what is each client's own (view, truth, statistics)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from spacesim.data.records import Sun
 from spacesim.splat.compose.pose import MAX_SCALE, MIN_SCALE, Pose
@@ -12,6 +12,9 @@ from spacesim.viewer.panels.handles import Gizmos, SunHandle
 from spacesim.viewer.session import Session, Statistics
 from spacesim.viewer.state import COMPARISONS, MODES, SIDES, SceneState, SharedScene, clamp
 
+if TYPE_CHECKING:
+    import viser
+
 SCALES = (MIN_SCALE, MAX_SCALE)  #: factors that the field of a model takes
 SAMPLES = (4, 256)  #: of the path tracer, a pixel
 
@@ -19,7 +22,7 @@ SAMPLES = (4, 256)  #: of the path tracer, a pixel
 class SunControls:
     """Azimuth and elevation as sliders; they follow the Sun that is dragged. Nothing where no Sun matters."""
 
-    def __init__(self, gui: Any, shared: SharedScene) -> None:
+    def __init__(self, gui: "viser.GuiApi", shared: SharedScene) -> None:
         self._shared = shared
         sun = shared.state.sun
         azimuth, elevation = sun.angles if sun else (0.0, 0.0)
@@ -39,7 +42,7 @@ class SunControls:
         azimuth, elevation = sun.angles
         self.azimuth.value, self.elevation.value = round(azimuth, 1) % 360, round(elevation, 1)
 
-    async def _on_slider(self, event: Any) -> None:
+    async def _on_slider(self, event: "viser.GuiEvent") -> None:
         if event.client is None:  # we moved it ourselves
             return
         azimuth = clamp(self.azimuth.value, 0, 360, 0)
@@ -51,10 +54,10 @@ class ModelControls:
     """A scale for each model, its place in numbers, and a way back to where it was."""
 
     def __init__(
-        self, gui: Any, renderer: SceneRenderer, shared: SharedScene, gizmos: Gizmos, sun: SunHandle | None
+        self, gui: "viser.GuiApi", renderer: SceneRenderer, shared: SharedScene, gizmos: Gizmos, sun: SunHandle | None
     ) -> None:
         self._shared, self._gizmos, self._start = shared, gizmos, shared.state
-        self.scales: list[Any] = []
+        self.scales: list[viser.GuiNumberHandle] = []
         with gui.add_folder("Models", order=3):
             self.handles = gui.add_checkbox("Handles", True, hint="gizmos of the models and of the Sun")
             for k, model in enumerate(renderer.models):
@@ -71,8 +74,8 @@ class ModelControls:
             if sun is not None:
                 sun.show(bool(self.handles.value))
 
-    def _on_scale(self, k: int) -> Callable[[Any], Any]:
-        async def scaled(event: Any) -> None:
+    def _on_scale(self, k: int) -> Callable[["viser.GuiEvent"], Awaitable[None]]:
+        async def scaled(event: "viser.GuiEvent") -> None:
             if event.client is None:
                 return
             scale = clamp(self.scales[k].value, *SCALES, 1.0)
@@ -109,7 +112,7 @@ class ClientControls:
 
     def __init__(
         self,
-        gui: Any,
+        gui: "viser.GuiApi",
         session: Session,
         actions: Actions,
         facts: Sequence[str],
@@ -162,7 +165,7 @@ class ClientControls:
         self.scale.visible = bool(html)
 
 
-def _call(action: Callable[[], None]) -> Callable[[Any], Any]:
+def _call(action: Callable[[], None]) -> Callable[[object], Awaitable[None]]:
     """A callback that awaits nothing: those of a client happen in the order in which it acted."""
 
     async def called(_event: object) -> None:

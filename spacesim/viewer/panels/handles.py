@@ -1,9 +1,9 @@
 """What can be grabbed in the scene: a gizmo for each model, the Sun on its sphere, the cameras of the data."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from spacesim.data.records import Dataset, Sun
 from spacesim.splat.compose.pose import Pose
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.state import SceneState, SharedScene, pose_from_handle
+
+if TYPE_CHECKING:
+    import viser
 
 SUN_AWAY = 1.15  #: distance of the Sun's handle from the middle, in radii of the scene
 GIZMO = 0.5  #: length of a gizmo's axes, in radii of the model
@@ -54,7 +57,7 @@ def sun_from_drag(centre: Array, radius: float, eye: Array, pointer: Array, befo
 class Gizmos:
     """A gizmo for each model, the same for all clients."""
 
-    def __init__(self, scene: Any, renderer: SceneRenderer, shared: SharedScene) -> None:
+    def __init__(self, scene: "viser.SceneApi", renderer: SceneRenderer, shared: SharedScene) -> None:
         self._shared = shared
         self._handles = [
             scene.add_transform_controls(
@@ -71,8 +74,8 @@ class Gizmos:
         for k, handle in enumerate(self._handles):
             handle.on_update(self._moved(k))
 
-    def _moved(self, k: int) -> Callable[[Any], Any]:
-        async def moved(event: Any) -> None:
+    def _moved(self, k: int) -> Callable[["viser.TransformControlsEvent"], Awaitable[None]]:
+        async def moved(event: "viser.TransformControlsEvent") -> None:
             wxyz, position = event.target.wxyz, event.target.position
             self._shared.change(lambda state: state.with_pose(k, pose_from_handle(state.poses[k], wxyz, position)))
 
@@ -98,7 +101,7 @@ class SunHandle:
     """A ball on a sphere about the scene, to be dragged, and an arrow along its light; the same for all clients."""
 
     def __init__(
-        self, scene: Any, renderer: SceneRenderer, shared: SharedScene, dragged: Callable[[Sun], None]
+        self, scene: "viser.SceneApi", renderer: SceneRenderer, shared: SharedScene, dragged: Callable[[Sun], None]
     ) -> None:
         self._renderer, self._shared, self._dragged = renderer, shared, dragged
         radius = self._place(shared.state)[1]
@@ -138,7 +141,7 @@ class SunHandle:
         centre, radius = self._renderer.bounds(state)
         return centre, SUN_AWAY * radius
 
-    async def _drag(self, event: Any) -> None:
+    async def _drag(self, event: "viser.SceneNodeDragEvent") -> None:
         state = self._shared.state
         if state.sun is None:
             return
@@ -168,7 +171,9 @@ def dataset_cameras(dataset: Dataset, most: int = MAX_FRUSTA) -> list[DatasetCam
     return [distinct[k * len(distinct) // most] for k in range(most)]
 
 
-def add_frusta(scene: Any, dataset: Dataset, size: float, jump: Callable[[int], None]) -> list[Any]:
+def add_frusta(
+    scene: "viser.SceneApi", dataset: Dataset, size: float, jump: Callable[[int], None]
+) -> "list[viser.CameraFrustumHandle]":
     """A frustum for each of `dataset_cameras` in a client's scene; a click on one calls jump(frame). size: metres"""
     handles = []
     for spot in dataset_cameras(dataset):
@@ -190,7 +195,7 @@ def add_frusta(scene: Any, dataset: Dataset, size: float, jump: Callable[[int], 
     return handles
 
 
-def _on_click(number: int, jump: Callable[[int], None]) -> Callable[[Any], Any]:
+def _on_click(number: int, jump: Callable[[int], None]) -> Callable[[object], Awaitable[None]]:
     async def clicked(_event: object) -> None:
         jump(number)
 

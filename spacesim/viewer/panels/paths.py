@@ -2,9 +2,9 @@
 
 import re
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Awaitable, Callable, Collection, Hashable
 from pathlib import Path as FilePath
-from typing import Any
+from typing import TYPE_CHECKING
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.splat.compose.scenefile import save_scene
@@ -12,6 +12,9 @@ from spacesim.viewer.client import Client
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.path import STEP, CameraPath, Player, keyframe_view, orbit_from_view, scene_to_save, vertical_fov
 from spacesim.viewer.state import SceneState, SharedScene, clamp
+
+if TYPE_CHECKING:
+    import viser
 
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}\.toml")
 STEPS = (0.1, 60.0)  #: seconds between two keyframes
@@ -26,7 +29,7 @@ class PathControls:
 
     def __init__(
         self,
-        gui: Any,
+        gui: "viser.GuiApi",
         renderer: SceneRenderer,
         shared: SharedScene,
         client: Callable[[int], Client | None],
@@ -62,8 +65,8 @@ class PathControls:
         for number in list(self._players):
             self.forget(number)
 
-    def with_client(self, action: Callable[[int, Client], None]) -> Callable[[Any], Any]:
-        async def called(event: Any) -> None:
+    def with_client(self, action: Callable[[int, Client], None]) -> Callable[["viser.GuiEvent"], Awaitable[None]]:
+        async def called(event: "viser.GuiEvent") -> None:
             client = None if event.client is None else self._client(event.client_id)
             if client is not None:
                 action(event.client_id, client)
@@ -143,12 +146,12 @@ class FileControls:
 
     def __init__(
         self,
-        gui: Any,
+        gui: "viser.GuiApi",
         renderer: SceneRenderer,
         shared: SharedScene,
         paths: PathControls,
         out: FilePath,
-        do: Callable[[Any, Any], None],
+        do: Callable[[Callable[[], object], Hashable], None],
     ) -> None:
         self._renderer, self._shared, self._paths, self._out, self._do = renderer, shared, paths, out, do
         self._own: set[FilePath] = set()

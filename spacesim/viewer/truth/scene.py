@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import MAX_LIST_BYTES, read_json
+from spacesim.data.files import MAX_LIST_BYTES, JsonDict, read_json
 from spacesim.data.structure import structure
 from spacesim.data.toml import Document
 from spacesim.scenes.config import ObjectConfig, SceneConfig
@@ -45,7 +45,7 @@ def compose_scene(scenes: Sequence[SceneConfig], poses: Sequence[Pose]) -> Scene
         for what in ("exposure", "tone", "white_balance", "distortion"):
             _expect_same(first, other, what, getattr(first.camera, what), getattr(other.camera, what))
     objects: list[ObjectConfig] = []
-    materials: dict[str, Any] = {}
+    materials: JsonDict = {}
     for k, (scene, pose) in enumerate(zip(scenes, poses, strict=True)):
         renamed = {name: f"{name}@{k}" for name in scene.materials} if k else {name: name for name in scene.materials}
         materials |= {renamed[name]: material for name, material in scene.materials.items()}
@@ -101,7 +101,7 @@ def _pose_object(item: ObjectConfig, pose: Pose, renamed: Mapping[str, str]) -> 
     return replace(item, position=(x, y, z), rotation_wxyz=(w, i, j, k), scale=placed.scale, materials=used)
 
 
-def _expect_same(first: SceneConfig, second: SceneConfig, what: str, value: Any, found: Any) -> None:
+def _expect_same(first: SceneConfig, second: SceneConfig, what: str, value: object, found: object) -> None:
     if value != found:
         raise InputError(
             f"{second.name}: expected the {what} of {first.name} ({value}), found another ({found}); the truth of both "
@@ -123,7 +123,7 @@ def _with_absolute_mesh(item: ObjectConfig, path: Path) -> ObjectConfig:
     return replace(item, mesh=str(place.resolve()))
 
 
-def _without_nulls(value: Any) -> Any:
+def _without_nulls(value: object) -> Any:
     if isinstance(value, Mapping):
         return {key: _without_nulls(item) for key, item in value.items() if item is not None}
     return [_without_nulls(item) for item in value] if isinstance(value, list) else value

@@ -4,10 +4,10 @@ import threading
 from collections.abc import Hashable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from spacesim.data.errors import InputError
 from spacesim.data.records import Dataset
+from spacesim.scenes.config import SceneConfig
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.run import Predictor
 from spacesim.viewer.drawing.frames import picture_size
@@ -34,8 +34,8 @@ class TruthService:
 
     def __init__(self, data: Sequence[Path | None], dataset: Dataset | None, start: SceneState) -> None:
         self._data, self._dataset, self._start = data, dataset, start
-        self._scenes: list[Any] | str | None = None
-        self._whole: Any = None  # the dataset's own scene
+        self._scenes: list[SceneConfig] | str | None = None
+        self._whole: SceneConfig | None = None  # the dataset's own scene
         self._lock = threading.Lock()
         self._queue = TraceQueue(self._on_trace_result)
 
@@ -81,7 +81,7 @@ class TruthService:
         start = self._start.poses if len(self._start.poses) > 1 else (Pose(),)
         return [] if [pose.key for pose in state.poses] == [pose.key for pose in start] else None
 
-    def _recorded_scenes(self) -> list[Any] | str:
+    def _recorded_scenes(self) -> list[SceneConfig] | str:
         """The scenes of the models' data, or why they are not known; looked up once."""
         with self._lock:
             if self._scenes is None:
@@ -93,12 +93,12 @@ class TruthService:
                     self._scenes = self._parts() or str(error)
             return self._scenes
 
-    def _parts(self) -> list[Any] | None:
+    def _parts(self) -> list[SceneConfig] | None:
         """The scenes of several models by the dataset's own, which shows all of them as they stand at the start."""
-        several = self._whole is not None and len(self._data) > 1
-        return split_scene(self._whole, self._start.poses) if several else None
+        whole = self._whole if len(self._data) > 1 else None
+        return None if whole is None else split_scene(whole, self._start.poses)
 
-    def _scene(self, path: Path | None) -> Any:
+    def _scene(self, path: Path | None) -> SceneConfig:
         if path is None:
             others = "them" if len(self._data) == 1 else "data of the whole scene, an object for each model,"
             raise InputError(

@@ -9,14 +9,18 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from spacesim.data.images.tone import display_values
 from spacesim.data.records import Camera, Sun
-from spacesim.data.tone import display_values
+from spacesim.scenes.config import CameraConfig, SceneConfig
 from spacesim.scenes.generation.workers import connect_to_parent, select_backend
 from spacesim.viewer.drawing.paint import Planes
+
+if TYPE_CHECKING:
+    from spacesim.scenes.render import Renderer
 
 PASS = 4  #: samples a pixel between two answers
 NICENESS = 10  #: less urgent than the viewer's own pictures
@@ -27,7 +31,7 @@ class TraceRequest:
     """What to trace."""
 
     number: int  #: given back with answers
-    scene: Any  #: a `SceneConfig`
+    scene: SceneConfig
     camera: Camera
     sun: Sun
     samples: int  #: a pixel
@@ -50,8 +54,8 @@ class Tracer:
     """Answers requests; keeps the scene last asked for."""
 
     def __init__(self) -> None:
-        self._scene: Any = None
-        self._renderer: Any = None
+        self._scene: SceneConfig | None = None
+        self._renderer: Renderer | None = None
 
     def answers(self, request: TraceRequest) -> Iterator[TraceResult]:
         """One answer after another, each of more samples than the one before."""
@@ -61,15 +65,15 @@ class Tracer:
             labels = renderer.labels(camera, sun)
             yield TraceResult(request.number, _label_planes(labels, request.models), 1, True)
             return
-        total, weight, done = 0.0, 0.0, 0
+        total, weight, done = np.zeros(()), np.zeros(()), 0
         while done < request.samples:
             radiance, alpha = renderer.radiance(camera, sun, (request.scene.seed, done))
             total, weight, done = total + radiance.astype(np.float64), weight + alpha.astype(np.float64), done + PASS
             share = PASS / done
-            planes = _picture(np.asarray(total) * share, np.asarray(weight) * share, config)
+            planes = _picture(total * share, weight * share, config)
             yield TraceResult(request.number, planes, done, done >= request.samples)
 
-    def _loaded(self, scene: Any) -> Any:
+    def _loaded(self, scene: SceneConfig) -> "Renderer":
         if self._renderer is None or scene != self._scene:
             from spacesim.scenes import Renderer, build
 
@@ -79,8 +83,8 @@ class Tracer:
         return self._renderer
 
 
-def _picture(radiance: np.ndarray, alpha: np.ndarray, config: Any) -> Planes:
-    """As the data's pictures are, over black, without a sensor's noise. config: a `CameraConfig`"""
+def _picture(radiance: np.ndarray, alpha: np.ndarray, config: CameraConfig) -> Planes:
+    """As the data's pictures are, over black, without a sensor's noise."""
     if config.sensor is not None:  # which records what is over black
         rgb = display_values(config.exposure * radiance, config.tone)
     else:

@@ -14,9 +14,9 @@ from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.images import load_image, read_exr, read_png
+from spacesim.data.images.tone import as_bytes, display_values
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import find_unreadable_files, load_truth, read_dataset
-from spacesim.data.tone import as_bytes, display_values
 from spacesim.scenes import build, generate, read_scene
 from spacesim.scenes.background import globe as globe_module
 from spacesim.scenes.background.config import BackgroundConfig

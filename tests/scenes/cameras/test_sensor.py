@@ -5,7 +5,7 @@ import pytest
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import srgb_from_linear
-from spacesim.data.tone import filmic
+from spacesim.data.images.tone import filmic
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.exposure import record_image
 from spacesim.scenes.cameras.sensor import SensorConfig

@@ -17,8 +17,8 @@ from spacesim.data.records import Camera
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Pinhole
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
 from spacesim.splat.raster.project import project
-from spacesim.splat.raster.reference import render_reference
 from spacesim.splat.raster.render import render
+from spacesim.splat.reference.rasterizer import render_reference
 
 KINDS = ("perspective", "orthographic")
 POSE = look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0])

@@ -13,9 +13,9 @@ from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Pinh
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.output import OUTPUTS
 from spacesim.splat.raster.project import project
-from spacesim.splat.raster.reference import render_reference
 from spacesim.splat.raster.render import FEATURES_PER_PASS, render
 from spacesim.splat.raster.surface import gather_or_zero, normals, unit
+from spacesim.splat.reference.rasterizer import render_reference
 
 POSE = look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0])
 

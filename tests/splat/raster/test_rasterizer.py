@@ -17,8 +17,8 @@ from spacesim.splat.raster import blend as rasterize
 from spacesim.splat.raster import records, tiles
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
 from spacesim.splat.raster.project import Pinhole, project
-from spacesim.splat.raster.reference import real_spherical_harmonics, render_reference
 from spacesim.splat.raster.render import render
+from spacesim.splat.reference.rasterizer import real_spherical_harmonics, render_reference
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.trainer import Trainer
 

@@ -12,7 +12,7 @@ from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb
-from spacesim.data.tone import STANDARD_EXPOSURE, TONES, WHITES, display_values, tone_and_exposure
+from spacesim.data.images.tone import STANDARD_EXPOSURE, TONES, WHITES, display_values, tone_and_exposure
 from spacesim.scenes.lights.sun import EXPOSURE
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.field import FieldConfig

@@ -4,8 +4,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from spacesim.data.geometry import Array
+from spacesim.data.images.sheet import GAP, WHITE_PAGE, font
 from spacesim.data.importers.video.model import Model
-from spacesim.data.sheet import GAP, WHITE_PAGE, font
 
 _SIDE, _TITLE, _LABEL = 460, 26, 22  # pixels
 _CAMERA, _FIRST, _AXIS = (31, 119, 180), (214, 39, 40), (150, 190, 215)

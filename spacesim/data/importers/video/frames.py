@@ -49,7 +49,7 @@ def read_frames(path: Path, again: bool = False) -> Iterator[FilmFrame]:
     with open_regular(path, "a video file"):
         pass
     try:
-        container: Any = library.open(str(path))
+        container = library.open(str(path))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: expected a video that FFmpeg reads, found {_reason(error)}") from None
     with container:

@@ -230,7 +230,7 @@ def _frames(
         )
 
 
-def _source(kind: str, src: Path, asked: Wishes, **more: Any) -> dict[str, JsonValue]:
+def _source(kind: str, src: Path, asked: Wishes, **more: JsonValue) -> dict[str, JsonValue]:
     options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(asked).items()}
     return {"kind": kind, "source": str(src), **more, **options}
 

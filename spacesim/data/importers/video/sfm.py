@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -101,9 +101,14 @@ def _library() -> ModuleType:
         raise InputError(f"structure from motion: expected pycolmap, found none; type: {INSTALL}") from None
 
 
-def _run(colmap: ModuleType, work: Callable[[Any], Any], poll: Callable[[], None] | None = None) -> Any:
+T = TypeVar("T")
+
+
+def _run(colmap: ModuleType, work: Callable[[object], T], poll: Callable[[], None] | None = None) -> T:
     """What `work` gives, which is called with a token that ends it. `poll` is called while it runs."""
-    token, results, failures = colmap.CancellationToken(), [], []
+    token = colmap.CancellationToken()
+    results: list[T] = []
+    failures: list[BaseException] = []
 
     def call() -> None:
         try:

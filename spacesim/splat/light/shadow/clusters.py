@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Float
+from spacesim.backend.arrays import Array3f, Array4f, Float
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array
 from spacesim.splat.light.shadow.light_camera import (
@@ -38,7 +38,7 @@ MIN_EXTENT = 1e-6  #: metres that an image covers at least: a point has no exten
 ROUNDING = 1e-9  #: by which a scale may seem to fall short of the least one
 
 Indices = NDArray[np.intp]
-Occlude = Callable[[Gaussians, Orthographic], Any]
+Occlude = Callable[[Gaussians, Orthographic], Float]
 
 
 def occlusion_in_clusters(
@@ -66,7 +66,7 @@ def occlusion_in_clusters(
     if gaussians.count == 0:
         return dr.zeros(ad.Float, 0)
     camera, coverage = _fitted(_shapes(gaussians), light_rows(direction), size, crop)
-    occlusion = occlude(gaussians, camera)
+    occlusion: Any = occlude(gaussians, camera)
     if _is_one_camera_enough(coverage, least_scale):
         return occlusion
     axes = light_axes(direction)
@@ -198,7 +198,10 @@ def _rank(members: Indices, centres: Array, radii: Array) -> tuple[float, ...]:
     return (-len(members), *low, *high)
 
 
-def _shapes(gaussians: Gaussians) -> tuple[Any, ...]:
+Shapes = tuple[Array3f, Array3f, Array4f, Float]  #: means, log scales, quaternions, logit opacities
+
+
+def _shapes(gaussians: Gaussians) -> Shapes:
     """(means, log scales, quaternions, logit opacities), detached."""
     names = ("means", "log_scales", "quaternions", "logit_opacities")
     return tuple(dr.detach(getattr(gaussians, name)) for name in names)
@@ -211,7 +214,7 @@ def _is_one_camera_enough(coverage: Float, least_scale: float) -> bool:
 
 
 @recorded
-def _fitted(shapes: tuple[Any, ...], light: Float, size: int, crop: bool) -> tuple[Orthographic, Float]:
+def _fitted(shapes: Shapes, light: Float, size: int, crop: bool) -> tuple[Orthographic, Float]:
     """(the one camera of a compact set, Float [4]: its pixels a metre in x and y, how many Gaussians have their centre
     in its image, how many can be drawn). Counts are exact to 2^24."""
     means, log_scales, quaternions, logits = shapes
@@ -225,7 +228,7 @@ def _fitted(shapes: tuple[Any, ...], light: Float, size: int, crop: bool) -> tup
 
 
 @recorded
-def _radii(shapes: tuple[Any, ...], light: Float) -> list[Float]:
+def _radii(shapes: Shapes, light: Float) -> list[Float]:
     """Three standard deviations along the light frame's x and y, [N] metres each (4.30, 4.31); NaN where a
     Gaussian cannot be drawn."""
     _, log_scales, quaternions, _ = shapes

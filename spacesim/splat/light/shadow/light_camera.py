@@ -5,7 +5,6 @@ Gaussians are, so that no step waits for the host.
 """
 
 from functools import lru_cache
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -51,7 +50,7 @@ def light_rows(direction: ArrayLike) -> Float:
 
 
 @lru_cache(maxsize=SUNS)
-def _rows(*direction: float) -> Any:
+def _rows(*direction: float) -> Float:
     return ad.Float(light_axes(direction).T.ravel().tolist())
 
 

@@ -7,7 +7,7 @@ Gaussian. Everything is detached.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import drjit as dr
 
@@ -327,7 +327,7 @@ class _Window:
         def has_more(k: UInt32, _sums: object) -> Bool:
             return k < side * side
 
-        def add(k: UInt32, sums: list[Float]) -> Any:
+        def add(k: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
             column, row = left + ad.Float(k % side), top + ad.Float(k // side)
             share = _overlap(column, self.x, half_x) * _overlap(row, self.y, half_y)
             active = self.active & (share > 0)

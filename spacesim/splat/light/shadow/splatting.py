@@ -193,7 +193,7 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[UInt32, UInt32], c
     def remaining(k: UInt32, _transmittance: object, _last: object) -> Bool:
         return k < end
 
-    def take(k: UInt32, transmittance: list[Float], last: list[UInt32]) -> Any:
+    def take(k: UInt32, transmittance: list[Float], last: list[UInt32]) -> tuple[UInt32, list[Float], list[UInt32]]:
         record = load(records, k, lists.capacity)
         powers = exponents(record, lane.x, lane.y, shape)
         receiver = record[6] > 0
@@ -240,7 +240,7 @@ def _sum_slots(slots: Float, lists: TileLists, capacity: int) -> Array2f:
     def remaining(position: UInt32, _total: object) -> Bool:
         return position < end
 
-    def add(position: UInt32, total: Any) -> Any:
+    def add(position: UInt32, total: Array2f) -> tuple[UInt32, Array2f]:
         return position + 1, total + dr.gather(ad.Array2f, slots, lists.sum_of_slot(position))
 
     state = position, ad.Array2f(0)
@@ -271,7 +271,7 @@ def _replay(
     def remaining(k: UInt32, _transmittance: object, _behind: object) -> Bool:
         return k > start
 
-    def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> Any:
+    def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> tuple[UInt32, list[Float], list[Float]]:
         k = k - 1
         record = load(walked.records, k, lists.capacity)
         powers = exponents(record, lane.x, lane.y, shape)
@@ -314,7 +314,7 @@ class _Occlusion(dr.CustomOp):
         blocker_boxes: Footprints,
         receiver_boxes: Footprints,
         image_size: tuple[int, int],
-    ) -> Any:
+    ) -> Float:
         # Sizes in arrays: dr.freeze (1.5) takes one number for another where both have occurred among the arguments.
         self.size = dr.opaque(ad.UInt32, image_size[0]), dr.opaque(ad.UInt32, image_size[1])
         self.count = dr.width(blockers.x)

@@ -9,9 +9,9 @@ from spacesim.backend.upload import upload
 from spacesim.data.geometry import fibonacci_sphere, look_at, quaternion_from_rotation
 from spacesim.splat.light.shadow.bias import grazing_bias, offset_receivers, receiver_bias
 from spacesim.splat.light.shadow.light_camera import fit_camera, light_rows, towards_sun
-from spacesim.splat.light.shadow.reference import reference_bias
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.reference.shadow_mapping import reference_bias
 
 NAMES = ("thickness", "alignment", "confidence", "bias")
 

@@ -14,9 +14,9 @@ from spacesim.data.geometry import fibonacci_sphere, look_at, quaternion_from_ro
 from spacesim.splat.light.shadow import mapping
 from spacesim.splat.light.shadow.light_camera import fit_camera, light_rows
 from spacesim.splat.light.shadow.mapping import SUN_RADIUS_DEG, MappingConfig, occlusion_by_mapping
-from spacesim.splat.light.shadow.reference import camera_record, reference_bias, reference_occlusion
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.reference.shadow_mapping import camera_record, reference_bias, reference_occlusion
 
 CONFIGS = {
     "bilinear": MappingConfig(),

@@ -11,10 +11,10 @@ from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import look_at
 from spacesim.splat.light.shadow.bias import receiver_bias
-from spacesim.splat.light.shadow.reference_splatting import occlusion_reference
 from spacesim.splat.light.shadow.splatting import BETA_MIN, LEAST_BETA, differentiable_occlusion, occlusion_by_splatting
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.reference.shadow_splatting import occlusion_reference
 
 PARAMETERS = ("means", "log_scales", "quaternions", "logit_opacities")
 POSE = look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0])

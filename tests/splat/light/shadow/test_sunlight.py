@@ -9,8 +9,8 @@ from spacesim.backend import recorded, recordings
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import direction_from_angles, fibonacci_sphere
 from spacesim.splat.light.shadow.light_camera import MARGIN, REACH, fit_camera, light_axes, light_rows, towards_sun
-from spacesim.splat.light.shadow.reference import camera_record, reference_bounds
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.reference.shadow_mapping import camera_record, reference_bounds
 
 AXES = [*np.eye(3), *-np.eye(3)]
 

@@ -4,14 +4,13 @@ They share no code with the kernels: covariances are matrices, windows are measu
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from spacesim.data.geometry import Array, rotation_from_quaternion
 from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
-from spacesim.splat.raster.reference import ReferenceOutput, render_reference
+from spacesim.splat.reference.rasterizer import ReferenceOutput, render_reference
 
 
 def camera_record(camera: Orthographic) -> OrthographicCamera:
@@ -149,7 +148,7 @@ def _variance(picture: ReferenceOutput, share: Array, receiver: float, softness:
     return float((1 - passes) * covered / (4 * config.radius**2))
 
 
-def _shadowed(gap: Any, softness: float) -> Any:
+def _shadowed(gap: Array, softness: float) -> Array:
     return 1 / (1 + np.exp(np.clip(gap / softness, -60, 60)))
 
 

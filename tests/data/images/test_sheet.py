@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from spacesim.data.sheet import (
+from spacesim.data.images.sheet import (
     DARK_PAGE,
     GAP,
     LABEL_HEIGHT,

@@ -1,4 +1,4 @@
-"""The slow twin of `splatting`: every receiver against every blocker on every pixel, in float64 numpy. For tests.
+"""The slow twin of shadow splatting: every receiver against every blocker on every pixel, in float64 numpy. For tests.
 
 It sorts nothing, walks no lists and ends no pixel early: the products of 4.8 are formed as the thesis writes them.
 """
@@ -9,7 +9,7 @@ import numpy as np
 
 from spacesim.data.geometry import rotation_from_quaternion
 from spacesim.splat.raster.cameras import OrthographicCamera
-from spacesim.splat.raster.reference import DILATION, PIXEL
+from spacesim.splat.reference.rasterizer import DILATION, PIXEL
 
 ALPHA_MIN, ALPHA_MAX = 1 / 255, 0.999
 

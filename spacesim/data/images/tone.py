@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spacesim.data.files import JsonMapping
-from spacesim.data.images import srgb_from_linear
+from spacesim.data.images.color import srgb_from_linear
 
 Tone = Literal["srgb", "filmic"]
 TONES: tuple[Tone, ...] = get_args(Tone)
