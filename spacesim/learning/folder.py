@@ -4,7 +4,8 @@ import logging
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -15,8 +16,9 @@ import numpy as np
 import spacesim
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonDict, holds_files, read_json, write_json
+from spacesim.data.files import JsonDict, holds_files, read_json, remove_leftovers, write_json
 from spacesim.data.identity import same_digest, training_digest
+from spacesim.data.lock import lock_folder
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
 from spacesim.data.toml import Document
@@ -52,6 +54,23 @@ class TrainingProgress:
     def words(self) -> str:
         """For a bar or a line."""
         return f"loss {self.loss:.4f}" + ("" if self.gaussian_count is None else f", {self.gaussian_count} Gaussians")
+
+
+def is_finished(out: Path, described: JsonDict, resume: bool, read_config: ReadConfig) -> bool:
+    """Whether `out` holds the whole run that is so described already. Raises as `check_folder`."""
+    check_folder(out, described, resume, read_config)
+    return (out / "model.safetensors").exists()
+
+
+@contextmanager
+def open_folder(out: Path, described: JsonDict, resume: bool, read_config: ReadConfig) -> Iterator[None]:
+    """`out` for a training that is so described, and for no other while the block runs. Raises as `check_folder`, and
+    where another training is at work in it."""
+    with lock_folder(out):
+        check_folder(out, described, resume, read_config)  # again: another training may have come and gone
+        remove_leftovers(out)
+        write_json(out / "config.json", described)
+        yield
 
 
 def check_folder(out: Path, described: JsonDict, resume: bool, read_config: ReadConfig) -> None:
