@@ -25,7 +25,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, may_shade
 from spacesim.data.records import Camera, Sun
 from spacesim.nerf.draw import Samples, chunks, shown, unit_normals
 from spacesim.nerf.partition import PlacedField, PlacedFields, Shading, model_rays, partition
@@ -211,13 +211,6 @@ class Composition(FieldScene):
                 own = pose.inverse().points(points[reached]), pose.direction_in_model(sun.direction)
                 seen[reached] *= sun_visibility(run.networks, run.parameters, run.filled, run.box, *own, bias=0.0)
         return seen
-
-
-def may_shade(caster: tuple[Array, float], receiver: tuple[Array, float], sun: Array) -> bool:
-    """Could anything of one sphere, (centre, radius), be before the Sun for anything of another?"""
-    reach, offset = caster[1] + receiver[1], caster[0] - receiver[0]
-    ahead = float(offset @ sun)
-    return ahead > -reach and float(np.linalg.norm(offset - ahead * sun)) < reach
 
 
 def _place(model: Placed, camera: Camera, sun: Sun | None) -> PlacedField:
