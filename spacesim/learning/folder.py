@@ -162,15 +162,25 @@ def describe_data(dataset: Dataset) -> JsonDict:
 def _check_resumable(out: Path, described: JsonDict, resume: bool, read_config: ReadConfig) -> None:
     if not resume:
         raise InputError(f"{out}: expected a new folder, found a run; resume=True goes on with it")
-    config, data = read_config(out / "config.json")
+    try:
+        config, data = read_config(out / "config.json")
+    except InputError:
+        values = read_json(out / "config.json")
+        method, found = values.get("method") if isinstance(values, dict) else None, described["method"]
+        if isinstance(method, str) and method != found:  # of another family, whose configurations have other fields
+            raise _started_with(out, "method", method, found) from None
+        raise
     data["path"] = described["data"]["path"]  # it may have moved
     if same_digest(str(data.get("digest")), described["data"]["digest"]):
         data["digest"] = described["data"]["digest"]  # older versions told less
     current = {**config.to_json(), "data": data}  # what an older version did not write is as by default
     difference = _first_difference(current, described)
     if difference is not None:
-        key, old, new = difference
-        raise InputError(f"{out}: was started with {key} {old!r}, expected the same to resume it, found {new!r}")
+        raise _started_with(out, *difference)
+
+
+def _started_with(out: Path, key: str, old: object, new: object) -> InputError:
+    return InputError(f"{out}: was started with {key} {old!r}, expected the same to resume it, found {new!r}")
 
 
 def _first_difference(old: JsonDict, new: JsonDict, within: str = "") -> tuple[str, Any, Any] | None:
