@@ -127,6 +127,13 @@ def test_a_run_of_one_family_is_not_resumed_by_the_other(dataset, finished, tiny
             methods.train(dataset, out, config, resume=True)
 
 
+@pytest.mark.parametrize("method", ["nerfx", 3, None, ["nerf"]])
+def test_a_run_of_no_method_is_refused(tmp_path, method):
+    (tmp_path / "config.json").write_text(json.dumps({**CONFIG.to_json(), "method": method, "data": {"path": "."}}))
+    with pytest.raises(InputError, match=r"config.json: method: expected one of vanilla, .*nerf-relight, found"):
+        methods.load_run(tmp_path)
+
+
 def test_pictures_beside_the_box_are_left_out_in_one_sentence(dataset, caplog):
     turn = np.diag([-1.0, 1, -1, 1])  # looks the other way
     turned = [
