@@ -27,7 +27,7 @@ from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, may_shade
 from spacesim.data.records import Camera, Sun
-from spacesim.nerf.draw import Samples, chunks, shown, unit_normals
+from spacesim.nerf.draw import Samples, check_chunk, chunks, shown, unit_normals
 from spacesim.nerf.partition import PlacedField, PlacedFields, Shading, model_rays, partition
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.sampling.box import SceneBox
@@ -163,7 +163,9 @@ class Composition(FieldScene):
         )
 
     def crossing(self, fields: PlacedFields, camera: Camera) -> np.ndarray:
-        """Numbers, row by row, of the pixels whose rays cross what a model fills."""
+        """Numbers, row by row, of the pixels whose rays cross what a model fills. Raises MemoryError where a chunk of
+        rays does not fit."""
+        check_chunk(self._runs[0].networks.config)
         size, count, width = camera.width * camera.height, self.chunk, dr.opaque(ad.UInt32, camera.width)
         seen = (_find_crossing(fields, dr.opaque(ad.UInt32, first), width, count) for first in range(0, size, count))
         return np.flatnonzero(np.concatenate([np.array(part, bool) for part in seen])[:size]).astype(np.uint32)

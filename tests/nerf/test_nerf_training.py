@@ -134,6 +134,18 @@ def test_a_run_of_no_method_is_refused(tmp_path, method):
         methods.load_run(tmp_path)
 
 
+def test_rays_that_do_not_fit_into_memory_are_told(dataset, finished, monkeypatch):
+    many = replace(CONFIG, rays=2**20, samples=1024, chunk=2**20)
+    assert many.ray_bytes * many.rays > 10**12
+    monkeypatch.setattr("spacesim.backend.memory.free_memory", lambda needed=0: 10**11)
+    with pytest.raises(MemoryError, match="rays: a step of 1048576 rays needs about"):
+        Trainer(dataset, many)
+    wide = replace(finished, networks=type(finished.networks)(many))
+    for drawn in (wide, methods.compose([PlacedRun(wide)])):
+        with pytest.raises(MemoryError, match="chunk: a picture by 1048576 rays at once needs about"):
+            drawn.predict(dataset.test[0].camera)
+
+
 def test_pictures_beside_the_box_are_left_out_in_one_sentence(dataset, caplog):
     turn = np.diag([-1.0, 1, -1, 1])  # looks the other way
     turned = [

@@ -9,6 +9,7 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.memory import check_free_memory
 from spacesim.backend.upload import upload
 from spacesim.data.errors import check_ranges
 from spacesim.data.files import JsonDict
@@ -54,6 +55,7 @@ class Trainer(TrainingLoop):
 
     def __init__(self, dataset: Dataset, config: NerfConfig) -> None:
         self.config, self.iteration, self.proposal_steps = config, 0, 0
+        check_free_memory(config.ray_bytes * config.rays, f"rays: a step of {config.rays} rays")
         self.box = scene_box(dataset, config.margin)
         self.networks = Networks(config)
         self.pixels = training_pixels(dataset, self.box, config.knows_sun)
