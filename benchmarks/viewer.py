@@ -5,14 +5,16 @@
 Without a run the scene is the sphere of random splats of the other benchmarks, relightable and with shadows. "draw" is
 a picture in full resolution under another camera, or another Sun or pose, numpy and colour map included; "frames/s" is
 what a client over a websocket gets that moves its camera as soon as a picture has come, and the resolution that the
-viewer has chosen by then. Then, for --seconds, clients of another process (`visitor.py`) use every control, turn round
-the scene, leave without a word and come back. Memory is what the viewer's process has in memory, files apart: the most
-of all, and after each tenth of the time what is left when free memory has gone back to the system; growth is by a line
+viewer has chosen by then. Of scenes with radiance fields, after a movement: when the first picture comes, and the one
+in full resolution. Then, for --seconds, clients of another process (`visitor.py`) use every control, turn round the
+scene, leave without a word and come back. Memory is what the viewer's process has in memory, files apart: the most of
+all, and after each tenth of the time what is left when free memory has gone back to the system; growth is by a line
 through the second half of these. Recordings are Dr.Jit's, one for each size of picture and of its lists. `--seconds 0`
 leaves all that out.
 """
 
 import gc
+import io
 import itertools
 import json
 import subprocess
@@ -20,12 +22,14 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import common
 import numpy as np
 import visitor
+from PIL import Image
 
 from spacesim import backend
 from spacesim.data.errors import InputError, WorkError
@@ -36,7 +40,7 @@ from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 from spacesim.splat.train.config import preset
-from spacesim.viewer.drawing.frames import draw_frame
+from spacesim.viewer.drawing.frames import draw_frame, picture_size
 from spacesim.viewer.drawing.memory import give_back
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.load import load_setup
@@ -73,6 +77,7 @@ def main() -> None:
     modes = ("colour", "depth", "ellipsoids")
     try:
         rates = [rate(viewer, mode, options.side, options.moving) for mode in modes if mode in show.renderer.modes]
+        at_rest = [rest(viewer, options.side, options.repeats)] if show.renderer.progressive else []
         soak = look_around(viewer, options.seconds, options.clients, options.side) if options.seconds > 0 else {}
     finally:
         viewer.stop()
@@ -81,10 +86,12 @@ def main() -> None:
         "side": options.side,
         "draw": rows,
         "rates": rates,
+        "at_rest": at_rest,
         "soak": soak,
     }
     tables = {"Pictures in full resolution, ms": rows, "Frames a client gets while it moves": rates}
-    common.emit(report, {**tables, "Looking around": [soak] if soak else []}, options)
+    tables |= {"Pictures after a movement, ms": at_rest, "Looking around": [soak] if soak else []}
+    common.emit(report, tables, options)
 
 
 def spheres(count: int) -> ViewerSetup:
@@ -163,6 +170,39 @@ def rate(viewer: Viewer, mode: str, side: int, lasts: float) -> common.Row:
     while viewer.clients:
         time.sleep(0.01)
     return {"mode": mode, "frames/s": f"{count / (lasts / 2):.1f}", "of full resolution": f"{np.mean(shares):.2f}"}
+
+
+def rest(viewer: Viewer, side: int, repeats: int) -> common.Row:
+    """Milliseconds from a movement to the first picture, and to the one in full resolution."""
+    client, camera = visitor.Visitor(viewer.url, (side, side)), places(viewer.setup)
+    client.begin()
+    most = min((one for one in SIDES if one >= side), default=SIDES[-1])
+    client.use("Resolution", str(most))
+    full = picture_size(ViewerCamera(next(camera), visitor.FOV, side, side), most)
+    first, refined = list[float](), list[float]()
+    for _ in range(common.WARM_UP + repeats):
+        _finish(viewer, client)
+        start = time.perf_counter()
+        client.look(next(camera))
+        client.picture()
+        first.append(time.perf_counter() - start)
+        while Image.open(io.BytesIO(client.shown)).size != full:
+            client.picture()
+        refined.append(time.perf_counter() - start)
+    client.leave()
+    while viewer.clients:
+        time.sleep(0.01)
+    timings = [str(common.Timing.of(seconds[common.WARM_UP :])) for seconds in (first, refined)]
+    return {"first": timings[0], "in full resolution": timings[1]}
+
+
+def _finish(viewer: Viewer, client: visitor.Visitor) -> None:
+    """Take all pictures that are on their way."""
+    with suppress(TimeoutError):
+        while True:
+            while not viewer.loop.idle:
+                time.sleep(0.01)
+            client.picture(patience=0.3)
 
 
 def look_around(viewer: Viewer, lasts: float, clients: int, side: int) -> common.Row:

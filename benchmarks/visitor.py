@@ -68,6 +68,7 @@ class Visitor:
         self.handles: dict[str, list[float]] = {}
         self.first: dict[str, np.ndarray] = {}
         self.files = 0  # that were sent whole
+        self.shown = b""  # the last picture, a file
 
     def look(self, pose: np.ndarray) -> None:
         """Look from a pose [4, 4]."""
@@ -110,10 +111,10 @@ class Visitor:
         position = (np.array(self.handles[name]) + offset).tolist()
         self.tell("TransformControlsUpdateMessage", name=name, wxyz=[1.0, 0, 0, 0], position=position, owner="")
 
-    def picture(self, until: Callable[[], bool] | None = None) -> None:
-        """Wait for the next one, or until something else is so. Raises TimeoutError."""
+    def picture(self, until: Callable[[], bool] | None = None, patience: float = PATIENCE) -> None:
+        """Wait for the next one, or until something else is so. Raises TimeoutError after so many seconds."""
         while True:
-            data = self.socket.recv(timeout=PATIENCE)
+            data = self.socket.recv(timeout=patience)
             assert isinstance(data, bytes)
             size = int.from_bytes(data[8:16], "little")
             messages = msgspec.msgpack.decode(self._unzip.decompress(data[16 : 16 + size]))["messages"]
@@ -134,7 +135,9 @@ class Visitor:
             self.first[key] = np.array(message[key])
         elif kind == "FileTransferStartDownload":
             self.files += 1
-        return kind == "BackgroundImageMessage" and bool(message["rgb_data"])
+        is_picture = kind == "BackgroundImageMessage" and bool(message["rgb_data"])
+        self.shown = message["rgb_data"] if is_picture else self.shown
+        return is_picture
 
     def leave(self) -> None:
         """Without a word."""

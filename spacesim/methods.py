@@ -75,7 +75,10 @@ def load_run(path: str | Path) -> "Run | NerfRun":
     """Load a finished run of any method. Raises InputError where the folder is no run or its training has not ended."""
     config = Path(path) / "config.json"
     values = read_json(config) if config.exists() else {}
-    if isinstance(values, dict) and values.get("method") in nerf.METHODS:
+    method = values.get("method", "vanilla") if isinstance(values, dict) else "vanilla"
+    if method not in (*METHODS, *splat.ALIASES):
+        raise InputError(f"{config}: method: expected one of {', '.join(METHODS)}, found {method!r:.60}")
+    if method in nerf.METHODS:
         from spacesim.nerf.run import load_run as load_field
 
         return load_field(path)

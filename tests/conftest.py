@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tiny import GENERATE, TRAIN, Outcome, call
+from tiny import GENERATE, TRAIN, TRAIN_FIELD, Outcome, call
 
 # A shell may have started us with Ctrl-C ignored, which the commands that tests start and stop would inherit.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -80,5 +80,14 @@ def tiny_eval(tiny_run, tiny_data, tmp_path_factory) -> Path:
     """`tiny_run` evaluated on the test views of `tiny_data`."""
     out = tmp_path_factory.mktemp("tiny") / "eval"
     done = call("eval", tiny_run, "--data", tiny_data, "--out", out)
+    assert done.code == 0, done.errors
+    return out
+
+
+@pytest.fixture(scope="session")
+def tiny_field(tiny_data, tmp_path_factory) -> Path:
+    """A radiance field that is told the Sun, 60 iterations on `tiny_data`."""
+    out = tmp_path_factory.mktemp("tiny") / "field"
+    done = call("train", tiny_data, "--out", out, "--method", "nerf-relight", *TRAIN_FIELD)
     assert done.code == 0, done.errors
     return out

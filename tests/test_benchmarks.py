@@ -574,20 +574,26 @@ def test_against_gsplat_says_what_it_needs(command):
 @smallest(
     "viewer.py --backend llvm --gaussians 200 --side 64 --repeats 1 --moving 0.5 --seconds 1 --clients 1 --json",
     "viewer.py RUN --backend llvm --side 64 --repeats 1 --moving 0.5 --seconds 0 --json",
+    "viewer.py FIELD --backend llvm --side 64 --repeats 1 --moving 4 --seconds 0 --json",
 )
-def test_viewer_tells_pictures_rates_and_memory(command, tiny_run, place):
+def test_viewer_tells_pictures_rates_and_memory(command, tiny_run, tiny_field, place):
     pytest.importorskip("viser", reason="viser is not installed")
-    (place / "RUN").symlink_to(tiny_run)
+    for name, run in (("RUN", tiny_run), ("FIELD", tiny_field)):
+        (place / name).symlink_to(run)
     report = json.loads(call(command, ended_alone))
-    assert report["gaussians"] == (300 if "RUN" in command else 200)
+    assert report["gaussians"] == (300 if "RUN" in command else 0 if "FIELD" in command else 200)
     pictures = {row["picture"]: float(row["ms"].split()[0]) for row in report["draw"]}
     assert {"colour, another camera", "depth, another camera", "colour, another Sun"} < set(pictures)
     assert min(pictures.values()) > 0
-    assert [row["mode"] for row in report["rates"]] == ["colour", "depth", "ellipsoids"]
+    assert [row["mode"] for row in report["rates"]] == ["colour", "depth", "ellipsoids"][: 3 - ("FIELD" in command)]
+    for row in report["at_rest"]:
+        first, refined = (float(row[key].split()[0]) for key in ("first", "in full resolution"))
+        assert 0 < first <= refined
+    assert len(report["at_rest"]) == ("FIELD" in command)
     for row in report["rates"]:
         assert float(row["frames/s"]) > 0
         assert 0 < float(row["of full resolution"]) <= 1
-    if "RUN" in command:
+    if "RUN" in command or "FIELD" in command:
         assert report["soak"] == {}
     else:
         kept = [float(size) for size in report["soak"]["MiB kept after each tenth"].split(", ")]

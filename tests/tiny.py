@@ -12,6 +12,7 @@ from spacesim.cli import main
 
 GENERATE = ("--views", "6", "--test-views", "2", "--resolution", "40", "--spp", "4")
 TRAIN = ("--preset", "demo", "--iterations", "50", "--set", "init_count=300")
+TRAIN_FIELD = ("--preset", "demo", "--iterations", "60", "--set=rays=512", "--set=samples=12", "--set=chunk=2048")
 PROGRESS = re.compile(r"(generate|train|evaluate|sweep|compose|export): \d+/\d+ ")
 
 

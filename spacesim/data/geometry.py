@@ -104,6 +104,14 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Array:
     return quaternion if quaternion[0] >= 0 else -quaternion
 
 
+def may_shade(caster: tuple[Array, float], receiver: tuple[Array, float], sun: Array) -> bool:
+    """Could anything within one sphere, (centre [3], radius), be before the Sun for anything within another? sun: [3]
+    towards it, unit"""
+    reach, offset = caster[1] + receiver[1], caster[0] - receiver[0]
+    ahead = float(offset @ sun)
+    return ahead > -reach and float(np.linalg.norm(offset - ahead * sun)) < reach
+
+
 def fibonacci_sphere(count: int, seed: int | None = None) -> Array:
     """`count` nearly even unit directions [count, 3] on the spherical Fibonacci lattice.
 

@@ -4,7 +4,8 @@ import logging
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -15,8 +16,9 @@ import numpy as np
 import spacesim
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonDict, holds_files, read_json, write_json
+from spacesim.data.files import JsonDict, holds_files, read_json, remove_leftovers, write_json
 from spacesim.data.identity import same_digest, training_digest
+from spacesim.data.lock import lock_folder
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
 from spacesim.data.toml import Document
@@ -52,6 +54,23 @@ class TrainingProgress:
     def words(self) -> str:
         """For a bar or a line."""
         return f"loss {self.loss:.4f}" + ("" if self.gaussian_count is None else f", {self.gaussian_count} Gaussians")
+
+
+def is_finished(out: Path, described: JsonDict, resume: bool, read_config: ReadConfig) -> bool:
+    """Whether `out` holds the whole run that is so described already. Raises as `check_folder`."""
+    check_folder(out, described, resume, read_config)
+    return (out / "model.safetensors").exists()
+
+
+@contextmanager
+def open_folder(out: Path, described: JsonDict, resume: bool, read_config: ReadConfig) -> Iterator[None]:
+    """`out` for a training that is so described, and for no other while the block runs. Raises as `check_folder`, and
+    where another training is at work in it."""
+    with lock_folder(out):
+        check_folder(out, described, resume, read_config)  # again: another training may have come and gone
+        remove_leftovers(out)
+        write_json(out / "config.json", described)
+        yield
 
 
 def check_folder(out: Path, described: JsonDict, resume: bool, read_config: ReadConfig) -> None:
@@ -143,15 +162,25 @@ def describe_data(dataset: Dataset) -> JsonDict:
 def _check_resumable(out: Path, described: JsonDict, resume: bool, read_config: ReadConfig) -> None:
     if not resume:
         raise InputError(f"{out}: expected a new folder, found a run; resume=True goes on with it")
-    config, data = read_config(out / "config.json")
+    try:
+        config, data = read_config(out / "config.json")
+    except InputError:
+        values = read_json(out / "config.json")
+        method, found = values.get("method") if isinstance(values, dict) else None, described["method"]
+        if isinstance(method, str) and method != found:  # of another family, whose configurations have other fields
+            raise _started_with(out, "method", method, found) from None
+        raise
     data["path"] = described["data"]["path"]  # it may have moved
     if same_digest(str(data.get("digest")), described["data"]["digest"]):
         data["digest"] = described["data"]["digest"]  # older versions told less
     current = {**config.to_json(), "data": data}  # what an older version did not write is as by default
     difference = _first_difference(current, described)
     if difference is not None:
-        key, old, new = difference
-        raise InputError(f"{out}: was started with {key} {old!r}, expected the same to resume it, found {new!r}")
+        raise _started_with(out, *difference)
+
+
+def _started_with(out: Path, key: str, old: object, new: object) -> InputError:
+    return InputError(f"{out}: was started with {key} {old!r}, expected the same to resume it, found {new!r}")
 
 
 def _first_difference(old: JsonDict, new: JsonDict, within: str = "") -> tuple[str, object, object] | None:

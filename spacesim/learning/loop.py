@@ -1,32 +1,139 @@
-"""The loop of a training, of any method: history, progress, checkpoints, and how it is asked to stop."""
+"""The training of a model, of any method: its loop, checkpoints, how it is asked to stop, the run that it leaves."""
 
+import logging
 import math
+import shlex
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar
 
+import numpy as np
+
+from spacesim import backend, interrupts
 from spacesim.backend.arrays import Float
-from spacesim.data.errors import WorkError
-from spacesim.learning.folder import TrainingProgress
+from spacesim.data.errors import InputError, WorkError
+from spacesim.data.files import JsonDict, write_json
+from spacesim.data.structure import Rules, structure
+from spacesim.data.toml import Document
+from spacesim.learning.folder import (
+    TrainingClock,
+    TrainingProgress,
+    checkpoints,
+    device,
+    versions,
+    write_checkpoint,
+)
+from spacesim.learning.tensors import read_tensors, write_tensors
 
 HISTORY_EVERY = 50  #: iterations between two entries of the history
 
+log = logging.getLogger(__name__)
+
 
 class TrainingLoop(ABC):
-    """What trains a model, one step after another."""
+    """What trains a model, one step after another. A family of methods says what a step is, and what there is to keep.
 
-    config: Any  #: with `iterations` and `checkpoint_every`
+    The same dataset, configuration and backend give bitwise the same model, also across `save` and `restore`.
+    """
+
+    form: ClassVar[str]  #: the word by which files of the family are known, see `read_tensors`
+    header: ClassVar[type]  #: record of what a checkpoint says beside its arrays: iteration, history, `counts`
+    config: Any  #: with `iterations`, `checkpoint_every`, `to_json`
     iteration: int  #: steps taken
     history: list[dict[str, float]]  #: iteration and loss now and then, of Gaussians their number
+    seconds: dict[str, float]  #: parts of training's time that the run tells apart, by their names
 
     @abstractmethod
     def step(self) -> Float:
         """One update. Returns the loss, Float of width 1."""
 
+    @abstractmethod
+    def model_tensors(self) -> dict[str, np.ndarray]:
+        """The trained model by name."""
+
+    @abstractmethod
+    def state_tensors(self) -> dict[str, np.ndarray]:
+        """What the next step depends on beside the model, by name."""
+
+    @abstractmethod
+    def counts(self) -> dict[str, int]:
+        """What it depends on of whole numbers beside the iteration, by name."""
+
+    @abstractmethod
+    def put(self, tensors: Mapping[str, np.ndarray], header: Any) -> None:
+        """Take over what a checkpoint holds. header: its record. Raises KeyError, TypeError or ValueError where that
+        does not fit."""
+
+    @abstractmethod
+    def summary(self) -> JsonDict:
+        """What training.json says of the model."""
+
+    def files(self) -> dict[str, JsonDict]:
+        """What a finished run has beside its model: files by name."""
+        return {}
+
     @property
     def gaussian_count(self) -> int | None:
         """None of a model without Gaussians."""
         return None
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint: everything that the next step depends on."""
+        header = {"iteration": self.iteration, "history": self.history, **self.counts()}
+        write_tensors(path, {**self.model_tensors(), **self.state_tensors()}, header, self.form)
+
+    def restore(self, path: Path) -> None:
+        """Continue from what `save` wrote. Raises InputError where the file does not fit."""
+        tensors, said = read_tensors(path, self.form)
+        header: Any = structure(self.header, Document(f"{path}: header", said, {}), Rules())
+        if header.iteration > self.config.iterations:
+            raise InputError(f"{path}: expected an iteration up to {self.config.iterations}, found {header.iteration}")
+        try:
+            self.put(tensors, header)
+        except TypeError:
+            raise InputError(f"{path}: expected a checkpoint of training, found tensors of other shapes") from None
+        except KeyError as error:
+            (name,) = error.args
+            raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {name}") from None
+        except ValueError as error:
+            raise InputError(f"{path}: expected a checkpoint of this training ({error})") from None
+        self.iteration, self.history = header.iteration, [asdict(entry) for entry in header.history]
+
+    def complete(self, out: Path, on_progress: Callable[[TrainingProgress], None], command: Sequence[str] = ()) -> None:
+        """Train from the newest checkpoint in `out` to the end, and write the run, its model last. command: what the
+        user typed."""
+        newest = max(checkpoints(out), default=None)
+        if newest is not None:
+            self.restore(newest)
+            log.info("resumed at iteration %d from %s", self.iteration, newest)
+        clock = TrainingClock(out, self.iteration)
+        self.seconds = {name: clock.kept.get(name, 0.0) if clock.before else 0.0 for name in self.seconds}
+
+        def checkpoint() -> None:
+            write_checkpoint(self.save, out, self.iteration)
+            clock.write(self.iteration, **self.seconds)
+
+        with interrupts.defer_interrupts() as should_stop:  # the writing, too: the last steps may have no checkpoint
+            self.run(on_progress, checkpoint, should_stop)
+            write_json(
+                out / "training.json",
+                {
+                    "history": self.history,
+                    "seconds": round(clock.total(), 3),
+                    **{f"{name}_seconds": round(seconds, 3) for name, seconds in self.seconds.items()},
+                    "backend": backend.select(),
+                    "device": device(),
+                    "command": shlex.join(command) if command else None,
+                    "versions": versions(),
+                    **self.summary(),
+                },
+            )
+            for name, content in self.files().items():
+                write_json(out / name, content)
+            header = {"iteration": self.iteration, "config": self.config.to_json()}
+            write_tensors(out / "model.safetensors", self.model_tensors(), header, self.form)
 
     def run(
         self,

@@ -7,28 +7,27 @@ tile's list of Gaussians is walked once more, together with it. All is blended a
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import drjit as dr
 import numpy as np
 
-from spacesim import backend
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Bool, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.records import Camera, Sun
-from spacesim.learning.prediction import ComposedPrediction, check_picture
 from spacesim.mixed.shadow import FieldsBeside, sun_views
 from spacesim.mixed.walk import ListedSplats, Segments, blend_segments, listed
 from spacesim.nerf.compose import Composition as Fields
 from spacesim.nerf.draw import chunks, unit_normals
 from spacesim.nerf.partition import PlacedFields, partition
 from spacesim.nerf.run import NerfRun
+from spacesim.nerf.scene import DrawnScene, FieldScene
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.compose.scene import COVERED, ComposeConfig, LitGaussians
+from spacesim.splat.compose.scene import ComposeConfig, LitGaussians
 from spacesim.splat.compose.scene import Composition as Splats
 from spacesim.splat.light.shadow.mapping import SunView
 from spacesim.splat.raster.bin import bin_splats
@@ -46,7 +45,7 @@ COMMON = 4  #: features that both have: colour, visibility
 T = TypeVar("T")
 
 
-class Composition:
+class Composition(FieldScene):
     """Posed runs of both families under one Sun; in scene files what `splat.compose.Composition` is to Gaussians.
 
     models: at least one of each family;  config: how they shade each other. `shadows` is of Gaussians on each other;
@@ -55,7 +54,7 @@ class Composition:
     """
 
     def __init__(self, models: Sequence[Any], config: ComposeConfig | None = None, path: Path | None = None) -> None:
-        self.models, self.config, self.path = tuple(models), config or ComposeConfig(), path
+        super().__init__(models, config or ComposeConfig(), path)
         are_fields = [isinstance(model.run, NerfRun) for model in self.models]
         if all(are_fields) or not any(are_fields):
             raise InputError("models: expected at least one of Gaussians and one radiance field, found one family")
@@ -79,14 +78,14 @@ class Composition:
         return self._fields.model_bytes + self._splats.model_bytes
 
     @property
-    def backend(self) -> str:
-        """The backend that renders now."""
-        return backend.select()
-
-    @property
     def relightable(self) -> bool:
         """Whether the Sun's direction changes what is predicted."""
         return self._shades or self._fields.relightable or self._splats.relightable
+
+    @property
+    def has_shadows(self) -> bool:
+        """See `FieldScene`."""
+        return self._shades or self._splats.has_shadows or self._fields.has_shadows
 
     @property
     def _shades(self) -> bool:
@@ -120,13 +119,6 @@ class Composition:
         both = dict(zip(self._of_fields, of_fields, strict=True)) | dict(zip(self._of_splats, of_splats, strict=True))
         return [both[k] for k in range(len(self.models))]
 
-    def stops(self, exposure: float | None) -> float:
-        """0: colours are blended as sRGB values. Raises InputError for an exposure."""
-        if exposure is not None:
-            found = f"a radiance field in {self.path or 'the scene'}"
-            raise InputError(f"exposure: expected runs trained in linear light (light.linear) alone, found {found}")
-        return 0.0
-
     def posed(self, poses: Sequence[Pose]) -> "Composition":
         """The scene with these poses, one of each model. What does not change with them is kept."""
         other: Composition = object.__new__(Composition)
@@ -137,47 +129,6 @@ class Composition:
         other._splats = other._shaded(self._splats.posed([poses[k] for k in self._of_splats]))
         return other
 
-    def predict(
-        self,
-        camera: Camera,
-        sun: Sun | None = None,
-        normals: bool = False,
-        exposure: float | None = None,
-        on_chunk: Callable[[], None] | None = None,
-    ) -> ComposedPrediction:
-        """Render one view. on_chunk: see `nerf.draw.chunks`. Raises InputError where the Sun matters and none is told,
-        and for an exposure."""
-        self.stops(exposure)
-        if sun is None and self.relightable:
-            source = self.path or "scene"
-            raise InputError(f"{source}: expected the Sun's direction for a scene that it changes, found none")
-        check_picture(camera)
-        drawn = self._draw(camera, sun, normals, False, on_chunk)
-        planes = drawn.image("features")
-        alpha, shares = drawn.image("alpha"), planes[..., COMMON:]
-        number = np.where(alpha >= COVERED, np.array(self._order)[shares.argmax(axis=-1)] + 1, 0).astype(np.int32)
-        covered = alpha > 0
-        visibility = np.divide(planes[..., 3], alpha, out=np.zeros_like(alpha), where=covered)
-        knows = self._shades or self._splats.has_shadows or self._fields.has_shadows
-        return ComposedPrediction(
-            np.ascontiguousarray(planes[..., :3]),
-            alpha,
-            drawn.image("depth"),
-            visibility if knows else None,
-            drawn.image("normal") if normals else None,
-            number,
-        )
-
-    def surface_depth(self, camera: Camera) -> np.ndarray:
-        """[H, W] float32: depth in metres along the optical axis at which half of the light is gone, 0 where it is
-        not, whatever the Sun."""
-        drawn = self._unshaded._draw(camera, Sun(np.array([0.0, 0.0, 1.0])), False, True, None)
-        return drawn.image("median_depth")
-
-    @cached_property
-    def _unshaded(self) -> "Composition":
-        return Composition(self.models, replace(self.config, shadows="none"), self.path)
-
     @property
     def _order(self) -> list[int]:
         """Which model each share is of: Gaussians, then fields."""
@@ -186,15 +137,26 @@ class Composition:
 
     def _draw(
         self, camera: Camera, sun: Sun | None, normals: bool, median: bool, on_chunk: Callable[[], None] | None
-    ) -> RenderOutput:
-        """features: colour (3), visibility, the share of each model of `_order` in the opacity."""
+    ) -> DrawnScene:
         times = self.supersample
         lit = self._splats.lit(camera, sun)
         wide = upsampled_camera(camera, times)
         views = self._views.of(self._splats, self._fields, lit, sun) if sun is not None and self._shades else []
         fields = self._fields.placed(wide, sun, views)
         draw = partial(self._draw_once, wide, lit, fields, normals, median, on_chunk)
-        return render_supersampled(draw, camera, times, 3)
+        drawn = render_supersampled(draw, camera, times, 3)
+        planes = drawn.image("features")
+        shares = np.zeros((*planes.shape[:2], len(self.models)), np.float32)
+        shares[..., self._order] = planes[..., COMMON:]  # models without Gaussians have none
+        return DrawnScene(
+            np.ascontiguousarray(planes[..., :3]),
+            drawn.image("alpha"),
+            drawn.image("depth"),
+            drawn.image("median_depth") if median else None,
+            planes[..., 3] if self.has_shadows else None,
+            drawn.image("normal") if normals else None,
+            shares,
+        )
 
     def _draw_once(
         self,
@@ -206,7 +168,8 @@ class Composition:
         on_chunk: Callable[[], None] | None,
         pinhole: Pinhole,
     ) -> RenderOutput:
-        """A picture with one ray a pixel."""
+        """A picture with one ray a pixel. features: colour (3), visibility, the share of each model of `_order` in the
+        opacity."""
         splats, planes = _blend_splats(lit, pinhole, self._splats.antialiased, normals, median)
         width, count = dr.opaque(ad.UInt32, camera.width), 3 * normals
         pixels = self._fields.crossing(fields, camera)

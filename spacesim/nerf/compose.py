@@ -21,23 +21,20 @@ from typing import Any, Protocol
 import drjit as dr
 import numpy as np
 
-from spacesim import backend
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, may_shade
 from spacesim.data.records import Camera, Sun
-from spacesim.learning.prediction import ComposedPrediction, check_picture
-from spacesim.nerf.draw import Samples, chunks, shown, unit_normals
+from spacesim.nerf.draw import Samples, check_chunk, chunks, shown, unit_normals
 from spacesim.nerf.partition import Beside, PlacedField, PlacedFields, Shading, model_rays, partition
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.sampling.box import SceneBox
 from spacesim.nerf.sampling.rays import Rays, camera_rows
 from spacesim.nerf.sampling.render import sum_rays, volume_weights
+from spacesim.nerf.scene import DrawnScene, FieldScene
 from spacesim.nerf.shadow import sun_visibility
-
-COVERED = 0.5  #: alpha from which on a pixel shows a model
 
 
 def draw_chunk(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, normals: bool) -> Float:
@@ -78,7 +75,7 @@ class Placed(Protocol):
     name: str
 
 
-class Composition:
+class Composition(FieldScene):
     """Posed radiance fields under one Sun; in scene files what `splat.compose.Composition` is to Gaussians.
 
     models: at least one;  config: how they shade each other: `shadows` is "none", or else by transmittance towards the
@@ -89,7 +86,7 @@ class Composition:
     def __init__(self, models: Sequence[Any], config: Any, path: Path | None = None) -> None:
         if not models:
             raise InputError("models: expected at least one, found none")
-        self.models, self.config, self.path = tuple(models), config, path
+        super().__init__(models, config, path)
         self._runs: list[NerfRun] = list({id(model.run): model.run for model in self.models}.values())
         self._which = tuple(self._runs.index(model.run) for model in self.models)
 
@@ -97,11 +94,6 @@ class Composition:
     def model_bytes(self) -> int:
         """Size of the models' files, each counted once."""
         return sum(run.model_bytes for run in self._runs)
-
-    @property
-    def backend(self) -> str:
-        """The backend that renders now."""
-        return backend.select()
 
     @property
     def relightable(self) -> bool:
@@ -142,66 +134,38 @@ class Composition:
         """Rays that are drawn at once."""
         return self._runs[0].networks.config.chunk
 
-    def stops(self, exposure: float | None) -> float:
-        """0: colours are sRGB values. Raises InputError for an exposure."""
-        if exposure is not None:
-            raise InputError(f"exposure: expected runs trained in linear light (light.linear), found {self.path}")
-        return 0.0
-
     def posed(self, poses: Sequence[Any]) -> "Composition":
         """The scene with these poses, one of each model."""
         models = [replace(model, pose=pose) for model, pose in zip(self.models, poses, strict=True)]
         return Composition(models, self.config, self.path)
 
-    def predict(
-        self,
-        camera: Camera,
-        sun: Sun | None = None,
-        normals: bool = False,
-        exposure: float | None = None,
-        on_chunk: Callable[[], None] | None = None,
-    ) -> ComposedPrediction:
-        """Render one view. on_chunk: see `draw.chunks`. Raises InputError where the Sun matters and none is told, and
-        for an exposure."""
-        self.stops(exposure)
-        self.check_sun(sun)
-        check_picture(camera)
-        planes = self._draw(camera, sun, normals, on_chunk).reshape(-1, camera.height, camera.width)
-        rest, alpha = iter(planes[6:]), planes[3].copy()
-        shares = np.stack([next(rest) for _ in self.models])
-        number = np.where(alpha >= COVERED, shares.argmax(axis=0) + 1, 0).astype(np.int32)
-        normal = unit_normals(np.stack([next(rest) for _ in range(3)], axis=-1)) if normals else None
-        visibility = over_alpha(next(rest), alpha) if self.has_shadows else None
-        rgb = np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1))
-        return ComposedPrediction(rgb, alpha, planes[4].copy(), visibility, normal, number)
-
-    def surface_depth(self, camera: Camera) -> np.ndarray:
-        """[H, W] float32: depth in metres along the optical axis at which half of the light is gone, 0 where it is
-        not, whatever the Sun."""
-        unshaded = Composition(self.models, replace(self.config, shadows="none"), self.path)
-        planes = unshaded._draw(camera, Sun(np.array([0.0, 0.0, 1.0])), False, None)
-        return np.where(planes[3] >= COVERED, planes[5], np.float32(0)).reshape(camera.height, camera.width)
-
-    def check_sun(self, sun: Sun | None) -> None:
-        """Raise InputError where the Sun matters and none is told."""
-        if sun is None and self.relightable:
-            raise InputError(
-                f"{self.path or 'sun'}: expected the Sun's direction for a scene that it changes, found none"
-            )
-
-    def _draw(self, camera: Camera, sun: Sun | None, normals: bool, on_chunk: Callable[[], None] | None) -> np.ndarray:
-        """[C, H W] planes of `draw_chunk`."""
+    def _draw(
+        self, camera: Camera, sun: Sun | None, normals: bool, median: bool, on_chunk: Callable[[], None] | None
+    ) -> DrawnScene:
+        """See `FieldScene`; the median depth is there in any case."""
         fields, width = self.placed(camera, sun), dr.opaque(ad.UInt32, camera.width)
         count = 6 + len(self.models) + 3 * normals + self.has_shadows
-        planes = np.zeros((count, camera.width * camera.height), np.float32)
+        planes = np.zeros((camera.height, camera.width, count), np.float32)
+        flat = planes.reshape(-1, count)
         for part, padded in chunks(self.crossing(fields, camera), self.chunk, on_chunk):
             rays = dr.width(padded)
             packed = _draw_chunk(fields, padded, width, rays, normals)
-            planes[:, part] = np.array(packed).reshape(-1, rays)[:, : len(part)]
-        return planes
+            flat[part] = np.array(packed).reshape(-1, rays)[:, : len(part)].T
+        rgb, alpha, depth, median_depth, shares, rest = np.split(planes, np.cumsum([3, 1, 1, 1, len(self.models)]), -1)
+        return DrawnScene(
+            np.ascontiguousarray(rgb),
+            alpha[..., 0].copy(),
+            depth[..., 0].copy(),
+            median_depth[..., 0].copy(),
+            rest[..., -1].copy() if self.has_shadows else None,
+            unit_normals(rest[..., :3]) if normals else None,
+            shares,
+        )
 
     def crossing(self, fields: PlacedFields, camera: Camera) -> np.ndarray:
-        """Numbers, row by row, of the pixels whose rays cross what a model fills."""
+        """Numbers, row by row, of the pixels whose rays cross what a model fills. Raises MemoryError where a chunk of
+        rays does not fit."""
+        check_chunk(self._runs[0].networks.config)
         size, count, width = camera.width * camera.height, self.chunk, dr.opaque(ad.UInt32, camera.width)
         seen = (_find_crossing(fields, dr.opaque(ad.UInt32, first), width, count) for first in range(0, size, count))
         return np.flatnonzero(np.concatenate([np.array(part, bool) for part in seen])[:size]).astype(np.uint32)
@@ -249,18 +213,6 @@ class Composition:
                 own = pose.inverse().points(points[reached]), pose.direction_in_model(sun.direction)
                 seen[reached] *= sun_visibility(run.networks, run.parameters, run.filled, run.box, *own, bias=0.0)
         return seen
-
-
-def may_shade(caster: tuple[Array, float], receiver: tuple[Array, float], sun: Array) -> bool:
-    """Could anything of one sphere, (centre, radius), be before the Sun for anything of another?"""
-    reach, offset = caster[1] + receiver[1], caster[0] - receiver[0]
-    ahead = float(offset @ sun)
-    return ahead > -reach and float(np.linalg.norm(offset - ahead * sun)) < reach
-
-
-def over_alpha(blended: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Blended values by the alpha; 0 where that is 0."""
-    return np.divide(blended, alpha, out=np.zeros_like(alpha), where=alpha > 0)
 
 
 def _place(model: Placed, camera: Camera, sun: Sun | None) -> PlacedField:

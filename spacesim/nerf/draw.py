@@ -8,9 +8,10 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Float, UInt32
+from spacesim.backend.memory import check_free_memory
 from spacesim.backend.upload import upload
 from spacesim.data.records import Camera
-from spacesim.nerf.config import CHUNK
+from spacesim.nerf.config import CHUNK, NerfConfig
 from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks, places
 from spacesim.nerf.sampling.box import SceneBox
@@ -138,7 +139,8 @@ def draw(
     normals: bool,
 ) -> dict[str, np.ndarray]:
     """Planes of a picture by name, [H, W] or [H, W, 3] float32, depths in metres. Memory on the device is that of a
-    chunk of rays. sun: [3] towards it, of a field that is told"""
+    chunk of rays: raises MemoryError where these do not fit. sun: [3] towards it, of a field that is told"""
+    check_chunk(networks.config)
     left_out = {"normal": not normals, "visibility": not networks.config.casts_shadows}
     names = [name for name in PLANES if not left_out.get(name)]
     size, chunk = camera.width * camera.height, networks.config.chunk
@@ -170,6 +172,11 @@ def draw(
     if normals:
         result["normal"] = unit_normals(result["normal"])
     return result
+
+
+def check_chunk(config: NerfConfig) -> None:
+    """Raise MemoryError where the rays that are drawn at once do not fit into memory."""
+    check_free_memory(config.ray_bytes * config.chunk // 2, f"chunk: a picture by {config.chunk} rays at once")
 
 
 def chunks(

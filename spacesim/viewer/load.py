@@ -1,17 +1,13 @@
 """From what the command line names to what is shown."""
 
 from pathlib import Path
-from typing import Any
 
 from spacesim.data.errors import InputError
 from spacesim.data.records import Dataset, Sun
 from spacesim.data.store import read_dataset
-from spacesim.methods import load_run, load_scene
-from spacesim.nerf.compose import Composition as Fields
-from spacesim.nerf.run import NerfRun
-from spacesim.splat.compose import Composition, PlacedRun
+from spacesim.methods import compose, load_run, load_scene
+from spacesim.splat.compose import PlacedRun
 from spacesim.splat.compose.path import PosedScene
-from spacesim.splat.compose.scene import ComposeConfig
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.path import path_from_scene
 from spacesim.viewer.server import ViewerSetup, import_viser
@@ -59,9 +55,7 @@ def _scene(path: Path) -> PosedScene:
     run = load_run(path)
     folder = path.resolve()
     name = folder.parent.name if folder.name == "run" else folder.name
-    placed: list[Any] = [PlacedRun(run, name=name)]  # type: ignore[arg-type]
-    composition: Any = Fields(placed, ComposeConfig()) if isinstance(run, NerfRun) else Composition(placed)
-    return PosedScene(composition)
+    return PosedScene(compose([PlacedRun(run, name=name)]))  # type: ignore[arg-type]
 
 
 def _initial_sun(dataset: Dataset | None) -> Sun:

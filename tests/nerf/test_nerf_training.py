@@ -20,6 +20,7 @@ from spacesim.methods import load_predictor
 from spacesim.nerf.config import GridConfig, NerfConfig, ProposalConfig, preset, with_settings
 from spacesim.nerf.run import NerfRun, load_run
 from spacesim.nerf.sampling.box import scene_box
+from spacesim.nerf.train.pixels import training_pixels
 from spacesim.nerf.train.train import train
 from spacesim.nerf.train.trainer import FORMAT, Trainer
 from spacesim.splat.compose import ComposeConfig, PlacedRun
@@ -111,6 +112,54 @@ train(read_dataset(Path({str(dataset.root)!r})), Path({str(tmp_path / "run")!r})
         train(dataset, tmp_path / "run", replace(CONFIG, seed=5), resume=True)
     resumed = train(dataset, tmp_path / "run", CONFIG, resume=True)
     assert model_bytes(resumed) == model_bytes(finished)
+
+
+def test_a_run_of_one_family_is_not_resumed_by_the_other(dataset, finished, tiny_run):
+    for out, config, words in (
+        (
+            finished.path,
+            methods.preset("demo", "vanilla"),
+            "method 'nerf', expected the same to resume it, found 'vanilla'",
+        ),
+        (tiny_run, CONFIG, "method 'vanilla', expected the same to resume it, found 'nerf'"),
+    ):
+        with pytest.raises(InputError, match=f"was started with {words}"):
+            methods.train(dataset, out, config, resume=True)
+
+
+@pytest.mark.parametrize("method", ["nerfx", 3, None, ["nerf"]])
+def test_a_run_of_no_method_is_refused(tmp_path, method):
+    (tmp_path / "config.json").write_text(json.dumps({**CONFIG.to_json(), "method": method, "data": {"path": "."}}))
+    with pytest.raises(InputError, match=r"config.json: method: expected one of vanilla, .*nerf-relight, found"):
+        methods.load_run(tmp_path)
+
+
+def test_rays_that_do_not_fit_into_memory_are_told(dataset, finished, monkeypatch):
+    many = replace(CONFIG, rays=2**20, samples=1024, chunk=2**20)
+    assert many.ray_bytes * many.rays > 10**12
+    monkeypatch.setattr("spacesim.backend.memory.free_memory", lambda needed=0: 10**11)
+    with pytest.raises(MemoryError, match="rays: a step of 1048576 rays needs about"):
+        Trainer(dataset, many)
+    wide = replace(finished, networks=type(finished.networks)(many))
+    for drawn in (wide, methods.compose([PlacedRun(wide)])):
+        with pytest.raises(MemoryError, match="chunk: a picture by 1048576 rays at once needs about"):
+            drawn.predict(dataset.test[0].camera)
+
+
+def test_pictures_beside_the_box_are_left_out_in_one_sentence(dataset, caplog):
+    turn = np.diag([-1.0, 1, -1, 1])  # looks the other way
+    turned = [
+        replace(f, camera=replace(f.camera, world_from_camera=f.camera.world_from_camera @ turn)) for f in dataset.train
+    ]
+    box = scene_box(dataset, CONFIG.margin)
+    others = training_pixels(replace(dataset, train=dataset.train[2:]), box, False)
+    found = training_pixels(replace(dataset, train=(*turned[:2], *dataset.train[2:])), box, False)
+    assert int(found.count[0]) == int(others.count[0])
+    (record,) = caplog.records
+    assert f"2 of {len(dataset.train)} pictures show nothing of the scene box" in record.message
+    assert dataset.train[0].file_path in record.message
+    with pytest.raises(InputError, match="found rays that all miss it"):
+        training_pixels(replace(dataset, train=tuple(turned)), box, False)
 
 
 def test_damaged_checkpoints_are_told_in_one_sentence(dataset, tmp_path):

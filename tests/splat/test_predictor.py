@@ -9,7 +9,8 @@ from splats import random_splats
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera, Sun
-from spacesim.splat.compose import ComposedRun, Composition, PlacedRun, Pose, load_predictor
+from spacesim.methods import load_predictor
+from spacesim.splat.compose import ComposedRun, Composition, PlacedRun, Pose
 from spacesim.splat.compose.aligned import AlignedRun
 from spacesim.splat.compose.run import PlacedPart
 from spacesim.splat.raster.gaussians import Gaussians

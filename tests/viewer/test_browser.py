@@ -1,4 +1,5 @@
-"""The viewer in headless Chromium: it opens, handles are dragged, truth appears, what is saved is drawn again."""
+"""The viewer in headless Chromium: it opens, handles are dragged, truth appears, what is saved is drawn again; fields
+beside Gaussians are refined."""
 
 import time
 from types import SimpleNamespace
@@ -10,9 +11,28 @@ from browser import CHROMIUM, PATIENCE, Browser, choose, fill, press, wait_for
 from spacesim.data.images import read_png
 from spacesim.data.records import Sun
 from spacesim.splat.compose import Pose
-from spacesim.viewer.drawing.frames import draw_mode
+from spacesim.viewer.drawing.frames import draw_mode, picture_size
 from spacesim.viewer.drawing.paint import PALETTE
+from spacesim.viewer.load import load_setup
 from spacesim.viewer.panels.handles import GIZMO, SUN_AWAY
+from spacesim.viewer.server import Viewer
+from spacesim.viewer.state import MODES
+
+MIXED = """
+[[models]]
+run = "{run}"
+[[models]]
+name = "field"
+run = "{field}"
+position = [0.0, 0.0, 1.6]
+scale = 0.5
+[sun]
+azimuth_deg = 20.0
+elevation_deg = 60.0
+[camera]
+position = [12.0, -4.0, 4.5]
+look_at = [0.0, 0.0, 0.8]
+"""
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +48,22 @@ def browser(tmp_path_factory):
 def tab(viewer, browser):
     """A page that shows its first picture: page, client, size of the window."""
     return opened_tab(viewer, browser)
+
+
+@pytest.fixture(scope="module")
+def mixed(tiny_run, tiny_field, tmp_path_factory):
+    """Gaussians below, a radiance field above them, served on loopback."""
+    folder = tmp_path_factory.mktemp("mixed")
+    (folder / "mixed.toml").write_text(MIXED.format(run=tiny_run, field=tiny_field))
+    one = Viewer(load_setup(folder / "mixed.toml", out=folder), port=0)
+    one.start()
+    yield one
+    one.stop()
+
+
+@pytest.fixture(scope="module")
+def mixed_tab(mixed, browser):
+    return opened_tab(mixed, browser, 700, 420)
 
 
 def opened_tab(viewer, browser, width=900, height=560):
@@ -204,3 +240,52 @@ def test_two_clients_at_once(viewer, browser, tab, at_start):
     wait_for(lambda: len(viewer.clients) == count - 1, "the client to go")
     viewer.set_state(at_start)
     assert settled(tab.page, tab.client).max() > 40
+
+
+def test_a_mixed_scene_is_refined_when_still(mixed, mixed_tab, monkeypatch):
+    page, client = mixed_tab.page, mixed_tab.client
+    picture = settled(page, client)
+    assert "300 Gaussians in 1 model, 1 radiance field" in page.text()
+    assert (picture.max(axis=-1) > 60).mean() > 0.01
+    sizes, show = [], client.session._screen.show
+    monkeypatch.setattr(
+        client.session._screen, "show", lambda p, full: (sizes.append((p.shape[1], full)), show(p, full))
+    )
+    x, y = client.session.view.width / 2, 60.0
+    page.drag((x, y), (x + 60, y))
+    settled(page, client)
+    whole, _ = picture_size(client.session.view, client.session.settings.side)
+    assert min(width for width, _ in sizes) <= whole / 2  # while it moves
+    assert sizes[-1] == (whole, True)
+    assert "(100 % of full resolution)" in page.text()
+    page.drag((x + 60, y), (x, y))
+    assert np.abs(settled(page, client) - picture).mean() < 2
+
+
+def test_all_modes_of_a_mixed_scene_can_be_seen(mixed, mixed_tab):
+    options = mixed_tab.client.controls.mode.options
+    assert set(options) == set(MODES) - {"ellipsoids"}
+    shown = {}
+    for mode in options:
+        choose_mode(mixed_tab, mode)
+        shown[mode] = settled(mixed_tab.page, mixed_tab.client)
+        assert "to be seen" not in mixed_tab.page.text()
+        assert (shown[mode].max(axis=-1) > 60).mean() > 0.01, mode
+    for mode in options[1:]:
+        assert np.abs(shown[mode] - shown[options[0]]).mean() > 1, mode
+    for color in PALETTE[:2]:  # both are there
+        assert (np.abs(shown["object id"] - np.array(color)).max(axis=-1) < 30).mean() > 0.002
+
+
+def test_a_dragged_gizmo_moves_the_field_of_a_mixed_scene(mixed, mixed_tab):
+    choose_mode(mixed_tab, "object id")
+    before = settled(mixed_tab.page, mixed_tab.client)
+    pose, model = mixed.setup.state.poses[1], mixed.setup.renderer.models[1]
+    up, grab = np.array([0, 0, 1]), 0.3 * GIZMO * pose.scale * model.radius
+    start, end = (on_page(mixed_tab.client, pose.translation + length * up) for length in (grab, grab - 0.6))
+    mixed_tab.page.drag(start, end)
+    wait_for(lambda: mixed.shared.state.poses[1].translation[2] < pose.translation[2] - 0.3, "the field to be moved")
+    after = settled(mixed_tab.page, mixed_tab.client)
+    assert mixed.shared.state.poses[0].key == mixed.setup.state.poses[0].key
+    middle = [np.argwhere(np.abs(p - np.array(PALETTE[1])).max(axis=-1) < 30)[:, 0].mean() for p in (before, after)]
+    assert middle[1] > middle[0] + 10  # pixels: it has gone down

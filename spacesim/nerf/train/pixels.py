@@ -50,6 +50,7 @@ def training_pixels(dataset: Dataset, box: SceneBox, suns: bool) -> Pixels:
                 f"told the Sun, found none in {frame.file_path}"
             )
     parts: list[tuple[np.ndarray, ...]] = []
+    outside: list[str] = []
     for number, frame in enumerate(dataset.train):
         image = load_image(dataset, frame)
         row, column = np.nonzero(image.valid & crosses(frame.camera, box))
@@ -57,10 +58,13 @@ def training_pixels(dataset: Dataset, box: SceneBox, suns: bool) -> Pixels:
         colors = np.ascontiguousarray(np.rint(rgba * 255).astype(np.uint8)).view("<u4").ravel()
         parts.append((colors, (column + (row << 16)).astype(np.uint32), np.full(len(row), number, np.uint32)))
         if not len(row):
-            log.warning("%s: no ray of it that counts crosses the scene box", frame.file_path)
+            outside.append(frame.file_path)
     color, place, view = (np.concatenate(group) for group in zip(*parts, strict=True))
     if not len(color):
         raise InputError(f"{dataset.root}: expected pictures of what is in the scene box, found rays that all miss it")
+    if outside:
+        shown = f"{len(outside)} of {len(dataset.train)} pictures show nothing of the scene box and are left out"
+        log.warning("%s: %s, the first is %s", dataset.root, shown, outside[0])
     check_free_memory(A_PIXEL * len(color), f"{dataset.root}: its {len(color)} training pixels")
     towards = [frame.sun.direction if suns and frame.sun else np.zeros(3) for frame in dataset.train]
     return Pixels(

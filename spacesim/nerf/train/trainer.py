@@ -1,21 +1,20 @@
 """The training loop of a radiance field: `step`, a look at what is empty now and then, checkpoints."""
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.memory import check_free_memory
 from spacesim.backend.upload import upload
-from spacesim.data.errors import InputError, check_ranges
+from spacesim.data.errors import check_ranges
+from spacesim.data.files import JsonDict
 from spacesim.data.records import Dataset
-from spacesim.data.structure import Rules, structure
-from spacesim.data.toml import Document
 from spacesim.learning.adam import corrections
 from spacesim.learning.loop import TrainingLoop
-from spacesim.learning.tensors import read_tensors, write_tensors
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.fields.model import Networks
 from spacesim.nerf.sampling.box import SceneBox, scene_box
@@ -49,13 +48,13 @@ class CheckpointHeader:
 
 
 class Trainer(TrainingLoop):
-    """The parameters of a radiance field, their moments, and what is known as empty, one step after another.
+    """The parameters of a radiance field, their moments, and what is known as empty, one step after another."""
 
-    The same dataset, configuration and backend give bitwise the same model, also across `save` and `restore`.
-    """
+    form, header = FORMAT, CheckpointHeader
 
     def __init__(self, dataset: Dataset, config: NerfConfig) -> None:
         self.config, self.iteration, self.proposal_steps = config, 0, 0
+        check_free_memory(config.ray_bytes * config.rays, f"rays: a step of {config.rays} rays")
         self.box = scene_box(dataset, config.margin)
         self.networks = Networks(config)
         self.pixels = training_pixels(dataset, self.box, config.knows_sun)
@@ -64,7 +63,7 @@ class Trainer(TrainingLoop):
         self.second = [dr.zeros(ad.Float, dr.width(values)) for values in self.parameters]
         self.occupancy = dr.opaque(ad.Float, 0, config.occupancy**3)  #: see `Occupancy`
         self.filled = dr.opaque(ad.Float, 1, config.occupancy**3)
-        self.history: list[dict[str, float]] = []
+        self.history, self.seconds = [], {}
         self._step, self._look_around = recorded(step), recorded(look_around)
 
     def step(self) -> Float:
@@ -92,52 +91,45 @@ class Trainer(TrainingLoop):
             )
         return loss
 
-    def save(self, path: Path) -> None:
-        """Write everything that the next step depends on."""
-        tensors = self.model_tensors()
-        for name, values in (("adam.first", self.first), ("adam.second", self.second), ("filled", [self.filled])):
-            tensors |= {f"{name}.{i:02d}": np.array(value) for i, value in enumerate(values)}
-        header = {"iteration": self.iteration, "proposal_steps": self.proposal_steps, "history": self.history}
-        write_tensors(path, tensors, header, FORMAT)
-
     def model_tensors(self) -> dict[str, np.ndarray]:
-        """The trained model by name."""
+        """Grids, networks, which cells are filled, the box."""
         own = {name: np.array(values) for name, values in zip(self.networks.names(), self.parameters, strict=True)}
         return {**own, "occupancy": np.array(self.occupancy), "box": np.stack([self.box.low, self.box.size])}
 
-    def restore(self, path: Path) -> None:
-        """Continue from what `save` wrote. Raises InputError where the file does not fit."""
-        tensors, header = read_tensors(path, FORMAT)
-        checkpoint = structure(CheckpointHeader, Document(f"{path}: header", header, {}), Rules())
-        if checkpoint.iteration > self.config.iterations:
-            raise InputError(
-                f"{path}: expected an iteration up to {self.config.iterations}, found {checkpoint.iteration}"
-            )
-        try:
-            parameters = self.networks.parameters(tensors)
-            first, second = (
-                [_sized(tensors, f"adam.{order}.{i:02d}", dr.width(one)) for i, one in enumerate(parameters)]
-                for order in ("first", "second")
-            )
-            occupancy, filled = (_sized(tensors, name, dr.width(self.occupancy)) for name in ("occupancy", "filled.00"))
-            box = box_of(tensors)
-        except KeyError as error:
-            (name,) = error.args
-            raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {name}") from None
-        except ValueError as error:
-            raise InputError(f"{path}: expected a checkpoint of this training ({error})") from None
+    def state_tensors(self) -> dict[str, np.ndarray]:
+        """Adam's moments, and what rays skip."""
+        tensors: dict[str, np.ndarray] = {}
+        for name, values in (("adam.first", self.first), ("adam.second", self.second), ("filled", [self.filled])):
+            tensors |= {f"{name}.{i:02d}": np.array(value) for i, value in enumerate(values)}
+        return tensors
+
+    def counts(self) -> dict[str, int]:
+        """Steps in which proposals have learned."""
+        return {"proposal_steps": self.proposal_steps}
+
+    def put(self, tensors: Mapping[str, np.ndarray], header: CheckpointHeader) -> None:
+        """See `TrainingLoop.put`; nothing has changed where it raises."""
+        parameters = self.networks.parameters(tensors)
+        first, second = (
+            [_sized(tensors, f"adam.{order}.{i:02d}", dr.width(one)) for i, one in enumerate(parameters)]
+            for order in ("first", "second")
+        )
+        occupancy, filled = (_sized(tensors, name, dr.width(self.occupancy)) for name in ("occupancy", "filled.00"))
+        box = box_of(tensors)
         if not (np.array_equal(box.low, self.box.low) and np.array_equal(box.size, self.box.size)):
-            raise InputError(f"{path}: expected a checkpoint of this data's scene box, found another box")
+            raise ValueError("box: expected this data's scene box, found another")
         self.parameters, self.first, self.second = parameters, first, second
-        self.occupancy, self.filled = occupancy, filled
-        self.iteration, self.proposal_steps = checkpoint.iteration, checkpoint.proposal_steps
-        self.history = [asdict(entry) for entry in checkpoint.history]
+        self.occupancy, self.filled, self.proposal_steps = occupancy, filled, header.proposal_steps
+
+    def summary(self) -> JsonDict:
+        """How many numbers were trained."""
+        return {"parameters": sum(dr.width(values) for values in self.parameters)}
 
     def _key(self, number: int) -> UInt32:
         return dr.opaque(ad.UInt32, step_key(self.config.seed, number))
 
 
-def box_of(tensors: dict[str, np.ndarray]) -> SceneBox:
+def box_of(tensors: Mapping[str, np.ndarray]) -> SceneBox:
     """The box that `Trainer.model_tensors` names. Raises KeyError, or ValueError where it is none."""
     box = tensors["box"].astype(np.float64)
     if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > 0).all():
@@ -145,7 +137,7 @@ def box_of(tensors: dict[str, np.ndarray]) -> SceneBox:
     return SceneBox(box[0], box[1])
 
 
-def _sized(tensors: dict[str, np.ndarray], name: str, size: int) -> Float:
+def _sized(tensors: Mapping[str, np.ndarray], name: str, size: int) -> Float:
     values = tensors[name]
     if values.shape != (size,) or not np.isfinite(values).all():
         raise ValueError(f"{name}: expected {size} finite numbers, found others")

@@ -2,7 +2,7 @@
 
 from spacesim.splat.compose.path import CameraView, Keyframe, Orbit, PosedScene, SceneFrame
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.compose.run import ComposedRun, load_predictor
+from spacesim.splat.compose.run import ComposedRun
 from spacesim.splat.compose.scene import ComposeConfig, ComposedPrediction, Composition, DrawnView, PlacedRun
 from spacesim.splat.compose.scenefile import load_scene, save_scene
 
@@ -19,7 +19,6 @@ __all__ = [
     "Pose",
     "PosedScene",
     "SceneFrame",
-    "load_predictor",
     "load_scene",
     "save_scene",
 ]

@@ -12,9 +12,7 @@ from spacesim.backend.arrays import Bool
 from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose.scene import ComposedPrediction, Composition
-from spacesim.splat.compose.scenefile import load_scene
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.run import Predictor, load_run
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,10 +142,3 @@ class ComposedRun:
         """See `Composition.predict`."""
         prediction: ComposedPrediction = self.composition.predict(camera, sun, normals, exposure)
         return prediction
-
-
-def load_predictor(path: Path) -> Predictor:
-    """The run in a folder, or the scene of a TOML file at its beginning. Raises InputError where there is neither."""
-    if path.suffix != ".toml":
-        return load_run(path)
-    return ComposedRun(load_scene(path).posed_at(0.0), path)

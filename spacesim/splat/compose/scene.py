@@ -21,7 +21,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, may_shade
 from spacesim.data.records import Camera, Sun
 from spacesim.learning.prediction import ComposedPrediction, check_picture
 from spacesim.splat.compose.members import Ensemble, Member, display_colors
@@ -394,7 +394,8 @@ class Composition:
         """v_inter of 4.15 for member k, in its own frame: what is seen of the Sun depends neither on where all stands
         nor on how it is turned, and softness, bias and pixels are those of its training."""
         ensemble, members = self._ensemble, self._ensemble.members
-        if not any(_may_shade(members[j], poses[j], members[k], poses[k], sun) for j in range(len(poses)) if j != k):
+        spheres = [(pose.points(one.centre), one.radius * pose.scale) for one, pose in zip(members, poses, strict=True)]
+        if not any(may_shade(spheres[j], spheres[k], sun) for j in range(len(poses)) if j != k):
             return None
         member, back = members[k], poses[k].inverse()
         scene = ensemble.placed([Pose() if j == k else back.after(pose) for j, pose in enumerate(poses)])
@@ -437,16 +438,6 @@ def _dim(part: Light, share: Float | None) -> Light:
     if share is None:
         return part
     return [color * share for color in colors], share if visibility is None else visibility * share
-
-
-def _may_shade(caster: Member, at: Pose, receiver: Member, there: Pose, sun: Array) -> bool:
-    """Could a Gaussian of `caster` be before the Sun for one of `receiver`? By spheres around both; True where it is
-    not sure."""
-    reach = caster.radius * at.scale + receiver.radius * there.scale
-    offset = at.points(caster.centre) - there.points(receiver.centre)
-    ahead = float(offset @ sun)
-    aside = float(np.linalg.norm(offset - ahead * sun))
-    return ahead > -reach and aside < reach
 
 
 def _log_choices(models: Sequence[PlacedRun], ensemble: Ensemble) -> None:

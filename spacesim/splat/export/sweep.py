@@ -117,7 +117,8 @@ def sweep(
     if not run.relightable:
         raise InputError(
             f"{run.path}: expected a run that the Sun relights, found one of the method {run.config['method']} that "
-            "knows one light only; train with the method relight, or one with shadows, on frames that name their Sun"
+            "knows one light only; train with the method relight, nerf-relight, or one with shadows, on frames that "
+            "name their Sun"
         )
     if keep_frames and holds_files(out / FRAMES_NAME):
         raise InputError(f"{out / FRAMES_NAME}: expected an empty folder for the frames, found files in it")

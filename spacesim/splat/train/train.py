@@ -1,31 +1,19 @@
 """`train`: a dataset and a configuration to a run on disk, resumable at any time."""
 
 import logging
-import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from spacesim import backend, interrupts
 from spacesim.data.errors import InputError
-from spacesim.data.files import remove_leftovers, write_json
+from spacesim.data.files import write_json
 from spacesim.data.images.tone import tone_and_exposure
-from spacesim.data.lock import lock_folder
 from spacesim.data.records import Dataset
 from spacesim.data.store import write_points
 from spacesim.learning.cameras import farthest_camera, focus_point
-from spacesim.learning.folder import (
-    TrainingClock,
-    TrainingProgress,
-    check_folder,
-    checkpoints,
-    describe_data,
-    device,
-    versions,
-    write_checkpoint,
-)
+from spacesim.learning.folder import TrainingProgress, check_folder, describe_data, is_finished, open_folder
 from spacesim.splat.run import Run, load_run, read_config
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
@@ -53,8 +41,7 @@ def train(
     """
     out, config = Path(out), _with_tone_and_exposure(config, dataset)
     described = {**config.to_json(), "data": describe_data(dataset)}
-    check_folder(out, described, resume, read_config)
-    if (out / "model.safetensors").exists():
+    if is_finished(out, described, resume, read_config):
         return load_run(out)
     if config.warm_start is not None and (remark := config.warm_start.remark(config.iterations)):
         log.warning(remark)
@@ -65,15 +52,12 @@ def train(
     of_sun = sun_warning(dataset) if config.sun == "unknown" else ""
     for remark in filter(None, (of_sun, scale_warning(dataset), distance_warning(dataset))):
         log.warning(remark)
-    with lock_folder(out):
-        check_folder(out, described, resume, read_config)  # again: another training may have come and gone
-        remove_leftovers(out)
-        write_json(out / "config.json", described)
+    with open_folder(out, described, resume, read_config):
         if config.sun == "unknown":
             trainer = _trainer_from_shape(dataset, config, out, on_progress)
         elif config.refine_poses:
             trainer = _trainer_of_poses(dataset, config, out, on_progress)
-        _train(trainer, out, on_progress, command)
+        trainer.complete(out, on_progress, command)
     return load_run(out)
 
 
@@ -114,7 +98,7 @@ def _trainer_of_poses(
         first = Trainer(dataset, learning, suns)
         write_json(folder / "config.json", described)
         log.info("learning the poses of %d pictures, %d iterations", len(dataset.train), learning.iterations)
-        _train(first, folder, on_progress, ())
+        first.complete(folder, on_progress)
         assert first.pictures.poses is not None
         write_tensors(path, {"values": first.pictures.poses.numbers.values}, {})
     log.info("training with the poses found")
@@ -122,51 +106,6 @@ def _trainer_of_poses(
     if values.shape != (len(dataset.train), 6) or not np.isfinite(values).all():
         raise InputError(f"{path}: expected the poses of {len(dataset.train)} pictures, found others; delete it")
     return Trainer(dataset, config, suns, values)
-
-
-def _train(
-    trainer: Trainer, out: Path, on_progress: Callable[[TrainingProgress], None], command: Sequence[str]
-) -> None:
-    """From the newest checkpoint in `out` to the end, and write the run."""
-    newest = max(checkpoints(out), default=None)
-    if newest is not None:
-        trainer.restore(newest)
-        log.info("resumed at iteration %d from %s", trainer.iteration, newest)
-    seconds = TrainingClock(out, trainer.iteration)
-    trainer.refinement_seconds = seconds.kept.get("refinement", 0.0) if seconds.before else 0.0
-
-    def checkpoint() -> None:
-        write_checkpoint(trainer.save, out, trainer.iteration)
-        seconds.write(trainer.iteration, refinement=trainer.refinement_seconds)
-
-    with interrupts.defer_interrupts() as should_stop:  # the writing, too: the last steps may have no checkpoint yet
-        trainer.run(on_progress, checkpoint, should_stop)
-        _write(trainer, out, seconds.total(), command)
-        for sentence in trainer.pictures.sentences():
-            log.info(sentence)
-
-
-def _write(trainer: Trainer, out: Path, seconds: float, command: Sequence[str]) -> None:
-    """What a finished run says of itself, then the model."""
-    write_json(
-        out / "training.json",
-        {
-            "history": trainer.history,
-            "seconds": round(seconds, 3),
-            "refinement_seconds": round(trainer.refinement_seconds, 3),
-            "gaussians": trainer.gaussians.count,
-            "backend": backend.select(),
-            "device": device(),
-            "command": shlex.join(command) if command else None,
-            "versions": versions(),
-            **trainer.pictures.summary(),
-        },
-    )
-    cameras = trainer.pictures.cameras()
-    if cameras is not None:
-        write_json(out / "cameras.json", cameras)
-    header = {"iteration": trainer.iteration, "config": trainer.config.to_json()}
-    write_tensors(out / "model.safetensors", trainer.model_tensors(), header)
 
 
 def _with_tone_and_exposure(config: TrainConfig, dataset: Dataset) -> TrainConfig:

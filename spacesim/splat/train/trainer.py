@@ -4,9 +4,9 @@ A step takes one view or several forward and backward (`view_pass`), moves all p
 (`optimizer.update`), and refines the set of Gaussians if it is time to.
 """
 
+import logging
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -19,16 +19,15 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset
-from spacesim.data.structure import Rules, structure
-from spacesim.data.toml import Document
 from spacesim.learning.adam import NetworkAdam
 from spacesim.learning.cameras import farthest_camera, focus_point, nearest_camera
+from spacesim.learning.folder import TrainingProgress
 from spacesim.learning.loop import TrainingLoop
 from spacesim.splat.light.bounce import ALBEDO
 from spacesim.splat.light.model import LightModel, TrainingFrame, is_near, robust_radius
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
-from spacesim.splat.train.checkpoint import CheckpointHeader, read_tensors, write_tensors
+from spacesim.splat.train.checkpoint import FORMAT, CheckpointHeader
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.optimizer.update import Update
@@ -42,20 +41,21 @@ from spacesim.splat.train.view_pass import ViewPass, ViewResult
 from spacesim.splat.train.views import TrainingView, TrainingViews
 from spacesim.splat.train.warm_start import Attraction, WarmStart
 
+log = logging.getLogger(__name__)
+
 
 class Trainer(TrainingLoop):
     """Gaussians, their optimizer and their strategy, and the networks of light where the method has some, one step
-    after another.
+    after another."""
 
-    The same dataset, configuration and backend give bitwise the same model, also across `save` and `restore`.
-    """
+    form, header = FORMAT, CheckpointHeader
 
     def __init__(
         self, dataset: Dataset, config: TrainConfig, first_suns: FirstSuns | None = None, poses: Array | None = None
     ) -> None:
         """first_suns: where the Suns of pictures that name none start, of a configuration that estimates them
         poses: [V, 6] what an earlier training learned of them and stays, of a configuration that refines poses"""
-        self.config, self.iteration, self.refinement_seconds = config, 0, 0.0
+        self.config, self.iteration = config, 0
         _check_sizes(dataset, config)
         self.views = _views(dataset, config)
         self.pictures = LearnedPictures(dataset, config, first_suns, poses)
@@ -75,7 +75,7 @@ class Trainer(TrainingLoop):
             self.warm_start = WarmStart(config.warm_start, self.views, centre, nearest, self.gaussians.count)
             means = self.gaussians.to_numpy()["means"]
             self._start_radius = float(np.linalg.norm(means - centre, axis=1)[is_near(means)].max())
-        self.history: list[dict[str, float]] = []
+        self.history, self.seconds = [], {"refinement": 0.0}
         self._view_pass = ViewPass(config, self.scene_scale)
         self._update = Update(config.antialiased, self.scene_scale)
         self._update_light = recorded(update_light)
@@ -120,7 +120,7 @@ class Trainer(TrainingLoop):
         self.strategy.refine(done, self.gaussians, self.optimizer, rng, leniency)
         if timed:
             dr.sync_thread()
-            self.refinement_seconds += time.perf_counter() - start
+            self.seconds["refinement"] += time.perf_counter() - start
 
     def _forward_backward(self, rows: list[Float], degree: int, number: int) -> ViewResult:
         """Forward, loss, backward for one view, `number` of the training."""
@@ -190,9 +190,13 @@ class Trainer(TrainingLoop):
         moved, optimizer.first, optimizer.second = self._update_light(_learned(light), moments, gradients, factors)
         light.weights, light.embeddings = moved[:count], moved[count:]
 
-    def save(self, path: Path) -> None:
-        """Write everything that the next step depends on."""
-        tensors = self.model_tensors()
+    def model_tensors(self) -> dict[str, np.ndarray]:
+        """The Gaussians, and the networks where there are any."""
+        return {**self.gaussians.to_numpy(), **(self.light.tensors() if self.light else {})}
+
+    def state_tensors(self) -> dict[str, np.ndarray]:
+        """Adam's moments, what is learned of pictures, statistics of the strategy and of a warm start."""
+        tensors: dict[str, np.ndarray] = {}
         for name, optimizer in (("adam", self.optimizer), ("adam.light", self.light_optimizer)):
             for order, moments in zip(("first", "second"), optimizer.moments(), strict=True):
                 tensors |= {f"{name}.{order}.{i:02d}": moment for i, moment in enumerate(moments)}
@@ -200,53 +204,52 @@ class Trainer(TrainingLoop):
         tensors |= {f"strategy.{name}": np.array(value) for name, value in self.strategy.state.items()}
         if self.warm_start and self._warming(self.iteration):
             tensors |= {f"warm_start.{name}": np.array(value) for name, value in self.warm_start.state.items()}
-        header = {"iteration": self.iteration, "adam_steps": self.optimizer.steps, "history": self.history}
-        write_tensors(path, tensors, header)
+        return tensors
 
-    def model_tensors(self) -> dict[str, np.ndarray]:
-        """The trained model by name: the Gaussians, and the networks where there are any."""
-        return {**self.gaussians.to_numpy(), **(self.light.tensors() if self.light else {})}
+    def counts(self) -> dict[str, int]:
+        """Steps of Adam."""
+        return {"adam_steps": self.optimizer.steps}
 
-    def restore(self, path: Path) -> None:
-        """Continue from what `save` wrote. Raises InputError where the file does not fit."""
-        tensors, header = read_tensors(path)
-        checkpoint = structure(CheckpointHeader, Document(f"{path}: header", header, {}), Rules())
-        if checkpoint.iteration > self.config.iterations:
-            raise InputError(
-                f"{path}: expected an iteration up to {self.config.iterations}, found {checkpoint.iteration}"
-            )
-        try:
-            gaussians = Gaussians.from_numpy(tensors)
-            if gaussians.count == 0:
-                raise ValueError("no Gaussians")
-            light = LightModel.from_tensors(self.config.light, tensors) if self.config.light else None
-            sizes, fresh = ([dr.width(one) for one in _learned(model)] for model in (light, self.light))
-            if sizes != fresh:
-                raise ValueError(f"light.embeddings: expected {len(self.views)} pictures, found another number")
-            optimizer, light_optimizer = Adam(gaussians.rows()), NetworkAdam(_learned(light))
-            _restore_moments(optimizer, tensors, "adam")
-            _restore_moments(light_optimizer, tensors, "adam.light")
-            self.pictures.restore(tensors)
-            state = _restore_state(self.strategy.state, tensors, "strategy", gaussians.count)
-            warming = self.warm_start is not None and self._warming(checkpoint.iteration)
-            names = self.warm_start.state if self.warm_start and warming else {}
-            warm = _restore_state(names, tensors, "warm_start", gaussians.count)
-        except TypeError:
-            raise InputError(f"{path}: expected a checkpoint of training, found tensors of other shapes") from None
-        except KeyError as error:
-            (name,) = error.args
-            raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {name}") from None
-        except ValueError as error:
-            raise InputError(f"{path}: expected a checkpoint of this training ({error})") from None
+    def put(self, tensors: Mapping[str, np.ndarray], header: CheckpointHeader) -> None:
+        """See `TrainingLoop.put`."""
+        gaussians = Gaussians.from_numpy(tensors)
+        if gaussians.count == 0:
+            raise ValueError("no Gaussians")
         kinds, expected = ((g.sh_degree, g.feature_count) for g in (gaussians, self.gaussians))
         if kinds != expected:
-            raise InputError(f"{path}: expected Gaussians with the colours of this method, found others")
+            raise ValueError("expected Gaussians with the colours of this method, found others")
+        light = LightModel.from_tensors(self.config.light, tensors) if self.config.light else None
+        sizes, fresh = ([dr.width(one) for one in _learned(model)] for model in (light, self.light))
+        if sizes != fresh:
+            raise ValueError(f"light.embeddings: expected {len(self.views)} pictures, found another number")
+        optimizer, light_optimizer = Adam(gaussians.rows()), NetworkAdam(_learned(light))
+        _restore_moments(optimizer, tensors, "adam")
+        _restore_moments(light_optimizer, tensors, "adam.light")
+        self.pictures.restore(tensors)
+        state = _restore_state(self.strategy.state, tensors, "strategy", gaussians.count)
+        warming = self.warm_start is not None and self._warming(header.iteration)
+        names = self.warm_start.state if self.warm_start and warming else {}
+        warm = _restore_state(names, tensors, "warm_start", gaussians.count)
         self.gaussians, self.light, self.strategy.state = gaussians, light, state
         self.optimizer, self.light_optimizer = optimizer, light_optimizer
-        optimizer.steps = light_optimizer.steps = checkpoint.adam_steps
-        self.iteration, self.history = checkpoint.iteration, [asdict(entry) for entry in checkpoint.history]
+        optimizer.steps = light_optimizer.steps = header.adam_steps
         if self.warm_start and warm:
             self.warm_start.state = warm
+
+    def summary(self) -> JsonDict:
+        """The number of Gaussians, what was learned of pictures."""
+        return {"gaussians": self.gaussians.count, **self.pictures.summary()}
+
+    def files(self) -> dict[str, JsonDict]:
+        """RUN/cameras.json, where something was learned of pictures."""
+        cameras = self.pictures.cameras()
+        return {} if cameras is None else {"cameras.json": cameras}
+
+    def complete(self, out: Path, on_progress: Callable[[TrainingProgress], None], command: Sequence[str] = ()) -> None:
+        """See `TrainingLoop.complete`; logs what was learned of pictures."""
+        super().complete(out, on_progress, command)
+        for sentence in self.pictures.sentences():
+            log.info(sentence)
 
     def background(self, index: int, view: TrainingView) -> np.ndarray:
         """[3] float32: the colour that a step's picture and its truth are laid over."""

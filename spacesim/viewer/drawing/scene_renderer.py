@@ -89,7 +89,8 @@ class SceneRenderer:
     def why_missing(self, plane: str) -> str:
         """Why a plane cannot be had, in words."""
         if plane == "visibility":
-            return "no model here predicts shadows (the methods shadow-map, shadow-splat and baseline-park do)"
+            methods = "shadow-map, shadow-splat, baseline-park and nerf-relight"
+            return f"no model here predicts shadows (the methods {methods} do)"
         return f"no model here predicts {plane}"
 
 
@@ -97,7 +98,7 @@ def _describe(counts: Sequence[int | None]) -> str:
     """counts: Gaussians of each model, None of a field"""
     fields = counts.count(None)
     models = len(counts) - fields
-    parts = [f"{sum(count or 0 for count in counts):,} Gaussians in {models} model(s)"] * (models > 0)
+    parts = [f"{sum(count or 0 for count in counts):,} Gaussians in {models} model{'s' * (models > 1)}"] * (models > 0)
     return ", ".join([*parts, *[f"{fields} radiance field{'s' * (fields > 1)}"] * (fields > 0)])
 
 
