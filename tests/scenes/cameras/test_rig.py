@@ -9,13 +9,13 @@ from spacesim.scenes import build, read_scene
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.orbit import mean_motion
 from spacesim.scenes.cameras.rig import (
-    RIGS,
     SINGLE_SUN,
     ApproachRig,
     FibonacciRig,
     FlyAroundRig,
     PolarArcRig,
     RandomRig,
+    RigConfig,
     TargetSphere,
     fitting_distance,
     held_out_suns,
@@ -24,7 +24,9 @@ from spacesim.scenes.cameras.rig import (
     training_suns,
 )
 from spacesim.scenes.generation.generate import plan_views
+from spacesim.scenes.rigs import RIGS
 
+ARRANGED = [kind for kind, rig in RIGS.items() if issubclass(rig, RigConfig)]
 SCENE = build(read_scene("boxsat"))
 TARGET = TargetSphere(np.array([1.0, -2.0, 0.5]), 2.0)
 CAMERA = CameraConfig((96, 64), fov_deg=40.0)
@@ -98,7 +100,7 @@ def test_suns():
     assert (known @ held_out.T).max() < np.cos(np.radians(0.5))
 
 
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.parametrize("kind", ARRANGED)
 def test_test_views_are_of_the_training_suns_unless_others_are_asked_for(kind):
     train, test = plan(RIGS[kind](suns=4, views=2, test_views=3), TARGET, CAMERA, 0)
     directions = {view.sun.angles for view in train}
@@ -110,7 +112,7 @@ def test_test_views_are_of_the_training_suns_unless_others_are_asked_for(kind):
     assert len(test) == 15
 
 
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.parametrize("kind", ARRANGED)
 def test_test_views_of_known_suns_beside_those_of_others(kind):
     options = {"suns": 4, "views": 2, "test_suns": 5, "test_views": 3}
     before = plan(RIGS[kind](**options), TARGET, CAMERA, 0)
@@ -149,7 +151,7 @@ def test_scene_json_names_such_views_only_where_asked_for():
         FibonacciRig(known_test_views=3)
 
 
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.parametrize("kind", ARRANGED)
 def test_given_suns_take_the_place_of_the_rigs_own(kind):
     rig = RIGS[kind](sun=((10.0, 20.0), (200.0, -60.0)), views=3, test_views=2)
     train, _ = plan(rig, TARGET, CAMERA, 0)
@@ -157,7 +159,7 @@ def test_given_suns_take_the_place_of_the_rigs_own(kind):
     np.testing.assert_allclose(sun_directions(train), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.parametrize("kind", ARRANGED)
 @pytest.mark.parametrize("views", [1, 2, 7])
 def test_frames_held_out_are_none_of_training(kind, views):
     train, test = plan(RIGS[kind](suns=1, views=views, test_views=9), TARGET, CAMERA, 3)
@@ -371,7 +373,11 @@ def test_scenes_say_their_rig(tmp_path):
         (RandomRig, {"near": -1.0}, "near: expected metres from 1e-09 to 1e\\+12, found -1.0"),
         (RandomRig, {"near": 9.0, "far": 5.0}, "far: expected at least near, 9 m, found 5.0"),
         (RandomRig, {"random_suns": True, "suns": 3}, "random_suns: expected 1 suns .* found 3 suns and 0 test_suns$"),
-        (RandomRig, {"max_phase_deg": 90.0}, "max_phase_deg: expected .* beside random_suns, found 90.0"),
+        (
+            RandomRig,
+            {"max_phase_deg": 40.0, "min_phase_deg": 40.0},
+            "min_phase_deg: expected an angle from 0 to 39 deg",
+        ),
         (RandomRig, {"random_suns": True, "max_phase_deg": 0.0}, "max_phase_deg: expected an angle from 1 to 180"),
         (RandomRig, {"random_suns": True, "sun": ((1.0, 2.0),)}, "random_suns: expected false where sun"),
         (ApproachRig, {"axis": "x"}, "axis: expected one of v-bar, -v-bar, r-bar, -r-bar, found 'x'"),
