@@ -19,7 +19,7 @@ from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import DatasetWriter, FrameWriter
 from spacesim.scenes.build import build
-from spacesim.scenes.cameras.rig import PlannedView, TargetSphere, plan
+from spacesim.scenes.cameras.rig import PlannedView, RandomRig, TargetSphere, plan
 from spacesim.scenes.config import SceneConfig
 from spacesim.scenes.generation.estimate import LONG, Estimate, measure, samples
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, raw_suffixes, versions, writing_threads
@@ -71,7 +71,8 @@ def generate(
         more = {name: {**keys, "sunlit_fraction": sunlit[name]} for name, keys in sweep.keys.items()}
         lens, mesh = config.camera.distortion, sweep.scene.mesh
         dataset = writer.finish(*listed, points, colors, mesh, lens, lambda d: write_overview(d.root, d), more)
-        warn_of_dark_frames(sunlit, {name: keys.get("sun_visibility") == 0 for name, keys in more.items()})
+        hint = "max_phase_deg keeps the Sun on the camera's side" if isinstance(config.rig, RandomRig) else ""
+        warn_of_dark_frames(sunlit, {name: keys.get("sun_visibility") == 0 for name, keys in more.items()}, hint)
         return dataset
 
 

@@ -29,9 +29,11 @@ def sunlit_fractions(root: Path, names: Sequence[str]) -> dict[str, float | None
         return dict(zip(names, pool.map(fraction, names), strict=True))
 
 
-def warn_of_dark_frames(sunlit: Mapping[str, float | None], eclipsed: Mapping[str, bool]) -> None:
-    """Log one warning that counts the frames without an object or without sunlight on it. eclipsed: frames of which
-    the Earth hides all of the Sun"""
+def warn_of_dark_frames(sunlit: Mapping[str, float | None], eclipsed: Mapping[str, bool], hint: str) -> None:
+    """Log one warning that counts the frames without an object or without sunlight on it.
+
+    eclipsed: frames of which the Earth hides all of the Sun; hint: what avoids dark frames
+    """
     empty = [name for name, share in sunlit.items() if share is None]
     dark = [name for name, share in sunlit.items() if share is not None and share < DARK]
     words = []
@@ -42,5 +44,4 @@ def warn_of_dark_frames(sunlit: Mapping[str, float | None], eclipsed: Mapping[st
     if empty:
         words.append(f"{len(empty)} of {len(sunlit)} frames show no object ({empty[0]} first)")
     if words:
-        hint = "; max_phase_deg of a random rig avoids dark ones" if len(dark) > sum(eclipsed.values()) else ""
-        _log.warning("generate: %s%s", "; ".join(words), hint)
+        _log.warning("generate: %s", "; ".join([*words, *([hint] if dark and hint else [])]))

@@ -221,7 +221,7 @@ def _parquet(path: Path, content: bytes) -> Columns:
         import pyarrow.parquet
     except ImportError:
         raise InputError(
-            f"{path}: expected the package pyarrow for Parquet, found none; type: pip install pyarrow"
+            f"{path}: expected the package pyarrow for Parquet, found none; type: pip install 'spacesim[parquet]'"
         ) from None
     try:
         table = pyarrow.parquet.read_table(pyarrow.BufferReader(content))

@@ -24,6 +24,7 @@ from spacesim.scenes.cameras.rig import (
     training_suns,
 )
 from spacesim.scenes.generation.generate import plan_views
+from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.rigs import RIGS
 
 ARRANGED = [kind for kind, rig in RIGS.items() if issubclass(rig, RigConfig)]
@@ -280,6 +281,37 @@ def test_random_suns_stay_on_the_cameras_side():
     unlimited = plan(RandomRig(views=9, random_suns=True), TARGET, CAMERA, 2)[0]
     whole = plan(RandomRig(views=9, random_suns=True, max_phase_deg=180.0), TARGET, CAMERA, 2)[0]
     np.testing.assert_array_equal(sun_directions(unlimited), sun_directions(whole))
+
+
+def phases(views):
+    towards = normalize(positions(views) - TARGET.centre)
+    return np.degrees(np.arccos(np.einsum("ni,ni->n", towards, sun_directions(views))))
+
+
+@pytest.mark.parametrize("suns", [{"random_suns": True}, {"sun": ((10.0, -70.0), (40.0, 25.0))}])
+def test_phase_angles_stay_in_a_range(suns):
+    options = {"views": 300, "cropped": True, **suns}
+    train, test = plan(RandomRig(**options, test_views=20, min_phase_deg=50.0, max_phase_deg=80.0), TARGET, CAMERA, 2)
+    found = phases(train + test)
+    assert 50 - 1e-9 <= found.min() < 52
+    assert 78 < found.max() <= 80 + 1e-9
+    free = plan(RandomRig(**options), TARGET, CAMERA, 2)[0]
+    assert phases(free).max() > 160
+    for view, other in zip(train, free, strict=True):  # the target stays where it is in the picture
+        np.testing.assert_allclose(in_camera(view), in_camera(other), atol=1e-12)
+    attitudes = np.array([view.camera.world_from_camera[:3, 0] for view in train])
+    assert np.linalg.norm(attitudes.mean(axis=0)) < 0.2  # any roll
+    assert plan(RandomRig(**options), TARGET, CAMERA, 2)[0][0].sun.angles == free[0].sun.angles
+
+
+def test_random_suns_keep_clear_of_the_earth_where_phase_angles_are_limited():
+    earth = EarthConfig(elevation_deg=-90.0, altitude_km=500.0)
+    over = TargetSphere(TARGET.centre, TARGET.radius, earth)
+    rig = RandomRig(views=400, random_suns=True, max_phase_deg=120.0)
+    found = sun_directions(plan(rig, over, CAMERA, 2)[0]) @ earth.direction
+    assert np.degrees(np.arccos(found.max())) > np.degrees(earth.angular_radius) + 0.59
+    unlimited = plan(RandomRig(views=400, random_suns=True), over, CAMERA, 2)[0]
+    assert np.mean(sun_directions(unlimited) @ earth.direction > np.cos(earth.angular_radius)) > 0.2
 
 
 def test_a_lattice_of_suns_with_a_view_each():
