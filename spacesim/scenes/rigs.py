@@ -4,6 +4,7 @@ from dataclasses import fields
 
 from spacesim.scenes.cameras.rig import ApproachRig, FibonacciRig, FlyAroundRig, PolarArcRig, RandomRig, Rig
 from spacesim.scenes.trajectory.rig import FileRig
+from spacesim.scenes.trajectory.spice import SpiceRig
 
 RIGS: dict[str, type[Rig]] = {
     "fibonacci": FibonacciRig,
@@ -12,6 +13,7 @@ RIGS: dict[str, type[Rig]] = {
     "approach": ApproachRig,
     "fly-around": FlyAroundRig,
     "file": FileRig,
+    "spice": SpiceRig,
 }
 """The first is the default."""
 

@@ -25,6 +25,7 @@ from spacesim.scenes.cameras.rig import (
     Views,
     intermediate_steps,
 )
+from spacesim.scenes.trajectory.ccsds import motion_of
 from spacesim.scenes.trajectory.motion import Moments, Motion, merge, seen_from_target
 from spacesim.scenes.trajectory.table import read_table
 
@@ -132,23 +133,33 @@ def check_exposures(exposures: Array | None) -> None:
 class FileRig(TrajectoryRig):
     """A trajectory of files: a table (docs/how-to/trajectory.md), CCSDS messages, or both, which then add up."""
 
-    path: str = ""  #: a table, .csv, .json or .parquet; relative to the scene file
+    path: str = ""  #: a table, .csv, .json or .parquet; this and the others are relative to the scene file
+    camera: tuple[str, ...] = ()  #: CCSDS messages of what carries the camera: an OEM, an AEM or both
+    target: tuple[str, ...] = ()  #: CCSDS messages of the target
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        expect(bool(self.path), "path", "a file with a trajectory", self.path)
+        if not self.files() or not all((*self.camera, *self.target)):
+            raise InputError("path: expected a file with a trajectory, or messages of camera or target, found none")
 
     def located(self, folder: Path) -> Rig:
-        return replace(self, path=str(folder / self.path))
+        camera, target = (tuple(str(folder / name) for name in names) for names in (self.camera, self.target))
+        return replace(self, path=str(folder / self.path) if self.path else "", camera=camera, target=target)
 
     def files(self) -> tuple[Path, ...]:
-        return (Path(self.path),)
+        return tuple(Path(name) for name in (self.path, *self.camera, *self.target) if name)
 
     def to_json(self) -> JsonDict:
-        return {**asdict(self), "path": Path(self.path).name}
+        names = {key: [Path(name).name for name in getattr(self, key)] for key in ("camera", "target")}
+        return {**asdict(self), "path": Path(self.path).name, **names}
 
     def motion(self) -> Motion:
-        return merge([read_table(Path(self.path))])
+        parts = [read_table(Path(self.path))] if self.path else []
+        if self.camera or self.target:
+            of = {"camera": [Path(name) for name in self.camera], "target": [Path(name) for name in self.target]}
+            said = bool(self.sun) or any(part.sun is not None for part in parts)
+            parts.append(motion_of(of, with_sun=not said))
+        return merge(parts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -251,7 +251,7 @@ def test_an_exposure_for_each_frame(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"path": ""}, "path: expected a file with a trajectory, found ''"),
+        ({"path": ""}, "path: expected a file with a trajectory, or messages of camera or target, found none"),
         ({"views": -1}, "views: expected 0 to 10,000,000, found -1"),
         ({"step_s": 0.0}, "step_s: expected seconds above 0"),
         ({"step_s": 1.0, "views": 3}, "views: expected none beside step_s, found 3"),
