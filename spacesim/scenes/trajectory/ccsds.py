@@ -1,4 +1,4 @@
-"""Orbit and attitude ephemeris messages in KVN: CCSDS 502.0-B-2 and B-3 (OEM), 504.0-B-1 and B-2 (AEM).
+"""Orbit and attitude ephemeris messages, KVN or XML: CCSDS 502.0-B-2 and B-3 (OEM), 504.0-B-1 and B-2 (AEM).
 
 Of an OEM the state vectors are read (not covariances and accelerations), of an AEM quaternions. Between epochs
 positions are cubic by their velocities and attitudes are slerped, whatever INTERPOLATION says; where segments meet in
@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -106,14 +107,10 @@ def read_message(path: Path) -> Message:
 
 
 def _message(path: Path, text: str) -> Message:
-    version = _VERSION.search(text)
-    if version is None or version[1] not in ("OEM", "AEM"):
-        found = "XML" if text.lstrip().startswith("<") else version[0] if version else "neither"
-        raise InputError(f"expected CCSDS_OEM_VERS or CCSDS_AEM_VERS (KVN), found {found}")
-    segments = list(_segments(text))
+    kind, segments = _read_xml(text) if text.lstrip("\ufeff \r\n\t").startswith("<") else _read_kvn(text)
     if not segments or not all(segment.lines for segment in segments):
-        raise InputError("expected META_START, META_STOP and lines of data in every segment, found none")
-    is_orbit = version[1] == "OEM"
+        raise InputError("expected metadata and data in every segment, at least one, found none")
+    is_orbit = kind == "OEM"
     known = [(_outer(one.meta)[0] if not is_orbit else _meta(one.meta, "REF_FRAME")).upper() for one in segments]
     systems = [_meta(segment.meta, "TIME_SYSTEM").upper() for segment in segments]
     centers = [_meta(segment.meta, "CENTER_NAME").upper() if is_orbit else "" for segment in segments]
@@ -132,7 +129,48 @@ def _message(path: Path, text: str) -> Message:
             raise InputError(f"expected segments of which each begins where the last one ends, found two that {how}")
         keep = len(times) - bool(number)
         times, values = np.concatenate([times[:keep], seconds]), np.concatenate([values[:keep], numbers])
-    return Message(path, version[1], known[0], systems[0], centers[0], day, times, values)
+    return Message(path, kind, known[0], systems[0], centers[0], day, times, values)
+
+
+def _read_xml(text: str) -> tuple[str, list[_Segment]]:
+    """("OEM" or "AEM", segments) of a message in XML: data as KVN has them, quaternions with the scalar last."""
+    if "<!" in text.replace("<!--", "").replace("<![CDATA[", ""):  # entities could be without bounds
+        raise InputError("expected XML without declarations of its own, found some")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise InputError(f"expected XML, found text that breaks off or is malformed ({error})") from None
+
+    def leaves(item: ElementTree.Element) -> dict[str, str]:
+        return {_local(leaf): (leaf.text or "").strip() for leaf in item.iter() if not len(leaf)}
+
+    kinds = [_local(item).upper() for item in root.iter() if _local(item) in ("oem", "aem")]
+    if len(kinds) != 1:
+        raise InputError(f"expected one OEM or AEM in XML, found {len(kinds)}")
+    of_state, names = {
+        "OEM": ("stateVector", ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")),
+        "AEM": ("attitudeState", ("EPOCH", "Q1", "Q2", "Q3", "QC")),
+    }[kinds[0]]
+    segments = []
+    for item in (item for item in root.iter() if _local(item) == "segment"):
+        meta = next((leaves(one) for one in item if _local(one) == "metadata"), {})
+        states = [leaves(one) for one in item.iter() if _local(one) == of_state]
+        lines = [[state[name] for name in names if name in state] for state in states]
+        segments.append(_Segment({**meta, "QUATERNION_TYPE": "LAST"}, lines))
+    return kinds[0], segments
+
+
+def _local(item: ElementTree.Element) -> str:
+    """The name of an element without its namespace."""
+    return str(item.tag).rpartition("}")[2]
+
+
+def _read_kvn(text: str) -> tuple[str, list[_Segment]]:
+    version = _VERSION.search(text)
+    if version is None or version[1] not in ("OEM", "AEM"):
+        found = version[0] if version else "neither"
+        raise InputError(f"expected CCSDS_OEM_VERS or CCSDS_AEM_VERS, found {found}")
+    return version[1], list(_segments(text))
 
 
 def _segments(text: str) -> Iterator[_Segment]:
@@ -194,7 +232,7 @@ def _numbers(segment: _Segment, count: int) -> Array:
     """[N, count - 1] of the data lines, whose first word is the epoch."""
     for line in segment.lines:
         if len(line) < count:
-            raise InputError(f"expected an epoch and {count - 1} numbers a line, found {' '.join(line)[:80]!r}")
+            raise InputError(f"expected an epoch and {count - 1} numbers, found {' '.join(line)[:80]!r}")
     try:
         return np.array([[float(word) for word in line[1:count]] for line in segment.lines])
     except ValueError as error:

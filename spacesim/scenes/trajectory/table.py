@@ -26,7 +26,8 @@ import numpy as np
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
 from spacesim.data.files import MAX_LIST_BYTES, PARSED, read_bytes
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, normalize
+from spacesim.data.records import SUN_LENGTHS, SUN_WORDS
 from spacesim.data.structure import did_you_mean
 from spacesim.scenes.trajectory.epochs import read_epochs
 from spacesim.scenes.trajectory.motion import Motion
@@ -92,10 +93,13 @@ def _motion(path: Path, columns: Columns) -> Motion:
                 tracks[f"{body}_turn"] = Attitude(turn, times, q)
     if "sun" in present:
         sun = np.stack([_numbers(columns, name) for name in present["sun"]], axis=-1)
-        if not (np.linalg.norm(sun, axis=1) > 0).all():  # which nan is not
-            row = int((~(np.linalg.norm(sun, axis=1) > 0)).argmax())
-            raise InputError(f"sun_x: expected a direction, found {sun[row].tolist()} in row {row + 1}")
-        tracks["sun"] = Track("sun direction", times, sun / np.linalg.norm(sun, axis=1, keepdims=True))
+        least, most = SUN_LENGTHS
+        largest = np.abs(sun).max(axis=1)
+        wrong = ~((largest >= least) & (largest <= most))  # which nan is not
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise InputError(f"sun_x: expected {SUN_WORDS}, found {sun[row].tolist()} in row {row + 1}")
+        tracks["sun"] = Track("sun direction", times, normalize(sun))
     if "exposure" in present:
         exposure = _numbers(columns, "exposure")
         if not (exposure > 0).all():

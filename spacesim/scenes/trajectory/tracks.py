@@ -57,7 +57,8 @@ class Attitude:
 
     def __post_init__(self) -> None:
         check_times(self.times, self.name)
-        lengths = np.linalg.norm(self.quaternions, axis=1)
+        with np.errstate(over="ignore"):
+            lengths = np.linalg.norm(self.quaternions, axis=1)
         wrong = ~(np.abs(lengths - 1) <= UNIT)
         if wrong.any():
             row = int(wrong.argmax())

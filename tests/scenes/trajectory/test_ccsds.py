@@ -1,5 +1,8 @@
 """Orbit and attitude ephemeris messages against the motion that they are written from."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,6 +12,7 @@ from spacesim.scenes import build, read_scene
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.rig import TargetSphere, plan
 from spacesim.scenes.generation.generate import plan_views
+from spacesim.scenes.scenefile import scene_text
 from spacesim.scenes.trajectory.ccsds import motion_of, read_message
 from spacesim.scenes.trajectory.ephemeris import sun_direction
 from spacesim.scenes.trajectory.epochs import read_epochs
@@ -143,6 +147,70 @@ def test_segments_that_meet(tmp_path):
             read_message(both)
 
 
+def test_xml_tells_the_same_as_kvn(tmp_path):
+    def elements(values):
+        return "".join(f"<{key}>{value}</{key}>" for key, value in values.items())
+
+    for path, names, state in (
+        (oem(tmp_path / "a.oem", TIMES), ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT"), "{}"),
+        (aem(tmp_path / "a.aem", TIMES), ("Q1", "Q2", "Q3", "QC"), "<quaternionEphemeris>{}</quaternionEphemeris>"),
+    ):
+        kind, meta = path.suffix[1:], META if path.suffix == ".oem" else AEM
+        tag = "stateVector" if kind == "oem" else "attitudeState"
+        lines = [line.split() for line in path.read_text().splitlines() if line.startswith("2030")]
+        lines = [line for line in lines if len(line) > 4]
+        states = [state.format(elements(dict(zip(("EPOCH", *names), line, strict=True)))) for line in lines]
+        data = "".join(f"<{tag}>{one}</{tag}>" for one in states)
+        segment = f"<segment><metadata>{elements(meta)}</metadata><data>{data}</data></segment>"
+        xml = path.with_suffix(".xml")
+        xml.write_text(
+            f'<?xml version="1.0"?><!-- of a test --><ndm xmlns="urn:ccsds"><{kind} id="CCSDS_{kind.upper()}_VERS" '
+            f'version="2.0"><header/><body>{segment}</body></{kind}></ndm>'
+        )
+        one, other = read_message(path), read_message(xml)
+        np.testing.assert_array_equal(other.values, one.values)
+        np.testing.assert_array_equal(other.times, one.times)
+        assert (other.kind, other.frame, other.day, other.center) == (one.kind, one.frame, one.day, one.center)
+
+
+def test_damaged_files_end_in_a_sentence(tmp_path):
+    """Bytes changed, cut out and put in at random, of messages and of a table."""
+    table = tmp_path / "a.csv"
+    table.write_text("time_s,camera_x_m,camera_y_m,camera_z_m,sun_x,sun_y,sun_z\n0,1,2,3,1,1,1\n1,2,2,3,0,1,1\n")
+    random = np.random.default_rng(3)
+    pieces = [b"nan", b"1e999", b",", b"\n", b"-", b'"', b"\0", b"9" * 40, b"\xff"]
+    ended = []
+    for path in (oem(tmp_path / "a.oem", TIMES), aem(tmp_path / "a.aem", TIMES), table):
+        whole = path.read_bytes()
+        for number in range(150):
+            at = int(random.integers(len(whole)))
+            cut = int(random.integers(0, 4))
+            damaged = tmp_path / f"damaged{path.suffix}"
+            damaged.write_bytes(whole[:at] + pieces[number % len(pieces)] + whole[at + cut :])
+            rig = FileRig(path=str(damaged)) if path == table else FileRig(camera=(str(damaged),))
+            try:
+                plan(rig, TargetSphere(np.zeros(3), 1.0), CameraConfig((16, 16)), 0)
+            except InputError as error:
+                ended.append(str(error))
+    assert 200 < len(ended) < 450
+    assert [one for one in ended if "\n" in one] == []
+
+
+def test_the_documented_scene_file_is_one(tmp_path):
+    text = (Path(__file__).parents[3] / "docs/how-to/trajectory.md").read_text(encoding="utf-8")
+    (scene,) = re.findall(r'^```toml title="chase.toml"\n(.*?)^```', text, re.MULTILINE | re.DOTALL)
+    (tmp_path / "chase.toml").write_text(scene, encoding="utf-8")
+    for name in ("chaser", "target"):
+        oem(tmp_path / f"{name}.oem", TIMES, 2e-6 * (name == "chaser"))
+        aem(tmp_path / f"{name}.aem", TIMES)
+    config = read_scene(tmp_path / "chase.toml")
+    assert len(plan_views(build(config), config)[0]) == len(TIMES)
+    written = tmp_path / "again.toml"
+    written.write_text(scene_text(config), encoding="utf-8")
+    again = read_scene(written)
+    assert len(plan_views(build(again), again)[0]) == len(TIMES)
+
+
 def test_the_sun_against_the_almanacs_formula():
     """Its low precision formula (0.01 degrees) is of the equinox of date: precessed in longitude."""
     for year in (1990, 2010, 2030, 2049):
@@ -198,18 +266,21 @@ LINE = "2030-03-01T12:00:00 0 0 0 1"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"expected CCSDS_OEM_VERS or CCSDS_AEM_VERS \(KVN\), found neither"),
-        ("<?xml version='1.0'?><oem/>", "found XML"),
+        ("", "expected CCSDS_OEM_VERS or CCSDS_AEM_VERS, found neither"),
+        ("<?xml version='1.0'?><oem/>", "expected metadata and data in every segment, at least one, found none"),
+        ("<?xml version='1.0'?><opm/>", "expected one OEM or AEM in XML, found 0"),
+        ("<oem>", "expected XML, found text that breaks off"),
+        ("<!DOCTYPE a [<!ENTITY b 'c'>]><oem>&b;</oem>", "expected XML without declarations of its own"),
         ("CCSDS_OPM_VERS = 2.0", "found CCSDS_OPM_VERS = 2.0"),
-        ("CCSDS_AEM_VERS = 1.0", "expected META_START, META_STOP and lines of data in every segment, found none"),
-        (kvn("AEM", AEM, ""), "expected META_START, META_STOP and lines of data"),
+        ("CCSDS_AEM_VERS = 1.0", "expected metadata and data in every segment, at least one, found none"),
+        (kvn("AEM", AEM, ""), "expected metadata and data in every segment"),
         (kvn("OEM", {"CENTER_NAME": "EARTH"}, LINE), "REF_FRAME: expected it in the metadata of every segment"),
         (
             kvn("AEM", {**AEM, "ATTITUDE_TYPE": "SPIN"}, LINE),
             "ATTITUDE_TYPE: expected one of .* found SPIN",
         ),
         (kvn("AEM", {**AEM, "ATTITUDE_DIR": "C2D"}, LINE), "ATTITUDE_DIR: expected A2B or B2A, found C2D"),
-        (kvn("AEM", AEM, LINE[:-1]), "expected an epoch and 4 numbers a line, found '2030-03-01T12:00:00 0 0 0'"),
+        (kvn("AEM", AEM, LINE[:-1]), "expected an epoch and 4 numbers, found '2030-03-01T12:00:00 0 0 0'"),
         (kvn("AEM", AEM, LINE.replace(" 1", " x")), "expected numbers in every line of data"),
         (kvn("AEM", AEM, LINE.replace("12:", "24:")), "epoch: expected an epoch such as .* in row 1"),
         (kvn("AEM", AEM, LINE.replace(" 1", " 2")), "expected quaternions of length 1, found one of 2 in row 1"),
