@@ -59,6 +59,7 @@ class Renderer:
         self.spp = spp
         self._distortion = tuple(distortion)
         self._loaded = load(scene)
+        self._earth = scene.earth  # where it is now
         self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
         self._sampler = mi.load_dict({"type": "independent"})
         self._labeller = Labeller(scene, self._loaded, distortion)
@@ -71,7 +72,7 @@ class Renderer:
         Earth is; None: where the scene says."""
         spp = spp or self.spp
         _check_memory(camera, spp)
-        self._loaded.point(sun, earth or self.scene.earth)
+        self._point(sun, earth)
         sunlight = self._launch_passes(self._loaded.sunlit, camera, seed, spp)
         earthlit = self._loaded.earthlit
         earthlight = self._launch_passes(earthlit, camera, (*seed, _EARTH), spp) if earthlit else None
@@ -85,7 +86,7 @@ class Renderer:
     def radiance(self, camera: Camera, sun: Sun, seed: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """(radiance [H, W, 3] from all sources, alpha [H, W]) of what `render` returns, without the labels."""
         _check_memory(camera, self.spp)
-        self._loaded.point(sun, self.scene.earth)
+        self._point(sun)
         radiance, alpha = _mean_radiance(
             self._launch_passes(self._loaded.sunlit, camera, seed, self.spp), camera, self.spp
         )
@@ -96,8 +97,14 @@ class Renderer:
 
     def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
         """All fields of what `render` returns but radiance and alpha, which take no paths."""
-        self._loaded.point(sun, self.scene.earth)
+        self._point(sun)
         return self._labeller.labels(camera, sun)
+
+    def _point(self, sun: Sun, earth: EarthConfig | None = None) -> None:
+        """Move the Sun and the Earth. None: to where the scene says"""
+        earth = earth or self.scene.earth
+        self._loaded.point(sun, None if earth == self._earth else earth)
+        self._earth = earth
 
     def _launch_passes(self, scene: Any, camera: Camera, seed: Sequence[int], spp: int) -> list[Any]:
         """Sums over samples, as `_trace_paths` returns them, of each pass; the device may still be at work on them."""

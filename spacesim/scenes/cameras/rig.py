@@ -1,5 +1,6 @@
 """Where the Suns and the cameras are: lattices, random poses, approaches and fly-arounds."""
 
+import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -97,8 +98,13 @@ class Rig(ABC):
         return ()
 
     def to_json(self) -> JsonDict:
-        """What scene.json says of it: plain values."""
-        return asdict(self)
+        """What scene.json says of it: plain values. Raises InputError for others."""
+        values = asdict(self)
+        try:
+            json.dumps(values, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"rig: expected fields that JSON has, or a to_json of its own, found {error}") from None
+        return values
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,8 @@ def seen_from_target(motion: Motion, times: Array, camera_from_optics: Array, ce
     """`motion` at `times` [N] in the target's frame.
 
     camera_from_optics: [3, 3] OpenCV camera axes to those whose attitude is told; centre: [3] of the objects, scene
-    frame, which a camera looks at where no attitude of it is told. Raises InputError for a time that is not covered.
+    frame, which a camera looks at, the world's z upwards, where no attitude of it is told. Raises InputError for a time
+    that is not covered.
     """
     count = len(times)
     still, unturned = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
@@ -117,9 +118,10 @@ def seen_from_target(motion: Motion, times: Array, camera_from_optics: Array, ce
         turn = motion.camera_turn.at(times) if motion.camera_turn else unturned
         poses[:, :3, :3] = target_from_world @ turn @ camera_from_optics
     else:
-        for pose in poses:
-            if np.linalg.norm(pose[:3, 3] - centre) > 0:
-                pose[:] = look_at(pose[:3, 3], centre)
+        up = to_target(np.tile([0.0, 0.0, 1.0], (count, 1)))
+        for k in range(count):
+            if np.linalg.norm(poses[k, :3, 3] - centre) > 0:
+                poses[k] = look_at(poses[k, :3, 3], centre, up[k])
     return Moments(
         times,
         poses,

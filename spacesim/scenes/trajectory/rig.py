@@ -35,9 +35,9 @@ T = TypeVar("T")
 @dataclass(frozen=True)
 class TrajectoryRig(Rig):
     """Camera and target move as a trajectory says. The dataset is in the target's frame: cameras, Sun and Earth move
-    about a target that stands still. Where no attitude of the camera is told it looks at the target; where no Sun is,
-    `sun` says it. Test frames lie halfway between training frames; of a trajectory without times they are some of its
-    rows, held out. Raises InputError for a value out of range."""
+    about a target that stands still. Where no attitude of the camera is told it looks at the target, the world's z
+    upwards; where no Sun is told, `sun` says it. Test frames lie halfway between training frames; of a trajectory
+    without times they are some of its rows, held out. Raises InputError for a value out of range."""
 
     views: int = 0  #: training frames, evenly over the time that is covered; 0: at the trajectory's own times
     step_s: float | None = None  #: seconds between training frames, in place of views

@@ -1,5 +1,6 @@
 """What is known at some times, and its values between them."""
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +10,13 @@ from scipy.spatial.transform import Rotation, Slerp
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 
+AMBIGUOUS_DEG = 120.0
+"""Turn between two rows beyond which the shorter way may well be the wrong one."""
+
 UNIT = 1e-3
 """By how much the length of a quaternion may differ from 1: rounding to three digits makes no more."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +78,9 @@ class Attitude:
         rotations = Rotation.from_quat(self.quaternions[:, [1, 2, 3, 0]])
         if len(self.times) == 1:
             return np.repeat(rotations.as_matrix(), len(times), axis=0)
+        largest = float(np.degrees((rotations[:-1].inv() * rotations[1:]).magnitude().max()))
+        if largest > AMBIGUOUS_DEG and not np.isin(times, self.times).all():
+            _log.warning("%s: turns by %.0f degrees between two rows; which way is a guess", self.name, largest)
         turned: Array = Slerp(self.times, rotations)(times).as_matrix()
         return turned
 

@@ -160,6 +160,32 @@ def test_attitudes_between_rows_turn_evenly_the_shorter_way():
     np.testing.assert_allclose(angles, [[0, 0, 10], [0, 0, 20], [0, 0, 50]], atol=1e-10)
 
 
+def test_a_turn_that_may_be_either_way_is_told(caplog):
+    turns = Attitude("a", np.array([0.0, 4.0]), wxyz(Rotation.from_rotvec(np.radians([[0, 0, 0], [0, 0, 150]]))))
+    turns.at(np.array([0.0, 4.0]))
+    assert caplog.records == []
+    turns.at(np.array([0.0, 1.0]))
+    assert [one.message for one in caplog.records] == ["a: turns by 150 degrees between two rows; which way is a guess"]
+
+
+def test_a_camera_that_looks_at_a_target_that_tumbles_does_not_roll_with_it(table):
+    text = table.read_text().splitlines()
+    names = text[1].split(",")
+    kept = [k for k, name in enumerate(names) if not name.startswith("world_from_camera")]
+    table.write_text("\n".join(",".join(line.split(",")[k] for k in kept) for line in text[1:]))
+    for view in plan(FileRig(path=str(table)), TARGET, CAMERA, 0)[0]:
+        turn = state(view.time)[3].as_matrix() @ view.camera.world_from_camera[:3, :3]
+        assert abs(turn[2, 0]) < 1e-9  # the picture's rows lie level in the world
+        assert turn[2, 1] < 0  # and its top is up
+
+
+def test_an_earth_that_is_too_near(tmp_path):
+    names = ["camera_x_m", "camera_y_m", "camera_z_m", "earth_x_m", "earth_y_m", "earth_z_m"]
+    path = write(tmp_path / "p.csv", [[9, 0, 0, 0, 0, 6e6]], names)
+    with pytest.raises(InputError, match=r"earth: expected the Earth's centre beyond its radius .* 6000 km in train_0"):
+        generate(read_scene("boxsat", **SMALL, trajectory=path), tmp_path / "data")
+
+
 def test_without_an_attitude_the_camera_looks_at_the_target(tmp_path):
     names = ["time_s", "camera_x_km", "camera_y_km", "camera_z_km"]
     path = write(tmp_path / "p.csv", [[0, 0.01, 0, 0], [1, 0, 0.02, 0]], names)

@@ -59,6 +59,16 @@ def test_a_class_of_ones_own(tmp_path):
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
+@dataclass(frozen=True)
+class WithArray(Corkscrew):
+    extra: object = None
+
+
+def test_a_class_whose_fields_json_does_not_have(tmp_path):
+    with pytest.raises(InputError, match="rig: expected fields that JSON has, or a to_json of its own"):
+        ss.generate("boxsat", tmp_path / "data", rig=WithArray(extra=np.eye(2)), **SMALL)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
