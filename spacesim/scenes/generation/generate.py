@@ -71,7 +71,8 @@ def generate(
         more = {name: {**keys, "sunlit_fraction": sunlit[name]} for name, keys in sweep.keys.items()}
         lens, mesh = config.camera.distortion, sweep.scene.mesh
         dataset = writer.finish(*listed, points, colors, mesh, lens, lambda d: write_overview(d.root, d), more)
-        hint = "max_phase_deg keeps the Sun on the camera's side" if isinstance(config.rig, RandomRig) else ""
+        free = isinstance(config.rig, RandomRig) and config.rig.max_phase_deg is None
+        hint = "max_phase_deg = 90 keeps the Sun on the camera's side, clear of the Earth" if free else ""
         warn_of_dark_frames(sunlit, {name: keys.get("sun_visibility") == 0 for name, keys in more.items()}, hint)
         return dataset
 
@@ -208,7 +209,8 @@ class _DatasetPlan:
         inside = self.renderer.inside(np.stack([spec.camera.position for spec in self.specs]))
         if inside.any():
             name = self.specs[int(inside.argmax())].name
-            raise InputError(f"distance: expected cameras outside of {config.name}, found that of {name} within a part")
+            field = "distance" if hasattr(config.rig, "distance") else "rig"
+            raise InputError(f"{field}: expected cameras outside of {config.name}, found that of {name} within a part")
 
     def _frame(self, index: int, spp: int, name: str, view: PlannedView) -> FrameSpec:
         sunlight, earth = 1.0, self.scene.earth
@@ -257,7 +259,7 @@ def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedVi
     files = config.rig.located(config.folder or Path()).files()
     return {
         "schema": SCHEMA,
-        **({"files": {path.name: digest_of(path) for path in files}} if files else {}),
+        **({"files": [{"name": path.name, "sha256": digest_of(path)} for path in files]} if files else {}),
         **scene.describe(),
         "mesh": [_mesh_counts(scene, i) for i in range(1, len(scene.objects) + 1)],
         "suns": {"train": _angles(train), "test": _angles(test)},

@@ -6,7 +6,6 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,8 +27,6 @@ from spacesim.scenes.cameras.rig import (
 from spacesim.scenes.trajectory.ccsds import motion_of
 from spacesim.scenes.trajectory.motion import Moments, Motion, merge, seen_from_target
 from spacesim.scenes.trajectory.table import read_table
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)

@@ -254,7 +254,7 @@ def test_a_dataset_along_a_table(table, tmp_path):
     assert {frame["sun_visibility"] for frame in frames} == {1.0}
     assert all(0 < frame["sunlit_fraction"] <= 1 for frame in frames)
     assert read_dataset(tmp_path / "a").train[1].time == 22.5
-    assert list(json.loads((tmp_path / "a/scene.json").read_text())["files"]) == ["path.csv"]
+    assert [file["name"] for file in json.loads((tmp_path / "a/scene.json").read_text())["files"]] == ["path.csv"]
     table.write_text(table.read_text().replace("0.0,", "0.00,", 1))
     with pytest.raises(InputError, match="'files' differs"):
         generate(read_scene(scene, **SMALL, test_views=1), tmp_path / "a", resume=True)
