@@ -95,16 +95,16 @@ class Renderer:
             radiance = radiance + _mean_radiance(earth, camera, self.spp)[0]
         return radiance, alpha
 
-    def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
-        """All fields of what `render` returns but radiance and alpha, which take no paths."""
-        self._point(sun)
-        return self._labeller.labels(camera, sun)
-
     def _point(self, sun: Sun, earth: EarthConfig | None = None) -> None:
         """Move the Sun and the Earth. None: to where the scene says"""
         earth = earth or self.scene.earth
         self._loaded.point(sun, None if earth == self._earth else earth)
         self._earth = earth
+
+    def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
+        """All fields of what `render` returns but radiance and alpha, which take no paths."""
+        self._point(sun)
+        return self._labeller.labels(camera, sun)
 
     def _launch_passes(self, scene: Any, camera: Camera, seed: Sequence[int], spp: int) -> list[Any]:
         """Sums over samples, as `_trace_paths` returns them, of each pass; the device may still be at work on them."""
