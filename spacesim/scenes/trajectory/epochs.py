@@ -9,7 +9,7 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 
-_EPOCH = re.compile(r"(\d{4})-(?:(\d{2})-(\d{2})|(\d{3}))[T ](\d{2}):(\d{2}):(\d{2}(?:\.\d*)?)Z?")
+_EPOCH = re.compile(r"(\d{4})-(?:(\d{2})-(\d{2})|(\d{3}))[T ](\d{2}):(\d{2}):(\d{2}(?:\.\d*)?)(?:Z|\+00:00)?")
 
 
 def read_epochs(texts: Sequence[object], name: str) -> tuple[int, Array]:

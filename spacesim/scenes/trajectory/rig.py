@@ -156,7 +156,10 @@ class FileRig(TrajectoryRig):
             of = {"camera": [Path(name) for name in self.camera], "target": [Path(name) for name in self.target]}
             said = bool(self.sun) or any(part.sun is not None for part in parts)
             parts.append(motion_of(of, with_sun=not said))
-        return merge(parts)
+        motion = merge(parts)
+        if not motion.tracks.keys() & {"camera", "camera_turn", "target", "target_turn"}:
+            raise InputError(f"{self.path}: expected a pose of the camera or of the target, found no column of either")
+        return motion
 
 
 @dataclass(frozen=True, eq=False)

@@ -179,6 +179,12 @@ def test_a_camera_that_looks_at_a_target_that_tumbles_does_not_roll_with_it(tabl
         assert turn[2, 1] < 0  # and its top is up
 
 
+def test_a_table_without_a_pose(tmp_path):
+    path = write(tmp_path / "p.csv", [[0, 1, 0, 0]], ["time_s", "sun_x", "sun_y", "sun_z"])
+    with pytest.raises(InputError, match=r"p.csv: expected a pose of the camera or of the target, found no column"):
+        plan(FileRig(path=str(path)), TARGET, CAMERA, 0)
+
+
 def test_an_earth_that_is_too_near(tmp_path):
     names = ["camera_x_m", "camera_y_m", "camera_z_m", "earth_x_m", "earth_y_m", "earth_z_m"]
     path = write(tmp_path / "p.csv", [[9, 0, 0, 0, 0, 6e6]], names)

@@ -51,7 +51,7 @@ def test_every_format_tells_the_same(tmp_path, name):
 
 def test_units_directions_and_epochs(tmp_path):
     columns = {
-        "time_utc": ["2030-03-01T23:59:59.5", "2030-061T00:00:01Z"],
+        "time_utc": ["2030-03-01T23:59:59.5", "2030-061 00:00:01+00:00"],
         **{f"target_{axis}_km": [1.0, 2.0] for axis in "xyz"},
         **{f"target_v{axis}_km_s": [0.5, 0.25] for axis in "xyz"},
         **dict(zip((f"target_from_world_q{axis}" for axis in "wxyz"), ([0.6], [0.8], [0], [0]), strict=True)),
