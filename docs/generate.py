@@ -16,7 +16,7 @@ import sys
 import textwrap
 import tokenize
 from collections.abc import Iterable, Iterator
-from dataclasses import is_dataclass, replace
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 from unittest.mock import patch
@@ -224,19 +224,19 @@ def scene_page() -> str:
     """Every table of a scene file: the record that it becomes, its fields and their defaults."""
     import spacesim as ss
     from spacesim.data.structure import keys_of
+    from spacesim.scenes.cameras.rig import RigConfig
+    from spacesim.scenes.rigs import RIGS
     from spacesim.scenes.scenefile import RULES
 
     records = {name: record_in(hint) for name, hint in get_type_hints(ss.SceneConfig).items()}
-    example = ss.read_scene("boxsat")
-    kinds = {replace(example, rig=cls()).to_json()["rig"]["kind"]: cls for cls in records["rig"].__subclasses__()}
     tables: dict[str, type] = {
         "The scene": ss.SceneConfig,
         "[[objects]]": records["objects"],
         "[materials.NAME]": records["materials"],
         "[sun]": records["sun"],
         "[earth]": records["earth"],
-        "[rig]": records["rig"],
-        **{f'[rig] kind = "{kind}"': cls for kind, cls in kinds.items()},
+        "[rig]": RigConfig,
+        **{f'[rig] kind = "{kind}"': cls for kind, cls in RIGS.items()},
         "[camera]": records["camera"],
         "[camera.sensor]": record_in(get_type_hints(records["camera"])["sensor"]),
         "[quality]": records["quality"],
@@ -256,9 +256,13 @@ def record_in(hint: Any) -> Any:
 
 
 def record_entry(cls: type, keys: Iterable[str]) -> str:
-    """A record: its docstring, and those of its fields that are keys of a file."""
+    """A record: its docstring, and those of its fields that are keys of a file, of what it extends too; but what
+    `[rig]` says of most rigs is not said again."""
     known = set(keys)
-    lines = [line for line in field_lines(cls) if line.splitlines()[-1].partition(":")[0] in known]
+    bases = [base for base in reversed(cls.__mro__) if is_dataclass(base) and base.__name__ != "RigConfig"]
+    records = list(dict.fromkeys([*bases, cls]))
+    every = [line for record in records for line in field_lines(record)]
+    lines = [line for line in every if line.splitlines()[-1].partition(":")[0] in known]
     return f"{block(inspect.getdoc(cls) or '')}\n\n{block(chr(10).join(lines), 'python')}"
 
 

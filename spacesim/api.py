@@ -24,6 +24,8 @@ from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.run import NerfRun
 from spacesim.scenes import SceneConfig, read_scene
 from spacesim.scenes import generate as _generate
+from spacesim.scenes.cameras.rig import Rig
+from spacesim.scenes.trajectory.rig import PoseRig
 from spacesim.splat.compose import PosedScene
 from spacesim.splat.compose.output import Composed
 from spacesim.splat.compose.output import compose as _compose
@@ -50,6 +52,7 @@ __all__ = [
     "Image",
     "NerfConfig",
     "NerfRun",
+    "PoseRig",
     "PosedScene",
     "RefinedPose",
     "RenderOutput",
@@ -85,6 +88,8 @@ def generate(
     *,
     resume: bool = False,
     workers: int = 1,
+    rig: Rig | None = None,
+    trajectory: str | Path | None = None,
     progress: ProgressCallback | None = None,
     **options: object,
 ) -> Dataset:
@@ -93,6 +98,8 @@ def generate(
     scene: name of a built-in scene ("boxsat"), a scene file (.toml), a mesh file, or what `read_scene` returns
     resume: complete what an interrupted call has left; a finished dataset is returned as it is
     workers: processes of this machine
+    rig: `PoseRig` of cameras of your own, or another `Rig`;  trajectory: a table that cameras follow
+        (docs/how-to/trajectory.md)
     options: of the scene, as the command line has them: suns, views, test_suns, test_views, sun=[(azimuth, elevation),
         ...] in degrees, distance in metres, resolution=256 or (width, height) in pixels, fov_deg, exposure (display
         value of a radiance of 1 W m^-2 sr^-1), spp (samples a pixel), seed
@@ -101,6 +108,8 @@ def generate(
     Raises InputError for a scene, an option or a folder that cannot be, WorkError where disk, memory or processes fail,
     BackendError where no backend can run.
     """
+    if rig is not None or trajectory is not None:
+        options = {"rig": rig, "trajectory": trajectory, **options}
     if not isinstance(scene, SceneConfig):
         scene = read_scene(scene, **options)
     elif options:

@@ -27,7 +27,7 @@ from tiny import Outcome, call, outcome
 from spacesim.cli.program import parser
 
 ROOT = Path(__file__).parents[1]
-TUTORIALS = sorted(ROOT.glob("docs/tutorials/*.md"))
+TUTORIALS = [*sorted(ROOT.glob("docs/tutorials/*.md")), ROOT / "docs/how-to/trajectory.md"]  #: run as a whole
 PAGES = [path for path in sorted(ROOT.glob("docs/**/*.md")) if path not in TUTORIALS]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 SCRIPTS = sorted([*ROOT.glob("benchmarks/*.py"), *ROOT.glob("examples/*.py")])

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from spacesim import backend, interrupts
-from spacesim.cli.parser import Parser, angles, resolution
+from spacesim.cli.parser import Parser, angles, frame_range, resolution
 from spacesim.data.errors import InputError
 
 SUMMARY, NEEDS_BACKEND = "path-trace a dataset with its truth", False
 _SCENE_OPTIONS = (
     *("suns", "views", "test_suns", "test_views", "known_test_views", "shared_test_views", "sun", "distance"),
-    *("resolution", "exposure", "spp", "test_spp", "seed", "units", "up", "background"),
+    *("resolution", "exposure", "spp", "test_spp", "seed", "units", "up", "background", "trajectory"),
 )
 
 
@@ -33,6 +33,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--sun", type=angles, action="append", metavar="AZ,EL", help="a training Sun, degrees; repeatable"
     )
+    parser.add_argument("--trajectory", metavar="FILE", help="follow a table: .csv, .json or .parquet")
     parser.add_argument("--distance", type=float, metavar="M", help="metres from the cameras to the target's centre")
     parser.add_argument("--resolution", type=resolution, metavar="PX", help="pixels of each side, or WIDTHxHEIGHT")
     parser.add_argument("--fov", type=float, metavar="DEG", help="angle that the image's width covers")
@@ -43,6 +44,9 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument("--seed", type=int, metavar="N")
     parser.add_argument("--units", metavar="UNIT", help="of a mesh file: m (default), cm, mm, km, in or ft")
     parser.add_argument("--up", metavar="AXIS", help="of a mesh file: x, y or z (default: the format's own)")
+    parser.add_argument(
+        "--frames", type=frame_range, metavar="A:B", help="make these frames alone; --resume completes the dataset"
+    )
     parser.add_argument("--resume", action="store_true", help="complete what an interrupted run left")
     many = parser.add_mutually_exclusive_group()
     many.add_argument("--workers", type=int, default=1, metavar="N", help="processes that render (1)")
@@ -61,7 +65,7 @@ def option_of(field: str, options: argparse.Namespace) -> str | None:
 def run(options: argparse.Namespace) -> None:
     from spacesim.progress import show_progress
     from spacesim.scenes import generate, read_scene
-    from spacesim.scenes.generation.generate import estimate
+    from spacesim.scenes.generation.generate import estimate, generate_part
     from spacesim.scenes.scenefile import scene_text
 
     changes = {name: getattr(options, name) for name in _SCENE_OPTIONS}
@@ -77,6 +81,10 @@ def run(options: argparse.Namespace) -> None:
         raise InputError("out: expected a folder for the dataset, found none")
     backend.select(options.backend)
     with show_progress("generate", "frames") as report:
+        if options.frames is not None:
+            made, count = generate_part(scene, options.out, options.frames, report, options.workers, options.ray)
+            interrupts.print_output(f"{options.out}: {made} of {count} frames; --resume completes it")
+            return
         dataset = generate(scene, options.out, options.resume, report, options.workers, options.ray)
     interrupts.print_output(
         f"{options.out}: {len(dataset.train)} training and {len(dataset.test)} test frames of {scene.name}"

@@ -66,6 +66,14 @@ def resolution(text: str) -> int | tuple[int, int]:
     return (int(sides[0]), int(sides[1])) if len(sides) == 2 else int(sides[0])
 
 
+def frame_range(text: str) -> tuple[int, int | None]:
+    """(first, end) of "A:B"; without B the end is None, without A the first is 0."""
+    first, colon, end = text.partition(":")
+    if not colon or not all(not side or (side.isascii() and side.isdigit()) for side in (first, end)):
+        raise argparse.ArgumentTypeError(f"expected A:B, numbers of frames, found {text!r}")
+    return int(first or 0), int(end) if end else None
+
+
 def add_view(parser: Parser) -> None:
     """The options that say from where a run is seen."""
     where = parser.add_mutually_exclusive_group()

@@ -14,8 +14,9 @@ except ImportError:  # Windows
 
 
 @contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
     """Make `folder` and keep every other `lock_folder` out of it, of this and other processes, within the `with` block.
+    shared: others that are shared may be in it.
 
     Raises InputError where another one is in it. The lock is on the folder itself and leaves nothing there. Where the
     system or the file system cannot do that (Windows; NFS locks files alone) nobody is kept out; where the folder
@@ -27,16 +28,16 @@ def lock_folder(folder: Path) -> Iterator[None]:
         descriptor = os.open(folder, os.O_RDONLY) if fcntl else None
     try:
         if descriptor is not None:
-            _lock(folder, descriptor)
+            _lock(folder, descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
         yield
     finally:
         if descriptor is not None:
             os.close(descriptor)
 
 
-def _lock(folder: Path, descriptor: int) -> None:
+def _lock(folder: Path, descriptor: int, kind: int) -> None:
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         holder = _holder(os.fstat(descriptor).st_ino)
         who = f" (process {holder})" if holder else ""

@@ -158,26 +158,33 @@ class DatasetWriter(FrameWriter):
     """Writes a dataset folder; an interrupted run leaves whole files only, which a later run completes.
 
     root: the folder, made here; scene: what to render, as JSON values, written to scene.json first; resume: go on with
-    a folder that holds the same scene; raw: as in FrameWriter. Only one at a time may work on a folder. Raises
+    a folder that holds the same scene; raw: as in FrameWriter; shared: others write frames of it at the same time, so
+    that files in the making and damaged ones are left alone. Otherwise only one at a time may work on a folder. Raises
     InputError where it holds anything else.
     """
 
     def __init__(
-        self, root: Path, scene: Mapping[str, JsonValue], resume: bool = False, raw: Sequence[str] = ()
+        self,
+        root: Path,
+        scene: Mapping[str, JsonValue],
+        resume: bool = False,
+        raw: Sequence[str] = (),
+        shared: bool = False,
     ) -> None:
         super().__init__(root, raw)
         scene = json.loads(json.dumps(scene, allow_nan=False))  # as it reads back
         if self.root.exists() and not self.root.is_dir():
             raise InputError(f"{self.root}: expected a folder to write to, found a file")
         present = sorted(p.name for p in self.root.glob("*") if not p.name.endswith(".part"))
-        if "scene.json" in present:
+        if "scene.json" in present or (present and (self.root / "scene.json").exists()):  # another may have begun
             self._check_resumable(scene, resume)
         elif present:
             raise InputError(f"{self.root}: expected a new or empty folder, found {present[0]} in it")
         else:
             write_json(self.root / "scene.json", scene)
-        remove_leftovers(self.root)
-        if resume:
+        if not shared:
+            remove_leftovers(self.root)
+        if resume and not shared:
             self._remove_damaged()
 
     def finish(
@@ -189,13 +196,14 @@ class DatasetWriter(FrameWriter):
         mesh: "trimesh.Trimesh",
         distortion: Sequence[float] = (),
         overview: Callable[[Dataset], None] | None = None,
+        more: Mapping[str, Mapping[str, JsonValue]] | None = None,
     ) -> Dataset:
         """Write points.ply, mesh.ply, SHA256SUMS and, once the disks hold everything, transforms.json; returns the
         dataset as it reads back.
 
         train, test: (frame name, camera, sun) of each frame; points: [N, 3] metres; colors: [N, 3] uint8;
         distortion: Brown-Conrady k1, k2, p1, p2, k3 of all frames, () none; overview: writes pictures of the whole into
-        the folder.
+        the folder; more: other keys of frames, by their names.
         """
         missing = [name for name, _, _ in (*train, *test) if not self.has_frame(name)]
         if missing:
@@ -203,7 +211,7 @@ class DatasetWriter(FrameWriter):
         remove_leftovers(self.root)  # of processes that were killed
         write_points(self.root / "points.ply", points, colors)
         write_bytes(self.root / "mesh.ply", mesh.export(file_type="ply", vertex_normal=False))
-        path, meta = self.root / "transforms.json", _describe_frames(train, test, distortion)
+        path, meta = self.root / "transforms.json", _describe_frames(train, test, distortion, more or {})
         content = json_bytes(meta)
         if overview is not None:
             overview(dataset_of(path, meta))
@@ -316,7 +324,10 @@ def _read_label(path: Path, camera: Camera) -> None:
 
 
 def _describe_frames(
-    train: Sequence[tuple[str, Camera, Sun]], test: Sequence[tuple[str, Camera, Sun]], distortion: Sequence[float]
+    train: Sequence[tuple[str, Camera, Sun]],
+    test: Sequence[tuple[str, Camera, Sun]],
+    distortion: Sequence[float],
+    more: Mapping[str, Mapping[str, JsonValue]],
 ) -> dict[str, JsonValue]:
     """transforms.json: intrinsics stand at the top where all frames share them."""
     intrinsics = [intrinsics_of(camera) for _, camera, _ in (*train, *test)]
@@ -337,6 +348,7 @@ def _describe_frames(
                 "silhouette_path": f"silhouette/{name}.png",
                 "id_path": f"id/{name}.png",
                 "depth_file_path": f"depth/{name}.png",
+                **more.get(name, {}),
             }
         )
     return {

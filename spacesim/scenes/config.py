@@ -9,9 +9,11 @@ from spacesim.data.errors import InputError, expect
 from spacesim.data.files import JsonDict
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.cameras.camera import CameraConfig
-from spacesim.scenes.cameras.rig import FibonacciRig, RigConfig, kinds_with, rig_kind
+from spacesim.scenes.cameras.rig import FibonacciRig, Rig
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.lights.sun import SunConfig
+from spacesim.scenes.rigs import kinds_with, rig_kind
+from spacesim.scenes.trajectory.rig import FileRig
 
 Vector = tuple[float, float, float]
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "in": 0.0254, "ft": 0.3048}
@@ -30,6 +32,7 @@ MAX_COORDINATE = 1e9
 _UNLESS_ASKED_FOR = (
     "known_test_views",
     "shared_test_views",
+    "min_phase_deg",
     "max_phase_deg",
 )  # in scene.json: datasets without them stay as they were
 
@@ -121,7 +124,7 @@ class SceneConfig:
     sun: SunConfig = field(default_factory=SunConfig)  #: its size and brightness
     earth: EarthConfig | None = None  #: lights the scene; none: the Sun alone
     background: BackgroundConfig | None = None  #: drawn behind the objects; none: pictures have alpha
-    rig: RigConfig = field(default_factory=FibonacciRig)  #: where cameras and Suns stand
+    rig: Rig = field(default_factory=FibonacciRig)  #: where cameras and Suns stand
     camera: CameraConfig = field(default_factory=CameraConfig)  #: that takes the pictures
     quality: QualityConfig = field(default_factory=QualityConfig)  #: samples and points
     folder: Path | None = field(default=None, compare=False)  #: where relative paths of meshes begin
@@ -139,7 +142,8 @@ class SceneConfig:
 
     def to_json(self) -> JsonDict:
         """Plain JSON values, without the folder: a dataset does not depend on where its scene file lay."""
-        values = {key: value for key, value in asdict(replace(self, folder=None)).items() if key != "folder"}
+        values = {**asdict(replace(self, folder=None, rig=FibonacciRig())), "rig": self.rig.to_json()}
+        del values["folder"]
         rig = {key: value for key, value in values["rig"].items() if value or key not in _UNLESS_ASKED_FOR}
         if self.background is None:
             del values["background"]
@@ -148,11 +152,20 @@ class SceneConfig:
 
 def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
     """`scene` with its name or seed, or fields of its rig, camera or quality changed by name; None changes nothing.
+    `rig` is a rig in place of the scene's own, and `trajectory` the table that such a one follows (`FileRig`).
     `resolution` may be one number, of a square. `sun` takes the place of the rig's own arrangement, whatever the number
     of its Suns, and `suns` alone that of `sun`. `background` is a `BackgroundConfig` or the words of one.
 
     Raises InputError for a name that this scene's rig does not know, or a value out of range.
     """
+    rig_given, path = options.pop("rig", None), options.pop("trajectory", None)
+    if path is not None:
+        expect(rig_given is None, "trajectory", "none beside a rig", str(path))
+        rig_given = FileRig(path=str(Path(str(path)).absolute()))
+    if rig_given is not None:
+        if not isinstance(rig_given, Rig):
+            raise InputError(f"rig: expected a Rig, such as PoseRig, found {str(rig_given)[:60]!r}")
+        scene = replace(scene, rig=rig_given)
     changes: dict[str, JsonDict] = {"": {}, "rig": {}, "camera": {}, "quality": {}}
     owners = {
         part: {f.name for f in fields(getattr(scene, part))} if part else {"name", "seed", "background"}
@@ -167,7 +180,8 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
     rig = changes["rig"]
     if "sun" in rig:
         rig["sun"] = tuple((float(azimuth), float(elevation)) for azimuth, elevation in rig["sun"])
-        rig.setdefault("suns", len(rig["sun"]))
+        if "suns" in owners["rig"]:
+            rig.setdefault("suns", len(rig["sun"]))
     elif "suns" in rig:
         rig["sun"] = ()
     if isinstance(changes[""].get("background"), str):

@@ -38,13 +38,15 @@ class Labeller:
         self._distortion = tuple(distortion)
         self._units = loaded.units
         self._parts = PartTable.of(scene, self._scene)
-        self._directions = SolarDirections(scene.sun, loaded.sun.limb)
+        self._sun = loaded.sun
+        self._directions = SolarDirections(scene.sun)
         self._centres = record_on_cuda(self._trace_centres)
         self._penumbrae = record_on_cuda(self._trace_penumbrae)
 
     def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
         """All fields of Truth but radiance and alpha."""
-        inputs = KernelCamera.of(camera, self._units), kernel_input(sun.direction), self._directions.few(sun)
+        disc = self._directions.few(sun, self._sun.limb)
+        inputs = KernelCamera.of(camera, self._units), kernel_input(sun.direction), disc
         numbers, ids, points = self._centres(self._scene, self._parts, *inputs)
         labels = _images(numbers, ids, camera)
         self._refine(points, sun, labels)
@@ -82,7 +84,7 @@ class Labeller:
         """Settle penumbrae in the labels sun_visibility and shadow."""
         visibility, shadow, cosine = (labels[name].reshape(-1) for name in ("sun_visibility", "shadow", "sun_cosine"))
         mixed = np.flatnonzero((visibility > 0) & (visibility < 1))
-        disc = self._directions.many(sun) if len(mixed) else None
+        disc = self._directions.many(sun, self._sun.limb) if len(mixed) else None
         settled = np.zeros(len(cosine), bool)
         while disc is not None and len(mixed):
             todo = _dilate(mixed, labels["shadow"].shape)

@@ -22,6 +22,7 @@ from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes.cameras.kernel_camera import KernelCamera, record_on_cuda
 from spacesim.scenes.labels import OFFSET, Labeller
+from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.scene import Scene, load
 
 MAX_WAVEFRONT = 1 << 24
@@ -59,16 +60,20 @@ class Renderer:
         self.spp = spp
         self._distortion = tuple(distortion)
         self._loaded = load(scene)
+        self._earth = scene.earth  # where it is now
         self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
         self._sampler = mi.load_dict({"type": "independent"})
         self._labeller = Labeller(scene, self._loaded, distortion)
         self._sums = record_on_cuda(self._trace_paths)
 
-    def render(self, camera: Camera, sun: Sun, seed: Sequence[int], spp: int | None = None) -> Truth:
-        """What `camera` sees under `sun` by `spp` samples a pixel; `seed` makes the noise."""
+    def render(
+        self, camera: Camera, sun: Sun, seed: Sequence[int], spp: int | None = None, earth: EarthConfig | None = None
+    ) -> Truth:
+        """What `camera` sees under `sun` by `spp` samples a pixel; `seed` makes the noise. earth: where the scene's
+        Earth is; None: where the scene says."""
         spp = spp or self.spp
         _check_memory(camera, spp)
-        self._loaded.point(sun)
+        self._point(sun, earth)
         sunlight = self._launch_passes(self._loaded.sunlit, camera, seed, spp)
         earthlit = self._loaded.earthlit
         earthlight = self._launch_passes(earthlit, camera, (*seed, _EARTH), spp) if earthlit else None
@@ -76,13 +81,13 @@ class Renderer:
         radiance, alpha = _mean_radiance(sunlight, camera, spp)
         if earthlight is None:
             return Truth(radiance=radiance, alpha=alpha, **labels)
-        earth, _ = _mean_radiance(earthlight, camera, spp)
-        return Truth(radiance=radiance + earth, alpha=alpha, **labels, radiance_earth=earth)
+        reflected, _ = _mean_radiance(earthlight, camera, spp)
+        return Truth(radiance=radiance + reflected, alpha=alpha, **labels, radiance_earth=reflected)
 
     def radiance(self, camera: Camera, sun: Sun, seed: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """(radiance [H, W, 3] from all sources, alpha [H, W]) of what `render` returns, without the labels."""
         _check_memory(camera, self.spp)
-        self._loaded.point(sun)
+        self._point(sun)
         radiance, alpha = _mean_radiance(
             self._launch_passes(self._loaded.sunlit, camera, seed, self.spp), camera, self.spp
         )
@@ -91,9 +96,15 @@ class Renderer:
             radiance = radiance + _mean_radiance(earth, camera, self.spp)[0]
         return radiance, alpha
 
+    def _point(self, sun: Sun, earth: EarthConfig | None = None) -> None:
+        """Move the Sun and the Earth. None: to where the scene says"""
+        earth = earth or self.scene.earth
+        self._loaded.point(sun, None if earth == self._earth else earth)
+        self._earth = earth
+
     def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
         """All fields of what `render` returns but radiance and alpha, which take no paths."""
-        self._loaded.point(sun)
+        self._point(sun)
         return self._labeller.labels(camera, sun)
 
     def _launch_passes(self, scene: mt.Scene, camera: Camera, seed: Sequence[int], spp: int) -> list[Float]:

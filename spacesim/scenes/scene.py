@@ -173,10 +173,13 @@ class MitsubaScene:
     earthlit: mt.Scene | None = None
     earth: Source | None = None
 
-    def point(self, sun: Sun) -> None:
-        """Move the Sun; the Earth's phase follows."""
+    def point(self, sun: Sun, earth: EarthConfig | None = None) -> None:
+        """Move the Sun and, where one is given to a scene that has one, the Earth; the Earth's phase follows."""
         self.sun.point(sun)
         if self.earth is not None:
+            if earth is not None:
+                self.sun.place(earth)
+                self.earth.place(earth)
             self.earth.point(sun)
 
 

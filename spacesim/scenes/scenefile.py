@@ -11,17 +11,18 @@ from spacesim.data import toml
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.structure import Rules, did_you_mean, keys_of, structure
-from spacesim.scenes.cameras.rig import RIGS, RigConfig
+from spacesim.scenes.cameras.rig import Rig
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
 from spacesim.scenes.lights.sun import SunConfig
 from spacesim.scenes.materials.table import customise_preset, material_names
+from spacesim.scenes.rigs import RIGS, rig_kind
 from spacesim.scenes.spacecraft import SPACECRAFT, spacecraft
 
 SCENES = Path(__file__).parents[1] / "assets" / "scenes"
 BUILT_IN_SCENES = tuple(sorted(path.stem for path in SCENES.glob("*.toml")))
 
 RULES = Rules(
-    kinds={RigConfig: RIGS},
+    kinds={Rig: RIGS},
     hidden=((SceneConfig, "folder"), (SunConfig, "color")),  # the place of the file; what the white balance makes of it
     spread=("resolution", "albedo"),
 )
@@ -50,10 +51,12 @@ def read_scene(source: str | Path, **options: object) -> SceneConfig:
 
 def scene_text(scene: SceneConfig) -> str:
     """The scene as a TOML file that `read_scene` reads; meshes are relative to the working directory where they lie
-    below it."""
+    below it. Raises InputError for a rig that scene files do not know."""
+    if type(scene.rig) not in RIGS.values():
+        raise InputError(f"rig: expected one that a scene file can say, found {rig_kind(scene.rig)}")
     folder = scene.folder or Path()
     objects = tuple(replace(item, mesh=_from_here(folder / item.mesh)) if item.mesh else item for item in scene.objects)
-    return toml.dump(_plain(replace(scene, objects=objects)))
+    return toml.dump(_plain(replace(scene, objects=objects, rig=scene.rig.located(folder))))
 
 
 def _mesh_scene(path: Path, source: str, reading: JsonMapping) -> SceneConfig:

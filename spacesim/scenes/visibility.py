@@ -52,10 +52,9 @@ class Disc:
 
 
 class SolarDirections:
-    """Directions to a Sun's disc; sun: how large it is; limb: of the Earth, or None."""
+    """Directions to a Sun's disc; sun: how large it is."""
 
-    def __init__(self, sun: SunConfig, limb: Limb | None) -> None:
-        self._limb = limb
+    def __init__(self, sun: SunConfig) -> None:
         angle = 2 * math.pi * np.arange(RIM) / RIM
         rim = 0.999 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         k = np.arange(FINE)
@@ -65,16 +64,16 @@ class SolarDirections:
         self._coarse = sine * np.vstack([np.zeros((1, 2)), rim if sine else np.empty((0, 2))])
         self._fine = sine * fine
 
-    def few(self, sun: Sun) -> Disc:
-        """The disc's centre and rim."""
-        return self._disc(self._coarse, sun)
+    def few(self, sun: Sun, limb: Limb | None) -> Disc:
+        """The disc's centre and rim. limb: of the Earth, or None."""
+        return self._disc(self._coarse, sun, limb)
 
-    def many(self, sun: Sun) -> Disc:
+    def many(self, sun: Sun, limb: Limb | None) -> Disc:
         """Directions spread evenly over the disc, from its centre outwards."""
-        return self._disc(self._fine, sun)
+        return self._disc(self._fine, sun, limb)
 
-    def _disc(self, points: Array, sun: Sun) -> Disc:
+    def _disc(self, points: Array, sun: Sun, limb: Limb | None) -> Disc:
         height = np.sqrt(1 - (points**2).sum(axis=1))
         rotated = np.column_stack([points, height]) @ axis_frame([0, 0, 0], sun.direction)[:3, :3].T
         directions = backend.mitsuba().Vector3f(np.ascontiguousarray(rotated.T, np.float32))
-        return Disc(len(points), directions, self._limb)
+        return Disc(len(points), directions, limb)

@@ -18,12 +18,13 @@ from spacesim.data.errors import InputError
 from spacesim.data.structure import keys_of
 from spacesim.scenes.build import build
 from spacesim.scenes.cameras.camera import CameraConfig
-from spacesim.scenes.cameras.rig import RIGS, RigConfig
+from spacesim.scenes.cameras.rig import RigConfig
 from spacesim.scenes.cameras.sensor import SensorConfig
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, QualityConfig, SceneConfig
 from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.lights.sun import SunConfig
+from spacesim.scenes.rigs import RIGS
 from spacesim.scenes.scenefile import BUILT_IN_SCENES, RULES, SCENES, read_scene, scene_text
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -1,6 +1,7 @@
 """What is behind the objects of each frame: where the Earth is, and what the camera sees of it and of the stars."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,13 +38,16 @@ class Background:
             units = Units.of(scene.bounding_sphere)
             self._globe = Globe(units, distortion, scene.sun.irradiance, _number(seed, _GLOBE))
 
-    def placement(self, camera: Camera, sun: Sun, index: int) -> Placement | None:
-        """Where the Earth is in frame `index`; None where it is not behind."""
-        earth = self._earth
+    def placement(
+        self, camera: Camera, sun: Sun, index: int, earth: EarthConfig | None = None, sky: Array | None = None
+    ) -> Placement | None:
+        """Where the Earth is in frame `index`; None where it is not behind. earth, sky: as in `radiance`"""
+        earth = earth or self._earth
         if self._globe is None:
             return None
         if self._fixed:
-            return Placement(earth.direction, earth.distance, _turn(np.random.default_rng([self._seed, _WHERE])))
+            turn = _turn(np.random.default_rng([self._seed, _WHERE]))
+            return Placement(earth.direction, earth.distance, turn if sky is None else turn @ sky)
         start = _number(self._seed, _WHEN) * 2.0**-32
         if (start + index * _GOLDEN) % 1 >= self._config.share:
             return None
@@ -58,12 +62,20 @@ class Background:
                 break
         return Placement(direction, earth.distance, _turn(random))
 
-    def radiance(self, camera: Camera, sun: Sun, index: int) -> np.ndarray:
-        """[H, W, 3] float32, W m^-2 sr^-1: what frame `index` would show without objects."""
+    def radiance(
+        self, camera: Camera, sun: Sun, index: int, earth: EarthConfig | None = None, sky: Array | None = None
+    ) -> np.ndarray:
+        """[H, W, 3] float32, W m^-2 sr^-1: what frame `index` would show without objects.
+
+        earth: where the Earth is, None: as the scene says; sky: [3, 3] from the world's axes to those in which stars
+        and a fixed Earth's ground stand still, None: the world's."""
         result = np.zeros((camera.height, camera.width, 3), np.float32)
         if self._stars is not None:
-            result += np.float32(self._config.star_gain) * self._stars.draw(camera, self._distortion)[..., None]
-        place = self.placement(camera, sun, index)
+            pose = camera.world_from_camera.copy()
+            pose[:3, :3] = pose[:3, :3] if sky is None else sky @ pose[:3, :3]
+            stars = self._stars.draw(replace(camera, world_from_camera=pose), self._distortion)
+            result += np.float32(self._config.star_gain) * stars[..., None]
+        place = self.placement(camera, sun, index, earth, sky)
         if place is not None and self._globe is not None:
             light, cover = self._globe.draw(camera, sun, place)
             result = result * (1 - cover[..., None]) + light

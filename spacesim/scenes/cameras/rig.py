@@ -1,18 +1,22 @@
 """Where the Suns and the cameras are: lattices, random poses, approaches and fly-arounds."""
 
+import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
 from spacesim.data.errors import InputError, expect
+from spacesim.data.files import JsonDict
 from spacesim.data.geometry import Array, fibonacci_sphere, look_at, normalize, rotation_from_quaternion
 from spacesim.data.records import Camera, Sun
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.orbit import ORBIT_NORMAL, WORLD_FROM_LVLH, ellipse, mean_motion, star_direction
+from spacesim.scenes.lights.earth import EarthConfig
 
 SINGLE_SUN = (45.0, 35.0)
 """Azimuth and elevation, degrees, of the Sun where only one is asked for: the thesis's single-Sun
@@ -41,15 +45,26 @@ MIN_METRES, MAX_METRES = 1e-9, 1e12
 MAX_FRAMES = 10_000_000
 """Of a dataset: the plan of all frames is held in memory."""
 
+SUN_MARGIN = math.radians(0.6)
+"""Between the Earth's limb and the centre of Suns that it shall not hide: two of the Sun's radii at 1 au."""
+
+TRIES = 1000
+"""Poses that are drawn for one whose Sun the Earth does not hide."""
+
 _TRAIN, _TEST, _HELD_OUT, _KNOWN = range(4)  # streams of random numbers
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedView:
-    """One frame to render."""
+    """One frame to render. What a rig does not know, the scene says."""
 
     camera: Camera
     sun: Sun
+    time: float | None = None  #: seconds
+    epoch: str | None = None  #: the same as the calendar says it
+    exposure: float | None = None  #: display value of a radiance of 1 W m^-2 sr^-1
+    earth: Array | None = None  #: [3] from the world's origin to the Earth's centre, metres
+    sky_from_world: Array | None = None  #: [3, 3] to the axes in which stars stand still; None: the world's
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +73,7 @@ class TargetSphere:
 
     centre: Array
     radius: float
+    earth: EarthConfig | None = None  #: of the scene
 
 
 Views = tuple[list[PlannedView], list[PlannedView]]  #: of training and of testing
@@ -66,8 +82,34 @@ ViewsOf = Callable[[Sun, int, Stream], Sequence[PlannedView]]  #: so many views 
 
 
 @dataclass(frozen=True)
-class RigConfig(ABC):
-    """Suns and views of every rig. Raises InputError for a value out of range.
+class Rig(ABC):
+    """Where Suns and cameras are. For one of your own that `PoseRig` cannot be, subclass it as a frozen dataclass."""
+
+    @abstractmethod
+    def views_of(self, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
+        """The training and the test views of `target`. Raises InputError where the rig does not suit it."""
+
+    def located(self, folder: Path) -> "Rig":
+        """The same with paths of files that begin in `folder`, where they are relative."""
+        return self
+
+    def files(self) -> tuple[Path, ...]:
+        """What it reads."""
+        return ()
+
+    def to_json(self) -> JsonDict:
+        """What scene.json says of it: plain values. Raises InputError for others."""
+        values = asdict(self)
+        try:
+            json.dumps(values, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"rig: expected fields that JSON has, or a to_json of its own, found {error}") from None
+        return values
+
+
+@dataclass(frozen=True)
+class RigConfig(Rig):
+    """Suns and views of rigs that arrange them. Raises InputError for a value out of range.
 
     Every training Sun has `views` training views. Every test Sun has `test_views` test views; the test Suns are
     `test_suns` directions that training never sees or, where that is 0, the training Suns.
@@ -101,10 +143,6 @@ class RigConfig(ABC):
         suns = len(self.sun) or self.suns
         frames = suns * (self.views + self.known_test_views) + (self.test_suns or suns) * self.test_views
         expect(frames <= MAX_FRAMES, "views", f"at most {MAX_FRAMES:,} frames of all Suns", frames)
-
-    @abstractmethod
-    def views_of(self, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
-        """The training and the test views of `target`. Raises InputError where the rig does not suit it."""
 
     def sun_directions(self, seed: int) -> tuple[list[Sun], list[Sun]]:
         """The training and the test Suns: lattices, unless the rig arranges them."""
@@ -197,8 +235,9 @@ class RandomRig(RigConfig):
     #: the image
     cropped: bool = False
     random_suns: bool = False  #: every frame has its own Sun, from anywhere
-    #: greatest angle between Sun and camera as the target sees them, where Suns are random; none: any. At 180 the Sun
-    #: stands behind the target, and nothing that is seen is lit
+    #: least and greatest angle between Sun and camera as the target sees them; none: any. At 180 the Sun stands behind
+    #: the target, and nothing that is seen is lit. With either, random Suns keep clear of the Earth's disc, too
+    min_phase_deg: float | None = None
     max_phase_deg: float | None = None
 
     def __post_init__(self) -> None:
@@ -207,9 +246,12 @@ class RandomRig(RigConfig):
         if self.near is not None and self.far is not None:
             expect(self.near <= self.far, "far", f"at least near, {self.near:g} m", self.far)
         if self.max_phase_deg is not None:
-            expected = "an angle from 1 to 180 degrees, beside random_suns"
-            fits = self.random_suns and 1 <= self.max_phase_deg <= 180
-            expect(fits, "max_phase_deg", expected, self.max_phase_deg)
+            fits = 1 <= self.max_phase_deg <= 180
+            expect(fits, "max_phase_deg", "an angle from 1 to 180 degrees", self.max_phase_deg)
+        if self.min_phase_deg is not None:
+            most = 180.0 if self.max_phase_deg is None else self.max_phase_deg
+            fits = 0 <= self.min_phase_deg <= most - 1
+            expect(fits, "min_phase_deg", f"an angle from 0 to {most - 1:g} degrees", self.min_phase_deg)
         expect(not (self.random_suns and self.sun), "random_suns", "false where sun names the Suns", True)
         if self.random_suns and (self.suns, self.test_suns) != (1, 0):
             found = f"{self.suns} suns and {self.test_suns} test_suns"
@@ -218,26 +260,57 @@ class RandomRig(RigConfig):
     def views_of(self, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
         near = self.near or min(fitting_distance(target.radius, camera), self.far or math.inf)
         far = self.far or FAR * near
+        limited = (self.min_phase_deg, self.max_phase_deg) != (None, None)
 
         def some(sun: Sun, count: int, stream: Stream) -> list[PlannedView]:
             views = []
             for k in range(count):
                 random = np.random.default_rng([seed, *stream, k])
-                pose = self._pose(random, target, camera, (near, far))
-                view_sun = self._random_sun(random, pose, target) if self.random_suns else sun
+                for _ in range(TRIES):
+                    pose = self._pose(random, target, camera, (near, far))
+                    view_sun = self._random_sun(random, pose, target) if self.random_suns else sun
+                    if view_sun is not None:
+                        break
+                else:
+                    expected = "phase angles at which the Earth does not hide the Sun"
+                    raise InputError(f"max_phase_deg: expected {expected}, found none of some {TRIES} poses")
+                if limited and not self.random_suns:
+                    pose = self._turn_about_sun(random, pose, view_sun, target)
                 views.append(PlannedView(camera.at(pose), view_sun))
             return views
 
         return self.all_views(self.sun_directions(seed), some)
 
-    def _random_sun(self, random: np.random.Generator, pose: Array, target: TargetSphere) -> Sun:
-        """The first of Suns drawn from anywhere that is near enough to the camera's side."""
-        towards = normalize(pose[:3, 3] - target.centre)
+    @property
+    def _phase_cosines(self) -> tuple[float, float]:
+        """Least and greatest cosine of the phase angle."""
         least = -1.0 if self.max_phase_deg is None else math.cos(math.radians(self.max_phase_deg))
+        return least, 1.0 if self.min_phase_deg is None else math.cos(math.radians(self.min_phase_deg))
+
+    def _random_sun(self, random: np.random.Generator, pose: Array, target: TargetSphere) -> Sun | None:
+        """The first of Suns drawn from anywhere whose phase angle is in range; None where the Earth hides it."""
+        towards = normalize(pose[:3, 3] - target.centre)
+        least, most = self._phase_cosines
         while True:
             sun = Sun(random.normal(size=3))
-            if sun.direction @ towards >= least:
-                return sun
+            if least <= sun.direction @ towards and (most == 1 or sun.direction @ towards <= most):
+                break
+        if target.earth is None or (least, most) == (-1, 1):
+            return sun
+        hidden = sun.direction @ target.earth.direction > math.cos(target.earth.angular_radius + SUN_MARGIN)
+        return None if hidden else sun
+
+    def _turn_about_sun(self, random: np.random.Generator, pose: Array, sun: Sun, target: TargetSphere) -> Array:
+        """`pose` turned about the target to a place that is drawn at random among those of a phase angle in range."""
+        offset = pose[:3, 3] - target.centre
+        cosine, angle = random.uniform(*self._phase_cosines), random.uniform(0, 2 * math.pi)
+        sine = math.sqrt(max(1 - cosine * cosine, 0))
+        wanted = _frame_about(sun.direction) @ [sine * math.cos(angle), sine * math.sin(angle), cosine]
+        turn = _frame_about(wanted) @ _frame_about(normalize(offset)).T
+        turned = np.eye(4)
+        turned[:3, :3] = turn @ pose[:3, :3]
+        turned[:3, 3] = target.centre + turn @ offset
+        return turned
 
     def _pose(
         self, random: np.random.Generator, target: TargetSphere, camera: CameraConfig, depths: Array | tuple
@@ -339,27 +412,7 @@ class FlyAroundRig(RigConfig):
         return _views_on_path(self, self.sun_directions(seed), at, closed)
 
 
-RIGS: dict[str, type[RigConfig]] = {
-    "fibonacci": FibonacciRig,
-    "polar-arc": PolarArcRig,
-    "random": RandomRig,
-    "approach": ApproachRig,
-    "fly-around": FlyAroundRig,
-}
-"""The kinds of rig, as scene files name them."""
-
-
-def rig_kind(rig: RigConfig) -> str:
-    """The name of a rig's kind."""
-    return next(name for name, cls in RIGS.items() if type(rig) is cls)
-
-
-def kinds_with(option: str) -> list[str]:
-    """The kinds of rig that know an option."""
-    return [name for name, cls in RIGS.items() if option in {f.name for f in fields(cls)}]
-
-
-def plan(rig: RigConfig, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
+def plan(rig: Rig, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
     """The training and the test views of a rig. Random streams are derived from (seed, purpose, index)."""
     return rig.views_of(target, camera, seed)
 
@@ -427,6 +480,12 @@ def _views_on_path(
         return [at(step, sun, (*stream, k)) for k, step in enumerate(steps)]
 
     return rig.all_views(suns, along)
+
+
+def _frame_about(axis: Array) -> Array:
+    """[3, 3] a rotation whose third column is the unit `axis` [3]."""
+    side = normalize(np.cross(np.eye(3)[np.abs(axis).argmin()], axis))
+    return np.stack([side, np.cross(axis, side), axis], axis=1)
 
 
 def _expect_metres(least: float = MIN_METRES, **lengths: float | None) -> None:

@@ -10,14 +10,18 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+
 import spacesim
+from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun, Truth
-from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, FrameWriter
+from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, SHADOW_LIT, SHADOW_SELF_CAST, FrameWriter
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.background.draw import Background
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.exposure import record_image
 from spacesim.scenes.config import QualityConfig
+from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
 
@@ -37,6 +41,10 @@ class FrameSpec:
     camera: Camera
     sun: Sun
     spp: int  #: samples a pixel
+    exposure: float | None = None  #: None: the camera's
+    earth: EarthConfig | None = None  #: None: where the scene says, if it has one at all
+    sunlight: float = 1.0  #: factor on the Sun's light, of an Earth that the scene does not have
+    sky_from_world: Array | None = None  #: [3, 3], None: stars stand still in the world
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +58,7 @@ class Job:
     root: Path  #: the dataset's folder
     threads: int  #: that encode, a process
     background: BackgroundConfig | None = None
+    shared: bool = False  #: other jobs make frames in the same folder now
 
     @property
     def writer(self) -> FrameWriter:
@@ -78,6 +87,17 @@ def cores() -> int:
 def writing_threads(processes: int) -> int:
     """Threads that encode in each of so many processes on this machine."""
     return min(MAX_THREADS, max(1, math.ceil(cores() / processes)))
+
+
+def dim(truth: Truth, sunlight: float) -> Truth:
+    """`truth`, all of whose light is the Sun's, under a fraction of it: that much of the disc is seen."""
+    if sunlight == 1:
+        return truth
+    factor = np.float32(sunlight)
+    visibility = factor * truth.sun_visibility
+    hidden = (truth.shadow == SHADOW_LIT) & (visibility < 0.5)
+    shadow = np.where(hidden, np.uint8(SHADOW_SELF_CAST), truth.shadow)
+    return replace(truth, radiance=factor * truth.radiance, sun_visibility=visibility, shadow=shadow)
 
 
 class FrameMaker:
@@ -109,9 +129,12 @@ class FrameMaker:
                         continue
                     while waiting and (waiting[0].done() or len(waiting) >= self._most):
                         yield waiting.popleft().result()
-                    truth = self._renderer.render(spec.camera, spec.sun, (self._job.seed, spec.index), spec.spp)
+                    seed = (self._job.seed, spec.index)
+                    truth = self._renderer.render(spec.camera, spec.sun, seed, spec.spp, spec.earth)
+                    truth = dim(truth, spec.sunlight)
                     if self._background is not None:
-                        behind = self._background.radiance(spec.camera, spec.sun, spec.index)
+                        where = spec.earth, spec.sky_from_world
+                        behind = self._background.radiance(spec.camera, spec.sun, spec.index, *where)
                         truth = replace(truth, radiance_background=behind)
                     waiting.append(pool.submit(self._write, spec, truth))
                 while waiting:
@@ -121,6 +144,7 @@ class FrameMaker:
 
     def _write(self, spec: FrameSpec, truth: Truth) -> str:
         seed, behind = (self._job.seed, spec.index), truth.radiance_background
-        recording = record_image(truth.radiance, truth.alpha, self._job.camera, seed, behind)
+        camera = self._job.camera if spec.exposure is None else replace(self._job.camera, exposure=spec.exposure)
+        recording = record_image(truth.radiance, truth.alpha, camera, seed, behind)
         self._writer.write_frame(spec.name, truth, recording.image, recording.raw)
         return spec.name

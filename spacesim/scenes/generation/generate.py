@@ -13,16 +13,21 @@ import numpy as np
 from spacesim import backend
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import MAX_LIST_BYTES, JsonValue, read_json, write_json
+from spacesim.data.geometry import Array, angles_from_direction
+from spacesim.data.integrity.manifest import digest_of
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
-from spacesim.data.store import DatasetWriter
+from spacesim.data.store import DatasetWriter, FrameWriter
 from spacesim.scenes.build import build
-from spacesim.scenes.cameras.rig import PlannedView, TargetSphere, plan
+from spacesim.scenes.cameras.rig import PlannedView, RandomRig, TargetSphere, plan
 from spacesim.scenes.config import SceneConfig
 from spacesim.scenes.generation.estimate import LONG, Estimate, measure, samples
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, raw_suffixes, versions, writing_threads
+from spacesim.scenes.generation.lighting import sunlit_fractions, warn_of_dark_frames
 from spacesim.scenes.generation.overview import write_overview
 from spacesim.scenes.generation.points import sample_surface_points
+from spacesim.scenes.lights.earth import EARTH_RADIUS_KM
+from spacesim.scenes.lights.eclipse import visible_fraction
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
 
@@ -51,8 +56,7 @@ def generate(
     scene that cannot be built, a camera within an object or a folder that cannot be used or that another run works on,
     WorkError where disk, memory or processes fail.
     """
-    expect(workers >= 1, "workers", "at least 1", workers)
-    expect(ray is None or workers == 1, "workers", "none beside ray, which counts for itself", workers)
+    _check_processes(workers, ray)
     sweep = _DatasetPlan(config)
     job = replace(sweep.job, root=Path(out).absolute())
     described = describe(sweep.scene, config, sweep.train, sweep.test)
@@ -60,17 +64,70 @@ def generate(
         with _frame_maker(sweep.renderer, workers, ray) as make:
             alone.enter_context(lock_folder(job.root))
             writer = _open(Path(out), described, resume, sweep)
-            missing = [spec for spec in sweep.specs if not writer.has_frame(spec.name)]
-            total, complete = len(sweep.specs), len(sweep.specs) - len(missing)
-            if progress is not None and complete:
-                progress(complete, total, "")
-            for done, name in enumerate(_make_frames(make, job, missing, sweep.renderer), start=complete + 1):
-                if progress is not None:
-                    progress(done, total, name)
+            _make_missing(writer, sweep.specs, lambda left: _make_frames(make, job, left, sweep.renderer), progress)
         points, colors = sample_surface_points(sweep.renderer, config.quality.points, config.seed)
         listed = _view_records(sweep.train), _view_records(sweep.test)
-        lens = config.camera.distortion
-        return writer.finish(*listed, points, colors, sweep.scene.mesh, lens, lambda d: write_overview(d.root, d))
+        sunlit = sunlit_fractions(job.root, [spec.name for spec in sweep.specs])
+        more = {name: {**keys, "sunlit_fraction": sunlit[name]} for name, keys in sweep.keys.items()}
+        lens, mesh = config.camera.distortion, sweep.scene.mesh
+        dataset = writer.finish(*listed, points, colors, mesh, lens, lambda d: write_overview(d.root, d), more)
+        free = isinstance(config.rig, RandomRig) and config.rig.max_phase_deg is None
+        hint = "max_phase_deg = 90 keeps the Sun on the camera's side, clear of the Earth" if free else ""
+        warn_of_dark_frames(sunlit, {name: keys.get("sun_visibility") == 0 for name, keys in more.items()}, hint)
+        return dataset
+
+
+def generate_part(
+    config: SceneConfig,
+    out: Path,
+    frames: tuple[int, int | None],
+    progress: GenerationProgress | None = None,
+    workers: int = 1,
+    ray: str | None = None,
+) -> tuple[int, int]:
+    """Render some frames of a dataset into the folder `out`, where others may make theirs at the same time; returns
+    (number of frames of this part, of all). `generate` with resume completes the dataset once all parts are there, and
+    its bytes are the same as without parts.
+
+    frames: (first, end) among all frames, training ones first, as slices have them; None: up to the last. Parts made in
+    folders of their own can be copied into one. Raises as `generate`.
+    """
+    _check_processes(workers, ray)
+    sweep = _DatasetPlan(config)
+    first, end = frames
+    count = len(sweep.specs)
+    possible = 0 <= first < count and (end is None or first < end)
+    expected = f"A:B, A from 0 to {count - 1}, the number of the last frame, and B above it"
+    expect(possible, "frames", expected, f"{first}:{'' if end is None else end}")
+    specs = sweep.specs[first:end]
+    job = replace(sweep.job, root=Path(out).absolute(), shared=True)
+    described = describe(sweep.scene, config, sweep.train, sweep.test)
+    with ExitStack() as alone, _frame_maker(sweep.renderer, workers, ray) as make:
+        alone.enter_context(lock_folder(job.root, shared=True))
+        writer = DatasetWriter(Path(out), described, True, raw_suffixes(sweep.job.camera), shared=True)
+        _make_missing(writer, specs, lambda left: make(job, left), progress)
+    return len(specs), count
+
+
+def _check_processes(workers: int, ray: str | None) -> None:
+    expect(workers >= 1, "workers", "at least 1", workers)
+    expect(ray is None or workers == 1, "workers", "none beside ray, which counts for itself", workers)
+
+
+def _make_missing(
+    writer: FrameWriter,
+    specs: Sequence[FrameSpec],
+    make: Callable[[list[FrameSpec]], Iterator[str]],
+    progress: GenerationProgress | None,
+) -> None:
+    """Make those of the frames that are not there, and tell of each."""
+    missing = [spec for spec in specs if not writer.has_frame(spec.name)]
+    total, complete = len(specs), len(specs) - len(missing)
+    if progress is not None and complete:
+        progress(complete, total, "")
+    for done, name in enumerate(make(missing), start=complete + 1):
+        if progress is not None:
+            progress(done, total, name)
 
 
 def _open(root: Path, described: dict[str, JsonValue], resume: bool, sweep: "_DatasetPlan") -> DatasetWriter:
@@ -145,18 +202,52 @@ class _DatasetPlan:
         views = [(quality.spp, *planned) for planned in self.train] + [
             (quality.resolved_test_spp, *planned) for planned in self.test
         ]
-        self.specs = [FrameSpec(i, name, view.camera, view.sun, spp) for i, (spp, name, view) in enumerate(views)]
+        self.specs = [self._frame(i, *planned) for i, planned in enumerate(views)]
+        self.keys = {name: self._keys_of(view) for _, name, view in views}
         threads = writing_threads(1)
         self.job = Job(self.scene, config.camera, quality, config.seed, Path(), threads, config.background)
         inside = self.renderer.inside(np.stack([spec.camera.position for spec in self.specs]))
         if inside.any():
             name = self.specs[int(inside.argmax())].name
-            raise InputError(f"distance: expected cameras outside of {config.name}, found that of {name} within a part")
+            field = "distance" if hasattr(config.rig, "distance") else "rig"
+            raise InputError(f"{field}: expected cameras outside of {config.name}, found that of {name} within a part")
+
+    def _frame(self, index: int, spp: int, name: str, view: PlannedView) -> FrameSpec:
+        sunlight, earth = 1.0, self.scene.earth
+        if view.earth is not None and not np.linalg.norm(view.earth) > 1e3 * EARTH_RADIUS_KM:
+            found = f"{np.linalg.norm(view.earth) / 1e3:.6g} km in {name}"
+            raise InputError(
+                f"earth: expected the Earth's centre beyond its radius of {EARTH_RADIUS_KM} km, found {found}"
+            )
+        if view.earth is not None and earth is None:
+            sunlight = visible_fraction(view.sun.direction, view.earth, self.scene.sun.angular_radius)
+        elif view.earth is not None and earth is not None:  # which hides the Sun as it is traced
+            earth = replace(earth, **_place_of(view.earth))
+        return FrameSpec(index, name, view.camera, view.sun, spp, view.exposure, earth, sunlight, view.sky_from_world)
+
+    def _keys_of(self, view: PlannedView) -> dict[str, JsonValue]:
+        """What transforms.json says of a frame beside its camera and its Sun's direction."""
+        earth = view.earth
+        if earth is None and self.scene.earth is not None:
+            earth = 1e3 * EARTH_RADIUS_KM * self.scene.earth.distance * self.scene.earth.direction
+        visible = None
+        if earth is not None:
+            visible = visible_fraction(view.sun.direction, earth, self.scene.sun.angular_radius)
+        keys: dict[str, JsonValue] = {"time": view.time, "epoch": view.epoch, "exposure": view.exposure}
+        return {key: value for key, value in {**keys, "sun_visibility": visible}.items() if value is not None}
+
+
+def _place_of(earth: Array) -> dict[str, float]:
+    """Where the Earth is, as `EarthConfig` says it, of the vector [3] to its centre, metres."""
+    azimuth, elevation = angles_from_direction(earth)
+    altitude = float(np.linalg.norm(earth)) * 1e-3 - EARTH_RADIUS_KM
+    return {"azimuth_deg": azimuth, "elevation_deg": elevation, "altitude_km": altitude}
 
 
 def plan_views(scene: Scene, config: SceneConfig) -> tuple[NamedViews, NamedViews]:
     """The named training and test views."""
-    train, test = plan(config.rig, TargetSphere(*scene.bounding_sphere), config.camera, config.seed)
+    target = TargetSphere(*scene.bounding_sphere, scene.earth)
+    train, test = plan(config.rig.located(config.folder or Path()), target, config.camera, config.seed)
     return (
         [(f"train_{i:05d}", view) for i, view in enumerate(train)],
         [(f"test_{i:05d}", view) for i, view in enumerate(test)],
@@ -165,8 +256,10 @@ def plan_views(scene: Scene, config: SceneConfig) -> tuple[NamedViews, NamedView
 
 def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedViews) -> dict[str, JsonValue]:
     """scene.json: all that is needed to render the same dataset again."""
+    files = config.rig.located(config.folder or Path()).files()
     return {
         "schema": SCHEMA,
+        **({"files": [{"name": path.name, "sha256": digest_of(path)} for path in files]} if files else {}),
         **scene.describe(),
         "mesh": [_mesh_counts(scene, i) for i in range(1, len(scene.objects) + 1)],
         "suns": {"train": _angles(train), "test": _angles(test)},

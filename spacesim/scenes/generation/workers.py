@@ -79,7 +79,8 @@ def make_in_processes(job: Job, specs: Sequence[FrameSpec], count: int) -> Itera
                     yield name
     except BaseException:
         _stop(workers)
-        remove_leftovers(job.root)
+        if not job.shared:
+            remove_leftovers(job.root)
         raise
     finally:
         _stop(workers)

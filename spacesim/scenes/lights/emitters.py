@@ -104,6 +104,10 @@ def _classes() -> tuple[type, type]:
             self.limb = Limb.of(earth) if earth else None
             self.point(Sun(np.array([1.0, 0.0, 0.0])))
 
+        def place(self, earth: EarthConfig) -> None:
+            """Move the Earth, which hides it."""
+            self.limb = Limb.of(earth)
+
         def point(self, sun: Sun) -> None:
             """Move the Sun."""
             self.direction = kernel_input(sun.direction)
@@ -129,11 +133,15 @@ def _classes() -> tuple[type, type]:
 
         def __init__(self, earth: EarthConfig, sun: SunConfig) -> None:
             super().__init__()
+            self.place(earth)
+            self.full = mi.Color3f(kernel_input(earth.albedo / math.pi * sun.irradiance))
+            self.point(Sun(np.array([1.0, 0.0, 0.0])))
+
+        def place(self, earth: EarthConfig) -> None:
+            """Move the Earth; its albedo stays."""
             self.limb = Limb.of(earth)
             self.centre, self.distance = kernel_input(earth.direction), kernel_input(earth.distance)
             self.density = kernel_input(1 / (2 * math.pi * (1 - math.cos(earth.angular_radius))))
-            self.full = mi.Color3f(kernel_input(earth.albedo / math.pi * sun.irradiance))
-            self.point(Sun(np.array([1.0, 0.0, 0.0])))
 
         def point(self, sun: Sun) -> None:
             """Move the Sun: the phase changes."""

@@ -12,6 +12,7 @@ from spacesim.data.files import MAX_LIST_BYTES, JsonDict, read_json
 from spacesim.data.structure import structure
 from spacesim.data.toml import Document
 from spacesim.scenes.config import ObjectConfig, SceneConfig
+from spacesim.scenes.rigs import RIGS
 from spacesim.scenes.scenefile import RULES
 from spacesim.splat.compose.pose import Pose
 
@@ -31,6 +32,8 @@ def load_recorded_scene(data: Path) -> SceneConfig:
     recorded = _without_nulls(config)
     if isinstance(recorded.get("sun"), dict):
         recorded["sun"].pop("color", None)  # what the white balance makes of it, again
+    if isinstance(recorded.get("rig"), dict) and recorded["rig"].get("kind") not in RIGS:  # of somebody's own
+        del recorded["rig"]
     scene = structure(SceneConfig, Document(str(path), recorded, {}), RULES)
     return replace(scene, objects=tuple(_with_absolute_mesh(item, path) for item in scene.objects))
 

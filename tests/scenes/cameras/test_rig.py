@@ -9,13 +9,13 @@ from spacesim.scenes import build, read_scene
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.orbit import mean_motion
 from spacesim.scenes.cameras.rig import (
-    RIGS,
     SINGLE_SUN,
     ApproachRig,
     FibonacciRig,
     FlyAroundRig,
     PolarArcRig,
     RandomRig,
+    RigConfig,
     TargetSphere,
     fitting_distance,
     held_out_suns,
@@ -24,7 +24,10 @@ from spacesim.scenes.cameras.rig import (
     training_suns,
 )
 from spacesim.scenes.generation.generate import plan_views
+from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.scenes.rigs import RIGS
 
+ARRANGED = [kind for kind, rig in RIGS.items() if issubclass(rig, RigConfig)]
 SCENE = build(read_scene("boxsat"))
 TARGET = TargetSphere(np.array([1.0, -2.0, 0.5]), 2.0)
 CAMERA = CameraConfig((96, 64), fov_deg=40.0)
@@ -98,7 +101,7 @@ def test_suns():
     assert (known @ held_out.T).max() < np.cos(np.radians(0.5))
 
 
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.parametrize("kind", ARRANGED)
 def test_test_views_are_of_the_training_suns_unless_others_are_asked_for(kind):
     train, test = plan(RIGS[kind](suns=4, views=2, test_views=3), TARGET, CAMERA, 0)
     directions = {view.sun.angles for view in train}
@@ -110,7 +113,7 @@ def test_test_views_are_of_the_training_suns_unless_others_are_asked_for(kind):
     assert len(test) == 15
 
 
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.parametrize("kind", ARRANGED)
 def test_test_views_of_known_suns_beside_those_of_others(kind):
     options = {"suns": 4, "views": 2, "test_suns": 5, "test_views": 3}
     before = plan(RIGS[kind](**options), TARGET, CAMERA, 0)
@@ -149,7 +152,7 @@ def test_scene_json_names_such_views_only_where_asked_for():
         FibonacciRig(known_test_views=3)
 
 
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.parametrize("kind", ARRANGED)
 def test_given_suns_take_the_place_of_the_rigs_own(kind):
     rig = RIGS[kind](sun=((10.0, 20.0), (200.0, -60.0)), views=3, test_views=2)
     train, _ = plan(rig, TARGET, CAMERA, 0)
@@ -157,7 +160,7 @@ def test_given_suns_take_the_place_of_the_rigs_own(kind):
     np.testing.assert_allclose(sun_directions(train), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.parametrize("kind", ARRANGED)
 @pytest.mark.parametrize("views", [1, 2, 7])
 def test_frames_held_out_are_none_of_training(kind, views):
     train, test = plan(RIGS[kind](suns=1, views=views, test_views=9), TARGET, CAMERA, 3)
@@ -280,6 +283,37 @@ def test_random_suns_stay_on_the_cameras_side():
     np.testing.assert_array_equal(sun_directions(unlimited), sun_directions(whole))
 
 
+def phases(views):
+    towards = normalize(positions(views) - TARGET.centre)
+    return np.degrees(np.arccos(np.einsum("ni,ni->n", towards, sun_directions(views))))
+
+
+@pytest.mark.parametrize("suns", [{"random_suns": True}, {"sun": ((10.0, -70.0), (40.0, 25.0))}])
+def test_phase_angles_stay_in_a_range(suns):
+    options = {"views": 300, "cropped": True, **suns}
+    train, test = plan(RandomRig(**options, test_views=20, min_phase_deg=50.0, max_phase_deg=80.0), TARGET, CAMERA, 2)
+    found = phases(train + test)
+    assert 50 - 1e-9 <= found.min() < 52
+    assert 78 < found.max() <= 80 + 1e-9
+    free = plan(RandomRig(**options), TARGET, CAMERA, 2)[0]
+    assert phases(free).max() > 160
+    for view, other in zip(train, free, strict=True):  # the target stays where it is in the picture
+        np.testing.assert_allclose(in_camera(view), in_camera(other), atol=1e-12)
+    attitudes = np.array([view.camera.world_from_camera[:3, 0] for view in train])
+    assert np.linalg.norm(attitudes.mean(axis=0)) < 0.2  # any roll
+    assert plan(RandomRig(**options), TARGET, CAMERA, 2)[0][0].sun.angles == free[0].sun.angles
+
+
+def test_random_suns_keep_clear_of_the_earth_where_phase_angles_are_limited():
+    earth = EarthConfig(elevation_deg=-90.0, altitude_km=500.0)
+    over = TargetSphere(TARGET.centre, TARGET.radius, earth)
+    rig = RandomRig(views=400, random_suns=True, max_phase_deg=120.0)
+    found = sun_directions(plan(rig, over, CAMERA, 2)[0]) @ earth.direction
+    assert np.degrees(np.arccos(found.max())) > np.degrees(earth.angular_radius) + 0.59
+    unlimited = plan(RandomRig(views=400, random_suns=True), over, CAMERA, 2)[0]
+    assert np.mean(sun_directions(unlimited) @ earth.direction > np.cos(earth.angular_radius)) > 0.2
+
+
 def test_a_lattice_of_suns_with_a_view_each():
     """--suns 20 --views 1: every picture, of testing too, has a Sun of its own."""
     train, test = plan(RandomRig(suns=20, views=1, test_suns=4, test_views=1), TARGET, CAMERA, 2)
@@ -371,7 +405,11 @@ def test_scenes_say_their_rig(tmp_path):
         (RandomRig, {"near": -1.0}, "near: expected metres from 1e-09 to 1e\\+12, found -1.0"),
         (RandomRig, {"near": 9.0, "far": 5.0}, "far: expected at least near, 9 m, found 5.0"),
         (RandomRig, {"random_suns": True, "suns": 3}, "random_suns: expected 1 suns .* found 3 suns and 0 test_suns$"),
-        (RandomRig, {"max_phase_deg": 90.0}, "max_phase_deg: expected .* beside random_suns, found 90.0"),
+        (
+            RandomRig,
+            {"max_phase_deg": 40.0, "min_phase_deg": 40.0},
+            "min_phase_deg: expected an angle from 0 to 39 deg",
+        ),
         (RandomRig, {"random_suns": True, "max_phase_deg": 0.0}, "max_phase_deg: expected an angle from 1 to 180"),
         (RandomRig, {"random_suns": True, "sun": ((1.0, 2.0),)}, "random_suns: expected false where sun"),
         (ApproachRig, {"axis": "x"}, "axis: expected one of v-bar, -v-bar, r-bar, -r-bar, found 'x'"),

@@ -12,10 +12,12 @@ import pytest
 from tiny import contents
 
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.lock import lock_folder
 from spacesim.data.store import FrameWriter, find_unreadable_files, read_points
 from spacesim.scenes import build, generate, read_scene
 from spacesim.scenes.cameras.sensor import SensorConfig
-from spacesim.scenes.generation.generate import estimate
+from spacesim.scenes.generation.generate import estimate, generate_part
+from spacesim.scenes.trajectory.rig import PoseRig
 
 SMALL = {"views": 4, "test_views": 2, "resolution": (24, 24), "spp": 4, "points": 300}
 
@@ -200,6 +202,55 @@ def test_bad_scene_folder_and_camera_are_refused(made, tmp_path):
         generate(boxsat(), made)
     with pytest.raises(InputError, match="'spp' differs"):
         generate(boxsat(spp=5), made, resume=True)
+
+
+def test_parts_make_the_same_dataset_as_one_run(made, tmp_path, spacesim):
+    """Two at once in one folder, one in a folder of its own that is copied, then one command that completes it."""
+    root, apart = tmp_path / "data", tmp_path / "apart"
+    assert generate_part(boxsat(), root, (0, 2)) == (2, 6)
+    with lock_folder(root, shared=True):  # as another part holds it
+        generate_part(boxsat(), root, (2, 3))
+        (root / "id/.other.part").write_bytes(b"of another part, in the making")
+        generate_part(boxsat(), root, (2, 3))
+        assert (root / "id/.other.part").exists()
+        with pytest.raises(InputError, match="expected no other run at work in the folder"):
+            generate(boxsat(), root, resume=True)
+    generate_part(boxsat(), apart, (3, 5), workers=2)
+    shutil.copytree(apart, root, dirs_exist_ok=True)
+    assert not (root / "transforms.json").exists()
+    generate(boxsat(), root, resume=True)
+    assert contents(root) == contents(made)
+    with pytest.raises(InputError, match="'spp' differs"):
+        generate_part(boxsat(spp=5), root, (0, 1))
+    with pytest.raises(InputError, match=r"frames: expected A:B, A from 0 to 5, .* found '6:'"):
+        generate_part(boxsat(), root, (6, None))
+    with pytest.raises(InputError, match=r"frames: expected .* found '3:3'"):
+        generate_part(boxsat(), root, (3, 3))
+    small = ("generate", "boxsat", "--views", 4, "--test-views", 2, "--resolution", 16, "--spp", 1, "--out")
+    for part in ("0:3", "3:100"):
+        done = spacesim(*small, tmp_path / "b", "--frames", part)
+        assert (done.code, done.output) == (0, f"{tmp_path / 'b'}: 3 of 6 frames; --resume completes it\n")
+    assert spacesim(*small, tmp_path / "b", "--resume").code == 0
+    assert spacesim(*small, tmp_path / "c").code == 0
+    assert contents(tmp_path / "b") == contents(tmp_path / "c")
+    assert spacesim(*small, tmp_path / "d", "--frames", "1-2").is_refusal("--frames", "A:B")
+    assert spacesim(*small, tmp_path / "d", "--frames", "9:").is_refusal("frames")
+
+
+def test_dark_and_empty_frames_are_counted_in_one_warning(tmp_path, caplog):
+    from spacesim.data.geometry import look_at
+
+    poses = [look_at([9, 0, 0], [0, 0, 0]), look_at([-9, 0, 0], [0, 0, 0]), look_at([9, 0, 0], [99, 0, 0])]
+    rig = PoseRig(np.array(poses), sun=(0, 0))
+    config = read_scene("boxsat", resolution=(24, 24), spp=4, points=50, rig=rig)
+    generate(config, tmp_path / "data")
+    told = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    assert told == [
+        "generate: 1 of 3 frames show the object in the dark (train_00001 first); 1 of 3 frames show no object "
+        "(train_00002 first)"
+    ]
+    frames = json.loads((tmp_path / "data/transforms.json").read_text())["frames"]
+    assert [frame["sunlit_fraction"] for frame in frames] == [pytest.approx(0.8, abs=0.2), 0.0, None]
 
 
 def test_estimate_and_workers_on_the_command_line(spacesim, tmp_path):

@@ -1,0 +1,132 @@
+"""How camera, target, Sun and Earth move in a world, and what of it a scene is told: all of it seen from the target.
+
+The world is whatever frame the file is in. The scene's own frame is that of the target: its body axes, with the origin
+where the target is. So a dataset shows a target that stands still, which is what it is trained on, whatever it does in
+the world. Where nothing is said of the target, the scene's frame is the world.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from datetime import date, timedelta
+
+import numpy as np
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import Array, look_at, normalize
+from spacesim.scenes.trajectory.tracks import Attitude, Track
+
+DAY = 86_400.0
+"""Seconds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What is known of a motion; None: nothing. All in one world frame, metres, seconds."""
+
+    day: int | None = None  #: from whose midnight times count (a proleptic ordinal), None: a clock of its own
+    timed: bool = True  #: False: times are numbers of rows, and there is nothing between them
+    camera: Track | None = None  #: position
+    camera_turn: Attitude | None = None  #: world_from_camera, or of the body that carries it
+    target: Track | None = None  #: position
+    target_turn: Attitude | None = None  #: world_from_target
+    earth: Track | None = None  #: position of the Earth's centre
+    sun: Track | None = None  #: direction towards the Sun
+    exposure: Track | None = None  #: display value of a radiance of 1 W m^-2 sr^-1
+
+    @property
+    def tracks(self) -> dict[str, Track | Attitude]:
+        """All that is known."""
+        found: dict[str, Track | Attitude | None]
+        found = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("day", "timed")}
+        return {name: track for name, track in found.items() if track is not None}
+
+    def times(self) -> Array:
+        """[N] the times of the camera's track, else the target's, that all tracks cover. Raises InputError where there
+        is none, or no pose."""
+        main = self.camera or self.camera_turn or self.target or self.target_turn
+        if main is None:
+            raise InputError("trajectory: expected a pose of the camera or of the target, found none")
+        first = max(self.tracks.values(), key=lambda track: float(track.times[0]))
+        last = min(self.tracks.values(), key=lambda track: float(track.times[-1]))
+        common = main.times[(main.times >= first.times[0]) & (main.times <= last.times[-1])]
+        if not len(common):
+            raise InputError(
+                f"trajectory: expected a time that all of it covers, found that {last.name} ends before "
+                f"{first.name} begins"
+            )
+        return common
+
+    def epoch(self, seconds: float) -> str | None:
+        """A time as the calendar says it, of its own time system; None of a clock of its own."""
+        if self.day is None:
+            return None
+        days, rest = divmod(round(seconds * 1e6), round(DAY * 1e6))
+        minutes, micro = divmod(rest, 60_000_000)
+        day = date.fromordinal(self.day) + timedelta(days)
+        return f"{day.isoformat()}T{minutes // 60:02d}:{minutes % 60:02d}:{micro / 1e6:09.6f}"
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """A motion at N times, as the scene sees it: in the target's frame, metres."""
+
+    times: Array  #: [N] seconds
+    world_from_camera: Array  #: [N, 4, 4] of the scene's world, OpenCV axes
+    turn: Array  #: [N, 3, 3] from the scene's axes to those of the motion's world
+    sun: Array | None  #: [N, 3] unit, towards the Sun
+    earth: Array | None  #: [N, 3] to the Earth's centre
+    exposure: Array | None  #: [N]
+
+
+def merge(motions: Sequence[Motion]) -> Motion:
+    """What several files tell together. Raises InputError where two tell the same, or their clocks differ."""
+    whole = motions[0]
+    for other in motions[1:]:
+        if (whole.day is None) != (other.day is None):
+            raise InputError(
+                "trajectory: expected calendar times in all of its files (time_utc in a table), or in none"
+            )
+        both = sorted(whole.tracks.keys() & other.tracks.keys())
+        if both:
+            names = f"{whole.tracks[both[0]].name} and {other.tracks[both[0]].name}"
+            raise InputError(f"trajectory: expected one source of each track, found {names}")
+        later = DAY * ((other.day or 0) - (whole.day or 0))
+        moved = {name: replace(track, times=track.times + later) for name, track in other.tracks.items()}
+        whole = replace(whole, timed=whole.timed and other.timed, **moved)  # type: ignore[arg-type]
+    return whole
+
+
+def seen_from_target(motion: Motion, times: Array, camera_from_optics: Array, centre: Array) -> Moments:
+    """`motion` at `times` [N] in the target's frame.
+
+    camera_from_optics: [3, 3] OpenCV camera axes to those whose attitude is told; centre: [3] of the objects, scene
+    frame, which a camera looks at, the world's z upwards, where no attitude of it is told. Raises InputError for a time
+    that is not covered.
+    """
+    count = len(times)
+    still, unturned = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
+    place = motion.target.at(times) if motion.target else still
+    world_from_target = motion.target_turn.at(times) if motion.target_turn else unturned
+    target_from_world = np.swapaxes(world_from_target, 1, 2)
+
+    def to_target(vectors: Array) -> Array:
+        return np.einsum("nij,nj->ni", target_from_world, vectors)
+
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, 3] = to_target((motion.camera.at(times) if motion.camera else still) - place)
+    if motion.camera_turn or not motion.camera:
+        turn = motion.camera_turn.at(times) if motion.camera_turn else unturned
+        poses[:, :3, :3] = target_from_world @ turn @ camera_from_optics
+    else:
+        up = to_target(np.tile([0.0, 0.0, 1.0], (count, 1)))
+        for k in range(count):
+            if np.linalg.norm(poses[k, :3, 3] - centre) > 0:
+                poses[k] = look_at(poses[k, :3, 3], centre, up[k])
+    return Moments(
+        times,
+        poses,
+        world_from_target,
+        normalize(to_target(motion.sun.at(times))) if motion.sun else None,
+        to_target(motion.earth.at(times) - place) if motion.earth else None,
+        motion.exposure.at(times)[:, 0] if motion.exposure else None,
+    )

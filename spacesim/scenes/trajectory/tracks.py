@@ -1,0 +1,107 @@
+"""What is known at some times, and its values between them."""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import Array
+
+AMBIGUOUS_DEG = 120.0
+"""Turn between two rows beyond which the shorter way may well be the wrong one."""
+
+UNIT = 1e-3
+"""By how much the length of a quaternion may differ from 1: rounding to three digits makes no more."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Numbers at times that grow, linear between them, or cubic where their rates are known (Hermite).
+
+    name: as errors call it. Raises InputError for times that do not grow and for numbers that are not finite.
+    """
+
+    name: str
+    times: Array  #: [N] seconds
+    values: Array  #: [N, C]
+    rates: Array | None = None  #: [N, C] a second
+
+    def __post_init__(self) -> None:
+        check_times(self.times, self.name)
+        for values in (self.values, self.rates):
+            if values is not None and not np.isfinite(values).all():
+                row = int((~np.isfinite(values)).any(axis=1).argmax())
+                raise InputError(f"{self.name}: expected finite numbers, found {values[row].tolist()} in row {row + 1}")
+
+    def at(self, times: Array) -> Array:
+        """[M, C] values at `times` [M]. Raises InputError for a time that is before the first or after the last."""
+        check_covered(self, times)
+        if len(self.times) == 1:
+            return np.repeat(self.values, len(times), axis=0)
+        if self.rates is not None:
+            spline: Array = CubicHermiteSpline(self.times, self.values, self.rates)(times)
+            return spline
+        return np.stack([np.interp(times, self.times, column) for column in self.values.T], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Attitude:
+    """Rotations at times that grow, at an even rate about one axis, the shorter way, between them (slerp: K. Shoemake,
+    "Animating rotation with quaternion curves", SIGGRAPH 1985).
+
+    Raises InputError for times that do not grow and for quaternions whose length is not 1.
+    """
+
+    name: str
+    times: Array  #: [N] seconds
+    quaternions: Array  #: [N, 4] (w, x, y, z), to the world's axes
+
+    def __post_init__(self) -> None:
+        check_times(self.times, self.name)
+        with np.errstate(over="ignore"):
+            lengths = np.linalg.norm(self.quaternions, axis=1)
+        wrong = ~(np.abs(lengths - 1) <= UNIT)
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise InputError(
+                f"{self.name}: expected quaternions of length 1, found one of {lengths[row]:.6g} in row {row + 1}"
+            )
+
+    def at(self, times: Array) -> Array:
+        """[M, 3, 3] rotations at `times` [M]. Raises InputError for a time before the first or after the last."""
+        check_covered(self, times)
+        rotations = Rotation.from_quat(self.quaternions[:, [1, 2, 3, 0]])
+        if len(self.times) == 1:
+            return np.repeat(rotations.as_matrix(), len(times), axis=0)
+        largest = float(np.degrees((rotations[:-1].inv() * rotations[1:]).magnitude().max()))
+        if largest > AMBIGUOUS_DEG and not np.isin(times, self.times).all():
+            _log.warning("%s: turns by %.0f degrees between two rows; which way is a guess", self.name, largest)
+        turned: Array = Slerp(self.times, rotations)(times).as_matrix()
+        return turned
+
+
+def check_times(times: Array, name: str) -> None:
+    """Raise InputError unless `times` [N] are finite and grow."""
+    if not len(times):
+        raise InputError(f"{name}: expected at least one time, found none")
+    bad = ~np.isfinite(times)
+    if bad.any():
+        raise InputError(f"{name}: expected finite times, found {times[int(bad.argmax())]} in row {bad.argmax() + 1}")
+    steps = np.diff(times)
+    if (steps <= 0).any():
+        row = int((steps <= 0).argmax()) + 1
+        how = "repeats that of" if steps[row - 1] == 0 else "is before"
+        raise InputError(f"{name}: expected times that grow, found in row {row + 1} one that {how} row {row}")
+
+
+def check_covered(track: Track | Attitude, times: Array) -> None:
+    """Raise InputError where one of `times` [M] is before the track's first or after its last."""
+    first, last = float(track.times[0]), float(track.times[-1])
+    if len(times) and not (first <= times.min() and times.max() <= last):
+        out = times.min() if times.min() < first else times.max()
+        raise InputError(f"{track.name}: expected times from {first:.10g} to {last:.10g} s, found {out:.10g} s")
