@@ -55,6 +55,9 @@ class Source(Protocol):
     def point(self, sun: Sun) -> None:
         """Move the Sun."""
 
+    def place(self, earth: EarthConfig) -> None:
+        """Move the Earth."""
+
 
 @cache
 def _classes() -> tuple[type, type]:
