@@ -1,7 +1,8 @@
 """What `import spacesim as ss` gives: plain values in, records and numpy arrays out.
 
-Each function says in one call what the command of its name does; what is behind it stands in the layers of
-docs/explanation/architecture.md.
+`generate`, `train`, `evaluate`, `compose`, `write_report` and `import_dataset` do what the commands generate, train,
+eval, compose, report and import do; `render` rasterizes Gaussians, `Run.render` is the command render. What is behind
+them stands in the layers of docs/explanation/architecture.md.
 """
 
 from collections.abc import Callable
@@ -100,9 +101,9 @@ def generate(
     workers: processes of this machine
     rig: `PoseRig` of cameras of your own, or another `Rig`;  trajectory: a table that cameras follow
         (docs/how-to/trajectory.md)
-    options: of the scene, as the command line has them: suns, views, test_suns, test_views, sun=[(azimuth, elevation),
-        ...] in degrees, distance in metres, resolution=256 or (width, height) in pixels, fov_deg, exposure (display
-        value of a radiance of 1 W m^-2 sr^-1), spp (samples a pixel), seed
+    options: of the scene, as the command line has them: suns, views (under each Sun), test_suns, test_views,
+        sun=[(azimuth, elevation), ...] in degrees, distance in metres, resolution=256 or (width, height) in pixels,
+        fov_deg, exposure (display value of a radiance of 1 W m^-2 sr^-1), spp (samples a pixel), seed
     progress: called with (frames done, frames in all, name of the frame last done)
 
     Raises InputError for a scene, an option or a folder that cannot be, WorkError where disk, memory or processes fail,

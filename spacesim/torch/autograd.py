@@ -1,8 +1,9 @@
 """The two operations that torch differentiates: Gaussians to splats, splats to pictures; each of all cameras at once.
 
-Of small pictures the host's work takes longer than the kernels: a direction is one array for each tensor that comes or
-goes, and no operation of torch's in between. On CUDA nothing waits for another stream: Dr.Jit's own waits for torch's
-default one, and that for it, as CUDA has it of streams that are not created as non-blocking.
+Of small pictures the host's work takes longer than the kernels. So each pass, forward and backward, hands over one
+array for each tensor, and no operation of torch's stands in between. On CUDA nothing waits for another stream:
+Dr.Jit's own waits for torch's default one, and that for it, as CUDA has it of streams that are not created as
+non-blocking.
 """
 
 from collections.abc import Sequence

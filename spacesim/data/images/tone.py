@@ -34,7 +34,7 @@ def display_values(linear: np.ndarray, tone: str) -> np.ndarray:
 
 
 def filmic(linear: np.ndarray) -> np.ndarray:
-    """Linear values of a film-like curve that keeps highlights up to 7.2 apart: 0.8 for 1, clipped to [0, 1].
+    """Linear values in [0, 1] of a film-like curve: its white is 7.2, and it makes 0.8 of 1.
 
     K. Narkowicz, "ACES Filmic Tone Mapping Curve", 2016: a rational fit to the ACES reference and output transforms.
     """

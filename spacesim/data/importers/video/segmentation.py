@@ -3,8 +3,9 @@
 Before a black sky the object is what is brighter than the sky and neither a star nor cut off by the picture's border.
 Where the Earth is behind it, colours decide: mixtures of Gaussians of the object's colours and of what surrounds it,
 and a random walk with these as priors (L. Grady, "Multilabel random walker image segmentation using prior models",
-2005), which stops at edges. In a sequence the frames before a black sky come first; from these the object is followed
-to their neighbours, where it is nearly at the same place and of the same colours, while what is behind it passes.
+2005), which stops at edges. In a sequence, frames whose background is black sky come first; from these the object is
+followed to their neighbours, where it is nearly at the same place and of the same colours, while what is behind it
+passes.
 """
 
 import math

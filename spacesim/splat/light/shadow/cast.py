@@ -48,7 +48,7 @@ class ShadowConfig:
 
     method: MappingConfig | SplattingConfig = field(default_factory=MappingConfig)  #: shadow mapping or splatting (4.3)
     size: int = 512  #: pixels of each side of the Sun's picture, of which the thesis names none
-    bias: float = 10.0  #: strength lambda_b of the receiver-depth bias (4.26), 0 for none
+    bias: float = 10.0  #: strength lambda_b of the receiver-depth bias (4.26), 0: none but that of `grazing`
     #: what holds at a grazing Sun, too, where the thesis's bias goes to 0: a bias (`grazing_bias`), points offset
     #: along the normals (`offset_receivers`), or both
     grazing: Literal["none", "bias", "lift", "both"] = "none"

@@ -19,7 +19,7 @@ MAX_THRESHOLD = 1e6  #: of any threshold or length that is configured
 
 class Strategy(ABC):
     """state: {name: Float [N]}, all that the next densification step depends on beside the Gaussians themselves; goes
-    into checkpoints and follows every Gaussian that is duplicated, split or pruned."""
+    into checkpoints. `refine` rearranges it with the Gaussians that it duplicates, splits or prunes."""
 
     state: dict[str, Float]
 
