@@ -85,7 +85,7 @@ def main() -> None:
             data = data or shadows.make_data(options.out / "data", resolution=options.resolution)
             config = with_options(row.config, iterations=options.iterations)
             run = trained(options.out / row.run / "run", read_dataset(data), config, row.run, show_progress)
-        results[row.name] = judged(row, run, pair, options.out / "pairs", not options.no_geometry)
+        results[row.name] = evaluated_twice(row, run, pair, options.out / "pairs", not options.no_geometry)
     write_report([options.out / "pairs" / name for name in results], options.out / "pairs/report.html")
     tables = {
         f"The {which} boxsat, Sun ({SUN[0]:g}, {SUN[1]:g})": [
@@ -130,11 +130,11 @@ def make_pair(out: Path, resolution: int, views: int) -> Path:
     return common.generated("boxsat-pair", out, sun=[SUN], **size)
 
 
-def judged(row: Row, run: Run, pair: Dataset, out: Path, shapes: bool) -> dict[str, Any]:
+def evaluated_twice(row: Row, run: Run, pair: Dataset, out: Path, shapes: bool) -> dict[str, Any]:
     """metrics.json of the scene with this run twice."""
-    judge = EvaluateConfig() if shapes else EvaluateConfig(geometry=None)
+    measures = EvaluateConfig() if shapes else EvaluateConfig(geometry=None)
     scene = composed(run, out / f"{row.name}.toml", row.shadows)
-    return evaluated(scene, pair, out / row.name, judge, row.name, show_progress)
+    return evaluated(scene, pair, out / row.name, measures, row.name, show_progress)
 
 
 def table_row(name: str, metrics: Mapping[str, Any], which: str) -> common.Row:

@@ -17,6 +17,7 @@ import textwrap
 import tokenize
 from collections.abc import Iterable, Iterator
 from dataclasses import is_dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 from unittest.mock import patch
@@ -178,7 +179,7 @@ def members(cls: type) -> Iterator[tuple[str, Any]]:
     for name, member in vars(cls).items():
         function = getattr(member, "fget", None) or getattr(member, "__func__", None) or getattr(member, "func", member)
         if not name.startswith("_") and inspect.isfunction(function) and function.__doc__:
-            yield name, function if not isinstance(member, property) else member
+            yield name, member if isinstance(member, property | cached_property) else function
 
 
 def signature(function: Any, name: str) -> str:

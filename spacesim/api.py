@@ -20,6 +20,7 @@ from spacesim.data.store import load_truth
 from spacesim.data.structure import Rules, did_you_mean, places_of
 from spacesim.data.toml import dotted
 from spacesim.data.transforms import read_dataset
+from spacesim.learning.rendering import Rendering
 from spacesim.methods import load_predictor, load_run, load_scene, preset
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.run import NerfRun
@@ -36,7 +37,7 @@ from spacesim.splat.raster.cameras import Pinhole, Projection
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import RenderOutput
 from spacesim.splat.raster.render import render as _render
-from spacesim.splat.run import Rendering, Run
+from spacesim.splat.run import Run
 from spacesim.splat.sun_search import SunEstimate
 from spacesim.splat.train.config import TrainConfig
 

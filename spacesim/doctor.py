@@ -80,7 +80,7 @@ def _check_llvm() -> Finding:
 
 def _check_lpips() -> Finding:
     if _version("torch") is None:
-        return _finding(False, "torch is not installed; type: pip install torch")
+        return _finding(False, "torch is not installed; type: pip install 'spacesim[lpips]'")
     importlib.import_module("torch")
     weights, sentence = importlib.import_module("spacesim.eval.metrics.lpips").find_weights()
     return _finding(weights is not None, sentence)

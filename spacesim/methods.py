@@ -27,8 +27,12 @@ Config = TrainConfig | NerfConfig
 
 
 def preset(name: str = "fast", method: str = "vanilla", strategy: str | None = None) -> Config:
-    """The configuration of a preset; see `splat.train.config.preset` and `nerf.config.preset`. Raises InputError for a
-    name that is none, and for a strategy of a method without Gaussians."""
+    """The configuration of a preset, a `TrainConfig` or, of a radiance field, a `NerfConfig`.
+
+    name: "demo", "fast", "fine" (Gaussians alone) or "thesis";  method: one of `spacesim train --help`;  strategy: of
+    densification, "default" where none is named
+    Raises InputError for a name that is none, and for a strategy of a method without Gaussians.
+    """
     if method not in nerf.METHODS:
         if method not in (*splat.METHODS, *splat.ALIASES):
             hint = did_you_mean(method, METHODS)

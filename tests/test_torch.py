@@ -204,6 +204,14 @@ def test_modes_backgrounds_and_what_is_told():
     assert torch.equal(torch.cat([one[0] for one in each]), rgb)
 
 
+def test_numbers_of_numpy_and_backgrounds_of_one_channel_are_taken():
+    leaves = as_floats(scene())
+    depths, _, _ = rasterization(**leaves, width=SIDE, height=SIDE, sh_degree=3, render_mode="D")
+    size = {"width": np.int64(SIDE), "height": np.int32(SIDE), "near_plane": np.float32(0.01), "sh_degree": 3}
+    over, _, _ = rasterization(**leaves, **size, render_mode="D", backgrounds=torch.ones(2, 1, device=DEVICE))
+    assert torch.equal(depths, over)  # as gsplat has it: depth has no background
+
+
 def test_planes_and_radii_leave_out_what_is_beyond_them():
     leaves = as_floats(scene())
     size = {"width": SIDE, "height": SIDE, "sh_degree": 0, "render_mode": "ED", "packed": False}
@@ -358,7 +366,7 @@ def test_same_tensors_same_bits():
 def test_without_torch_a_sentence():
     program = "import sys; sys.modules['torch'] = None; import spacesim.torch"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert "ImportError: spacesim.torch: expected torch, found none; type: pip install torch" in done.stderr
+    assert "ImportError: spacesim.torch: expected torch, found none; type: pip install 'spacesim[torch]'" in done.stderr
 
 
 def test_recordings_serve_other_numbers_of_gaussians(monkeypatch):

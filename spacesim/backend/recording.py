@@ -140,10 +140,10 @@ class _Names(dict[Any, str]):
     def __init__(self) -> None:
         self._numbers = itertools.count()
 
-    def __missing__(self, told: object) -> str:
+    def __missing__(self, kind: object) -> str:
         if len(self) >= MAX_KEYS:
             self.clear()
-        name = self[told] = str(next(self._numbers))
+        name = self[kind] = str(next(self._numbers))
         return name
 
 
@@ -161,9 +161,9 @@ def _split(value: Any, arrays: list[Any]) -> Any:
         arrays.extend(value)
         return kind, len(value)
     if kind is list or kind is tuple:
-        told = _split_each(value, arrays)
-        new = kind is list and all(part is ... for part in told)  # of a type that is in `_leaves` from now on
-        return kind, len(told) if new else told
+        kinds = _split_each(value, arrays)
+        new = kind is list and all(part is ... for part in kinds)  # of a type that is in `_leaves` from now on
+        return kind, len(kinds) if new else kinds
     if kind is dict:
         return kind, tuple(value), _split_each(value.values(), arrays)
     constant = _constants.get(id(value))
@@ -172,12 +172,12 @@ def _split(value: Any, arrays: list[Any]) -> Any:
     names = _names(kind)  # type: ignore[arg-type]
     if names is not None:
         before = len(arrays)
-        told = _split_each([getattr(value, name) for name in names], arrays)
+        kinds = _split_each([getattr(value, name) for name in names], arrays)
         if len(arrays) > before or not _is_constant(value):
-            return kind, told
+            return kind, kinds
         if len(_constants) >= MAX_KEYS:
             _constants.clear()
-        _constants[id(value)] = value, (kind, _names_of_constants[told])
+        _constants[id(value)] = value, (kind, _names_of_constants[kinds])
         return _constants[id(value)][1]
     _leaves.add(kind)
     arrays.append(value)
@@ -194,17 +194,17 @@ def _is_constant(value: Any) -> bool:
 
 
 def _split_each(values: Iterable[Any], arrays: list[Any]) -> tuple[Any, ...]:
-    told = []
+    kinds = []
     for value in values:
         kind = type(value)
         if kind in _leaves:  # as most are
             arrays.append(value)
-            told.append(...)
+            kinds.append(...)
         elif kind is int:
-            told.append(value)
+            kinds.append(value)
         else:
-            told.append(_split(value, arrays))
-    return tuple(told)
+            kinds.append(_split(value, arrays))
+    return tuple(kinds)
 
 
 def _joined(value: Any, arrays: Iterator[Any]) -> Any:

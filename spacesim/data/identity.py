@@ -53,10 +53,10 @@ def _content_digests(root: Path, paths: Sequence[str]) -> dict[str, str | None]:
         written = (root / MANIFEST).stat().st_mtime_ns if manifest else 0
     except (InputError, OSError):  # a broken one: files tell themselves
         manifest, written = {}, 0
-    told = {path: manifest[path] for path in paths if path in manifest and _changed(root / path) <= written}
-    others = [path for path in dict.fromkeys(paths) if path not in told]
+    known = {path: manifest[path] for path in paths if path in manifest and _changed(root / path) <= written}
+    others = [path for path in dict.fromkeys(paths) if path not in known]
     with ThreadPoolExecutor(_THREADS) as pool:
-        return {**told, **dict(zip(others, pool.map(lambda path: _digest_of(root / path), others), strict=True))}
+        return {**known, **dict(zip(others, pool.map(lambda path: _digest_of(root / path), others), strict=True))}
 
 
 def _changed(path: Path) -> float:

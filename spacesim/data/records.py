@@ -82,7 +82,8 @@ class Camera:
 
     @staticmethod
     def from_fov(world_from_camera: Array, width: int, height: int, fov_x_deg: float) -> "Camera":
-        """A camera with square pixels, a centred principal point and a horizontal field of view in degrees."""
+        """A camera with square pixels, a centred principal point and a horizontal field of view in degrees. Raises
+        InputError for a size or a field of view that no camera has."""
         focal = 0.5 * width / np.tan(0.5 * np.radians(fov_x_deg))
         return Camera(world_from_camera, width, height, focal, focal, 0.5 * width, 0.5 * height)
 
@@ -96,7 +97,9 @@ class Camera:
         up: ArrayLike = (0.0, 0.0, 1.0),
     ) -> "Camera":
         """A camera at `position` [3] that looks at `target` [3], metres, its picture upright towards `up`; see
-        `from_fov`."""
+        `from_fov`. Raises InputError where both are one place, too."""
+        if not np.linalg.norm(np.subtract(target, position)) > 0:
+            raise InputError(f"position: expected another place than the target, found {np.asarray(position).tolist()}")
         return Camera.from_fov(look_at(position, target, up), width, height, fov_x_deg)
 
 
@@ -114,7 +117,8 @@ class Sun:
 
     @staticmethod
     def from_angles(azimuth_deg: float, elevation_deg: float) -> "Sun":
-        """Azimuth from +x towards +y, elevation from the xy plane, degrees (thesis 4.1)."""
+        """Azimuth from +x towards +y, elevation from the xy plane, degrees (thesis 4.1). Raises InputError for numbers
+        that are not finite."""
         return Sun(direction_from_angles(azimuth_deg, elevation_deg))
 
     @staticmethod
@@ -153,7 +157,7 @@ class Truth:
     part_id: np.ndarray  #: [H, W] uint8, 1 for the first part of the scene, 0 none
     sun_visibility: np.ndarray  #: [H, W] fraction of the solar disc seen, 0 where the surface faces away
     sun_cosine: np.ndarray  #: [H, W] n . s
-    shadow: np.ndarray  #: [H, W] uint8 class: see `spacesim.data.store.SHADOW_*`
+    shadow: np.ndarray  #: [H, W] uint8: 0 no surface, 85 faces away, 170 cast by itself, 170 + k by object k, 255 lit
     radiance_earth: np.ndarray | None = None  #: [H, W, 3] the Earth's part of `radiance`, where there is an Earth
     radiance_background: np.ndarray | None = None  #: [H, W, 3] of what was drawn behind the objects, as if alone
 
@@ -166,7 +170,7 @@ class Frame:
     camera: Camera  #: of the image without its distortion
     sun: Sun | None = None  #: None where nobody told it
     gt_path: str | None = None  #: EXR of all that `Truth` has
-    shadow_path: str | None = None  #: PNG of shadow classes: see `spacesim.data.store.SHADOW_*`
+    shadow_path: str | None = None  #: PNG of shadow classes, see `Truth.shadow`
     silhouette_path: str | None = None  #: PNG, 255 where an object is
     id_path: str | None = None  #: PNG, 1 for the first object, 0 none
     depth_file_path: str | None = None  #: depth along the optical axis, as Nerfstudio has it

@@ -22,7 +22,8 @@ from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import read_record
 from spacesim.learning.folder import finished_model, read_described
-from spacesim.learning.prediction import Prediction, Rendering, check_picture
+from spacesim.learning.prediction import Prediction, check_picture
+from spacesim.learning.rendering import Rendering
 from spacesim.learning.tensors import read_tensors
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.draw import draw

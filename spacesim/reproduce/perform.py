@@ -95,23 +95,23 @@ def _perform(root: Path, size: Size, work: Experiment, reporting: Reporting) -> 
     if work.fully_lit:
         dataset = fully_lit_alone(dataset, size.fully_lit_deg)
     run = trained(folder / "run", dataset, work.config, work.name, reporting)
-    judge = EvaluateConfig(geometry=size.geometry)
+    measures = EvaluateConfig(geometry=size.geometry)
     for part in work.parts:
         title = f"{work.name}, {part}"
         if (folder / _last_file(part)).exists():
             continue
         if part == "own":
-            evaluated(run, dataset, folder / part, judge, title, reporting)
+            evaluated(run, dataset, folder / part, measures, title, reporting)
         elif part == "pair":
             assert isinstance(run, Run)
             assert isinstance(work.config, TrainConfig)
             pair = read_dataset(data_folder(root, part))
             scene = composed(run, folder / "pair.toml", shadows_between(work.config))
-            evaluated(scene, pair, folder / part, replace(judge, geometry=None), title, reporting)
+            evaluated(scene, pair, folder / part, replace(measures, geometry=None), title, reporting)
         elif part == "one-sun":
             other = read_dataset(data_folder(root, part))
             _draw_depth(run, other, folder / part, size.fully_lit_deg)
-            evaluated(run, other, folder / part, judge, title, reporting)
+            evaluated(run, other, folder / part, measures, title, reporting)
         elif part == "frames":
             with reporting(title, "scenes") as tell:
                 write_json(folder / _last_file(part), time_frames(run, dataset, tell))
@@ -131,14 +131,14 @@ def trained(folder: Path, dataset: Dataset, config: methods.Config, name: str, r
 
 
 def evaluated(
-    run: "Predictor", dataset: Dataset, folder: Path, judge: EvaluateConfig, name: str, reporting: Reporting
+    run: "Predictor", dataset: Dataset, folder: Path, measures: EvaluateConfig, name: str, reporting: Reporting
 ) -> JsonDict:
     """What metrics.json of an evaluation and its report hold."""
     if (folder / "report.html").exists():
         known: JsonDict = read_json(folder / "metrics.json")
         return known
     with reporting(f"evaluate {name}", "frames") as report:
-        metrics = evaluate(run, dataset, folder, judge, report)
+        metrics = evaluate(run, dataset, folder, measures, report)
     write_report([folder], folder / "report.html")
     return metrics
 

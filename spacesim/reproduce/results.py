@@ -265,8 +265,8 @@ def _best(column: Column, keys: Sequence[str], means: Means) -> Values:
 
 def _in_order(table: Table, key: str, means: Means) -> list[int]:
     """[pairs of rows in the thesis's order, pairs that can be compared], over all columns."""
-    told: list[bool] = []
+    holding: list[bool] = []
     for column in table.columns:
         printed = {name: value for name, value in means["printed", column.metric].items() if value is not None}
-        told += pairs(column, printed, means[key, column.metric])
-    return [sum(told), len(told)]
+        holding += pairs(column, printed, means[key, column.metric])
+    return [sum(holding), len(holding)]

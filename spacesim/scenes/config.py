@@ -167,20 +167,20 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
             raise InputError(f"rig: expected a Rig, such as PoseRig, found {str(rig_given)[:60]!r}")
         scene = replace(scene, rig=rig_given)
     changes: dict[str, JsonDict] = {"": {}, "rig": {}, "camera": {}, "quality": {}}
-    owners = {
+    names_by_part = {
         part: {f.name for f in fields(getattr(scene, part))} if part else {"name", "seed", "background"}
         for part in changes
     }
     for name, value in options.items():
-        part = next((part for part, names in owners.items() if name in names), None)
+        part = next((part for part, names in names_by_part.items() if name in names), None)
         if part is None:
-            raise InputError(f"{name}: expected {_options_of(scene, name, owners)}")
+            raise InputError(f"{name}: expected {_options_of(scene, name, names_by_part)}")
         if value is not None:
             changes[part][name] = (value, value) if name == "resolution" and isinstance(value, int) else value
     rig = changes["rig"]
     if "sun" in rig:
         rig["sun"] = tuple((float(azimuth), float(elevation)) for azimuth, elevation in rig["sun"])
-        if "suns" in owners["rig"]:
+        if "suns" in names_by_part["rig"]:
             rig.setdefault("suns", len(rig["sun"]))
     elif "suns" in rig:
         rig["sun"] = ()
@@ -190,10 +190,10 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
     return replace(scene, **changes[""], **parts)
 
 
-def _options_of(scene: SceneConfig, name: str, owners: Mapping[str, Iterable[str]]) -> str:
+def _options_of(scene: SceneConfig, name: str, names_by_part: Mapping[str, Iterable[str]]) -> str:
     """What is expected of an option that `scene` does not know: those of its rig, where another kind knows it."""
     kinds = kinds_with(name)
-    names = owners["rig"] if kinds else set().union(*owners.values())
+    names = names_by_part["rig"] if kinds else set().union(*names_by_part.values())
     whose = f"{scene.name}, whose rig is of kind {rig_kind(scene.rig)}"
     others = f" ({' and '.join(kinds)} know{'s' * (len(kinds) == 1)} {name})" if kinds else ""
     return f"one of the options {', '.join(sorted(names))} of {whose}{others}"

@@ -22,7 +22,8 @@ from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import read_record
 from spacesim.learning.folder import finished_model, read_described
-from spacesim.learning.prediction import Prediction, Rendering, check_picture
+from spacesim.learning.prediction import Prediction, check_picture
+from spacesim.learning.rendering import Rendering
 from spacesim.splat.light.config import MAX_EXPOSURE
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.gaussians import Gaussians

@@ -8,13 +8,14 @@ Tensors on a CUDA device run on CUDA, others on the CPU, one of the two in a pro
 spinning and take cores from the kernels: `torch.set_num_threads(1)`.
 """
 
+from operator import index
 from typing import TypedDict
 
 try:
     import torch
     from torch import Tensor
 except ImportError:
-    raise ImportError("spacesim.torch: expected torch, found none; type: pip install torch") from None
+    raise ImportError("spacesim.torch: expected torch, found none; type: pip install 'spacesim[torch]'") from None
 
 from spacesim import backend
 from spacesim.torch import arguments
@@ -125,16 +126,17 @@ def rasterization(
     arguments.check_choice("render_mode", render_mode, arguments.RENDER_MODES)
     arguments.check_choice("rasterize_mode", rasterize_mode, arguments.RASTERIZE_MODES)
     arguments.check_choice("camera_model", camera_model, arguments.CAMERA_MODELS)
+    width, height = index(width), index(height)  # numpy's are no numbers of a recording
     count, cameras = arguments.check_shapes(means, quats, scales, opacities, viewmats, Ks, width, height)
     arguments.check_colors(colors, backgrounds, sh_degree, render_mode, means, cameras)
     backend.select("cuda" if means.is_cuda else "llvm")
     settings = arguments.raster_settings(
         width=width,
         height=height,
-        near=near_plane,
-        far=far_plane,
-        radius_clip=radius_clip,
-        eps2d=eps2d,
+        near=float(near_plane),
+        far=float(far_plane),
+        radius_clip=float(radius_clip),
+        eps2d=float(eps2d),
         antialiased=rasterize_mode == "antialiased",
         ortho=camera_model == "ortho",
         degree=sh_degree,

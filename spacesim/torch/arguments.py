@@ -115,7 +115,8 @@ def check_colors(
         if shape[:-2] not in ((count,), (cameras, count)) or shape[-1] != 3 or shape[-2] < (sh_degree + 1) ** 2:
             raise ValueError(f"colors: expected harmonics [{count}, K, 3] of degree {sh_degree}, found {list(shape)}")
     channels = 3 if sh_degree is not None else shape[-1]
-    if backgrounds is not None and tuple(backgrounds.shape) != (cameras, channels):
+    sizes = (channels, 1) if render_mode in ("D", "ED") else (channels,)  # of depths alone backgrounds count nothing
+    if backgrounds is not None and tuple(backgrounds.shape) not in [(cameras, size) for size in sizes]:
         raise ValueError(f"backgrounds: expected [{cameras}, {channels}], found {list(backgrounds.shape)}")
     if render_mode == "D" and shape[-1] == 0:
         raise ValueError("colors: expected at least one channel, found none")

@@ -64,8 +64,8 @@ class Project(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
         ctx.settings, ctx.leaves = settings, _leaves(tensors)
         count = len(tensors[0])
-        room = round_capacity(count)
-        found: list[ProjectedSplats] = [project(leaves, settings, room) for leaves in ctx.leaves]
+        capacity = round_capacity(count)
+        found: list[ProjectedSplats] = [project(leaves, settings, capacity) for leaves in ctx.leaves]
         means2d = _stack([to_table(one.means2d, count, 2) for one in found])
         table = _stack([to_table(one.table, count, TABLE) for one in found])
         radii = _stack([to_table(one.radii, count, 2) for one in found])
@@ -80,11 +80,11 @@ class Project(torch.autograd.Function):
         if grad_means2d is None and grad_table is None:
             return (None,) * (len(tensors) + 1)
         wanted = Wanted(*ctx.needs_input_grad[: len(tensors)])
-        room = round_capacity(len(tensors[0]))
+        capacity = round_capacity(len(tensors[0]))
         each = []
         for camera, leaves in enumerate(ctx.leaves):
             centres, rest = (None if one is None else to_floats(_of(one, camera)) for one in (grad_means2d, grad_table))
-            found = project_back(leaves, ctx.settings, wanted, centres, rest, room)
+            found = project_back(leaves, ctx.settings, wanted, centres, rest, capacity)
             each.append(_gradient_tensors(found, tensors))
         harmonic = tensors[GAUSSIANS]
         shared = GAUSSIANS + (harmonic is None or harmonic.dim() == 3)

@@ -31,18 +31,18 @@ def columns(tensor: Tensor) -> list[Float]:
     return [column(flat, i, size, len(tensor)) for i in range(size)]
 
 
-def rows(values: list[NumberT], size: int, count: int, room: int | None = None) -> NumberT:
-    """A flat array [room * size] whose first `count` rows are `values` (at least one column, at most `size`) side by
-    side; what is missing of a row is 0. One kernel writes it, in packets of at most WIDEST numbers that divide a row;
-    `dr.concat` would launch one for each column.
+def rows(values: list[NumberT], size: int, count: int, capacity: int | None = None) -> NumberT:
+    """A flat array [capacity * size] whose first `count` rows are `values` (at least one column, at most `size`) side
+    by side; what is missing of a row is 0. One kernel writes it, in packets of at most WIDEST numbers that divide a
+    row; `dr.concat` would launch one for each column.
 
-    room: `count` by default; in a recording a number that is an argument of it, by `round_capacity`: what a recording
-    allocates stays as large as it was when it was recorded"""
+    capacity: `count` by default; in a recording a number that is an argument of it, by `round_capacity`: what a
+    recording allocates stays as large as it was when it was recorded"""
     kind = type(values[0])
     packet = next(width for width in (WIDEST, 8, 4, 2, 1) if size % width == 0)
     packets = size // packet
     whole = len(values) + packet > size  # packets that hold a value are all that there are
-    length = size * (count if room is None else room)
+    length = size * (count if capacity is None else capacity)
     target = dr.empty(kind, length) if whole else dr.zeros(kind, length)
     place = dr.arange(ad.UInt32, count) * packets
     values = values + [kind(0)] * (-len(values) % packet)

@@ -138,8 +138,8 @@ class _Inputs:
 
 
 @recorded(elements=lambda arrays, *_rest, **_named: dr.width(arrays[0]) // 3)
-def project(leaves: Leaves, settings: RasterSettings, room: int) -> ProjectedSplats:
-    """Splats of one camera. room: for rows of N Gaussians, by `round_capacity`."""
+def project(leaves: Leaves, settings: RasterSettings, capacity: int) -> ProjectedSplats:
+    """Splats of one camera. capacity: room for the rows of N Gaussians, by `round_capacity`."""
     splats, footprints, colors = _splats_of(_Inputs.of(leaves, settings.degree), settings)
     s, count = splats, dr.width(leaves.opacities)
     halves = footprints.half_width, footprints.half_height
@@ -148,9 +148,9 @@ def project(leaves: Leaves, settings: RasterSettings, room: int) -> ProjectedSpl
         splats=splats,
         footprints=footprints,
         colors=colors,
-        means2d=rows([s.x, s.y], 2, count, room),
-        table=rows([s.a, s.b, s.c, s.opacity, s.depth, *colors], TABLE, count, room),
-        radii=rows(radii, 2, count, room),
+        means2d=rows([s.x, s.y], 2, count, capacity),
+        table=rows([s.a, s.b, s.c, s.opacity, s.depth, *colors], TABLE, count, capacity),
+        radii=rows(radii, 2, count, capacity),
     )
 
 
@@ -161,10 +161,10 @@ def project_back(
     wanted: Wanted,
     grad_means2d: Float | None,
     grad_table: Float | None,
-    room: int,
+    capacity: int,
 ) -> LeafGradients:
     """The adjoint of `project`. grad_means2d [N * 2], grad_table [N * TABLE]: gradients of these, None of one that is
-    all zeros;  room: as there"""
+    all zeros;  capacity: as there"""
     inputs = _Inputs.of(leaves, settings.degree)
     known = {name: getattr(inputs, name) for name, one in vars(wanted).items() if one}
     for group in known.values():
@@ -183,9 +183,9 @@ def project_back(
     found: dict[str, Any] = {name: [dr.grad(value) for value in group] for name, group in known.items()}
     for name, size in (("means", 3), ("quats", 4), ("scales", 3), ("opacities", 1)):
         if name in found:
-            found[name] = rows(found[name], size, count, room)
+            found[name] = rows(found[name], size, count, capacity)
     if "harmonics" in found:
-        found["harmonics"] = rows(found["harmonics"], dr.width(leaves.harmonics) // count, count, room)
+        found["harmonics"] = rows(found["harmonics"], dr.width(leaves.harmonics) // count, count, capacity)
     return LeafGradients(**found)
 
 

@@ -32,7 +32,7 @@ LINEAR_FILE = "alex.pth"
 MIN_SIDE = 31
 """Smallest height and width, pixels, that leave AlexNet's second pooling something to pool."""
 
-INSTALL = "pip install torch"
+INSTALL = "pip install 'spacesim[lpips]'"
 
 # AlexNet's convolutions: place in torchvision's `features`, weight shape, stride, padding, pooling before it.
 _LAYERS = (

@@ -112,8 +112,10 @@ class Field:
         density = DensityField.of(config.grid, config.width, config.features + 3 * has_normals)
         of_sun = config.sun_harmonics if config.knows_sun else None
         terms = (config.harmonics + 1) ** 2 + (0 if of_sun is None else (of_sun + 1) ** 2)
-        told = COSINES if has_normals else terms
-        shape = MlpShape(config.features + told, 1, 6 if config.casts_shadows else 3, config.width, config.color_layers)
+        directions = COSINES if has_normals else terms
+        shape = MlpShape(
+            config.features + directions, 1, 6 if config.casts_shadows else 3, config.width, config.color_layers
+        )
         return Field(density, shape, config.features, config.harmonics, of_sun, has_normals)
 
     @property
@@ -147,10 +149,10 @@ class Field:
         if self.has_normals:
             assert sun is not None, "a field that is told the Sun"
             normal = ad.Array3f(*features[self.features :])
-            told = surface_cosines(normal, view, sun)
+            directions = surface_cosines(normal, view, sun)
         else:
-            told = self.directions(view, sun)
-        items = to_matrix([*features[: self.features], *told])
+            directions = self.directions(view, sun)
+        items = to_matrix([*features[: self.features], *directions])
         raw, layers = mlp.forward(self.color, parameters[self.split :], items, _one())
         color = [sigmoid(row(raw, i)) for i in range(self.color.outputs)]
         return density, color, FieldTape(tape, layers, color, normal, view, sun)

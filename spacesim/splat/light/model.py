@@ -163,7 +163,7 @@ class LightModel:
         reads the mean one."""
         shadows = self.shadows(gaussians, sun)
         embedding = self._mean_embedding() if picture is None else self._embedding(picture)
-        inputs = self._inputs(gaussians, camera, self._told(sun, embedding), shadows)
+        inputs = self._inputs(gaussians, camera, self._with_embedding(sun, embedding), shadows)
         batch = PaddedBatch.of(gaussians.count)
         colors, visibility, tape = kernels.shade(self.config, self.weights, inputs, batch)
         return Shading(colors, visibility[0] if visibility else None, shadows, inputs, batch, tape, picture)
@@ -195,8 +195,8 @@ class LightModel:
         of_any_size = replace(camera, width=1, height=1)  # directions do not depend on it: one recording for all sizes
         batch = PaddedBatch.of(gaussians.count, still=True)
         cache = self._picture_cache(_features(gaussians), batch)
-        told = cache.embedding if embedding is None else [upload(np.asarray(embedding, np.float64))]
-        inputs = self._inputs(gaussians, of_any_size, self._told(sun, told), None)
+        of_picture = cache.embedding if embedding is None else [upload(np.asarray(embedding, np.float64))]
+        inputs = self._inputs(gaussians, of_any_size, self._with_embedding(sun, of_picture), None)
         of_field, _ = split_weights(self.config, self.weights)
         visibility = [] if light.visibility is None else [light.visibility]
         shown = kernels.shade_picture(
@@ -220,9 +220,9 @@ class LightModel:
             grad_visibilities,
             by_sun,
         )
-        grad_features, grad_weights, grad_occlusion, by_told, grad_sun = kernels.adjoint(*arguments)
+        grad_features, grad_weights, grad_occlusion, by_encoding, grad_sun = kernels.adjoint(*arguments)
         grad_geometry = shading.shadows.adjoint(grad_occlusion[0]) if grad_occlusion and shading.shadows else []
-        by_embeddings = [self._embedding_gradient(gradient, shading.picture) for gradient in by_told]
+        by_embeddings = [self._embedding_gradient(gradient, shading.picture) for gradient in by_encoding]
         return LightGradients(grad_features, grad_weights, by_embeddings, grad_geometry, grad_sun)
 
     def tensors(self) -> dict[str, np.ndarray]:
@@ -253,7 +253,7 @@ class LightModel:
             model.embeddings = [upload(embeddings)]
         return model
 
-    def _told(self, sun: np.ndarray | None, embedding: list[Float]) -> SunEncoding:
+    def _with_embedding(self, sun: np.ndarray | None, embedding: list[Float]) -> SunEncoding:
         """`encode_sun` with an embedding in a list, or nothing."""
         terms = self.encode_sun(sun)
         return replace(terms, field_encoding=dr.concat([terms.field_encoding, *embedding])) if embedding else terms
@@ -267,12 +267,12 @@ class LightModel:
         size = self.config.field.embeddings
         return [upload(np.array(every, np.float64).reshape(-1, size).mean(axis=0)) for every in self.embeddings]
 
-    def _embedding_gradient(self, by_told: Float, picture: int | None) -> Float:
-        """Float [V * E], 0 but where the picture's embedding stands. by_told: gradient of what the field is told"""
+    def _embedding_gradient(self, by_encoding: Float, picture: int | None) -> Float:
+        """Float [V * E], 0 but where the picture's embedding stands. by_encoding: gradient of what the field is told"""
         assert picture is not None, "the mean embedding is not trained"
         size, first = self.config.field.embeddings, self.config.field.sun.size
         gradient = dr.zeros(ad.Float, dr.width(self.embeddings[0]))
-        own = dr.gather(ad.Float, by_told, first + dr.arange(ad.UInt32, size))
+        own = dr.gather(ad.Float, by_encoding, first + dr.arange(ad.UInt32, size))
         dr.scatter(gradient, own, self._embedding_index(picture))
         return gradient
 

@@ -196,15 +196,15 @@ def adjoint(
     grad_weights, grad_items = mlp.backward(
         config.field.shape, field_weights, tape.field, inputs.sun.field_encoding, grad_output
     )
-    by_told = []
+    by_encoding = []
     if config.field.embeddings or by_sun:
-        by_told = [mlp.shared_gradient(config.field.shape, field_weights, grad_weights)]
+        by_encoding = [mlp.shared_gradient(config.field.shape, field_weights, grad_weights)]
     parts = [(grad_items, 0, config.field.features)]
     grad_shown = [batch.pad_zeros(gradient) for gradient in grad_visibility]
     grad_facing = [gradient * visibility for gradient in grad_shown] if config.field.surface else []
     grad_sun = []
     if by_sun:
-        grad_sun = [sun_adjoint(config.field, _field_inputs(inputs), grad_items, grad_facing, by_told[0], batch)]
+        grad_sun = [sun_adjoint(config.field, _field_inputs(inputs), grad_items, grad_facing, by_encoding[0], batch)]
     if config.field.surface:
         parts.append((normals_adjoint(config.field, _field_inputs(inputs), grad_items, grad_facing, batch), 0, 3))
     grad_occlusion = -sum(
@@ -230,9 +230,9 @@ def adjoint(
         parts.append((batch.matrix(grad_albedo), 0, 3))
     grad_raw_occlusion = [grad_occlusion] if config.shadow and config.shadow.gradients else []
     dr.eval(grad_raw_occlusion)
-    by_told = by_told if config.field.embeddings else []
+    by_encoding = by_encoding if config.field.embeddings else []
     grad_raw_occlusion = batch.unpad(grad_raw_occlusion, inputs.means.x)
-    return batch.pack(parts, inputs.features), grad_weights, grad_raw_occlusion, by_told, grad_sun
+    return batch.pack(parts, inputs.features), grad_weights, grad_raw_occlusion, by_encoding, grad_sun
 
 
 def _refine_items(config: LightConfig, refine: RefineConfig, inputs: ShadingInputs, batch: PaddedBatch) -> TensorXf:

@@ -167,7 +167,7 @@ def test_what_is_missing_is_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("wishes", "sentence"),
+    ("options", "sentence"),
     [
         ({"fov": 0.0}, "fov: expected degrees from 0.7 to 136, found 0.0"),
         ({"fov": 140.0}, "fov: expected degrees from 0.7 to 136, found 140.0"),
@@ -177,11 +177,11 @@ def test_what_is_missing_is_named(tmp_path, monkeypatch):
         ({"masks": "nowhere"}, "masks: expected a folder, found none"),
     ],
 )
-def test_wrong_options_are_named(tmp_path, wishes, sentence):
+def test_wrong_options_are_named(tmp_path, options, sentence):
     for k, pose in enumerate(poses_around(3)):
         write_png(tmp_path / "in" / f"{k}.png", box_from(pose)[0])
     with pytest.raises(InputError, match=sentence):
-        import_dataset("images", tmp_path / "in", tmp_path / "out", **wishes)
+        import_dataset("images", tmp_path / "in", tmp_path / "out", **options)
 
 
 def test_a_field_of_view_that_no_camera_has_is_refused_at_once(tmp_path, monkeypatch):

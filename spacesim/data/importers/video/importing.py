@@ -39,7 +39,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Wishes:
+class ImportOptions:
     """What both importers are asked for. Raises InputError for a value out of range."""
 
     masks: str | Path | None = None  #: a folder; "none": the background stays; None: cut out by `segment_sequence`
@@ -61,15 +61,15 @@ class Wishes:
 
 
 def import_video(
-    src: Path, out: Path, *, frames: int = FRAMES, progress: Progress | None = None, **wishes: Any
+    src: Path, out: Path, *, frames: int = FRAMES, progress: Progress | None = None, **options: Any
 ) -> Dataset:
-    """Import a video of one object. frames: taken at most, see `frames.choose`; wishes: fields of `Wishes`.
+    """Import a video of one object. frames: taken at most, see `frames.choose`; options: fields of `ImportOptions`.
 
     The dataset has structure.json, which tells how the poses were found, and cameras.png. Its unit is the median
     distance of the cameras where neither `length` nor `distance` is known. Raises InputError as `read_frames` and
     `reconstruct` do, and where `out` is not free.
     """
-    asked = Wishes(**wishes)
+    asked = ImportOptions(**options)
     expect(LEAST <= frames <= 5000, "frames", f"{LEAST} to 5000", frames)
     source = _source("video", src, asked, frames=frames)
     check_free(out, source)
@@ -95,12 +95,12 @@ def import_video(
         return _import(src, out, folder, keys, True, asked, source, tell, {"frames_of_video": len(seen.motion)})
 
 
-def import_images(src: Path, out: Path, *, progress: Progress | None = None, **wishes: Any) -> Dataset:
+def import_images(src: Path, out: Path, *, progress: Progress | None = None, **options: Any) -> Dataset:
     """Import a folder of pictures of one object by one camera; of their names' order, in time where there are many.
 
-    wishes: fields of `Wishes`. Raises InputError as `import_video` does, and for pictures of several sizes.
+    options: fields of `ImportOptions`. Raises InputError as `import_video` does, and for pictures of several sizes.
     """
-    asked = Wishes(**wishes)
+    asked = ImportOptions(**options)
     if not src.is_dir():
         raise InputError(f"{src}: expected a folder of pictures, found {'a file' if src.exists() else 'nothing'}")
     source = _source("images", src, asked)
@@ -129,7 +129,7 @@ def _import(
     folder: Path,
     keys: Mapping[str, Mapping[str, JsonValue]],
     ordered: bool,
-    asked: Wishes,
+    asked: ImportOptions,
     source: dict[str, JsonValue],
     tell: "_Teller",
     facts: dict[str, JsonValue],
@@ -168,7 +168,7 @@ def _import(
     )
 
 
-def _find_masks(folder: Path, names: Sequence[str], asked: Wishes, tell: "_Teller") -> bool:
+def _find_masks(folder: Path, names: Sequence[str], asked: ImportOptions, tell: "_Teller") -> bool:
     """Write folder/masks/NAME, 255 the object; False where the background stays."""
     if asked.masks is not None and str(asked.masks) == NO_MASKS:
         return False
@@ -230,7 +230,7 @@ def _frames(
         )
 
 
-def _source(kind: str, src: Path, asked: Wishes, **more: JsonValue) -> dict[str, JsonValue]:
+def _source(kind: str, src: Path, asked: ImportOptions, **more: JsonValue) -> dict[str, JsonValue]:
     options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(asked).items()}
     return {"kind": kind, "source": str(src), **more, **options}
 

@@ -138,8 +138,8 @@ def _jittered(rows: list[Float], values: Float, streams: UInt64) -> list[Float]:
     normal = [random.next_float32_normal() for _ in range(3)]
     scales = [dr.exp(row) for row in rows[3:6]]
     axes = principal_axes(ad.Array4f(rows[6:10]))
-    factor, gate = (dr.gather(ad.Float, values, ad.UInt32(i)) for i in range(2))
-    opening = factor * dr.rcp(1 + dr.exp(OPACITY_GATE_SLOPE * (opacities(rows[10]) - gate)))
+    factor, least = (dr.gather(ad.Float, values, ad.UInt32(i)) for i in range(2))
+    opening = factor * dr.rcp(1 + dr.exp(OPACITY_GATE_SLOPE * (opacities(rows[10]) - least)))
     vector = ad.Array3f(normal)
     along = [dr.dot(axis, vector) * scale * scale for axis, scale in zip(axes, scales, strict=True)]
     moved = ad.Array3f(rows[:3]) + opening * (along[0] * axes[0] + along[1] * axes[1] + along[2] * axes[2])

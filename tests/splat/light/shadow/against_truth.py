@@ -76,7 +76,7 @@ def main() -> None:
     print(f"| shadows | error | balanced | {classes} | dark at {grazing} |")
     raw = () if options.own else raw_shadows(run.gaussians, dataset, options.size)
     for name, visibility in itertools.chain(raw, own_shadows(run)):
-        shares = judged(run.gaussians, dataset, frames, visibility)
+        shares = mask_errors(run.gaussians, dataset, frames, visibility)
         print(f"| {name} | {' | '.join(f'{100 * share:.1f}' for share in shares)} |", flush=True)
 
 
@@ -112,7 +112,7 @@ def unseen(dataset: Dataset) -> list[Frame]:
     return [frame for of_sun in found.values() for frame in of_sun[:VIEWS]]
 
 
-def judged(gaussians: Gaussians, dataset: Dataset, frames: Sequence[Frame], visibility: Visibility) -> list[float]:
+def mask_errors(gaussians: Gaussians, dataset: Dataset, frames: Sequence[Frame], visibility: Visibility) -> list[float]:
     """Of lit and cast-shadow pixels the error rate and the balanced one; share of lit pixels that are dark, of those in
     cast and in attached shadow that are lit, of all that are wrong; then the share of lit pixels that are dark, by the
     Sun's elevation over the surface (`EDGES`)."""
