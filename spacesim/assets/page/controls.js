@@ -1,0 +1,148 @@
+// The page: orbiting, zooming, dragging the Sun; by mouse, touch and keys.
+
+const FIELD_OF_VIEW = 35; // degrees, over the shorter side of the window
+const SUN_AWAY = 1.25; // of the model's radius: where the Sun's handle stands
+const START = { azimuth: 20, elevation: 20, distance: 1, sunAzimuth: 45, sunElevation: 35 };
+const DEGREES_PER_PIXEL = 0.4, DEGREES_PER_KEY = 5, ZOOM_PER_KEY = 1.15;
+
+const element = (id) => document.getElementById(id);
+const clamp = (value, least, most) => Math.min(Math.max(value, least), most);
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+
+class Controls {
+  constructor(renderer, about) {
+    Object.assign(this, { renderer, about, canvas: renderer.canvas, handle: element("sun"), pointers: new Map() });
+    this.fit = about.radius / Math.sin((FIELD_OF_VIEW / 2) * (Math.PI / 180)); // distance from which all is seen
+    this.state = { ...START };
+    for (const id of about.sun ? ["suns", "sun", "sunhelp", "sunkeys"] : []) element(id).hidden = false;
+    this.#listen();
+    this.change({});
+  }
+
+  /** Move the view or the Sun, and draw. */
+  change(moves) {
+    const state = Object.assign(this.state, moves);
+    state.elevation = clamp(state.elevation, -89.9, 89.9);
+    state.distance = clamp(state.distance, 0.05, 20);
+    state.sunElevation = clamp(state.sunElevation, -90, 90);
+    state.sunAzimuth = ((state.sunAzimuth % 360) + 360) % 360;
+    for (const [id, value] of [["azimuth", state.sunAzimuth], ["elevation", state.sunElevation]]) {
+      element(id).value = value;
+      document.querySelector(`output[for=${id}]`).value = `${value.toFixed(0)}°`;
+    }
+    this.waiting ??= requestAnimationFrame(() => {
+      this.waiting = null;
+      this.draw();
+    });
+  }
+
+  draw() {
+    const { canvas } = this, ratio = Math.min(window.devicePixelRatio, 2);
+    const width = Math.max(1, Math.round(canvas.clientWidth * ratio)), height = Math.max(1, Math.round(canvas.clientHeight * ratio));
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    const camera = this.camera(width, height), sun = directionFromAngles(this.state.sunAzimuth, this.state.sunElevation);
+    this.renderer.draw(camera, sun);
+    if (this.about.sun) this.#placeHandle(camera, sun, ratio);
+  }
+
+  /** The camera of a picture, pixels: see `Renderer.draw`. */
+  camera(width, height) {
+    const { azimuth, elevation, distance } = this.state, away = directionFromAngles(azimuth, elevation);
+    const eye = this.about.centre.map((value, i) => value + distance * this.fit * away[i]);
+    const forward = away.map((value) => -value), length = Math.hypot(forward[0], forward[1]);
+    const right = [forward[1] / length, -forward[0] / length, 0], down = cross(forward, right);
+    const focal = (0.5 * Math.min(width, height)) / Math.tan((FIELD_OF_VIEW / 2) * (Math.PI / 180));
+    return { axes: [...right, ...down, ...forward], eye, lens: [focal, focal, width / 2, height / 2] };
+  }
+
+  #placeHandle({ axes, eye, lens }, sun, ratio) {
+    const offset = this.about.centre.map((value, i) => value + SUN_AWAY * this.about.radius * sun[i] - eye[i]);
+    const [x, y, z] = [0, 3, 6].map((row) => dot(axes.slice(row, row + 3), offset));
+    const { clientWidth, clientHeight } = this.canvas, scale = lens[0] / Math.max(z, 1e-3) / ratio;
+    this.handle.style.left = `${clamp(clientWidth / 2 + scale * x, 22, clientWidth - 22)}px`;
+    this.handle.style.top = `${clamp(clientHeight / 2 + scale * y, 22, clientHeight - 22)}px`;
+    this.isNear = dot(axes.slice(6), sun) < 0;
+    this.handle.classList.toggle("behind", !this.isNear);
+  }
+
+  #moveSun(right, up, degrees) {
+    const { sunAzimuth, sunElevation } = this.state;
+    this.change({ sunAzimuth: sunAzimuth + degrees * right, sunElevation: sunElevation + degrees * up });
+  }
+
+  #orbit(right, up, degrees) {
+    this.change({ azimuth: this.state.azimuth - degrees * right, elevation: this.state.elevation - degrees * up });
+  }
+
+  #listen() {
+    const { canvas, handle, pointers, about } = this;
+    for (const target of [canvas, handle]) {
+      target.addEventListener("pointerdown", (event) => {
+        target.setPointerCapture(event.pointerId);
+        const movesSun = about.sun && (target === handle || event.shiftKey);
+        pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, movesSun, side: this.isNear ? 1 : -1 });
+      });
+      target.addEventListener("pointermove", (event) => this.#drag(event));
+      for (const end of ["pointerup", "pointercancel"])
+        target.addEventListener(end, (event) => pointers.delete(event.pointerId));
+      target.addEventListener("keydown", (event) => this.#press(event, target === handle));
+    }
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.change({ distance: this.state.distance * Math.exp(clamp(event.deltaY, -200, 200) * 0.0015) });
+    }, { passive: false });
+    element("azimuth").addEventListener("input", (event) => this.change({ sunAzimuth: event.target.valueAsNumber }));
+    element("elevation").addEventListener("input", (event) => this.change({ sunElevation: event.target.valueAsNumber }));
+    element("panel").addEventListener("reset", (event) => {
+      event.preventDefault();
+      this.change(START);
+    });
+    new ResizeObserver(() => this.change({})).observe(canvas);
+    canvas.addEventListener("webglcontextlost", () => element("message").append("The graphics were lost: reload the page."));
+  }
+
+  #drag(event) {
+    const { pointers } = this, pointer = pointers.get(event.pointerId);
+    if (!pointer) return;
+    const right = event.clientX - pointer.x, down = event.clientY - pointer.y, apart = this.#apart();
+    Object.assign(pointer, { x: event.clientX, y: event.clientY });
+    if (pointers.size === 2) this.change({ distance: (this.state.distance * apart) / Math.max(this.#apart(), 1) });
+    else if (pointer.movesSun) this.#moveSun(pointer.side * right, -down, DEGREES_PER_PIXEL);
+    else if (pointers.size === 1) this.#orbit(right, -down, DEGREES_PER_PIXEL);
+  }
+
+  /** Pixels between two fingers. */
+  #apart() {
+    const [a, b] = this.pointers.values();
+    return b ? Math.hypot(a.x - b.x, a.y - b.y) : 1;
+  }
+
+  #press(event, isSun) {
+    const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+    const zooms = { "+": 1 / ZOOM_PER_KEY, "=": 1 / ZOOM_PER_KEY, "-": ZOOM_PER_KEY };
+    if (event.ctrlKey || event.altKey || event.metaKey) return;
+    if (arrows[event.key]) {
+      const [right, up] = arrows[event.key];
+      if (this.about.sun && (isSun || event.shiftKey)) this.#moveSun(this.isNear ? right : -right, up, DEGREES_PER_KEY);
+      else this.#orbit(-right, -up, DEGREES_PER_KEY);
+    } else if (zooms[event.key]) this.change({ distance: this.state.distance * zooms[event.key] });
+    else if (event.key.toLowerCase() === "r") this.change(START);
+    else return;
+    event.preventDefault();
+  }
+}
+
+async function start() {
+  const about = JSON.parse(element("about").textContent), message = element("message");
+  try {
+    const arrays = await unpack(element("data").textContent, about.arrays);
+    window.controls = new Controls(new Renderer(element("view"), about, arrays), about);
+    message.textContent = "";
+  } catch (error) {
+    message.textContent = error.message;
+    throw error;
+  }
+}
+
+start();

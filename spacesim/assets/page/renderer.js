@@ -1,0 +1,244 @@
+// WebGL 2: textures of the model, and a picture of what a camera sees under a Sun.
+
+const LAYERS = 6; // parts in which a picture is drawn; between them, pixels that are opaque are closed
+
+class Renderer {
+  /** Raises Error where the browser has no WebGL 2. */
+  constructor(canvas, about, arrays) {
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
+    if (!gl) throw new Error("This page needs WebGL 2, which this browser or its settings do not give.");
+    Object.assign(this, { gl, canvas, about, arrays });
+    this.isFine = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
+    const { count, components, terms, curve } = about, defines = {
+      COMPONENTS: components, TERMS: terms, NODES: `${about.nodes?.[2] ?? 1}.0`, SPREAD: about.antialiased ? 1 / 12 : 0.3,
+      LINEAR: Boolean(curve), FILMIC: curve?.tone === "filmic",
+    };
+    for (const name of ["cosines", "bounce", "antialiased", "curve"]) if (about[name]) defines[name.toUpperCase()] = "";
+    const header = ["#version 300 es", "precision highp float;", "precision highp int;"];
+    for (const [name, value] of Object.entries(defines)) header.push(`#define ${name} ${value}`);
+    const program = (vertex, fragment) => this.#program(vertex, `${header.join("\n")}\n${fragment}`);
+    this.shade = program(SHADE_VERTEX, SHADE_FRAGMENT);
+    this.splat = program(`${header.join("\n")}\n${SPLAT_VERTEX}`, SPLAT_FRAGMENT);
+    this.close = program(SHADE_VERTEX, CLOSE_FRAGMENT);
+    this.show = program(SHADE_VERTEX, SHOW_FRAGMENT);
+
+    this.rows = Math.ceil(count / WIDTH);
+    const texture = (...format) => this.#texture(WIDTH, this.rows, ...format);
+    this.textures = {
+      means: texture(gl.RGB32F, gl.RGB, gl.FLOAT, this.#padded(arrays.means, 3)),
+      turns: texture(gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, this.#padded(arrays.quaternions, 4)),
+      shapes: texture(gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, this.#padded(arrays.shapes, 4)),
+      front: texture(gl.RGBA32F, gl.RGBA, gl.FLOAT, null),
+      back: texture(gl.RGBA32F, gl.RGBA, gl.FLOAT, null),
+      shaded: this.isFine ? texture(gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, null) : texture(gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, null),
+      colors: this.#layers(arrays.colors, components),
+    };
+    if (about.cosines) this.textures.table = this.#table(arrays.color_table);
+    const normals = arrays.normals ?? new Int8Array(3 * count);
+    this.textures.normals = texture(gl.RGB8_SNORM, gl.RGB, gl.BYTE, this.#padded(normals, 3));
+    this.light = { front: new Float32Array(4 * WIDTH * this.rows), back: new Float32Array(4 * WIDTH * this.rows) };
+    this.shadeTarget = this.#target(this.textures.shaded);
+    this.order = gl.createBuffer();
+    this.sorted = new Uint32Array(count);
+    this.depths = new Float32Array(count);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    gl.bufferData(gl.ARRAY_BUFFER, this.sorted.byteLength, gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribDivisor(0, 1);
+    this.sun = null;
+  }
+
+  /** Draw the picture that a camera {axes: [9] camera from world, eye: [3], lens: [4]} sees under a Sun [3]. */
+  draw(camera, sun, stops = 0) {
+    const { gl, canvas, about } = this;
+    if (this.width !== canvas.width || this.height !== canvas.height) this.#resize(canvas.width, canvas.height);
+    this.#shade(camera, sun);
+    this.#sort(camera);
+
+    const [fx, fy, cx, cy] = camera.lens, { width, height } = this;
+    const limits = [(-0.15 * width - cx) / fx, (-0.15 * height - cy) / fy, (1.15 * width - cx) / fx, (1.15 * height - cy) / fy];
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.pictureTarget);
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clearDepth(1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    this.#use(this.splat, ["means", "turns", "shapes", "shaded"]);
+    gl.uniformMatrix3fv(this.#at("axes"), true, camera.axes);
+    gl.uniform3fv(this.#at("eye"), camera.eye);
+    gl.uniform4fv(this.#at("lens"), camera.lens);
+    gl.uniform4fv(this.#at("limits"), limits);
+    gl.uniform2f(this.#at("size"), width, height);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
+    gl.enable(gl.DEPTH_TEST);
+    gl.depthMask(false);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    for (let layer = 0; layer < LAYERS; layer++) {
+      const first = Math.floor((layer * this.drawn) / LAYERS), end = Math.floor(((layer + 1) * this.drawn) / LAYERS);
+      if (layer > 0) this.#closeOpaque();
+      gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 4 * first);
+      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, end - first);
+    }
+    gl.depthMask(true);
+    gl.disable(gl.DEPTH_TEST);
+    gl.disable(gl.BLEND);
+
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    this.#use(this.show, []);
+    this.#bind("picture", this.picture, gl.TEXTURE_2D, 0);
+    gl.uniform1f(this.#at("gain"), about.curve ? about.curve.white * 2 ** stops : 1);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /** Colours of all Gaussians, a texel each. */
+  #shade(camera, sun) {
+    const { gl, about, arrays } = this;
+    if (this.sun === null || sun.some((value, i) => value !== this.sun[i])) {
+      this.sun = [...sun];
+      lightUp(about, arrays, sun, this.light.front, this.light.back);
+      for (const side of about.bounce ? ["front", "back"] : ["front"]) {
+        gl.bindTexture(gl.TEXTURE_2D, this.textures[side]);
+        gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.rows, gl.RGBA, gl.FLOAT, this.light[side]);
+      }
+      if (!about.cosines)
+        this.basis = interpolateRow(arrays.color_table, about.color_side, about.terms * about.components, sun);
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.shadeTarget);
+    gl.viewport(0, 0, WIDTH, this.rows);
+    this.#use(this.shade, ["means", "normals", "front", "back"]);
+    this.#bind("colors", this.textures.colors, gl.TEXTURE_2D_ARRAY, 6);
+    if (about.cosines) this.#bind("table", this.textures.table, gl.TEXTURE_3D, 7);
+    else gl.uniform4fv(this.#at("table"), this.basis);
+    gl.uniform3fv(this.#at("eye"), camera.eye);
+    gl.uniform3fv(this.#at("sun"), sun);
+    gl.uniform1f(this.#at("offset"), about.offset);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /** Numbers of the Gaussians before the camera, near ones first: sorted by counting. */
+  #sort({ axes, eye }) {
+    const { count } = this.about, { means } = this.arrays, { depths, sorted } = this, [, , , , , , x, y, z] = axes;
+    const shift = x * eye[0] + y * eye[1] + z * eye[2];
+    let least = Infinity, most = -Infinity;
+    for (let i = 0; i < count; i++) {
+      depths[i] = x * means[3 * i] + y * means[3 * i + 1] + z * means[3 * i + 2] - shift;
+      const depth = depths[i]; // in single precision
+      if (depth > 0 && depth < least) least = depth;
+      if (depth > most) most = depth;
+    }
+    const bins = 1 << 16, scale = (bins - 1) / Math.max(most - least, 1e-9), starts = new Uint32Array(bins + 1);
+    for (let i = 0; i < count; i++) if (depths[i] >= least) starts[Math.floor((depths[i] - least) * scale) + 1]++;
+    for (let bin = 0; bin < bins; bin++) starts[bin + 1] += starts[bin];
+    this.drawn = starts[bins];
+    for (let i = 0; i < count; i++) if (depths[i] >= least) sorted[starts[Math.floor((depths[i] - least) * scale)]++] = i;
+    this.gl.bindBuffer(this.gl.ARRAY_BUFFER, this.order);
+    this.gl.bufferSubData(this.gl.ARRAY_BUFFER, 0, sorted.subarray(0, this.drawn));
+  }
+
+  /** Pixels that are opaque get depth 0, which nothing is drawn behind. */
+  #closeOpaque() {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.closeTarget);
+    gl.useProgram(this.close);
+    this.#bind("picture", this.picture, gl.TEXTURE_2D, 0);
+    gl.depthMask(true);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.depthMask(false);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.pictureTarget);
+    this.#use(this.splat, ["means", "turns", "shapes", "shaded"]);
+  }
+
+  #resize(width, height) {
+    const { gl } = this;
+    for (const target of [this.pictureTarget, this.closeTarget]) gl.deleteFramebuffer(target ?? null);
+    gl.deleteTexture(this.picture ?? null);
+    gl.deleteRenderbuffer(this.depth ?? null);
+    Object.assign(this, { width, height });
+    this.picture = this.isFine 
+      ? this.#texture(width, height, gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, null)
+      : this.#texture(width, height, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, null);
+    this.depth = gl.createRenderbuffer();
+    gl.bindRenderbuffer(gl.RENDERBUFFER, this.depth);
+    gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT16, width, height);
+    this.pictureTarget = this.#target(this.picture, this.depth);
+    this.closeTarget = this.#target(null, this.depth);
+  }
+
+  #target(color, depth = null) {
+    const { gl } = this, target = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    if (color) gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, color, 0);
+    else gl.drawBuffers([gl.NONE]);
+    if (depth) gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
+    return target;
+  }
+
+  #program(vertex, fragment) {
+    const { gl } = this, program = gl.createProgram();
+    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+    return program;
+  }
+
+  #use(program, names) {
+    this.program = program;
+    this.gl.useProgram(program);
+    names.forEach((name, unit) => this.#bind(name, this.textures[name], this.gl.TEXTURE_2D, unit));
+  }
+
+  #bind(name, texture, kind, unit) {
+    const { gl } = this;
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(kind, texture);
+    gl.uniform1i(this.#at(name), unit);
+  }
+
+  #at(name) {
+    return this.gl.getUniformLocation(this.gl.getParameter(this.gl.CURRENT_PROGRAM), name);
+  }
+
+  #texture(width, height, inside, format, type, values) {
+    const { gl } = this, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.texImage2D(gl.TEXTURE_2D, 0, inside, width, height, 0, format, type, values);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+    return texture;
+  }
+
+  #layers(values, layers) {
+    const { gl, rows } = this, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
+    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGB8_SNORM, WIDTH, rows, layers);
+    const length = values.length / layers;
+    for (let k = 0; k < layers; k++) {
+      const layer = this.#padded(values.subarray(k * length, (k + 1) * length), 3);
+      gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, WIDTH, rows, 1, gl.RGB, gl.BYTE, layer);
+    }
+    return texture;
+  }
+
+  #table(values) {
+    const { gl, about } = this, [width, height, depth] = about.nodes, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_3D, texture);
+    gl.texImage3D(gl.TEXTURE_3D, 0, gl.RGBA16F, width, height, (depth * about.components) / 4, 0, gl.RGBA, gl.HALF_FLOAT, values);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_3D, name, gl.LINEAR);
+    for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T, gl.TEXTURE_WRAP_R])
+      gl.texParameteri(gl.TEXTURE_3D, name, gl.CLAMP_TO_EDGE);
+    return texture;
+  }
+
+  /** Numbers of the Gaussians with zeros up to the end of the texture's last row. */
+  #padded(values, each) {
+    const full = new values.constructor(each * WIDTH * this.rows);
+    full.set(values);
+    return full;
+  }
+}
