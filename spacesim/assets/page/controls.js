@@ -3,6 +3,8 @@
 const FIELD_OF_VIEW = 35; // degrees, over the shorter side of the window
 const SUN_AWAY = 1.25; // of the model's radius: where the Sun's handle stands
 const START = { azimuth: 20, elevation: 20, distance: 1, sunAzimuth: 45, sunElevation: 35 };
+const FRAME = 1000 / 30, REST = 250; // milliseconds: of a frame, and until the view is at rest
+const SHARES = [1, 0.75, 0.5, 0.375]; // of the full resolution, while it moves where frames take longer
 const DEGREES_PER_PIXEL = 0.4, DEGREES_PER_KEY = 5, ZOOM_PER_KEY = 1.15;
 
 const element = (id) => document.getElementById(id);
@@ -12,7 +14,7 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 
 class Controls {
   constructor(renderer, about) {
-    Object.assign(this, { renderer, about, canvas: renderer.canvas, handle: element("sun"), pointers: new Map() });
+    Object.assign(this, { renderer, about, canvas: renderer.canvas, handle: element("sun"), pointers: new Map(), share: 0 });
     this.fit = about.radius / Math.sin((FIELD_OF_VIEW / 2) * (Math.PI / 180)); // distance from which all is seen
     this.state = { ...START };
     for (const id of about.sun ? ["suns", "sun", "sunhelp", "sunkeys"] : []) element(id).hidden = false;
@@ -31,14 +33,21 @@ class Controls {
       element(id).value = value;
       document.querySelector(`output[for=${id}]`).value = `${value.toFixed(0)}°`;
     }
-    this.waiting ??= requestAnimationFrame(() => {
-      this.waiting = null;
-      this.draw();
-    });
+    this.waiting ??= requestAnimationFrame((now) => this.#drawMoving(now));
   }
 
-  draw() {
-    const { canvas } = this, ratio = Math.min(window.devicePixelRatio, 2);
+  /** A picture in the resolution that the last frames had time for; once all is at rest, the full one. */
+  #drawMoving(now) {
+    const took = now - this.last;
+    if (took < REST) this.share = clamp(this.share + (took > 1.2 * FRAME) - (took < 0.6 * FRAME), 0, SHARES.length - 1);
+    Object.assign(this, { waiting: null, last: now });
+    this.draw(SHARES[this.share]);
+    clearTimeout(this.resting);
+    if (this.share > 0) this.resting = setTimeout(() => this.draw(), REST);
+  }
+
+  draw(share = 1) {
+    const { canvas } = this, ratio = share * Math.min(window.devicePixelRatio, 2);
     const width = Math.max(1, Math.round(canvas.clientWidth * ratio)), height = Math.max(1, Math.round(canvas.clientHeight * ratio));
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     const camera = this.camera(width, height), sun = directionFromAngles(this.state.sunAzimuth, this.state.sunElevation);

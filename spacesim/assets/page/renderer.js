@@ -1,11 +1,9 @@
 // WebGL 2: textures of the model, and a picture of what a camera sees under a Sun.
 
-const LAYERS = 6; // parts in which a picture is drawn; between them, pixels that are opaque are closed
-
 class Renderer {
   /** Raises Error where the browser has no WebGL 2. */
   constructor(canvas, about, arrays) {
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
+    const gl = canvas.getContext("webgl2", { antialias: false, depth: false });
     if (!gl) throw new Error("This page needs WebGL 2, which this browser or its settings do not give.");
     Object.assign(this, { gl, canvas, about, arrays });
     this.isFine = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
@@ -17,10 +15,9 @@ class Renderer {
     const header = ["#version 300 es", "precision highp float;", "precision highp int;"];
     for (const [name, value] of Object.entries(defines)) header.push(`#define ${name} ${value}`);
     const program = (vertex, fragment) => this.#program(vertex, `${header.join("\n")}\n${fragment}`);
-    this.shade = program(SHADE_VERTEX, SHADE_FRAGMENT);
+    this.shade = program(FULL_VERTEX, SHADE_FRAGMENT);
     this.splat = program(`${header.join("\n")}\n${SPLAT_VERTEX}`, SPLAT_FRAGMENT);
-    this.close = program(SHADE_VERTEX, CLOSE_FRAGMENT);
-    this.show = program(SHADE_VERTEX, SHOW_FRAGMENT);
+    this.show = program(FULL_VERTEX, SHOW_FRAGMENT);
 
     this.rows = Math.ceil(count / WIDTH);
     const texture = (...format) => this.#texture(WIDTH, this.rows, ...format);
@@ -30,7 +27,7 @@ class Renderer {
       shapes: texture(gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, this.#padded(arrays.shapes, 4)),
       front: texture(gl.RGBA32F, gl.RGBA, gl.FLOAT, null),
       back: texture(gl.RGBA32F, gl.RGBA, gl.FLOAT, null),
-      shaded: this.isFine ? texture(gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, null) : texture(gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, null),
+      shaded: this.#empty(WIDTH, this.rows),
       colors: this.#layers(arrays.colors, components),
     };
     if (about.cosines) this.textures.table = this.#table(arrays.color_table);
@@ -38,18 +35,15 @@ class Renderer {
     this.textures.normals = texture(gl.RGB8_SNORM, gl.RGB, gl.BYTE, this.#padded(normals, 3));
     this.light = { front: new Float32Array(4 * WIDTH * this.rows), back: new Float32Array(4 * WIDTH * this.rows) };
     this.shadeTarget = this.#target(this.textures.shaded);
-    this.order = gl.createBuffer();
-    this.sorted = new Uint32Array(count);
+    this.textures.order = texture(gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, null);
+    this.sorted = new Uint32Array(WIDTH * this.rows);
     this.depths = new Float32Array(count);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.bufferData(gl.ARRAY_BUFFER, this.sorted.byteLength, gl.DYNAMIC_DRAW);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribDivisor(0, 1);
+    this.#makeQuads(count);
     this.sun = null;
   }
 
   /** Draw the picture that a camera {axes: [9] camera from world, eye: [3], lens: [4]} sees under a Sun [3]. */
-  draw(camera, sun, stops = 0) {
+  draw(camera, sun) {
     const { gl, canvas, about } = this;
     if (this.width !== canvas.width || this.height !== canvas.height) this.#resize(canvas.width, canvas.height);
     this.#shade(camera, sun);
@@ -57,36 +51,26 @@ class Renderer {
 
     const [fx, fy, cx, cy] = camera.lens, { width, height } = this;
     const limits = [(-0.15 * width - cx) / fx, (-0.15 * height - cy) / fy, (1.15 * width - cx) / fx, (1.15 * height - cy) / fy];
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.pictureTarget);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, about.curve ? this.pictureTarget : null);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
-    gl.clearDepth(1);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    this.#use(this.splat, ["means", "turns", "shapes", "shaded"]);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    this.#use(this.splat, ["means", "turns", "shapes", "shaded", "order"]);
     gl.uniformMatrix3fv(this.#at("axes"), true, camera.axes);
     gl.uniform3fv(this.#at("eye"), camera.eye);
     gl.uniform4fv(this.#at("lens"), camera.lens);
     gl.uniform4fv(this.#at("limits"), limits);
     gl.uniform2f(this.#at("size"), width, height);
     gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
-    gl.enable(gl.DEPTH_TEST);
-    gl.depthMask(false);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    for (let layer = 0; layer < LAYERS; layer++) {
-      const first = Math.floor((layer * this.drawn) / LAYERS), end = Math.floor(((layer + 1) * this.drawn) / LAYERS);
-      if (layer > 0) this.#closeOpaque();
-      gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 4 * first);
-      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, end - first);
-    }
-    gl.depthMask(true);
-    gl.disable(gl.DEPTH_TEST);
+    gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE); // what is nearer comes first
+    gl.drawElements(gl.TRIANGLES, 6 * this.drawn, gl.UNSIGNED_INT, 0);
     gl.disable(gl.BLEND);
+    if (!about.curve) return;
 
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     this.#use(this.show, []);
     this.#bind("picture", this.picture, gl.TEXTURE_2D, 0);
-    gl.uniform1f(this.#at("gain"), about.curve ? about.curve.white * 2 ** stops : 1);
+    gl.uniform1f(this.#at("white"), about.curve.white);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
@@ -117,7 +101,7 @@ class Renderer {
 
   /** Numbers of the Gaussians before the camera, near ones first: sorted by counting. */
   #sort({ axes, eye }) {
-    const { count } = this.about, { means } = this.arrays, { depths, sorted } = this, [, , , , , , x, y, z] = axes;
+    const { gl, depths, sorted } = this, { count } = this.about, { means } = this.arrays, [, , , , , , x, y, z] = axes;
     const shift = x * eye[0] + y * eye[1] + z * eye[2];
     let least = Infinity, most = -Infinity;
     for (let i = 0; i < count; i++) {
@@ -131,45 +115,40 @@ class Renderer {
     for (let bin = 0; bin < bins; bin++) starts[bin + 1] += starts[bin];
     this.drawn = starts[bins];
     for (let i = 0; i < count; i++) if (depths[i] >= least) sorted[starts[Math.floor((depths[i] - least) * scale)]++] = i;
-    this.gl.bindBuffer(this.gl.ARRAY_BUFFER, this.order);
-    this.gl.bufferSubData(this.gl.ARRAY_BUFFER, 0, sorted.subarray(0, this.drawn));
+    gl.bindTexture(gl.TEXTURE_2D, this.textures.order);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, sorted);
   }
 
-  /** Pixels that are opaque get depth 0, which nothing is drawn behind. */
-  #closeOpaque() {
-    const { gl } = this;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.closeTarget);
-    gl.useProgram(this.close);
-    this.#bind("picture", this.picture, gl.TEXTURE_2D, 0);
-    gl.depthMask(true);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
-    gl.depthMask(false);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.pictureTarget);
-    this.#use(this.splat, ["means", "turns", "shapes", "shaded"]);
+  /** Two triangles a Gaussian: software draws instances one by one, many times as slowly. */
+  #makeQuads(count) {
+    const { gl } = this, corners = new Uint32Array(6 * count);
+    for (let i = 0; i < count; i++) [0, 1, 2, 2, 1, 3].forEach((corner, j) => (corners[6 * i + j] = 4 * i + corner));
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
   }
 
+  /** Linear light is blended in half floats: eight bits would show steps in the dark. */
   #resize(width, height) {
     const { gl } = this;
-    for (const target of [this.pictureTarget, this.closeTarget]) gl.deleteFramebuffer(target ?? null);
-    gl.deleteTexture(this.picture ?? null);
-    gl.deleteRenderbuffer(this.depth ?? null);
     Object.assign(this, { width, height });
-    this.picture = this.isFine 
-      ? this.#texture(width, height, gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, null)
-      : this.#texture(width, height, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, null);
-    this.depth = gl.createRenderbuffer();
-    gl.bindRenderbuffer(gl.RENDERBUFFER, this.depth);
-    gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT16, width, height);
-    this.pictureTarget = this.#target(this.picture, this.depth);
-    this.closeTarget = this.#target(null, this.depth);
+    if (!this.about.curve) return;
+    gl.deleteFramebuffer(this.pictureTarget ?? null);
+    gl.deleteTexture(this.picture ?? null);
+    this.picture = this.#empty(width, height);
+    this.pictureTarget = this.#target(this.picture);
   }
 
-  #target(color, depth = null) {
+  /** A texture to draw into, of half floats where these can be. */
+  #empty(width, height) {
+    const { gl } = this;
+    if (this.isFine) return this.#texture(width, height, gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, null);
+    return this.#texture(width, height, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, null);
+  }
+
+  #target(color) {
     const { gl } = this, target = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
-    if (color) gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, color, 0);
-    else gl.drawBuffers([gl.NONE]);
-    if (depth) gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, color, 0);
     return target;
   }
 

@@ -2,7 +2,7 @@
 
 const WIDTH = 2048; // Gaussians in a row of a texture
 
-const SHADE_VERTEX = `#version 300 es
+const FULL_VERTEX = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
 // A fragment a Gaussian: its colour seen from the eye, dimmed by shadow, with the light that bounces onto it.
@@ -81,13 +81,15 @@ uniform mat3 axes; // camera from world
 uniform vec3 eye;
 uniform vec4 lens, limits; // focal lengths and principal point, pixels; tangents at which splats are linearized at most
 uniform vec2 size; // pixels
-layout(location = 0) in uint splat;
+uniform highp usampler2D order; // numbers of the Gaussians, near ones first
 out vec2 place; // standard deviations from the centre
 flat out vec3 color;
 flat out float power; // log2 of the opacity
 
 void main() {
-  ivec2 at = ivec2(splat % ${WIDTH}u, splat / ${WIDTH}u);
+  int number = gl_VertexID / 4, corner = gl_VertexID % 4;
+  int splat = int(texelFetch(order, ivec2(number % ${WIDTH}, number / ${WIDTH}), 0).r);
+  ivec2 at = ivec2(splat % ${WIDTH}, splat / ${WIDTH});
   vec4 q = texelFetch(turns, at, 0), shape = texelFetch(shapes, at, 0);
   vec3 center = axes * (texelFetch(means, at, 0).xyz - eye), scale = exp(shape.xyz);
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // not drawn
@@ -115,7 +117,7 @@ void main() {
   float longer = 0.5 * (xx + yy) + radius, shorter = determinant / longer;
   float cosine = radius > 0.0 ? half_difference / radius : 1.0; // of twice the angle of the longer axis
   vec2 along = vec2(sqrt(0.5 + 0.5 * cosine), (xy < 0.0 ? -1.0 : 1.0) * sqrt(max(0.5 - 0.5 * cosine, 0.0)));
-  place = reach * (2.0 * vec2(gl_VertexID & 1, gl_VertexID >> 1) - 1.0);
+  place = reach * (2.0 * vec2(corner & 1, corner >> 1) - 1.0);
   vec2 pixel = lens.xy * tangent + lens.zw + place.x * sqrt(longer) * along + place.y * sqrt(shorter) * vec2(-along.y, along.x);
   color = texelFetch(shaded, at, 0).rgb;
   power = log2(opacity);
@@ -134,22 +136,16 @@ void main() {
   shown = vec4(alpha * color, alpha);
 }`;
 
-// Closes what is opaque: the depth test then ends the work there.
-const CLOSE_FRAGMENT = `
-uniform sampler2D picture;
-void main() { if (texelFetch(picture, ivec2(gl_FragCoord.xy), 0).a < 0.999) discard; }`;
-
+// Linear light through the tone curve.
 const SHOW_FRAGMENT = `
 uniform sampler2D picture;
-uniform float gain;
+uniform float white;
 out vec4 shown;
 void main() {
   vec3 v = texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb;
-#ifdef CURVE
-  v *= gain;
+  v *= white;
   if (FILMIC) v = v * (2.51 * v + 0.03) / (v * (2.43 * v + 0.59) + 0.14);
   v = clamp(v, 0.0, 1.0);
   v = mix(12.92 * v, 1.055 * pow(v, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, v));
-#endif
   shown = vec4(v, 1.0);
 }`;

@@ -124,6 +124,7 @@ class _Cosines:
         shared = self.light.encode_sun(None).field_encoding
         output, _ = mlp.forward(field.shape, self.weights, items, shared, self.first_layer)
         colors = [mlp.sigmoid(batch.row(output, channel)) for channel in range(3)]
+        dr.eval(colors)
         return np.stack([np.array(color)[: self.gaussians.count] for color in colors], axis=1)
 
     def table(self, inverse: np.ndarray, report: Callable[[], None]) -> np.ndarray:

@@ -28,12 +28,15 @@ Arrays = dict[str, np.ndarray]
 def write_page(run: Run, path: Path, report: Callable[[int, int], None] | None = None) -> None:
     """Write `run` as a page. report: told (steps done, of all)
 
-    The same run on the same machine gives the same bytes. Raises InputError for a run without Gaussians.
+    The same run on the same backend gives the same bytes. Raises InputError for a run without Gaussians and for a file
+    that cannot be written.
     """
     if run.gaussian_count == 0:
         raise InputError(f"{run.path}: expected a run with Gaussians, found none")
+    if Path(path).is_dir():
+        raise InputError(f"{path}: expected a file to write, found a folder")
     about, arrays = _content(run, report)
-    write_bytes(path, _page(run, about, arrays).encode())
+    write_bytes(Path(path), _page(run, about, arrays).encode())
 
 
 def _content(run: Run, report: Callable[[int, int], None] | None) -> tuple[JsonDict, Arrays]:
