@@ -19,7 +19,9 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     form = parser.add_mutually_exclusive_group(required=True)
     form.add_argument("--ply", type=Path, metavar="FILE", help="Gaussians: INRIA layout, the dataset's frame and scale")
     form.add_argument("--mesh", type=Path, metavar="FILE", help="the surface of a run: .ply, .obj, .glb or .stl")
-    form.add_argument("--html", type=Path, metavar="FILE", help="a run as one page for any browser: orbit, drag the Sun")
+    form.add_argument(
+        "--html", type=Path, metavar="FILE", help="a run as one page for any browser: orbit, drag the Sun"
+    )
     form.add_argument("--speedplus", type=Path, metavar="DIR", help="a dataset's images and poses as SPEED+ has them")
     form.add_argument("--bop", type=Path, metavar="DIR", help="a dataset's images, depth, masks, poses, models for BOP")
     parser.add_argument("--sun", type=angles, metavar="AZ,EL", help="for --ply of a relightable run: whose colours")

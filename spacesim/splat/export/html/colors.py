@@ -49,7 +49,10 @@ class ColorTables:
 
 def color_steps(light: LightModel | None) -> int:
     """How often `tabulate_colors` reports."""
-    return 0 if light is None else CONDITIONS + _kind(light).nodes
+    if light is None:
+        return 0
+    suns = SUN_SIDE**2 if light.config.field.knows_sun else 1
+    return CONDITIONS + (int(np.prod(NODES)) if tells_cosines(light) else suns * VIEWS)
 
 
 def tabulate_colors(gaussians: Gaussians, light: LightModel | None, report: Callable[[], None]) -> ColorTables:
@@ -97,8 +100,6 @@ def _sample(gaussians: Gaussians) -> Gaussians:
 class _Cosines:
     """Conditions are what `surface_cosines` gives."""
 
-    nodes = int(np.prod(NODES))
-
     def __init__(self, gaussians: Gaussians, light: LightModel) -> None:
         self.gaussians, self.light, self.field = gaussians, light, light.config.field
         self.batch = PaddedBatch.of(gaussians.count, still=True)
@@ -145,8 +146,6 @@ class _Cosines:
 
 class _Directions:
     """Conditions are a Sun, None of a field that is not told, and a direction from the camera."""
-
-    nodes = SUN_SIDE**2 * VIEWS
 
     def __init__(self, gaussians: Gaussians, light: LightModel) -> None:
         self.gaussians, self.light = gaussians, light

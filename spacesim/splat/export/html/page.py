@@ -42,8 +42,7 @@ def write_page(run: Run, path: Path, report: Callable[[int, int], None] | None =
 def _content(run: Run, report: Callable[[int, int], None] | None) -> tuple[JsonDict, Arrays]:
     """What the page is told, and its arrays."""
     gaussians, light = run.gaussians, run.light
-    lit = light is not None and light.config.field.knows_sun
-    steps = color_steps(light) + (sunlight_steps(gaussians.count) if lit else 0)
+    steps = color_steps(light) + (sunlight_steps(gaussians, light) if light else 0)
     done = 0
 
     def step() -> None:
@@ -53,7 +52,7 @@ def _content(run: Run, report: Callable[[int, int], None] | None) -> tuple[JsonD
             report(done, steps)
 
     colors = tabulate_colors(gaussians, light, step)
-    sunlight = tabulate_sunlight(gaussians, light, step) if lit else None
+    sunlight = tabulate_sunlight(gaussians, light, step) if light else None
     arrays = _shapes(gaussians) | {"colors": colors.coefficients, "color_table": colors.table}
     means = arrays["means"].astype(np.float64)
     about: JsonDict = {
@@ -61,7 +60,7 @@ def _content(run: Run, report: Callable[[int, int], None] | None) -> tuple[JsonD
         "centre": np.median(means, axis=0).tolist(),
         "radius": robust_radius(means),
         "antialiased": run.antialiased,
-        "sun": lit,
+        "sun": run.relightable,
         "components": len(colors.coefficients),
         "offset": colors.offset,
     }

@@ -45,11 +45,11 @@ def octahedral_directions(side: int) -> np.ndarray:
 
 def tabulate_sunlight(gaussians: Gaussians, light: LightModel, report: Callable[[], None]) -> SunlightTables:
     """Tables of a model that knows the Sun, of N Gaussians. report: called `sunlight_steps` times"""
-    count, side = gaussians.count, _side(gaussians.count)
+    count, side = gaussians.count, _side(gaussians, light)
     directions = octahedral_directions(side)
     check_memory(count * len(directions) * 2, f"shadows of {count} Gaussians under {len(directions)} Suns")
     levels = np.zeros((len(directions), count), np.uint8)
-    blocks = side // BOUNCE_SIDE
+    blocks = max(side // BOUNCE_SIDE, 1)
     bounced = np.zeros((BOUNCE_SIDE, BOUNCE_SIDE, count, 6), np.float32)
     albedo = _albedo(gaussians, light)
     for index, sun in enumerate(directions):
@@ -67,13 +67,15 @@ def tabulate_sunlight(gaussians: Gaussians, light: LightModel, report: Callable[
     return SunlightTables(side, packed, components.reshape(len(components), count, 6), table)
 
 
-def sunlight_steps(count: int) -> int:
-    """How often `tabulate_sunlight` of `count` Gaussians reports."""
-    return _side(count) ** 2
+def sunlight_steps(gaussians: Gaussians, light: LightModel) -> int:
+    """How often `tabulate_sunlight` reports."""
+    return _side(gaussians, light) ** 2
 
 
-def _side(count: int) -> int:
-    return SIDE if count <= MANY else SIDE_OF_MANY
+def _side(gaussians: Gaussians, light: LightModel) -> int:
+    if light.config.shadow is None:
+        return BOUNCE_SIDE if light.config.bounce else 0
+    return SIDE if gaussians.count <= MANY else SIDE_OF_MANY
 
 
 def _albedo(gaussians: Gaussians, light: LightModel) -> np.ndarray:
