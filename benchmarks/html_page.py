@@ -5,7 +5,7 @@
 "frames/s" is what headless Chromium draws in software, each frame waited for: while the view goes round, while the Sun
 does, and while the page itself may draw fewer pixels, as it does where frames take long. Decibels are PSNR within the
 silhouette: of the page and of `render` against the true pictures of Suns that no training picture shows, each Sun's
-first frame, and of the page against `render`, over whole pictures.
+first frame (of data that has none: test frames), and of the page against `render`, over whole pictures.
 """
 
 import base64
@@ -33,7 +33,7 @@ from spacesim.splat.export.html.page import write_page
 from spacesim.splat.run import Run, load_run
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
-from browser import CHROMIUM, Browser, Page, wait_for  # noqa: E402
+from browser import CHROMIUM, Browser, Page, wait_for
 
 LEAST_ALPHA = 0.5  #: of the silhouette
 MOVES = {
@@ -55,7 +55,8 @@ def main() -> None:
         sys.exit("expected Chromium, found none")
     backend.select(options.backend)
     run = load_run(options.run)
-    frames, dataset = unseen(options.data or Path(run.config["data"]["path"]), options.suns)
+    dataset = read_dataset(options.data or Path(run.config["data"]["path"]))
+    frames, what = judged(dataset, options.suns)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "page.html"
         start = time.perf_counter()
@@ -79,21 +80,22 @@ def main() -> None:
     tables = {
         "The page": [size],
         "Frames a second": rates,
-        f"{len(near)} unseen Suns": [means | {"worst loss, dB": worst}],
+        f"{len(near)} {what}": [means | {"worst loss, dB": worst}],
     }
     common.emit({"page": size, "rates": rates, "suns": near, "means": means, "worst_loss": worst}, tables, options)
 
 
-def unseen(path: Path, count: int) -> tuple[list[Frame], Dataset]:
-    """The first test frame of each of `count` Suns at most that training has not seen; of data without Suns, of all."""
-    dataset = read_dataset(path)
+def judged(dataset: Dataset, count: int) -> tuple[list[Frame], str]:
+    """The first test frame of each of `count` Suns at most that training has not seen, or, where there are none, the
+    first test frames; which of these they are."""
     known = known_suns(dataset.test, dataset.train)
-    frames = [frame for frame, seen in zip(dataset.test, known, strict=True) if not seen]
-    by_sun = {None if frame.sun is None else tuple(frame.sun.direction): frame for frame in reversed(frames)}
-    chosen = list(by_sun.values())[::-1] if None not in by_sun else frames
-    if not chosen:
-        raise InputError(f"{path}: expected test frames under Suns that training has not seen, found none")
-    return chosen[:count], dataset
+    frames = [frame for frame, seen in zip(dataset.test, known, strict=True) if seen is False]
+    by_sun = {tuple(frame.sun.direction): frame for frame in reversed(frames) if frame.sun is not None}
+    if by_sun:
+        return list(by_sun.values())[::-1][:count], "unseen Suns"
+    if not dataset.test:
+        raise InputError(f"{dataset.root}: expected test frames, found none")
+    return dataset.test[:count], "test frames"
 
 
 def opened(browser: Browser, path: Path, width: int, height: int) -> Page:

@@ -1,13 +1,13 @@
-"""The colours of Gaussians, shadows apart, by principal components: K numbers a channel of each Gaussian, and a table of
-what Sun and view make of each component, which all share.
+"""The colours of Gaussians, shadows apart, by principal components: K numbers a channel of each Gaussian, and a table,
+which all share, of what Sun and view make of each component.
 
 A field's colours of a Gaussian are a function of a condition c, Sun and view. With coefficients C [3 N, K] and K
 functions b(c), they are C b(c). C comes from the principal components of a sample of the Gaussians under random c, b at
 the table's nodes from least squares over the sample. There are two kinds of c, as there are of fields:
 
 cosines      of surface fields: n . h, n . v and n . s about each Gaussian's own normal
-directions   of all others: the Sun's and, by spherical harmonics, the view's. Plain harmonics (`vanilla`) are this, too,
-             with one Sun, and a component for each harmonic
+directions   of all others: the Sun's and, by spherical harmonics, the view's. Plain harmonics (`vanilla`) are this,
+             too, with one Sun, and a component for each harmonic
 """
 
 from collections.abc import Callable
@@ -104,6 +104,7 @@ class _Cosines:
         self.gaussians, self.light, self.field = gaussians, light, light.config.field
         self.batch = PaddedBatch.of(gaussians.count, still=True)
         self.weights, _ = split_weights(light.config, light.weights)
+        assert gaussians.features is not None, "a field reads features"
         self.first_layer = first_layer_of_features(self.field, self.weights, gaussians.features, self.batch)
 
     def conditions(self, rng: np.random.Generator) -> np.ndarray:

@@ -1,8 +1,8 @@
 """What the Sun gives each Gaussian, tabulated over all directions of the Sun: shadows and light that bounces.
 
-Visibility is nearly binary and follows no few components: with 256 of them, 256 bytes a Gaussian, the error is 0.08 (root
-mean square); an octahedral map of 32 x 32 directions (Cigolle et al. 2014) at 4 bits takes 110 bytes once deflated, and
-pictures of it are 0.03 dB from those of the run (`benchmarks/html_page.py`). What bounces is smooth: few components do.
+Visibility is nearly binary and follows no few components: with 256 of them, 256 bytes a Gaussian, it is 0.08 off (root
+mean square). An octahedral map of 32 x 32 directions (Cigolle et al. 2014) at 4 bits, 115 bytes once deflated, costs
+pictures 0.03 dB. What bounces is smooth: few components do.
 """
 
 from collections.abc import Callable
@@ -89,7 +89,7 @@ def _albedo(gaussians: Gaussians, light: LightModel) -> np.ndarray:
 
 def _principal_components(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(float32 [S, K], int8 [K, M]) whose product, in shares of 1/127, is near `rows` [S, M]."""
-    values, vectors = np.linalg.eigh(rows.astype(np.float64) @ rows.T.astype(np.float64))
+    _, vectors = np.linalg.eigh(rows.astype(np.float64) @ rows.T.astype(np.float64))
     basis = vectors[:, ::-1][:, :BOUNCE_COMPONENTS]
     return quantized(basis, basis.T.astype(np.float32) @ rows)
 
