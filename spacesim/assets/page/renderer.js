@@ -153,7 +153,7 @@ class Renderer {
   }
 
   #program(vertex, fragment) {
-    const { gl } = this, program = gl.createProgram();
+    const { gl } = this, program = Object.assign(gl.createProgram(), { places: {} });
     for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, text);
@@ -180,7 +180,8 @@ class Renderer {
   }
 
   #at(name) {
-    return this.gl.getUniformLocation(this.gl.getParameter(this.gl.CURRENT_PROGRAM), name);
+    const { gl, program } = this;
+    return (program.places[name] ??= gl.getUniformLocation(program, name));
   }
 
   #texture(width, height, inside, format, type, values) {
