@@ -39,6 +39,16 @@ function octahedralCells([x, y, z], side) {
   ];
 }
 
+/** The nearest cell of such a map. */
+function nearestCell(x, y, z, side) {
+  const sum = Math.abs(x) + Math.abs(y) + Math.abs(z);
+  const across = x / sum, along = y / sum;
+  const u = z < 0 ? (1 - Math.abs(along)) * (across < 0 ? -1 : 1) : across;
+  const v = z < 0 ? (1 - Math.abs(across)) * (along < 0 ? -1 : 1) : along;
+  const column = Math.min(Math.floor(((u + 1) / 2) * side), side - 1);
+  return Math.min(Math.floor(((v + 1) / 2) * side), side - 1) * side + column;
+}
+
 /** A row of a table [directions, width] at a direction, interpolated. */
 function interpolateRow(table, side, width, sun) {
   const row = new Float32Array(width);

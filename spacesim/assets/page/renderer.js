@@ -99,13 +99,15 @@ class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /** Numbers of the Gaussians before the camera, near ones first: sorted by counting. */
+  /** Numbers of the Gaussians before the camera that can be seen, near ones first: sorted by counting. */
   #sort({ axes, eye }) {
     const { gl, depths, sorted } = this, { count } = this.about, { means } = this.arrays, [, , , , , , x, y, z] = axes;
+    const outside = this.#isOutside(eye);
     const shift = x * eye[0] + y * eye[1] + z * eye[2];
     let least = Infinity, most = -Infinity;
     for (let i = 0; i < count; i++) {
       depths[i] = x * means[3 * i] + y * means[3 * i + 1] + z * means[3 * i + 2] - shift;
+      if (outside && !this.#isSeen(i, eye)) depths[i] = -Infinity;
       const depth = depths[i]; // in single precision
       if (depth > 0 && depth < least) least = depth;
       if (depth > most) most = depth;
@@ -117,6 +119,20 @@ class Renderer {
     for (let i = 0; i < count; i++) if (depths[i] >= least) sorted[starts[Math.floor((depths[i] - least) * scale)]++] = i;
     gl.bindTexture(gl.TEXTURE_2D, this.textures.order);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, sorted);
+  }
+
+  /** Whether no Gaussian but outliers is farther from the centre than the eye: maps of what is seen hold then. */
+  #isOutside(eye) {
+    const { centre, seen } = this.about;
+    return Math.hypot(...centre.map((value, i) => eye[i] - value)) > seen.radius;
+  }
+
+  /** Whether a Gaussian is seen from the eye: its map's nearest direction. */
+  #isSeen(i, eye) {
+    const { means, seen } = this.arrays, { side } = this.about.seen;
+    const x = eye[0] - means[3 * i], y = eye[1] - means[3 * i + 1], z = eye[2] - means[3 * i + 2];
+    const cell = nearestCell(x, y, z, side);
+    return (seen[(i * side * side + cell) >> 3] >> (cell & 7)) & 1;
   }
 
   /** Two triangles a Gaussian: software draws instances one by one, many times as slowly. */

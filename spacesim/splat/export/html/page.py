@@ -14,6 +14,8 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, write_bytes
 from spacesim.data.tone import WHITES
 from spacesim.splat.export.html.colors import NODES, color_steps, tabulate_colors, tells_cosines
+from spacesim.splat.export.html.seen import SIDE as SEEN_SIDE
+from spacesim.splat.export.html.seen import tabulate_seen
 from spacesim.splat.export.html.sunlight import BOUNCE_SIDE, SunlightTables, sunlight_steps, tabulate_sunlight
 from spacesim.splat.light.model import robust_radius
 from spacesim.splat.raster.gaussians import Gaussians
@@ -42,7 +44,7 @@ def write_page(run: Run, path: Path, report: Callable[[int, int], None] | None =
 def _content(run: Run, report: Callable[[int, int], None] | None) -> tuple[JsonDict, Arrays]:
     """What the page is told, and its arrays."""
     gaussians, light = run.gaussians, run.light
-    steps = color_steps(light) + (sunlight_steps(gaussians, light) if light else 0)
+    steps = SEEN_SIDE**2 + color_steps(light) + (sunlight_steps(gaussians, light) if light else 0)
     done = 0
 
     def step() -> None:
@@ -55,10 +57,14 @@ def _content(run: Run, report: Callable[[int, int], None] | None) -> tuple[JsonD
     sunlight = tabulate_sunlight(gaussians, light, step) if light else None
     arrays = _shapes(gaussians) | {"colors": colors.coefficients, "color_table": colors.table}
     means = arrays["means"].astype(np.float64)
+    centre = np.median(means, axis=0)
+    seen = tabulate_seen(gaussians, run.antialiased, centre, step)
+    arrays["seen"] = seen.bits
     about: JsonDict = {
         "count": gaussians.count,
-        "centre": np.median(means, axis=0).tolist(),
+        "centre": centre.tolist(),
         "radius": robust_radius(means),
+        "seen": {"side": SEEN_SIDE, "radius": seen.radius},
         "antialiased": run.antialiased,
         "sun": run.relightable,
         "components": len(colors.coefficients),

@@ -15,10 +15,10 @@ from tiny import call
 
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import look_at
+from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera, Sun
 from spacesim.eval.metrics.image import psnr
-from spacesim.splat.export.html import colors, sunlight
+from spacesim.splat.export.html import colors, seen, sunlight
 from spacesim.splat.export.html.page import write_page
 from spacesim.splat.export.html.sunlight import octahedral_directions
 from spacesim.splat.light.config import LightConfig
@@ -213,6 +213,23 @@ def test_the_sun_is_dragged_by_its_handle_with_shift_and_by_sliders(relit):
     assert "-30°" in relit.text()
 
 
+def test_slow_frames_have_fewer_pixels_until_all_is_at_rest(relit):
+    share = relit.evaluate(
+        """new Promise(done => {
+            let frames = 0;
+            const step = () => {
+                const start = performance.now();
+                while (performance.now() - start < 60);
+                controls.change({ azimuth: controls.state.azimuth + 1 });
+                if (++frames < 14) requestAnimationFrame(step);
+                else done(controls.canvas.width / innerWidth);
+            };
+            step(); })"""
+    )
+    assert share < 0.5
+    wait_for(lambda: relit.evaluate("controls.canvas.width === innerWidth"), "the full resolution")
+
+
 def test_keys_and_reset(relit):
     start = state(relit)
     relit.evaluate("element('view').focus()")
@@ -239,6 +256,32 @@ def test_the_page_stands_alone_and_is_small(pages):
         assert "default-src 'none'" in text
         assert not re.search(r"https?:|import\s*\(|src=|\{\{", text)
         assert len(text) < 10e6 / 15_000 * COUNT + 250_000  # the tables and the program are the same for all
+
+
+def test_what_a_shell_hides_is_not_drawn_but_from_within(runs, tabs):
+    """A small ball amid a closed shell, and one far outside."""
+    rng = np.random.default_rng(2)
+    shell = fibonacci_sphere(2000)
+    means = np.concatenate([shell, [[0.0, 0, 0], [0, 0, 1.6]]])
+    arrays = {
+        "means": means,
+        "log_scales": np.log(np.concatenate([np.full((2000, 3), 0.09), np.full((2, 3), 0.05)])),
+        "quaternions": rng.normal(size=(2002, 4)),
+        "logit_opacities": np.full(2002, 7.0),
+        "sh": np.zeros((2002, 1, 3)),
+    }
+    steps: list[None] = []
+    found = seen.tabulate_seen(Gaussians.from_numpy(arrays), False, np.zeros(3), lambda: steps.append(None))
+    bits = np.unpackbits(found.bits, axis=1, bitorder="little")
+    assert len(steps) == bits.shape[1] == seen.SIDE**2
+    assert bits[2000].sum() == 0
+    assert bits[2001].all()  # beyond the pictures
+    cosine = shell @ octahedral_directions(seen.SIDE).T
+    assert bits[:2000][cosine > 0.3].mean() > 0.97
+    assert bits[:2000][cosine < -0.5].mean() < 0.01
+    tabs["relit"].evaluate("controls.change({ distance: 3 })")
+    wait_for(lambda: tabs["relit"].evaluate("controls.waiting === null"), "the picture")
+    assert 0 < tabs["relit"].evaluate("controls.renderer.drawn") < COUNT
 
 
 def test_the_same_run_gives_the_same_bytes(runs, pages, tmp_path):
