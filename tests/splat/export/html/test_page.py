@@ -258,7 +258,7 @@ def test_the_page_stands_alone_and_is_small(pages):
         assert len(text) < 10e6 / 15_000 * COUNT + 250_000  # the tables and the program are the same for all
 
 
-def test_what_a_shell_hides_is_not_drawn_but_from_within(runs, tabs):
+def test_what_a_shell_hides_is_not_seen():
     """A small ball amid a closed shell, and one far outside."""
     rng = np.random.default_rng(2)
     shell = fibonacci_sphere(2000)
@@ -279,9 +279,16 @@ def test_what_a_shell_hides_is_not_drawn_but_from_within(runs, tabs):
     cosine = shell @ octahedral_directions(seen.SIDE).T
     assert bits[:2000][cosine > 0.3].mean() > 0.97
     assert bits[:2000][cosine < -0.75].mean() < 0.01
-    tabs["relit"].evaluate("controls.change({ distance: 3 })")
-    wait_for(lambda: tabs["relit"].evaluate("controls.waiting === null"), "the picture")
-    assert 0 < tabs["relit"].evaluate("controls.renderer.drawn") < COUNT
+
+
+def test_what_is_hidden_is_not_drawn_but_from_within(relit):
+    drawn_at = "(controls.state.distance = {}, controls.draw(), controls.renderer.drawn)"
+    assert relit.evaluate(drawn_at.format(1)) > 0.5 * COUNT
+    relit.evaluate("{ const { seen } = controls.renderer.arrays; window.kept = seen.slice(); seen.fill(0); }")
+    assert relit.evaluate(drawn_at.format(1)) == 0
+    assert relit.evaluate(drawn_at.format(0.05)) > 0
+    relit.evaluate("{ controls.renderer.arrays.seen.set(kept); }")
+    assert relit.evaluate(drawn_at.format(1)) > 0.5 * COUNT
 
 
 def test_the_same_run_gives_the_same_bytes(runs, pages, tmp_path):
