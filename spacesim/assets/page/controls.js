@@ -30,8 +30,10 @@ class Controls {
     state.sunElevation = clamp(state.sunElevation, -90, 90);
     state.sunAzimuth = ((state.sunAzimuth % 360) + 360) % 360;
     for (const [id, value] of [["azimuth", state.sunAzimuth], ["elevation", state.sunElevation]]) {
+      const output = document.querySelector(`output[for=${id}]`), text = `${value.toFixed(0)}°`;
+      if (output.value === text && element(id).valueAsNumber === value) continue;
       element(id).value = value;
-      document.querySelector(`output[for=${id}]`).value = `${value.toFixed(0)}°`;
+      output.value = text;
     }
     this.waiting ??= requestAnimationFrame((now) => this.#drawMoving(now));
   }
@@ -48,7 +50,7 @@ class Controls {
 
   draw(share = 1) {
     const { canvas } = this, ratio = share * Math.min(window.devicePixelRatio, 2);
-    const width = Math.max(1, Math.round(canvas.clientWidth * ratio)), height = Math.max(1, Math.round(canvas.clientHeight * ratio));
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     const camera = this.camera(width, height), sun = directionFromAngles(this.state.sunAzimuth, this.state.sunElevation);
     this.renderer.draw(camera, sun);
@@ -69,8 +71,9 @@ class Controls {
     const offset = this.about.centre.map((value, i) => value + SUN_AWAY * this.about.radius * sun[i] - eye[i]);
     const [x, y, z] = [0, 3, 6].map((row) => dot(axes.slice(row, row + 3), offset));
     const { clientWidth, clientHeight } = this.canvas, scale = lens[0] / Math.max(z, 1e-3) / ratio;
-    this.handle.style.left = `${clamp(clientWidth / 2 + scale * x, 22, clientWidth - 22)}px`;
-    this.handle.style.top = `${clamp(clientHeight / 2 + scale * y, 22, clientHeight - 22)}px`;
+    const left = clamp(clientWidth / 2 + scale * x, 22, clientWidth - 22);
+    const top = clamp(clientHeight / 2 + scale * y, 22, clientHeight - 22);
+    this.handle.style.transform = `translate(${left}px, ${top}px)`; // which lays nothing out anew
     this.isNear = dot(axes.slice(6), sun) < 0;
     this.handle.classList.toggle("behind", !this.isNear);
   }

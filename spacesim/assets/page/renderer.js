@@ -50,7 +50,8 @@ class Renderer {
     this.#sort(camera);
 
     const [fx, fy, cx, cy] = camera.lens, { width, height } = this;
-    const limits = [(-0.15 * width - cx) / fx, (-0.15 * height - cy) / fy, (1.15 * width - cx) / fx, (1.15 * height - cy) / fy];
+    const limit = (share) => [(share * width - cx) / fx, (share * height - cy) / fy];
+    const limits = [...limit(-0.15), ...limit(1.15)];
     gl.bindFramebuffer(gl.FRAMEBUFFER, about.curve ? this.pictureTarget : null);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);

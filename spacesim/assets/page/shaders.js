@@ -118,7 +118,8 @@ void main() {
   float cosine = radius > 0.0 ? half_difference / radius : 1.0; // of twice the angle of the longer axis
   vec2 along = vec2(sqrt(0.5 + 0.5 * cosine), (xy < 0.0 ? -1.0 : 1.0) * sqrt(max(0.5 - 0.5 * cosine, 0.0)));
   place = reach * (2.0 * vec2(corner & 1, corner >> 1) - 1.0);
-  vec2 pixel = lens.xy * tangent + lens.zw + place.x * sqrt(longer) * along + place.y * sqrt(shorter) * vec2(-along.y, along.x);
+  vec2 pixel = lens.xy * tangent + lens.zw + place.x * sqrt(longer) * along;
+  pixel += place.y * sqrt(shorter) * vec2(-along.y, along.x);
   color = texelFetch(shaded, at, 0).rgb;
   power = log2(opacity);
   gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
