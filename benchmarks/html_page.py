@@ -1,4 +1,4 @@
-"""A run as a page (`spacesim export RUN --html FILE`): how large, how fast in a browser without a GPU, how near to `render`.
+"""A run as a page (`spacesim export RUN --html FILE`): how large, how fast without a GPU, how near to `render`.
 
     python benchmarks/html_page.py RUN [--data DATA] [--suns 20] [--seconds 5] [--size 800x600]
 
