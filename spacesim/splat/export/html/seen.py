@@ -1,5 +1,5 @@
 """From which directions each Gaussian is seen: what others hide, of a closed body half, need not be drawn. Browsers
-without a GPU draw so much faster; pictures lose less than 0.01 dB."""
+without a GPU draw faster; pictures of `boxsat` lose 0.01 dB on average, 0.1 dB at worst."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
