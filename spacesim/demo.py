@@ -1,4 +1,4 @@
-"""`spacesim demo`: one satellite under several Suns, from a scene to a report: a few minutes on two CPU cores."""
+"""`spacesim demo`: one satellite under several Suns, from a scene to a report and a page: minutes on two CPU cores."""
 
 import json
 import logging
@@ -12,10 +12,12 @@ from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, holds_files, read_json, write_json
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
+from spacesim.eval.report.headings import PAGE
 from spacesim.eval.report.write import write_report
 from spacesim.progress import Reporter, report_training
 from spacesim.scenes import generate, read_scene
 from spacesim.scenes.generation.generate import versions
+from spacesim.splat.export.html.page import write_page
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.train import train
 
@@ -38,8 +40,8 @@ TRAINING = preset("demo", "shadow-map")
 def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Reporter]]) -> JsonDict:
     """Generate, train, evaluate and report into `out`; what an earlier call of the same demo has finished is kept.
 
-    Returns {"report": path, "metrics": metrics.json, "seconds": {part: s}}. Raises InputError where `out` holds other
-    files than a demo's.
+    Returns {"report": path, "page": path, "metrics": metrics.json, "seconds": {part: s}}. Raises InputError where
+    `out` holds other files than a demo's.
     """
     out = Path(out)
     _prepare(out)
@@ -56,11 +58,16 @@ def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Repor
         command = ("spacesim", "demo", "--out", str(out))
         run = train(dataset, out / "run", TRAINING, True, report_training(report), command)
     finished("train")
+    page = out / "run" / PAGE
+    if not page.exists():
+        with reporting("export", "steps") as report:
+            write_page(run, page, report)
+    finished("page")
     with reporting("evaluate", "frames") as report:
         metrics = evaluate(run, dataset, out / "eval", EvaluateConfig(), report)
     write_report([out / "eval"], out / "eval" / "report.html")
     finished("evaluate and report")
-    return {"report": out / "eval" / "report.html", "metrics": metrics, "seconds": seconds}
+    return {"report": out / "eval" / "report.html", "page": page, "metrics": metrics, "seconds": seconds}
 
 
 def _prepare(out: Path) -> None:

@@ -5,6 +5,7 @@ import json
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 import time
@@ -569,6 +570,21 @@ def test_against_gsplat_says_what_it_needs(command):
     assert (done.code, done.output) == (2, "")
     (said,) = done.errors
     assert re.fullmatch(r"gsplat: expected gsplat 1.5 and torch with CUDA, found none \(.*\)", said)
+
+
+@smallest("html_page.py RUN --backend llvm --seconds 0.5 --size 120x90 --suns 2 --json")
+def test_the_page_tells_its_size_its_speed_and_how_near_it_is(command, tiny_run, place):
+    if shutil.which("chromium") is None:
+        pytest.skip("there is no Chromium to drive")
+    (place / "RUN").symlink_to(tiny_run)
+    report = json.loads(call(command, ended))
+    assert report["page"]["Gaussians"] == 300
+    assert 0.03 < report["page"]["MB"] < 0.3
+    assert len(report["rates"]) == 3
+    assert min(row["frames/s"] for row in report["rates"]) > 0
+    assert len(report["suns"]) == 2
+    assert report["means"]["page against render, dB"] > 30
+    assert report["worst_loss"] < 1.5
 
 
 @smallest(

@@ -571,6 +571,7 @@ UNWRITABLE = ["BELOW_A_FILE/out", *(path for path in ("/proc/out", "/dev/full") 
         "render RUN --out OUT/a.png",
         "render RUN --out OUT/a.exr",
         "export RUN --ply OUT/a.ply",
+        "export RUN --html OUT/a.html",
     ],
 )
 def test_unwritable_output_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tiny_eval, tmp_path, arguments, place):

@@ -23,4 +23,6 @@ def run(options: argparse.Namespace) -> None:
     done = demo(options.out, show_progress)
     print_headline(done["metrics"])
     parts = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in done["seconds"].items())
-    interrupts.print_output(f"{parts}\nreport: {done['report'].resolve()}")
+    interrupts.print_output(
+        f"{parts}\nreport: {done['report'].resolve()}\nto turn and relight: {done['page'].resolve()}"
+    )

@@ -19,6 +19,9 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     form = parser.add_mutually_exclusive_group(required=True)
     form.add_argument("--ply", type=Path, metavar="FILE", help="Gaussians: INRIA layout, the dataset's frame and scale")
     form.add_argument("--mesh", type=Path, metavar="FILE", help="the surface of a run: .ply, .obj, .glb or .stl")
+    form.add_argument(
+        "--html", type=Path, metavar="FILE", help="a run as one page for any browser: orbit, drag the Sun"
+    )
     form.add_argument("--speedplus", type=Path, metavar="DIR", help="a dataset's images and poses as SPEED+ has them")
     form.add_argument("--bop", type=Path, metavar="DIR", help="a dataset's images, depth, masks, poses, models for BOP")
     parser.add_argument("--sun", type=angles, metavar="AZ,EL", help="for --ply of a relightable run: whose colours")
@@ -43,6 +46,8 @@ def run(options: argparse.Namespace) -> None:
         _export_bop(options)
     elif options.mesh is not None:
         _export_mesh(options)
+    elif options.html is not None:
+        _export_html(options)
     else:
         _export_ply(options)
 
@@ -103,6 +108,24 @@ def _export_mesh(options: argparse.Namespace) -> None:
     interrupts.print_output(
         f"{options.mesh}: {len(surface.faces)} faces from {surface.views} views, voxels of {surface.voxel:.4g} m"
     )
+
+
+def _export_html(options: argparse.Namespace) -> None:
+    from spacesim.methods import load_run
+    from spacesim.progress import show_progress
+    from spacesim.splat.export.html.page import write_page
+    from spacesim.splat.run import Run
+
+    if options.path.suffix == ".toml":
+        raise InputError(f"html: expected a run, found {options.path}, a scene: its runs can be exported one by one")
+    backend.select(options.backend)
+    run = load_run(options.path)
+    if not isinstance(run, Run):
+        raise InputError(f"html: expected a run of Gaussians, found {options.path}, a radiance field")
+    with show_progress("export", "steps") as report:
+        write_page(run, options.html, report)
+    size = options.html.stat().st_size / 1e6
+    interrupts.print_output(f"{options.html}: {run.gaussian_count} Gaussians, {size:.1f} MB")
 
 
 def _export_speedplus(options: argparse.Namespace) -> None:

@@ -1,10 +1,26 @@
 """The report's headings: what was evaluated on what, what was fitted to it, where each part of the page begins."""
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import quote
 
 from spacesim.eval.notes import explain_ignored
 from spacesim.eval.report.html import escape, table
 from spacesim.eval.report.read import Evaluation
+
+PAGE = "page.html"  #: in a run's folder: what the report leads to, of `spacesim export RUN --html RUN/page.html`
+
+
+def page_links(runs: Sequence[Evaluation], folder: Path) -> str:
+    """HTML: links to the runs' pages, relative to the report's folder; "" where there are none."""
+    links = []
+    for run in runs:
+        page = Path(run.metrics["run"]) / PAGE
+        if page.is_file():
+            address = Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix()
+            links.append(f'<a href="{escape(quote(address))}">{escape(run.name)}</a>')
+    return f'<p class="lead">To turn round, under a Sun to drag: {", ".join(links)}.</p>' if links else ""
 
 
 def header(runs: Sequence[Evaluation], scenes: str) -> str:

@@ -12,7 +12,7 @@ from spacesim.data.files import JsonDict, JsonMapping, read_bytes, write_bytes
 from spacesim.eval.labels import IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric, metric_of
 from spacesim.eval.report.charts import column_histograms, histogram, line_chart, shared_edges
 from spacesim.eval.report.gallery import gallery
-from spacesim.eval.report.headings import aligned_words, common_header, data_header, fitted_words, header
+from spacesim.eval.report.headings import aligned_words, common_header, data_header, fitted_words, header, page_links
 from spacesim.eval.report.html import escape, page, picture, section, table
 from spacesim.eval.report.lighting import by_grazing_angle, relighting, shadow_masks
 from spacesim.eval.report.read import Evaluation, by_data, legend, read_evals
@@ -34,21 +34,22 @@ def write_report(evals: Sequence[Path], out: Path) -> None:
     Raises InputError where a folder holds no evaluation or `out` cannot be written.
     """
     try:
-        content = _content(read_evals(evals))
+        content = _content(read_evals(evals), Path(out).absolute().parent)
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         named = ", ".join(str(Path(folder) / "metrics.json") for folder in evals)
         raise InputError(f"{named}: expected metrics of this version, found a damaged file ({error!r})") from error
     write_bytes(Path(out), content.encode("utf-8", "backslashreplace"))
 
 
-def _content(runs: Sequence[Evaluation]) -> str:
-    """The page: runs are compared where they were evaluated on the same frames, one part of it for each such data."""
+def _content(runs: Sequence[Evaluation], folder: Path) -> str:
+    """The page: runs are compared where they were evaluated on the same frames, one part of it for each such data.
+    folder: where it will be"""
     groups = by_data(runs)
     scenes = " and ".join(sorted({run.scene for run in runs}))
     if len(groups) == 1:
-        body = [header(groups[0], scenes), *_sections(groups[0])]
+        body = [header(groups[0], scenes), page_links(runs, folder), *_sections(groups[0])]
     else:
-        body = [common_header(groups, scenes)]
+        body = [common_header(groups, scenes), page_links(runs, folder)]
         for number, group in enumerate(groups, start=1):
             body += [data_header(number, group), *_sections(group)]
     body.append("<footer>Written by spacesim. Equation numbers: the thesis that defines the metrics.</footer>")

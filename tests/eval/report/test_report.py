@@ -502,6 +502,17 @@ def test_what_is_no_evaluation(folder, tmp_path):
     assert not out.exists()
 
 
+def test_a_page_in_the_runs_folder_is_led_to(folder):
+    run = folder.parent / "a run"
+    run.mkdir()
+    named = another(folder, "eval2", lambda metrics: metrics.update(run=str(run)))
+    assert page_of(named).values("a", "href") == []
+    (run / "page.html").write_text("")
+    page = page_of(named)
+    assert page.values("a", "href") == ["a%20run/page.html"]
+    assert "To turn round, under a Sun to drag: " in page.text
+
+
 def test_same_folder_same_bytes(folder, tmp_path):
     write_report([folder], tmp_path / "a.html")
     write_report([folder], tmp_path / "b.html")
