@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from spacesim.api import (
         BackendError,
         Camera,
+        CameraClient,
         Composed,
         Dataset,
         Frame,
@@ -61,6 +62,7 @@ __version__ = "0.1.0"
 __all__ = [
     "BackendError",
     "Camera",
+    "CameraClient",
     "Composed",
     "Dataset",
     "Frame",

@@ -28,6 +28,7 @@ from spacesim.scenes import SceneConfig, read_scene
 from spacesim.scenes import generate as _generate
 from spacesim.scenes.cameras.rig import Rig
 from spacesim.scenes.trajectory.rig import PoseRig
+from spacesim.serve.client import CameraClient
 from spacesim.splat.compose import PosedScene
 from spacesim.splat.compose.output import Composed
 from spacesim.splat.compose.output import compose as _compose
@@ -47,6 +48,7 @@ ProgressCallback = Callable[[int, int, str], None]
 __all__ = [
     "BackendError",
     "Camera",
+    "CameraClient",
     "Composed",
     "Dataset",
     "Frame",

@@ -788,3 +788,13 @@ def test_a_film_is_compared_with_its_own_frames(tmp_path):
     found = align(own, true)
     assert (found.cameras, found.matched_by) == (10, "source_index in transforms.json")
     np.testing.assert_allclose(found.pose.matrix, inside.inverse().matrix, atol=1e-9)
+
+
+@smallest("serve.py --backend llvm --gaussians 300 --side 32 --spp 1 --repeats 2 --requests 50 --json")
+def test_serve_loses_no_request(command):
+    pytest.importorskip("zmq", reason="pyzmq is not installed")
+    report = json.loads(call(command))
+    assert [row["served"] for row in report["rows"]] == [ANY, "boxsat, 1 samples"]
+    assert all(row["pictures/s"] > 0 for row in report["rows"])
+    (many,) = report["many"]
+    assert many["answered"] == many["requests"] == 50

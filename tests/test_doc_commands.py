@@ -11,7 +11,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Callable, Iterator
-from contextlib import redirect_stderr
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, replace
 from functools import cache
 from io import StringIO
@@ -35,6 +35,7 @@ PROGRAM = re.compile(
     r"(?:\.venv/bin/)?(spacesim) |(?:python )?((?:benchmarks|examples|scripts|tests)/[\w/]+\.py)(?: |$)"
 )
 HAS_VISER = importlib.util.find_spec("viser") is not None
+HAS_ZMQ = importlib.util.find_spec("zmq") is not None
 
 VALUES = {  # what stands in a command for a value
     **{"N": "2", "PX": "24", "K": "1", "NAME": "boxsat", "FILE": "boxsat", "AZ,EL": "40,25", "NAME=RUN": "none=RUN"},
@@ -50,6 +51,7 @@ SMALL = {  # options that a command gets, so that it is as small as can be
     "sweep": {"--frames": "2", "--size": "24"},
     "compose": {"--size": "24"},
     "view": {"--port": "0"},
+    "serve": {"--port": "0"},
 }
 SMALLER = {  # and other values of those that it has
     **{"--suns": "2", "--known-test-views": "1", "--test-spp": "2", "--workers": "2"},
@@ -370,7 +372,7 @@ class Desk:
         if key not in self.done:
             place.mkdir()
             there = [str(place / f"{k}{key[k]}") if k in outputs else word for k, word in enumerate(words)]
-            self.done[key] = (viewed(there) if words[0] == "view" else call(*there)), place
+            self.done[key] = (stopped(there) if words[0] in LASTING else call(*there)), place
         ended, place = self.done[key]
         for k, name in outputs.items():
             if (place / f"{k}{key[k]}").exists():
@@ -391,9 +393,12 @@ class Desk:
             path.symlink_to(self.given[name])
 
 
-def viewed(words: list[str]) -> Outcome:
-    """The viewer's, with Ctrl-C once it has told its address."""
-    if not HAS_VISER:
+LASTING = {"view": HAS_VISER, "serve": HAS_ZMQ}  #: commands that end by Ctrl-C, and whether they can run
+
+
+def stopped(words: list[str]) -> Outcome:
+    """Of a command that lasts, with Ctrl-C once it has told its address."""
+    if not LASTING[words[0]]:
         return Outcome(0, "", [])
     command = [sys.executable, "-u", "-m", "spacesim", *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
@@ -487,6 +492,7 @@ SMALL_FACE = {  # of the six lines
 SMALL_BLOCKS = {  # in the Python of a document: what takes the place of what
     "README.md": SMALL_FACE,
     "index.md": SMALL_FACE,
+    "how-to/closed-loop.md": {"128, 128": "32, 32"},
     "how-to/gradients.md": {"640, 480": "32, 24", "2000": "50"},
     "tutorials/first-model.md": {"256, 256": "24, 24"},
     "tutorials/torch.md": {"96, 400, 100": "24, 50, 3"},
@@ -494,6 +500,7 @@ SMALL_BLOCKS = {  # in the Python of a document: what takes the place of what
 }
 PRINTED = {  # by the blocks of a document, among other things
     "README.md": "(24, 24, 3) ",
+    "how-to/closed-loop.md": "\n2 ",
     "reference/dataset.md": "(40, 40) (40, 40, 3) 255",
     "reference/models-and-materials.md": "primary_mirror",
     "tutorials/first-model.md": "nearest point ",
@@ -519,8 +526,22 @@ def test_python_runs(path, given, tmp_path, monkeypatch, capsys):
     for name in ("runs/boxsat", *(("data", "run") if path.name not in ("README.md", "index.md") else ())):
         desk.put(name)
     text = shrunk(path, "\n".join(blocks(path, "python")))
-    exec(compile(text, path.name, "exec"), {})
+    with answering(text) as asked:
+        exec(compile(asked, path.name, "exec"), {})
     assert PRINTED.get(name_of(path), "") in capsys.readouterr().out
+
+
+@contextmanager
+def answering(text: str) -> Iterator[str]:
+    """Python that asks a camera, if it does, beside one that answers, at an address of its own."""
+    if "tcp://127.0.0.1:5556" not in text:
+        yield text
+        return
+    pytest.importorskip("zmq", reason="pyzmq is not installed")
+    from spacesim.serve.draw import load_served
+
+    with module_of("tests/serve/serving.py").serving(load_served("boxsat", spp=1)) as address:
+        yield text.replace("tcp://127.0.0.1:5556", address)
 
 
 def film_of_a_box() -> bytes:
@@ -561,7 +582,7 @@ def test_a_tutorial_runs(path, tmp_path, monkeypatch, capsys):
                 if words[:2] == ["import", "video"]:  # so small, the film shows too little to find poses by
                     Path(words[2]).write_bytes(film_of_a_box())
                 small = smaller(tuple(words))
-                ended = viewed(small) if words[0] == "view" else call(*small)
+                ended = stopped(small) if words[0] in LASTING else call(*small)
                 assert ended.code == 0, (line, ended.errors)
         ran, said = ran + 1, said + capsys.readouterr().out
     assert ran >= 3

@@ -11,25 +11,40 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 # What a file may not import at all, by the folder or module in which it stands.
 TOP = ("cli", "demo", "doctor", "api", "methods", "reproduce")  #: over all folders
-ABOVE = ("data", "learning", "scenes", "splat", "nerf", "mixed", "eval", "viewer", *TOP)  #: over `backend`
+ABOVE = ("data", "learning", "scenes", "splat", "nerf", "mixed", "eval", "viewer", "serve", *TOP)  #: over `backend`
 FORBIDDEN = {
     "backend": (*(f"spacesim.{top}" for top in ABOVE), "numpy"),
     "backend.upload": tuple(f"spacesim.{top}" for top in ABOVE),  # what else the package does goes without numpy
-    "doctor": ("spacesim.scenes", "spacesim.splat", "spacesim.viewer", "spacesim.cli"),
+    "doctor": ("spacesim.scenes", "spacesim.splat", "spacesim.viewer", "spacesim.serve", "spacesim.cli"),
     "data": (
         "mitsuba",
         "drjit",
         *(f"spacesim.backend.{name}" for name in ("ad", "selection", "llvm", "recording", "select", "mitsuba")),
-        *(f"spacesim.{top}" for top in ("learning", "scenes", "splat", "nerf", "mixed", "eval", "viewer", *TOP)),
+        *(
+            f"spacesim.{top}"
+            for top in ("learning", "scenes", "splat", "nerf", "mixed", "eval", "viewer", "serve", *TOP)
+        ),
     ),
-    "learning": tuple(f"spacesim.{top}" for top in ("scenes", "splat", "nerf", "mixed", "eval", "viewer", *TOP)),
-    "scenes": tuple(f"spacesim.{top}" for top in ("learning", "splat", "nerf", "mixed", "eval", "viewer", *TOP)),
-    "splat": tuple(f"spacesim.{top}" for top in ("scenes", "nerf", "mixed", "eval", "viewer", *TOP)),
-    "nerf": tuple(f"spacesim.{top}" for top in ("scenes", "splat", "mixed", "eval", "viewer", *TOP)),
-    "mixed": tuple(f"spacesim.{top}" for top in ("scenes", "eval", "viewer", *TOP)),
-    "eval": tuple(f"spacesim.{top}" for top in ("viewer", *TOP)),
-    "viewer": ("spacesim.cli", "spacesim.demo", "spacesim.doctor", "spacesim.reproduce"),
-    "reproduce": ("spacesim.viewer", "spacesim.cli", "spacesim.demo", "spacesim.doctor", "spacesim.api"),
+    "learning": tuple(
+        f"spacesim.{top}" for top in ("scenes", "splat", "nerf", "mixed", "eval", "viewer", "serve", *TOP)
+    ),
+    "scenes": tuple(
+        f"spacesim.{top}" for top in ("learning", "splat", "nerf", "mixed", "eval", "viewer", "serve", *TOP)
+    ),
+    "splat": tuple(f"spacesim.{top}" for top in ("scenes", "nerf", "mixed", "eval", "viewer", "serve", *TOP)),
+    "nerf": tuple(f"spacesim.{top}" for top in ("scenes", "splat", "mixed", "eval", "viewer", "serve", *TOP)),
+    "mixed": tuple(f"spacesim.{top}" for top in ("scenes", "eval", "viewer", "serve", *TOP)),
+    "eval": tuple(f"spacesim.{top}" for top in ("viewer", "serve", *TOP)),
+    "serve": tuple(f"spacesim.{name}" for name in ("viewer", "cli", "demo", "doctor", "reproduce", "api")),
+    "viewer": ("spacesim.serve", "spacesim.cli", "spacesim.demo", "spacesim.doctor", "spacesim.reproduce"),
+    "reproduce": (
+        "spacesim.viewer",
+        "spacesim.serve",
+        "spacesim.cli",
+        "spacesim.demo",
+        "spacesim.doctor",
+        "spacesim.api",
+    ),
 }
 OF_RASTER = tuple(f"spacesim.splat.{folder}" for folder in ("light", "train", "compose", "export", "run"))
 OF_LIGHT = tuple(f"spacesim.splat.{folder}" for folder in ("train", "compose", "export", "run"))

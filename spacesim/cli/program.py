@@ -15,7 +15,21 @@ from pathlib import Path
 from types import ModuleType
 
 from spacesim import __version__, backend
-from spacesim.cli import compose, demo, doctor, export, generate, render, report, reproduce, sweep, train, verify, view
+from spacesim.cli import (
+    compose,
+    demo,
+    doctor,
+    export,
+    generate,
+    render,
+    report,
+    reproduce,
+    serve,
+    sweep,
+    train,
+    verify,
+    view,
+)
 from spacesim.cli import eval as evaluate
 from spacesim.cli import import_ as import_command
 from spacesim.cli.parser import Parser
@@ -32,6 +46,7 @@ COMMANDS: dict[str, ModuleType] = {
     "render": render,
     "sweep": sweep,
     "view": view,
+    "serve": serve,
     "compose": compose,
     "verify": verify,
     "export": export,

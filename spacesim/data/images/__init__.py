@@ -4,7 +4,7 @@ from spacesim.data.images.color import linear_from_srgb, luminance, srgb_from_li
 from spacesim.data.images.exr import read_exr, walk_exr_header, write_exr
 from spacesim.data.images.lens import Resampling, Undistortion, distort_points, undistort_points
 from spacesim.data.images.load import load_image, read_labels, resample, undistort
-from spacesim.data.images.png import has_alpha, image_size, read_png, write_png
+from spacesim.data.images.png import has_alpha, image_size, png_bytes, read_png, write_png
 
 __all__ = [
     "Resampling",
@@ -15,6 +15,7 @@ __all__ = [
     "linear_from_srgb",
     "load_image",
     "luminance",
+    "png_bytes",
     "read_exr",
     "read_labels",
     "read_png",

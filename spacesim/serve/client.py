@@ -1,0 +1,47 @@
+"""A client of `spacesim serve`: one request, one answer."""
+
+import json
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from spacesim.data.errors import WorkError
+from spacesim.data.records import Camera, Sun
+from spacesim.serve.protocol import VERSION, arrays_of, import_zmq
+
+
+class CameraClient:
+    """Asks a camera that answers (docs/how-to/closed-loop.md); `with` closes it. timeout: seconds to wait. Raises
+    InputError where pyzmq is not installed."""
+
+    def __init__(self, address: str = "tcp://127.0.0.1:5556", timeout: float = 60.0) -> None:
+        zmq = import_zmq()
+        self.address, self.timeout = address, timeout
+        self._socket = zmq.Context.instance().socket(zmq.REQ)
+        for option in (zmq.REQ_RELAXED, zmq.REQ_CORRELATE):  # after a timeout it can ask again
+            self._socket.setsockopt(option, 1)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.connect(address)
+
+    def picture(self, camera: Camera, sun: Sun | None = None, **options: Any) -> dict[str, np.ndarray]:
+        """The arrays that were asked for, by name. options: exposure (EV), outputs=("rgb", "depth", ...), seed, see
+        spacesim/serve/protocol.py. Raises InputError for what cannot be, WorkError where nobody answers."""
+        lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        fields = {"camera": {"world_from_camera": camera.world_from_camera.tolist(), **lens}, **options}
+        if sun is not None:
+            fields["sun"] = sun.direction.tolist()
+        self._socket.send(json.dumps({"version": VERSION, "id": 0, **fields}).encode())
+        if not self._socket.poll(round(1e3 * self.timeout)):
+            raise WorkError(f"{self.address}: expected an answer within {self.timeout:g} s, found none")
+        return arrays_of(self._socket.recv_multipart())
+
+    def close(self) -> None:
+        """Hang up."""
+        self._socket.close()
+
+    def __enter__(self) -> "CameraClient":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()

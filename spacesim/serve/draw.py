@@ -1,0 +1,169 @@
+"""What is served: a scene that is path-traced, or a run or a composed scene that is predicted."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from spacesim import interrupts
+from spacesim.data import toml
+from spacesim.data.errors import InputError, WorkError
+from spacesim.data.files import JsonDict
+from spacesim.data.images.tone import STANDARD_EXPOSURE, as_bytes, display_values
+from spacesim.data.records import Camera, Sun
+from spacesim.serve.protocol import OUTPUTS, Output
+
+_log = logging.getLogger(__name__)
+
+MAX_EXPOSURE = 40.0  #: EV, of path-traced pictures
+_LABELS = {
+    "visibility": "sun_visibility",
+    **{name: name for name in ("depth", "normal", "object_id", "part_id", "shadow")},
+}
+
+
+class Served(Protocol):
+    """Draws pictures, on one thread."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """What it is called: of the scene, then of its objects."""
+
+    @property
+    def facts(self) -> JsonDict:
+        """What clients may want to know: served, kind, outputs, relightable."""
+
+    def draw(
+        self, camera: Camera, sun: Sun | None, exposure: float | None, outputs: Sequence[Output], seed: int
+    ) -> dict[str, np.ndarray]:
+        """The arrays that `outputs` name, see `protocol.Output`. Raises InputError for what it does not have, where the
+        Sun matters and none is told, and for an exposure that cannot be."""
+
+
+def draw(
+    served: Served, camera: Camera, sun: Sun | None, exposure: float | None, outputs: Sequence[Output], seed: int
+) -> dict[str, np.ndarray]:
+    """What `served` draws. Raises InputError, WorkError or MemoryError where there is no picture, and nothing else: it
+    ends no server."""
+    try:
+        return served.draw(camera, sun, exposure, outputs, seed)
+    except WorkError:
+        raise
+    except RuntimeError as error:  # of Dr.Jit
+        if interrupts.is_interrupt(error):
+            raise KeyboardInterrupt from None
+        _log.warning("serve: the computation failed (%s)", " ".join(str(error).split()))
+        raise WorkError("the computation failed; the server's log says why") from None
+
+
+class TracedScene:
+    """A scene, path-traced; spp: samples a pixel, None: as the scene says."""
+
+    outputs = OUTPUTS
+
+    def __init__(self, config: Any, spp: int | None = None) -> None:
+        from spacesim.scenes import Renderer, build
+        from spacesim.scenes.background.draw import Background
+
+        scene, self._config, self._background = build(config), config, None
+        quality, lens = config.quality, config.camera.distortion
+        self._renderer = Renderer(scene, spp or quality.spp, quality.max_depth, lens)
+        if config.background is not None:
+            self._background = Background(config.background, scene, lens, config.seed)
+        self.names = (config.name, *(item.spacecraft.name for item in scene.objects))
+
+    @property
+    def facts(self) -> JsonDict:
+        """See `Served`."""
+        traced = {"kind": "scene", "spp": self._renderer.spp}
+        return {"served": self.names[0], **traced, "outputs": list(self.outputs), "relightable": True}
+
+    def draw(
+        self, camera: Camera, sun: Sun | None, exposure: float | None, outputs: Sequence[Output], seed: int
+    ) -> dict[str, np.ndarray]:
+        """See `Served`."""
+        if sun is None:
+            raise InputError("sun: expected its direction for a scene, found none")
+        if exposure is not None and not abs(exposure) <= MAX_EXPOSURE:
+            raise InputError(f"exposure: expected -{MAX_EXPOSURE:g} to {MAX_EXPOSURE:g} EV, found {exposure}")
+        arrays: dict[str, np.ndarray] = {}
+        if {"rgb", "alpha", "radiance"} & set(outputs):
+            radiance, alpha = self._renderer.radiance(camera, sun, (self._config.seed, seed))
+            arrays = {"radiance": radiance, "alpha": alpha}
+            if "rgb" in outputs:
+                arrays["rgb"] = self._picture(radiance, alpha, camera, sun, exposure, seed)
+        if set(_LABELS) & set(outputs):
+            labels = self._renderer.labels(camera, sun)
+            arrays |= {name: labels[key] for name, key in _LABELS.items()}
+        return {name: arrays[name] for name in outputs}
+
+    def _picture(
+        self, radiance: np.ndarray, alpha: np.ndarray, camera: Camera, sun: Sun, exposure: float | None, seed: int
+    ) -> np.ndarray:
+        """[H, W, 3] uint8: as `generate` records it, over black where that has alpha."""
+        from dataclasses import replace
+
+        from spacesim.scenes.cameras.exposure import record_image
+
+        config = self._config.camera
+        if exposure is not None:
+            config = replace(config, exposure=STANDARD_EXPOSURE * 2.0**exposure)
+        if self._background is None and config.sensor is None:
+            picture, covered = np.zeros_like(radiance), alpha > 0
+            share = alpha[covered][:, None]
+            picture[covered] = share * display_values(config.exposure * radiance[covered] / share, config.tone)
+            return as_bytes(picture)
+        behind = None if self._background is None else self._background.radiance(camera, sun, seed)
+        image = record_image(radiance, alpha, config, (self._config.seed, seed), behind).image
+        return np.repeat(image[..., None], 3, axis=-1) if image.ndim == 2 else image
+
+
+class PredictedRun:
+    """A run of any method, or a composed scene: a `Predictor`."""
+
+    outputs: tuple[Output, ...] = ("rgb", "alpha", "depth", "normal", "visibility", "object_id")
+
+    def __init__(self, run: Any) -> None:
+        self.run = run
+        path = Path(run.path).resolve()
+        name = path.stem if path.suffix == ".toml" else path.parent.name if path.name == "run" else path.name
+        self.names = (name, *(part.name for part in run.parts))
+
+    @property
+    def facts(self) -> JsonDict:
+        """See `Served`."""
+        known = {"kind": "run", "method": self.run.config.get("method"), "relightable": self.run.relightable}
+        return {"served": self.names[0], **known, "outputs": list(self.outputs)}
+
+    def draw(
+        self, camera: Camera, sun: Sun | None, exposure: float | None, outputs: Sequence[Output], seed: int
+    ) -> dict[str, np.ndarray]:
+        """See `Served`; nothing here is random."""
+        seen = self.run.predict(camera, sun, normals="normal" in outputs, exposure=exposure)
+        arrays = {"rgb": as_bytes(seen.rgb), "alpha": seen.alpha, "depth": seen.depth, "normal": seen.normal}
+        arrays |= {"visibility": seen.visibility, "object_id": getattr(seen, "id", None)}
+        for name in outputs:
+            if arrays.get(name) is None:
+                there = [key for key, array in arrays.items() if array is not None]
+                raise InputError(f"outputs: expected some of {', '.join(there)} of {self.names[0]}, found {name}")
+        return {name: arrays[name] for name in outputs}
+
+
+def load_served(what: str | Path, spp: int | None = None) -> Served:
+    """What draws a scene (a built-in name, a scene file, a mesh file), a run (a folder) or a composed scene (a TOML
+    file with models). spp: samples a pixel of a scene. Raises InputError where there is none of these, and for samples
+    of a run."""
+    from spacesim.methods import load_predictor
+    from spacesim.scenes import BUILT_IN_SCENES, read_scene
+
+    path = Path(what)
+    is_composed = path.suffix.lower() == ".toml" and "models" in toml.read_document(path).values
+    if is_composed or (path.is_dir() and str(what) not in BUILT_IN_SCENES):
+        if spp is not None:
+            raise InputError(f"spp: expected with a scene, found {spp} with {what}, which is not path-traced")
+        return PredictedRun(load_predictor(path))
+    if spp is not None and not 1 <= spp <= 1_000_000:
+        raise InputError(f"spp: expected 1 to 1,000,000, found {spp}")
+    return TracedScene(read_scene(what), spp)
