@@ -127,6 +127,11 @@ def _check_png(content: bytes) -> None:
 
 def write_png(path: Path, pixels: np.ndarray, durable: bool = True) -> None:
     """Write [H, W], [H, W, 3] or [H, W, 4] uint8, or [H, W] uint16, as PNG: whole or not at all (see `write_bytes`)."""
+    write_bytes(path, png_bytes(pixels), durable)
+
+
+def png_bytes(pixels: np.ndarray) -> bytes:
+    """What `write_png` writes."""
     is_grey = pixels.ndim == 2 and pixels.dtype in (np.uint8, np.uint16)
     is_color = pixels.ndim == 3 and pixels.shape[2] in (3, 4) and pixels.dtype == np.uint8
     if pixels.size == 0 or not (is_grey or is_color):
@@ -136,7 +141,7 @@ def write_png(path: Path, pixels: np.ndarray, durable: bool = True) -> None:
         )
     stream = io.BytesIO()
     PillowImage.fromarray(np.ascontiguousarray(pixels)).save(stream, format="PNG", compress_level=_PNG_LEVEL)
-    write_bytes(path, stream.getvalue(), durable)
+    return stream.getvalue()
 
 
 def write_exr(path: Path, layers: Mapping[str, np.ndarray], durable: bool = True) -> None:

@@ -28,6 +28,9 @@ from spacesim.data.records import SUN_WORDS, Camera, Dataset, Frame, Sun
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 TRUTH_PATHS = ("gt_path", "shadow_path", "silhouette_path", "id_path", "depth_file_path", "mask_path")
+DEPTH_UNITS = "depth_unit_scale_factor", "integer_depth_scale"  #: keys: Nerfstudio's name, instant-ngp's
+MILLIMETRE = 1e-3  #: metres: Nerfstudio's default
+MAX_DEPTH_UNIT = 1e30  #: metres a step
 _HOLD_OUT = 8
 _SPLITS = ("train", "val", "test")
 
@@ -96,7 +99,20 @@ def _dataset(
     root = path.parent
     scene = read_object(root / "scene.json") if (root / "scene.json").exists() else {}
     points, mesh = (_path(path, meta, key) for key in ("ply_file_path", "mesh_path"))
-    return Dataset(root, train, test, points, mesh, scene, missing)
+    return Dataset(root, train, test, points, mesh, scene, missing, read_depth_unit(path, meta))
+
+
+def read_depth_unit(path: Path, values: Json) -> float:
+    """Metres a step of depth pictures, by transforms.json or one of its frames. Raises InputError where that cannot
+    be."""
+    key = next((key for key in DEPTH_UNITS if values.get(key) is not None), None)
+    try:
+        unit = MILLIMETRE if key is None else _number(values, key)
+        if 0 < unit < MAX_DEPTH_UNIT:
+            return unit
+        raise InputError(f"expected metres above 0 as {key}, found {values[key]!r}")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def read_camera(path: Path) -> Camera:
