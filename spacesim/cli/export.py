@@ -22,10 +22,14 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     form.add_argument("--mesh", type=Path, metavar="FILE", help="the surface of a run: .ply, .obj, .glb or .stl")
     form.add_argument("--speedplus", type=Path, metavar="DIR", help="a dataset's images and poses as SPEED+ has them")
     form.add_argument("--bop", type=Path, metavar="DIR", help="a dataset's images, depth, masks, poses, models for BOP")
-    form.add_argument("--coco", type=Path, metavar="DIR", help="a dataset's masks, boxes and keypoints as COCO has them")
+    form.add_argument(
+        "--coco", type=Path, metavar="DIR", help="a dataset's masks, boxes and keypoints as COCO has them"
+    )
     form.add_argument("--yolo", type=Path, metavar="DIR", help="the same for Ultralytics: detect, segment and pose")
     form.add_argument("--webdataset", type=Path, metavar="DIR", help="a dataset with its labels as shards")
-    parser.add_argument("--keypoints", metavar="N|FILE", help="for a dataset: how many are found (11), or which they are")
+    parser.add_argument(
+        "--keypoints", metavar="N|FILE", help="for a dataset: how many are found (11), or which they are"
+    )
     parser.add_argument("--sun", type=angles, metavar="AZ,EL", help="for --ply of a relightable run: whose colours")
     parser.add_argument("--object", metavar="K", help="for SPEED+: whose poses, by number or name (the first)")
     parser.add_argument("--data", type=Path, metavar="DATA", help="for --mesh: the dataset, where it has moved")

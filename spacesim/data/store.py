@@ -44,6 +44,7 @@ __all__ = [
     "DatasetWriter",
     "FrameWriter",
     "find_unreadable_files",
+    "load_depth",
     "load_truth",
     "read_dataset",
     "read_points",
@@ -98,6 +99,18 @@ def load_truth(dataset: Dataset, frame: Frame) -> Truth:
         source = Undistortion(frame.camera, frame.distortion)
         values = {k: source.linear(v) if k in _FILTERED else source.nearest(v) for k, v in values.items()}
     return Truth(**values)
+
+
+def load_depth(dataset: Dataset, frame: Frame) -> np.ndarray:
+    """[H, W] float32: depth along the optical axis, metres, 0 none, of the picture as it is stored. Raises InputError
+    where that is missing or broken."""
+    if frame.depth_file_path is None:
+        raise InputError(f"{dataset.root}: expected depth of {frame.file_path}, found no depth_file_path")
+    path = dataset.root / frame.depth_file_path
+    steps = _read_label(path, frame.camera)
+    if steps.ndim != 2:
+        raise InputError(f"{path}: expected depth in one channel, found {steps.shape[2]}")
+    return (steps * dataset.depth_unit).astype(np.float32)
 
 
 class FrameWriter:
@@ -306,11 +319,13 @@ def find_unreadable_files(path: Path) -> list[str]:
     return problems
 
 
-def _read_label(path: Path, camera: Camera) -> None:
-    size = read_png(path).shape[:2]
+def _read_label(path: Path, camera: Camera) -> np.ndarray:
+    pixels = read_png(path)
+    size = pixels.shape[:2]
     if size != (camera.height, camera.width):
         expected = f"{camera.width}x{camera.height}"
         raise InputError(f"{path}: expected {expected} pixels as the camera says, found {size[1]}x{size[0]}")
+    return pixels
 
 
 def _describe_frames(

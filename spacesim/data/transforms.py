@@ -105,9 +105,9 @@ def _dataset(
 def read_depth_unit(path: Path, values: Json) -> float:
     """Metres a step of depth pictures, by transforms.json or one of its frames. Raises InputError where that cannot
     be."""
-    key = next((key for key in DEPTH_UNITS if values.get(key) is not None), None)
+    key = next((key for key in DEPTH_UNITS if values.get(key) is not None), DEPTH_UNITS[0])
     try:
-        unit = MILLIMETRE if key is None else _number(values, key)
+        unit = MILLIMETRE if values.get(key) is None else _number(values, key)
         if 0 < unit < MAX_DEPTH_UNIT:
             return unit
         raise InputError(f"expected metres above 0 as {key}, found {values[key]!r}")

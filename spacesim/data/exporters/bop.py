@@ -165,9 +165,7 @@ def _depth_scale(farthest: float) -> float:
     return round(scale, 1)
 
 
-def _write_models(
-    out: Path, targets: list[LabelledObject], models: list[int], bodies: Sequence[BodyLabels]
-) -> None:
+def _write_models(out: Path, targets: list[LabelledObject], models: list[int], bodies: Sequence[BodyLabels]) -> None:
     infos: JsonDict = {}
     for number in dict.fromkeys(models):
         target, body = targets[models.index(number)], bodies[models.index(number)]

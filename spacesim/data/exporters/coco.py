@@ -4,9 +4,9 @@
     DIR/train/NAME.png, DIR/val/NAME.png     pictures over black, as the camera records them
     DIR/keypoints.json                       the keypoints in 3D: see `keypoints`
 
-Masks are run lengths (compressed RLE). Boxes count from the picture's upper left corner; keypoints count from the centre
-of its first pixel, as COCO's do, so they are half a pixel less than ours. Their visibility is 2 seen, 1 hidden, 0 not in
-the picture. Images also have `camera`, pixels, with cx and cy from the corner.
+Masks are run lengths (compressed RLE). Boxes count from the picture's upper left corner; keypoints count from the
+centre of its first pixel, as COCO's do, so they are half a pixel less than ours. Their visibility is 2 seen, 1 hidden,
+0 not in the picture. Images also have `camera`, pixels, with cx and cy from the corner.
 """
 
 from pathlib import Path
@@ -55,8 +55,9 @@ def write_coco(
         annotations[split] += [_annotation(number, instance) for instance in instances]
     total = 0
     for split in splits:
-        for total, annotation in enumerate(annotations[split], start=total + 1):
-            annotation["id"] = total
+        for annotation in annotations[split]:
+            total += 1
+            annotation["id"] = total  # 0 would be taken for none
         content = {"images": images[split], "annotations": annotations[split], "categories": categories}
         write_json(out / f"annotations/{split}.json", {"info": {"description": dataset.root.name}, **content})
     write_body_labels(out / NAME, labeller.bodies)

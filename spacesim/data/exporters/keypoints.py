@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from spacesim.data.errors import InputError
 from spacesim.data.exporters.objects import LabelledObject, model_numbers
-from spacesim.data.exporters.symmetries import SymmetryAxis, find_symmetries
+from spacesim.data.exporters.symmetries import SymmetryAxis, find_symmetries, sample_surface
 from spacesim.data.files import MAX_JSON_BYTES, write_json
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.mesh import MAX_COORDINATE, drawable_faces
@@ -26,7 +27,12 @@ COUNT = 11  #: keypoints that are found, as many as are usual for SPEED's Tango
 MAX_COUNT = 1000
 CELLS = 24  #: cells of a grid along an object's longest side, of each of which one corner is a candidate
 RAYS = 128  #: directions from which it is asked whether a candidate is seen
-FLAT = 0.45  #: share of all directions: a flat place is seen from half of them, a cube's corner from 7/8, a tip from all
+FLAT = (
+    0.45  #: share of all directions: a flat place is seen from half of them, a cube's corner from 7/8, a tip from all
+)
+MIDST = 0.1  #: weight of what has the surface all around, to be added to that distance
+NEAR = 0.08  #: of the object's size: around a candidate
+SAMPLES = 10_000  #: points of the surface
 START = 1e-5  #: of the object's size: how far from the surface rays begin
 
 
@@ -109,11 +115,12 @@ def find_keypoints(vertices: Array, faces: np.ndarray, count: int = COUNT) -> Ar
     """[K, 3] at most `count` corners of a mesh, spread over it: seen from far around, and far from each other.
 
     vertices: [V, 3], faces: [F, 3]. Candidates are the vertices of the mesh, of each cell of a grid the one farthest
-    from the middle. Each is weighed by the share of directions from which it is seen, beyond `FLAT`: a corner or a tip
-    sticks out, what lies within is seen from nowhere; no use is made of normals or of what hangs together, so meshes
-    may be open, and vertices stand there more than once. Then the farthest are picked (T. F. Gonzalez, 1985): the
-    next is that of the largest product of weight and distance to those before. The order of vertices and faces does
-    not matter. Raises InputError for a count below 1 and a mesh without an area.
+    from the middle. Each is weighed by the share of directions from which it is seen, beyond `FLAT` (a corner or a tip
+    sticks out, what lies within is seen from nowhere), and by how far it is from the middle of the surface around it
+    (at corners and ends, that is all to one side). No use is made of normals or of what hangs together, so meshes may
+    be open, and vertices stand there more than once. Then the farthest are picked (T. F. Gonzalez, 1985): the next is
+    that of the largest product of weight and distance to those before. The order of vertices and faces does not
+    matter. Raises InputError for a count below 1 and a mesh without an area.
     """
     import igl
 
@@ -133,7 +140,7 @@ def find_keypoints(vertices: Array, faces: np.ndarray, count: int = COUNT) -> Ar
     for k, point in enumerate(candidates):
         origins = point + START * size * directions
         weights[k] = (tree.intersect_ray_first(vertices, faces, origins, directions)[0] < 0).mean()
-    weights = np.maximum(weights - FLAT, 0)
+    weights = np.maximum(weights - FLAT, 0) * (MIDST + _offsets(candidates, vertices, faces, NEAR * size))
     if not weights.any():  # a hollow: nothing of it is seen from outside
         weights[:] = 1
     nearest, chosen = arms, []
@@ -146,6 +153,16 @@ def find_keypoints(vertices: Array, faces: np.ndarray, count: int = COUNT) -> Ar
         apart = np.linalg.norm(candidates - candidates[best], axis=1)
         nearest = np.minimum(nearest, apart) if len(chosen) > 1 else apart
     return candidates[chosen]
+
+
+def _offsets(points: Array, vertices: Array, faces: np.ndarray, radius: float) -> Array:
+    """[C] of points [C, 3], how far the middle of the surface within `radius` is from them, in radii: 0 amid a face or
+    a sheet, some 0.3 on a cube's edge, 0.5 in its corner, 0.6 in that of a sheet."""
+    samples = sample_surface(vertices, faces, SAMPLES)
+    near = cKDTree(samples).query_ball_point(points, radius)
+    alone = points + np.array([radius, 0, 0])  # something thin: an end, as far as is known
+    middles = [samples[some].mean(axis=0) if some else other for some, other in zip(near, alone, strict=True)]
+    return np.asarray(np.linalg.norm(np.array(middles) - points, axis=1) / radius)
 
 
 def _candidates(points: Array, low: Array, size: float) -> tuple[Array, Array]:

@@ -55,6 +55,21 @@ def find_symmetries(
     return tuple(shape.matrix(turn) for turn in _group(discrete, bool(round_axes))), tuple(continuous)
 
 
+def sample_surface(vertices: Array, faces: np.ndarray, count: int) -> Array:
+    """[count, 3] points spread evenly over a mesh, the same in whatever order its vertices and faces are."""
+    corners = vertices[faces]
+    corners = np.take_along_axis(corners, np.lexsort(corners.transpose(2, 0, 1))[..., None], axis=1)
+    corners = corners[np.lexsort(corners.reshape(-1, 9).T)]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    ends = np.cumsum(areas)
+    picked = np.minimum(np.searchsorted(ends, ends[-1] * (np.arange(count) + 0.5) / count), len(ends) - 1)
+    share = np.random.default_rng(0).random((count, 2))
+    share = np.where(share.sum(axis=1, keepdims=True) > 1, 1 - share, share)
+    along = corners[picked, 1:] - corners[picked, :1]
+    points: Array = corners[picked, 0] + (share[..., None] * along).sum(axis=1)
+    return points
+
+
 class _Shape:
     """A surface, and points on it."""
 
@@ -64,14 +79,13 @@ class _Shape:
         self.vertices, self.faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
         corners = vertices[faces]
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        rng = np.random.default_rng(0)
-        picked = np.searchsorted(np.cumsum(areas), areas.sum() * (np.arange(SAMPLES) + 0.5) / SAMPLES)
-        share = rng.random((SAMPLES, 2))
-        share = np.where(share.sum(axis=1, keepdims=True) > 1, 1 - share, share)
-        along = corners[picked, 1:] - corners[picked, :1]
-        self.points: Array = corners[picked, 0] + (share[..., None] * along).sum(axis=1)
-        self.points = np.concatenate([self.points, vertices[np.unique(faces)][:: max(1, len(vertices) // SAMPLES)]])
+        some = vertices[np.unique(faces)][:: max(1, len(vertices) // SAMPLES)]
+        self.points: Array = np.concatenate([sample_surface(vertices, faces, SAMPLES), some])
         self.centre: list[float] = (np.average(corners.mean(axis=1), axis=0, weights=areas)).tolist()
+        arms = corners - self.centre
+        squares = np.einsum("f,fki,fkj->ij", areas, arms, arms)  # of a triangle: sum of those of corners and of the sum
+        sums = arms.sum(axis=1)
+        self.moments: Array = squares + np.einsum("f,fi,fj->ij", areas, sums, sums)
         self.size = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
         self._tree = igl.AABB()
         self._tree.init(self.vertices, self.faces)
@@ -95,7 +109,7 @@ class _Shape:
 def _axes(shape: _Shape) -> list[Array]:
     """Unit vectors [3], each of a pair of opposite ones once."""
     lattice = [(x, y, z) for x in (0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)]
-    principal = np.linalg.eigh(np.cov((shape.points[:SAMPLES] - shape.centre).T))[1].T
+    principal = np.linalg.eigh(shape.moments)[1].T
     axes: list[Array] = []
     for axis in sorted(lattice, key=lambda numbers: sum(map(abs, numbers))) + list(principal):
         unit = normalize(np.array(axis, np.float64))

@@ -22,6 +22,7 @@ from spacesim.data.images import png_bytes
 from spacesim.data.records import Dataset, Frame
 
 SHARD = 1 << 28  #: bytes after which a shard is full
+OVERHEAD = 1024  #: bytes a file, at most: its header, and zeros up to the next 512
 MOST = 1000  #: frames of a shard
 
 
@@ -55,30 +56,28 @@ class _Shard:
 
     def __init__(self, out: Path, split: str) -> None:
         self._out, self._split, self._count = out, split, 0
-        self._open()
-
-    def _open(self) -> None:
-        self._stream, self._frames = io.BytesIO(), 0
-        self._tar = tarfile.open(fileobj=self._stream, mode="w", format=tarfile.USTAR_FORMAT)
+        self._frames: list[tuple[str, dict[str, bytes]]] = []
+        self._size = 0
 
     def add(self, name: str, files: dict[str, bytes]) -> None:
-        if self._frames and (
-            self._frames == MOST or self._stream.tell() + sum(len(content) for content in files.values()) > SHARD
-        ):
+        size = sum(len(content) + OVERHEAD for content in files.values())
+        if self._frames and (len(self._frames) == MOST or self._size + size > SHARD):
             self.close()
-            self._open()
-        for suffix, content in files.items():
-            member = tarfile.TarInfo(f"{name}.{suffix}")
-            member.size, member.mode = len(content), 0o644
-            self._tar.addfile(member, io.BytesIO(content))
-        self._frames += 1
+        self._frames.append((name, files))
+        self._size += size
 
     def close(self) -> int:
-        """How many shards there are."""
-        self._tar.close()
+        """Write what there is; how many shards there are."""
         if self._frames:
-            write_bytes(self._out / f"{self._split}-{self._count:06d}.tar", self._stream.getvalue(), durable=False)
-            self._count += 1
+            stream = io.BytesIO()
+            with tarfile.open(fileobj=stream, mode="w", format=tarfile.GNU_FORMAT) as tar:
+                for name, files in self._frames:
+                    for suffix, content in files.items():
+                        member = tarfile.TarInfo(f"{name}.{suffix}")
+                        member.size, member.mode = len(content), 0o644
+                        tar.addfile(member, io.BytesIO(content))
+            write_bytes(self._out / f"{self._split}-{self._count:06d}.tar", stream.getvalue(), durable=False)
+            self._frames, self._size, self._count = [], 0, self._count + 1
         return self._count
 
 
