@@ -15,7 +15,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
-from spacesim.data.store import load_truth
+from spacesim.data.store import load_depth, load_truth
 from spacesim.data.structure import Rules, did_you_mean, places_of
 from spacesim.data.toml import dotted
 from spacesim.data.transforms import read_dataset
@@ -65,6 +65,7 @@ __all__ = [
     "evaluate",
     "generate",
     "import_dataset",
+    "load_depth",
     "load_image",
     "load_run",
     "load_scene",

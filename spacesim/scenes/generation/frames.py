@@ -13,6 +13,7 @@ from pathlib import Path
 import spacesim
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, FrameWriter
+from spacesim.data.transforms import MILLIMETRE
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.background.draw import Background
 from spacesim.scenes.cameras.camera import CameraConfig
@@ -50,11 +51,12 @@ class Job:
     root: Path  #: the dataset's folder
     threads: int  #: that encode, a process
     background: BackgroundConfig | None = None
+    depth_unit: float = MILLIMETRE  #: metres a step of the pictures of depth
 
     @property
     def writer(self) -> FrameWriter:
         """Writes into the folder."""
-        return FrameWriter(self.root, raw_suffixes(self.camera))
+        return FrameWriter(self.root, raw_suffixes(self.camera), self.depth_unit)
 
 
 def raw_suffixes(camera: CameraConfig) -> tuple[str, ...]:

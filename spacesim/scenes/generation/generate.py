@@ -2,20 +2,23 @@
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from spacesim import backend
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import MAX_LIST_BYTES, JsonValue, read_json, write_json
+from spacesim.data.geometry import Array
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
-from spacesim.data.store import DatasetWriter
+from spacesim.data.store import DEPTH_UNIT, DatasetWriter, choose_depth_unit
+from spacesim.data.transforms import MILLIMETRE
 from spacesim.scenes.build import build
 from spacesim.scenes.cameras.rig import PlannedView, TargetSphere, plan
 from spacesim.scenes.config import SceneConfig
@@ -27,6 +30,7 @@ from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
 
 SCHEMA = 2  #: of scene.json
+COARSE_DEPTH = 0.01  #: of the scene's size: longer steps of depth pictures are told
 
 GenerationProgress = Callable[[int, int, str], None]
 MakeFrames = Callable[[Job, Sequence[FrameSpec]], Iterator[str]]  #: makes frames and yields their names
@@ -60,6 +64,7 @@ def generate(
         with _frame_maker(sweep.renderer, workers, ray) as make:
             alone.enter_context(lock_folder(job.root))
             writer = _open(Path(out), described, resume, sweep)
+            _warn_of_coarse_depth(writer.depth_unit, sweep.scene)
             missing = [spec for spec in sweep.specs if not writer.has_frame(spec.name)]
             total, complete = len(sweep.specs), len(sweep.specs) - len(missing)
             if progress is not None and complete:
@@ -71,6 +76,16 @@ def generate(
         listed = _view_records(sweep.train), _view_records(sweep.test)
         lens = config.camera.distortion
         return writer.finish(*listed, points, colors, sweep.scene.mesh, lens, lambda d: write_overview(d.root, d))
+
+
+def _warn_of_coarse_depth(unit: float, scene: Scene) -> None:
+    size = 2 * scene.bounding_sphere[1]
+    if unit > COARSE_DEPTH * size:
+        _log.warning(
+            "depth/*.png: steps of %g m, to reach the farthest view, are coarse for %.3g m; gt/*.exr has depth in full",
+            unit,
+            size,
+        )
 
 
 def _open(root: Path, described: dict[str, JsonValue], resume: bool, sweep: "_DatasetPlan") -> DatasetWriter:
@@ -148,6 +163,7 @@ class _DatasetPlan:
         self.specs = [FrameSpec(i, name, view.camera, view.sun, spp) for i, (spp, name, view) in enumerate(views)]
         threads = writing_threads(1)
         self.job = Job(self.scene, config.camera, quality, config.seed, Path(), threads, config.background)
+        self.job = replace(self.job, depth_unit=depth_unit(self.scene, [*self.train, *self.test]))
         inside = self.renderer.inside(np.stack([spec.camera.position for spec in self.specs]))
         if inside.any():
             name = self.specs[int(inside.argmax())].name
@@ -170,6 +186,7 @@ def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedVi
         **scene.describe(),
         "mesh": [_mesh_counts(scene, i) for i in range(1, len(scene.objects) + 1)],
         "suns": {"train": _angles(train), "test": _angles(test)},
+        **({DEPTH_UNIT: unit} if (unit := depth_unit(scene, [*train, *test])) != MILLIMETRE else {}),
         "exposure": config.camera.exposure,
         "seed": config.seed,
         "spp": config.quality.spp,
@@ -178,6 +195,18 @@ def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedVi
         "backend": backend.select(),
         "versions": versions(),
     }
+
+
+def depth_unit(scene: Scene, named: NamedViews) -> float:
+    """Metres a step of depth pictures, with which 16 bits reach all that the views may see."""
+    points: Array = scene.mesh.vertices
+    with suppress(QhullError):
+        points = points[ConvexHull(points).vertices]
+    farthest = 0.0
+    for _, view in named:
+        forward = view.camera.world_from_camera[:3, 2]
+        farthest = max(farthest, float((points @ forward).max() - view.camera.position @ forward))
+    return choose_depth_unit(farthest)
 
 
 def _mesh_counts(scene: Scene, object_id: int) -> dict[str, int]:
