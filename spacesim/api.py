@@ -28,7 +28,7 @@ from spacesim.splat.compose import PosedScene
 from spacesim.splat.compose.output import Composed
 from spacesim.splat.compose.output import compose as _compose
 from spacesim.splat.fit import estimate_sun
-from spacesim.splat.pose import RefinedPose, refine_pose
+from spacesim.splat.pose import FoundPose, RefinedPose, find_pose, refine_pose
 from spacesim.splat.raster.cameras import Pinhole, Projection
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import RenderOutput
@@ -45,6 +45,7 @@ __all__ = [
     "Camera",
     "Composed",
     "Dataset",
+    "FoundPose",
     "Frame",
     "Gaussians",
     "Image",
@@ -63,6 +64,7 @@ __all__ = [
     "compose",
     "estimate_sun",
     "evaluate",
+    "find_pose",
     "generate",
     "import_dataset",
     "load_depth",

@@ -15,7 +15,21 @@ from pathlib import Path
 from types import ModuleType
 
 from spacesim import __version__, backend
-from spacesim.cli import compose, demo, doctor, export, generate, render, report, reproduce, sweep, train, verify, view
+from spacesim.cli import (
+    compose,
+    demo,
+    doctor,
+    export,
+    generate,
+    locate,
+    render,
+    report,
+    reproduce,
+    sweep,
+    train,
+    verify,
+    view,
+)
 from spacesim.cli import eval as evaluate
 from spacesim.cli import import_ as import_command
 from spacesim.cli.parser import Parser
@@ -35,6 +49,7 @@ COMMANDS: dict[str, ModuleType] = {
     "compose": compose,
     "verify": verify,
     "export": export,
+    "locate": locate,
     "reproduce": reproduce,
 }
 """Each has SUMMARY, a line about it; add_options(parser, arguments); run(options); NEEDS_BACKEND, whether a backend is

@@ -134,6 +134,32 @@ def read_camera(path: Path) -> Camera:
         raise InputError(f"{path}: {error}") from None
 
 
+def read_views(path: Path) -> dict[str, Frame]:
+    """Cameras, lenses and Suns that a file like transforms.json tells, by its file paths, whether pictures are there or
+    not; of a file of one camera (see `read_camera`), that alone under "". Frames without a pose are left out. Raises
+    InputError where a key is missing or broken, and where there is no frame."""
+    meta = read_object(path)
+    entries = meta.get("frames", [{"file_path": ""}])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{path}: expected a list of frames, found another value")
+    found = {}
+    for entry in entries:
+        values = _without_nulls({**meta, **entry})
+        name = str(values.get("file_path", ""))
+        if "transform_matrix" not in values:
+            continue
+        try:
+            if "w" not in values or "h" not in values:
+                raise InputError("expected w and h, the size in pixels, found none")
+            camera, lens, sun = _read_camera(values, path), _read_distortion(values), _read_sun(values)
+        except InputError as error:
+            raise InputError(f"{path}: frame {name}: {error}" if name else f"{path}: {error}") from None
+        found[name] = Frame(name, camera, sun, distortion=lens)
+    if not found:
+        raise InputError(f"{path}: expected frames with a transform_matrix, found none")
+    return found
+
+
 def read_sun(path: Path, file_path: str) -> Sun | None:
     """The Sun that a file like transforms.json has of a frame, None where it has none. Raises InputError where it is
     broken."""
