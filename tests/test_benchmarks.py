@@ -766,3 +766,18 @@ def test_a_film_is_compared_with_its_own_frames(tmp_path):
     found = align(own, true)
     assert (found.cameras, found.matched_by) == (10, "source_index in transforms.json")
     np.testing.assert_allclose(found.pose.matrix, inside.inverse().matrix, atol=1e-9)
+
+
+@smallest("pose_basin.py --backend llvm --out OUT --data DATA --run RUN --views 1 --searched 1 --seed 1 --json")
+def test_pose_basin_tells_each_case(command, tiny_data, tiny_run, place, monkeypatch):
+    monkeypatch.setattr("spacesim.splat.pose.search.DIRECTIONS", 30)
+    (place / "DATA").symlink_to(tiny_data)
+    (place / "RUN").symlink_to(tiny_run)
+    report = json.loads(call(command))
+    cases = [row["case"] for row in report["rows"]]
+    assert cases[:4] == [f"angle {angle} deg, range 5 %" for angle in (5, 10, 20, 40)]
+    assert "searched" in cases
+    assert cases[-1].startswith("phase ")
+    for row in report["rows"]:
+        assert 0 <= row["found"] <= 1
+        assert 0 <= row["wrong of converged"] <= 1

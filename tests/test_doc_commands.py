@@ -42,7 +42,7 @@ VALUES = {  # what stands in a command for a value
     **{"GAUSSIANSxPIXELS,...": "300x32", "GAUSSIANSxPIXELS": "300x32", "PATH": "opensplat"},
 }
 FILES = {"DATA", "RUN", "RUNS", "EVAL", "DIR", "OUT", "PAIR", "BOXSAT", "URL"}
-OUTPUTS = ("--out", "--ply", "--mesh", "--speedplus", "--bop")
+OUTPUTS = ("--out", "--ply", "--mesh", "--speedplus", "--bop", "--coco", "--yolo", "--webdataset")
 
 SMALL = {  # options that a command gets, so that it is as small as can be
     "generate": {"--views": "2", "--test-views": "1", "--resolution": "24", "--spp": "1"},
