@@ -14,6 +14,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import common
@@ -54,7 +55,7 @@ def main() -> None:
     cases = dict.fromkeys(str(view["case"]) for view in views)
     rows = [summary(case, [view for view in views if view["case"] == case]) for case in cases]
     usual = [view for view in views if view["case"] == case_of(*USUAL)]
-    for low, high in zip(PHASES[:-1], PHASES[1:], strict=True):
+    for low, high in pairwise(PHASES):
         some = [view for view in usual if low <= view["phase"] < high]
         if some:
             rows.append(summary(f"phase {low:g} to {high:g} deg", some))

@@ -1,6 +1,7 @@
 """Poses found without a guess, and files of them."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +14,12 @@ from test_refine_pose import CAMERA, SIZE, errors, picture, run_of
 from spacesim import InputError, find_pose
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
-from spacesim.data.store import intrinsics_of, read_dataset
+from spacesim.data.store import intrinsics_of
 from spacesim.data.transforms import read_views
-from spacesim.splat.pose.locate import locate
+from spacesim.splat.pose.locate import _frames, _guess, locate
 from spacesim.splat.pose.search import ModelViews, _cut
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.run import Run
+from spacesim.splat.run import Run, load_run
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def camera_at(k: int) -> Camera:
 
 @pytest.mark.parametrize("alpha", [False, True])
 def test_poses_from_anywhere_are_found(run, views, alpha):
-    for k in range(2):
+    for k in range(1 if alpha else 2):
         true = camera_at(k)
         drawn = run.predict(true)
         seen = np.clip(drawn.rgb, 0, 1)
@@ -190,15 +191,28 @@ def test_wrong_inputs_are_refused_in_a_sentence(run, pictures, tmp_path, change,
 
 
 def test_the_command(spacesim, tiny_run, tiny_data, tmp_path):
-    """A dataset's own poses are not looked at, unless they are given to start from."""
-    out = tmp_path / "poses.json"
-    done = spacesim("locate", tiny_run, tiny_data, "--out", out, "--start", tiny_data / "transforms.json")
+    """Cameras are those of the poses to start from, or of the run's data."""
+    folder, out = tmp_path / "pictures", tmp_path / "poses.json"
+    folder.mkdir()
+    shutil.copy(tiny_data / "images/test_00000.png", folder)
+    done = spacesim("locate", tiny_run, folder, "--out", out, "--start", tiny_data / "transforms.json")
     assert done.code == 0, done.errors
-    assert f"{out}: 8 pictures, " in done.output
-    entries = json.loads(out.read_text())["frames"]
-    assert [entry["file_path"] for entry in entries] == [frame.file_path for frame in read_dataset(tiny_data).frames]
-    assert all(np.isfinite(entry["covariance"]).all() for entry in entries)
-    assert spacesim("locate", tiny_run, tiny_data, "--out", out).is_refusal(out, "--resume")
+    assert f"{out}: 1 pictures, " in done.output
+    (entry,) = json.loads(out.read_text())["frames"]
+    assert entry["file_path"] == "test_00000.png"
+    assert entry["start"] == "given"
+    assert np.isfinite(entry["covariance"]).all()
+    assert spacesim("locate", tiny_run, folder, "--out", out).is_refusal(out, "--resume")
     assert spacesim("locate", tiny_run, tmp_path / "x", "--out", tmp_path / "b.json").is_refusal(tmp_path / "x")
-    assert spacesim("locate", tiny_run, tiny_data, "--out", tmp_path / "b.json", "--within", "5").is_refusal("--within")
+    assert spacesim("locate", tiny_run, folder, "--out", tmp_path / "b.json", "--within", "5").is_refusal("--within")
     assert not (tmp_path / "b.json").exists()
+
+
+def test_a_datasets_own_poses_are_not_looked_at(tiny_run, tiny_data):
+    frames, dataset = _frames(load_run(tiny_run), tiny_data, {}, None)
+    assert dataset is not None
+    assert [frame.file_path for frame in frames] == [frame.file_path for frame in dataset.frames]
+    assert _guess({}, frames[0]) is None
+    told = read_views(tiny_data / "transforms.json")
+    guess = _guess(told, frames[0])
+    np.testing.assert_array_equal(guess.world_from_camera, dataset.frames[0].camera.world_from_camera)

@@ -11,11 +11,15 @@ import trimesh
 from PIL import Image as PillowImage
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
+from scipy.spatial.distance import cdist
 from tiny import contents
 
-from spacesim.data.exporters import write_coco, write_speedplus, write_webdataset, write_yolo
+from spacesim.data.exporters import LabelledObject, write_coco, write_speedplus, write_webdataset, write_yolo
+from spacesim.data.exporters.bop import _spread, _write_models
+from spacesim.data.exporters.keypoints import BodyLabels
 from spacesim.data.exporters.labels import Labeller
 from spacesim.data.exporters.objects import opaque_picture
+from spacesim.data.exporters.symmetries import find_symmetries
 from spacesim.data.images import read_png
 from spacesim.data.importers.speedplus import import_speedplus
 from spacesim.data.store import load_depth
@@ -197,3 +201,44 @@ def test_commands_take_keypoints(spacesim, labelled, tmp_path):
     assert spacesim("export", labelled.root, "--mesh", "a.ply", "--keypoints", "4").is_refusal("--keypoints")
     assert spacesim("export", labelled.root, "--coco", given).is_refusal(given)
     assert not (tmp_path / "b").exists()
+
+
+def test_bop_models_have_symmetries_and_vertices_all_over(tmp_path):
+    """By bop_toolkit's rules: R p + t in millimetres takes the model to itself; continuous ones turn about an axis
+    through an offset."""
+    prism, cylinder = trimesh.creation.box((1, 1, 3)), trimesh.creation.cylinder(0.5, 2, sections=64)
+    prism.apply_translation([0.2, 0, 0])
+    targets, bodies = [], []
+    for number, mesh in enumerate((prism, cylinder), start=1):
+        vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+        targets.append(LabelledObject(number, f"body {number}", np.eye(4), vertices, faces))
+        bodies.append(BodyLabels(number, {"a": (0.0, 0.0, 0.0)}, "", *find_symmetries(vertices, faces)))
+    _write_models(tmp_path, targets, [1, 2], bodies)
+    infos = json.loads((tmp_path / "models/models_info.json").read_text())
+    assert infos == json.loads((tmp_path / "models_eval/models_info.json").read_text())
+    assert len(infos["1"]["symmetries_discrete"]) == 7
+    assert "symmetries_continuous" not in infos["1"]
+    for matrix in infos["1"]["symmetries_discrete"]:
+        pose = np.reshape(matrix, (4, 4))
+        turned = 1000 * prism.vertices @ pose[:3, :3].T + pose[:3, 3]
+        assert cdist(turned, 1000 * prism.vertices).min(axis=1).max() < 1e-6
+    (axis,) = infos["2"]["symmetries_continuous"]
+    np.testing.assert_allclose(np.abs(axis["axis"]), [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(axis["offset"][:2], 0, atol=1e-9)
+    for number, target in enumerate(targets, start=1):
+        whole, eval_ = (
+            trimesh.load(tmp_path / f"{folder}/obj_{number:06d}.ply", process=False)
+            for folder in ("models", "models_eval")
+        )
+        np.testing.assert_allclose(whole.vertices, 1000 * target.vertices, atol=1e-3)
+        assert len(eval_.vertices) > 500
+        assert eval_.edges_unique_length.max() <= 0.05 * infos[str(number)]["diameter"] + 1e-6
+        assert eval_.area == pytest.approx(whole.area, rel=1e-6)
+
+
+def test_bop_merges_what_is_fine(tmp_path):
+    ball = trimesh.creation.icosphere(6)
+    spread = _spread(1000 * ball.vertices, ball.faces, 2000.0)
+    assert 2000 < len(spread.vertices) < len(ball.vertices) / 2
+    assert abs(spread.area / (1e6 * ball.area) - 1) < 0.01
+    np.testing.assert_allclose(np.linalg.norm(spread.vertices, axis=1), 1000, atol=10)
