@@ -25,11 +25,14 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from spacesim.data.records import Sun
+    from spacesim.methods import load_run
     from spacesim.progress import show_progress
     from spacesim.splat.pose.locate import locate
-    from spacesim.splat.run import load_run
+    from spacesim.splat.run import Run, check_gaussians
 
     run = load_run(options.path)
+    check_gaussians(run)
+    assert isinstance(run, Run)
     sun = Sun.from_angles(*options.sun) if options.sun else None
     more = {} if options.within is None else {"within": options.within}
     with show_progress("locate", "pictures") as report:
