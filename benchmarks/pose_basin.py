@@ -5,9 +5,10 @@
 
 Data and run as of `benchmarks/pose.py`. Path-traced pictures over a black sky, without alpha. Each view's camera goes
 round the object by an angle, rolls by as much and changes its range by a share, both ways at random; `within` of
-`refine_pose` says so. Where a case names one, the other is 5 degrees or 5 %. The phase angle is that at the object
-between Sun and camera. Darkness multiplies linear light before it is rounded to 8 bits. "searched" is `find_pose`, with
-no start at all. "found": within 2 degrees and 2 %; "wrong of converged" the share of these that is not.
+`refine_pose` says by how much that turns and moves it. Where a case names one, the other is 5 degrees or 5 %. The phase
+angle is that at the object between Sun and camera. Darkness multiplies linear light before it is rounded to 8 bits.
+"searched" is `find_pose`, with no start at all. "found": within 2 degrees and 2 %; "wrong of converged" the share of
+these that is not.
 """
 
 import math
@@ -75,7 +76,9 @@ def measured(run: Run, data: Dataset, count: int, searched: int, seed: int) -> I
     for case, degrees, share, factor, times in cases:
         for k, frame in enumerate(taken(data, times * count)):
             start = displaced(frame.camera, degrees, share, np.random.default_rng([seed, k]))
-            yield {"case": case, **refined(run, data, frame, start, (degrees, share), factor, seed)}
+            moved = math.hypot(2 * math.sin(math.radians(0.5 * degrees)), share)
+            within = min(math.sqrt(2) * degrees, 60.0), min(moved, 0.5)  # attitude and place
+            yield {"case": case, **refined(run, data, frame, start, within, factor, seed)}
     for frame in taken(data, searched) if searched else ():
         yield {"case": "searched", **refined(run, data, frame, None, USUAL, 1.0, seed)}
 
@@ -116,8 +119,7 @@ def refined(
             views = ModelViews.of(run, frame.sun if run.relightable else None, False)
             pose = find_pose(run, image, frame.camera, frame.sun, seed=seed, views=views).pose
         else:
-            reach = min(within[0], 60.0), min(within[1], 0.5)
-            pose = refine_pose(run, image, start, frame.sun, within=reach, seed=seed)
+            pose = refine_pose(run, image, start, frame.sun, within=within, seed=seed)
         row |= {"off": list(errors(pose.camera, frame.camera)), "converged": pose.converged}
     except InputError:  # nothing in the picture is brighter than the sky
         pass
