@@ -771,6 +771,7 @@ def test_a_film_is_compared_with_its_own_frames(tmp_path):
 @smallest("pose_basin.py --backend llvm --out OUT --data DATA --run RUN --views 1 --searched 1 --seed 1 --json")
 def test_pose_basin_tells_each_case(command, tiny_data, tiny_run, place, monkeypatch):
     monkeypatch.setattr("spacesim.splat.pose.search.DIRECTIONS", 30)
+    monkeypatch.setattr("spacesim.splat.pose.refine.CANDIDATES", 4)
     (place / "DATA").symlink_to(tiny_data)
     (place / "RUN").symlink_to(tiny_run)
     report = json.loads(call(command))
