@@ -27,7 +27,7 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.data.records import Sun
     from spacesim.methods import load_run
     from spacesim.progress import show_progress
-    from spacesim.splat.pose.locate import locate
+    from spacesim.splat.locate import locate
     from spacesim.splat.run import Run, check_gaussians
 
     run = load_run(options.path)

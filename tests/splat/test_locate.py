@@ -16,7 +16,7 @@ from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.data.store import intrinsics_of
 from spacesim.data.transforms import read_views
-from spacesim.splat.pose.locate import _frames, _guess, locate
+from spacesim.splat.locate import _frames, _guess, locate
 from spacesim.splat.pose.search import ModelViews, _cut
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run, load_run
