@@ -55,6 +55,7 @@ def make(folder: Path, frames: int = 600, height: int = 300, seed: int = 0, spp:
             write_speedplus(made, folder / "speedplus", progress=report)
         for number, path in enumerate(sorted((folder / "speedplus/synthetic/images").glob("*.png"))):
             write_png(path, degraded(read_png(path), (seed, number)), durable=False)
+        shutil.rmtree(folder / "speedplus/synthetic/masks")  # SPEED+ has none
         import_speedplus(folder / "speedplus", folder / "data")
     data = read_dataset(folder / "data")
     if not (folder / "told/transforms.json").exists():

@@ -16,7 +16,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
-from spacesim.data.store import load_truth
+from spacesim.data.store import load_depth, load_truth
 from spacesim.data.structure import Rules, did_you_mean, places_of
 from spacesim.data.toml import dotted
 from spacesim.data.transforms import read_dataset
@@ -33,7 +33,7 @@ from spacesim.splat.compose import PosedScene
 from spacesim.splat.compose.output import Composed
 from spacesim.splat.compose.output import compose as _compose
 from spacesim.splat.fit import estimate_sun
-from spacesim.splat.pose import RefinedPose, refine_pose
+from spacesim.splat.pose import FoundPose, RefinedPose, find_pose, refine_pose
 from spacesim.splat.raster.cameras import Pinhole, Projection
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import RenderOutput
@@ -51,6 +51,7 @@ __all__ = [
     "CameraClient",
     "Composed",
     "Dataset",
+    "FoundPose",
     "Frame",
     "Gaussians",
     "Image",
@@ -70,8 +71,10 @@ __all__ = [
     "compose",
     "estimate_sun",
     "evaluate",
+    "find_pose",
     "generate",
     "import_dataset",
+    "load_depth",
     "load_image",
     "load_run",
     "load_scene",

@@ -798,3 +798,19 @@ def test_serve_loses_no_request(command):
     assert all(row["pictures/s"] > 0 for row in report["rows"])
     (many,) = report["many"]
     assert many["answered"] == many["requests"] == 50
+
+
+@smallest("pose_basin.py --backend llvm --out OUT --data DATA --run RUN --views 1 --searched 1 --seed 1 --json")
+def test_pose_basin_tells_each_case(command, tiny_data, tiny_run, place, monkeypatch):
+    monkeypatch.setattr("spacesim.splat.pose.search.DIRECTIONS", 30)
+    monkeypatch.setattr("spacesim.splat.pose.refine.CANDIDATES", 4)
+    (place / "DATA").symlink_to(tiny_data)
+    (place / "RUN").symlink_to(tiny_run)
+    report = json.loads(call(command))
+    cases = [row["case"] for row in report["rows"]]
+    assert cases[:4] == [f"angle {angle} deg, range 5 %" for angle in (5, 10, 20, 40)]
+    assert "searched" in cases
+    assert cases[-1].startswith("phase ")
+    for row in report["rows"]:
+        assert 0 <= row["found"] <= 1
+        assert 0 <= row["wrong of converged"] <= 1

@@ -43,7 +43,7 @@ VALUES = {  # what stands in a command for a value
     **{"GAUSSIANSxPIXELS,...": "300x32", "GAUSSIANSxPIXELS": "300x32", "PATH": "opensplat"},
 }
 FILES = {"DATA", "RUN", "RUNS", "EVAL", "DIR", "OUT", "PAIR", "BOXSAT", "URL"}
-OUTPUTS = ("--out", "--ply", "--mesh", "--speedplus", "--bop")
+OUTPUTS = ("--out", "--ply", "--mesh", "--speedplus", "--bop", "--coco", "--yolo", "--webdataset")
 
 SMALL = {  # options that a command gets, so that it is as small as can be
     "generate": {"--views": "2", "--test-views": "1", "--resolution": "24", "--spp": "1"},
@@ -428,6 +428,8 @@ def given(tiny_data, tmp_path_factory) -> dict[str, Path]:
     camera = {key: meta[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
     camera["transform_matrix"] = meta["frames"][0]["transform_matrix"]
     (folder / "camera.json").write_text(json.dumps(camera), encoding="utf-8")
+    (folder / "pictures").mkdir()
+    (folder / "pictures/test_00000.png").symlink_to(tiny_data / "images/test_00000.png")
     run, files = folder / "runs/boxsat", ("my.toml", "hubble.glb", "camera.json", "scene.toml")
     evaluated = call("eval", run, "--data", tiny_data, "--out", folder / "eval", "--no-geometry")
     assert evaluated.code == 0, evaluated.errors
@@ -437,6 +439,8 @@ def given(tiny_data, tmp_path_factory) -> dict[str, Path]:
             "DATA": tiny_data,
             "fox": tiny_data,
             "PAIR": folder / "pair",
+            "pictures": folder / "pictures",
+            "rough.json": tiny_data / "transforms.json",
             "SCENE.toml": folder / "scene.toml",
         },
         **{name: run for name in ("run", "RUN", "other", "out/demo/run", "runs/boxsat")},

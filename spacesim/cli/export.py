@@ -11,6 +11,7 @@ from spacesim.cli.printing import KNOWS_ONE_LIGHT, WANTS_FILTER
 from spacesim.data.errors import InputError, WorkError
 
 SUMMARY, NEEDS_BACKEND = "a run or a dataset as files for other tools", False
+LABELS = "speedplus", "bop", "coco", "yolo", "webdataset"  #: forms of a dataset
 
 
 def add_options(parser: Parser, arguments: Sequence[str]) -> None:
@@ -24,6 +25,14 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     )
     form.add_argument("--speedplus", type=Path, metavar="DIR", help="a dataset's images and poses as SPEED+ has them")
     form.add_argument("--bop", type=Path, metavar="DIR", help="a dataset's images, depth, masks, poses, models for BOP")
+    form.add_argument(
+        "--coco", type=Path, metavar="DIR", help="a dataset's masks, boxes and keypoints as COCO has them"
+    )
+    form.add_argument("--yolo", type=Path, metavar="DIR", help="the same for Ultralytics: detect, segment and pose")
+    form.add_argument("--webdataset", type=Path, metavar="DIR", help="a dataset with its labels as shards")
+    parser.add_argument(
+        "--keypoints", metavar="N|FILE", help="for a dataset: how many are found (11), or which they are"
+    )
     parser.add_argument("--sun", type=angles, metavar="AZ,EL", help="for --ply of a relightable run: whose colours")
     parser.add_argument("--object", metavar="K", help="for SPEED+: whose poses, by number or name (the first)")
     parser.add_argument("--data", type=Path, metavar="DATA", help="for --mesh: the dataset, where it has moved")
@@ -37,13 +46,14 @@ def run(options: argparse.Namespace) -> None:
         raise InputError("object: expected with --speedplus, found without it")
     if options.sun is not None and options.ply is None:
         raise InputError("sun: expected with --ply, found without it")
+    labels = next((name for name in LABELS if getattr(options, name) is not None), None)
+    if options.keypoints is not None and labels is None:
+        raise InputError(f"keypoints: expected with --{', --'.join(LABELS)}, found without one")
     for name in ("data", "views", "voxel", "truncation"):
         if getattr(options, name) is not None and options.mesh is None:
             raise InputError(f"{name}: expected with --mesh, found without it")
-    if options.speedplus is not None:
-        _export_speedplus(options)
-    elif options.bop is not None:
-        _export_bop(options)
+    if labels is not None:
+        _export_labels(options, labels)
     elif options.mesh is not None:
         _export_mesh(options)
     elif options.html is not None:
@@ -128,27 +138,35 @@ def _export_html(options: argparse.Namespace) -> None:
     interrupts.print_output(f"{options.html}: {run.gaussian_count} Gaussians, {size:.1f} MB")
 
 
-def _export_speedplus(options: argparse.Namespace) -> None:
-    from spacesim.data.exporters import write_speedplus
+def _export_labels(options: argparse.Namespace, kind: str) -> None:
+    from spacesim.data import exporters
     from spacesim.data.store import read_dataset
     from spacesim.progress import show_progress
 
-    dataset = read_dataset(options.path)
+    out, dataset = getattr(options, kind), read_dataset(options.path)
+    keypoints = _keypoints(options.keypoints)
     with show_progress("export", "frames") as report:
-        target = write_speedplus(dataset, options.speedplus, options.object, report)
-    interrupts.print_output(f"{options.speedplus}: {len(dataset.frames)} images with the pose of {target.name}")
+        if kind == "speedplus":
+            words = f"the pose of {exporters.write_speedplus(dataset, out, options.object, keypoints, report).name}"
+        elif kind == "bop":
+            from spacesim.scenes.silhouette import silhouette_finder
+
+            backend.select(options.backend)
+            targets = exporters.write_bop(dataset, out, silhouette_finder, keypoints, report)
+            words = f"the poses of {', '.join(target.name for target in targets)}"
+        elif kind == "webdataset":
+            words = f"their labels in {exporters.write_webdataset(dataset, out, keypoints, report)} shards"
+        else:
+            write = exporters.write_coco if kind == "coco" else exporters.write_yolo
+            words = f"{write(dataset, out, keypoints, report)} instances"
+    interrupts.print_output(f"{out}: {len(dataset.frames)} images with {words}")
 
 
-def _export_bop(options: argparse.Namespace) -> None:
-    from spacesim.data.exporters import write_bop
-    from spacesim.data.store import read_dataset
-    from spacesim.progress import show_progress
-    from spacesim.scenes.silhouette import silhouette_finder
-
-    backend.select(options.backend)
-    dataset = read_dataset(options.path)
-    with show_progress("export", "frames") as report:
-        targets = write_bop(dataset, options.bop, silhouette_finder, report)
-    interrupts.print_output(
-        f"{options.bop}: {len(dataset.frames)} images with the poses of {', '.join(t.name for t in targets)}"
-    )
+def _keypoints(text: str | None) -> int | Path | None:
+    """How many, or the file that tells them."""
+    if text is None:
+        return None
+    try:
+        return int(text)
+    except ValueError:
+        return Path(text)

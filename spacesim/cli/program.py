@@ -21,6 +21,7 @@ from spacesim.cli import (
     doctor,
     export,
     generate,
+    locate,
     render,
     report,
     reproduce,
@@ -50,6 +51,7 @@ COMMANDS: dict[str, ModuleType] = {
     "compose": compose,
     "verify": verify,
     "export": export,
+    "locate": locate,
     "reproduce": reproduce,
 }
 """Each has SUMMARY, a line about it; add_options(parser, arguments); run(options); NEEDS_BACKEND, whether a backend is

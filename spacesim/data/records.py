@@ -191,6 +191,7 @@ class Dataset:
     scene: JsonMapping = field(default_factory=dict)  #: scene.json, {} for data from elsewhere
     #: images that transforms.json names and that are not there: their frames are left out
     missing: tuple[str, ...] = ()
+    depth_unit: float = 1e-3  #: metres a step of the pictures of depth
 
     @property
     def frames(self) -> tuple[Frame, ...]:

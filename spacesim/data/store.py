@@ -33,7 +33,7 @@ from spacesim.data.integrity.manifest import check_manifest, read_manifest, writ
 from spacesim.data.integrity.whole import is_whole
 from spacesim.data.mesh import check_points, load_trimesh
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
-from spacesim.data.transforms import dataset_of, read_dataset
+from spacesim.data.transforms import DEPTH_UNITS, MILLIMETRE, dataset_of, read_dataset
 
 if TYPE_CHECKING:
     import trimesh
@@ -46,6 +46,7 @@ __all__ = [
     "DatasetWriter",
     "FrameWriter",
     "find_unreadable_files",
+    "load_depth",
     "load_truth",
     "read_dataset",
     "read_points",
@@ -69,7 +70,9 @@ _LABELS = ("object_id", "part_id", "shadow")
 _OPTIONAL = ("radiance_earth", "radiance_background")
 _FILTERED = ("radiance", "alpha", *_OPTIONAL)
 RAW_MONOCHROME, RAW_COLOR = ("",), ("_r", "_g", "_b")  #: suffixes of the files in raw/
-_DEPTH_UNIT = 1e-3  # metres a step of depth/*.png: Nerfstudio's default depth_unit_scale_factor
+DEPTH_UNIT = "depth_unit"  #: key of scene.json: metres a step of depth/*.png, where that is no millimetre
+DEPTH_MARGIN = 1.05  #: beyond the farthest surface that coarser steps reach
+_MOST_STEPS = np.iinfo(np.uint16).max
 
 _log = logging.getLogger(__name__)
 
@@ -102,15 +105,40 @@ def load_truth(dataset: Dataset, frame: Frame) -> Truth:
     return Truth(**values)
 
 
+def load_depth(dataset: Dataset, frame: Frame) -> np.ndarray:
+    """[H, W] float32: depth along the optical axis, metres, 0 none, of the picture as it is stored. Raises InputError
+    where that is missing or broken."""
+    if frame.depth_file_path is None:
+        raise InputError(f"{dataset.root}: expected depth of {frame.file_path}, found no depth_file_path")
+    path = dataset.root / frame.depth_file_path
+    steps = _read_label(path, frame.camera)
+    if steps.ndim != 2:
+        raise InputError(f"{path}: expected depth in one channel, found {steps.shape[2]}")
+    return (steps * dataset.depth_unit).astype(np.float32)
+
+
+def choose_depth_unit(farthest: float) -> float:
+    """Metres a step of depth pictures of 16 bits: a millimetre where that reaches `farthest`, metres, else the finest
+    of 2, 5, 10, 20, ... millimetres that reaches `DEPTH_MARGIN` times as far."""
+    if farthest <= _MOST_STEPS * MILLIMETRE:
+        return MILLIMETRE
+    steps = DEPTH_MARGIN * farthest / _MOST_STEPS / MILLIMETRE
+    decade = 10 ** int(np.floor(np.log10(steps)))
+    factor = next(factor for factor in (1, 2, 5, 10) if factor * decade >= steps)
+    return factor * decade / 1000
+
+
 class FrameWriter:
     """Writes the frames of a dataset folder that exists; any number of processes and machines may do so at once.
 
-    root: the folder; raw: suffixes of the names of a sensor's pictures in raw/: () none, RAW_MONOCHROME or RAW_COLOR.
+    root: the folder; raw: suffixes of the names of a sensor's pictures in raw/: () none, RAW_MONOCHROME or RAW_COLOR;
+    depth_unit: metres a step of depth/*.png.
     """
 
-    def __init__(self, root: Path, raw: Sequence[str] = ()) -> None:
+    def __init__(self, root: Path, raw: Sequence[str] = (), depth_unit: float = MILLIMETRE) -> None:
         self.root = Path(root)
         self.raw = tuple(raw)
+        self.depth_unit = depth_unit
         self._warned = False
 
     def has_frame(self, name: str) -> bool:
@@ -146,10 +174,11 @@ class FrameWriter:
         write_exr(self.root / "gt" / f"{name}.exr", present, durable=False)
 
     def _encode_depth(self, depth: np.ndarray, surface: np.ndarray) -> np.ndarray:
-        steps = np.round(np.where(surface, depth, 0).astype(np.float64) / _DEPTH_UNIT)
-        beyond = ~(steps <= np.iinfo(np.uint16).max)
+        steps = np.round(np.where(surface, depth, 0).astype(np.float64) / self.depth_unit)
+        beyond = ~(steps <= _MOST_STEPS)
         if beyond.any() and not self._warned:
-            _log.warning("depth/*.png: surfaces beyond 65.535 m are stored as 0; gt/*.exr has their depth")
+            most = _MOST_STEPS * self.depth_unit
+            _log.warning("depth/*.png: surfaces beyond %g m are stored as 0; gt/*.exr has their depth", most)
             self._warned = True
         return np.where(beyond, 0, steps).astype(np.uint16)
 
@@ -157,10 +186,10 @@ class FrameWriter:
 class DatasetWriter(FrameWriter):
     """Writes a dataset folder; an interrupted run leaves whole files only, which a later run completes.
 
-    root: the folder, made here; scene: what to render, as JSON values, written to scene.json first; resume: go on with
-    a folder that holds the same scene; raw: as in FrameWriter; shared: others write frames of it at the same time, so
-    that files in the making and damaged ones are left alone. Otherwise only one at a time may work on a folder. Raises
-    InputError where it holds anything else.
+    root: the folder, made here; scene: what to render, as JSON values, written to scene.json first, its DEPTH_UNIT is
+    that of depth/*.png; resume: go on with a folder that holds the same scene; raw: as in FrameWriter; shared: others
+    write frames of it at the same time, so that files in the making and damaged ones are left alone. Otherwise only one
+    at a time may work on a folder. Raises InputError where it holds anything else.
     """
 
     def __init__(
@@ -171,7 +200,7 @@ class DatasetWriter(FrameWriter):
         raw: Sequence[str] = (),
         shared: bool = False,
     ) -> None:
-        super().__init__(root, raw)
+        super().__init__(root, raw, float(str(scene.get(DEPTH_UNIT, MILLIMETRE))))
         scene = json.loads(json.dumps(scene, allow_nan=False))  # as it reads back
         if self.root.exists() and not self.root.is_dir():
             raise InputError(f"{self.root}: expected a folder to write to, found a file")
@@ -212,10 +241,12 @@ class DatasetWriter(FrameWriter):
         write_points(self.root / "points.ply", points, colors)
         write_bytes(self.root / "mesh.ply", mesh.export(file_type="ply", vertex_normal=False))
         path, meta = self.root / "transforms.json", _describe_frames(train, test, distortion, more or {})
+        meta = {DEPTH_UNITS[0]: self.depth_unit, **meta}
         content = json_bytes(meta)
         if overview is not None:
             overview(dataset_of(path, meta))
         parts = ["scene.json", "points.ply", "mesh.ply", *sorted(picture.name for picture in self.root.glob("*.png"))]
+        parts += ["keypoints.json"] * (self.root / "keypoints.json").is_file()
         parts += [file for name, _, _ in (*train, *test) for file in self._files_of(name)]
         write_manifest(self.root, parts, {path.name: hashlib.sha256(content).hexdigest()})
         flush_disks()
@@ -316,11 +347,13 @@ def find_unreadable_files(path: Path) -> list[str]:
     return problems
 
 
-def _read_label(path: Path, camera: Camera) -> None:
-    size = read_png(path).shape[:2]
+def _read_label(path: Path, camera: Camera) -> np.ndarray:
+    pixels = read_png(path)
+    size = pixels.shape[:2]
     if size != (camera.height, camera.width):
         expected = f"{camera.width}x{camera.height}"
         raise InputError(f"{path}: expected {expected} pixels as the camera says, found {size[1]}x{size[0]}")
+    return pixels
 
 
 def _describe_frames(

@@ -28,6 +28,9 @@ from spacesim.data.records import SUN_WORDS, Camera, Dataset, Frame, Sun
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 TRUTH_PATHS = ("gt_path", "shadow_path", "silhouette_path", "id_path", "depth_file_path", "mask_path")
+DEPTH_UNITS = "depth_unit_scale_factor", "integer_depth_scale"  #: keys: Nerfstudio's name, instant-ngp's
+MILLIMETRE = 1e-3  #: metres: Nerfstudio's default
+MAX_DEPTH_UNIT = 1e30  #: metres a step
 _HOLD_OUT = 8
 _SPLITS = ("train", "val", "test")
 
@@ -96,7 +99,20 @@ def _dataset(
     root = path.parent
     scene = read_object(root / "scene.json") if (root / "scene.json").exists() else {}
     points, mesh = (_path(path, meta, key) for key in ("ply_file_path", "mesh_path"))
-    return Dataset(root, train, test, points, mesh, scene, missing)
+    return Dataset(root, train, test, points, mesh, scene, missing, read_depth_unit(path, meta))
+
+
+def read_depth_unit(path: Path, values: Json) -> float:
+    """Metres a step of depth pictures, by transforms.json or one of its frames. Raises InputError where that cannot
+    be."""
+    key = next((key for key in DEPTH_UNITS if values.get(key) is not None), DEPTH_UNITS[0])
+    try:
+        unit = MILLIMETRE if values.get(key) is None else _number(values, key)
+        if 0 < unit < MAX_DEPTH_UNIT:
+            return unit
+        raise InputError(f"expected metres above 0 as {key}, found {values[key]!r}")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def read_camera(path: Path) -> Camera:
@@ -116,6 +132,32 @@ def read_camera(path: Path) -> Camera:
         return _read_camera(values, path)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def read_views(path: Path) -> dict[str, Frame]:
+    """Cameras, lenses and Suns that a file like transforms.json tells, by its file paths, whether pictures are there or
+    not; of a file of one camera (see `read_camera`), that alone under "". Frames without a pose are left out. Raises
+    InputError where a key is missing or broken, and where there is no frame."""
+    meta = read_object(path)
+    entries = meta.get("frames", [{"file_path": ""}])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{path}: expected a list of frames, found another value")
+    found = {}
+    for entry in entries:
+        values = _without_nulls({**meta, **entry})
+        name = str(values.get("file_path", ""))
+        if "transform_matrix" not in values:
+            continue
+        try:
+            if "w" not in values or "h" not in values:
+                raise InputError("expected w and h, the size in pixels, found none")
+            camera, lens, sun = _read_camera(values, path), _read_distortion(values), _read_sun(values)
+        except InputError as error:
+            raise InputError(f"{path}: frame {name}: {error}" if name else f"{path}: {error}") from None
+        found[name] = Frame(name, camera, sun, distortion=lens)
+    if not found:
+        raise InputError(f"{path}: expected frames with a transform_matrix, found none")
+    return found
 
 
 def read_sun(path: Path, file_path: str) -> Sun | None:

@@ -10,7 +10,7 @@ from spacesim.backend import mitsuba_types as mt
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.exporters import LabelledObject, Silhouette
-from spacesim.data.exporters.bop import bounding_box
+from spacesim.data.exporters.masks import bounding_box
 from spacesim.data.geometry import Array
 from spacesim.data.mesh import drawable_faces
 from spacesim.data.records import Camera

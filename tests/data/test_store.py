@@ -21,7 +21,9 @@ from spacesim.data.images import load_image, read_exr, write_exr
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import (
     DatasetWriter,
+    choose_depth_unit,
     find_unreadable_files,
+    load_depth,
     load_truth,
     read_dataset,
     read_points,
@@ -363,3 +365,35 @@ def test_our_own_images_load(root):
     assert image.rgb.shape == (HEIGHT, WIDTH, 3)
     np.testing.assert_allclose(image.alpha, make_truth().alpha, atol=0.5 / 255)
     assert image.valid.all()
+
+
+@pytest.mark.parametrize(
+    ("farthest", "unit"), [(0, 1e-3), (65.535, 1e-3), (65.6, 2e-3), (124.8, 2e-3), (125, 5e-3), (4e5, 10), (7e6, 200)]
+)
+def test_the_finest_round_step_that_reaches(farthest, unit):
+    assert choose_depth_unit(farthest) == pytest.approx(unit, rel=1e-12)
+
+
+def test_far_depth_is_stored_in_the_unit_that_transforms_json_says(tmp_path, caplog):
+    truth = make_truth()
+    truth.depth[5, 5:7] = [500.0, 655.0]
+    writer = DatasetWriter(tmp_path / "data", {**SCENE, "depth_unit": 0.01})
+    for name in TRAIN + TEST:
+        writer.write_frame(name, truth, picture_of(truth))
+    frames = make_frames(TRAIN + TEST)
+    dataset = writer.finish(frames[:2], frames[2:], POINTS, COLORS, trimesh.creation.box())
+    assert json.loads((tmp_path / "data/transforms.json").read_text())["depth_unit_scale_factor"] == 0.01
+    stored = np.asarray(PillowImage.open(tmp_path / "data/depth/train_00000.png"))
+    assert stored[5, 5:7].tolist() == [50000, 65500]
+    np.testing.assert_allclose(load_depth(dataset, dataset.train[0]), truth.depth, atol=5.1e-3)
+    assert not caplog.records
+    with pytest.raises(InputError, match="expected the scene asked for, 'depth_unit' differs"):
+        DatasetWriter(tmp_path / "data", SCENE, True)
+
+
+@pytest.mark.parametrize("unit", [0, -1, "x", True, float("nan")])
+def test_units_of_depth_that_cannot_be(root, unit):
+    meta = json.loads((root / "transforms.json").read_text())
+    (root / "transforms.json").write_text(json.dumps({**meta, "depth_unit_scale_factor": unit}))
+    with pytest.raises(InputError, match=r"transforms\.json: expected .* as depth_unit_scale_factor"):
+        read_dataset(root)

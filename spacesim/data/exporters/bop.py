@@ -1,8 +1,11 @@
 """BOP, the benchmark for 6D object pose estimation (T. Hodan et al., ECCV 2018), scene-wise, as its toolkit has it.
 
-    DIR/camera.json                 DIR/models/models_info.json, obj_000001.ply (mm)
-    DIR/train/000000, test/000000   scene_camera.json  scene_gt.json  scene_gt_info.json
-                                    rgb/ or gray/  depth/  mask/  mask_visib/
+    DIR/camera.json  keypoints.json   DIR/models, models_eval: models_info.json, obj_000001.ply (mm)
+    DIR/train/000000, test/000000     scene_camera.json  scene_gt.json  scene_gt_info.json
+                                      rgb/  depth/  mask/  mask_visib/
+
+models_eval has the same shapes with vertices all over them, at most some 10,000, as errors are measured at vertices.
+models_info.json tells symmetries: see `symmetries`.
 
 A point p of a model is at cam_R_m2c p + cam_t_m2c in the camera, in millimetres, the axes OpenCV's. In BOP's rendered
 datasets the centres of pixels have whole coordinates, so cam_K's principal point is half a pixel less than ours.
@@ -19,7 +22,16 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
 from spacesim.data.errors import InputError
-from spacesim.data.exporters.objects import ExportProgress, LabelledObject, labelled_objects, new_folder, opaque_picture
+from spacesim.data.exporters.keypoints import NAME, BodyLabels, body_labels, write_body_labels
+from spacesim.data.exporters.masks import NO_BOX, bounding_box
+from spacesim.data.exporters.objects import (
+    ExportProgress,
+    LabelledObject,
+    labelled_objects,
+    model_numbers,
+    new_folder,
+    opaque_picture,
+)
 from spacesim.data.files import JsonDict, write_bytes, write_json
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame
@@ -27,6 +39,8 @@ from spacesim.data.store import load_truth
 
 MM = 1000.0
 HALF = 0.5  # from our pixel coordinates to those of BOP
+EDGE = 0.05  #: of the diameter: longest edges of models_eval
+MOST_VERTICES = 10_000  #: from which on models_eval merges vertices
 SEEN_ENOUGH = 0.1  #: visible fraction from which on an instance is a target of the test (BOP challenge)
 
 
@@ -46,20 +60,24 @@ def write_bop(
     dataset: Dataset,
     out: Path,
     outline: Callable[[list[LabelledObject]], Outline],
+    keypoints: int | Path | None = None,
     progress: ExportProgress | None = None,
 ) -> list[LabelledObject]:
     """Write `dataset` into the new folder `out`; returns the objects whose poses are labels.
 
-    outline: makes what finds silhouettes, which takes rays (see `spacesim.scenes.silhouette`). Raises InputError for
-    distorted images, which BOP does not know, and for a folder that is not empty.
+    outline: makes what finds silhouettes, which takes rays (see `spacesim.scenes.silhouette`);  keypoints: how many are
+    to be found, or a file, see `body_labels`. Raises InputError for distorted images, which BOP does not know, and for
+    a folder that is not empty.
     """
     for frame in dataset.frames:
         if any(frame.distortion):
             raise InputError(f"{frame.file_path}: expected an image without lens distortion, which BOP does not know")
     targets = labelled_objects(dataset)
+    bodies = body_labels(dataset, targets, keypoints)
     out = new_folder(out)
-    models = _models(targets)
-    _write_models(out / "models", targets, models)
+    models = model_numbers(targets)
+    _write_models(out, targets, models, bodies)
+    write_body_labels(out / NAME, bodies)
     find = outline(targets)
     done = 0
     for split, frames in (("train", dataset.train), ("test", dataset.test)):
@@ -87,7 +105,8 @@ def _write_frame(
     """Write the pictures of a frame; returns its entries of scene_camera.json and scene_gt_info.json."""
     truth = load_truth(dataset, frame)
     picture = opaque_picture(dataset, frame)
-    write_png(scene / ("rgb" if picture.ndim == 3 else "gray") / f"{image:06d}.png", picture, durable=False)
+    picture = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
+    write_png(scene / "rgb" / f"{image:06d}.png", picture, durable=False)
     depth = np.where(truth.object_id > 0, truth.depth, 0) * MM
     scale = _depth_scale(float(depth.max()))
     stored = np.round(depth / scale).astype(np.uint16)
@@ -102,7 +121,7 @@ def _write_frame(
         count = silhouette.count + int((visible & ~silhouette.mask).sum())
         infos.append(
             {
-                "bbox_obj": list(silhouette.box if visible.any() else _NO_BOX),
+                "bbox_obj": list(silhouette.box if visible.any() else NO_BOX),
                 "bbox_visib": list(bounding_box(visible)),
                 "px_count_all": count,
                 "px_count_valid": int((stored[mask] > 0).sum()),
@@ -118,18 +137,6 @@ def _write_frame(
         "cam_t_w2c": (MM * pose[:3, 3]).tolist(),
     }
     return entry, infos
-
-
-_NO_BOX = (-1, -1, -1, -1)
-
-
-def bounding_box(pixels: np.ndarray, origin: tuple[int, int] = (0, 0)) -> tuple[int, int, int, int]:
-    """(x, y, width, height) of what is set in [H, W] bool whose first pixel is at `origin`; -1 each for none."""
-    if not pixels.any():
-        return _NO_BOX
-    columns, rows = np.flatnonzero(pixels.any(axis=0)), np.flatnonzero(pixels.any(axis=1))
-    x, y = int(columns[0]), int(rows[0])
-    return x + origin[0], y + origin[1], int(columns[-1]) - x + 1, int(rows[-1]) - y + 1
 
 
 def _pose(camera: Camera, target: LabelledObject, model: int) -> JsonDict:
@@ -158,37 +165,51 @@ def _depth_scale(farthest: float) -> float:
     return round(scale, 1)
 
 
-def _models(targets: list[LabelledObject]) -> list[int]:
-    """Number of each target's model, from 1: objects of the same shape are instances of one model."""
-    numbers: list[int] = []
-    for i, target in enumerate(targets):
-        same = (numbers[k] for k in range(i) if _is_same(targets[k], target))
-        numbers.append(next(same, max(numbers, default=0) + 1))
-    return numbers
-
-
-def _is_same(first: LabelledObject, second: LabelledObject) -> bool:
-    if first.vertices.shape != second.vertices.shape or not np.array_equal(first.faces, second.faces):
-        return False
-    return bool(np.abs(first.vertices - second.vertices).max() < 1e-5 * np.ptp(first.vertices, axis=0).max())
-
-
-def _write_models(folder: Path, targets: list[LabelledObject], models: list[int]) -> None:
-    infos = {}
+def _write_models(out: Path, targets: list[LabelledObject], models: list[int], bodies: Sequence[BodyLabels]) -> None:
+    infos: JsonDict = {}
     for number in dict.fromkeys(models):
-        target = targets[models.index(number)]
+        target, body = targets[models.index(number)], bodies[models.index(number)]
         points = MM * target.vertices
-        mesh = trimesh.Trimesh(points, target.faces, process=False)
-        write_bytes(
-            folder / f"obj_{number:06d}.ply", mesh.export(file_type="ply", encoding="ascii", vertex_normal=True)
-        )
+        diameter = _diameter(points)
+        for folder, mesh in (
+            ("models", trimesh.Trimesh(points, target.faces, process=False)),
+            ("models_eval", _spread(points, target.faces, diameter)),
+        ):
+            content = mesh.export(file_type="ply", encoding="ascii", vertex_normal=True)
+            write_bytes(out / folder / f"obj_{number:06d}.ply", content)
         low, sizes = points.min(axis=0), np.ptp(points, axis=0)
         infos[str(number)] = {
-            "diameter": _diameter(points),
+            "diameter": diameter,
             **{f"min_{axis}": float(x) for axis, x in zip("xyz", low, strict=True)},
             **{f"size_{axis}": float(x) for axis, x in zip("xyz", sizes, strict=True)},
         }
-    write_json(folder / "models_info.json", infos)
+        if body.symmetries_discrete:
+            to_mm = np.where(np.arange(16) % 4 == 3, MM, 1.0) * (np.arange(16) < 12) + (np.arange(16) == 15)
+            matrices = [(np.array(matrix) * to_mm).tolist() for matrix in body.symmetries_discrete]
+            infos[str(number)]["symmetries_discrete"] = matrices
+        if body.symmetries_continuous:
+            infos[str(number)]["symmetries_continuous"] = [
+                {"axis": list(round_.axis), "offset": [MM * x for x in round_.offset]}
+                for round_ in body.symmetries_continuous
+            ]
+    for folder in ("models", "models_eval"):
+        write_json(out / folder / "models_info.json", infos)
+
+
+def _spread(points: np.ndarray, faces: np.ndarray, diameter: float) -> trimesh.Trimesh:
+    """The mesh with edges of at most `EDGE` diameters, and where it has more than `MOST_VERTICES`, those in a cell of a
+    grid merged, as fine as will do."""
+    edge, merged, corners = EDGE * diameter, points, faces
+    for share in (0.1, 0.2, 0.4):
+        if len(merged) <= MOST_VERTICES:
+            break
+        cells = np.floor(points / (share * edge)).astype(np.int64)
+        place = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+        counts = np.bincount(place)
+        merged = np.stack([np.bincount(place, points[:, axis]) / counts for axis in range(3)], axis=1)
+        corners = place[faces]
+        corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+    return trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(merged, corners, edge, max_iter=30), process=False)
 
 
 def _diameter(points: np.ndarray) -> float:

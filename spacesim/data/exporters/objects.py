@@ -1,6 +1,6 @@
 """What every exporter needs of a dataset: the objects with their poses and meshes, and opaque pictures."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -91,6 +91,21 @@ def select_object(targets: list[LabelledObject], name: str | None) -> LabelledOb
     raise InputError(f"object: expected one of {names}, found {name!r}")
 
 
+def model_numbers(targets: Sequence[LabelledObject]) -> list[int]:
+    """Number of each target's model, from 1: objects of the same shape are instances of one model."""
+    numbers: list[int] = []
+    for i, target in enumerate(targets):
+        same = (numbers[k] for k in range(i) if _is_same(targets[k], target))
+        numbers.append(next(same, max(numbers, default=0) + 1))
+    return numbers
+
+
+def _is_same(first: LabelledObject, second: LabelledObject) -> bool:
+    if first.vertices.shape != second.vertices.shape or not np.array_equal(first.faces, second.faces):
+        return False
+    return bool(np.abs(first.vertices - second.vertices).max() < 1e-5 * np.ptp(first.vertices, axis=0).max())
+
+
 def opaque_picture(dataset: Dataset, frame: Frame) -> np.ndarray:
     """[H, W] or [H, W, 3] uint8: the picture of `frame` over black, as its camera records it in space.
 
@@ -119,6 +134,12 @@ def _development(dataset: Dataset) -> tuple[float, str]:
         raise InputError(f"{dataset.root / 'scene.json'}: expected the exposure and the tone, found none") from None
     expect(tone in TONES, f"{dataset.root / 'scene.json'}: tone", f"one of {', '.join(TONES)}", tone)
     return exposure, tone
+
+
+def frame_camera(frame: Frame) -> dict[str, float | list[float]]:
+    """Intrinsics of the stored picture, pixels, and k1, k2, p1, p2, k3 of its lens."""
+    camera, lens = frame.camera, list(frame.distortion or (0.0,) * 5)
+    return {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "distortion": lens}
 
 
 def new_folder(out: Path) -> Path:

@@ -4,6 +4,9 @@
     DIR/synthetic/train.json             [{filename, q_vbs2tango_true, r_Vo2To_vbs_true}, ...]
     DIR/synthetic/validation.json        our test split, which is what SPEED+ calls its labelled synthetic images
     DIR/synthetic/images/NAME.png
+    DIR/synthetic/masks/NAME.png         255 where the object is seen, else 0
+    DIR/synthetic/keypoints.json         {filename: [[x, y, v], ...]}: pixels, v 2 seen, 1 hidden, 0 not in the picture
+    DIR/keypoints.json                   the same in 3D: see `keypoints`
 
 What was imported from SPEED+ keeps its labels: of frames whose poses have stayed, these are written again as they were.
 
@@ -17,10 +20,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from spacesim.data.errors import InputError
+from spacesim.data.exporters.keypoints import NAME, write_body_labels
+from spacesim.data.exporters.labels import Labeller
 from spacesim.data.exporters.objects import (
     ExportProgress,
     LabelledObject,
-    labelled_objects,
     new_folder,
     opaque_picture,
     select_object,
@@ -28,7 +32,7 @@ from spacesim.data.exporters.objects import (
 from spacesim.data.files import MAX_LIST_BYTES, JsonDict, read_json, write_json
 from spacesim.data.geometry import camera_that_sees, quaternion_from_rotation
 from spacesim.data.identity import frame_names
-from spacesim.data.images import write_png
+from spacesim.data.images import read_labels, write_png
 from spacesim.data.records import Camera, Dataset, Frame
 
 PIXEL_PITCH = 5.86e-6
@@ -40,27 +44,47 @@ BODY = LabelledObject(1, "the body", np.eye(4), np.empty((0, 3)), np.empty((0, 3
 
 
 def write_speedplus(
-    dataset: Dataset, out: Path, target_name: str | None = None, progress: ExportProgress | None = None
+    dataset: Dataset,
+    out: Path,
+    target_name: str | None = None,
+    keypoints: int | Path | None = None,
+    progress: ExportProgress | None = None,
 ) -> LabelledObject:
     """Write `dataset` into the new folder `out`; returns the object whose poses the labels are.
 
     target_name: number or name of the object, None the first; of an import it is the body that the world is the frame
-    of. Raises InputError for another object, for frames of several cameras, which SPEED+ does not know, and for a
-    folder that is not empty.
+    of;  keypoints: how many are to be found, or a file, see `body_labels`. An import has no mesh: it gets masks where
+    it has silhouettes, and no keypoints. Raises InputError for another object, for frames of several cameras, which
+    SPEED+ does not know, and for a folder that is not empty.
     """
     kept = {} if dataset.scene else _kept_labels(dataset)
-    target = select_object([BODY] if kept else labelled_objects(dataset), target_name)
+    labeller = None if kept else Labeller(dataset, keypoints)
+    if keypoints is not None and labeller is None:
+        raise InputError(f"keypoints: expected with a dataset that has a mesh, found {dataset.root}, an import")
+    target = select_object(labeller.targets if labeller else [BODY], target_name)
     camera = _camera(dataset.frames)
     out = new_folder(out)
     frames = dataset.frames
     names = [f"{name}.png" for name in frame_names(frames)]
+    points: JsonDict = {}
     for number, (name, frame) in enumerate(zip(names, frames, strict=True), start=1):
         write_png(out / "synthetic/images" / name, opaque_picture(dataset, frame), durable=False)
+        mask = None
+        if labeller is not None:
+            (instance,) = (found for found in labeller.instances(frame) if found.target is target)
+            mask, points[name] = instance.mask, instance.keypoints.tolist()
+        elif frame.silhouette_path is not None:
+            mask = read_labels(dataset.root / frame.silhouette_path, frame.camera) > 0
+        if mask is not None:
+            write_png(out / "synthetic/masks" / name, np.where(mask, 255, 0).astype(np.uint8), durable=False)
         if progress is not None:
             progress(number, len(frames), frame.file_path)
     labels = [_label(name, frame, target, kept.get(frame.file_path)) for name, frame in zip(names, frames, strict=True)]
     write_json(out / "synthetic/train.json", labels[: len(dataset.train)])
     write_json(out / "synthetic/validation.json", labels[len(dataset.train) :])
+    if labeller is not None:
+        write_json(out / "synthetic/keypoints.json", points)
+        write_body_labels(out / NAME, [body for body in labeller.bodies if body.id == target.id])
     write_json(out / "camera.json", camera)
     return target
 

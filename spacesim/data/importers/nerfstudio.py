@@ -1,8 +1,9 @@
 """Folders of Nerfstudio, instant-ngp and NeRF-synthetic (Blender) as datasets of ours.
 
-What `data.transforms` reads by itself, and: lenses of OPENCV_FISHEYE, which are undistorted; depth, which comes out in
-millimetres. Its unit is what transforms.json says as `depth_unit_scale_factor` or instant-ngp's `integer_depth_scale`;
-Nerfstudio itself has it among the options of training, a millimetre by default.
+What `data.transforms` reads by itself, and: lenses of OPENCV_FISHEYE, which are undistorted; depth. Its unit is what
+transforms.json says as `depth_unit_scale_factor` or instant-ngp's `integer_depth_scale`; Nerfstudio itself has it among
+the options of training, a millimetre by default. It comes out in millimetres where 16 bits reach so far; else pictures
+of one unit keep it.
 """
 
 import io
@@ -25,12 +26,19 @@ from spacesim.data.importers.masks import MASKED
 from spacesim.data.importers.pictures import FrameMaker, View, fitted
 from spacesim.data.importers.writing import ImportedFrame, Progress, frame_names, write_dataset
 from spacesim.data.records import Dataset, Frame
-from spacesim.data.store import read_points
-from spacesim.data.transforms import dataset_of, dataset_of_pair, image_path, read_object, read_pair
+from spacesim.data.store import choose_depth_unit, read_points
+from spacesim.data.transforms import (
+    DEPTH_UNITS,
+    MILLIMETRE,
+    dataset_of,
+    dataset_of_pair,
+    image_path,
+    read_object,
+    read_pair,
+)
 
 _MODELS: dict[str, LensModel] = {model.name: model for model in LENS_MODELS.values()}
-_UNITS = ("depth_unit_scale_factor", "integer_depth_scale")
-_MILLIMETRE = 1e-3  # metres a step of depth/*.png; Nerfstudio's default
+_FAR = 1000.0  # times the median: depth beyond stands for none
 
 _log = logging.getLogger(__name__)
 
@@ -120,9 +128,9 @@ def _is_number(value: object) -> bool:
 
 def _unit(path: Path, name: str, values: JsonMapping) -> float:
     """Metres a step of a frame's depth."""
-    key = next((key for key in _UNITS if key in values), None)
+    key = next((key for key in DEPTH_UNITS if key in values), None)
     if key is None:
-        return _MILLIMETRE
+        return MILLIMETRE
     if not _is_number(values[key]) or not values[key] > 0:
         raise InputError(f"{path}: frame {name}: expected metres above 0 as {key}, found {values[key]!r}")
     return float(values[key])
@@ -130,7 +138,7 @@ def _unit(path: Path, name: str, values: JsonMapping) -> float:
 
 def _write(dataset: Dataset, extras: _Extras, out: Path, source: JsonMapping, progress: Progress | None) -> Dataset:
     assert source["masked"] in MASKED
-    maker, depths = FrameMaker(source["masked"]), _DepthReader()
+    maker, depths = FrameMaker(source["masked"]), _DepthReader(_common_unit(dataset.root, extras))
     paths = _below_one_folder(dataset.root, [frame.file_path for frame in dataset.frames])
     names = dict(zip(dataset.frames, frame_names(paths), strict=True))
 
@@ -138,7 +146,9 @@ def _write(dataset: Dataset, extras: _Extras, out: Path, source: JsonMapping, pr
         return [maker.frame(_view(dataset, frame, names[frame], extras, depths)) for frame in frames]
 
     points = None if dataset.ply_file_path is None else read_points(dataset.root / dataset.ply_file_path)
-    return write_dataset(out, make(dataset.train), make(dataset.test), source, points, progress=progress)
+    return write_dataset(
+        out, make(dataset.train), make(dataset.test), source, points, progress=progress, depth_unit=depths.unit
+    )
 
 
 def _below_one_folder(root: Path, paths: Sequence[str]) -> list[str]:
@@ -172,29 +182,54 @@ def _view(dataset: Dataset, frame: Frame, name: str, extras: _Extras, depths: "_
     return View(name, path, camera.world_from_camera, lens, mask, frame.sun, silhouette, depth, keys)
 
 
+def _common_unit(root: Path, extras: _Extras) -> float:
+    """Metres a step in which all depth is written."""
+    files = sorted({(path, unit) for path, unit in extras.depth.values()})
+    reach = [unit * _farthest(root / path) for path, unit in files if unit > MILLIMETRE or path.endswith(".npy")]
+    unit, units = choose_depth_unit(max(reach, default=0.0)), {unit for _, unit in files}
+    if unit > MILLIMETRE and len(units) == 1 and not any(path.endswith(".npy") for path, _ in files):
+        return units.pop()
+    return unit
+
+
+def _farthest(path: Path) -> float:
+    """Steps, of what does not stand for none."""
+    steps = _read_steps(path).astype(np.float64)
+    there = steps[np.isfinite(steps) & (steps > 0)]
+    return float(there[there <= _FAR * np.median(there)].max()) if len(there) else 0.0
+
+
+def _read_steps(path: Path) -> np.ndarray:
+    """[H, W] of a picture or an array."""
+    steps = _read_npy(path) if path.suffix == ".npy" else read_png(path)
+    if steps.ndim != 2:
+        raise InputError(f"{path}: expected depth in one channel, found {list(steps.shape)}")
+    return steps
+
+
 @dataclass
 class _DepthReader:
     """Reads depth in any unit. Warns once of what does not fit into 16 bits."""
 
+    unit: float = MILLIMETRE  #: metres a step of what is written
     warned: bool = False
 
     def read(self, path: Path, unit: float, width: int, height: int) -> np.ndarray:
-        """[H, W] uint16 millimetres of a picture, or an array of NumPy's (.npy), in steps of `unit` metres; another
-        size is brought to width x height by the nearest pixel. 0 where there is none or it is beyond 65.535 m."""
-        steps = _read_npy(path) if path.suffix == ".npy" else read_png(path)
-        if steps.ndim != 2:
-            raise InputError(f"{path}: expected depth in one channel, found {list(steps.shape)}")
+        """[H, W] uint16 steps of a picture, or an array of NumPy's (.npy), in steps of `unit` metres; another size is
+        brought to width x height by the nearest pixel. 0 where there is none or it is beyond 16 bits."""
+        steps = _read_steps(path)
         if steps.shape != (height, width):
             rows = (np.arange(height) + 0.5) * steps.shape[0] / height
             columns = (np.arange(width) + 0.5) * steps.shape[1] / width
             steps = steps[rows.astype(np.intp)[:, None], columns.astype(np.intp)]
+        most = np.iinfo(np.uint16).max
         with np.errstate(invalid="ignore", over="ignore"):
-            millimetres = np.rint(steps.astype(np.float64) * (unit / _MILLIMETRE))
-            fits = (millimetres > 0) & (millimetres <= np.iinfo(np.uint16).max)
-        if not self.warned and (millimetres[np.isfinite(millimetres)] > np.iinfo(np.uint16).max).any():
-            _log.warning("%s: depth beyond 65.535 m is stored as 0, none", path)
+            written = np.rint(steps.astype(np.float64) * (unit / self.unit))
+            fits = (written > 0) & (written <= most)
+        if not self.warned and (written[np.isfinite(written)] > most).any():
+            _log.warning("%s: depth beyond %g m is stored as 0, none", path, most * self.unit)
             self.warned = True
-        return np.where(fits, millimetres, 0).astype(np.uint16)
+        return np.where(fits, written, 0).astype(np.uint16)
 
 
 def _read_npy(path: Path) -> np.ndarray:

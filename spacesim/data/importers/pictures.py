@@ -36,7 +36,7 @@ class View:
     mask: Path | None = None  #: white = object, or = known, as the frames' maker says
     sun: Sun | None = None
     silhouette: Path | None = None  #: other than 0 = object
-    depth: Callable[[], np.ndarray] | None = None  #: makes uint16 [H, W], millimetres along the optical axis
+    depth: Callable[[], np.ndarray] | None = None  #: makes uint16 [H, W], steps along the optical axis
     keys: Mapping[str, JsonValue] = field(default_factory=dict)  #: as of `ImportedFrame`
 
 

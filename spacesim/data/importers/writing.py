@@ -28,7 +28,7 @@ from spacesim.data.integrity.manifest import write_manifest
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import write_points
-from spacesim.data.transforms import dataset_of, read_dataset
+from spacesim.data.transforms import DEPTH_UNITS, MILLIMETRE, dataset_of, read_dataset
 
 SOURCE = "import.json"  #: of a dataset: where it comes from and what was asked for; written first
 _PARTS = {"silhouette": "silhouette_path", "mask": "mask_path", "depth": "depth_file_path"}
@@ -50,7 +50,7 @@ class ImportedFrame:
     sun: Sun | None = None
     silhouette: Picture | None = None  #: 255 object, 0 none: a pixel without is empty
     mask: Picture | None = None  #: 255 counts, 0: ignore this pixel, nothing is known of it
-    depth: Picture | None = None  #: 16 bits, millimetres along the optical axis, 0 none
+    depth: Picture | None = None  #: 16 bits, steps along the optical axis, 0 none
     keys: JsonMapping = field(default_factory=dict)  #: that transforms.json has of the frame besides
 
 
@@ -62,6 +62,7 @@ def write_dataset(
     points: tuple[np.ndarray, np.ndarray] | None = None,
     files: Mapping[str, bytes] | None = None,
     progress: Progress | None = None,
+    depth_unit: float = MILLIMETRE,
 ) -> Dataset:
     """Write frames from elsewhere into the folder `out` as a dataset, transforms.json last; returns it as read back.
 
@@ -69,6 +70,7 @@ def write_dataset(
     source: what import.json says: the kind of import, from where, its options
     points: (positions [N, 3] metres, colours [N, 3] uint8) to start training from
     files: others by their names in `out`: pictures of the cameras, reports
+    depth_unit: metres a step of depth pictures
     Where an earlier import of the same source was interrupted, it is begun anew in its folder. Raises InputError where
     `out` holds anything else, where a picture cannot be read, where two have one name, and where no frame is left.
     """
@@ -90,6 +92,8 @@ def write_dataset(
             if progress is not None:
                 progress(number, len(frames), frame.name)
         meta: JsonDict = {"camera_model": "OPENCV", "frames": entries}
+        if any(frame.depth is not None for frame in frames):
+            meta = {DEPTH_UNITS[0]: depth_unit, **meta}
         if test is not None:
             names = [entry["file_path"] for entry in entries]
             meta |= {"train_filenames": names[: len(train)], "test_filenames": names[len(train) :]}

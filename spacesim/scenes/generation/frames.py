@@ -16,6 +16,7 @@ import spacesim
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, SHADOW_LIT, SHADOW_SELF_CAST, FrameWriter
+from spacesim.data.transforms import MILLIMETRE
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.background.draw import Background
 from spacesim.scenes.cameras.camera import CameraConfig
@@ -59,11 +60,12 @@ class Job:
     threads: int  #: that encode, a process
     background: BackgroundConfig | None = None
     shared: bool = False  #: other jobs make frames in the same folder now
+    depth_unit: float = MILLIMETRE  #: metres a step of the pictures of depth
 
     @property
     def writer(self) -> FrameWriter:
         """Writes into the folder."""
-        return FrameWriter(self.root, raw_suffixes(self.camera))
+        return FrameWriter(self.root, raw_suffixes(self.camera), self.depth_unit)
 
 
 def raw_suffixes(camera: CameraConfig) -> tuple[str, ...]:

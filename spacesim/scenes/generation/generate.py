@@ -2,13 +2,14 @@
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from spacesim import backend
 from spacesim.data.errors import InputError, expect
@@ -17,7 +18,8 @@ from spacesim.data.geometry import Array, angles_from_direction
 from spacesim.data.integrity.manifest import digest_of
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
-from spacesim.data.store import DatasetWriter, FrameWriter
+from spacesim.data.store import DEPTH_UNIT, DatasetWriter, FrameWriter, choose_depth_unit
+from spacesim.data.transforms import MILLIMETRE
 from spacesim.scenes.build import build
 from spacesim.scenes.cameras.rig import PlannedView, RandomRig, TargetSphere, plan
 from spacesim.scenes.config import SceneConfig
@@ -32,6 +34,7 @@ from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
 
 SCHEMA = 2  #: of scene.json
+COARSE_DEPTH = 0.01  #: of the scene's size: longer steps of depth pictures are told
 
 GenerationProgress = Callable[[int, int, str], None]
 MakeFrames = Callable[[Job, Sequence[FrameSpec]], Iterator[str]]  #: makes frames and yields their names
@@ -64,6 +67,7 @@ def generate(
         with _frame_maker(sweep.renderer, workers, ray) as make:
             alone.enter_context(lock_folder(job.root))
             writer = _open(Path(out), described, resume, sweep)
+            _warn_of_coarse_depth(writer.depth_unit, sweep.scene)
             _make_missing(writer, sweep.specs, lambda left: _make_frames(make, job, left, sweep.renderer), progress)
         points, colors = sample_surface_points(sweep.renderer, config.quality.points, config.seed)
         listed = _view_records(sweep.train), _view_records(sweep.test)
@@ -128,6 +132,16 @@ def _make_missing(
     for done, name in enumerate(make(missing), start=complete + 1):
         if progress is not None:
             progress(done, total, name)
+
+
+def _warn_of_coarse_depth(unit: float, scene: Scene) -> None:
+    size = 2 * scene.bounding_sphere[1]
+    if unit > COARSE_DEPTH * size:
+        _log.warning(
+            "depth/*.png: steps of %g m, to reach the farthest view, are coarse for %.3g m; gt/*.exr has depth in full",
+            unit,
+            size,
+        )
 
 
 def _open(root: Path, described: dict[str, JsonValue], resume: bool, sweep: "_DatasetPlan") -> DatasetWriter:
@@ -206,6 +220,7 @@ class _DatasetPlan:
         self.keys = {name: self._keys_of(view) for _, name, view in views}
         threads = writing_threads(1)
         self.job = Job(self.scene, config.camera, quality, config.seed, Path(), threads, config.background)
+        self.job = replace(self.job, depth_unit=depth_unit(self.scene, [*self.train, *self.test]))
         inside = self.renderer.inside(np.stack([spec.camera.position for spec in self.specs]))
         if inside.any():
             name = self.specs[int(inside.argmax())].name
@@ -263,6 +278,7 @@ def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedVi
         **scene.describe(),
         "mesh": [_mesh_counts(scene, i) for i in range(1, len(scene.objects) + 1)],
         "suns": {"train": _angles(train), "test": _angles(test)},
+        **({DEPTH_UNIT: unit} if (unit := depth_unit(scene, [*train, *test])) != MILLIMETRE else {}),
         "exposure": config.camera.exposure,
         "seed": config.seed,
         "spp": config.quality.spp,
@@ -271,6 +287,18 @@ def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedVi
         "backend": backend.select(),
         "versions": versions(),
     }
+
+
+def depth_unit(scene: Scene, named: NamedViews) -> float:
+    """Metres a step of depth pictures, with which 16 bits reach all that the views may see."""
+    points: Array = scene.mesh.vertices
+    with suppress(QhullError):
+        points = points[ConvexHull(points).vertices]
+    farthest = 0.0
+    for _, view in named:
+        forward = view.camera.world_from_camera[:3, 2]
+        farthest = max(farthest, float((points @ forward).max() - view.camera.position @ forward))
+    return choose_depth_unit(farthest)
 
 
 def _mesh_counts(scene: Scene, object_id: int) -> dict[str, int]:

@@ -1,10 +1,14 @@
-"""Pictures that tell what a dataset holds: how densely cameras look at the target, and a contact sheet of frames."""
+"""What tells of a whole dataset: how densely cameras look at the target, a contact sheet of frames, keypoints."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
 
 from spacesim.data import density
+from spacesim.data.errors import InputError
+from spacesim.data.exporters import keypoints, labelled_objects
+from spacesim.data.exporters.keypoints import body_labels, write_body_labels
 from spacesim.data.images import read_png, sheet, write_png
 from spacesim.data.images.sheet import Tile
 from spacesim.data.records import Dataset, Frame
@@ -13,14 +17,20 @@ MAX_TILES = 60
 
 SHEET_NAME = "contact_sheet.png"
 
+_log = logging.getLogger(__name__)
+
 
 def write_overview(root: Path, dataset: Dataset) -> None:
-    """Write the camera density and the contact sheet of `dataset` into the folder `root`.
+    """Write the camera density, the contact sheet and keypoints.json of `dataset` into the folder `root`.
 
     Raises InputError where a picture or the mesh cannot be read.
     """
     density.write_camera_density(root / density.NAME, dataset)
     write_png(root / SHEET_NAME, contact_sheet(dataset))
+    try:
+        write_body_labels(root / keypoints.NAME, body_labels(dataset, labelled_objects(dataset)))
+    except InputError as error:
+        _log.warning("%s; so there is no %s", error, keypoints.NAME)
 
 
 def contact_sheet(dataset: Dataset) -> np.ndarray:

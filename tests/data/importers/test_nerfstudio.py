@@ -163,7 +163,7 @@ def test_masks_mean_what_is_asked(tmp_path):
 
 @pytest.mark.parametrize("form", ["png", "npy", "float npy"])
 @pytest.mark.parametrize("declared", [{}, {"depth_unit_scale_factor": 0.01}, {"integer_depth_scale": 0.25}, None])
-def test_depth_of_any_unit_becomes_millimetres(tmp_path, caplog, form, declared):
+def test_depth_of_any_unit_becomes_millimetres_where_these_reach(tmp_path, form, declared):
     unit = 0.5 if declared is None else next(iter(declared.values()), 0.001)
     key = "depth_path" if declared and "integer_depth_scale" in declared else "depth_file_path"
     steps = np.arange(192).reshape(12, 16).astype(np.uint16)
@@ -174,9 +174,25 @@ def test_depth_of_any_unit_becomes_millimetres(tmp_path, caplog, form, declared)
         np.save(root / "depth.npy", steps.astype(np.float32)[..., None] if form == "float npy" else steps)
     dataset = imported(root, tmp_path / "out", **({"depth_unit": 0.5} if declared is None else {}))
     depth = read_png(tmp_path / "out" / dataset.frames[0].depth_file_path)
-    exact = np.rint(steps * unit * 1000)
-    np.testing.assert_array_equal(depth, np.where(exact <= 65535, exact, 0))
-    assert (len([r for r in caplog.records if "65.535" in r.getMessage()]) == 1) == (exact.max() > 65535)
+    expected = 0.001 if unit < 0.3 else 0.5 if form == "png" else 0.002
+    assert dataset.depth_unit == expected
+    assert json.loads((tmp_path / "out/transforms.json").read_text())["depth_unit_scale_factor"] == expected
+    np.testing.assert_array_equal(depth, np.rint(steps * unit / expected))
+    metres = ss.load_depth(dataset, dataset.frames[0])
+    np.testing.assert_allclose(metres, steps * unit, atol=0.51 * expected)
+
+
+def test_depth_that_stands_for_none_does_not_count(tmp_path, caplog):
+    """As far planes are written: it would take all steps away from what is near."""
+    depth = np.linspace(2, 80, 192).reshape(12, 16)
+    depth[0] = 1e10
+    root = folder(tmp_path / "src", named(2, depth_file_path="depth.npy"), depth_unit_scale_factor=1.0)
+    np.save(root / "depth.npy", depth)
+    dataset = imported(root, tmp_path / "out")
+    metres = ss.load_depth(dataset, dataset.frames[0])
+    assert (metres[0] == 0).all()
+    np.testing.assert_allclose(metres[1:], depth[1:], atol=1.01e-3)
+    assert len([r for r in caplog.records if "depth beyond 131.07 m" in r.getMessage()]) == 1
 
 
 def test_pictures_of_a_fraction_of_the_size(tmp_path):

@@ -13,7 +13,7 @@ from tiny import contents
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.lock import lock_folder
-from spacesim.data.store import FrameWriter, find_unreadable_files, read_points
+from spacesim.data.store import FrameWriter, find_unreadable_files, load_depth, load_truth, read_points
 from spacesim.scenes import build, generate, read_scene
 from spacesim.scenes.cameras.sensor import SensorConfig
 from spacesim.scenes.generation.generate import estimate, generate_part
@@ -37,6 +37,7 @@ def test_dataset_is_whole(made):
     assert find_unreadable_files(made) == []
     files = set(contents(made))
     top = {"transforms.json", "scene.json", "mesh.ply", "points.ply", "contact_sheet.png", "camera_density.png"}
+    top |= {"keypoints.json"}
     top |= {"SHA256SUMS"}
     assert top | {"gt/train_00003.exr", "id/test_00001.png"} <= files
     assert len(files) == len(top) + 6 * 6
@@ -77,7 +78,7 @@ def test_same_seed_gives_the_same_bytes_and_another_does_not(made, tmp_path):
     again, other, first = contents(tmp_path / "again"), contents(tmp_path / "other"), contents(made)
     assert again == first
     assert set(other) == set(first)
-    assert [name for name in first if first[name] == other[name]] == ["mesh.ply"]
+    assert [name for name in first if first[name] == other[name]] == ["keypoints.json", "mesh.ply"]
 
 
 def test_resume_gives_the_same_bytes(made, tmp_path):
@@ -155,6 +156,28 @@ def test_the_first_error_of_a_writing_thread_ends_the_run(tmp_path, monkeypatch)
         generate(boxsat(views=80), tmp_path / "data")
     assert 2 <= len(done) < 40
     assert not (tmp_path / "data/transforms.json").exists()
+
+
+def test_far_views_have_depth_too(tmp_path, caplog):
+    """In coarser steps, of which transforms.json tells; near ones keep millimetres."""
+    far = read_scene("boxsat", views=2, test_views=1, resolution=24, spp=1, distance=300.0, fov_deg=1.0, points=20)
+    dataset = generate(far, tmp_path / "far")
+    assert dataset.depth_unit == 0.005
+    for frame in dataset.frames:
+        truth = load_truth(dataset, frame)
+        assert truth.depth.max() > 295
+        np.testing.assert_allclose(load_depth(dataset, frame), truth.depth, atol=0.0026)
+    assert not [record for record in caplog.records if "depth/" in record.getMessage()]
+    very_far = read_scene("boxsat", views=1, test_views=0, resolution=8, spp=1, distance=4e5, fov_deg=0.001, points=1)
+    assert generate(very_far, tmp_path / "very-far").depth_unit == 10
+    assert len([record for record in caplog.records if "are coarse for" in record.getMessage()]) == 1
+
+
+def test_keypoints_lie_beside_the_mesh(made):
+    (body,) = json.loads((made / "keypoints.json").read_text())["objects"]
+    assert (body["id"], body["name"], len(body["keypoints"])) == (1, "boxsat", 11)
+    _, distance, _ = build(boxsat()).mesh.nearest.on_surface(list(body["keypoints"].values()))
+    assert distance.max() < 1e-5
 
 
 def test_a_sensors_raw_pictures_are_part_of_a_frame(tmp_path):

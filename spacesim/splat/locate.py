@@ -1,0 +1,213 @@
+"""Poses of pictures against a trained model, one after the other, as a file.
+
+poses.json is a transforms.json with, of each frame, `covariance` [6, 6], `gain`, `error`, `converged` and `iterations`
+of `RefinedPose`, `residual` and `ambiguous` of `FoundPose`, and `start`: "given" or "searched". A picture that cannot
+be located has `failed`, a sentence, and no pose.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+from spacesim.data.errors import InputError
+from spacesim.data.files import MAX_LIST_BYTES, JsonDict, read_json, write_json
+from spacesim.data.images import load_image
+from spacesim.data.records import Camera, Dataset, Frame, Sun
+from spacesim.data.transforms import read_dataset, read_views
+from spacesim.splat.pose.refine import refine_pose
+from spacesim.splat.pose.search import FoundPose, ModelViews, find_pose, residual_of
+from spacesim.splat.run import Run, check_gaussians
+
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+SAVE_EVERY = 10.0  #: seconds between two writings of the file
+Progress = Callable[[int, int, str], None]  #: pictures done, of how many, name of the last
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """What came of many pictures."""
+
+    pictures: int  #: in all
+    converged: int  #: of which the pose may be trusted
+    failed: int  #: that have no pose
+
+
+def locate(
+    run: Run,
+    images: Path,
+    out: Path,
+    start: Path | None = None,
+    camera: Path | None = None,
+    sun: Sun | None = None,
+    within: tuple[float, float] = (5.0, 0.05),
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> Located:
+    """Find the poses of pictures and write them to the file `out`, now and then and at the end.
+
+    images: a dataset, whose poses are not looked at; a folder of pictures; or one picture
+    start: a file like transforms.json with poses to start from, by file path or name; None or a picture that it lacks:
+        searched for;  within: how far off these may be, see `refine_pose`
+    camera: a file with the intrinsics of pictures that neither a dataset nor `start` tells of: the first frame of a
+        transforms.json; None: that of the run's data;  sun: of all pictures, in place of what files tell
+    resume: keep what an interrupted call has found
+
+    Raises InputError where files cannot be read, where a run needs a Sun and none is told, or `out` is there and not to
+    be resumed, or of other work. What is wrong with one picture is told of that.
+    """
+    check_gaussians(run)
+    told = {} if start is None else read_views(start)
+    frames, dataset = _frames(run, images, told, camera)
+    for frame in frames:
+        if run.relightable and sun is None and frame.sun is None:
+            method = run.config["method"]
+            raise InputError(f"sun: expected the direction for a run of {method}, found none for {frame.file_path}")
+    settings: JsonDict = {
+        "run": str(run.path),
+        "gaussians": run.gaussian_count,
+        "images": str(images),
+        "start": None if start is None else str(start),
+        "within": list(within),
+        "sun": None if sun is None else sun.direction.tolist(),
+    }
+    entries = _finished(out, settings, resume)
+    views: dict[tuple[bytes | None, bool], ModelViews] = {}
+    saved = time.monotonic()
+    try:
+        for done, frame in enumerate(frames, start=1):
+            if frame.file_path not in entries:
+                light = sun or frame.sun
+                guess = _guess(told, frame)
+                entries[frame.file_path] = _entry(run, images, dataset, frame, guess, light, within, views)
+                if time.monotonic() - saved > SAVE_EVERY:
+                    _write(out, settings, entries)
+                    saved = time.monotonic()
+            if progress is not None:
+                progress(done, len(frames), frame.file_path)
+    finally:
+        _write(out, settings, entries)
+    trusted = sum(bool(entry.get("converged")) for entry in entries.values())
+    return Located(len(frames), trusted, sum("failed" in entry for entry in entries.values()))
+
+
+def _frames(
+    run: Run, images: Path, told: Mapping[str, Frame], camera: Path | None
+) -> tuple[list[Frame], Dataset | None]:
+    """Pictures with their intrinsics, lenses and Suns, and the dataset where they are one. Poses mean nothing."""
+    if (images / "transforms.json").is_file() or images.suffix == ".json":
+        dataset = read_dataset(images)
+        return list(dataset.frames), dataset
+    if images.is_dir():
+        names = sorted(path.name for path in images.iterdir() if path.suffix.lower() in PICTURES)
+        if not names:
+            raise InputError(f"{images}: expected a dataset or a folder of pictures, found neither")
+    elif images.is_file():
+        names = [images.name]
+    else:
+        raise InputError(f"{images}: expected a dataset, a folder of pictures or one picture, found nothing")
+    usual: Frame | None = None
+    frames = []
+    for name in names:
+        like = _match(told, name)
+        if like is None:
+            usual = usual or _usual(run, camera)
+            like = replace(usual, sun=None)
+        frames.append(replace(like, file_path=name))
+    return frames, None
+
+
+def _usual(run: Run, camera: Path | None) -> Frame:
+    """One with the intrinsics of pictures of which nothing else is known."""
+    if camera is not None:
+        return next(iter(read_views(camera).values()))
+    data = Path(run.config["data"]["path"]) if "data" in run.config else Path()
+    if not data.exists() or data == Path():
+        raise InputError("camera: expected a file with the intrinsics of the pictures, found none")
+    return read_dataset(data).train[0]
+
+
+def _match(told: Mapping[str, Frame], name: str) -> Frame | None:
+    """The frame of that path; else the one of that file name, if it is alone."""
+    if name in told:
+        return told[name]
+    same = [frame for path, frame in told.items() if PurePosixPath(path).name == PurePosixPath(name).name]
+    return same[0] if len(same) == 1 else None
+
+
+def _guess(told: Mapping[str, Frame], frame: Frame) -> Camera | None:
+    like = _match(told, frame.file_path)
+    return None if like is None else replace(frame.camera, world_from_camera=like.camera.world_from_camera)
+
+
+def _entry(
+    run: Run,
+    images: Path,
+    dataset: Dataset | None,
+    frame: Frame,
+    guess: Camera | None,
+    sun: Sun | None,
+    within: tuple[float, float],
+    views: dict[tuple[bytes | None, bool], ModelViews],
+) -> JsonDict:
+    """What poses.json has of a picture. views: those of the Sun of the last picture, kept here."""
+    try:
+        root = dataset or Dataset(images if images.is_dir() else images.parent, (frame,), ())
+        image = load_image(root, frame)
+        has_alpha = bool(image.alpha.min() < 1)
+        if guess is not None:
+            pose = refine_pose(run, image, guess, sun, within=within)
+            found = FoundPose(pose, residual_of(run, image, pose, sun), False)
+        else:
+            key = None if sun is None else sun.direction.tobytes(), has_alpha
+            if key not in views:
+                views.clear()
+                views[key] = ModelViews.of(run, sun, has_alpha)
+            found = find_pose(run, image, frame.camera, sun, views=views[key])
+    except InputError as error:
+        return {"file_path": frame.file_path, "failed": str(error)}
+    pose, camera = found.pose, found.pose.camera
+    entry: JsonDict = {
+        "file_path": frame.file_path,
+        "transform_matrix": camera.opengl.tolist(),
+        **{
+            "w": camera.width,
+            "h": camera.height,
+            "fl_x": camera.fx,
+            "fl_y": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+        },
+        **dict(zip(("k1", "k2", "p1", "p2", "k3"), frame.distortion, strict=False)),
+        "covariance": pose.covariance.tolist(),
+        "converged": pose.converged,
+        "ambiguous": found.ambiguous,
+        "residual": found.residual,
+        "error": pose.error,
+        "gain": pose.gain,
+        "iterations": pose.iterations,
+        "start": "searched" if guess is None else "given",
+    }
+    if sun is not None:
+        entry["sun_direction"] = sun.direction.tolist()
+    return entry
+
+
+def _finished(out: Path, settings: JsonDict, resume: bool) -> dict[str, JsonDict]:
+    """Entries of an earlier call, by file paths."""
+    if not out.exists():
+        return {}
+    if not resume:
+        raise InputError(f"{out}: expected a new file, found one; --resume goes on with it")
+    values = read_json(out, MAX_LIST_BYTES)
+    if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
+        raise InputError(f"{out}: expected poses of an interrupted call, found another file")
+    if values.get("settings") != settings:
+        raise InputError(f"{out}: expected poses of the same run, pictures and options, found others")
+    entries = [entry for entry in values["frames"] if isinstance(entry, dict) and "failed" not in entry]
+    return {str(entry.get("file_path")): entry for entry in entries}
+
+
+def _write(out: Path, settings: JsonDict, entries: Mapping[str, JsonDict]) -> None:
+    frames: Sequence[JsonDict] = list(entries.values())
+    write_json(out, {"camera_model": "OPENCV", "settings": settings, "frames": frames})

@@ -1,0 +1,26 @@
+"""A dataset with a lens, whose objects hide each other and are cut off."""
+
+from pathlib import Path
+
+import pytest
+
+from spacesim.data.records import Dataset
+from spacesim.data.store import read_dataset
+from spacesim.scenes import generate
+from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
+
+LENS = (-0.25, 0.08, 0.002, -0.001, 0.0)
+
+
+@pytest.fixture(scope="session")
+def labelled(tmp_path_factory) -> Dataset:
+    """Two boxsats and a cubesat, 3 training and 1 test view of 160 x 120 pixels."""
+    objects = (
+        ObjectConfig(spacecraft="boxsat"),
+        ObjectConfig(spacecraft="cubesat", position=(2.0, 1.0, 2.0), rotation_wxyz=(0.8, 0.1, -0.5, 0.3), scale=2.0),
+        ObjectConfig(spacecraft="boxsat", name="twin", position=(-3.0, -3.0, -3.0)),
+    )
+    options = {"views": 3, "test_views": 1, "resolution": (160, 120), "spp": 1, "points": 50, "fov_deg": 40.0}
+    root: Path = tmp_path_factory.mktemp("labelled") / "data"
+    generate(with_options(SceneConfig("three", objects), **options, distance=9.0, distortion=LENS), root)
+    return read_dataset(root)
