@@ -177,6 +177,7 @@ class Frame:
     mask_path: str | None = None  #: 0 = ignore this pixel
     time: float | None = None  #: when it was taken, in any unit: pictures of one film
     distortion: tuple[float, ...] = ()  #: Brown-Conrady k1, k2, p1, p2, k3 of the stored image; () for none
+    exposure: float | None = None  #: of a picture of `generate` that has its own; None: that of scene.json
 
 
 @dataclass(frozen=True, eq=False)

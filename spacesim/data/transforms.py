@@ -229,7 +229,9 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
     except InputError as error:
         raise InputError(f"{source}: frame {file_path}: {error}") from None
     paths = {key: _path(source, entry, key) for key in TRUTH_PATHS}
-    return Frame(file_path, camera, sun, **paths, time=time, distortion=distortion)
+    exposure = entry.get("exposure")  # others mean all kinds of things by it
+    own = float(exposure) if isinstance(exposure, int | float) and 0 < exposure < math.inf else None
+    return Frame(file_path, camera, sun, **paths, time=time, distortion=distortion, exposure=own)
 
 
 def _read_camera(values: Json, image: Path) -> Camera:

@@ -116,7 +116,7 @@ def opaque_picture(dataset: Dataset, frame: Frame) -> np.ndarray:
     pixels = read_png(dataset.root / frame.file_path)
     if pixels.ndim == 2 or pixels.shape[2] == 3:
         return pixels
-    exposure, tone = _development(dataset)
+    exposure, tone = _development(dataset, frame)
     if frame.gt_path is None:
         raise InputError(f"{dataset.root}: expected the radiance of {frame.file_path}, found no gt_path")
     path = dataset.root / frame.gt_path
@@ -126,14 +126,14 @@ def opaque_picture(dataset: Dataset, frame: Frame) -> np.ndarray:
     return as_bytes(display_values(exposure * radiance, tone))
 
 
-def _development(dataset: Dataset) -> tuple[float, str]:
-    """Exposure and tone curve of the dataset's pictures."""
+def _development(dataset: Dataset, frame: Frame) -> tuple[float, str]:
+    """Exposure and tone curve of a picture."""
     try:
         exposure, tone = float(dataset.scene["exposure"]), str(dataset.scene["config"]["camera"]["tone"])
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{dataset.root / 'scene.json'}: expected the exposure and the tone, found none") from None
     expect(tone in TONES, f"{dataset.root / 'scene.json'}: tone", f"one of {', '.join(TONES)}", tone)
-    return exposure, tone
+    return frame.exposure or exposure, tone
 
 
 def frame_camera(frame: Frame) -> dict[str, float | list[float]]:

@@ -9,7 +9,9 @@ from tiny import contents
 
 import spacesim as ss
 from spacesim.data.errors import InputError
+from spacesim.data.exporters.objects import opaque_picture
 from spacesim.data.geometry import fibonacci_sphere, look_at
+from spacesim.data.images.tone import as_bytes, display_values
 from spacesim.scenes.cameras.rig import PlannedView, Rig
 from spacesim.scenes.scenefile import scene_text
 from spacesim.viewer.truth.scene import load_recorded_scene
@@ -90,6 +92,16 @@ def test_a_class_whose_fields_json_does_not_have(tmp_path):
 def test_impossible_arrays_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         ss.PoseRig(**{"world_from_camera": POSES, **options})
+
+
+def test_exports_develop_each_picture_as_it_was_exposed(tmp_path):
+    rig = ss.PoseRig(POSES, sun=(10, 20), exposure=[0.001, 0.004, 0.001, 0.004])
+    data = ss.generate("boxsat", tmp_path / "data", rig=rig, **SMALL)
+    assert [frame.exposure for frame in data.train] == [0.001, 0.004, 0.001, 0.004]
+    for frame in data.train:
+        radiance = ss.load_truth(data, frame).radiance
+        expected = as_bytes(display_values(frame.exposure * radiance, "srgb"))
+        np.testing.assert_array_equal(opaque_picture(data, frame), expected)
 
 
 def test_what_is_no_rig(tmp_path):
