@@ -63,7 +63,8 @@ def test_the_reference_has_a_table_for_each_record():
     used = {record for config in presets for record in records_in(replace(config, warm_start=warm_start("fast")))}
     assert len(used) >= 15
     assert used - set(tables) == set()
-    row = r"| `bias` | number | `10` | strength lambda_b of the receiver-depth bias (4.26), 0: none but that of `grazing` |"
+    says = "strength lambda_b of the receiver-depth bias (4.26), 0: none but that of `grazing`"
+    row = f"| `bias` | number | `10` | {says} |"
     assert row in shown
     assert r"| `init` | mesh \| points \| random \| none | `none` |" in shown
     assert "`light.shadow.method` (`splatting`)" in shown
