@@ -12,6 +12,7 @@ Errors over sigma: the median of sqrt(e^T C^-1 e / 6), 0.94 of a covariance C th
 views of which the method says so; "wrong of these": what of them is off by more than 2 degrees or 2 %.
 """
 
+import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -44,19 +45,13 @@ Picture = Callable[[Run, Dataset, Frame], Any]
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="where data and run are, or are made")
-    parser.add_argument("--data", type=Path, help="a dataset with Suns and test views")
-    parser.add_argument("--run", type=Path, help="a run trained on it")
+    parser = arguments(__doc__)
     parser.add_argument("--views", type=common.positive, default=50, help="test views, evenly taken (default 50)")
     parser.add_argument("--starts", type=common.positive, default=4)
     parser.add_argument("--seed", type=common.natural, default=0)
     options = parser.parse_args()
     backend.select(options.backend)
-    if (options.data is None) != (options.run is None):
-        raise InputError("--data, --run: expected both or none, found one")
-    data = read_dataset(options.data) if options.data else make_data(options.out / "data")
-    run = load_run(options.run) if options.run else make_run(data, options.out / "run")
+    data, run = data_and_run(options)
     chosen = np.unique(np.linspace(0, len(data.test) - 1, min(options.views, len(data.test))).astype(int))
     views: dict[str, list[common.Row]] = {
         name: list(measured(run, data, [data.test[k] for k in chosen], picture, options.starts, options.seed))
@@ -65,6 +60,23 @@ def main() -> None:
     rows = [summary(name, group, some) for name, found in views.items() for group, some in groups(found)]
     title = f"From {DEGREES:g} degrees and {100 * SHARE:g} % of the distance off, {options.starts} starts"
     common.emit({"rows": rows, "views": views}, {title: rows}, options)
+
+
+def arguments(description: str | None) -> argparse.ArgumentParser:
+    """With where data and run are, for `data_and_run`."""
+    parser = common.arguments(description)
+    parser.add_argument("--out", type=Path, required=True, help="where data and run are, or are made")
+    parser.add_argument("--data", type=Path, help="a dataset with Suns and test views")
+    parser.add_argument("--run", type=Path, help="a run trained on it")
+    return parser
+
+
+def data_and_run(options: argparse.Namespace) -> tuple[Dataset, Run]:
+    """Those that are named, or made. Raises InputError where only one is named."""
+    if (options.data is None) != (options.run is None):
+        raise InputError("--data, --run: expected both or none, found one")
+    data = read_dataset(options.data) if options.data else make_data(options.out / "data")
+    return data, load_run(options.run) if options.run else make_run(data, options.out / "run")
 
 
 def make_data(out: Path) -> Dataset:

@@ -16,11 +16,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import common
 import numpy as np
-from pose import WRONG, errors, make_data, make_run
+from pose import WRONG, arguments, data_and_run, errors
 from scipy.spatial.transform import Rotation
 
 from spacesim import backend
@@ -28,10 +27,9 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import degrees_between, normalize
 from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
 from spacesim.data.records import Camera, Dataset, Frame
-from spacesim.data.store import read_dataset
 from spacesim.splat.pose import find_pose, refine_pose
 from spacesim.splat.pose.search import ModelViews
-from spacesim.splat.run import Run, load_run
+from spacesim.splat.run import Run
 
 ANGLES, RANGES, DARKNESS = (5.0, 10.0, 20.0, 40.0), (0.1, 0.2, 0.4), (0.3, 0.1)
 PHASES = (0.0, 60.0, 120.0, 180.0)  #: degrees, limits
@@ -39,19 +37,13 @@ USUAL = 5.0, 0.05  #: degrees and share of the range by which cameras are off
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="where data and run are, or are made")
-    parser.add_argument("--data", type=Path, help="a dataset with Suns and test views")
-    parser.add_argument("--run", type=Path, help="a run trained on it")
+    parser = arguments(__doc__)
     parser.add_argument("--views", type=common.positive, default=5, help="test views a case, evenly taken (default 5)")
     parser.add_argument("--searched", type=common.natural, default=5, help="of these, views that are searched for")
     parser.add_argument("--seed", type=common.natural, default=0)
     options = parser.parse_args()
     backend.select(options.backend)
-    if (options.data is None) != (options.run is None):
-        raise InputError("--data, --run: expected both or none, found one")
-    data = read_dataset(options.data) if options.data else make_data(options.out / "data")
-    run = load_run(options.run) if options.run else make_run(data, options.out / "run")
+    data, run = data_and_run(options)
     views = list(measured(run, data, options.views, options.searched, options.seed))
     cases = dict.fromkeys(str(view["case"]) for view in views)
     rows = [summary(case, [view for view in views if view["case"] == case]) for case in cases]

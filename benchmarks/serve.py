@@ -12,10 +12,8 @@ a tenth of them on, free memory given back before each reading.
 
 import gc
 import json
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import common
@@ -28,7 +26,7 @@ from spacesim.data.records import Camera, Sun
 from spacesim.serve.client import CameraClient
 from spacesim.serve.draw import PredictedRun, Served, load_served
 from spacesim.serve.protocol import import_zmq
-from spacesim.serve.server import CameraServer
+from spacesim.serve.server import serving
 from spacesim.viewer.drawing.memory import give_back
 
 SUN = Sun.from_angles(40, 25)
@@ -73,20 +71,6 @@ def served_splats(path: str | None, count: int) -> tuple[Served, float]:
         raise WorkError(f"{path}: expected a run of Gaussians, found one without")
     places = np.linalg.norm(gaussians.to_numpy()["means"], axis=1)
     return served, 3.0 * float(np.percentile(places, 99))
-
-
-@contextmanager
-def serving(served: Served) -> Iterator[str]:
-    """The address of a server on a thread of its own."""
-    server, ended = CameraServer(served, port=0), threading.Event()
-    thread = threading.Thread(target=server.run, args=(ended.is_set,))
-    thread.start()
-    try:
-        yield server.address
-    finally:
-        ended.set()
-        thread.join()
-        server.close()
 
 
 def views(reach: float, side: int) -> Iterator[Camera]:

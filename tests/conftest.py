@@ -2,10 +2,11 @@
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from browser import CHROMIUM, Browser
 from tiny import GENERATE, TRAIN, TRAIN_FIELD, Outcome, call
 
 # A shell may have started us with Ctrl-C ignored, which the commands that tests start and stop would inherit.
@@ -55,6 +56,16 @@ def _threads(request) -> None:
 def spacesim() -> Callable[..., Outcome]:
     """Call a command in this process."""
     return call
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory) -> Iterator[Browser]:
+    """Headless Chromium."""
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium to drive")
+    one = Browser(tmp_path_factory.mktemp("chromium"))
+    yield one
+    one.close()
 
 
 @pytest.fixture(scope="session")

@@ -9,9 +9,11 @@ import errno
 import ipaddress
 import logging
 import socket as sockets
+import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
@@ -133,6 +135,21 @@ def serve(served: Served, host: str, port: int, say: Callable[[str], None]) -> N
     except KeyboardInterrupt:
         pass
     finally:
+        server.close()
+
+
+@contextmanager
+def serving(served: Served) -> Iterator[str]:
+    """The address of a server on a free port that draws on a thread of its own, while the block runs; nothing else may
+    draw before it has answered."""
+    server, ended = CameraServer(served, port=0), threading.Event()
+    thread = threading.Thread(target=server.run, args=(ended.is_set,))
+    thread.start()
+    try:
+        yield server.address
+    finally:
+        ended.set()
+        thread.join()
         server.close()
 
 

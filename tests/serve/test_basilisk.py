@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from serving import serving
 
 from spacesim.data.images import read_png
 from spacesim.data.records import Camera, Sun
+from spacesim.serve.server import serving
 from spacesim.serve.vizard import rotation_from_mrp
 
 SCRIPT = Path(__file__).parents[2] / "examples" / "closed_loop" / "basilisk.py"

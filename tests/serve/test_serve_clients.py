@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from serving import serving
 
 from spacesim.data.geometry import look_at
 from spacesim.data.images import read_png
 from spacesim.data.records import Camera, Sun
+from spacesim.serve.server import serving
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SUN = Sun(np.array([1.0, 0.5, 0.8]))

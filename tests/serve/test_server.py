@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from serving import CAMERA, SUN, serving
+from serving import CAMERA, SUN
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images.tone import as_bytes
@@ -16,7 +16,7 @@ from spacesim.data.records import Sun
 from spacesim.serve.client import CameraClient
 from spacesim.serve.draw import load_served
 from spacesim.serve.protocol import OUTPUTS, arrays_of
-from spacesim.serve.server import MAX_FRAME_BYTES, CameraServer
+from spacesim.serve.server import MAX_FRAME_BYTES, CameraServer, serving
 
 DROPPED = "serve: a client takes no answers; what it asks for is dropped"
 PATIENCE = 60_000  #: milliseconds

@@ -5,7 +5,6 @@ import struct
 
 import numpy as np
 import pytest
-from serving import serving
 from test_server import asked
 
 from spacesim.data.errors import InputError
@@ -13,6 +12,7 @@ from spacesim.data.geometry import look_at, rotation_from_quaternion
 from spacesim.data.images import png_bytes, read_png
 from spacesim.data.records import Camera, Sun
 from spacesim.serve import wire
+from spacesim.serve.server import serving
 from spacesim.serve.vizard import Simulation, depth_colors, rotation_from_mrp
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, PATIENCE, Browser, choose, fill, press, wait_for
+from browser import PATIENCE, choose, fill, press, wait_for
 
 from spacesim.data.images import read_png
 from spacesim.data.records import Sun
@@ -33,15 +33,6 @@ elevation_deg = 60.0
 position = [12.0, -4.0, 4.5]
 look_at = [0.0, 0.0, 0.8]
 """
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium to drive")
-    one = Browser(tmp_path_factory.mktemp("chromium"))
-    yield one
-    one.close()
 
 
 @pytest.fixture(scope="module")

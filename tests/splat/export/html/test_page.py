@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, Browser, wait_for
+from browser import wait_for
 from PIL import Image
 from tiny import call
 
@@ -91,15 +91,6 @@ def pages(runs, tmp_path_factory) -> dict[str, Path]:
     for name, run in runs.items():
         write_page(run, folder / f"{name}.html")
     return {name: folder / f"{name}.html" for name in runs}
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium to drive")
-    one = Browser(tmp_path_factory.mktemp("chromium"))
-    yield one
-    one.close()
 
 
 @pytest.fixture(scope="module")
