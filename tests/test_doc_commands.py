@@ -190,7 +190,7 @@ def module_of(script: str) -> Any:
 
 
 def takes_arguments(script: str) -> bool:
-    return re.search(r"import argparse|common\.arguments\(", (ROOT / script).read_text(encoding="utf-8")) is not None
+    return "parse_args(" in (ROOT / script).read_text(encoding="utf-8")
 
 
 def can_be_read(script: str) -> bool:
@@ -543,8 +543,9 @@ def answering(text: str) -> Iterator[str]:
         return
     pytest.importorskip("zmq", reason="pyzmq is not installed")
     from spacesim.serve.draw import load_served
+    from spacesim.serve.server import serving
 
-    with module_of("tests/serve/serving.py").serving(load_served("boxsat", spp=1)) as address:
+    with serving(load_served("boxsat", spp=1)) as address:
         yield text.replace("tcp://127.0.0.1:5556", address)
 
 
