@@ -3,14 +3,23 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from spacesim import backend, interrupts
 from spacesim.cli.parser import Parser, angles
 from spacesim.cli.printing import KNOWS_ONE_LIGHT, WANTS_FILTER
 from spacesim.data.errors import InputError, WorkError
 
+if TYPE_CHECKING:
+    import numpy as np
+
+    from spacesim.data.records import Camera
+    from spacesim.splat.export.splats import Form
+
 SUMMARY, NEEDS_BACKEND = "a run or a dataset as files for other tools", False
+SPLATS: "tuple[Form, ...]" = ("ply", "glb", "spz", "usd")  #: forms of a run's Gaussians
 LABELS = "speedplus", "bop", "coco", "yolo", "webdataset"  #: forms of a dataset
 
 
@@ -19,6 +28,9 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument("--backend", choices=backend.NAMES, default="auto", help="default: CUDA, else LLVM")
     form = parser.add_mutually_exclusive_group(required=True)
     form.add_argument("--ply", type=Path, metavar="FILE", help="Gaussians: INRIA layout, the dataset's frame and scale")
+    form.add_argument("--glb", type=Path, metavar="FILE", help="Gaussians: glTF with KHR_gaussian_splatting")
+    form.add_argument("--spz", type=Path, metavar="FILE", help="Gaussians: SPZ, a tenth of the size")
+    form.add_argument("--usd", type=Path, metavar="FILE", help="Gaussians: OpenUSD text, .usda")
     form.add_argument("--mesh", type=Path, metavar="FILE", help="the surface of a run: .ply, .obj, .glb or .stl")
     form.add_argument(
         "--html", type=Path, metavar="FILE", help="a run as one page for any browser: orbit, drag the Sun"
@@ -33,7 +45,19 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--keypoints", metavar="N|FILE", help="for a dataset: how many are found (11), or which they are"
     )
-    parser.add_argument("--sun", type=angles, metavar="AZ,EL", help="for --ply of a relightable run: whose colours")
+    parser.add_argument(
+        "--sun", type=angles, metavar="AZ,EL", help="for a relightable run: whose colours Gaussians or --mesh have"
+    )
+    parser.add_argument(
+        "--up", metavar="z|y|-y", help="the file's axis that the dataset's +z becomes (y in glTF and SPZ)"
+    )
+    parser.add_argument(
+        "--scale", type=float, metavar="N", help="for Gaussians and --mesh: units of the file a metre (1)"
+    )
+    parser.add_argument(
+        "--recentre", action="store_true", help="for Gaussians and --mesh: put the middle at the origin"
+    )
+    parser.add_argument("--spz-version", type=int, choices=(3, 4), help="3 (default) or 4, smaller, which few read yet")
     parser.add_argument("--object", metavar="K", help="for SPEED+: whose poses, by number or name (the first)")
     parser.add_argument("--data", type=Path, metavar="DATA", help="for --mesh: the dataset, where it has moved")
     parser.add_argument("--views", type=int, metavar="N", help="for --mesh: how many are fused, at most (64)")
@@ -44,35 +68,53 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
 def run(options: argparse.Namespace) -> None:
     if options.object is not None and options.speedplus is None:
         raise InputError("object: expected with --speedplus, found without it")
-    if options.sun is not None and options.ply is None:
-        raise InputError("sun: expected with --ply, found without it")
+    splats = next((form for form in SPLATS if getattr(options, form) is not None), None)
+    if splats is None and options.mesh is None:
+        for name, given in (("sun", options.sun), ("up", options.up), ("scale", options.scale)):
+            _check_absent(name, given, (*SPLATS, "mesh"))
+        _check_absent("recentre", options.recentre or None, (*SPLATS, "mesh"))
+    if splats != "spz":
+        _check_absent("spz_version", options.spz_version, ("spz",))
     labels = next((name for name in LABELS if getattr(options, name) is not None), None)
-    if options.keypoints is not None and labels is None:
-        raise InputError(f"keypoints: expected with --{', --'.join(LABELS)}, found without one")
-    for name in ("data", "views", "voxel", "truncation"):
-        if getattr(options, name) is not None and options.mesh is None:
-            raise InputError(f"{name}: expected with --mesh, found without it")
+    if labels is None:
+        _check_absent("keypoints", options.keypoints, LABELS)
+    if options.mesh is None:
+        for name in ("data", "views", "voxel", "truncation"):
+            _check_absent(name, getattr(options, name), ("mesh",))
     if labels is not None:
         _export_labels(options, labels)
     elif options.mesh is not None:
         _export_mesh(options)
     elif options.html is not None:
         _export_html(options)
-    else:
-        _export_ply(options)
+    elif splats is not None:
+        _export_splats(options, splats)
 
 
-def _export_ply(options: argparse.Namespace) -> None:
+def _check_absent(name: str, value: object, forms: Sequence[str]) -> None:
+    """An option of other forms."""
+    if value is not None:
+        found = "it" if len(forms) == 1 else "one"
+        raise InputError(f"{name}: expected with --{', --'.join(forms)}, found without {found}")
+
+
+def _export_splats(options: argparse.Namespace, form: "Form") -> None:
     from spacesim.data.records import Sun
     from spacesim.methods import load_run
     from spacesim.nerf.run import NerfRun
     from spacesim.splat.export.bake import bake
-    from spacesim.splat.export.ply import write_ply
+    from spacesim.splat.export.frame import FileFrame
+    from spacesim.splat.export.splats import Y_UP, check_ending, write_splats
 
+    out: Path = getattr(options, form)
+    check_ending(out, form)
+    frame = FileFrame(options.up or ("y" if form in Y_UP else "z"), _scale(options), options.recentre)
     backend.select(options.backend)
     run = load_run(options.path)
     if isinstance(run, NerfRun):
-        raise InputError(f"ply: expected a run of Gaussians, found {options.path}, a radiance field; --mesh takes it")
+        raise InputError(
+            f"{form}: expected a run of Gaussians, found {options.path}, a radiance field; --mesh takes it"
+        )
     model = run.gaussians
     if options.sun is None and run.relightable:
         raise InputError("sun: expected AZ,EL, under which a relightable run is to be exported, found none")
@@ -80,21 +122,31 @@ def _export_ply(options: argparse.Namespace) -> None:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
     if run.light is not None:
         model = bake(model, run.light, Sun.from_angles(*options.sun).direction if options.sun else None)
-    write_ply(model, options.ply)
+    write_splats(model, out, form, frame, run.antialiased, options.spz_version or 3)
     if run.antialiased:
         print(WANTS_FILTER, file=sys.stderr)
-    interrupts.print_output(f"{options.ply}: {run.gaussian_count} Gaussians")
+    interrupts.print_output(f"{out}: {run.gaussian_count} Gaussians")
+
+
+def _scale(options: argparse.Namespace) -> float:
+    return 1.0 if options.scale is None else float(options.scale)
 
 
 def _export_mesh(options: argparse.Namespace) -> None:
     from spacesim.data.mesh import mesh_suffix, write_mesh
+    from spacesim.data.records import Sun
     from spacesim.data.store import read_dataset
     from spacesim.methods import load_run
     from spacesim.nerf.run import NerfRun
     from spacesim.progress import show_progress
-    from spacesim.splat.export.mesh import MeshConfig, cameras_around, mesh_of, mesh_of_depths
+    from spacesim.splat.export.colors import color_vertices
+    from spacesim.splat.export.frame import FileFrame
+    from spacesim.splat.export.mesh import MeshConfig, cameras_around, depth_of, mesh_of_depths
 
-    mesh_suffix(options.mesh)
+    holds_colors = mesh_suffix(options.mesh) != ".stl"
+    if options.sun is not None and not holds_colors:
+        raise InputError(f"sun: expected a format that holds colours, found {options.mesh}")
+    frame = FileFrame(options.up or "z", _scale(options), options.recentre)
     settings = {"voxel": options.voxel, "truncation": options.truncation, "views": options.views}
     config = MeshConfig(**{name: value for name, value in settings.items() if value is not None})
     backend.select(options.backend)
@@ -107,16 +159,30 @@ def _export_mesh(options: argparse.Namespace) -> None:
     else:
         print(f"{data}: is gone; {config.views} cameras around the model take the place of its views", file=sys.stderr)
         cameras = cameras_around(run.gaussians, config.views)
+    if isinstance(run, NerfRun):
+        depth = run.surface_depth
+    else:
+        depth = partial(depth_of, run.gaussians, antialiased=run.antialiased)
     with show_progress("export", "steps") as report:
-        if isinstance(run, NerfRun):
-            surface = mesh_of_depths(run.surface_depth, cameras, config, report)
-        else:
-            surface = mesh_of(run.gaussians, cameras, config, run.antialiased, report)
+        surface = mesh_of_depths(depth, cameras, config, report)
     if len(surface.faces) == 0:
         raise WorkError(f"{options.path}: no view of the run shows an opaque surface, so there is no mesh to write")
-    write_mesh(options.mesh, surface.vertices, surface.faces)
+    sun = Sun.from_angles(*options.sun) if options.sun else None
+    colors = None
+    if sun is not None and not run.relightable:
+        print(KNOWS_ONE_LIGHT, file=sys.stderr)
+    if holds_colors and (sun is not None or not run.relightable):
+
+        def picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+            prediction = run.predict(camera, sun)
+            return prediction.rgb, prediction.alpha
+
+        with show_progress("export", "pictures") as report:
+            colors = color_vertices(surface, cameras, depth, picture, config.views, report)
+    write_mesh(options.mesh, frame.sized(surface.vertices), surface.faces, colors, options.up)
+    words = "" if colors is None else ", coloured"
     interrupts.print_output(
-        f"{options.mesh}: {len(surface.faces)} faces from {surface.views} views, voxels of {surface.voxel:.4g} m"
+        f"{options.mesh}: {len(surface.faces)} faces from {surface.views} views, voxels of {surface.voxel:.4g} m{words}"
     )
 
 

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong with the usage in one sentence, and takes "-40,10" for an argument, not for an option."""
+    """Says what is wrong with the usage in one sentence, and takes "-40,10" and "-y" for arguments, not for options."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._negative_number_matcher = re.compile(r"^-\.?\d")
+        self._negative_number_matcher = re.compile(r"^-(\.?\d|y$)")
 
     def flags(self) -> dict[str, str]:
         """{name of an option's value: the option}."""

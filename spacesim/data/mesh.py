@@ -10,12 +10,20 @@ import numpy as np
 
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
-from spacesim.data.files import read_bytes, write_bytes
+from spacesim.data.files import JsonValue, read_bytes, write_bytes
 from spacesim.data.geometry import Array
+from spacesim.data.glb import TRIANGLES, write_glb
+from spacesim.data.images.color import linear_from_srgb
 
 READ = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 WRITTEN = (".ply", ".obj", ".glb", ".stl")
 MAX_COORDINATE = 1e9  #: metres; corners beyond it are taken for damage (the Moon is at 3.8e8)
+#: {axis of a file that points up: rotation [3, 3], file from world, where z does and x stays}
+UPRIGHT = {
+    "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "y": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "-y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+}
 PARSED = 30  #: bytes of memory that a byte of a mesh file takes while it is read, at most; OBJ took 22
 
 
@@ -141,16 +149,41 @@ def mesh_suffix(path: Path) -> str:
     return suffix
 
 
-def write_mesh(path: Path, vertices: Array, faces: np.ndarray) -> None:
-    """Write vertices [V, 3] metres and faces [F, 3] as PLY, OBJ, STL or glTF (.glb), by the file's name. World axes; in
-    glTF y is up, and it is turned to that. Raises InputError for another name and where it cannot be written."""
+def write_mesh(
+    path: Path, vertices: Array, faces: np.ndarray, colors: np.ndarray | None = None, up: str | None = None
+) -> None:
+    """Write vertices [V, 3] metres and faces [F, 3] as PLY, OBJ, STL or glTF (.glb), by the file's name.
+
+    colors: [V, 3] sRGB values of the vertices, which STL cannot hold; light is in them, so glTF says that they are to
+    be shown unlit;  up: which axis of the file +z becomes, one of UPRIGHT; by default "y" in glTF, else "z"
+    Raises InputError for another name, for colours in STL and where it cannot be written.
+    """
     import trimesh
 
-    suffix = mesh_suffix(path)
+    path, suffix = Path(path), mesh_suffix(path)
+    if colors is not None and suffix == ".stl":
+        raise InputError(f"{path}: expected a format that holds colours, found STL")
+    vertices = vertices @ np.array(UPRIGHT[up or ("y" if suffix == ".glb" else "z")]).T
     if suffix == ".glb":
-        vertices = np.stack([vertices[:, 0], vertices[:, 2], -vertices[:, 1]], axis=1)
-    content = trimesh.Trimesh(vertices, faces, process=False).export(file_type=suffix[1:])
-    write_bytes(Path(path), content.encode() if isinstance(content, str) else content)
+        _write_glb_mesh(path, vertices, faces, colors)
+        return
+    bytes_of = None if colors is None else np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=bytes_of, process=False)
+    content = mesh.export(file_type=suffix[1:])
+    write_bytes(path, content.encode() if isinstance(content, str) else content)
+
+
+def _write_glb_mesh(path: Path, vertices: Array, faces: np.ndarray, colors: np.ndarray | None) -> None:
+    attributes = {"POSITION": vertices.astype(np.float32)}
+    material: dict[str, JsonValue] = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0}}
+    document: dict[str, JsonValue] = {"materials": [material]}
+    if colors is not None:
+        opaque = np.ones((len(colors), 1))
+        linear = np.concatenate([linear_from_srgb(np.clip(colors, 0, 1)), opaque], axis=1)
+        attributes["COLOR_0"] = np.rint(65535 * linear).astype(np.uint16)
+        material["extensions"] = {"KHR_materials_unlit": {}}
+        document["extensionsUsed"] = ["KHR_materials_unlit"]
+    write_glb(path, attributes, TRIANGLES, faces.ravel().astype(np.uint32), {"material": 0}, document)
 
 
 class SignedDistance:

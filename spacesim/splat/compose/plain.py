@@ -4,9 +4,9 @@ import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.records import Sun
-from spacesim.splat.compose.harmonics import rotate_harmonics
 from spacesim.splat.compose.scene import Composition
 from spacesim.splat.export.bake import bake
+from spacesim.splat.harmonics import rotate_harmonics
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 
 

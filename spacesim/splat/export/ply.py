@@ -6,6 +6,7 @@ import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_bytes, write_bytes
+from spacesim.splat.export.frame import unit_quaternions
 from spacesim.splat.raster.gaussians import Gaussians
 
 
@@ -21,9 +22,6 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     of unit length, spherical harmonics channel by channel; normals are 0."""
     arrays = gaussians.to_numpy()
     count, sh = gaussians.count, arrays["sh"]
-    quaternions = arrays["quaternions"] / np.maximum(
-        np.linalg.norm(arrays["quaternions"], axis=1, keepdims=True), 1e-12
-    )
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (sh.shape[1] - 1))
     opacity = arrays["logit_opacities"][:, None]
     parts = [
@@ -33,7 +31,7 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
         rest,
         opacity,
         arrays["log_scales"],
-        quaternions,
+        unit_quaternions(arrays["quaternions"]),
     ]
     table = np.concatenate(parts, axis=1).astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]

@@ -12,9 +12,9 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere
 from spacesim.data.records import Sun
 from spacesim.splat.compose import Composition, PlacedRun, Pose
-from spacesim.splat.compose.harmonics import band_rotations, rotate_harmonics
 from spacesim.splat.compose.plain import bake_scene
 from spacesim.splat.compose.pose import rotation_about
+from spacesim.splat.harmonics import band_rotations, rotate_harmonics
 from spacesim.splat.light.shadow.cast import cast_shadows
 from spacesim.splat.light.shadow.light_camera import light_rows
 from spacesim.splat.raster.cameras import Pinhole

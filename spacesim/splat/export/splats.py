@@ -1,0 +1,49 @@
+"""Gaussians as a file for other tools, in one of four formats."""
+
+from pathlib import Path
+from typing import Literal
+
+from spacesim.data.errors import InputError
+from spacesim.splat.export.frame import FileFrame
+from spacesim.splat.export.glb import write_gaussian_glb
+from spacesim.splat.export.ply import write_ply
+from spacesim.splat.export.spz import write_spz
+from spacesim.splat.export.usd import write_usd
+from spacesim.splat.raster.gaussians import Gaussians
+
+Form = Literal["ply", "glb", "spz", "usd"]
+ENDINGS = {"glb": (".glb",), "spz": (".spz",), "usd": (".usda", ".usd")}  #: of names; a PLY may have any
+Y_UP = ("glb", "spz")  #: formats that say that y points up; the others hold the dataset's axes
+
+
+def write_splats(
+    gaussians: Gaussians,
+    path: Path,
+    form: Form,
+    frame: FileFrame,
+    antialiased: bool = False,
+    spz_version: int = 3,
+) -> None:
+    """Write Gaussians with harmonics whose colours are sRGB values, see `bake`, in the file's frame.
+
+    antialiased: whether they are drawn with the anti-aliasing filter, which only SPZ can tell
+    Raises InputError for a name of another ending, and as the formats' own functions do.
+    """
+    check_ending(path, form)
+    placed = frame.placed(gaussians)
+    if form == "ply":
+        write_ply(placed, path)
+    elif form == "glb":
+        write_gaussian_glb(placed, path)
+    elif form == "spz":
+        write_spz(placed, path, antialiased, spz_version)
+    else:
+        write_usd(placed, path, frame.up)
+
+
+def check_ending(path: Path, form: Form) -> None:
+    """Raise InputError for a name by which nobody would know the format."""
+    endings = ENDINGS.get(form, ())
+    if endings and path.suffix.lower() not in endings:
+        found = path.suffix or "no ending"
+        raise InputError(f"{path}: expected a file name that ends in {' or '.join(endings)}, found {found}")
