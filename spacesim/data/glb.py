@@ -13,7 +13,7 @@ from spacesim.data.files import JsonMapping, JsonValue, write_bytes
 POINTS, TRIANGLES = 0, 4  #: modes of a primitive
 _MAX_BYTES = 0xFFFFFFFF  # what the header can tell
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-_COMPONENTS = {"float32": 5126, "uint16": 5123, "uint32": 5125}
+_COMPONENTS = {"float32": 5126, "uint32": 5125}
 _VERTICES, _INDICES = 34962, 34963  # targets of a buffer view
 
 
@@ -27,7 +27,7 @@ def write_glb(
 ) -> None:
     """Write one primitive.
 
-    attributes: {semantic: [N] or [N, C]}, float32, or uint16 for shares of 1; "POSITION" is one of them
+    attributes: {semantic: [N] or [N, C]}, float32; "POSITION" is one of them
     indices: uint32 [M], or None;  primitive, document: what else its object and the whole file say
     Raises InputError where it does not fit into the format's 4 GB, and where it cannot be written.
     """
@@ -51,8 +51,6 @@ def write_glb(
         accessor = add(array, _VERTICES)
         if name == "POSITION":  # which must tell its box
             accessor["min"], accessor["max"] = (edge.tolist() for edge in (array.min(axis=0), array.max(axis=0)))
-        elif array.dtype == np.uint16:
-            accessor["normalized"] = True
     described: dict[str, JsonValue] = {"attributes": numbers, "mode": mode}
     if indices is not None:
         described["indices"] = len(accessors)

@@ -179,8 +179,8 @@ def _write_glb_mesh(path: Path, vertices: Array, faces: np.ndarray, colors: np.n
     document: dict[str, JsonValue] = {"materials": [material]}
     if colors is not None:
         opaque = np.ones((len(colors), 1))
-        linear = np.concatenate([linear_from_srgb(np.clip(colors, 0, 1)), opaque], axis=1)
-        attributes["COLOR_0"] = np.rint(65535 * linear).astype(np.uint16)
+        linear = linear_from_srgb(np.clip(colors, 0, 1))
+        attributes["COLOR_0"] = np.concatenate([linear, opaque], axis=1).astype(np.float32)
         material["extensions"] = {"KHR_materials_unlit": {}}
         document["extensionsUsed"] = ["KHR_materials_unlit"]
     write_glb(path, attributes, TRIANGLES, faces.ravel().astype(np.uint32), {"material": 0}, document)

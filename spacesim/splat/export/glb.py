@@ -31,7 +31,7 @@ def write_gaussian_glb(gaussians: Gaussians, path: Path) -> None:
     colors = linear_from_srgb(np.clip(SH_C0 * arrays["sh"][:, 0] + 0.5, 0, 1))
     attributes = {
         "POSITION": arrays["means"],
-        "COLOR_0": np.rint(65535 * np.concatenate([colors, opacity[:, None]], axis=1)).astype(np.uint16),
+        "COLOR_0": np.concatenate([colors, opacity[:, None]], axis=1).astype(np.float32),
         f"{NAME}:ROTATION": np.roll(unit_quaternions(arrays["quaternions"]), -1, axis=1).astype(np.float32),
         f"{NAME}:SCALE": np.exp(np.clip(arrays["log_scales"], -LARGEST_LOG, LARGEST_LOG)),
         f"{NAME}:OPACITY": opacity.astype(np.float32),
