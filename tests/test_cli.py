@@ -18,6 +18,7 @@ from spacesim.cli.parser import view_of
 from spacesim.cli.program import in_flags, parser
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_exr, read_png
+from spacesim.data.mesh import read_mesh
 from spacesim.data.store import find_unreadable_files, read_dataset
 from spacesim.splat.export.ply import read_ply
 from spacesim.splat.run import load_run
@@ -358,6 +359,26 @@ def test_export(spacesim, tiny_run, tmp_path):
     assert np.array_equal(means, load_run(tiny_run).gaussians.to_numpy()["means"])
 
 
+@pytest.mark.parametrize("form", ["glb", "spz", "usd"])
+def test_export_for_other_viewers(spacesim, tiny_run, tmp_path, form):
+    out = tmp_path / {"usd": "model.usda"}.get(form, f"model.{form}")
+    done = spacesim("export", tiny_run, f"--{form}", out, "--scale", 2, "--recentre", "--up", "y")
+    assert (done.code, done.output, done.errors) == (0, f"{out}: 300 Gaussians\n", [])
+    assert out.stat().st_size > 300 * 15
+
+
+def test_export_of_a_mesh_with_colors(spacesim, tiny_run, tmp_path):
+    few = "--views", 3, "--voxel", 0.1
+    done = spacesim("export", tiny_run, "--mesh", tmp_path / "a.ply", *few)
+    assert (done.code, done.output.endswith(" m, coloured\n")) == (0, True), done
+    assert b"property uchar red" in (tmp_path / "a.ply").read_bytes()
+    done = spacesim("export", tiny_run, "--mesh", tmp_path / "b.ply", *few, "--scale", 10, "--recentre", "--up", "-y")
+    one, other = (read_mesh(tmp_path / name)[0] for name in ("a.ply", "b.ply"))
+    np.testing.assert_allclose(np.ptp(other, axis=0), 10 * np.ptp(one, axis=0)[[0, 2, 1]], rtol=1e-4)
+    middle = np.quantile(other, (0.005, 0.995), axis=0).mean(axis=0)
+    np.testing.assert_allclose(middle, 0, atol=1e-3)
+
+
 def test_paths_with_spaces_and_other_letters(spacesim, tiny_data, tmp_path):
     root = tmp_path / "Größe & Maß <1>"
     shutil.copytree(tiny_data, root / "данные")
@@ -528,6 +549,15 @@ def test_a_setting_that_cannot_be_is_named(spacesim, tiny_data, tmp_path, words,
         ("trian DATA --out OUT", ["COMMAND", "found 'trian'", "did you mean train?"]),
         ("export RUN", ["--ply"]),
         ("export DATA --ply OUT.ply", ["DATA", "config.json"]),
+        ("export RUN --glb OUT.ply", ["OUT.ply", ".glb"]),
+        ("export RUN --usd OUT.usdc", ["OUT.usdc", ".usda or .usd"]),
+        ("export RUN --usd OUT.usda --up -y", ["--up: expected z or y in USD"]),
+        ("export RUN --spz OUT.spz --up x", ["--up", "z, y, -y"]),
+        ("export RUN --ply OUT.ply --scale 0", ["--scale", "positive"]),
+        ("export RUN --glb OUT.glb --spz-version 4", ["--spz-version: expected with --spz, found without it"]),
+        ("export RUN --html OUT.html --recentre", ["--recentre: expected with --ply"]),
+        ("export RUN --html OUT.html --up y", ["--up: expected with --ply"]),
+        ("export RUN --mesh OUT.stl --sun 1,2", ["--sun", "holds colours"]),
     ],
 )
 def test_bad_usage_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tmp_path, arguments, names):
@@ -571,6 +601,9 @@ UNWRITABLE = ["BELOW_A_FILE/out", *(path for path in ("/proc/out", "/dev/full") 
         "render RUN --out OUT/a.png",
         "render RUN --out OUT/a.exr",
         "export RUN --ply OUT/a.ply",
+        "export RUN --glb OUT/a.glb",
+        "export RUN --spz OUT/a.spz",
+        "export RUN --usd OUT/a.usda",
         "export RUN --html OUT/a.html",
     ],
 )

@@ -13,9 +13,6 @@ from spacesim.cli.printing import KNOWS_ONE_LIGHT, WANTS_FILTER
 from spacesim.data.errors import InputError, WorkError
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from spacesim.data.records import Camera
     from spacesim.splat.export.splats import Form
 
 SUMMARY, NEEDS_BACKEND = "a run or a dataset as files for other tools", False
@@ -172,13 +169,8 @@ def _export_mesh(options: argparse.Namespace) -> None:
     if sun is not None and not run.relightable:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
     if holds_colors and (sun is not None or not run.relightable):
-
-        def picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-            prediction = run.predict(camera, sun)
-            return prediction.rgb, prediction.alpha
-
         with show_progress("export", "pictures") as report:
-            colors = color_vertices(surface, cameras, depth, picture, config.views, report)
+            colors = color_vertices(surface, cameras, depth, partial(run.predict, sun=sun), config.views, report)
     write_mesh(options.mesh, frame.sized(surface.vertices), surface.faces, colors, options.up)
     words = "" if colors is None else ", coloured"
     interrupts.print_output(

@@ -247,6 +247,7 @@ _LINES = (
     ("eval run --data data --out {out} --no-geometry", ("--split", "--lpips-weights", "--json")),
     ("report eval --out {out}.html", ("eval2", "data", "run")),
     ("export run --ply {out} --sun 1,2", ("--sun", "--object", "--data", "--views", "--voxel", "--truncation")),
+    ("export run --glb {out}.glb --sun 1,2", ("--up", "--scale", "--recentre", "--spz-version", "--spz", "--usd")),
     ("export run --mesh {out}.ply", ("--views", "--voxel", "--truncation", "--sun", "--data", "--mesh")),
     ("export data --speedplus {out}", ("--object", "--bop", "--sun")),
     ("verify data", ("--debug", "data", "--data")),

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
+from spacesim.learning.prediction import Prediction
 from spacesim.splat.export.mesh import RunMesh, select_views
 
 NEAR = 2.0  #: voxels: what lies deeper than the surface that a pixel shows is hidden in it
@@ -19,15 +20,15 @@ def color_vertices(
     mesh: RunMesh,
     cameras: Sequence[Camera],
     depth: Callable[[Camera], np.ndarray],
-    picture: Callable[[Camera], tuple[np.ndarray, np.ndarray]],
+    predict: Callable[[Camera], Prediction],
     most: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> Array:
     """[V, 3] sRGB values: the mean of what the pictures show at each vertex that they see, weighted by how squarely
     they see it; vertices that none sees take the colour of the nearest one that has one, black where there is none.
 
-    depth: [H, W] metres along a camera's axis, 0 where it sees no surface;  picture: (rgb [H, W, 3] sRGB values over
-    black, alpha [H, W]);  most: views used;  progress: called with the views done and all of them
+    depth: [H, W] metres along a camera's axis, 0 where it sees no surface;  predict: the run's picture from a
+    camera;  most: views used;  progress: called with the views done and all of them
     """
     normals = _normals(mesh)
     total, weights = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
@@ -47,8 +48,8 @@ def color_vertices(
         surface = depth(camera)[row.astype(int), column.astype(int)]
         near = (surface > 0) & (seen[chosen, 2] < surface + NEAR * mesh.voxel)
         chosen, places = chosen[near], np.stack([row[near] - 0.5, column[near] - 0.5])
-        rgb, alpha = picture(camera)
-        planes = [rgb[..., 0], rgb[..., 1], rgb[..., 2], alpha]
+        shown = predict(camera)
+        planes = [*np.moveaxis(shown.rgb, -1, 0), shown.alpha]
         *color, cover = (map_coordinates(plane, places, order=1, mode="nearest") for plane in planes)
         opaque = cover >= OPAQUE
         chosen, weight = chosen[opaque], cosine[chosen[opaque]] ** POWER

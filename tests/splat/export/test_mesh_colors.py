@@ -1,0 +1,122 @@
+"""Colours of vertices, against surfaces whose colours are known at every point; files of them, by trimesh."""
+
+import numpy as np
+import pytest
+import trimesh
+from splats import light_of
+from test_tsdf import cameras, rays
+
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import look_at
+from spacesim.data.mesh import write_mesh
+from spacesim.data.records import Camera
+from spacesim.learning.prediction import Prediction
+from spacesim.splat.export.colors import color_vertices
+from spacesim.splat.export.mesh import RunMesh
+
+AWAY = np.array([-3.0, 0, 0])  #: centre of the second sphere
+
+
+def seen(camera: Camera, centres: list) -> tuple[np.ndarray, np.ndarray]:
+    """(depth [H, W], place [H, W, 3]) of the nearest of some unit spheres; depth is 0 where there is none."""
+    d, o = rays(camera), camera.position
+    nearest = np.full(d.shape[:2], np.inf)
+    for centre in centres:
+        away = o - np.asarray(centre)
+        a, b, c = (d * d).sum(-1), d @ away, away @ away - 1
+        root = b * b - a * c
+        nearest = np.where(root > 0, np.minimum(nearest, (-b - np.sqrt(np.maximum(root, 0))) / a), nearest)
+    depth = np.where(np.isfinite(nearest), nearest, 0)
+    return depth.astype(np.float32), o + depth[..., None] * d
+
+
+def paint(places: np.ndarray) -> np.ndarray:
+    """Red about the origin, blue about AWAY, brighter upwards."""
+    first = places[..., :1] > -1.5
+    return np.where(first, [0.9, 0.1, 0.1], [0.1, 0.1, 0.9]) * (0.6 + 0.4 * places[..., 2:])
+
+
+def shown(camera: Camera, centres: list) -> Prediction:
+    depth, places = seen(camera, centres)
+    alpha = 0.8 * (depth > 0)
+    return Prediction(alpha[..., None] * paint(places), alpha, depth, None)
+
+
+def spheres(*centres) -> RunMesh:
+    parts = [trimesh.creation.icosphere(4).apply_translation(centre) for centre in centres]
+    both = trimesh.util.concatenate(parts)
+    return RunMesh(np.array(both.vertices), np.array(both.faces), 0.03, 0)
+
+
+def test_vertices_have_the_colors_of_what_is_there():
+    centres = [np.zeros(3)]
+    mesh, told = spheres(*centres), []
+    colors = color_vertices(
+        mesh,
+        cameras(30, 4.0, 128),
+        lambda c: seen(c, centres)[0],
+        lambda c: shown(c, centres),
+        20,
+        lambda *step: told.append(step),
+    )
+    assert np.abs(colors - paint(mesh.vertices)).max() < 0.02
+    assert told == [(k, 20) for k in range(21)]
+
+
+def test_what_stands_before_a_vertex_does_not_color_it():
+    centres = [np.zeros(3), AWAY]
+    mesh = spheres(*centres)
+    views = [
+        Camera.from_fov(look_at(np.array(eye, float), at), 128, 128, 50.0)
+        for eye, at in (((6, 0, 0), [0, 0, 0]), ((-3, 6, 0), AWAY))
+    ]
+    colors = color_vertices(mesh, views, lambda c: seen(c, centres)[0], lambda c: shown(c, centres), 9)
+    facing = mesh.vertices - AWAY
+    hidden = (np.linalg.norm(facing, axis=1) < 1.01) & (facing[:, 0] > 0.9)  # the first camera would see them
+    assert hidden.sum() > 20
+    assert (colors[hidden, 2] > 3 * colors[hidden, 0]).all()
+
+
+def test_vertices_that_no_view_sees_take_the_nearest_color():
+    centres, mesh = [np.zeros(3)], spheres(np.zeros(3))
+    view = Camera.from_fov(look_at(np.array([4.0, 0, 0]), np.zeros(3)), 96, 96, 40.0)
+    colors = color_vertices(mesh, [view], lambda c: seen(c, centres)[0], lambda c: shown(c, centres), 9)
+    behind, before = mesh.vertices[:, 0] < 0, mesh.vertices[:, 0] > 0.5
+    assert np.abs(colors[before] - paint(mesh.vertices[before])).max() < 0.05
+    assert colors[behind, 0].min() > 0.15
+    nothing = lambda c: Prediction(np.zeros((96, 96, 3)), np.zeros((96, 96)), np.zeros((96, 96)), None)  # noqa: E731
+    assert (color_vertices(mesh, [view], lambda c: seen(c, centres)[0], nothing, 9) == 0).all()
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
+def test_colors_in_files(tmp_path, suffix):
+    mesh = trimesh.creation.icosphere(2)
+    colors = paint(np.array(mesh.vertices))
+    write_mesh(tmp_path / f"a{suffix}", np.array(mesh.vertices), np.array(mesh.faces), colors)
+    found = trimesh.load(tmp_path / f"a{suffix}", process=False)
+    if suffix == ".glb":  # linear, to the standard; y is up
+        (found,) = found.geometry.values()
+        np.testing.assert_allclose(found.visual.vertex_attributes["color"][:, :3], light_of(colors), atol=1e-6)
+        np.testing.assert_allclose(found.vertices[:, 1], mesh.vertices[:, 2], atol=1e-6)
+    else:
+        np.testing.assert_allclose(found.visual.vertex_colors[:, :3] / 255, colors, atol=0.51 / 255)
+    assert (found.faces == mesh.faces).all()
+
+
+def test_stl_holds_no_colors(tmp_path):
+    with pytest.raises(InputError, match="expected a format that holds colours, found STL"):
+        write_mesh(tmp_path / "a.stl", np.eye(3), np.array([[0, 1, 2]]), np.ones((3, 3)))
+
+
+def test_meshes_stand_as_the_file_wants(tmp_path):
+    points = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    for name, up, wanted in (
+        ("a.glb", None, [0, 1, 0]),
+        ("b.glb", "z", [0, 0, 1]),
+        ("c.ply", "-y", [0, -1, 0]),
+        ("d.obj", None, [0, 0, 1]),
+    ):
+        write_mesh(tmp_path / name, points, np.array([[0, 1, 2]]), up=up)
+        found = trimesh.load(tmp_path / name, process=False, force="mesh")
+        np.testing.assert_allclose(found.vertices[0], wanted, atol=1e-7)
+        assert np.linalg.det(found.vertices) == pytest.approx(np.linalg.det(points))
