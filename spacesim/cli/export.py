@@ -26,7 +26,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     form = parser.add_mutually_exclusive_group(required=True)
     form.add_argument("--ply", type=Path, metavar="FILE", help="Gaussians: INRIA layout, the dataset's frame and scale")
     form.add_argument("--glb", type=Path, metavar="FILE", help="Gaussians: glTF with KHR_gaussian_splatting")
-    form.add_argument("--spz", type=Path, metavar="FILE", help="Gaussians: SPZ, a tenth of the size")
+    form.add_argument("--spz", type=Path, metavar="FILE", help="Gaussians: SPZ, a sixth of the size")
     form.add_argument("--usd", type=Path, metavar="FILE", help="Gaussians: OpenUSD text, .usda")
     form.add_argument("--mesh", type=Path, metavar="FILE", help="the surface of a run: .ply, .obj, .glb or .stl")
     form.add_argument(
@@ -54,7 +54,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--recentre", action="store_true", help="for Gaussians and --mesh: put the middle at the origin"
     )
-    parser.add_argument("--spz-version", type=int, choices=(3, 4), help="3 (default) or 4, smaller, which few read yet")
+    parser.add_argument("--spz-version", type=int, choices=(3, 4), help="3 (default), or 4, which fewer programs read")
     parser.add_argument("--object", metavar="K", help="for SPEED+: whose poses, by number or name (the first)")
     parser.add_argument("--data", type=Path, metavar="DATA", help="for --mesh: the dataset, where it has moved")
     parser.add_argument("--views", type=int, metavar="N", help="for --mesh: how many are fused, at most (64)")
@@ -120,7 +120,7 @@ def _export_splats(options: argparse.Namespace, form: "Form") -> None:
     if run.light is not None:
         model = bake(model, run.light, Sun.from_angles(*options.sun).direction if options.sun else None)
     write_splats(model, out, form, frame, run.antialiased, options.spz_version or 3)
-    if run.antialiased:
+    if run.antialiased and form != "spz":  # which tells it
         print(WANTS_FILTER, file=sys.stderr)
     interrupts.print_output(f"{out}: {run.gaussian_count} Gaussians")
 

@@ -1,4 +1,4 @@
-"""Gaussians as SPZ, a tenth of a PLY's size: versions 3 (gzip) and 4 (zstandard).
+"""Gaussians as SPZ, a sixth of a PLY's size: versions 3 (gzip) and 4 (zstandard).
 
 Source: nianticlabs/spz of 10 July 2026, README.md (containers) and src/cc/load-spz.cc (how numbers are quantised).
 """
