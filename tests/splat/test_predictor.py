@@ -10,7 +10,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera, Sun
 from spacesim.methods import load_predictor
-from spacesim.splat.compose import ComposedRun, Composition, PlacedRun, Pose
+from spacesim.splat.compose import ComposedRun, GaussianComposition, PlacedRun, Pose
 from spacesim.splat.compose.aligned import AlignedRun
 from spacesim.splat.compose.run import PlacedPart
 from spacesim.splat.raster.gaussians import Gaussians
@@ -34,10 +34,10 @@ def run(tmp_path) -> Run:
 @pytest.fixture
 def scene(run, tmp_path) -> ComposedRun:
     models = [PlacedRun(run, name="left"), PlacedRun(run, Pose(translation=[2.0, 0, 0]), "right")]
-    return ComposedRun(Composition(models), tmp_path / "scene.toml")
+    return ComposedRun(GaussianComposition(models), tmp_path / "scene.toml")
 
 
-@pytest.mark.parametrize("kind", [Run, AlignedRun, ComposedRun, Composition])
+@pytest.mark.parametrize("kind", [Run, AlignedRun, ComposedRun, GaussianComposition])
 def test_predict_is_asked_in_the_same_words(kind):
     assert words_of(kind.predict) == words_of(Predictor.predict)
 

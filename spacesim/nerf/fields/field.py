@@ -94,7 +94,7 @@ class FieldTape:
 
 
 @dataclass(frozen=True)
-class Field:
+class RadianceField:
     """Density and colour of a radiance field. The colour is told the direction of the view, and of the Sun where the
     method is, or in place of both the cosines about a normal, which is three of the density network's numbers."""
 
@@ -106,7 +106,7 @@ class Field:
     has_normals: bool  #: the colour is told cosines
 
     @staticmethod
-    def of(config: NerfConfig) -> "Field":
+    def of(config: NerfConfig) -> "RadianceField":
         """Of a configuration."""
         has_normals = config.has_normals
         density = DensityField.of(config.grid, config.width, config.features + 3 * has_normals)
@@ -116,7 +116,7 @@ class Field:
         shape = MlpShape(
             config.features + directions, 1, 6 if config.casts_shadows else 3, config.width, config.color_layers
         )
-        return Field(density, shape, config.features, config.harmonics, of_sun, has_normals)
+        return RadianceField(density, shape, config.features, config.harmonics, of_sun, has_normals)
 
     @property
     def split(self) -> int:

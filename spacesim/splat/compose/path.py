@@ -12,7 +12,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, direction_from_angles, look_at, normalize
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose.pose import Pose, interpolate_pose, interpolate_rotation, slerp
-from spacesim.splat.compose.scene import Composition
+from spacesim.splat.compose.scene import GaussianComposition
 
 FPS = 24.0  #: pictures a second where nothing is said
 ORBIT_FRAMES = 120  #: of an orbit where nothing is said: five seconds
@@ -91,7 +91,7 @@ class SceneFrame:
     """One picture of a scene."""
 
     time: float  #: seconds
-    composition: Composition  #: with the poses of that time
+    composition: GaussianComposition  #: with the poses of that time
     camera: Camera
     sun: Sun | None
 
@@ -100,7 +100,7 @@ class SceneFrame:
 class PosedScene:
     """All that a scene file says (docs/reference/composed-scenes.md)."""
 
-    composition: Composition  #: runs with their poses
+    composition: GaussianComposition  #: runs with their poses
     sun: Sun | None = None  #: None where it names none
     camera: Camera | None = None  #: None where it names none
     keyframes: Sequence[Keyframe] = ()  #: of camera, Sun and models, by time
@@ -133,7 +133,7 @@ class PosedScene:
         """The Sun at a time, seconds; None where nobody has said."""
         return self._track(lambda key: key.sun, interpolate_sun, time) or self.sun
 
-    def posed_at(self, time: float) -> Composition:
+    def posed_at(self, time: float) -> GaussianComposition:
         """The models where they are at a time, seconds."""
         poses = [
             self._track(lambda key, name=model.name: key.poses.get(name), interpolate_pose, time) or model.pose  # type: ignore[misc]

@@ -18,7 +18,7 @@ from spacesim.data.structure import Rules, did_you_mean, structure
 from spacesim.data.transforms import read_camera, read_dataset
 from spacesim.splat.compose.path import FPS, MAX_FRAMES, ORBIT_FRAMES, CameraView, Keyframe, Orbit, PosedScene
 from spacesim.splat.compose.pose import Pose, rotation_about
-from spacesim.splat.compose.scene import ComposeConfig, Composition, PlacedRun
+from spacesim.splat.compose.scene import ComposeConfig, GaussianComposition, PlacedRun
 from spacesim.splat.run import load_run
 
 FOV_DEG = 35.0  #: of a camera where nothing is said
@@ -216,12 +216,12 @@ T = TypeVar("T")
 
 
 def load_scene(
-    path: str | Path, load: Callable[[Path], Any] | None = None, compose: Callable[..., Any] = Composition
+    path: str | Path, load: Callable[[Path], Any] | None = None, compose: Callable[..., Any] = GaussianComposition
 ) -> PosedScene:
     """The scene that a TOML file describes, its runs loaded, each once. Raises InputError with file, line and key.
 
-    load: a folder to a run, None: one of Gaussians;  compose: makes a `Composition`, or what has its words for runs of
-    other methods
+    load: a folder to a run, None: one of Gaussians;  compose: makes a `GaussianComposition`, or what has its
+    words for runs of other methods
     """
     path = Path(path)
     document = toml.read_document(path)

@@ -62,7 +62,7 @@ class DepthView:
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class DistanceField:
     """A truncated signed distance on a grid."""
 
     grid: Grid
@@ -76,7 +76,7 @@ def fuse(
     grid: Grid,
     truncation: float = TRUNCATION,
     progress: Callable[[int], None] | None = None,
-) -> Field:
+) -> DistanceField:
     """The field of some views. truncation: voxels;  progress: called with the views done.
 
     Raises InputError where the grid does not fit into memory.
@@ -101,7 +101,7 @@ def fuse(
     total, weight = (np.array(values).reshape(grid.shape[::-1]) for values in sums)
     observed = weight > 0
     distance = np.divide(total, weight, out=np.ones_like(total), where=observed)
-    return Field(grid, distance, observed)
+    return DistanceField(grid, distance, observed)
 
 
 def check_memory(grid: Grid) -> None:

@@ -26,7 +26,12 @@ from spacesim.splat.light.field import (
 )
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shadow.light_camera import towards_sun
-from spacesim.splat.light.shadow.refine import RefineConfig, refine_inputs, refine_occlusion, refine_occlusion_slope
+from spacesim.splat.light.shadow.refine import (
+    ShadowRefinementConfig,
+    refine_inputs,
+    refine_occlusion,
+    refine_occlusion_slope,
+)
 from spacesim.splat.raster.cameras import Projection
 
 
@@ -235,7 +240,9 @@ def adjoint(
     return batch.pack(parts, inputs.features), grad_weights, grad_raw_occlusion, by_encoding, grad_sun
 
 
-def _refine_items(config: LightConfig, refine: RefineConfig, inputs: ShadingInputs, batch: PaddedBatch) -> TensorXf:
+def _refine_items(
+    config: LightConfig, refine: ShadowRefinementConfig, inputs: ShadingInputs, batch: PaddedBatch
+) -> TensorXf:
     """Items of the refinement, TensorXf [B, C, m]: 4.11, lengths in training scale."""
     x, y, z, scale = (dr.gather(ad.Float, inputs.training_frame, ad.UInt32(i)) for i in range(4))
     per_metre = dr.rcp(scale)

@@ -14,7 +14,7 @@ from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.raster.supersample import MAX_SUPERSAMPLE
 from spacesim.splat.train.old_config import ALIASES, in_this_layout
-from spacesim.splat.train.strategies.control import RefinementConfig
+from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.strategies.mcmc import McmcConfig
 from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig
@@ -112,7 +112,8 @@ class TrainConfig:
     )
     means_steps: int | None = None  #: in which the centres' step size falls; none: in the whole training
     rates: LearningRates = field(default_factory=LearningRates)  #: step sizes
-    refinement: RefinementConfig = field(default_factory=RefinementConfig)  #: schedule and rules of every strategy
+    #: schedule and rules of every strategy
+    refinement: DensificationConfig = field(default_factory=DensificationConfig)
     strategy: StrategyConfig = field(default_factory=DefaultStrategyConfig)  #: chooses what grows and what is pruned
 
     def __post_init__(self) -> None:

@@ -19,7 +19,7 @@ SPLIT_COUNT = 2
 
 
 @dataclass(frozen=True)
-class RefinementCounts:
+class DensificationCounts:
     """What a densification step did, in numbers of Gaussians."""
 
     duplicated: int = 0

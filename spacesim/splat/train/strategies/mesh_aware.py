@@ -16,7 +16,12 @@ from spacesim.backend.arrays import Bool, Float
 from spacesim.data.errors import InputError, WorkError, check_ranges
 from spacesim.data.mesh import SignedDistance
 from spacesim.splat.raster.gaussians import Gaussians, stack_rows
-from spacesim.splat.train.strategies.control import DensityControl, GaussianStatistics, RefinementConfig, select_parents
+from spacesim.splat.train.strategies.control import (
+    DensificationConfig,
+    DensityControl,
+    GaussianStatistics,
+    select_parents,
+)
 from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD
 
 KNOWN = ("known", "known_x", "known_y", "known_z")
@@ -77,7 +82,7 @@ class MeshAwareStrategy(DensityControl):
 
     def __init__(
         self,
-        config: RefinementConfig,
+        config: DensificationConfig,
         mesh_aware: MeshAwareConfig,
         surface: SignedDistance,
         scene_scale: float,
