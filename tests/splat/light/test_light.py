@@ -441,9 +441,7 @@ REFINEMENT = DensificationConfig(
 
 
 def training(name: str, **changes) -> TrainConfig:
-    shadow = CONFIGS[name].shadow
-    method = {"mapping": "shadow-map", "splatting": "shadow-splat"}[shadow.method.kind] if shadow else "relight"
-    given = {"method": method, "light": CONFIGS[name], "iterations": 60, "checkpoint_every": 25, "init_count": 40}
+    given = {"light": CONFIGS[name], "iterations": 60, "checkpoint_every": 25, "init_count": 40}
     return TrainConfig(**{**given, "refinement": REFINEMENT, **changes})
 
 
@@ -649,7 +647,7 @@ def test_resume_takes_what_an_older_version_did_not_write_for_the_default(small_
 
 def test_vanilla_ignores_suns_and_light_needs_them(small_lit_dataset):
     dark = replace(small_lit_dataset, train=tuple(replace(frame, sun=None) for frame in small_lit_dataset.train))
-    Trainer(dark, replace(training("relight"), method="vanilla", light=None))
+    Trainer(dark, replace(training("relight"), light=None))
     for name in ("relight", "map"):
         said = r"expected sun_direction in every training frame, or .* light\.field\.inputs=view, .*train_"
         with pytest.raises(InputError, match=said):
