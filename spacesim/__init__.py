@@ -24,9 +24,8 @@ else:  # or type checkers would take any name
 
     def __getattr__(name: str) -> object:
         is_private = name.startswith("_") and name != "__all__"
-        if (
-            is_private or find_spec(f"{__name__}.{name}") is not None
-        ):  # a module, which whoever imports it looks for here
+        is_module = not is_private and find_spec(f"{__name__}.{name}") is not None  # which an import looks for here
+        if is_private or is_module:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         api = import_module(f"{__name__}.api")
         if name != "__all__" and name not in api.__all__:
