@@ -66,14 +66,15 @@ class Unknown(Protocol):
 
 def find_unknowns(run: Predictor, gain: bool = False) -> tuple[Unknown, ...]:
     """Of a run, in the order in which they are fitted. gain: of each picture, too"""
-    model = run.run if isinstance(run, AlignedRun) else run
-    light = model.light if isinstance(model, Run) else None
     unknowns: list[Unknown] = []
-    if isinstance(model, Run) and light is not None and model.config.get("sun") == "unknown":
-        unknowns.append(SunFit(SunFinder(model.gaussians, light, model.antialiased, model.curve)))
-    if light is not None and light.embeddings:
-        size = light.config.field.embeddings
-        unknowns.append(EmbeddingFit.of(np.array(light.embeddings[0], np.float64).reshape(-1, size)))
+    model = run.gaussian_run
+    if model is not None and model.light is not None:
+        light = model.light
+        if model.config.get("sun") == "unknown":
+            unknowns.append(SunFit(SunFinder(model.gaussians, light, model.antialiased, model.curve)))
+        if light.embeddings:
+            size = light.config.field.embeddings
+            unknowns.append(EmbeddingFit.of(np.array(light.embeddings[0], np.float64).reshape(-1, size)))
     if gain:
         unknowns.append(GainFit())
     return tuple(unknowns)
@@ -104,7 +105,6 @@ def estimate_sun(run: Run, image: ArrayLike | Image, camera: Camera, mask: Array
 def draw(run: Predictor, camera: Camera, light: PictureLight) -> Prediction:
     """A view with a light. Its colours are clipped to [0, 1] where there is a gain."""
     if light.embedding is not None:
-        assert isinstance(run, Run | AlignedRun), "other runs have none"
         run = run.with_embedding(light.embedding)
     drawn = run.predict(camera, light.sun)
     return drawn if light.gain == 1 else replace(drawn, rgb=srgb_from_linear(light.gain * linear_from_srgb(drawn.rgb)))

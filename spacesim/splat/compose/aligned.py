@@ -72,6 +72,11 @@ class AlignedRun:
         """None: it was trained as one."""
         return ()
 
+    @property
+    def gaussian_run(self) -> Run:
+        """In axes and a scale of its own."""
+        return self.run
+
     def with_embedding(self, embedding: np.ndarray) -> "AlignedRun":
         """See `Run.with_embedding`."""
         return replace(self, run=self.run.with_embedding(embedding))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.backend.arrays import Bool
+from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose.scene import ComposedPrediction, GaussianComposition
@@ -135,6 +136,14 @@ class ComposedRun:
                 for model in models
             },
         }
+
+    @property
+    def gaussian_run(self) -> None:
+        """None: it has several."""
+
+    def with_embedding(self, embedding: np.ndarray) -> "ComposedRun":
+        """Raises InputError: each of its models has its own."""
+        raise InputError(f"embedding: expected a run, found {self.path}, a scene")
 
     def predict(
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
