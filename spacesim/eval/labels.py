@@ -13,7 +13,7 @@ class Metric:
     """A metric: its names, its unit and what it means."""
 
     key: str  #: name in metrics.json
-    label: str
+    label: str  #: its name on pages
     unit: str
     goal: str  #: "↑", "↓" or "→ x", the value to come close to
     digits: int  #: decimals

@@ -23,7 +23,7 @@ TEST = MappingConfig("percentage-closer", radius=0.5)  #: as `Member.cross_shado
 class FieldsBeside:
     """Fields in the Sun's way of Gaussians, see `splat.compose.scene.Beside`."""
 
-    fields: FieldComposition
+    fields: FieldComposition  #: radiance fields where they stand
 
     @property
     def key(self) -> bytes:

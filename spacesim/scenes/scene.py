@@ -54,10 +54,10 @@ class PlacedPart:
 class Scene:
     """What is rendered: objects under the Sun and, perhaps, the Earth."""
 
-    name: str
+    name: str  #: of the scene
     objects: tuple[SceneObject, ...]
-    sun: SunConfig = field(default_factory=SunConfig)
-    earth: EarthConfig | None = None
+    sun: SunConfig = field(default_factory=SunConfig)  #: how bright and how wide it is
+    earth: EarthConfig | None = None  #: None: there is none
 
     def __post_init__(self) -> None:
         parts = sum(len(item.spacecraft.parts) for item in self.objects)
@@ -169,9 +169,9 @@ class MitsubaScene:
     units: Units  #: of all three
     labelled: mt.Scene  #: the shapes without light, and no ray slips between two triangles of them
     sunlit: mt.Scene
-    sun: Source
+    sun: Source  #: the emitter of `sunlit`, which can be moved
     earthlit: mt.Scene | None = None
-    earth: Source | None = None
+    earth: Source | None = None  #: the emitter of `earthlit`, which can be moved
 
     def point(self, sun: Sun, earth: EarthConfig | None = None) -> None:
         """Move the Sun and, where one is given to a scene that has one, the Earth; the Earth's phase follows."""

@@ -33,7 +33,7 @@ ENOUGH = 1e-3  #: a step that lowers the cost by less than this share is the las
 class PictureLight:
     """What a view is drawn with."""
 
-    sun: Sun | None = None
+    sun: Sun | None = None  #: None: not named, and not found yet
     embedding: Array | None = None  #: [E], None: the mean of the training pictures'
     gain: float = 1.0  #: factor on linear values
 
@@ -43,7 +43,7 @@ class Picture:
     """A picture to fit to."""
 
     rgb: np.ndarray  #: [H, W, 3] sRGB values in [0, 1] over black
-    camera: Camera
+    camera: Camera  #: of the picture
 
 
 class Unknown(Protocol):
@@ -114,7 +114,7 @@ def draw(run: Predictor, camera: Camera, light: PictureLight) -> Prediction:
 class SunFit:
     """The Sun of a picture that does not name it, by a run whose training pictures did not name theirs."""
 
-    finder: SunFinder
+    finder: SunFinder  #: of the run's model
 
     name = "sun"
     how = "its direction, searched over the sphere by shading and shadows of a picture of 64 pixels"

@@ -19,8 +19,8 @@ class Page:
     """sRGB colours of the paper, of text and of text that matters less."""
 
     paper: Color
-    ink: Color
-    faint: Color
+    ink: Color  #: of text
+    faint: Color  #: of text that matters less
 
 
 WHITE_PAGE = Page((255, 255, 255), (0, 0, 0), (110, 110, 110))

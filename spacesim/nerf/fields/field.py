@@ -37,7 +37,8 @@ class DensityTape:
 class DensityField:
     """Density, and numbers that tell a colour network of the place."""
 
-    grid: HashGrid
+    grid: HashGrid  #: what is known of places
+    #: the network: what the grid says of a place in, the logarithm of the density and the other numbers out
     shape: MlpShape
 
     @staticmethod
@@ -85,7 +86,7 @@ class DensityField:
 class FieldTape:
     """What the adjoint of a field wants."""
 
-    density: DensityTape
+    density: DensityTape  #: what the density's own adjoint wants
     layers: list[Any]  #: of the colour network
     color: list[Float]  #: [N] each
     normal: Array3f | None  #: [3, N] of any length, where there are some
@@ -99,7 +100,7 @@ class RadianceField:
     method is, or in place of both the cosines about a normal, which is three of the density network's numbers."""
 
     density: DensityField
-    color: MlpShape
+    color: MlpShape  #: the network: features, view and Sun in, three colours out, of a field with shadows six
     features: int  #: numbers of a place that the colour network reads
     harmonics: int  #: degree, of the view's direction
     sun_harmonics: int | None  #: degree, of the Sun's; None of a field that is not told

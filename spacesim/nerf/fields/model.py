@@ -33,7 +33,7 @@ class Round:
 class Networks:
     """The fields of a configuration; their parameters lie in one list, those of the proposals first."""
 
-    config: NerfConfig
+    config: NerfConfig  #: how they are trained, which says how large they are
 
     @cached_property
     def proposals(self) -> tuple[DensityField, ...]:

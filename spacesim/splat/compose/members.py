@@ -106,7 +106,7 @@ class Ensemble:
 
     #: in an order that does not depend on how they were named, so that composing [A, B] and [B, A] is one and the same
     members: Sequence[Member]
-    starts: Sequence[int] = field(init=False)
+    starts: Sequence[int] = field(init=False)  #: of each member, the index of its first Gaussian
 
     def __post_init__(self) -> None:
         counts = [member.count for member in self.members]

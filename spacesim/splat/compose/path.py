@@ -58,8 +58,8 @@ class Keyframe:
     """What is where at a time, seconds; what it does not name goes on as the keyframes around say."""
 
     time: float
-    sun: Sun | None = None
-    view: CameraView | None = None
+    sun: Sun | None = None  #: None: not named here
+    view: CameraView | None = None  #: where the camera stands; None: not named here
     poses: Mapping[str, Pose] = field(default_factory=dict)  #: by the names of models
 
 
@@ -92,8 +92,8 @@ class SceneFrame:
 
     time: float  #: seconds
     composition: GaussianComposition  #: with the poses of that time
-    camera: Camera
-    sun: Sun | None
+    camera: Camera  #: pose and intrinsics at that time
+    sun: Sun | None  #: at that time; None where nobody has said
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +174,8 @@ class Track(Generic[T]):
     """Values at rising times, seconds; before the first and after the last the value stays."""
 
     times: Sequence[float]
-    values: Sequence[T]
-    blend: Callable[[T, T, float], T]
+    values: Sequence[T]  #: one for each time
+    blend: Callable[[T, T, float], T]  #: (value before, value after, share of the way from 0 to 1) -> the value between
 
     def at(self, time: float) -> T:
         """The value at a time; at a keyframe's own exactly what it says."""

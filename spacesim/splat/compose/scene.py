@@ -52,7 +52,7 @@ class PlacedRun:
     """A run and where it stands."""
 
     run: Run
-    pose: Pose = field(default_factory=Pose)
+    pose: Pose = field(default_factory=Pose)  #: of the model in the world
     name: str = ""  #: for messages and files
 
 
@@ -78,9 +78,9 @@ class DrawnView:
     #: alpha, depth, ... and `features`, of which `planes` says what they are: "rgb" (3, premultiplied, linear where
     #: there is a `curve`), "visibility" (1, premultiplied), "id" (one a model, in the order of `order`)
     output: RenderOutput
-    planes: dict[str, list[Float]]
-    order: list[int]
-    curve: tuple[str, float] | None
+    planes: dict[str, list[Float]]  #: the features by what they are, as above
+    order: list[int]  #: which model each plane of "id" is of
+    curve: tuple[str, float] | None  #: tone curve and exposure (EV) of linear colours; None where they are sRGB values
 
     def image(self, name: str, stops: float = 0.0) -> np.ndarray:
         """One of `OUTPUTS` that was asked for: rgb [H, W, 3] sRGB values over black, normal [H, W, 3], others [H, W];

@@ -48,13 +48,13 @@ class SunEncoding:
 class ShadingInputs:
     """What shading depends on beside weights."""
 
-    features: Float
-    means: Array3f
+    features: Float  #: Float, packed [F * N]
+    means: Array3f  #: Array3f [3, N], metres
     rotations_and_scales: tuple[Array4f, Array3f]  #: quaternions and log scales
     logits: Float  #: of opacities
     camera: Projection | None  #: None where the Sun's light alone is wanted
     raw_shadows: list[Float]  #: occlusion, normal alignment, light extent and bias, [N] each, or nothing
-    sun: SunEncoding
+    sun: SunEncoding  #: what networks and shadows are told of it
     training_frame: Float  #: Float [4], centre and scale of the training frame
 
 
@@ -62,8 +62,8 @@ class ShadingInputs:
 class ShadingTape:
     """What the adjoint needs of the forward pass."""
 
-    field: list[TensorXf]
-    refine: list[TensorXf]
+    field: list[TensorXf]  #: of the appearance field, layer by layer
+    refine: list[TensorXf]  #: of the shadow refinement network, layer by layer, or nothing
     colors: list[Float]  #: 3 arrays [M] before they are dimmed
     occlusion: list[Float]  #: the refined one [M] in a list, or nothing
     faces: list[Float]  #: of `sun_facing`, or nothing

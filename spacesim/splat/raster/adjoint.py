@@ -54,9 +54,9 @@ class SplatGradients:
     """Gradients of a scalar by the splats, [N] each (depths have none), and what densification asks for."""
 
     splats: Splats
-    features: list[Float]
+    features: list[Float]  #: of what was blended, a Float [N] for each channel
     absolute_x: Float  #: sum over pixels of |d / d x|, per pixel of screen (Ye et al. 2024, AbsGS)
-    absolute_y: Float
+    absolute_y: Float  #: the same of y
 
 
 @recorded

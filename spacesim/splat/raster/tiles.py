@@ -51,9 +51,9 @@ class TileLists:
     first_slot: UInt32
     slot_count: UInt32
     capacity: int
-    tiles_x: int
-    tiles_y: int
-    shape: TileShape
+    tiles_x: int  #: tiles in a row
+    tiles_y: int  #: rows of tiles
+    shape: TileShape  #: size of a tile, and how lanes share its pixels
     #: the tiles in the order in which they are given to lanes [T], or None for that of their indices
     order: UInt32 | None = None
     #: where each slot's pair stands in `splat` [P], or None: sums of pairs are then kept by slots (`sum_index`)
@@ -94,8 +94,8 @@ class LanePixels:
     place: UInt32
     x: Float
     y: Float
-    column: UInt32
-    row: UInt32
+    column: UInt32  #: of its first pixel, from 0
+    row: UInt32  #: of its first pixel, from 0
 
 
 def lane_pixels(lists: TileLists) -> LanePixels:

@@ -19,7 +19,7 @@ DILATION, PIXEL = 0.3, 1 / 12  #: pixels^2 added to covariances, and to those of
 
 @dataclass(frozen=True, eq=False)
 class ReferenceOutput:
-    """The planes of `RenderOutput`, float64: colour [H, W, 3] over black, alpha [H, W], depth [H, W] expected depth in
+    """The planes of `RenderOutput`, float64: color [H, W, 3] over black, alpha [H, W], depth [H, W] expected depth in
     metres, median_depth [H, W], normal [H, W, 3] unit or 0, features [H, W, C]."""
 
     color: np.ndarray

@@ -28,7 +28,7 @@ class Model:
 
     name: str  #: unlike the others'
     centre: Array  #: [3] and radius of its Gaussians, or of its box, its own frame, metres
-    radius: float
+    radius: float  #: metres, as `centre`
 
 
 class SceneRenderer:

@@ -210,10 +210,10 @@ def _occlusion_at(
 class SunView:
     """What the Sun sees of some Gaussians, to be asked of points that are none."""
 
-    light: ShadowMap
-    camera: Orthographic
+    light: ShadowMap  #: depth and alpha from the Sun
+    camera: Orthographic  #: the light camera
     softness: Float  #: epsilon_s of 4.5, metres
-    config: MappingConfig
+    config: MappingConfig  #: how the map is filtered
 
     @staticmethod
     def of(casters: Gaussians, camera: Orthographic, softness: float, config: MappingConfig) -> "SunView | None":
