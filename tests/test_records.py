@@ -1,4 +1,5 @@
-"""Every field of a record says what it is: in a comment `#:` beside it or above it, or in the record's docstring."""
+"""Every field of a record says what it is: in a comment `#:` beside it or above it, or in the record's docstring,
+which names it `so`, or so: ..."""
 
 import ast
 import re
@@ -23,7 +24,8 @@ def fields_in(record: ast.ClassDef) -> Iterator[ast.AnnAssign]:
 
 def explained(record: ast.ClassDef, lines: list[str]) -> tuple[set[str], set[str]]:
     """Names of its fields that are explained, and of those that are not."""
-    words = set(re.findall(r"\w+", ast.get_docstring(record) or ""))
+    named = re.findall(r"`(\w+)(?:\[\w+\])?`|(\w+): ", ast.get_docstring(record) or "")
+    words = {word for pair in named for word in pair}
     told, untold = set(), set()
     for node in fields_in(record):
         name = ast.unparse(node.target)
@@ -67,10 +69,14 @@ def test_what_explains_a_field_is_found():
     source = '''
 @dataclass(frozen=True)
 class Base:
-    """`named` is explained here."""
+    """`named` is explained here, and bare is not. called: so
+
+    `given[i]` is, too."""
 
     kind: ClassVar[str] = "base"
     named: int
+    called: int
+    given: list[int]
     beside: int = 1  #: metres
     #: metres
     above: int = 2

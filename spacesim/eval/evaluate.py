@@ -191,7 +191,7 @@ def evaluate(
 class FrameResult:
     """A frame's numbers."""
 
-    frame: Frame
+    frame: Frame  #: the frame that was evaluated
     record: JsonDict  #: its values by group, and what it is
     source: str  #: where its silhouette is from
     has_known_sun: bool | None  #: whether training has seen its Sun

@@ -14,7 +14,7 @@ class Metric:
 
     key: str  #: name in metrics.json
     label: str  #: its name on pages
-    unit: str
+    unit: str  #: "dB", "m", ...; "" of a share or a number alone
     goal: str  #: "↑", "↓" or "→ x", the value to come close to
     digits: int  #: decimals
     meaning: str  #: a sentence

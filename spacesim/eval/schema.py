@@ -53,7 +53,7 @@ class GrazingBin:
 
     from_deg: float  #: least height of the Sun over the surface, degrees
     to_deg: float  #: greatest height
-    pixels: int
+    pixels: int  #: how many there are, in all frames
     luminance_mae: float | None  #: mean absolute error of the luminance in [0, 1]
     visibility_mae: float | None  #: mean absolute error of the Sun's visibility in [0, 1]; None where none is predicted
     error_rate: float | None  #: share of the pixels that are on the wrong side of visibility one half
@@ -65,7 +65,7 @@ class GrazingBin:
 class SunGroups(Groups):
     """The groups over the frames of some Suns."""
 
-    frames: int = 0
+    frames: int = 0  #: how many there are
     suns: int = 0  #: how many these are
     by_grazing_angle: tuple[GrazingBin, ...] | None = None  #: errors by the Sun's height over the surface
 
@@ -166,7 +166,7 @@ class RelitView:
 class RelightSweep:
     """One view under many Suns."""
 
-    view: str
+    view: str  #: the frame whose camera it is seen from
     visibility: bool  #: whether it was predicted
     suns: tuple[RelitView, ...]  #: the views, by rising phase angle
 
@@ -187,7 +187,7 @@ class AlignmentFacts:
     inliers: int  #: of these, that it is fitted to
     rms: float  #: metres, between the positions of these
     rms_over_distance: float  #: the same as a share of the cameras' distance
-    scale: float
+    scale: float  #: factor on the run's lengths
 
 
 @dataclass(frozen=True)

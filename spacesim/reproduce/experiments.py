@@ -38,8 +38,8 @@ VANILLA, FULLY_LIT, TELESCOPE = "vanilla", "vanilla-fully-lit", "telescope"
 class Experiment:
     """A training and what is made of it: its folder's name, data and configuration."""
 
-    name: str
-    data: str
+    name: str  #: of its folder
+    data: str  #: name of the dataset
     config: methods.Config  #: of the training
     #: "own", "pair" and "one-sun" evaluate against these data, "suns" draws one view under many Suns, "frames" times
     #: frames of several models

@@ -61,7 +61,7 @@ class Row:
 
     name: str  #: as printed
     method: str  #: of training, that of ours beside it
-    cells: tuple[str, ...]
+    cells: tuple[str, ...]  #: numbers as printed, one for each column
     strategy: str = "default"  #: of densification, that of ours beside it
 
 
@@ -79,7 +79,7 @@ class Remark:
     """A cause of a difference, of a metric or, where that is "", of the whole table."""
 
     text: str  #: a sentence
-    metric: str = ""
+    metric: str = ""  #: group.name of metrics.json, or ""
 
 
 @dataclass(frozen=True)

@@ -38,16 +38,15 @@ class Leaves:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Of which leaves (means, quats, scales, opacities, harmonics, viewmat, intrinsics) gradients are asked for. Each
-    number of a camera costs a sum over all Gaussians."""
+    """Of which leaves gradients are asked for. Each number of a camera costs a sum over all Gaussians."""
 
-    means: bool
-    quats: bool
-    scales: bool
-    opacities: bool
-    harmonics: bool
-    viewmat: bool
-    intrinsics: bool
+    means: bool  #: whether of the centres
+    quats: bool  #: whether of the rotations
+    scales: bool  #: whether of the scales
+    opacities: bool  #: whether of the opacities
+    harmonics: bool  #: whether of the spherical harmonics
+    viewmat: bool  #: whether of the camera's pose
+    intrinsics: bool  #: whether of its focal lengths and principal point
 
 
 @dataclass
@@ -64,14 +63,13 @@ class ProjectedSplats:
 
 @dataclass
 class LeafGradients:
-    """Gradients of `Leaves`, flat, of the Gaussians (means, quats, scales, opacities, harmonics) with room for N at
-    least; None of those that were not wanted."""
+    """Gradients of `Leaves`, flat, of the Gaussians with room for N at least; None of those that were not wanted."""
 
-    means: Float | None = None
-    quats: Float | None = None
-    scales: Float | None = None
-    opacities: Float | None = None
-    harmonics: Float | None = None
+    means: Float | None = None  #: three numbers a Gaussian
+    quats: Float | None = None  #: four
+    scales: Float | None = None  #: three
+    opacities: Float | None = None  #: one
+    harmonics: Float | None = None  #: as many as there are
     viewmat: list[Float] | None = None  #: 16 numbers
     intrinsics: list[Float] | None = None  #: fx, fy, cx, cy
 

@@ -18,7 +18,7 @@ NAME, DETAIL = 14, 13  #: pixels of a label's lines, first and second
 class Page:
     """sRGB colours of the paper, of text and of text that matters less."""
 
-    paper: Color
+    paper: Color  #: of what is written on
     ink: Color  #: of text
     faint: Color  #: of text that matters less
 

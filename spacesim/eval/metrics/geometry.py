@@ -56,7 +56,7 @@ class GeometryConfig:
 class Shape:
     """A surface's samples, and how far each is from the other surface's, metres."""
 
-    samples: Samples
+    samples: Samples  #: points on it, with their normals
     distances: Array  #: [N] metres, from each sample to the nearest of the other surface
 
 

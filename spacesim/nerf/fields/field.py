@@ -99,7 +99,7 @@ class RadianceField:
     """Density and colour of a radiance field. The colour is told the direction of the view, and of the Sun where the
     method is, or in place of both the cosines about a normal, which is three of the density network's numbers."""
 
-    density: DensityField
+    density: DensityField  #: its density, and the numbers that the colour network reads
     color: MlpShape  #: the network: features, view and Sun in, three colours out, of a field with shadows six
     features: int  #: numbers of a place that the colour network reads
     harmonics: int  #: degree, of the view's direction

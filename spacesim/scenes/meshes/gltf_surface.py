@@ -19,7 +19,7 @@ class UvSet:
     """Which texture coordinates a material takes, and how: uv' = matrix [2, 3] (u, v, 1)."""
 
     index: int  #: number of the set: TEXCOORD_0, TEXCOORD_1, ...
-    matrix: np.ndarray
+    matrix: np.ndarray  #: [2, 3], as above
 
     def apply(self, uv: np.ndarray) -> np.ndarray:
         """[V, 2] transformed coordinates, v down; integers count as normalised."""

@@ -43,7 +43,7 @@ _TURNS = {
 class MeshReport:
     """What came out of a mesh file, and what did not."""
 
-    file: str
+    file: str  #: its name, without the folder
     parts: int  #: how many there are
     faces: int  #: triangles of all parts
     watertight: bool  #: all parts together close all edges

@@ -18,7 +18,7 @@ from spacesim.splat.run import Prediction, Run
 class AlignedRun:
     """A run whose model is turned, moved and scaled; see `Predictor`."""
 
-    run: Run
+    run: Run  #: in the axes and the scale of its training
     pose: Pose  #: of the model in the world
 
     @property

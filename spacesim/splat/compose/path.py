@@ -57,7 +57,7 @@ class CameraView:
 class Keyframe:
     """What is where at a time, seconds; what it does not name goes on as the keyframes around say."""
 
-    time: float
+    time: float  #: seconds
     sun: Sun | None = None  #: None: not named here
     view: CameraView | None = None  #: where the camera stands; None: not named here
     poses: Mapping[str, Pose] = field(default_factory=dict)  #: by the names of models
@@ -173,7 +173,7 @@ class PosedScene:
 class Track(Generic[T]):
     """Values at rising times, seconds; before the first and after the last the value stays."""
 
-    times: Sequence[float]
+    times: Sequence[float]  #: seconds, rising
     values: Sequence[T]  #: one for each time
     blend: Callable[[T, T, float], T]  #: (value before, value after, share of the way from 0 to 1) -> the value between
 

@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 class PlacedRun:
     """A run and where it stands."""
 
-    run: Run
+    run: Run  #: the trained model
     pose: Pose = field(default_factory=Pose)  #: of the model in the world
     name: str = ""  #: for messages and files
 

@@ -72,7 +72,7 @@ class SunEntry:
 
     azimuth_deg: float | None = None  #: degrees about +z, from +x
     elevation_deg: float | None = None  #: degrees over the xy plane
-    direction: Vector | None = None
+    direction: Vector | None = None  #: [3] towards the Sun, of any length, in place of the angles
 
     def __post_init__(self) -> None:
         angles = {"azimuth_deg": self.azimuth_deg, "elevation_deg": self.elevation_deg}
@@ -152,10 +152,10 @@ class CameraEntry(ViewEntry):
 
     resolution: tuple[int, int] | None = None  #: (width, height) pixels
     principal: tuple[float, float] | None = None  #: (cx, cy) pixels; None: the middle
-    file: str | None = None
+    file: str | None = None  #: a camera's file, relative to this one
     data: str | None = None  #: folder of a dataset, relative to the file
-    frame: int = 0
-    orbit: Orbit | None = None
+    frame: int = 0  #: number of a frame of `data`, training frames first
+    orbit: Orbit | None = None  #: on which the camera flies
 
     def __post_init__(self) -> None:
         super().__post_init__()

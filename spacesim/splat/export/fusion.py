@@ -57,7 +57,7 @@ class Grid:
 class DepthView:
     """A depth picture and its camera."""
 
-    camera: Camera
+    camera: Camera  #: from where it is seen
     depth: np.ndarray  #: [H, W] float32, z along the optical axis of `camera`, metres; 0 where there is no surface
 
 
@@ -65,7 +65,7 @@ class DepthView:
 class DistanceField:
     """A truncated signed distance on a grid."""
 
-    grid: Grid
+    grid: Grid  #: where the voxels are
     distance: np.ndarray  #: [Z, Y, X] float32 in [-1, 1], mean signed distance by the truncation, above 0 outside
     #: [Z, Y, X] bool, whether a view sees the voxel, or the surface less than the truncation before it
     observed: np.ndarray

@@ -28,8 +28,8 @@ class Splats:
     x: Float  #: centre, pixels
     y: Float  #: centre, pixels
     a: Float  #: inverse of the 2D covariance, pixels^-2
-    b: Float
-    c: Float
+    b: Float  #: likewise, off the diagonal
+    c: Float  #: likewise, of y
     opacity: Float  #: in [0, 1]
     depth: Float  #: z of the centre along the camera's axis, metres; negative behind an orthographic camera's origin
 

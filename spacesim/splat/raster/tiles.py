@@ -14,8 +14,8 @@ STEPS = 8  #: sizes of arrays from one power of two to the next, as a rule
 class TileShape:
     """A tile of width x height pixels is blended by `lanes` lanes; each holds `columns` columns of `rows` pixels."""
 
-    width: int
-    height: int
+    width: int  #: pixels
+    height: int  #: pixels
     lanes: int
     columns: int = 1
 
@@ -90,10 +90,10 @@ def round_capacity(count: int, steps: int = STEPS) -> int:
 class LanePixels:
     """Of each lane: its tile, its place in tile-major order, and its first pixel: centre (x, y), and indices."""
 
-    tile: UInt32
-    place: UInt32
-    x: Float
-    y: Float
+    tile: UInt32  #: number, row by row
+    place: UInt32  #: of the lane, where lanes are counted tile by tile
+    x: Float  #: of its first pixel's centre, pixels
+    y: Float  #: of its first pixel's centre, pixels
     column: UInt32  #: of its first pixel, from 0
     row: UInt32  #: of its first pixel, from 0
 

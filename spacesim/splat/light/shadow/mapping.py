@@ -78,8 +78,8 @@ class ShadowMap:
     alpha: Float  #: 1 - transmittance
     depth: Float  #: sum of weight x z, metres
     square: Float | None  #: of weight x z^2, metres^2, or None
-    width: int
-    height: int
+    width: int  #: pixels
+    height: int  #: pixels
 
 
 def occlusion_by_mapping(

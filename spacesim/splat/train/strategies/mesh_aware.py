@@ -53,9 +53,9 @@ class MeshAwareConfig:
 class Regions:
     """The partition of 5.2, [N] bool each: exterior, interior, boundary layer."""
 
-    exterior: np.ndarray
-    interior: np.ndarray
-    boundary: np.ndarray
+    exterior: np.ndarray  #: outside of the mesh by more than the outer margin
+    interior: np.ndarray  #: inside of it by more than the inner margin
+    boundary: np.ndarray  #: between both
 
 
 def regions(distance: np.ndarray, exterior_margin: float, interior_margin: float) -> Regions:
