@@ -56,7 +56,7 @@ class Scene:
 
     name: str  #: of the scene
     objects: tuple[SceneObject, ...]  #: in the order of their numbers
-    sun: SunConfig = field(default_factory=SunConfig)  #: how bright and how wide it is
+    sun: SunConfig = field(default_factory=SunConfig)  #: its shape, distance and colour
     earth: EarthConfig | None = None  #: None: there is none
 
     def __post_init__(self) -> None:
