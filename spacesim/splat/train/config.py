@@ -73,10 +73,9 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything that decides a trained model, apart from the data and the backend."""
+    """Everything that decides a trained model, apart from the data and the backend. `light` tells the method."""
 
-    #: what makes colours: fixed ones, or light: without shadows, by shadow maps, by shadow splatting, or as table 4.3;
-    #: `light` tells it
+    #: what makes colours: fixed ones, or light: without shadows, by shadow maps, by shadow splatting, or as table 4.3
     method: Method = field(init=False, default="vanilla")
     preset: Preset | None = None  #: the preset that this started from
     init: Init | None = None  #: where Gaussians start; none takes the first of points, mesh, random that can be had
