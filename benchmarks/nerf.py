@@ -31,7 +31,7 @@ from spacesim.eval.frame_metrics import frame_images
 from spacesim.eval.metrics import image
 from spacesim.learning.folder import TrainingProgress
 from spacesim.learning.prediction import Prediction
-from spacesim.nerf.compose import Composition
+from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.train.train import train
 from spacesim.nerf.train.trainer import Trainer
@@ -130,7 +130,7 @@ def frame_rows(run: NerfRun, data: Dataset, pixels: int) -> Iterator[common.Row]
     """Of one model as cameras of the data see it, and of some from where all of them fit."""
     for count in MODELS:
         placed = [PlacedRun(run, Pose(translation=place)) for place in places(data)[:count]]
-        scene = run if count == 1 else Composition(placed, ComposeConfig("none"))
+        scene = run if count == 1 else FieldComposition(placed, ComposeConfig("none"))
         frames = data.test[:9] if count == 1 else views(data)
         seconds = [_timed(scene, _sized(frame, pixels)) for frame in (*frames[:2], *frames)][2:]
         yield {"models": count, "frame, ms": 1e3 * float(np.median(seconds))}

@@ -65,13 +65,12 @@ def run(options: argparse.Namespace) -> None:
 def _export_ply(options: argparse.Namespace) -> None:
     from spacesim.data.records import Sun
     from spacesim.methods import load_run
-    from spacesim.nerf.run import NerfRun
     from spacesim.splat.export.bake import bake
     from spacesim.splat.export.ply import write_ply
 
     backend.select(options.backend)
-    run = load_run(options.path)
-    if isinstance(run, NerfRun):
+    run = load_run(options.path).gaussian_run
+    if run is None:
         raise InputError(f"ply: expected a run of Gaussians, found {options.path}, a radiance field; --mesh takes it")
     model = run.gaussians
     if options.sun is None and run.relightable:
@@ -124,13 +123,12 @@ def _export_html(options: argparse.Namespace) -> None:
     from spacesim.methods import load_run
     from spacesim.progress import show_progress
     from spacesim.splat.export.html.page import write_page
-    from spacesim.splat.run import Run
 
     if options.path.suffix == ".toml":
         raise InputError(f"html: expected a run, found {options.path}, a scene: its runs can be exported one by one")
     backend.select(options.backend)
-    run = load_run(options.path)
-    if not isinstance(run, Run):
+    run = load_run(options.path).gaussian_run
+    if run is None:
         raise InputError(f"html: expected a run of Gaussians, found {options.path}, a radiance field")
     with show_progress("export", "steps") as report:
         write_page(run, options.html, report)
