@@ -34,7 +34,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import TrainConfig, preset, with_options
-from spacesim.splat.train.strategies.control import RefinementConfig
+from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.trainer import Trainer
 
 try:
@@ -46,7 +46,7 @@ except ImportError as error:
 else:
     MISSING = None
 
-GSPLAT_DEFAULTS = RefinementConfig(
+GSPLAT_DEFAULTS = DensificationConfig(
     prune_opacity=0.005,
     prune_scale=0.1,
     prune_screen_size=0.15,

@@ -112,7 +112,7 @@ def measure_step(count: int, pixels: int, method: str, options: Any) -> common.R
         data = synthetic.write_dataset(Path(folder) / "data", count, pixels)
         lit = [replace(frame, sun=Sun(SUNS[i])) for i, frame in enumerate(data.train)]
         light = preset(options.preset, method).light
-        trainer = synthetic.still_trainer(replace(data, train=tuple(lit)), count, method=method, light=light)
+        trainer = synthetic.still_trainer(replace(data, train=tuple(lit)), count, light=light)
         clock = common.interleaved({"step": lambda: dr.eval(trainer.step())}, options.repeats)["step"]
         sums = common.kernels(lambda: dr.eval(trainer.step()))
     return {"Gaussians": count, "pixels": pixels, "method": method, "step (quartiles)": str(clock)} | {

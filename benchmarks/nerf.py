@@ -9,9 +9,13 @@ computer's memory, of test views drawn at so many pixels. --peers trains the rec
 for as many iterations of as many rays; that needs CUDA, torch, nerfacc and tinycudann.
 """
 
+import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +31,7 @@ from spacesim.eval.frame_metrics import frame_images
 from spacesim.eval.metrics import image
 from spacesim.learning.folder import TrainingProgress
 from spacesim.learning.prediction import Prediction
-from spacesim.nerf.compose import Composition
+from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.train.train import train
 from spacesim.nerf.train.trainer import Trainer
@@ -55,13 +59,8 @@ def main() -> None:
     config = replace(config, rays=options.rays)  # type: ignore[type-var]
     run, took = trained(data, options.out / "run", config)
     rows = [{"": f"spacesim, {options.preset}", **trained_row(step_time(data, run, options.repeats), took, run, data)}]
-    peer = load_peer(options.peers, name, "peer_nerfacc")
-    if peer is not None:
-        theirs = peer.Training(data, options.rays, config.iterations)
-        start = time.perf_counter()
-        theirs.run()
-        took = time.perf_counter() - start
-        rows.append({"": "nerfacc", **trained_row(step_timing(theirs.step, 2, options.repeats), took, theirs, data)})
+    if options.peers and load_peer(options.peers, name, "peer_nerfacc"):
+        rows += measured_apart(data, options.rays, config.iterations, options.repeats)
     frames = list(frame_rows(run, data, options.pixels))
     tables = {"Training": rows, f"A frame of {options.pixels} pixels": frames}
     common.emit({"training": rows, "frames": frames}, tables, options)
@@ -75,6 +74,26 @@ def trained(data: Dataset, folder: Path, config: Any) -> tuple[NerfRun, float]:
         tell: Callable[[TrainingProgress], None] = report_training(report)
         run = train(data, folder, config, True, tell)
     return run, float(run.training["seconds"])
+
+
+def measured_apart(data: Dataset, *sizes: int) -> list[common.Row]:
+    """The peer's row, measured in a process of its own: its libraries may end the process they are in."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        try:
+            return [pool.submit(peer_row, data, *sizes).result()]
+        except BrokenProcessPool:
+            print("nerfacc: not measured here (its process ended without a word)", file=sys.stderr)
+            return []
+
+
+def peer_row(data: Dataset, rays: int, iterations: int, repeats: int) -> common.Row:
+    from peer_nerfacc import Training
+
+    theirs = Training(data, rays, iterations)
+    start = time.perf_counter()
+    theirs.run()
+    took = time.perf_counter() - start
+    return {"": "nerfacc", **trained_row(step_timing(theirs.step, 2, repeats), took, theirs, data)}
 
 
 def step_time(data: Dataset, run: NerfRun, repeats: int) -> common.Timing:
@@ -111,7 +130,7 @@ def frame_rows(run: NerfRun, data: Dataset, pixels: int) -> Iterator[common.Row]
     """Of one model as cameras of the data see it, and of some from where all of them fit."""
     for count in MODELS:
         placed = [PlacedRun(run, Pose(translation=place)) for place in places(data)[:count]]
-        scene = run if count == 1 else Composition(placed, ComposeConfig("none"))
+        scene = run if count == 1 else FieldComposition(placed, ComposeConfig("none"))
         frames = data.test[:9] if count == 1 else views(data)
         seconds = [_timed(scene, _sized(frame, pixels)) for frame in (*frames[:2], *frames)][2:]
         yield {"models": count, "frame, ms": 1e3 * float(np.median(seconds))}

@@ -75,11 +75,11 @@ def followed(folder: Path, data: Dataset, config: TrainConfig, views: int) -> li
         tell = report_training(report)
         run = train(data, folder / "run", config, True, lambda progress: (keep(progress), tell(progress))[1])
     chosen = test_views(data, views)
-    points = []
+    trainer, points = None, []
     for path in sorted(kept.glob("step_*.safetensors")):
         found = path.with_suffix(".json")
         if not found.exists():
-            trainer = Trainer(data, config)
+            trainer = trainer or Trainer(data, config)
             trainer.restore(path)
             there = replace(run, gaussians=trainer.gaussians, light=trainer.light)
             write_json(found, {"iteration": trainer.iteration, **quality(there, data, chosen)})

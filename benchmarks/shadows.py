@@ -27,7 +27,7 @@ from spacesim.eval.report.write import write_report
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig
 from spacesim.splat.light.shadow.mapping import SUN_RADIUS_DEG, MappingConfig
-from spacesim.splat.light.shadow.refine import RefineConfig
+from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 from spacesim.splat.train.config import TrainConfig, preset, with_options, with_settings
 
 SCENE = {"suns": 16, "views": 40, "test_suns": 8, "test_views": 5, "resolution": 256, "spp": 64, "test_spp": 1024}
@@ -128,7 +128,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "none, surface, bounce", with_bounce(relit, splatted.light.bounce)
     yield "map, surface, no bounce", with_bounce(mapped, 0)
     yield "splat, surface, no bounce", with_bounce(splatted, 0)
-    told = RefineConfig(width=refine_of(splatted).width)
+    told = ShadowRefinementConfig(width=refine_of(splatted).width)
     yield "splat, surface, refinement told the Sun", with_shadow(splatted, refine=told)
     yield "splat, surface, no bounce, refinement told the Sun", with_bounce(with_shadow(splatted, refine=told), 0)
     if splatted.supersample == 1:
@@ -194,7 +194,7 @@ def shadow_of(config: TrainConfig) -> ShadowConfig:
     return config.light.shadow
 
 
-def refine_of(config: TrainConfig) -> RefineConfig:
+def refine_of(config: TrainConfig) -> ShadowRefinementConfig:
     refine = shadow_of(config).refine
     assert refine is not None
     return refine

@@ -15,7 +15,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import LearningRates, TrainConfig
-from spacesim.splat.train.strategies.control import RefinementConfig
+from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.trainer import Trainer
 
 VIEWS = 8
@@ -59,7 +59,7 @@ def still_trainer(dataset: Dataset, count: int, arrays: dict[str, np.ndarray] | 
         init_count=count,
         sh_every=1,
         rates=STILL,
-        refinement=RefinementConfig(refine_start=NEVER, refine_stop=NEVER, max_gaussians=count),
+        refinement=DensificationConfig(refine_start=NEVER, refine_stop=NEVER, max_gaussians=count),
         **options,
     )
     trainer = Trainer(dataset, config)

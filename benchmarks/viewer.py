@@ -35,7 +35,7 @@ from spacesim import backend
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Sun
 from spacesim.progress import show_progress
-from spacesim.splat.compose import Composition, PlacedRun, Pose
+from spacesim.splat.compose import GaussianComposition, PlacedRun, Pose
 from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
@@ -106,7 +106,7 @@ def spheres(count: int) -> ViewerSetup:
         light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, common.DISTANCE, 1.0), k)
         run = Run(Path(f"sphere{k}"), {"method": "shadow-map"}, {}, Gaussians.from_numpy(arrays), 0, light)
         placed.append(PlacedRun(run, Pose(translation=np.array([0.0, 0, height]), scale=0.8), f"sphere {k}"))
-    renderer = SceneRenderer(Composition(placed))
+    renderer = SceneRenderer(GaussianComposition(placed))
     poses = tuple(one.pose for one in placed)
     return ViewerSetup(renderer, SceneState(poses, Sun.from_angles(45, 60)), (None, None), None, Path())
 

@@ -65,6 +65,8 @@ def api_page() -> str:
         *(class_entry(f"ss.{name}", getattr(ss, name)) for name in classes(ss)),
         "## Errors",
         *(f"### ss.{name}\n\n{block(inspect.getdoc(getattr(ss, name)) or '')}" for name in errors(ss)),
+        "## What these take and give",
+        *(class_entry(f"{cls.__module__}.{cls.__name__}", cls, False) for cls in named_by(ss) if cls not in cameras),
         "## Torch",
         function_entry("spacesim.torch.rasterization", rasterization),
         "## Cameras of arrays",
@@ -74,6 +76,41 @@ def api_page() -> str:
         *(class_entry(f"spacesim.scenes.spacecraft.{cls.__name__}", cls) for cls in models),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def named_by(module: Any) -> list[type]:
+    """Our classes that signatures, fields and methods of a module's public names name, by their names, but for those
+    that are public themselves and for records of configurations, which have pages of their own."""
+    public = {name: getattr(module, name) for name in module.__all__}
+    found = {cls for thing in public.values() for cls in classes_in(annotations(thing, public))}
+    configured = [cls for name, cls in public.items() if name.endswith("Config")]
+    for cls in configured:  # grows while it is read
+        inner = classes_in(get_type_hints(cls).values()) if is_dataclass(cls) else ()
+        configured += [record for record in inner if record not in configured]
+    ours = {cls for cls in found if cls.__module__.startswith(module.__name__)}
+    rigs = {cls for cls in ours if inspect.isabstract(cls)}  # of which the pages have what can be made
+    return sorted(ours - {*public.values(), *configured} | rigs, key=lambda cls: cls.__name__)
+
+
+def annotations(thing: Any, names: dict[str, Any]) -> list[Any]:
+    """Of a function's signature, or of a class's fields and public methods; of an error none."""
+    if is_error(thing):
+        return []
+    hints = list(get_type_hints(thing, localns=names).values()) if not inspect.isclass(thing) else []
+    for cls in inspect.getmro(thing) if inspect.isclass(thing) else ():
+        hints += [hint for name, hint in get_type_hints(cls, localns=names).items() if not name.startswith("_")]
+        functions = [unwrapped(member) for name, member in vars(cls).items() if not name.startswith("_")]
+        for function in filter(inspect.isfunction, functions):
+            hints += get_type_hints(function, localns=names).values()
+    return hints
+
+
+def classes_in(hints: Iterable[Any]) -> Iterator[type]:
+    """The classes that annotations name."""
+    for hint in hints:
+        if inspect.isclass(hint) and not get_args(hint):
+            yield hint
+        yield from classes_in(hint if isinstance(hint, list) else get_args(hint))
 
 
 def functions(module: Any) -> list[str]:
@@ -101,12 +138,12 @@ def function_entry(title: str, function: Any) -> str:
     return f"### {title}\n\n{block(signature(function, name), 'python')}\n\n{block(inspect.getdoc(function) or '')}"
 
 
-def class_entry(title: str, cls: Any) -> str:
-    """A class: its fields as they stand in the code, and what can be asked of it."""
+def class_entry(title: str, cls: Any, with_methods: bool = True) -> str:
+    """A class: its fields as they stand in the code, and what can be asked of it. with_methods: of a record, too"""
     parts = [f"### {title}", block(inspect.getdoc(cls) or "")]
     if fields := list(field_lines(cls)):
         parts.append(block("\n".join(fields), "python"))
-    for name, member in members(cls):
+    for name, member in members(cls) if with_methods or not fields else ():
         own, said = f"{title.removeprefix('ss.')}.{name}", inspect.getdoc(member) or ""
         if inspect.isfunction(member):
             parts.append(f"{block(signature(member, own), 'python')}\n\n{block(said)}")
@@ -177,9 +214,14 @@ def flattened(code: str, node: ast.expr) -> str:
 def members(cls: type) -> Iterator[tuple[str, Any]]:
     """(name, function) of the public methods and properties that have a docstring."""
     for name, member in vars(cls).items():
-        function = getattr(member, "fget", None) or getattr(member, "__func__", None) or getattr(member, "func", member)
+        function = unwrapped(member)
         if not name.startswith("_") and inspect.isfunction(function) and function.__doc__:
             yield name, member if isinstance(member, property | cached_property) else function
+
+
+def unwrapped(member: Any) -> Any:
+    """The function of a property, a static or a class method; anything else as it is."""
+    return getattr(member, "fget", None) or getattr(member, "__func__", None) or getattr(member, "func", member)
 
 
 def signature(function: Any, name: str) -> str:
@@ -236,6 +278,7 @@ def scene_page() -> str:
         "[materials.NAME]": records["materials"],
         "[sun]": records["sun"],
         "[earth]": records["earth"],
+        "[background]": records["background"],
         "[rig]": RigConfig,
         **{f'[rig] kind = "{kind}"': cls for kind, cls in RIGS.items()},
         "[camera]": records["camera"],

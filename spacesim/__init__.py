@@ -8,116 +8,36 @@
     scores = ss.evaluate(run, data, "eval")
     pose = ss.refine_pose(run, image, camera, sun=(40, 25))
 
-Everything is imported when it is first used: `import spacesim` itself takes no time.
+What there is stands in `spacesim.api`, which is imported when a name of it is first used: `import spacesim` itself
+takes no time.
 """
 
-from typing import TYPE_CHECKING, Any
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 from spacesim.backend.llvm import name_llvm
-from spacesim.data.errors import InputError, WorkError
 
 if TYPE_CHECKING:
-    from spacesim.api import (
-        BackendError,
-        Camera,
-        CameraClient,
-        Composed,
-        Dataset,
-        FoundPose,
-        Frame,
-        Gaussians,
-        Image,
-        NerfConfig,
-        NerfRun,
-        PosedScene,
-        PoseRig,
-        RefinedPose,
-        Rendering,
-        RenderOutput,
-        Run,
-        SceneConfig,
-        Sun,
-        SunEstimate,
-        TrainConfig,
-        Truth,
-        compose,
-        estimate_sun,
-        evaluate,
-        find_pose,
-        generate,
-        import_dataset,
-        load_depth,
-        load_image,
-        load_run,
-        load_scene,
-        load_truth,
-        preset,
-        read_dataset,
-        read_scene,
-        refine_pose,
-        render,
-        train,
-        write_report,
-    )
+    from spacesim.api import *  # noqa: F403
+else:  # or type checkers would take any name
+
+    def __getattr__(name: str) -> object:
+        is_private = name.startswith("_") and name != "__all__"
+        is_module = not is_private and find_spec(f"{__name__}.{name}") is not None  # which an import looks for here
+        if is_private or is_module:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        api = import_module(f"{__name__}.api")
+        if name != "__all__" and name not in api.__all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        globals()[name] = getattr(api, name)
+        return globals()[name]
+
 
 __version__ = "0.1.0"
-
-__all__ = [
-    "BackendError",
-    "Camera",
-    "CameraClient",
-    "Composed",
-    "Dataset",
-    "FoundPose",
-    "Frame",
-    "Gaussians",
-    "Image",
-    "InputError",
-    "NerfConfig",
-    "NerfRun",
-    "PoseRig",
-    "PosedScene",
-    "RefinedPose",
-    "RenderOutput",
-    "Rendering",
-    "Run",
-    "SceneConfig",
-    "Sun",
-    "SunEstimate",
-    "TrainConfig",
-    "Truth",
-    "WorkError",
-    "compose",
-    "estimate_sun",
-    "evaluate",
-    "find_pose",
-    "generate",
-    "import_dataset",
-    "load_depth",
-    "load_image",
-    "load_run",
-    "load_scene",
-    "load_truth",
-    "preset",
-    "read_dataset",
-    "read_scene",
-    "refine_pose",
-    "render",
-    "train",
-    "write_report",
-]
 
 name_llvm()
 
 
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module 'spacesim' has no attribute {name!r}")
-    from spacesim import api
-
-    globals()[name] = getattr(api, name)
-    return globals()[name]
-
-
 def __dir__() -> list[str]:
-    return sorted([*__all__, "__version__"])
+    return sorted([*import_module(f"{__name__}.api").__all__, "__version__"])

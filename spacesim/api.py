@@ -12,7 +12,7 @@ from typing import Any
 
 from spacesim.backend import BackendError
 from spacesim.backend.arrays import Float
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
@@ -55,6 +55,7 @@ __all__ = [
     "Frame",
     "Gaussians",
     "Image",
+    "InputError",
     "NerfConfig",
     "NerfRun",
     "PoseRig",
@@ -68,6 +69,7 @@ __all__ = [
     "SunEstimate",
     "TrainConfig",
     "Truth",
+    "WorkError",
     "compose",
     "estimate_sun",
     "evaluate",

@@ -108,14 +108,13 @@ def load_predictor(path: Path) -> "Predictor":
 
 
 def compose(models: Sequence[Any], config: Any = None, path: Path | None = None) -> Any:
-    """What draws posed runs: `splat.compose.Composition`, of fields `nerf.compose.Composition`, of both
-    `mixed.scene.Composition`."""
-    from spacesim.mixed.scene import Composition as Mixed
-    from spacesim.nerf.compose import Composition as Fields
+    """What draws posed runs: `splat.compose.GaussianComposition`, of fields `nerf.compose.FieldComposition`, of both
+    `mixed.scene.MixedComposition`."""
+    from spacesim.mixed.scene import MixedComposition
+    from spacesim.nerf.compose import FieldComposition
     from spacesim.nerf.run import NerfRun
-    from spacesim.splat.compose.scene import ComposeConfig
-    from spacesim.splat.compose.scene import Composition as Splats
+    from spacesim.splat.compose.scene import ComposeConfig, GaussianComposition
 
     fields = [isinstance(model.run, NerfRun) for model in models]
-    kind = Fields if fields and all(fields) else Mixed if any(fields) else Splats
+    kind = FieldComposition if fields and all(fields) else MixedComposition if any(fields) else GaussianComposition
     return kind(models, config or ComposeConfig(), path)

@@ -160,6 +160,21 @@ def test_the_reference_has_every_public_name(name):
     assert docstring in entry[1]
 
 
+def test_the_reference_has_what_public_names_take_and_give():
+    """Whoever adds a class here may make it public, or have the signature name one that is."""
+    named = {cls.__name__: cls for cls in generator().named_by(ss)}
+    assert set(named) == {
+        *("GaussianComposition", "Keyframe", "LightModel", "ModelViews", "Networks", "Orbit", "Part", "PlannedView"),
+        *("Prediction", "Projection", "Rig", "SceneBox", "SceneFrame", "TargetSphere"),
+    }
+    for name, cls in named.items():
+        entry = re.search(
+            rf"^### {cls.__module__}\.{name}\n(.*?)(?=^##|\Z)", generated()["reference/api.md"], re.M | re.S
+        )
+        assert entry is not None, name
+        assert inspect.getdoc(cls) in entry[1]
+
+
 @pytest.mark.parametrize("name", [name for name in ss.__all__ if is_dataclass(getattr(ss, name))])
 def test_the_reference_explains_every_field(name):
     """Each has a comment, beside it or above."""

@@ -26,12 +26,12 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.progress import show_progress
     from spacesim.splat.compose.output import compose
     from spacesim.splat.compose.plain import bake_scene
-    from spacesim.splat.compose.scene import Composition
+    from spacesim.splat.compose.scene import GaussianComposition
     from spacesim.splat.export.ply import write_ply
 
     interrupts.set_resume_command("the same command")
     scene = load_scene(options.scene)
-    if options.ply is not None and not isinstance(scene.composition, Composition):
+    if options.ply is not None and not isinstance(scene.composition, GaussianComposition):
         raise InputError(f"ply: expected a scene of Gaussians, found {options.scene}, with radiance fields")
     with show_progress("compose", "frames") as report:
         done = compose(scene, options.out, options.size, report, options.exposure)

@@ -98,7 +98,6 @@ def _check_absent(name: str, value: object, forms: Sequence[str]) -> None:
 def _export_splats(options: argparse.Namespace, form: "Form") -> None:
     from spacesim.data.records import Sun
     from spacesim.methods import load_run
-    from spacesim.nerf.run import NerfRun
     from spacesim.splat.export.bake import bake
     from spacesim.splat.export.frame import FileFrame
     from spacesim.splat.export.splats import Y_UP, check_ending, write_splats
@@ -107,8 +106,8 @@ def _export_splats(options: argparse.Namespace, form: "Form") -> None:
     check_ending(out, form)
     frame = FileFrame(options.up or ("y" if form in Y_UP else "z"), _scale(options), options.recentre)
     backend.select(options.backend)
-    run = load_run(options.path)
-    if isinstance(run, NerfRun):
+    run = load_run(options.path).gaussian_run
+    if run is None:
         raise InputError(
             f"{form}: expected a run of Gaussians, found {options.path}, a radiance field; --mesh takes it"
         )
@@ -182,13 +181,12 @@ def _export_html(options: argparse.Namespace) -> None:
     from spacesim.methods import load_run
     from spacesim.progress import show_progress
     from spacesim.splat.export.html.page import write_page
-    from spacesim.splat.run import Run
 
     if options.path.suffix == ".toml":
         raise InputError(f"html: expected a run, found {options.path}, a scene: its runs can be exported one by one")
     backend.select(options.backend)
-    run = load_run(options.path)
-    if not isinstance(run, Run):
+    run = load_run(options.path).gaussian_run
+    if run is None:
         raise InputError(f"html: expected a run of Gaussians, found {options.path}, a radiance field")
     with show_progress("export", "steps") as report:
         write_page(run, options.html, report)

@@ -21,7 +21,7 @@ _WORDS: dict[object, str] = {int: "whole number", float: "number", bool: "true o
 
 
 @dataclass(frozen=True)
-class Field:
+class ConfigField:
     """A row of a list of fields."""
 
     key: str  #: dotted, as `--set` takes it
@@ -55,17 +55,17 @@ def meanings(cls: Any) -> dict[str, str]:
     return {f.name: result.get(f.name, "") for f in fields(cls)}
 
 
-def fields_of(record: object, at: str = "") -> Iterator[Field]:
+def fields_of(record: object, at: str = "") -> Iterator[ConfigField]:
     """Every field of a record, and of the records in it, with the values that it has."""
     cls: Any = type(record)
     hints, said = get_type_hints(cls), meanings(cls)
     for f in fields(cls):
         value, key = getattr(record, f.name), f"{at}{f.name}"
         if is_dataclass(value):
-            yield Field(key, type_words(hints[f.name]), kind_of(type(value)) or "", said[f.name])
+            yield ConfigField(key, type_words(hints[f.name]), kind_of(type(value)) or "", said[f.name])
             yield from fields_of(value, f"{key}.")
         else:
-            yield Field(key, type_words(hints[f.name]), _literal(value), said[f.name])
+            yield ConfigField(key, type_words(hints[f.name]), _literal(value), said[f.name])
 
 
 def type_words(hint: object) -> str:

@@ -28,11 +28,9 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.methods import load_run
     from spacesim.progress import show_progress
     from spacesim.splat.locate import locate
-    from spacesim.splat.run import Run, check_gaussians
+    from spacesim.splat.run import check_gaussians
 
-    run = load_run(options.path)
-    check_gaussians(run)
-    assert isinstance(run, Run)
+    run = check_gaussians(load_run(options.path))
     sun = Sun.from_angles(*options.sun) if options.sun else None
     more = {} if options.within is None else {"within": options.within}
     with show_progress("locate", "pictures") as report:

@@ -32,7 +32,7 @@ class Document:
     """A TOML file."""
 
     name: str  #: of the file, for messages
-    values: JsonMapping
+    values: JsonMapping  #: the file's tables, as plain values
     lines: Mapping[Keys, int]  #: of keys, tables and what is in lists, counted from 1
 
     def place(self, keys: Keys) -> str:

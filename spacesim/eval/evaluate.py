@@ -51,10 +51,8 @@ from spacesim.eval.relight import write_sweep
 from spacesim.eval.schema import SCHEMA
 from spacesim.eval.shape import write_shapes
 from spacesim.eval.suns import TrainedOn, count_suns, known_suns, rounded_angles, training_frames
-from spacesim.nerf.run import NerfRun
 from spacesim.splat.compose.aligned import AlignedRun, moved_frame
 from spacesim.splat.fit import Unknown, find_unknowns
-from spacesim.splat.run import Run
 
 if TYPE_CHECKING:
     from spacesim.splat.run import Predictor
@@ -102,11 +100,11 @@ def evaluate(
         raise InputError(f"{dataset.root}: expected frames in the split {config.split}, found none")
     alignment = align(config.align, dataset) if config.align else None
     if alignment:
-        if isinstance(run, NerfRun):
-            raise InputError(f"align: expected a run of Gaussians, found {run.path}, a radiance field")
-        if not isinstance(run, Run):
+        if run.parts:
             raise InputError(f"align: expected a run, found {run.path}, a scene, which says itself where models stand")
-        run = AlignedRun(run, alignment.pose)
+        if run.gaussian_run is None:
+            raise InputError(f"align: expected a run of Gaussians, found {run.path}, a radiance field")
+        run = AlignedRun(run.gaussian_run, alignment.pose)
     unknowns = find_unknowns(run, config.fit_gain)
     dark = next((frame for frame in frames if frame.sun is None), None)
     if dark is not None and run.relightable and not any(unknown.name == "sun" for unknown in unknowns):
@@ -193,7 +191,7 @@ def evaluate(
 class FrameResult:
     """A frame's numbers."""
 
-    frame: Frame
+    frame: Frame  #: the frame that was evaluated
     record: JsonDict  #: its values by group, and what it is
     source: str  #: where its silhouette is from
     has_known_sun: bool | None  #: whether training has seen its Sun

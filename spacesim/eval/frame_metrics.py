@@ -43,7 +43,7 @@ class FrameLight:
 class FrameTarget:
     """What a frame is compared with."""
 
-    image: Image
+    image: Image  #: the true picture, with its valid pixels
     silhouette: Mask  #: [H, W] bool, the object's pixels among the valid ones; all of them where it is not known
     source: str  #: where the silhouette is from: "truth", "alpha", or "frame" where it is not known
 

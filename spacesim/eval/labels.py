@@ -13,8 +13,8 @@ class Metric:
     """A metric: its names, its unit and what it means."""
 
     key: str  #: name in metrics.json
-    label: str
-    unit: str
+    label: str  #: its name on pages
+    unit: str  #: "dB", "m", ...; "" of a share or a number alone
     goal: str  #: "↑", "↓" or "→ x", the value to come close to
     digits: int  #: decimals
     meaning: str  #: a sentence

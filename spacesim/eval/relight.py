@@ -30,8 +30,8 @@ MAX_SUNS = 8
 class Sweep:
     """A view and the frames that name its Suns, by rising phase angle."""
 
-    view: Frame
-    lit_as: tuple[Frame, ...]
+    view: Frame  #: whose camera every picture is seen from
+    lit_as: tuple[Frame, ...]  #: frames whose Suns are taken, one for each Sun
     truths: tuple[Frame | None, ...]  #: the frame of this view under the Sun, None where the dataset has none
 
 

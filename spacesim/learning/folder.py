@@ -37,17 +37,17 @@ class TrainingData:
 
     path: str  #: of the folder
     digest: str | None = None  #: see `training_digest`, of runs that tell it
-    train_frames: int | None = None
-    test_frames: int | None = None
+    train_frames: int | None = None  #: how many there are to train on
+    test_frames: int | None = None  #: how many there are to evaluate on
 
 
 @dataclass(frozen=True)
 class TrainingProgress:
     """What a training loop tells of itself now and then."""
 
-    iteration: int
-    iterations: int
-    loss: float
+    iteration: int  #: how many are finished
+    iterations: int  #: how many there will be
+    loss: float  #: of the last one
     gaussian_count: int | None = None  #: None of a radiance field
 
     @property

@@ -21,14 +21,13 @@ from spacesim.data.errors import InputError
 from spacesim.data.records import Camera, Sun
 from spacesim.mixed.shadow import FieldsBeside, sun_views
 from spacesim.mixed.walk import ListedSplats, Segments, blend_segments, listed
-from spacesim.nerf.compose import Composition as Fields
+from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.draw import chunks, unit_normals
 from spacesim.nerf.partition import PlacedFields, partition
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.scene import DrawnScene, FieldScene
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.compose.scene import ComposeConfig, LitGaussians
-from spacesim.splat.compose.scene import Composition as Splats
+from spacesim.splat.compose.scene import ComposeConfig, GaussianComposition, LitGaussians
 from spacesim.splat.light.shadow.mapping import SunView
 from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.cameras import Pinhole
@@ -45,8 +44,9 @@ COMMON = 4  #: features that both have: colour, visibility
 T = TypeVar("T")
 
 
-class Composition(FieldScene):
-    """Posed runs of both families under one Sun; in scene files what `splat.compose.Composition` is to Gaussians.
+class MixedComposition(FieldScene):
+    """Posed runs of both families under one Sun; in scene files what `splat.compose.GaussianComposition` is to
+    Gaussians.
 
     models: at least one of each family;  config: how they shade each other. `shadows` is of Gaussians on each other;
     what has to do with a field is "none", or by light that comes through, which multiplies, so that the ratio of (4.15)
@@ -60,11 +60,11 @@ class Composition(FieldScene):
             raise InputError("models: expected at least one of Gaussians and one radiance field, found one family")
         self._of_fields = [k for k, is_field in enumerate(are_fields) if is_field]
         self._of_splats = [k for k, is_field in enumerate(are_fields) if not is_field]
-        self._fields = Fields([self.models[k] for k in self._of_fields], self.config, path)
-        self._splats = self._shaded(Splats([self.models[k] for k in self._of_splats], self.config, path))
+        self._fields = FieldComposition([self.models[k] for k in self._of_fields], self.config, path)
+        self._splats = self._shaded(GaussianComposition([self.models[k] for k in self._of_splats], self.config, path))
         self._views = _SunViews()
 
-    def _shaded(self, splats: Splats) -> Splats:
+    def _shaded(self, splats: GaussianComposition) -> GaussianComposition:
         return splats.shaded_by(FieldsBeside(self._fields))
 
     @property
@@ -106,7 +106,7 @@ class Composition(FieldScene):
         """(centre [3], radius) of each model, metres, world."""
         return self._in_order(self._fields.spheres, self._splats.spheres)
 
-    def field_alone(self, index: int) -> Fields:
+    def field_alone(self, index: int) -> FieldComposition:
         """The scene of model `index`, a radiance field, alone."""
         return self._fields.field_alone(self._of_fields.index(index))
 
@@ -119,9 +119,9 @@ class Composition(FieldScene):
         both = dict(zip(self._of_fields, of_fields, strict=True)) | dict(zip(self._of_splats, of_splats, strict=True))
         return [both[k] for k in range(len(self.models))]
 
-    def posed(self, poses: Sequence[Pose]) -> "Composition":
+    def posed(self, poses: Sequence[Pose]) -> "MixedComposition":
         """The scene with these poses, one of each model. What does not change with them is kept."""
-        other: Composition = object.__new__(Composition)
+        other: MixedComposition = object.__new__(MixedComposition)
         other.models = tuple(replace(model, pose=pose) for model, pose in zip(self.models, poses, strict=True))
         other.config, other.path, other._views = self.config, self.path, self._views
         other._of_fields, other._of_splats = self._of_fields, self._of_splats
@@ -193,7 +193,9 @@ class _SunViews:
 
     kept: list[tuple[bytes, list[SunView | None]]] = field(default_factory=list)
 
-    def of(self, splats: Splats, fields: Fields, lit: LitGaussians, sun: Sun) -> list[SunView | None]:
+    def of(
+        self, splats: GaussianComposition, fields: FieldComposition, lit: LitGaussians, sun: Sun
+    ) -> list[SunView | None]:
         """One of each field."""
         key = b"".join([sun.direction.tobytes(), *(model.pose.key for model in (*splats.models, *fields.models))])
         if not self.kept or self.kept[0][0] != key:

@@ -8,7 +8,7 @@ import numpy as np
 
 from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
-from spacesim.nerf.compose import Composition as Fields
+from spacesim.nerf.compose import FieldComposition
 from spacesim.splat.compose.members import MODEL_DISTANCE, PLAIN_SHADOWS
 from spacesim.splat.light.shadow.clusters import Supports, light_cameras
 from spacesim.splat.light.shadow.light_camera import light_axes
@@ -23,7 +23,7 @@ TEST = MappingConfig("percentage-closer", radius=0.5)  #: as `Member.cross_shado
 class FieldsBeside:
     """Fields in the Sun's way of Gaussians, see `splat.compose.scene.Beside`."""
 
-    fields: Fields
+    fields: FieldComposition  #: radiance fields where they stand
 
     @property
     def key(self) -> bytes:
@@ -35,7 +35,7 @@ class FieldsBeside:
         return self.fields.sun_visibility(points, sun)
 
 
-def sun_views(casters: Gaussians, fields: Fields, sun: Sun) -> "list[SunView | None]":
+def sun_views(casters: Gaussians, fields: FieldComposition, sun: Sun) -> "list[SunView | None]":
     """What the Sun sees of Gaussians, of each field over its box: `SunView`, or None where they cannot shade it."""
     axes, views = light_axes(sun.direction), []
     for corners in box_corners(fields):
@@ -47,7 +47,7 @@ def sun_views(casters: Gaussians, fields: Fields, sun: Sun) -> "list[SunView | N
     return views
 
 
-def box_corners(fields: Fields) -> Sequence[Array]:
+def box_corners(fields: FieldComposition) -> Sequence[Array]:
     """[8, 3] metres, world, of each field's box."""
     units = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(8, 3)
     return [model.pose.points(model.run.box.low + units * model.run.box.size) for model in fields.models]

@@ -43,7 +43,7 @@ class ListedSplats:
     """The splats of a picture's tiles, nearest first, with their features."""
 
     records: list[Float]  #: see `list_records`; the first feature is the depth
-    lists: TileLists
+    lists: TileLists  #: which splats each tile has
     features: int  #: without the depth
 
 

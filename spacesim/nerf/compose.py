@@ -75,8 +75,8 @@ class Placed(Protocol):
     name: str
 
 
-class Composition(FieldScene):
-    """Posed radiance fields under one Sun; in scene files what `splat.compose.Composition` is to Gaussians.
+class FieldComposition(FieldScene):
+    """Posed radiance fields under one Sun; in scene files what `splat.compose.GaussianComposition` is to Gaussians.
 
     models: at least one;  config: how they shade each other: `shadows` is "none", or else by transmittance towards the
     Sun, which multiplies: the ratio of (4.15) is that of the others alone. One model with no pose gives what its run
@@ -125,19 +125,19 @@ class Composition(FieldScene):
         """Where the middle of each model's box is, world, [3] metres."""
         return [centre for centre, _ in self.spheres]
 
-    def field_alone(self, index: int) -> "Composition":
+    def field_alone(self, index: int) -> "FieldComposition":
         """The scene of model `index` alone."""
-        return Composition([self.models[index]], self.config, self.path)
+        return FieldComposition([self.models[index]], self.config, self.path)
 
     @property
     def chunk(self) -> int:
         """Rays that are drawn at once."""
         return self._runs[0].networks.config.chunk
 
-    def posed(self, poses: Sequence[Any]) -> "Composition":
+    def posed(self, poses: Sequence[Any]) -> "FieldComposition":
         """The scene with these poses, one of each model."""
         models = [replace(model, pose=pose) for model, pose in zip(self.models, poses, strict=True)]
-        return Composition(models, self.config, self.path)
+        return FieldComposition(models, self.config, self.path)
 
     def _draw(
         self, camera: Camera, sun: Sun | None, normals: bool, median: bool, on_chunk: Callable[[], None] | None

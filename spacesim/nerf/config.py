@@ -47,7 +47,7 @@ class ProposalConfig:
 
 
 @dataclass(frozen=True)
-class ShadowConfig:
+class NerfShadowConfig:
     """How a field shadows itself: by what it lets through towards the Sun, along a second ray from each surface."""
 
     samples: int = 16  #: of that ray, of the field itself; 0: no shadows, what is told of the Sun has to do
@@ -75,7 +75,7 @@ class NerfConfig:
     #: place learns (`learning.reflectance`), which serve Suns never seen
     inputs: Literal["directions", "surface"] = "surface"
     sun_harmonics: int = 1  #: of "directions", of the Sun's: more of them tell training's few Suns apart by heart
-    shadow: ShadowConfig = field(default_factory=ShadowConfig)  #: of `nerf-relight`
+    shadow: NerfShadowConfig = field(default_factory=NerfShadowConfig)  #: of `nerf-relight`
     grid: GridConfig = field(default_factory=GridConfig)  #: what the field knows of places
     coarse: ProposalConfig = field(default_factory=ProposalConfig)  #: first round: reads evenly spaced samples
     fine: ProposalConfig = field(default_factory=lambda: ProposalConfig(16))  #: second: where the first saw density

@@ -116,7 +116,7 @@ class PlacedFields:
     parameters: list[Parameters]  #: of each of the networks
     filled: list[Float]  #: of each of the networks, see `Occupancy.filled`
     which: tuple[int, ...]  #: of each model, number among the networks
-    models: list[PlacedField]
+    models: list[PlacedField]  #: each where it stands
     shading: Shading | None  #: None where models do not shade each other
 
     @property
@@ -134,7 +134,7 @@ class PlacedFields:
 class Partition:
     """What lies along R rays, in K segments each: the models merged, and what pictures show of them."""
 
-    merged: Merged
+    merged: Merged  #: density and colour of all models together
     shares: list[Float]  #: [R K] of each model in the density
     slopes: Array3f | None  #: [3, R K] gradient of the density, world axes; None where no normals are asked for
     visibility: Float | None  #: [R K] share of the Sun's light that there is; None where nothing casts shadows

@@ -79,6 +79,14 @@ class NerfRun:
         """None: it was trained as one."""
         return ()
 
+    @property
+    def gaussian_run(self) -> None:
+        """None: it has no Gaussians."""
+
+    def with_embedding(self, embedding: np.ndarray) -> "NerfRun":
+        """Raises InputError: its pictures have none."""
+        raise InputError(f"embedding: expected a run of Gaussians, found {self.path}, a radiance field")
+
     def render(self, camera: Camera, sun: Sun | Sequence[float] | None = None) -> Rendering:
         """What `camera` sees under a Sun: rgb, alpha, depth and normal as numpy arrays, drawn when they are asked for.
 

@@ -31,8 +31,8 @@ class DrawnScene:
 
 
 class FieldScene(ABC):
-    """Posed runs under one Sun, radiance fields among them; in scene files what `splat.compose.Composition` is to
-    Gaussians.
+    """Posed runs under one Sun, radiance fields among them; in scene files what
+    `splat.compose.GaussianComposition` is to Gaussians.
 
     models: at least one;  config: how they shade each other, see `splat.compose.scene.ComposeConfig`
     """

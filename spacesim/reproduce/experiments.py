@@ -38,9 +38,9 @@ VANILLA, FULLY_LIT, TELESCOPE = "vanilla", "vanilla-fully-lit", "telescope"
 class Experiment:
     """A training and what is made of it: its folder's name, data and configuration."""
 
-    name: str
-    data: str
-    config: methods.Config
+    name: str  #: of its folder
+    data: str  #: name of the dataset
+    config: methods.Config  #: of the training
     #: "own", "pair" and "one-sun" evaluate against these data, "suns" draws one view under many Suns, "frames" times
     #: frames of several models
     parts: tuple[str, ...] = ()
@@ -51,9 +51,9 @@ class Experiment:
 class Curve:
     """A training whose Gaussians are counted over its first steps (figure 5.5)."""
 
-    name: str
-    config: TrainConfig
-    data: str = "one-sun"
+    name: str  #: of its folder
+    config: TrainConfig  #: of the training
+    data: str = "one-sun"  #: name of the dataset
 
 
 Work = Experiment | Curve

@@ -14,9 +14,9 @@ from spacesim.data.files import JsonValue
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset, Frame
 from spacesim.learning.folder import device
-from spacesim.nerf.compose import Composition as Fields
+from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.run import NerfRun
-from spacesim.splat.compose import ComposeConfig, Composition, PlacedRun, Pose
+from spacesim.splat.compose import ComposeConfig, GaussianComposition, PlacedRun, Pose
 
 if TYPE_CHECKING:
     from spacesim.splat.run import Run
@@ -33,7 +33,7 @@ def time_frames(run: "Run | NerfRun", dataset: Dataset, tell: Callable[[int, int
     "backend"}: of pictures as `predict` returns them, in the computer's memory."""
     frames = views(dataset)
     models = [PlacedRun(run, Pose(translation=place)) for place in places(dataset)]  # type: ignore[arg-type]
-    compose = Fields if isinstance(run, NerfRun) else Composition
+    compose = FieldComposition if isinstance(run, NerfRun) else GaussianComposition
     medians = []
     for count in range(1, len(models) + 1):
         scene = compose(models[:count], ComposeConfig("none"))

@@ -31,7 +31,7 @@ from spacesim.reproduce.size import Size
 from spacesim.splat.compose import (
     ComposeConfig,
     ComposedRun,
-    Composition,
+    GaussianComposition,
     PlacedRun,
     Pose,
     PosedScene,
@@ -146,7 +146,7 @@ def evaluated(
 def composed(run: Run, file: Path, shadows: str) -> ComposedRun:
     """The pair of tables 4.6 and 4.7, as a scene in a file; shadows: between the models, see `ComposeConfig`."""
     models = [PlacedRun(run, Pose(translation=np.array(place)), which) for which, place in PLACES.items()]
-    save_scene(file, PosedScene(Composition(models, ComposeConfig(shadows))))
+    save_scene(file, PosedScene(GaussianComposition(models, ComposeConfig(shadows))))
     return ComposedRun(load_scene(file).composition, file)
 
 

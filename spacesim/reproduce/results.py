@@ -36,7 +36,7 @@ Values = JsonDict
 class Shown:
     """A column of ours beside the thesis's."""
 
-    variant: Variant
+    variant: Variant  #: which of our trainings: as the thesis has it, or improved
     suns: str  #: "known_suns", "unseen_suns" or "", which of the test views count
 
     @property

@@ -10,7 +10,7 @@ from spacesim.eval.metrics.geometry import GeometryConfig
 class Size:
     """Data, trainings and evaluations. Counts of views are for each Sun."""
 
-    name: str = "full"
+    name: str = "full"  #: "full", "reduced" or "quick"
     resolution: int = 512  #: pixels of each side
     suns: int = 100  #: of training
     views: int = 100  #: of training
@@ -21,10 +21,10 @@ class Size:
     test_spp: int = 1024  #: samples a pixel of test views
     pair_views: int = 100  #: of two boxsats under one Sun
     one_sun_views: int = 400  #: of training, under one Sun (figures 4.3 and 4.4)
-    one_sun_test_views: int = 300
+    one_sun_test_views: int = 300  #: of testing, under that Sun
     fully_lit_deg: tuple[float, float] = (30.0, 15.0)  #: azimuth and elevation between camera and Sun, at most (4.2)
-    telescope_suns: int = 24
-    telescope_views: int = 100
+    telescope_suns: int = 24  #: of the telescope's training (figures 6.1 and 6.2)
+    telescope_views: int = 100  #: of the telescope's training
     telescope_iterations: int = 50_000  #: refinement stops at four fifths (section 6.2.2)
     figure_steps: int = 5_000  #: of figure 5.5
     figure_gaussians: int = 100_000  #: of figure 5.5

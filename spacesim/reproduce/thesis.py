@@ -20,9 +20,10 @@ SMALL = 1e-3  #: below it the thesis writes powers of ten
 class Column:
     """A column of a table."""
 
-    heading: str
+    heading: str  #: as printed
     metric: str  #: group.name of metrics.json
     goal: str  #: "↑", "↓" or "→ x", the value to come close to
+    #: how its numbers are printed
     form: Literal["ten-thousandths", "scientific", "count", "hundredths", "millionths"] = "ten-thousandths"
     spread: bool = True  #: whether the thesis has standard deviations
     arrow: bool = True  #: whether the thesis says which way is better
@@ -58,39 +59,39 @@ class Column:
 class Row:
     """A row of a table: what was trained, and its cells as printed."""
 
-    name: str
-    method: str
-    cells: tuple[str, ...]
-    strategy: str = "default"
+    name: str  #: as printed
+    method: str  #: of training, that of ours beside it
+    cells: tuple[str, ...]  #: numbers as printed, one for each column
+    strategy: str = "default"  #: of densification, that of ours beside it
 
 
 @dataclass(frozen=True)
 class Claim:
     """What the thesis says of two rows."""
 
-    metric: str
-    better: str
-    worse: str
+    metric: str  #: group.name of metrics.json
+    better: str  #: name of the row that the thesis has ahead
+    worse: str  #: name of the other row
 
 
 @dataclass(frozen=True)
 class Remark:
     """A cause of a difference, of a metric or, where that is "", of the whole table."""
 
-    text: str
-    metric: str = ""
+    text: str  #: a sentence
+    metric: str = ""  #: group.name of metrics.json, or ""
 
 
 @dataclass(frozen=True)
 class Table:
     """A table of the thesis."""
 
-    number: str
-    title: str
-    columns: tuple[Column, ...]
-    rows: tuple[Row, ...]
-    claims: tuple[Claim, ...]
-    remarks: tuple[Remark, ...] = ()
+    number: str  #: as printed: "4.4"
+    title: str  #: as printed
+    columns: tuple[Column, ...]  #: one for each metric
+    rows: tuple[Row, ...]  #: what was trained, a cell for each column
+    claims: tuple[Claim, ...]  #: what the thesis says of its rows
+    remarks: tuple[Remark, ...] = ()  #: why ours differ
     scene: Literal["own", "pair"] = "own"  #: the trained object alone, or two of it in one scene
     by_suns: bool = True  #: whether its numbers depend on the Suns of the test views
 
@@ -115,9 +116,9 @@ class Table:
 class Thesis:
     """All that is shown beside ours."""
 
-    conditions: Mapping[str, str]
+    conditions: Mapping[str, str]  #: data, trainings and device of the thesis, in words, by name
     nerf_times: float  #: what a frame of NeRFs takes as a multiple of one of Gaussians, "around" (figure 3.2)
-    tables: tuple[Table, ...]
+    tables: tuple[Table, ...]  #: in the thesis's order
 
 
 @cache

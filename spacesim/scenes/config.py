@@ -79,7 +79,7 @@ class ObjectConfig:
 class MaterialConfig:
     """A material of a scene file: a preset, changed."""
 
-    preset: str
+    preset: str  #: name of a material of the table
     albedo: Vector | None = None  #: linear camera RGB, 0 to 1
     roughness: float | None = None  #: GGX alpha; None: as the preset
 

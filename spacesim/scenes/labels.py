@@ -165,9 +165,9 @@ class _Points:
 class PartTable:
     """Labels of parts, each indexed by the number that Dr.Jit knows a shape by; inputs of kernels."""
 
-    objects: UInt32
-    parts: UInt32
-    albedos: Float
+    objects: UInt32  #: [S] numbers of the objects, from 1; 0 where there is no part
+    parts: UInt32  #: [S] numbers of the parts, from 1; 0 where there is none
+    albedos: Float  #: [3 S] mean linear camera RGB
     textured: Bool | None  #: whose albedo varies over them, None where no part's does
 
     @classmethod

@@ -30,7 +30,7 @@ MAX_OBJECTS, MAX_PARTS = 84, 255  #: 170 + object id is a shadow class below 255
 class SceneObject:
     """A spacecraft in the world."""
 
-    spacecraft: Spacecraft
+    spacecraft: Spacecraft  #: its parts, in body axes
     world_from_object: Array = field(default_factory=lambda: np.eye(4))  #: [4, 4] rigid transform, metres
 
 
@@ -38,9 +38,9 @@ class SceneObject:
 class PlacedPart:
     """A part in the world. object_id and part_id count from 1 over the scene."""
 
-    object_id: int
-    part_id: int
-    part: Part
+    object_id: int  #: number of its object, from 1
+    part_id: int  #: number over the whole scene, from 1
+    part: Part  #: in the axes of its object
     mesh: trimesh.Trimesh  #: world frame, metres
     normals: Array | None = None  #: as of the part, world frame
 
@@ -54,10 +54,10 @@ class PlacedPart:
 class Scene:
     """What is rendered: objects under the Sun and, perhaps, the Earth."""
 
-    name: str
-    objects: tuple[SceneObject, ...]
-    sun: SunConfig = field(default_factory=SunConfig)
-    earth: EarthConfig | None = None
+    name: str  #: of the scene
+    objects: tuple[SceneObject, ...]  #: in the order of their numbers
+    sun: SunConfig = field(default_factory=SunConfig)  #: its shape, distance and colour
+    earth: EarthConfig | None = None  #: None: there is none
 
     def __post_init__(self) -> None:
         parts = sum(len(item.spacecraft.parts) for item in self.objects)
@@ -168,10 +168,10 @@ class MitsubaScene:
 
     units: Units  #: of all three
     labelled: mt.Scene  #: the shapes without light, and no ray slips between two triangles of them
-    sunlit: mt.Scene
-    sun: Source
-    earthlit: mt.Scene | None = None
-    earth: Source | None = None
+    sunlit: mt.Scene  #: the shapes under the Sun
+    sun: Source  #: the emitter of `sunlit`, which can be moved
+    earthlit: mt.Scene | None = None  #: the shapes under the Earth; None without one
+    earth: Source | None = None  #: the emitter of `earthlit`, which can be moved
 
     def point(self, sun: Sun, earth: EarthConfig | None = None) -> None:
         """Move the Sun and, where one is given to a scene that has one, the Earth; the Earth's phase follows."""

@@ -26,7 +26,7 @@ FINE = 256  #: directions all over the disc: steps of 0.4 %
 class Disc:
     """Directions to points of the Sun's disc, inputs of kernels."""
 
-    count: int
+    count: int  #: of the directions
     directions: mt.Vector3f  #: `count` unit vectors
     limb: Limb | None  #: of the Earth, which can hide the Sun too, or None
 

@@ -107,10 +107,11 @@ class PictureRequest:
     """What is to be drawn."""
 
     camera: CameraFields | None = None  #: None: nothing, say what is served
+    #: azimuth and elevation, degrees, or a direction [3] towards it; None: not told
     sun: tuple[float, ...] | None = None
     exposure: float | None = None  #: EV
-    outputs: tuple[Output, ...] = ("rgb",)
-    seed: int = 0
+    outputs: tuple[Output, ...] = ("rgb",)  #: names of the planes that are asked for
+    seed: int = 0  #: of the noise of path-traced pictures
 
     def __post_init__(self) -> None:
         expect(0 <= self.seed < 2**63, "seed", "0 to 2^63 - 1", self.seed)

@@ -53,10 +53,10 @@ def rotation_from_mrp(mrp: Array) -> Array:
 class Body:
     """A spacecraft or a celestial body."""
 
-    name: str
+    name: str  #: as Basilisk has it
     position: Array  #: [3] metres, N
     body_from_inertial: Array  #: [3, 3]
-    is_spacecraft: bool
+    is_spacecraft: bool  #: false of a celestial body
     parent: str = ""  #: the spacecraft that it is a component of
 
     @property
@@ -69,7 +69,7 @@ class Body:
 class MountedCamera:
     """A camera on a body."""
 
-    number: int
+    number: int  #: by which Basilisk asks for its pictures
     parent: str  #: name of the body
     fov_deg: float  #: across the height
     width: int  #: pixels

@@ -33,7 +33,7 @@ ENOUGH = 1e-3  #: a step that lowers the cost by less than this share is the las
 class PictureLight:
     """What a view is drawn with."""
 
-    sun: Sun | None = None
+    sun: Sun | None = None  #: None: not named, and not found yet
     embedding: Array | None = None  #: [E], None: the mean of the training pictures'
     gain: float = 1.0  #: factor on linear values
 
@@ -43,7 +43,7 @@ class Picture:
     """A picture to fit to."""
 
     rgb: np.ndarray  #: [H, W, 3] sRGB values in [0, 1] over black
-    camera: Camera
+    camera: Camera  #: of the picture
 
 
 class Unknown(Protocol):
@@ -66,14 +66,15 @@ class Unknown(Protocol):
 
 def find_unknowns(run: Predictor, gain: bool = False) -> tuple[Unknown, ...]:
     """Of a run, in the order in which they are fitted. gain: of each picture, too"""
-    model = run.run if isinstance(run, AlignedRun) else run
-    light = model.light if isinstance(model, Run) else None
     unknowns: list[Unknown] = []
-    if isinstance(model, Run) and light is not None and model.config.get("sun") == "unknown":
-        unknowns.append(SunFit(SunFinder(model.gaussians, light, model.antialiased, model.curve)))
-    if light is not None and light.embeddings:
-        size = light.config.field.embeddings
-        unknowns.append(EmbeddingFit.of(np.array(light.embeddings[0], np.float64).reshape(-1, size)))
+    model = run.gaussian_run
+    if model is not None and model.light is not None:
+        light = model.light
+        if model.config.get("sun") == "unknown":
+            unknowns.append(SunFit(SunFinder(model.gaussians, light, model.antialiased, model.curve)))
+        if light.embeddings:
+            size = light.config.field.embeddings
+            unknowns.append(EmbeddingFit.of(np.array(light.embeddings[0], np.float64).reshape(-1, size)))
     if gain:
         unknowns.append(GainFit())
     return tuple(unknowns)
@@ -104,7 +105,6 @@ def estimate_sun(run: Run, image: ArrayLike | Image, camera: Camera, mask: Array
 def draw(run: Predictor, camera: Camera, light: PictureLight) -> Prediction:
     """A view with a light. Its colours are clipped to [0, 1] where there is a gain."""
     if light.embedding is not None:
-        assert isinstance(run, Run | AlignedRun), "other runs have none"
         run = run.with_embedding(light.embedding)
     drawn = run.predict(camera, light.sun)
     return drawn if light.gain == 1 else replace(drawn, rgb=srgb_from_linear(light.gain * linear_from_srgb(drawn.rgb)))
@@ -114,7 +114,7 @@ def draw(run: Predictor, camera: Camera, light: PictureLight) -> Prediction:
 class SunFit:
     """The Sun of a picture that does not name it, by a run whose training pictures did not name theirs."""
 
-    finder: SunFinder
+    finder: SunFinder  #: of the run's model
 
     name = "sun"
     how = "its direction, searched over the sphere by shading and shadows of a picture of 64 pixels"

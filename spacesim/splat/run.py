@@ -100,6 +100,14 @@ class Predictor(Protocol):
     def parts(self) -> Sequence[Part]:
         """The models of a scene, which stand for the dataset's objects in their order; none of a single run."""
 
+    @property
+    def gaussian_run(self) -> "Run | None":
+        """The trained run of Gaussians that it is, or moves; None of a scene and of a radiance field."""
+
+    def with_embedding(self, embedding: np.ndarray) -> "Predictor":
+        """The same with every view drawn with `embedding` [E]. Raises InputError where no picture of training has
+        one."""
+
     def predict(
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> Prediction:
@@ -177,6 +185,11 @@ class Run:
         return ()
 
     @property
+    def gaussian_run(self) -> "Run":
+        """Itself."""
+        return self
+
+    @property
     def curve(self) -> tuple[str, float] | None:
         """Tone curve and exposure (EV) of colours that are blended in linear light; None where they are sRGB values."""
         return self.light.config.curve if self.light else None
@@ -242,10 +255,11 @@ class Run:
         return _prediction(output, rgb, visibility, normals)
 
 
-def check_gaussians(run: Predictor) -> None:
-    """Raise InputError for a run of a method without Gaussians."""
-    if run.gaussians is None:
+def check_gaussians(run: Predictor) -> Run:
+    """The trained run of Gaussians that `run` is. Raises InputError where it is none."""
+    if run.gaussian_run is None:
         raise InputError(f"run: expected one of Gaussians, found one of the method {run.config['method']}")
+    return run.gaussian_run
 
 
 def stops(curve: tuple[str, float] | None, exposure: float | None, source: str) -> float:

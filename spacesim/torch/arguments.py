@@ -16,9 +16,9 @@ class RasterSettings:
     """What of a call is no tensor."""
 
     width: int  #: pixels
-    height: int
+    height: int  #: pixels
     near: float  #: metres
-    far: float
+    far: float  #: metres
     radius_clip: float  #: pixels; splats no larger are not drawn
     eps2d: float  #: pixels^2 added to the screen-space covariance
     antialiased: bool  #: what that adds to a splat's area is taken from its opacity

@@ -45,7 +45,7 @@ class Drawing:
 
     projected: list[ProjectedSplats]  #: of each camera
     width: int  #: pixels
-    height: int
+    height: int  #: pixels
     harmonic: bool  #: the harmonics' colours come first; else the tensor's, if any
     depth: bool  #: depth comes last
     visible: Tensor | None  #: of packed splats, which of C times N they are; else None, and means2d is [C, N, 2]

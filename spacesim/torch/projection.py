@@ -27,10 +27,10 @@ WIDEST_SPLAT = 2**30  #: pixels: an int32 holds no more
 class Leaves:
     """Flat arrays of a call: [N * size] of the Gaussians, and one camera's."""
 
-    means: Float
-    quats: Float
-    scales: Float
-    opacities: Float
+    means: Float  #: metres, 3 numbers a Gaussian
+    quats: Float  #: (w, x, y, z), of any length
+    scales: Float  #: metres, 3 numbers a Gaussian
+    opacities: Float  #: in [0, 1]
     harmonics: Float | None  #: three times K a Gaussian, K at least (degree + 1)^2; or None
     viewmat: Float  #: world to camera, row by row, 16 numbers
     intrinsics: Float  #: row by row, 9 numbers
@@ -40,21 +40,21 @@ class Leaves:
 class Wanted:
     """Of which leaves gradients are asked for. Each number of a camera costs a sum over all Gaussians."""
 
-    means: bool
-    quats: bool
-    scales: bool
-    opacities: bool
-    harmonics: bool
-    viewmat: bool
-    intrinsics: bool
+    means: bool  #: whether of the centres
+    quats: bool  #: whether of the rotations
+    scales: bool  #: whether of the scales
+    opacities: bool  #: whether of the opacities
+    harmonics: bool  #: whether of the spherical harmonics
+    viewmat: bool  #: whether of the camera's pose
+    intrinsics: bool  #: whether of its focal lengths and principal point
 
 
 @dataclass
 class ProjectedSplats:
     """What projecting found, as Dr.Jit's arrays without gradients."""
 
-    splats: Splats
-    footprints: Footprints
+    splats: Splats  #: ellipses on the screen, [N]
+    footprints: Footprints  #: which can be seen, and where
     colors: list[Float]  #: of harmonics, three Floats [N]; else none
     means2d: Float  #: rows x, y, pixels; room for N at least
     table: Float  #: rows of `TABLE` numbers: a, b, c of `Splats`, opacity, depth, and colours or 0
@@ -65,11 +65,11 @@ class ProjectedSplats:
 class LeafGradients:
     """Gradients of `Leaves`, flat, of the Gaussians with room for N at least; None of those that were not wanted."""
 
-    means: Float | None = None
-    quats: Float | None = None
-    scales: Float | None = None
-    opacities: Float | None = None
-    harmonics: Float | None = None
+    means: Float | None = None  #: three numbers a Gaussian
+    quats: Float | None = None  #: four
+    scales: Float | None = None  #: three
+    opacities: Float | None = None  #: one
+    harmonics: Float | None = None  #: as many as there are
     viewmat: list[Float] | None = None  #: 16 numbers
     intrinsics: list[Float] | None = None  #: fx, fy, cx, cy
 

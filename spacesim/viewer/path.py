@@ -9,7 +9,7 @@ import numpy as np
 
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
-from spacesim.splat.compose import Composition
+from spacesim.splat.compose import GaussianComposition
 from spacesim.splat.compose.path import FPS, MAX_FRAMES, CameraView, Keyframe, Orbit, PosedScene, SceneFrame
 from spacesim.viewer.state import SceneState, ViewerCamera
 
@@ -94,7 +94,7 @@ class CameraPath:
         """Without anything that moves."""
         return replace(self, keyframes=(), orbit=None, frames=None)
 
-    def at(self, composition: Composition, when: float) -> SceneFrame:
+    def at(self, composition: GaussianComposition, when: float) -> SceneFrame:
         """Camera, Sun (None where no keyframe names one) and poses at a time."""
         scene = PosedScene(composition, None, self.image, self.keyframes, self.orbit, self.picture_count, self.fps)
         return scene.at(when, min(when * self.fps / self.picture_count, 1.0) if self.orbit else 0.0)
@@ -135,7 +135,9 @@ def orbit_from_view(view: ViewerCamera, centre: Array) -> Orbit:
     return Orbit(radius, (x, y, z), min(max(elevation, -89.0), 89.0), azimuth)
 
 
-def scene_to_save(composition: Composition, state: SceneState, view: ViewerCamera, path: CameraPath) -> PosedScene:
+def scene_to_save(
+    composition: GaussianComposition, state: SceneState, view: ViewerCamera, path: CameraPath
+) -> PosedScene:
     """What `spacesim compose` draws: the path as it is played. Its image is that of the scene's file where that has one
     and the camera moves, else the view as the browser shows it, with square pixels."""
     camera, keys = path.camera, path.keyframes

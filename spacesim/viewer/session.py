@@ -25,9 +25,10 @@ class Statistics:
 
     rate: float  #: frames a second while moving, 0 before there is a second one
     seconds: float  #: to draw it
-    width: int
-    height: int
-    share: float
+    width: int  #: pixels
+    height: int  #: pixels
+    share: float  #: of the full resolution, on a side
+    #: least and greatest that the colours of depth stand for, metres; None of a picture of something else
     depths: tuple[float, float] | None
     status: str  #: sentences for the user, "" for none
 

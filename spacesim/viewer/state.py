@@ -125,7 +125,7 @@ class SceneState:
 class SharedScene:
     """The one scene that all clients see and change, from any thread: each change is a whole new `SceneState`."""
 
-    state: SceneState
+    state: SceneState  #: what all see now
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _listeners: list[Callable[[SceneState], None]] = field(default_factory=list)
 

@@ -34,7 +34,7 @@ from pathlib import Path
 import numpy as np
 import spacesim
 from spacesim.data.records import Sun
-from spacesim.splat.compose import Composition, PlacedRun, Pose
+from spacesim.splat.compose import GaussianComposition, PlacedRun, Pose
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 exec(sys.argv[2])
@@ -55,7 +55,8 @@ arrays = {
 run = Run(Path("ball"), {"method": "vanilla", "data": {"path": ""}}, {}, Gaussians.from_numpy(arrays), 0)
 models = [PlacedRun(run, Pose(translation=np.array([0.0, side, 0])), str(side)) for side in (-1, 1)]
 state = SceneState(tuple(placed.pose for placed in models), Sun(np.array([0.0, 0, 1])))
-viewer = Viewer(ViewerSetup(SceneRenderer(Composition(models)), state, (None, None), None, Path(sys.argv[1])), port=0)
+renderer = SceneRenderer(GaussianComposition(models))
+viewer = Viewer(ViewerSetup(renderer, state, (None, None), None, Path(sys.argv[1])), port=0)
 viewer.start()
 print(viewer.port, flush=True)
 for line in sys.stdin:

@@ -15,7 +15,7 @@ from spacesim.data.records import Camera, Dataset, Frame, Sun
 from spacesim.eval.align import align, match_frames, moved_dataset, residuals, similarity
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report.write import write_report
-from spacesim.splat.compose import ComposedRun, Composition, PlacedRun, Pose
+from spacesim.splat.compose import ComposedRun, GaussianComposition, PlacedRun, Pose
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 
@@ -214,6 +214,6 @@ def test_data_that_are_not_the_runs_are_noted(drawn, tmp_path, monkeypatch):
 
 def test_a_scene_is_not_aligned(drawn, tmp_path):
     run, truth, own = drawn
-    scene = ComposedRun(Composition([PlacedRun(run)]), tmp_path / "scene.toml")
+    scene = ComposedRun(GaussianComposition([PlacedRun(run)]), tmp_path / "scene.toml")
     with pytest.raises(InputError, match=r"align: expected a run, found .*scene\.toml"):
         evaluate(scene, truth, tmp_path / "eval", EvaluateConfig(align=own))

@@ -18,7 +18,7 @@ from spacesim.eval.objects import compare_object_shapes, object_names
 from spacesim.eval.report.surfaces import value_of
 from spacesim.eval.report.write import write_report
 from spacesim.eval.shape import BACKGROUND, COLORS, cameras_around_mesh, draw_distances, write_shapes
-from spacesim.splat.compose import ComposedRun, Composition, PlacedRun, Pose
+from spacesim.splat.compose import ComposedRun, GaussianComposition, PlacedRun, Pose
 from spacesim.splat.compose.pose import rotation_about
 from spacesim.splat.export.mesh import MeshConfig, cameras_around
 from spacesim.splat.raster.gaussians import Gaussians
@@ -73,7 +73,9 @@ def test_better_shapes_have_better_numbers(tiny):
 def placed_pair(run, dataset, folder):
     """Two models of one run, the second turned, moved and twice as large, and data whose true mesh is theirs."""
     poses = Pose(), Pose(rotation_about([0, 0, 1], 90), [9.0, 0, 2], 2.0)
-    scene = ComposedRun(Composition([PlacedRun(run, pose, f"model {k}") for k, pose in enumerate(poses)]), folder)
+    scene = ComposedRun(
+        GaussianComposition([PlacedRun(run, pose, f"model {k}") for k, pose in enumerate(poses)]), folder
+    )
     vertices, faces = read_mesh(dataset.root / dataset.mesh_path)
     second = 2 * vertices @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).T + [9, 0, 2]
     write_mesh(folder / "pair.ply", np.concatenate([vertices, second]), np.concatenate([faces, faces + len(vertices)]))
@@ -114,7 +116,7 @@ def test_objects_without_a_shape_of_their_own(tiny, tmp_path):
     run, dataset = tiny
     scene, pair = placed_pair(run, dataset, tmp_path)
     names = object_names(pair)
-    three = replace(scene, composition=Composition([*scene.composition.models, PlacedRun(run)]))
+    three = replace(scene, composition=GaussianComposition([*scene.composition.models, PlacedRun(run)]))
     less = {key: value for key, value in pair.scene.items() if key != "mesh"}
     for who, what, config in (
         (run, pair, SMALL),

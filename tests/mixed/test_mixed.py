@@ -14,7 +14,7 @@ from spacesim.data.images import read_png
 from spacesim.data.records import Sun
 from spacesim.data.store import read_dataset
 from spacesim.methods import compose, load_scene
-from spacesim.mixed.scene import Composition
+from spacesim.mixed.scene import MixedComposition
 from spacesim.nerf.train.train import train
 from spacesim.splat.compose import ComposeConfig, PlacedRun, Pose, save_scene
 from spacesim.splat.compose.pose import rotation_about
@@ -56,7 +56,7 @@ def test_an_empty_field_changes_nothing(empty, method):
     for antialiased in (False, True):
         run = made_run(method, antialiased=antialiased)
         mixed = scene((run, Pose()), (empty, Pose()))
-        assert isinstance(mixed, Composition)
+        assert isinstance(mixed, MixedComposition)
         found, alone = mixed.predict(EYE, SUN, normals=True), run.predict(EYE, SUN, normals=True)
         if method == "linear":  # blended as sRGB values beside a field
             alone = scene((run, Pose()), (made_run("vanilla", 7, count=0), Pose())).predict(EYE, SUN, normals=True)
@@ -206,7 +206,7 @@ def test_what_cannot_be_is_said(box):
     with pytest.raises(InputError, match="exposure: expected runs trained in linear light"):
         mixed.predict(EYE, SUN, exposure=1.0)
     with pytest.raises(InputError, match="found one family"):
-        Composition([PlacedRun(box)])
+        MixedComposition([PlacedRun(box)])
     assert scene((made_run("vanilla"), Pose()), (box, Pose())).predict(EYE).visibility is None
 
 

@@ -16,7 +16,7 @@ from spacesim.data.images import read_png
 from spacesim.data.records import Camera, Dataset
 from spacesim.data.store import read_dataset
 from spacesim.methods import load_scene
-from spacesim.nerf.compose import Composition
+from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.draw import Samples
 from spacesim.nerf.partition import merge
 from spacesim.nerf.run import NerfRun
@@ -124,9 +124,9 @@ def run(dataset, tmp_path_factory) -> NerfRun:
     return train(dataset, tmp_path_factory.mktemp("nerf") / "run", CONFIG)
 
 
-def scene(*models: tuple[NerfRun, Pose], shadows: str = "none") -> Composition:
+def scene(*models: tuple[NerfRun, Pose], shadows: str = "none") -> FieldComposition:
     placed = [PlacedRun(run, pose, f"model-{i}") for i, (run, pose) in enumerate(models)]  # type: ignore[arg-type]
-    return Composition(placed, ComposeConfig(shadows))
+    return FieldComposition(placed, ComposeConfig(shadows))
 
 
 def camera_at(place, towards=(0, 0, 0), size=36) -> Camera:
@@ -198,7 +198,7 @@ look_at = [0, 0, 0]
 resolution = [48, 32]
 """
     (tmp_path / "scene.toml").write_text(text)
-    assert isinstance(load_scene(tmp_path / "scene.toml").composition, Composition)
+    assert isinstance(load_scene(tmp_path / "scene.toml").composition, FieldComposition)
     done = spacesim("compose", tmp_path / "scene.toml", "--out", tmp_path / "out")
     assert done.code == 0, done.errors
     assert set(np.unique(read_png(tmp_path / "out/id/0000.png"))) == {0, 1, 2}

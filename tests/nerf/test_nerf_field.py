@@ -10,7 +10,7 @@ import pytest
 from spacesim.backend import ad
 from spacesim.backend.upload import upload, upload_rows
 from spacesim.nerf.config import CHUNK, GridConfig, NerfConfig, ProposalConfig
-from spacesim.nerf.fields.field import DensityField, Field
+from spacesim.nerf.fields.field import DensityField, RadianceField
 from spacesim.nerf.fields.hashgrid import PRIMES, HashGrid
 from spacesim.nerf.fields.model import Networks
 from spacesim.nerf.sampling.losses import normal_slope
@@ -130,7 +130,7 @@ SURFACE = "nerf-relight", "surface"
 @pytest.mark.parametrize(("method", "inputs"), [("nerf", "surface"), ("nerf-relight", "directions"), SURFACE])
 def test_gradients_of_a_field(points, method, inputs):
     """Along a direction, <gradient, direction> is the difference of the outputs' weighted sum."""
-    field, rng = Field.of(replace(TINY, method=method, inputs=inputs)), np.random.default_rng(5)
+    field, rng = RadianceField.of(replace(TINY, method=method, inputs=inputs)), np.random.default_rng(5)
     start = [values + 0.2 * rng.normal(size=values.shape) for values in field.initial(rng)]
     view = upload_rows((points - 0.4) / np.linalg.norm(points - 0.4, axis=0))
     sun = ad.Array3f(0, 0, 1) + dr.zeros(ad.Array3f, CHUNK)

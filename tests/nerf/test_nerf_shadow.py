@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from spacesim.backend.upload import upload
-from spacesim.nerf.config import CHUNK, GridConfig, NerfConfig, ProposalConfig, ShadowConfig
+from spacesim.nerf.config import CHUNK, GridConfig, NerfConfig, NerfShadowConfig, ProposalConfig
 from spacesim.nerf.fields.hashgrid import PRIMES
 from spacesim.nerf.fields.model import Networks
 from spacesim.nerf.sampling.box import SceneBox
@@ -13,7 +13,7 @@ from spacesim.nerf.shadow import sun_visibility
 
 CONFIG = NerfConfig(
     method="nerf-relight",
-    shadow=ShadowConfig(64, 0.02),
+    shadow=NerfShadowConfig(64, 0.02),
     width=8,
     features=3,
     grid=GridConfig(2, 3, 8, 8),

@@ -10,11 +10,12 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera, Sun
 from spacesim.methods import load_predictor
-from spacesim.splat.compose import ComposedRun, Composition, PlacedRun, Pose
+from spacesim.nerf.run import NerfRun
+from spacesim.splat.compose import ComposedRun, GaussianComposition, PlacedRun, Pose
 from spacesim.splat.compose.aligned import AlignedRun
 from spacesim.splat.compose.run import PlacedPart
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.run import Part, Predictor, Run
+from spacesim.splat.run import Part, Predictor, Run, check_gaussians
 
 CAMERA = Camera.from_fov(look_at((0, -4, 0), (0, 0, 0)), 24, 16, 40)
 SUN = Sun.from_angles(45, 30)
@@ -34,16 +35,17 @@ def run(tmp_path) -> Run:
 @pytest.fixture
 def scene(run, tmp_path) -> ComposedRun:
     models = [PlacedRun(run, name="left"), PlacedRun(run, Pose(translation=[2.0, 0, 0]), "right")]
-    return ComposedRun(Composition(models), tmp_path / "scene.toml")
+    return ComposedRun(GaussianComposition(models), tmp_path / "scene.toml")
 
 
-@pytest.mark.parametrize("kind", [Run, AlignedRun, ComposedRun, Composition])
+@pytest.mark.parametrize("kind", [Run, AlignedRun, ComposedRun, GaussianComposition])
 def test_predict_is_asked_in_the_same_words(kind):
     assert words_of(kind.predict) == words_of(Predictor.predict)
 
 
 @pytest.mark.parametrize(
-    ("kind", "protocol"), [(Run, Predictor), (AlignedRun, Predictor), (ComposedRun, Predictor), (PlacedPart, Part)]
+    ("kind", "protocol"),
+    [(Run, Predictor), (AlignedRun, Predictor), (ComposedRun, Predictor), (NerfRun, Predictor), (PlacedPart, Part)],
 )
 def test_all_that_is_asked_for_is_there(kind, protocol):
     asked = {name for name in vars(protocol) if not name.startswith("_")}
@@ -59,6 +61,16 @@ def test_a_run_has_no_parts_and_a_scene_those_of_its_models(run, scene):
     assert np.allclose(right.centre - left.centre, [2, 0, 0])
     assert np.allclose(np.array(right.gaussians.means) - np.array(left.gaussians.means), [[2], [0], [0]], atol=1e-6)
     assert right.antialiased is run.antialiased
+
+
+def test_one_model_of_gaussians_is_told_from_a_scene(run, scene):
+    assert run.gaussian_run is AlignedRun(run, Pose(scale=2.0)).gaussian_run is check_gaussians(run) is run
+    assert scene.gaussian_run is None
+    with pytest.raises(InputError, match="run: expected one of Gaussians, found one of the method vanilla"):
+        check_gaussians(scene)
+    for predictor in (run, scene):
+        with pytest.raises(InputError, match="embedding: expected"):
+            predictor.with_embedding(np.zeros(3))
 
 
 def test_both_refuse_an_exposure_of_srgb_values(run, scene):

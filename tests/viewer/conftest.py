@@ -8,7 +8,7 @@ import pytest
 import spacesim  # noqa: F401  names libLLVM before drjit is imported
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Sun
-from spacesim.splat.compose import Composition, PlacedRun, Pose
+from spacesim.splat.compose import GaussianComposition, PlacedRun, Pose
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
@@ -58,7 +58,7 @@ def renderer() -> SceneRenderer:
     """A red ball on the left, a green one on the right, seen along +x with z up."""
     red, green = ball_run("red", (0.9, 0.1, 0.1)), ball_run("green", (0.1, 0.9, 0.1))
     left, right = Pose(translation=np.array([0.0, 1, 0])), Pose(translation=np.array([0.0, -1, 0]))
-    return SceneRenderer(Composition([PlacedRun(red, left, "red"), PlacedRun(green, right, "green")]))
+    return SceneRenderer(GaussianComposition([PlacedRun(red, left, "red"), PlacedRun(green, right, "green")]))
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from spacesim import backend
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.records import Sun
-from spacesim.nerf.compose import Composition
+from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.config import GridConfig, NerfConfig, ProposalConfig
 from spacesim.nerf.fields.model import Networks
 from spacesim.nerf.run import NerfRun
@@ -57,7 +57,7 @@ def fields() -> SceneRenderer:
     run = field_run()
     poses = (Pose(translation=np.array([0.0, 1, 0])), Pose(translation=np.array([0.0, -1, 0]), scale=0.5))
     placed = [PlacedRun(run, pose, f"fog {k}") for k, pose in enumerate(poses)]
-    return SceneRenderer(Composition(placed, ComposeConfig()))
+    return SceneRenderer(FieldComposition(placed, ComposeConfig()))
 
 
 @pytest.fixture
@@ -89,7 +89,9 @@ def test_what_a_scene_of_fields_has(fields, state):
 def test_modes(fields, state, mode):
     frame = draw_frame(fields, state, view_from(-5, 0), DisplaySettings(mode, side=256), 0.25)
     if mode == "visibility":
-        single = SceneRenderer(Composition(fields.composition.models[:1], ComposeConfig()))  # nothing else shades it
+        single = SceneRenderer(
+            FieldComposition(fields.composition.models[:1], ComposeConfig())
+        )  # nothing else shades it
         alone = replace(state, poses=state.poses[:1])
         assert frame.picture.any()
         frame = draw_frame(single, alone, view_from(-5, 0), DisplaySettings(mode, side=256), 0.25)

@@ -44,7 +44,7 @@ class BodyLabels:
     keypoints: Mapping[str, tuple[float, float, float]]  #: by their names, in this order
     name: str = ""  #: of the object
     symmetries_discrete: tuple[tuple[float, ...], ...] = ()  #: [4, 4] row by row, each takes the body to itself
-    symmetries_continuous: tuple[SymmetryAxis, ...] = ()
+    symmetries_continuous: tuple[SymmetryAxis, ...] = ()  #: axes about which any turn takes the body to itself
 
     def __post_init__(self) -> None:
         if not 0 < len(self.keypoints) <= MAX_COUNT:

@@ -23,7 +23,7 @@ CLEARANCE = 1e-3  #: of the object's size: a keypoint so far within the surface 
 class Instance:
     """An object as a picture shows it."""
 
-    target: LabelledObject
+    target: LabelledObject  #: the object, with its pose and its mesh
     category: int  #: number of its model, from 1: objects of one shape share it
     mask: np.ndarray  #: [H, W] bool: pixels whose centres show it
     box: tuple[int, int, int, int]  #: x, y, width, height of these, pixels; -1 each for none
@@ -41,7 +41,7 @@ class Category:
 
     number: int  #: from 1
     name: str  #: of its first object
-    body: BodyLabels
+    body: BodyLabels  #: keypoints and symmetries of the model, in its own axes
 
 
 class Labeller:

@@ -23,7 +23,7 @@ class LabelledObject:
     """An object whose pose is a label."""
 
     id: int  #: in the label pictures, from 1
-    name: str
+    name: str  #: as scene.json has it
     world_from_object: Array  #: [4, 4] rigid, metres
     vertices: Array  #: [V, 3] metres, body frame, as large as in the scene
     faces: np.ndarray  #: [F, 3]

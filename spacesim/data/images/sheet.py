@@ -18,9 +18,9 @@ NAME, DETAIL = 14, 13  #: pixels of a label's lines, first and second
 class Page:
     """sRGB colours of the paper, of text and of text that matters less."""
 
-    paper: Color
-    ink: Color
-    faint: Color
+    paper: Color  #: of what is written on
+    ink: Color  #: of text
+    faint: Color  #: of text that matters less
 
 
 WHITE_PAGE = Page((255, 255, 255), (0, 0, 0), (110, 110, 110))

@@ -26,4 +26,4 @@ class Importer:
     `progress` is as in `writing.Progress`."""
     summary: str  #: what it reads, a line
     source: str  #: what SRC is: a folder, a file
-    options: tuple[Option, ...] = ()
+    options: tuple[Option, ...] = ()  #: what the command asks for beside the source

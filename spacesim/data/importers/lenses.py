@@ -112,10 +112,10 @@ def _unified(x: Array, y: Array, k: Sequence[float]) -> tuple[Array, Array]:
 class LensModel:
     """A camera model. Its parameters are the focal lengths, cx, cy and the others."""
 
-    name: str
+    name: str  #: as COLMAP calls it
     focal_lengths: int  #: 1, or 2: fx, fy
     others: int  #: further parameters
-    mapping: Projection
+    mapping: Projection  #: (x, y over z in camera axes, the other parameters) -> (u, v) before focal lengths and cx, cy
 
 
 LENS_MODELS: dict[int, LensModel] = {
@@ -145,7 +145,7 @@ NO_PINHOLE = {17: "EQUIRECTANGULAR"}  #: models that see all around, whose pictu
 class Lens:
     """A camera with its lens. Raises InputError for numbers that no camera has."""
 
-    model: LensModel
+    model: LensModel  #: how rays become pixels
     width: int  #: pixels
     height: int  #: pixels
     parameters: tuple[float, ...]  #: of the model, pixels where they are lengths

@@ -32,9 +32,9 @@ class View:
     name: str  #: of the frame
     path: Path  #: of the picture, which has the lens's size
     world_from_camera: Array  #: [4, 4]
-    lens: Lens
+    lens: Lens  #: intrinsics, size and distortion of the picture
     mask: Path | None = None  #: white = object, or = known, as the frames' maker says
-    sun: Sun | None = None
+    sun: Sun | None = None  #: None where the source does not name it
     silhouette: Path | None = None  #: other than 0 = object
     depth: Callable[[], np.ndarray] | None = None  #: makes uint16 [H, W], steps along the optical axis
     keys: Mapping[str, JsonValue] = field(default_factory=dict)  #: as of `ImportedFrame`

@@ -45,9 +45,9 @@ class ImportedFrame:
 
     name: str  #: relative path without suffix, below images/: each once
     picture: Picture  #: as `camera` and `distortion` say; with alpha where it is known to be empty around the object
-    camera: Camera
+    camera: Camera  #: pose and intrinsics of the picture as it is written
     distortion: tuple[float, ...] = ()  #: as of `Frame`
-    sun: Sun | None = None
+    sun: Sun | None = None  #: None where the source does not name it
     silhouette: Picture | None = None  #: 255 object, 0 none: a pixel without is empty
     mask: Picture | None = None  #: 255 counts, 0: ignore this pixel, nothing is known of it
     depth: Picture | None = None  #: 16 bits, steps along the optical axis, 0 none

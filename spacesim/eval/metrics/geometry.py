@@ -56,8 +56,8 @@ class GeometryConfig:
 class Shape:
     """A surface's samples, and how far each is from the other surface's, metres."""
 
-    samples: Samples
-    distances: Array
+    samples: Samples  #: points on it, with their normals
+    distances: Array  #: [N] metres, from each sample to the nearest of the other surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +76,9 @@ class ShapeResult:
 
     values: JsonDict | None  #: metrics.json's "geometry", or None
     note: str  #: a sentence where it, or a part of it, is None, else ""
-    #: None where the surfaces cannot be compared; truth, found: both surfaces, None where there is none
-    comparison: Comparison | None = None
-    truth: Mesh | None = None
-    predicted: RunMesh | None = None
+    comparison: Comparison | None = None  #: None where the surfaces cannot be compared
+    truth: Mesh | None = None  #: the true surface, None where there is none
+    predicted: RunMesh | None = None  #: the run's surface, None where there is none
 
 
 def compare_geometry(run: "Predictor", dataset: Dataset, config: GeometryConfig | None) -> ShapeResult:

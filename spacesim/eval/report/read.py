@@ -16,7 +16,7 @@ from spacesim.eval.schema import RULES, Metrics
 class Evaluation:
     """An evaluation on disk, as the report reads it."""
 
-    folder: Path
+    folder: Path  #: that `spacesim eval` has written
     index: int  #: place in the report
     name: str  #: the run's, unique there
     metrics: JsonDict  #: what metrics.json holds

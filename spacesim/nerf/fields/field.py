@@ -37,7 +37,8 @@ class DensityTape:
 class DensityField:
     """Density, and numbers that tell a colour network of the place."""
 
-    grid: HashGrid
+    grid: HashGrid  #: what is known of places
+    #: the network: what the grid says of a place in, the logarithm of the density and the other numbers out
     shape: MlpShape
 
     @staticmethod
@@ -85,7 +86,7 @@ class DensityField:
 class FieldTape:
     """What the adjoint of a field wants."""
 
-    density: DensityTape
+    density: DensityTape  #: what the density's own adjoint wants
     layers: list[Any]  #: of the colour network
     color: list[Float]  #: [N] each
     normal: Array3f | None  #: [3, N] of any length, where there are some
@@ -94,19 +95,19 @@ class FieldTape:
 
 
 @dataclass(frozen=True)
-class Field:
+class RadianceField:
     """Density and colour of a radiance field. The colour is told the direction of the view, and of the Sun where the
     method is, or in place of both the cosines about a normal, which is three of the density network's numbers."""
 
-    density: DensityField
-    color: MlpShape
+    density: DensityField  #: its density, and the numbers that the colour network reads
+    color: MlpShape  #: the network: features, view and Sun in, three colours out, of a field with shadows six
     features: int  #: numbers of a place that the colour network reads
     harmonics: int  #: degree, of the view's direction
     sun_harmonics: int | None  #: degree, of the Sun's; None of a field that is not told
     has_normals: bool  #: the colour is told cosines
 
     @staticmethod
-    def of(config: NerfConfig) -> "Field":
+    def of(config: NerfConfig) -> "RadianceField":
         """Of a configuration."""
         has_normals = config.has_normals
         density = DensityField.of(config.grid, config.width, config.features + 3 * has_normals)
@@ -116,7 +117,7 @@ class Field:
         shape = MlpShape(
             config.features + directions, 1, 6 if config.casts_shadows else 3, config.width, config.color_layers
         )
-        return Field(density, shape, config.features, config.harmonics, of_sun, has_normals)
+        return RadianceField(density, shape, config.features, config.harmonics, of_sun, has_normals)
 
     @property
     def split(self) -> int:

@@ -38,7 +38,7 @@ class Level:
 class HashGrid:
     """Numbers at the vertices of cubic grids over [0, 1]^3; between them they are trilinear."""
 
-    config: GridConfig
+    config: GridConfig  #: levels and sizes
 
     @cached_property
     def levels(self) -> tuple[Level, ...]:

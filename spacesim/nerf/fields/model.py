@@ -12,7 +12,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.nerf.config import NerfConfig, ProposalConfig
-from spacesim.nerf.fields.field import DensityField, DensityTape, Field, Parameters
+from spacesim.nerf.fields.field import DensityField, DensityTape, Parameters, RadianceField
 from spacesim.nerf.sampling.occupancy import Occupancy
 from spacesim.nerf.sampling.rays import Rays
 from spacesim.nerf.sampling.render import Weights, volume_weights
@@ -33,7 +33,7 @@ class Round:
 class Networks:
     """The fields of a configuration; their parameters lie in one list, those of the proposals first."""
 
-    config: NerfConfig
+    config: NerfConfig  #: how they are trained, which says how large they are
 
     @cached_property
     def proposals(self) -> tuple[DensityField, ...]:
@@ -46,9 +46,9 @@ class Networks:
         return self.config.coarse, self.config.fine
 
     @cached_property
-    def field(self) -> Field:
+    def field(self) -> RadianceField:
         """That which is drawn."""
-        return Field.of(self.config)
+        return RadianceField.of(self.config)
 
     @property
     def occupancy(self) -> Occupancy:

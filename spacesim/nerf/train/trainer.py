@@ -39,9 +39,9 @@ class CheckpointHeader:
     """What a checkpoint says beside its arrays."""
 
     iteration: int  #: finished ones
-    history: tuple[HistoryEntry, ...]
+    history: tuple[HistoryEntry, ...]  #: of some iterations, in order
     proposal_steps: int  #: in which proposals have learned
-    format: str = FORMAT
+    format: str = FORMAT  #: by which such files are known
 
     def __post_init__(self) -> None:
         check_ranges(self, iteration=(0, 2**53), proposal_steps=(0, 2**53))

@@ -49,16 +49,16 @@ class KernelCamera:
     precision would miss by more than a pixel.
     """
 
-    width: int
-    height: int
-    right: mt.Vector3f
-    down: mt.Vector3f
-    forward: mt.Vector3f
+    width: int  #: pixels
+    height: int  #: pixels
+    right: mt.Vector3f  #: unit, along the picture's rows
+    down: mt.Vector3f  #: unit, along its columns
+    forward: mt.Vector3f  #: unit, along the optical axis
     start: mt.Vector3f  #: where the axis meets that plane
     near: Float
     metre: Float  #: of the unit of length
-    focal: list[Float]
-    centre: list[Float]
+    focal: list[Float]  #: fx and fy, pixels
+    centre: list[Float]  #: cx and cy, pixels
 
     @classmethod
     def of(cls, camera: Camera, units: Units) -> "KernelCamera":

@@ -58,8 +58,8 @@ _TRAIN, _TEST, _HELD_OUT, _KNOWN = range(4)  # streams of random numbers
 class PlannedView:
     """One frame to render. What a rig does not know, the scene says."""
 
-    camera: Camera
-    sun: Sun
+    camera: Camera  #: pose and intrinsics
+    sun: Sun  #: that lights it
     time: float | None = None  #: seconds
     epoch: str | None = None  #: the same as the calendar says it
     exposure: float | None = None  #: display value of a radiance of 1 W m^-2 sr^-1
@@ -115,7 +115,7 @@ class RigConfig(Rig):
     `test_suns` directions that training never sees or, where that is 0, the training Suns.
     """
 
-    suns: int = 1
+    suns: int = 1  #: of training, where `sun` names none
     views: int = 100
     test_suns: int = 0
     test_views: int = 20
@@ -238,7 +238,7 @@ class RandomRig(RigConfig):
     #: least and greatest angle between Sun and camera as the target sees them; none: any. At 180 the Sun stands behind
     #: the target, and nothing that is seen is lit. With either, random Suns keep clear of the Earth's disc, too
     min_phase_deg: float | None = None
-    max_phase_deg: float | None = None
+    max_phase_deg: float | None = None  #: as `min_phase_deg`
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -39,8 +39,8 @@ class FrameSpec:
 
     index: int  #: among all frames of the dataset, it makes the noise
     name: str  #: e.g. "train_00012"
-    camera: Camera
-    sun: Sun
+    camera: Camera  #: pose and intrinsics
+    sun: Sun  #: that lights it
     spp: int  #: samples a pixel
     exposure: float | None = None  #: None: the camera's
     earth: EarthConfig | None = None  #: None: where the scene says, if it has one at all
@@ -52,13 +52,13 @@ class FrameSpec:
 class Job:
     """What every process that takes part has to know."""
 
-    scene: Scene
-    camera: CameraConfig
-    quality: QualityConfig
-    seed: int
+    scene: Scene  #: what is rendered
+    camera: CameraConfig  #: size, lens, sensor and exposure of all frames
+    quality: QualityConfig  #: samples and lengths of light paths
+    seed: int  #: of the noise and of what is drawn behind
     root: Path  #: the dataset's folder
     threads: int  #: that encode, a process
-    background: BackgroundConfig | None = None
+    background: BackgroundConfig | None = None  #: behind the objects, None: nothing
     shared: bool = False  #: other jobs make frames in the same folder now
     depth_unit: float = MILLIMETRE  #: metres a step of the pictures of depth
 

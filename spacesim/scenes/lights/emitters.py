@@ -34,8 +34,8 @@ def kernel_input(value: float | Array) -> Any:
 class Limb:
     """The Earth's outline, as seen from the scene: what lies behind it is hidden. An input of kernels."""
 
-    centre: mt.Vector3f
-    cosine: Float
+    centre: mt.Vector3f  #: unit, towards the Earth's centre
+    cosine: Float  #: of the angle between the centre and the outline
 
     @classmethod
     def of(cls, earth: EarthConfig) -> "Limb":

@@ -43,7 +43,7 @@ class Material:
     pixels are `images[KEY]`: uint8 [H, W], [H, W, 3] or [H, W, 4], sRGB-encoded colours or, where "raw", data.
     """
 
-    name: str
+    name: str  #: of the preset, or as a file has it
     albedo: Color  #: mean linear camera RGB reflectance, diffuse or (metals) specular
     bsdf: JsonMapping  #: Mitsuba's description
     source: str  #: where the numbers are from
@@ -152,16 +152,16 @@ Kind = Literal["diffuse", "coated", "metal"]
 class MaterialPreset:
     """A row of the table; its columns are explained there."""
 
-    kind: Kind
-    source: str
-    albedo: Color
-    absorptance: float | None = None
-    roughness: float | None = None
-    ior: float | None = None
-    normals: str | None = None
-    pattern: str | None = None
-    tile: float | None = None
-    spectrum: tuple[tuple[float, float], ...] = ()
+    kind: Kind  #: how it reflects
+    source: str  #: where the numbers are from
+    albedo: Color  #: linear camera RGB reflectance; of coated surfaces the base's as seen through the coat
+    absorptance: float | None = None  #: solar, 300 to 2500 nm, that the spectrum is scaled to
+    roughness: float | None = None  #: GGX alpha
+    ior: float | None = None  #: refractive index of the coat
+    normals: str | None = None  #: name of a picture of normals, as "crinkle"
+    pattern: str | None = None  #: name of a pattern of its colour, as "cells"
+    tile: float | None = None  #: metres that one repeat of the pictures covers
+    spectrum: tuple[tuple[float, float], ...] = ()  #: (wavelength in nm, reflectance), which the albedo follows from
 
     def material(self, name: str) -> Material:
         """The row as a Material of that name."""

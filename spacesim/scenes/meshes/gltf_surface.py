@@ -18,8 +18,8 @@ _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 class UvSet:
     """Which texture coordinates a material takes, and how: uv' = matrix [2, 3] (u, v, 1)."""
 
-    index: int
-    matrix: np.ndarray
+    index: int  #: number of the set: TEXCOORD_0, TEXCOORD_1, ...
+    matrix: np.ndarray  #: [2, 3], as above
 
     def apply(self, uv: np.ndarray) -> np.ndarray:
         """[V, 2] transformed coordinates, v down; integers count as normalised."""

@@ -19,7 +19,7 @@ MAX_SOLID_ANGLES = 20_000_000  #: solid angles worth computing to tell cavities 
 class RawPart:
     """A part of a mesh file, as it stands there."""
 
-    name: str
+    name: str  #: as the file has it
     vertices: np.ndarray  #: [V, 3]
     faces: np.ndarray  #: [F, 3] int
     uv: np.ndarray | None = None  #: [V, 2], v down from the picture's top row, or None

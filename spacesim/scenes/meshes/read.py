@@ -43,13 +43,13 @@ _TURNS = {
 class MeshReport:
     """What came out of a mesh file, and what did not."""
 
-    file: str
-    parts: int
-    faces: int
+    file: str  #: its name, without the folder
+    parts: int  #: how many there are
+    faces: int  #: triangles of all parts
     watertight: bool  #: all parts together close all edges
     bounds: np.ndarray  #: [2, 3] least and greatest corner, metres, z up
-    materials: tuple[str, ...]
-    textures: int
+    materials: tuple[str, ...]  #: their names, each once
+    textures: int  #: how many pictures they have
     dropped: tuple[str, ...]  #: sentences: in the file, not used
     changed: tuple[str, ...]  #: sentences: used, not as in the file
 

@@ -164,10 +164,10 @@ def _rgb_picture(image: Any, what: str, notes: Notes) -> np.ndarray:
 class Surface:
     """A material as its file gives it, already free of what cannot be had."""
 
-    name: str
+    name: str  #: as the file has it
     base_color: Color = (1.0, 1.0, 1.0)  #: linear RGB
-    metallic: float = 0.0
-    roughness: float = 1.0
+    metallic: float = 0.0  #: share of metal, 0 to 1
+    roughness: float = 1.0  #: 0 to 1, as glTF has it: GGX alpha is its square
     #: "base_color" [H, W, 3] sRGB-encoded, "metallic" and "roughness" [H, W], "normal" [H, W, 3], all uint8; the
     #: numbers multiply the pictures
     pictures: Mapping[str, np.ndarray] = field(default_factory=dict)

@@ -12,11 +12,11 @@ from spacesim.scenes.materials.table import Material
 class Part:
     """A named solid."""
 
-    name: str
+    name: str  #: unlike those of the other parts
     #: body frame, metres, faces outward, watertight in all that is built in; it may carry texture coordinates
     #: `mesh.visual.uv` [V, 2]
     mesh: trimesh.Trimesh
-    material: Material
+    material: Material  #: of its whole surface
     #: [3 F, 2] metres, the corners of its faces laid out in the plane where materials with a `tile` repeat; None: each
     #: face as seen along the axis that it is nearest to
     flat: Array | None = None
@@ -29,5 +29,5 @@ class Part:
 class Spacecraft:
     """Parts that together make one rigid object."""
 
-    name: str
-    parts: tuple[Part, ...]
+    name: str  #: of the model
+    parts: tuple[Part, ...]  #: all that can be seen of it

@@ -36,10 +36,10 @@ _BODY = re.compile(r"(SC_BODY|SC_BUS|INSTRUMENT|CAMERA|ACTUATOR|SENSOR)")  # fra
 class Message:
     """An OEM or an AEM."""
 
-    path: Path
+    path: Path  #: the file
     kind: str  #: "OEM" or "AEM"
     frame: str  #: REF_FRAME, or the frame of an AEM that is not the spacecraft's
-    time_system: str
+    time_system: str  #: TIME_SYSTEM: "UTC", "TDB", ...
     center: str  #: CENTER_NAME, "" of an AEM
     day: int  #: from whose midnight times count, a proleptic ordinal
     times: Array  #: [N] seconds

@@ -57,7 +57,7 @@ class Attitude:
     Raises InputError for times that do not grow and for quaternions whose length is not 1.
     """
 
-    name: str
+    name: str  #: whose it is, for messages
     times: Array  #: [N] seconds
     quaternions: Array  #: [N, 4] (w, x, y, z), to the world's axes
 

@@ -3,7 +3,7 @@
 from spacesim.splat.compose.path import CameraView, Keyframe, Orbit, PosedScene, SceneFrame
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.compose.run import ComposedRun
-from spacesim.splat.compose.scene import ComposeConfig, ComposedPrediction, Composition, DrawnView, PlacedRun
+from spacesim.splat.compose.scene import ComposeConfig, ComposedPrediction, DrawnView, GaussianComposition, PlacedRun
 from spacesim.splat.compose.scenefile import load_scene, save_scene
 
 __all__ = [
@@ -11,8 +11,8 @@ __all__ = [
     "ComposeConfig",
     "ComposedPrediction",
     "ComposedRun",
-    "Composition",
     "DrawnView",
+    "GaussianComposition",
     "Keyframe",
     "Orbit",
     "PlacedRun",

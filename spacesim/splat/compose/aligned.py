@@ -18,7 +18,7 @@ from spacesim.splat.run import Prediction, Run
 class AlignedRun:
     """A run whose model is turned, moved and scaled; see `Predictor`."""
 
-    run: Run
+    run: Run  #: in the axes and the scale of its training
     pose: Pose  #: of the model in the world
 
     @property
@@ -71,6 +71,11 @@ class AlignedRun:
     def parts(self) -> tuple[()]:
         """None: it was trained as one."""
         return ()
+
+    @property
+    def gaussian_run(self) -> Run:
+        """In axes and a scale of its own."""
+        return self.run
 
     def with_embedding(self, embedding: np.ndarray) -> "AlignedRun":
         """See `Run.with_embedding`."""

@@ -36,7 +36,7 @@ MODEL_DISTANCE = 5.0  #: farthest training camera of such a run, in its radii: c
 class Member:
     """A run as it takes part in scenes; its frame is the model's."""
 
-    run: Run
+    run: Run  #: the trained model
     rows: list[Float]  #: 11 Floats [N], `Gaussians.shape_rows`
     centre: Array  #: [3] metres
     radius: float  #: metres, of a sphere about the centre that holds every Gaussian to three standard deviations
@@ -106,7 +106,7 @@ class Ensemble:
 
     #: in an order that does not depend on how they were named, so that composing [A, B] and [B, A] is one and the same
     members: Sequence[Member]
-    starts: Sequence[int] = field(init=False)
+    starts: Sequence[int] = field(init=False)  #: of each member, the index of its first Gaussian
 
     def __post_init__(self) -> None:
         counts = [member.count for member in self.members]

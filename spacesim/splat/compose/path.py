@@ -12,7 +12,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, direction_from_angles, look_at, normalize
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose.pose import Pose, interpolate_pose, interpolate_rotation, slerp
-from spacesim.splat.compose.scene import Composition
+from spacesim.splat.compose.scene import GaussianComposition
 
 FPS = 24.0  #: pictures a second where nothing is said
 ORBIT_FRAMES = 120  #: of an orbit where nothing is said: five seconds
@@ -57,9 +57,9 @@ class CameraView:
 class Keyframe:
     """What is where at a time, seconds; what it does not name goes on as the keyframes around say."""
 
-    time: float
-    sun: Sun | None = None
-    view: CameraView | None = None
+    time: float  #: seconds
+    sun: Sun | None = None  #: None: not named here
+    view: CameraView | None = None  #: where the camera stands; None: not named here
     poses: Mapping[str, Pose] = field(default_factory=dict)  #: by the names of models
 
 
@@ -91,16 +91,16 @@ class SceneFrame:
     """One picture of a scene."""
 
     time: float  #: seconds
-    composition: Composition  #: with the poses of that time
-    camera: Camera
-    sun: Sun | None
+    composition: GaussianComposition  #: with the poses of that time
+    camera: Camera  #: pose and intrinsics at that time
+    sun: Sun | None  #: at that time; None where nobody has said
 
 
 @dataclass(frozen=True, eq=False)
 class PosedScene:
     """All that a scene file says (docs/reference/composed-scenes.md)."""
 
-    composition: Composition  #: runs with their poses
+    composition: GaussianComposition  #: runs with their poses
     sun: Sun | None = None  #: None where it names none
     camera: Camera | None = None  #: None where it names none
     keyframes: Sequence[Keyframe] = ()  #: of camera, Sun and models, by time
@@ -133,7 +133,7 @@ class PosedScene:
         """The Sun at a time, seconds; None where nobody has said."""
         return self._track(lambda key: key.sun, interpolate_sun, time) or self.sun
 
-    def posed_at(self, time: float) -> Composition:
+    def posed_at(self, time: float) -> GaussianComposition:
         """The models where they are at a time, seconds."""
         poses = [
             self._track(lambda key, name=model.name: key.poses.get(name), interpolate_pose, time) or model.pose  # type: ignore[misc]
@@ -173,9 +173,9 @@ class PosedScene:
 class Track(Generic[T]):
     """Values at rising times, seconds; before the first and after the last the value stays."""
 
-    times: Sequence[float]
-    values: Sequence[T]
-    blend: Callable[[T, T, float], T]
+    times: Sequence[float]  #: seconds, rising
+    values: Sequence[T]  #: one for each time
+    blend: Callable[[T, T, float], T]  #: (value before, value after, share of the way from 0 to 1) -> the value between
 
     def at(self, time: float) -> T:
         """The value at a time; at a keyframe's own exactly what it says."""

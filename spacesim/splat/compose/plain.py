@@ -4,13 +4,13 @@ import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.records import Sun
-from spacesim.splat.compose.scene import Composition
+from spacesim.splat.compose.scene import GaussianComposition
 from spacesim.splat.export.bake import bake
 from spacesim.splat.harmonics import rotate_harmonics
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 
 
-def bake_scene(composition: Composition, sun: Sun | None) -> Gaussians:
+def bake_scene(composition: GaussianComposition, sun: Sun | None) -> Gaussians:
     """All models in the world, in the order of `composition.placed`: colours of relightable runs as `bake` has them,
     harmonics turned with their models, shadows of models on each other included. sRGB values.
 

@@ -1,5 +1,5 @@
 """A composed scene in the place of a run (tables 4.6 and 4.7): of Gaussians, or of whatever has the words of their
-`Composition` (radiance fields, both)."""
+`GaussianComposition` (radiance fields, both)."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from spacesim.backend.arrays import Bool
+from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
-from spacesim.splat.compose.scene import ComposedPrediction, Composition
+from spacesim.splat.compose.scene import ComposedPrediction, GaussianComposition
 from spacesim.splat.raster.gaussians import Gaussians
 
 
@@ -36,7 +37,7 @@ class PlacedPart:
     def gaussians(self) -> Gaussians | None:
         """Its Gaussians where they stand, colours left out; None of a radiance field."""
         placed = self.composition.models[self.index]
-        return Composition([placed]).in_world() if placed.run.gaussians is not None else None
+        return GaussianComposition([placed]).in_world() if placed.run.gaussians is not None else None
 
     @property
     def antialiased(self) -> bool:
@@ -63,7 +64,7 @@ class PlacedPart:
 class ComposedRun:
     """Models that were trained apart, evaluated as one."""
 
-    composition: Any  #: a `Composition`, or what has its words
+    composition: Any  #: a `GaussianComposition`, or what has its words
     path: Path  #: the scene file's
     training: JsonDict = field(default_factory=dict)  #: nothing, as no training has seen the scene
 
@@ -96,12 +97,12 @@ class ComposedRun:
     @property
     def gaussians(self) -> Gaussians | None:
         """All models' Gaussians where they stand, colours left out; None where some are none."""
-        return self.composition.in_world() if isinstance(self.composition, Composition) else None
+        return self.composition.in_world() if isinstance(self.composition, GaussianComposition) else None
 
     @property
     def antialiased(self) -> Bool | bool:
         """Whether they are drawn with the anti-aliasing filter: one for all, or of each."""
-        return self.composition.antialiased if isinstance(self.composition, Composition) else False
+        return self.composition.antialiased if isinstance(self.composition, GaussianComposition) else False
 
     @property
     def sphere(self) -> tuple[np.ndarray, float]:
@@ -136,9 +137,17 @@ class ComposedRun:
             },
         }
 
+    @property
+    def gaussian_run(self) -> None:
+        """None: it has several."""
+
+    def with_embedding(self, embedding: np.ndarray) -> "ComposedRun":
+        """Raises InputError: each of its models has its own."""
+        raise InputError(f"embedding: expected a run, found {self.path}, a scene")
+
     def predict(
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> ComposedPrediction:
-        """See `Composition.predict`."""
+        """See `GaussianComposition.predict`."""
         prediction: ComposedPrediction = self.composition.predict(camera, sun, normals, exposure)
         return prediction

@@ -51,8 +51,8 @@ log = logging.getLogger(__name__)
 class PlacedRun:
     """A run and where it stands."""
 
-    run: Run
-    pose: Pose = field(default_factory=Pose)
+    run: Run  #: the trained model
+    pose: Pose = field(default_factory=Pose)  #: of the model in the world
     name: str = ""  #: for messages and files
 
 
@@ -78,9 +78,9 @@ class DrawnView:
     #: alpha, depth, ... and `features`, of which `planes` says what they are: "rgb" (3, premultiplied, linear where
     #: there is a `curve`), "visibility" (1, premultiplied), "id" (one a model, in the order of `order`)
     output: RenderOutput
-    planes: dict[str, list[Float]]
-    order: list[int]
-    curve: tuple[str, float] | None
+    planes: dict[str, list[Float]]  #: the features by what they are, as above
+    order: list[int]  #: which model each plane of "id" is of
+    curve: tuple[str, float] | None  #: tone curve and exposure (EV) of linear colours; None where they are sRGB values
 
     def image(self, name: str, stops: float = 0.0) -> np.ndarray:
         """One of `OUTPUTS` that was asked for: rgb [H, W, 3] sRGB values over black, normal [H, W, 3], others [H, W];
@@ -117,7 +117,8 @@ class Beside(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class LitGaussians:
-    """All Gaussians of a scene in the world, in the order of `Composition.placed`, as a camera sees them lit."""
+    """All Gaussians of a scene in the world, in the order of `GaussianComposition.placed`, as a camera sees them
+    lit."""
 
     gaussians: Gaussians  #: colours left out
     colors: list[Float]  #: three [N], sRGB display values
@@ -125,7 +126,7 @@ class LitGaussians:
     shares: list[Float]  #: [N] of each model: 1 for its Gaussians, else 0
 
 
-class Composition:
+class GaussianComposition:
     """Posed models under one Sun. What does not change with poses, Sun and camera is kept, also by what `moved` makes.
 
     models: at least one;  config: how they shade each other
@@ -213,28 +214,28 @@ class Composition:
 
     # ---- scenes ----
 
-    def moved(self, index: int, pose: Pose) -> "Composition":
+    def moved(self, index: int, pose: Pose) -> "GaussianComposition":
         """The scene with model `index` at another pose. Cheap: all that was loaded and computed of models is shared."""
         models = list(self.models)
         models[index] = replace(models[index], pose=pose)
         return self.posed([model.pose for model in models])
 
-    def posed(self, poses: Sequence[Pose]) -> "Composition":
+    def posed(self, poses: Sequence[Pose]) -> "GaussianComposition":
         """The scene with these poses, one of each model."""
-        other: Composition = object.__new__(Composition)
+        other: GaussianComposition = object.__new__(GaussianComposition)
         other.models = tuple(replace(m, pose=pose) for m, pose in zip(self.models, poses, strict=True))
         other.config, other.path = self.config, self.path
         other._members, other._ensemble, other._cache = self._members, self._ensemble, self._cache
         other._beside = self._beside
         return other
 
-    def shaded(self, config: ComposeConfig) -> "Composition":
+    def shaded(self, config: ComposeConfig) -> "GaussianComposition":
         """The scene with other shadows between its models."""
         other = self.posed([model.pose for model in self.models])
         other.config, other._cache = config, _Cache()
         return other
 
-    def shaded_by(self, beside: Beside) -> "Composition":
+    def shaded_by(self, beside: Beside) -> "GaussianComposition":
         """The scene in the shadow of something else, too."""
         other = self.posed([model.pose for model in self.models])
         other._beside = beside

@@ -18,7 +18,7 @@ from spacesim.data.structure import Rules, did_you_mean, structure
 from spacesim.data.transforms import read_camera, read_dataset
 from spacesim.splat.compose.path import FPS, MAX_FRAMES, ORBIT_FRAMES, CameraView, Keyframe, Orbit, PosedScene
 from spacesim.splat.compose.pose import Pose, rotation_about
-from spacesim.splat.compose.scene import ComposeConfig, Composition, PlacedRun
+from spacesim.splat.compose.scene import ComposeConfig, GaussianComposition, PlacedRun
 from spacesim.splat.run import load_run
 
 FOV_DEG = 35.0  #: of a camera where nothing is said
@@ -35,11 +35,11 @@ Matrix = tuple[Quaternion, Quaternion, Quaternion, Quaternion]
 class PoseEntry:
     """What a table says of a pose; None where it says nothing."""
 
-    position: Vector | None = None
-    rotation_wxyz: Quaternion | None = None
-    axis: Vector | None = None
-    angle_deg: float | None = None
-    scale: float | None = None
+    position: Vector | None = None  #: of the model's origin, metres
+    rotation_wxyz: Quaternion | None = None  #: quaternion, of any length
+    axis: Vector | None = None  #: of a turn by `angle_deg`, of any length
+    angle_deg: float | None = None  #: degrees about `axis`
+    scale: float | None = None  #: factor on the model's size
 
     def __post_init__(self) -> None:
         if (self.axis is None) != (self.angle_deg is None):
@@ -63,16 +63,16 @@ class ModelEntry(PoseEntry):
     """A table of [[models]]."""
 
     run: str = ""  #: the run's folder, relative to the file
-    name: str = ""
+    name: str = ""  #: unlike the others'; "": the folder's
 
 
 @dataclass(frozen=True)
 class SunEntry:
     """A direction towards the Sun: two angles, degrees, or a vector of any length."""
 
-    azimuth_deg: float | None = None
-    elevation_deg: float | None = None
-    direction: Vector | None = None
+    azimuth_deg: float | None = None  #: degrees about +z, from +x
+    elevation_deg: float | None = None  #: degrees over the xy plane
+    direction: Vector | None = None  #: [3] towards the Sun, of any length, in place of the angles
 
     def __post_init__(self) -> None:
         angles = {"azimuth_deg": self.azimuth_deg, "elevation_deg": self.elevation_deg}
@@ -97,12 +97,12 @@ class SunEntry:
 class ViewEntry:
     """Where a camera stands."""
 
-    position: Vector | None = None
-    look_at: Vector | None = None
-    up: Vector = (0.0, 0.0, 1.0)
-    transform_matrix: Matrix | None = None
-    fov_deg: float | None = None
-    focal: tuple[float, float] | None = None
+    position: Vector | None = None  #: metres
+    look_at: Vector | None = None  #: metres: the point in the picture's middle
+    up: Vector = (0.0, 0.0, 1.0)  #: a direction that the picture has upwards, beside `look_at`
+    transform_matrix: Matrix | None = None  #: camera to world, OpenGL axes, metres
+    fov_deg: float | None = None  #: degrees across the width
+    focal: tuple[float, float] | None = None  #: (fx, fy) pixels, in place of `fov_deg`
 
     def __post_init__(self) -> None:
         if (self.position is None) != (self.look_at is None):
@@ -150,12 +150,12 @@ class ViewEntry:
 class CameraEntry(ViewEntry):
     """[camera]: a view and an image; or a camera's file; or a frame of a dataset; or an orbit."""
 
-    resolution: tuple[int, int] | None = None
-    principal: tuple[float, float] | None = None
-    file: str | None = None
-    data: str | None = None
-    frame: int = 0
-    orbit: Orbit | None = None
+    resolution: tuple[int, int] | None = None  #: (width, height) pixels
+    principal: tuple[float, float] | None = None  #: (cx, cy) pixels; None: the middle
+    file: str | None = None  #: a camera's file, relative to this one
+    data: str | None = None  #: folder of a dataset, relative to the file
+    frame: int = 0  #: number of a frame of `data`, training frames first
+    orbit: Orbit | None = None  #: on which the camera flies
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -184,8 +184,8 @@ class KeyframeEntry:
     """A table of [[keyframes]]."""
 
     time: float  #: seconds
-    sun: SunEntry | None = None
-    camera: ViewEntry | None = None
+    sun: SunEntry | None = None  #: None: not named here
+    camera: ViewEntry | None = None  #: None: not named here
     models: Mapping[str, PoseEntry] = field(default_factory=dict)  #: poses by the models' names
 
 
@@ -193,13 +193,13 @@ class KeyframeEntry:
 class SceneEntry:
     """The whole file."""
 
-    models: tuple[ModelEntry, ...]
-    sun: SunEntry | None = None
-    camera: CameraEntry | None = None
-    shadows: str = ComposeConfig.shadows
-    frames: int | None = None
-    fps: float = FPS
-    keyframes: tuple[KeyframeEntry, ...] = ()
+    models: tuple[ModelEntry, ...]  #: in the order that object numbers count
+    sun: SunEntry | None = None  #: None: keyframes or whoever draws it say
+    camera: CameraEntry | None = None  #: None: whoever draws it says
+    shadows: str = ComposeConfig.shadows  #: of models on each other, see `ComposeConfig`
+    frames: int | None = None  #: pictures; None: up to the last keyframe, 120 of an orbit, else 1
+    fps: float = FPS  #: pictures a second
+    keyframes: tuple[KeyframeEntry, ...] = ()  #: of camera, Sun and models
 
     def __post_init__(self) -> None:
         if not self.models:
@@ -216,12 +216,12 @@ T = TypeVar("T")
 
 
 def load_scene(
-    path: str | Path, load: Callable[[Path], Any] | None = None, compose: Callable[..., Any] = Composition
+    path: str | Path, load: Callable[[Path], Any] | None = None, compose: Callable[..., Any] = GaussianComposition
 ) -> PosedScene:
     """The scene that a TOML file describes, its runs loaded, each once. Raises InputError with file, line and key.
 
-    load: a folder to a run, None: one of Gaussians;  compose: makes a `Composition`, or what has its words for runs of
-    other methods
+    load: a folder to a run, None: one of Gaussians;  compose: makes a `GaussianComposition`, or what has its
+    words for runs of other methods
     """
     path = Path(path)
     document = toml.read_document(path)

@@ -57,15 +57,15 @@ class Grid:
 class DepthView:
     """A depth picture and its camera."""
 
-    camera: Camera
+    camera: Camera  #: from where it is seen
     depth: np.ndarray  #: [H, W] float32, z along the optical axis of `camera`, metres; 0 where there is no surface
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class DistanceField:
     """A truncated signed distance on a grid."""
 
-    grid: Grid
+    grid: Grid  #: where the voxels are
     distance: np.ndarray  #: [Z, Y, X] float32 in [-1, 1], mean signed distance by the truncation, above 0 outside
     #: [Z, Y, X] bool, whether a view sees the voxel, or the surface less than the truncation before it
     observed: np.ndarray
@@ -76,7 +76,7 @@ def fuse(
     grid: Grid,
     truncation: float = TRUNCATION,
     progress: Callable[[int], None] | None = None,
-) -> Field:
+) -> DistanceField:
     """The field of some views. truncation: voxels;  progress: called with the views done.
 
     Raises InputError where the grid does not fit into memory.
@@ -101,7 +101,7 @@ def fuse(
     total, weight = (np.array(values).reshape(grid.shape[::-1]) for values in sums)
     observed = weight > 0
     distance = np.divide(total, weight, out=np.ones_like(total), where=observed)
-    return Field(grid, distance, observed)
+    return DistanceField(grid, distance, observed)
 
 
 def check_memory(grid: Grid) -> None:

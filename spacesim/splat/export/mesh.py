@@ -16,7 +16,7 @@ from spacesim.backend.arrays import Bool
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, fibonacci_sphere, look_at
 from spacesim.data.records import Camera
-from spacesim.splat.export.fusion import TRUNCATION, DepthView, Field, Grid, check_memory, fuse
+from spacesim.splat.export.fusion import TRUNCATION, DepthView, DistanceField, Grid, check_memory, fuse
 from spacesim.splat.export.sweep import resize_camera
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
@@ -176,7 +176,7 @@ def bounds(views: Sequence[DepthView]) -> tuple[Array, Array] | None:
     return np.maximum(points.min(axis=0), low - reach), np.minimum(points.max(axis=0), high + reach)
 
 
-def surface(field: Field) -> tuple[Array, np.ndarray]:
+def surface(field: DistanceField) -> tuple[Array, np.ndarray]:
     """Vertices [V, 3] metres and faces [F, 3] where the distance is 0 between voxels that are all observed."""
     grid = field.grid
     nx, ny, nz = grid.shape

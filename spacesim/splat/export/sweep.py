@@ -49,8 +49,8 @@ _STRIP = 28  #: pixels of the video's caption
 class SweepFiles:
     """What a sweep has left on the disk."""
 
-    sheet: Path
-    video: Path | None
+    sheet: Path  #: the contact sheet
+    video: Path | None  #: None where none could be made
     note: str | None  #: why there is no video, or None
 
 

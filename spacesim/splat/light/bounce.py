@@ -29,8 +29,8 @@ class Scatterers:
     #: Float, packed [F * N], in which normals stand from row `normals` and the logits of albedos (RGB) from row
     #: `albedos`
     features: Float
-    normals: int
-    albedos: int
+    normals: int  #: first row of the normals in `features`
+    albedos: int  #: first row of the albedos' logits in `features`
     means: Array3f  #: Array3f [3, N], metres
     log_scales: Array3f  #: Array3f [3, N]
     logit_opacities: Float  #: [N]

@@ -7,7 +7,7 @@ from spacesim.data.images.tone import Tone
 from spacesim.data.structure import check_choices
 from spacesim.splat.light.field import FieldConfig
 from spacesim.splat.light.shadow.cast import ShadowConfig
-from spacesim.splat.light.shadow.refine import RefineConfig
+from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 
 MAX_EMITTERS = 2**14  #: of one bounce
 MAX_EXPOSURE = 40  #: of an exposure, as large as a scene's camera can have
@@ -49,7 +49,7 @@ class LightConfig:
         return (self.tone or "srgb", self.exposure or 0.0) if self.linear else None
 
     @property
-    def refine(self) -> RefineConfig | None:
+    def refine(self) -> ShadowRefinementConfig | None:
         """The refinement of shadows, if there is one."""
         return self.shadow.refine if self.shadow else None
 

@@ -111,7 +111,7 @@ class FieldInputs:
     features: Float  #: Float, packed [F * N], `FieldConfig.stored` of them the field's
     means: Array3f  #: Array3f [3, N], metres
     rotations_and_scales: tuple[Array4f, Array3f]  #: (quaternions, log scales) of the Gaussians
-    camera: Projection
+    camera: Projection  #: from where the Gaussians are seen
     sun: Array3f  #: Array3f of width 1, unit, towards the Sun
 
 

@@ -26,7 +26,12 @@ from spacesim.splat.light.field import (
 )
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shadow.light_camera import towards_sun
-from spacesim.splat.light.shadow.refine import RefineConfig, refine_inputs, refine_occlusion, refine_occlusion_slope
+from spacesim.splat.light.shadow.refine import (
+    ShadowRefinementConfig,
+    refine_inputs,
+    refine_occlusion,
+    refine_occlusion_slope,
+)
 from spacesim.splat.raster.cameras import Projection
 
 
@@ -43,13 +48,13 @@ class SunEncoding:
 class ShadingInputs:
     """What shading depends on beside weights."""
 
-    features: Float
-    means: Array3f
+    features: Float  #: Float, packed [F * N]
+    means: Array3f  #: Array3f [3, N], metres
     rotations_and_scales: tuple[Array4f, Array3f]  #: quaternions and log scales
     logits: Float  #: of opacities
     camera: Projection | None  #: None where the Sun's light alone is wanted
     raw_shadows: list[Float]  #: occlusion, normal alignment, light extent and bias, [N] each, or nothing
-    sun: SunEncoding
+    sun: SunEncoding  #: what networks and shadows are told of it
     training_frame: Float  #: Float [4], centre and scale of the training frame
 
 
@@ -57,8 +62,8 @@ class ShadingInputs:
 class ShadingTape:
     """What the adjoint needs of the forward pass."""
 
-    field: list[TensorXf]
-    refine: list[TensorXf]
+    field: list[TensorXf]  #: of the appearance field, layer by layer
+    refine: list[TensorXf]  #: of the shadow refinement network, layer by layer, or nothing
     colors: list[Float]  #: 3 arrays [M] before they are dimmed
     occlusion: list[Float]  #: the refined one [M] in a list, or nothing
     faces: list[Float]  #: of `sun_facing`, or nothing
@@ -235,7 +240,9 @@ def adjoint(
     return batch.pack(parts, inputs.features), grad_weights, grad_raw_occlusion, by_encoding, grad_sun
 
 
-def _refine_items(config: LightConfig, refine: RefineConfig, inputs: ShadingInputs, batch: PaddedBatch) -> TensorXf:
+def _refine_items(
+    config: LightConfig, refine: ShadowRefinementConfig, inputs: ShadingInputs, batch: PaddedBatch
+) -> TensorXf:
     """Items of the refinement, TensorXf [B, C, m]: 4.11, lengths in training scale."""
     x, y, z, scale = (dr.gather(ad.Float, inputs.training_frame, ad.UInt32(i)) for i in range(4))
     per_metre = dr.rcp(scale)

@@ -26,7 +26,7 @@ GAINS = 0.5, 2.0  #: bounds on the picture's sRGB values over the model's: 2.3 s
 class Drawing:
     """A run under one Sun."""
 
-    run: Run
+    run: Run  #: the trained model
     sun: Array | None  #: [3], towards it
     sunlight: Sunlight | None  #: None of a run without light
 

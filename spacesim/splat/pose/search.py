@@ -64,8 +64,8 @@ class ModelViews:
     """A run under one Sun, seen from all around. Making it takes as long as drawing 300 small pictures."""
 
     centre: Array  #: [3] metres, of the model
-    cameras: tuple[Camera, ...]
-    cuts: tuple[_Cut, ...]
+    cameras: tuple[Camera, ...]  #: [D], from where it is seen
+    cuts: tuple[_Cut, ...]  #: [D], the model as each of these sees it
     patches: np.ndarray  #: [D, 2, PATCH * PATCH] each of length 1
     by_alpha: bool  #: whether masks are alpha, not what is bright
 

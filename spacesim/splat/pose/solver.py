@@ -24,11 +24,11 @@ PULL = 0.3  #: of the loss of a blurred picture: what half a squared `within` fr
 class State:
     """A pose on its way."""
 
-    camera: Camera
-    gain: float = 1.0
+    camera: Camera  #: with the pose found so far
+    gain: float = 1.0  #: factor on what is drawn
     loss: float = np.inf  #: on the level where it was solved last; see `RefinedPose`
-    iterations: int = 0
-    converged: bool = False
+    iterations: int = 0  #: steps that the last solving took
+    converged: bool = False  #: whether the last step was, at first, shorter than `CONVERGED`
 
 
 class Level:

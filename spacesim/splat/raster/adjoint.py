@@ -43,20 +43,20 @@ class PlaneGradients:
     """Gradients of a scalar with respect to what blending gave: planes [height * width] of the features, and of the
     transmittance."""
 
-    width: int
-    height: int
-    features: list[Float]
-    transmittance: Float
+    width: int  #: pixels
+    height: int  #: pixels
+    features: list[Float]  #: a plane for each channel
+    transmittance: Float  #: a plane
 
 
 @dataclass
 class SplatGradients:
     """Gradients of a scalar by the splats, [N] each (depths have none), and what densification asks for."""
 
-    splats: Splats
-    features: list[Float]
+    splats: Splats  #: by centre, inverse covariance and opacity
+    features: list[Float]  #: of what was blended, a Float [N] for each channel
     absolute_x: Float  #: sum over pixels of |d / d x|, per pixel of screen (Ye et al. 2024, AbsGS)
-    absolute_y: Float
+    absolute_y: Float  #: the same of y
 
 
 @recorded

@@ -73,8 +73,8 @@ class Projection(ABC):
     #: Float, first [18]: camera_from_world rows (12), pixels per unit in x and y, principal point (2, pixels of the
     #: whole image), first column and row of the crop (2)
     values: Float
-    width: int
-    height: int
+    width: int  #: pixels, of the crop where there is one
+    height: int  #: pixels, likewise
 
     @abstractmethod
     def in_reach(self, center: Array3f) -> Bool:

@@ -26,11 +26,11 @@ class Splats:
     """Screen-space ellipses, [N] each. exponent(dx, dy) = -(a dx^2 + 2 b dx dy + c dy^2) / 2."""
 
     x: Float  #: centre, pixels
-    y: Float
+    y: Float  #: centre, pixels
     a: Float  #: inverse of the 2D covariance, pixels^-2
-    b: Float
-    c: Float
-    opacity: Float
+    b: Float  #: likewise, off the diagonal
+    c: Float  #: likewise, of y
+    opacity: Float  #: in [0, 1]
     depth: Float  #: z of the centre along the camera's axis, metres; negative behind an orthographic camera's origin
 
 
@@ -39,7 +39,7 @@ class Footprints:
     """Which splats can be seen, where, and in which order. Not differentiable."""
 
     half_width: Float  #: [N] of the box around {alpha >= ALPHA_MIN}, pixels
-    half_height: Float
+    half_height: Float  #: of the same box, pixels
     visible: Bool  #: [N] bool
     order: UInt32  #: [N] UInt32 below 2^31, grows with depth; whatever its sign, and however far away the camera is
 

@@ -14,8 +14,8 @@ STEPS = 8  #: sizes of arrays from one power of two to the next, as a rule
 class TileShape:
     """A tile of width x height pixels is blended by `lanes` lanes; each holds `columns` columns of `rows` pixels."""
 
-    width: int
-    height: int
+    width: int  #: pixels
+    height: int  #: pixels
     lanes: int
     columns: int = 1
 
@@ -51,9 +51,9 @@ class TileLists:
     first_slot: UInt32
     slot_count: UInt32
     capacity: int
-    tiles_x: int
-    tiles_y: int
-    shape: TileShape
+    tiles_x: int  #: tiles in a row
+    tiles_y: int  #: rows of tiles
+    shape: TileShape  #: size of a tile, and how lanes share its pixels
     #: the tiles in the order in which they are given to lanes [T], or None for that of their indices
     order: UInt32 | None = None
     #: where each slot's pair stands in `splat` [P], or None: sums of pairs are then kept by slots (`sum_index`)
@@ -90,12 +90,12 @@ def round_capacity(count: int, steps: int = STEPS) -> int:
 class LanePixels:
     """Of each lane: its tile, its place in tile-major order, and its first pixel: centre (x, y), and indices."""
 
-    tile: UInt32
-    place: UInt32
-    x: Float
-    y: Float
-    column: UInt32
-    row: UInt32
+    tile: UInt32  #: number, row by row
+    place: UInt32  #: of the lane, where lanes are counted tile by tile
+    x: Float  #: of its first pixel's centre, pixels
+    y: Float  #: of its first pixel's centre, pixels
+    column: UInt32  #: of its first pixel, from 0
+    row: UInt32  #: of its first pixel, from 0
 
 
 def lane_pixels(lists: TileLists) -> LanePixels:

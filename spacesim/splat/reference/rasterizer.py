@@ -19,15 +19,14 @@ DILATION, PIXEL = 0.3, 1 / 12  #: pixels^2 added to covariances, and to those of
 
 @dataclass(frozen=True, eq=False)
 class ReferenceOutput:
-    """The planes of `RenderOutput`, float64: colour [H, W, 3] over black, alpha [H, W], depth [H, W] expected depth in
-    metres, median_depth [H, W], normal [H, W, 3] unit or 0, features [H, W, C]."""
+    """The planes of `RenderOutput`, float64."""
 
-    color: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray
-    median_depth: np.ndarray
-    normal: np.ndarray
-    features: np.ndarray
+    color: np.ndarray  #: [H, W, 3] over black
+    alpha: np.ndarray  #: [H, W]
+    depth: np.ndarray  #: [H, W] expected depth, metres
+    median_depth: np.ndarray  #: [H, W] metres
+    normal: np.ndarray  #: [H, W, 3] unit, or 0
+    features: np.ndarray  #: [H, W, C]
 
 
 def render_reference(

@@ -19,7 +19,7 @@ class HistoryEntry:
 
     iteration: int  #: how many were finished
     loss: float  #: of the last one
-    gaussians: int
+    gaussians: int  #: how many there were then
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class CheckpointHeader:
 
     iteration: int  #: finished ones
     adam_steps: int  #: finished ones
-    history: tuple[HistoryEntry, ...]
-    format: str = FORMAT
+    history: tuple[HistoryEntry, ...]  #: of some iterations, in order
+    format: str = FORMAT  #: by which such files are known
 
     def __post_init__(self) -> None:
         check_ranges(self, iteration=(0, 2**53), adam_steps=(0, 2**53))

@@ -11,10 +11,11 @@ from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.structure import Rules, alternatives, check_choices, did_you_mean, plain, structure
 from spacesim.data.toml import Document, read_document
 from spacesim.splat.light.config import LightConfig
+from spacesim.splat.light.shadow.cast import SplattingConfig
 from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.raster.supersample import MAX_SUPERSAMPLE
 from spacesim.splat.train.old_config import ALIASES, in_this_layout
-from spacesim.splat.train.strategies.control import RefinementConfig
+from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.strategies.default import DefaultStrategyConfig
 from spacesim.splat.train.strategies.mcmc import McmcConfig
 from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig
@@ -72,10 +73,10 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything that decides a trained model, apart from the data and the backend."""
+    """Everything that decides a trained model, apart from the data and the backend. `light` tells the method."""
 
     #: what makes colours: fixed ones, or light: without shadows, by shadow maps, by shadow splatting, or as table 4.3
-    method: Method = "vanilla"
+    method: Method = field(init=False, default="vanilla")
     preset: Preset | None = None  #: the preset that this started from
     init: Init | None = None  #: where Gaussians start; none takes the first of points, mesh, random that can be had
     iterations: int = 7_000  #: steps of training
@@ -112,10 +113,12 @@ class TrainConfig:
     )
     means_steps: int | None = None  #: in which the centres' step size falls; none: in the whole training
     rates: LearningRates = field(default_factory=LearningRates)  #: step sizes
-    refinement: RefinementConfig = field(default_factory=RefinementConfig)  #: schedule and rules of every strategy
+    #: schedule and rules of every strategy
+    refinement: DensificationConfig = field(default_factory=DensificationConfig)
     strategy: StrategyConfig = field(default_factory=DefaultStrategyConfig)  #: chooses what grows and what is pruned
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "method", _method_of(self.light))
         check_choices(self)
         if self.init_box is not None and not 0 < self.init_box <= MAX_BOX:
             raise InputError(f"init_box: expected a number above 0, at most {MAX_BOX:g}, found {self.init_box}")
@@ -140,18 +143,6 @@ class TrainConfig:
         if self.prior == "mesh" and not self.shape_terms:
             expected = "depth_weight or normal_weight above 0, which say how much of it counts"
             raise InputError(f"prior: expected {expected}, found neither")
-        self._check_light()
-
-    def _check_light(self) -> None:
-        """Raises InputError where light is not that of the method."""
-        shadow = self.light.shadow if self.light else None
-        found = "light without shadows" if self.light else "none"
-        if shadow is not None:
-            found = "shadow mapping" if isinstance(shadow.method, MappingConfig) else "shadow splatting"
-        by_method = {"vanilla": "none", "relight": "light without shadows", "shadow-map": "shadow mapping"}
-        expected = by_method.get(self.method, "shadow splatting")
-        if found != expected:
-            raise InputError(f"light: expected {expected}, which is the method {self.method}'s, found {found}")
 
     @property
     def shape_terms(self) -> tuple[str, ...]:
@@ -166,6 +157,8 @@ class TrainConfig:
     def to_json(self) -> JsonDict:
         """Plain values for config.json."""
         values: JsonDict = plain(self)
+        if self.light and self.light.shadow:
+            values["light"]["shadow"]["method"].pop("baseline", None)  # `method` tells it
         return values
 
     @staticmethod
@@ -174,7 +167,51 @@ class TrainConfig:
         besides, is passed over. name: of the file, for messages. Raises InputError for a key that is not known and for
         a value that cannot be."""
         settings = {key: value for key, value in values.items() if key != "data"}
-        return structure(TrainConfig, Document(name, in_this_layout(settings), {}), Rules())
+        return _read(Document(name, in_this_layout(settings), {}), Rules())
+
+
+def _method_of(light: LightConfig | None) -> Method:
+    """The method whose light this is."""
+    if light is None:
+        return "vanilla"
+    if light.shadow is None:
+        return "relight"
+    if isinstance(light.shadow.method, MappingConfig):
+        return "shadow-map"
+    return "baseline-park" if light.shadow.method.baseline else "shadow-splat"
+
+
+_LIGHTS: dict[Method, str] = {
+    "vanilla": "none",
+    "relight": "light without shadows",
+    "shadow-map": "shadow mapping",
+    "shadow-splat": "shadow splatting",
+    "baseline-park": "shadow splatting as table 4.3 has it",
+}
+"""The light of each method, in words."""
+
+
+@dataclass(frozen=True)
+class _Named:
+    """What files say beside the light, which tells it, too."""
+
+    method: Method = "vanilla"
+
+
+def _read(document: Document, rules: Rules) -> TrainConfig:
+    """The configuration that a document says. Raises InputError, also where its light is not that of its method."""
+    values = dict(document.values)
+    named = {"method": values.pop("method")} if "method" in values else {}
+    method = structure(_Named, replace(document, values=named), rules).method
+    config = structure(TrainConfig, replace(document, values=values), rules)
+    light = config.light
+    if method == "baseline-park" and light and light.shadow and isinstance(light.shadow.method, SplattingConfig):
+        shadow = replace(light.shadow, method=replace(light.shadow.method, baseline=True))
+        config = replace(config, light=replace(light, shadow=shadow))
+    if config.method != method:
+        expected = f"{_LIGHTS[method]}, which is the method {method}'s"
+        raise InputError(f"{document.label(('light',))}: expected {expected}, found {_LIGHTS[config.method]}")
+    return config
 
 
 def preset(name: str, method: str = "vanilla", strategy: str = "default") -> TrainConfig:
@@ -196,7 +233,7 @@ def preset(name: str, method: str = "vanilla", strategy: str = "default") -> Tra
     values = merged(values, sections["strategies"].get(strategy, {}))
     strategy_settings = {"kind": strategy, **values.get("strategy", {})}
     values |= {"preset": name, "method": method, "strategy": strategy_settings}
-    return structure(TrainConfig, Document(str(ASSETS / f"{name}.toml"), values, {}), Rules())
+    return _read(Document(str(ASSETS / f"{name}.toml"), values, {}), Rules())
 
 
 def warm_start(name: str) -> WarmStartConfig:
@@ -293,7 +330,7 @@ def with_settings(config: TrainConfig, settings: JsonMapping) -> TrainConfig:
                 raise InputError(f"{name}: expected {first} alone, which has no fields, found {name}")
             table = inner
         table[keys[-1]] = _put(table.get(keys[-1]), settings[name])
-    result = structure(TrainConfig, Document("", values, {}), Rules(none="none"))
+    result = _read(Document("", values, {}), Rules(none="none"))
     reads: tuple[str, ...] | None = getattr(result.strategy, "reads", None)
     for name in settings:
         first, _, key = name.partition(".")

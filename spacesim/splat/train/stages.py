@@ -81,10 +81,10 @@ class TargetImage:
 class LossSettings:
     """Weights of the terms."""
 
-    ssim: float
-    visibility: float
-    depth: float
-    normal: float
+    ssim: float  #: share of D-SSIM beside L1
+    visibility: float  #: of the error of the blended visibility
+    depth: float  #: of the error of the depth
+    normal: float  #: of one less the cosine between normals
     scale: float  #: metres, the unit of depth
     tone: str | None  #: curve of colours that are blended, with the background, in linear light, or None
     supersample: int = 1  #: places on a side of each pixel, see `pixel_means`

@@ -29,9 +29,9 @@ from spacesim.splat.train.views import TrainingView
 class BlendTape:
     """What blending a view leaves behind for its way back."""
 
-    splats: Splats
-    lists: TileLists
-    blended: BlendResult
+    splats: Splats  #: what was blended
+    lists: TileLists  #: which splats each tile has
+    blended: BlendResult  #: what `forward` leaves behind
 
 
 @dataclass
@@ -70,8 +70,8 @@ class ViewLoss:
 class ViewResult:
     """What a step has learned from one view: for the Gaussians, and for the networks."""
 
-    gradients: ViewGradients | None
-    loss: Float
+    gradients: ViewGradients | None  #: for the Gaussians; None once `take_gradients` has given them
+    loss: Float  #: Float of width 1
     by_networks: list[Float] = field(default_factory=list)  #: by their weights, then by the pictures' embeddings
     by_sun: Float | None = None  #: [3], by its direction, of pictures whose Suns are unknown
 

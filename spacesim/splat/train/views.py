@@ -27,9 +27,9 @@ SHARES = 4, 8  #: a fourth and an eighth of the memory that is free are not exce
 class TrainingView:
     """A training picture in main memory."""
 
-    index: int
-    camera: Camera
-    sun: np.ndarray | None
+    index: int  #: of its frame in the dataset's training frames
+    camera: Camera  #: pose and intrinsics
+    sun: np.ndarray | None  #: [3] unit, towards the Sun; None where the frame does not name it
     rgba: np.ndarray  #: [H * W] uint32, 8 bits a channel, red lowest
     valid: np.ndarray | None  #: [H * W] bool, or None where all pixels count
     opaque: bool  #: the picture has no transparency, so that what is behind the object is part of it

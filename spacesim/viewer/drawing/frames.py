@@ -98,7 +98,7 @@ class ResolutionControl:
     still take 70 % of the budget at most. The first `warm` frames of a size, which compile kernels, do not count.
     """
 
-    shares: tuple[float, ...] = SHARES
+    shares: tuple[float, ...] = SHARES  #: of the full resolution on a side, the first the largest
     budget: float = BUDGET
     warm: int = WARM
     level: int = 0  #: of `shares`

@@ -13,7 +13,7 @@ import numpy as np
 
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
-from spacesim.splat.compose import Composition
+from spacesim.splat.compose import GaussianComposition
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.viewer.drawing.ellipsoids import draw_ellipsoids
 from spacesim.viewer.drawing.paint import NEEDED, Planes
@@ -28,12 +28,12 @@ class Model:
 
     name: str  #: unlike the others'
     centre: Array  #: [3] and radius of its Gaussians, or of its box, its own frame, metres
-    radius: float
+    radius: float  #: metres, as `centre`
 
 
 class SceneRenderer:
     """A composed scene to be drawn. composition: with the poses that the viewer starts with, of Gaussians, or another
-    that predicts as `nerf.compose.Composition` does
+    that predicts as `nerf.compose.FieldComposition` does
 
     gaussian_count: of all models;  content: what there is, in words;  progressive: whether a picture takes so long that
     it comes in steps, of radiance fields;  modes: of `MODES`, those that there can be;  relightable: whether the Sun
@@ -45,7 +45,7 @@ class SceneRenderer:
         counts = [placed.run.gaussian_count for placed in composition.models]
         self.gaussian_count = sum(count or 0 for count in counts)
         self.content = _describe(counts)
-        self.progressive = not isinstance(composition, Composition)
+        self.progressive = not isinstance(composition, GaussianComposition)
         self.modes = tuple(mode for mode in MODES if mode != "ellipsoids" or not self.progressive)
         self.relightable = composition.relightable
         self.backend = composition.backend

@@ -31,9 +31,9 @@ class TraceRequest:
     """What to trace."""
 
     number: int  #: given back with answers
-    scene: SceneConfig
-    camera: Camera
-    sun: Sun
+    scene: SceneConfig  #: what is traced
+    camera: Camera  #: pose and intrinsics
+    sun: Sun  #: that lights it
     samples: int  #: a pixel
     mode: str  #: whose planes: "colour" asks for paths, the others for labels
     models: Sequence[int] = ()  #: see `model_ids`
@@ -43,11 +43,11 @@ class TraceRequest:
 class TraceResult:
     """A path-traced picture, or why there is none."""
 
-    number: int
+    number: int  #: of the request
     planes: Planes | None  #: of all samples so far, None where `error` says in a sentence why there are none
     samples: int  #: a pixel, so far
     done: bool  #: nothing more comes
-    error: str = ""
+    error: str = ""  #: a sentence, "" where there is none
 
 
 class Tracer:

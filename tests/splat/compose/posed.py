@@ -16,13 +16,13 @@ from spacesim.splat.light.field import DirectionsConfig, FieldConfig, SurfaceCon
 from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig
 from spacesim.splat.light.shadow.mapping import MappingConfig
-from spacesim.splat.light.shadow.refine import RefineConfig
+from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 
 TOLD = {"sun": Encoding("harmonics", 2), "view": Encoding("harmonics", 2)}
 FIELD = FieldConfig(features=5, width=12, layers=3, inputs=DirectionsConfig(**TOLD))
-REFINE = RefineConfig(features=3, width=8, sun=Encoding("harmonics", 1))
+REFINE = ShadowRefinementConfig(features=3, width=8, sun=Encoding("harmonics", 1))
 MAP = ShadowConfig(MappingConfig(), 64, refine=REFINE)
 CONFIGS = {
     "relight": LightConfig(FIELD),

@@ -14,7 +14,7 @@ from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose import (
     CameraView,
     ComposeConfig,
-    Composition,
+    GaussianComposition,
     Keyframe,
     Orbit,
     PlacedRun,
@@ -130,7 +130,7 @@ def test_keyframes_zoom_as_the_camera_is_resized():
     camera = Camera.from_fov(look_at([5, 0, 0], [0, 0, 0]), 64, 48, 40)
     near = CameraView(camera.world_from_camera, None, (4 * camera.fx, 4 * camera.fy))
     keys = [Keyframe(0.0, view=CameraView(camera.world_from_camera)), Keyframe(1.0, view=near)]
-    scene = PosedScene(Composition([PlacedRun(made_run("vanilla", 0), name="one")]), None, camera, keys)
+    scene = PosedScene(GaussianComposition([PlacedRun(made_run("vanilla", 0), name="one")]), None, camera, keys)
     small = scene.seen_by(Camera.from_fov(camera.world_from_camera, 16, 12, 40))
     for time, zoom in ((0.0, 1), (0.5, 2), (1.0, 4)):
         assert scene.at(time).camera.fx == pytest.approx(zoom * camera.fx)
@@ -201,7 +201,7 @@ def whole_scene(tmp_path: Path) -> PosedScene:
             1 / 3, Sun(np.array([0.3, 0.2, 0.4])), CameraView(look_at([0, 3, 0.2], [0, 0, 0]), np.zeros(3), (50.5, 51))
         ),
     ]
-    composition = Composition(models, ComposeConfig("ratio"))
+    composition = GaussianComposition(models, ComposeConfig("ratio"))
     return PosedScene(composition, Sun.from_angles(41.5, -12.25), camera, keys, None, 5, 12.5)
 
 

@@ -13,7 +13,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb, read_exr, read_png
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Sun
-from spacesim.splat.compose import Composition, Keyframe, PlacedRun, Pose, PosedScene
+from spacesim.splat.compose import GaussianComposition, Keyframe, PlacedRun, Pose, PosedScene
 from spacesim.splat.compose import output as module
 from spacesim.splat.compose.output import compose
 from spacesim.splat.export.video import encoder
@@ -30,7 +30,7 @@ def scene(frames: int = 3, away: float = 1.0, last: float = 0.2, methods=("map",
         Keyframe(0.0, poses={"m0": models[0].pose}),
         Keyframe(frames / 24, poses={"m0": Pose(translation=[0, last, 0])}),
     ]
-    return PosedScene(Composition(models), SUN, seen_from([4, -1, 2], pixels=24), keys, None, frames)
+    return PosedScene(GaussianComposition(models), SUN, seen_from([4, -1, 2], pixels=24), keys, None, frames)
 
 
 def test_pictures_that_are_no_longer_written_go(tmp_path):

@@ -12,7 +12,7 @@ from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.data.records import Camera, Sun
-from spacesim.splat.compose import ComposeConfig, Composition, PlacedRun, Pose
+from spacesim.splat.compose import ComposeConfig, GaussianComposition, PlacedRun, Pose
 from spacesim.splat.compose.pose import rotation_about
 from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.model import LightModel
@@ -53,7 +53,7 @@ def test_alone_and_not_posed_a_model_is_what_its_run_gives_to_the_bit(method):
     for antialiased in (False, True):
         run = made_run(method, antialiased=antialiased)
         alone = run.predict(EYE, SUN, normals=True)
-        composed = Composition([PlacedRun(run)]).predict(EYE, SUN, normals=True)
+        composed = GaussianComposition([PlacedRun(run)]).predict(EYE, SUN, normals=True)
         same(alone, composed)
         assert np.array_equal(composed.id, (alone.alpha >= 0.5).astype(np.int32))
 
@@ -64,9 +64,9 @@ def test_the_order_of_models_changes_nothing(shadows):
     poses = [Pose(), Pose(rotation_about([0, 1, 1], 30), [0.9, 0.6, 0.5], 0.7), Pose(translation=[-0.8, -0.4, -0.6])]
     models = [PlacedRun(run, pose) for run, pose in zip(runs, poses, strict=True)]
     models.append(PlacedRun(runs[1], Pose(translation=[0.2, 0.9, -0.7])))  # a run twice
-    first = Composition(models, ComposeConfig(shadows)).predict(EYE, SUN, normals=True)
+    first = GaussianComposition(models, ComposeConfig(shadows)).predict(EYE, SUN, normals=True)
     order = [2, 3, 0, 1]
-    second = Composition([models[i] for i in order], ComposeConfig(shadows)).predict(EYE, SUN, normals=True)
+    second = GaussianComposition([models[i] for i in order], ComposeConfig(shadows)).predict(EYE, SUN, normals=True)
     same(first, second)
     numbers = np.array([0, *(1 + np.argsort(order))])
     assert np.array_equal(numbers[first.id], second.id)
@@ -81,15 +81,15 @@ def test_moved_and_scaled_together_with_camera_and_sun_nothing_changes(method):
     for scale in (1.0, 0.02, 30.0):
         pose = Pose(TURN.rotation, TURN.translation, scale)
         sun = Sun(pose.rotation @ SUN.direction)
-        moved = Composition([PlacedRun(run, pose)]).predict(moved_camera(EYE, pose), sun)
+        moved = GaussianComposition([PlacedRun(run, pose)]).predict(moved_camera(EYE, pose), sun)
         near(alone, moved, scale=scale, names=names)
-        still = Composition([PlacedRun(run, pose)]).predict(EYE, sun)
+        still = GaussianComposition([PlacedRun(run, pose)]).predict(EYE, sun)
         assert np.abs(still.rgb - alone.rgb).max() > 0.05  # the test can fail
 
 
 def test_a_whole_scene_moved_and_scaled_looks_the_same():
     models = [PlacedRun(made_run("map", 1)), PlacedRun(made_run("splat", 2), Pose(TURN.rotation, [0.9, 0.8, 0.7], 0.6))]
-    scene = Composition([*models, PlacedRun(made_run("vanilla", 3), Pose(translation=[-0.7, -0.6, -0.7]))])
+    scene = GaussianComposition([*models, PlacedRun(made_run("vanilla", 3), Pose(translation=[-0.7, -0.6, -0.7]))])
     before = scene.predict(EYE, SUN)
     assert np.abs(before.rgb - scene.shaded(ComposeConfig("none")).predict(EYE, SUN).rgb).max() > 0.05  # shadows matter
     whole = Pose(rotation_about([2, 1, -1], 130), [5.0, -3.0, 2.0], 2.5)
@@ -100,22 +100,24 @@ def test_a_whole_scene_moved_and_scaled_looks_the_same():
 def test_a_scaled_model_looks_as_large_as_it_is():
     """Depth and silhouette of a disc of radius 0.5, made twice as large."""
     disc, eye = disc_run(0.5), seen_from([0, 0, 6], pixels=200)
-    small, large = (Composition([PlacedRun(disc, Pose(scale=s))]).predict(eye) for s in (1.0, 2.0))
+    small, large = (GaussianComposition([PlacedRun(disc, Pose(scale=s))]).predict(eye) for s in (1.0, 2.0))
     area = [(picture.alpha > 0.5).sum() for picture in (small, large)]
     assert area[1] / area[0] == pytest.approx(4, rel=0.1)
     assert small.depth[100, 100] == pytest.approx(6, abs=1e-3)
     assert large.depth[100, 100] == pytest.approx(6, abs=1e-3)
-    raised = Composition([PlacedRun(disc, Pose(translation=[0, 0, 2]))]).predict(eye)
+    raised = GaussianComposition([PlacedRun(disc, Pose(translation=[0, 0, 2]))]).predict(eye)
     assert raised.depth[100, 100] == pytest.approx(4, abs=1e-3)
 
 
 # ---- shadows between models ----
 
 
-def discs(gap: float, small: float = 0.5, sideways: float = 0.0) -> Composition:
+def discs(gap: float, small: float = 0.5, sideways: float = 0.0) -> GaussianComposition:
     """A disc of radius 1 in the plane z = 0, and a smaller one over it."""
     over = Pose(translation=[sideways, 0, gap], scale=small)
-    return Composition([PlacedRun(disc_run(1.0), name="below"), PlacedRun(disc_run(1.0, 1), over, name="above")])
+    return GaussianComposition(
+        [PlacedRun(disc_run(1.0), name="below"), PlacedRun(disc_run(1.0, 1), over, name="above")]
+    )
 
 
 def test_a_disc_casts_its_round_shadow():
@@ -145,15 +147,17 @@ def test_a_kilometre_apart_each_keeps_its_own_shadows_to_the_bit_and_aligned_the
     run, disc = made_run(method), disc_run(3.0)
     alone = run.predict(EYE, SUN)
     aside = Pose(translation=np.cross(SUN.direction, [0, 0, 1]) * 1000)
-    apart = Composition([PlacedRun(run), PlacedRun(disc, aside)]).predict(EYE, SUN)
+    apart = GaussianComposition([PlacedRun(run), PlacedRun(disc, aside)]).predict(EYE, SUN)
     assert np.array_equal(apart.rgb, alone.rgb)
     assert alone.visibility is None or np.array_equal(apart.visibility, alone.visibility)
-    behind = Composition([PlacedRun(run), PlacedRun(disc, Pose(translation=-1000 * SUN.direction))]).predict(EYE, SUN)
+    behind = GaussianComposition([PlacedRun(run), PlacedRun(disc, Pose(translation=-1000 * SUN.direction))]).predict(
+        EYE, SUN
+    )
     assert np.array_equal(behind.rgb, alone.rgb)
     # The disc faces the Sun, a kilometre ahead.
     facing = Pose(rotation_about(np.cross([0, 0, 1], SUN.direction), 55), 1000 * SUN.direction)
     assert np.allclose(facing.rotation @ [0, 0, 1], SUN.direction)
-    dark = Composition([PlacedRun(run), PlacedRun(disc, facing)]).predict(EYE, SUN)
+    dark = GaussianComposition([PlacedRun(run), PlacedRun(disc, facing)]).predict(EYE, SUN)
     assert dark.visibility.max() < 0.02
     assert dark.rgb.max() < 0.02 * max(1, alone.rgb.max())
     assert alone.rgb.max() > 0.5
@@ -163,8 +167,8 @@ def test_a_kilometre_apart_each_keeps_its_own_shadows_to_the_bit_and_aligned_the
     half = replace_translation(facing, 1000 * SUN.direction + 3.0 * across / np.linalg.norm(across))
     from_sun = seen_from(4 * SUN.direction)
     covered = run.predict(from_sun, SUN).alpha > 0.5
-    partly = Composition([PlacedRun(run), PlacedRun(disc, half)]).predict(from_sun, SUN)
-    apart = Composition([PlacedRun(run), PlacedRun(disc, aside)]).predict(from_sun, SUN)
+    partly = GaussianComposition([PlacedRun(run), PlacedRun(disc, half)]).predict(from_sun, SUN)
+    apart = GaussianComposition([PlacedRun(run), PlacedRun(disc, aside)]).predict(from_sun, SUN)
     assert 0.3 < partly.visibility[covered].sum() / apart.visibility[covered].sum() < 0.6
 
 
@@ -175,7 +179,7 @@ def test_shadows_of_others_end_where_they_end_whatever_is_done_against_acne(meth
     across /= np.linalg.norm(across)
     facing = rotation_about(np.cross([0, 0, 1], SUN.direction), 55)
     edge = Pose(facing, 50 * SUN.direction + 3.0 * across)
-    scene = Composition([PlacedRun(run, name="cut"), PlacedRun(disc_run(3.0), edge, "disc")])
+    scene = GaussianComposition([PlacedRun(run, name="cut"), PlacedRun(disc_run(3.0), edge, "disc")])
     lights = dict(zip((model.name for model in scene.placed), scene.cross_visibility(SUN), strict=True))
     visible, side = np.array(lights["cut"]), run.gaussians.to_numpy()["means"] @ across  # < 0 is beyond the disc
     assert (visible[side > 0.1] < 0.1).all()
@@ -195,7 +199,7 @@ def test_a_half_transparent_model_lets_half_of_the_light_through():
     one = {name: values[:1].copy() for name, values in veil_arrays.items()}
     one["means"][:], one["log_scales"][:], one["logit_opacities"][:] = 0, np.log([2.0, 2.0, 0.01]), 0.0
     veil = replace(disc, gaussians=type(disc.gaussians).from_numpy(one))
-    scene = Composition([PlacedRun(disc), PlacedRun(veil, Pose(translation=[0, 0, 2]))])
+    scene = GaussianComposition([PlacedRun(disc), PlacedRun(veil, Pose(translation=[0, 0, 2]))])
     centre = scene.predict(seen_from([0, 0.3, -6]), Sun(np.array([0, 0, 1.0]))).visibility[22:26, 22:26]
     np.testing.assert_allclose(centre, 0.5, atol=0.05)
 
@@ -211,13 +215,13 @@ def test_the_ratio_of_the_thesis_and_what_it_estimates_agree_where_a_model_has_n
 
 def test_shadows_between_models_are_as_the_run_in_the_shadow_was_configured():
     models = [PlacedRun(made_run("map", 1)), PlacedRun(made_run("splat", 2), Pose(translation=[0.5, 0.4, 0.3]))]
-    others, ratio = (Composition(models, ComposeConfig(name)).predict(EYE, SUN) for name in ("others", "ratio"))
+    others, ratio = (GaussianComposition(models, ComposeConfig(name)).predict(EYE, SUN) for name in ("others", "ratio"))
     assert np.abs(others.rgb - ratio.rgb).max() > 0.05
-    same(others, Composition(models).predict(EYE, SUN))
+    same(others, GaussianComposition(models).predict(EYE, SUN))
     for model in models:
         light = model.run.light
         light.config = replace(light.config, shadow=replace(light.config.shadow, between="ratio"))
-    same(ratio, Composition(models).predict(EYE, SUN))
+    same(ratio, GaussianComposition(models).predict(EYE, SUN))
 
 
 def test_shadows_off_are_off():
@@ -236,7 +240,7 @@ def test_all_methods_stand_together():
                Pose(translation=1.2 * np.array([seed % 3 - 1, seed // 3 - 1, 0])))
         for seed, method in enumerate(METHODS)
     ]  # fmt: skip
-    scene = Composition(models)
+    scene = GaussianComposition(models)
     picture = scene.predict(seen_from([0, -1, 6], pixels=64), SUN, normals=True)
     for name in PLANES:
         assert np.isfinite(getattr(picture, name)).all(), name
@@ -250,14 +254,17 @@ def test_each_model_keeps_its_own_filter():
     eye = seen_from([0, 0, 60], pixels=40)
     poses = Pose(translation=[-8.0, 0, 0]), Pose(translation=[8.0, 0, 0])
     runs = made_run("vanilla", 1, antialiased=True), made_run("vanilla", 1, antialiased=False)
-    both = Composition(
+    both = GaussianComposition(
         [PlacedRun(run, pose) for run, pose in zip(runs, poses, strict=True)], ComposeConfig("none")
     ).predict(eye)
     for run, pose in zip(runs, poses, strict=True):
-        alone = Composition([PlacedRun(run, pose)]).predict(eye)
+        alone = GaussianComposition([PlacedRun(run, pose)]).predict(eye)
         mine = alone.alpha > 0
         assert np.array_equal(both.rgb[mine], alone.rgb[mine])
-    sums = [Composition([PlacedRun(run, pose)]).predict(eye).alpha.sum() for run, pose in zip(runs, poses, strict=True)]
+    sums = [
+        GaussianComposition([PlacedRun(run, pose)]).predict(eye).alpha.sum()
+        for run, pose in zip(runs, poses, strict=True)
+    ]
     assert sums[0] < 0.8 * sums[1]
 
 
@@ -266,7 +273,7 @@ def test_linear_and_srgb_runs_blend_as_srgb():
     linear, other = made_run("linear", 1), made_run("vanilla", 2)
     pose = Pose(translation=[100.0, 0, 0])
     alone = linear.predict(EYE, SUN)
-    mixed = Composition([PlacedRun(linear), PlacedRun(other, pose)]).predict(EYE, SUN)
+    mixed = GaussianComposition([PlacedRun(linear), PlacedRun(other, pose)]).predict(EYE, SUN)
     assert np.array_equal(alone.alpha, mixed.alpha)
     assert not np.array_equal(alone.rgb, mixed.rgb)
     opaque = alone.alpha > 0.99
@@ -278,7 +285,7 @@ def test_linear_and_srgb_runs_blend_as_srgb():
 
 def test_objects_are_numbered_and_hide_each_other():
     eye = seen_from([0, 0, 8], pixels=64)
-    scene = Composition(
+    scene = GaussianComposition(
         [
             PlacedRun(disc_run(1.0), Pose(translation=[0, 0, 1])),
             PlacedRun(disc_run(1.0, 1), Pose(translation=[0.9, 0, 0])),
@@ -297,7 +304,7 @@ def test_objects_are_numbered_and_hide_each_other():
 
 def test_moving_anything_compiles_nothing_and_repeats_to_the_bit():
     models = [PlacedRun(made_run("map", 1)), PlacedRun(made_run("splat", 2), Pose(translation=[0.6, 0.5, 0.5]))]
-    scene = Composition([*models, PlacedRun(made_run("vanilla", 3), Pose(translation=[-0.6, -0.5, -0.5]))])
+    scene = GaussianComposition([*models, PlacedRun(made_run("vanilla", 3), Pose(translation=[-0.6, -0.5, -0.5]))])
 
     def frames():
         for k in range(4):
@@ -312,13 +319,13 @@ def test_moving_anything_compiles_nothing_and_repeats_to_the_bit():
     assert backend.recordings() == warm
     for one, other in zip(first, second, strict=True):
         same(one, other)
-    fresh = Composition(scene.models)
+    fresh = GaussianComposition(scene.models)
     same(fresh.predict(EYE, SUN), scene.predict(EYE, SUN))  # what was kept was right
 
 
 def test_where_numpy_puts_its_numbers_records_nothing_anew():
     """On LLVM one array in four begins at a multiple of 64 bytes, and kernels of such memory are others."""
-    scene, kept = Composition([PlacedRun(made_run("map", 1)), PlacedRun(made_run("vanilla", 3))]), []
+    scene, kept = GaussianComposition([PlacedRun(made_run("map", 1)), PlacedRun(made_run("vanilla", 3))]), []
     encoding, arrays = Encoding("harmonics", 2), made_run("map", 1).gaussians.to_numpy()
     made = {
         "camera": lambda k: Pinhole.of(seen_from([3.0 + k, 0, 1])).values,
@@ -352,10 +359,10 @@ def test_colors_are_recorded_once_for_pictures_of_all_sizes(method):
 
 
 def test_only_what_is_asked_for_is_computed(monkeypatch):
-    scene = Composition(
+    scene = GaussianComposition(
         [PlacedRun(made_run("map", 1)), PlacedRun(made_run("vanilla", 3), Pose(translation=[0.5, 0.5, 0.5]))]
     )
-    monkeypatch.setattr(Composition, "_shade_members", lambda *_: pytest.fail("computed light for nothing"))
+    monkeypatch.setattr(GaussianComposition, "_shade_members", lambda *_: pytest.fail("computed light for nothing"))
     drawn = scene.draw(EYE, None, ["depth", "id", "normal"])
     assert drawn.image("depth").shape == drawn.image("id").shape == (48, 48)
     assert drawn.image("normal").shape == (48, 48, 3)
@@ -377,7 +384,7 @@ def test_what_a_change_leaves_as_it_was_is_not_computed_again(monkeypatch):
 
     monkeypatch.setattr(LightModel, "sunlight", counted)
     one, other = made_run("map", 1), made_run("splat", 2)
-    scene = Composition([PlacedRun(one), PlacedRun(other, Pose(translation=[0.6, 0.5, 0.5]))])
+    scene = GaussianComposition([PlacedRun(one), PlacedRun(other, Pose(translation=[0.6, 0.5, 0.5]))])
     scene.predict(EYE, SUN)
     assert asked == [one.light, other.light] or asked == [other.light, one.light]
     scene.predict(seen_from([2.0, 2.0, 1.5]), SUN)
@@ -394,18 +401,18 @@ def test_what_a_change_leaves_as_it_was_is_not_computed_again(monkeypatch):
 
 def test_wrong_scenes_are_refused(caplog):
     with pytest.raises(InputError, match="models: expected at least one"):
-        Composition([])
+        GaussianComposition([])
     with pytest.raises(InputError, match="shadows: expected one of"):
         ComposeConfig("some")
-    scene = Composition([PlacedRun(made_run("map"))])
+    scene = GaussianComposition([PlacedRun(made_run("map"))])
     with pytest.raises(InputError, match=r"runs/map0: expected the Sun"):
         scene.predict(EYE)
     with caplog.at_level(logging.INFO, "spacesim"):
-        Composition([PlacedRun(made_run("vanilla"), name="old"), PlacedRun(made_run("map"))])
+        GaussianComposition([PlacedRun(made_run("vanilla"), name="old"), PlacedRun(made_run("map"))])
     assert len([line for line in caplog.messages if "old: knows the light" in line]) == 1
     caplog.clear()
     with caplog.at_level(logging.INFO, "spacesim"):
-        Composition([PlacedRun(made_run("linear")), PlacedRun(made_run("map"))])
+        GaussianComposition([PlacedRun(made_run("linear")), PlacedRun(made_run("map"))])
     assert any("blended as sRGB" in line for line in caplog.messages)
 
 
@@ -413,13 +420,13 @@ def test_models_of_one_gaussian_and_of_none():
     one, other = made_run("vanilla", 1, count=1), made_run("map", 2, count=1)
     for run in (one, other):
         for k in range(3):
-            shifted = Composition([PlacedRun(run, Pose(translation=[0.1 * k, 0, 0]))]).predict(EYE, SUN)
+            shifted = GaussianComposition([PlacedRun(run, Pose(translation=[0.1 * k, 0, 0]))]).predict(EYE, SUN)
             back = run.predict(seen_from([3.0 - 0.1 * k, -2.0, 1.5], [-0.1 * k, 0, 0]), SUN)
             np.testing.assert_allclose(shifted.rgb, back.rgb, atol=1e-5)
     empty = replace(one, gaussians=made_run("vanilla", 1, count=0).gaussians)
-    assert Composition([PlacedRun(empty)]).predict(EYE, SUN).alpha.max() == 0
-    beside = Composition([PlacedRun(empty), PlacedRun(other), PlacedRun(empty, Pose(translation=[0, 0, 1]))]).predict(
-        EYE, SUN
-    )
+    assert GaussianComposition([PlacedRun(empty)]).predict(EYE, SUN).alpha.max() == 0
+    beside = GaussianComposition(
+        [PlacedRun(empty), PlacedRun(other), PlacedRun(empty, Pose(translation=[0, 0, 1]))]
+    ).predict(EYE, SUN)
     assert np.array_equal(beside.rgb, other.predict(EYE, SUN).rgb)
     assert set(np.unique(beside.id)) <= {0, 2}

@@ -11,7 +11,7 @@ from scipy.special import sph_harm_y
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere
 from spacesim.data.records import Sun
-from spacesim.splat.compose import Composition, PlacedRun, Pose
+from spacesim.splat.compose import GaussianComposition, PlacedRun, Pose
 from spacesim.splat.compose.plain import bake_scene
 from spacesim.splat.compose.pose import rotation_about
 from spacesim.splat.harmonics import band_rotations, rotate_harmonics
@@ -64,7 +64,7 @@ def test_no_coefficients_and_no_rotation():
 def test_a_vanilla_scene_made_plain_is_the_same_picture(degree):
     """Two ways to the same colours: the camera brought into the model, the harmonics brought into the world."""
     turned = Pose(Rotation.random(rng=np.random.default_rng(3)).as_matrix(), [0.5, 0.4, 0.3], 0.8)
-    scene = Composition(
+    scene = GaussianComposition(
         [PlacedRun(made_run("vanilla", 1, degree=degree), turned), PlacedRun(made_run("vanilla", 2, degree=2)),
          PlacedRun(disc_run(0.3), Pose(translation=1.5 * SUN.direction))]
     )  # fmt: skip
@@ -92,7 +92,7 @@ def test_a_scene_made_plain_has_the_visibility_of_its_pictures(method):
     away, facing = 200 * across, rotation_about(np.cross([0, 0, 1], SUN.direction), 55)
     before = 50 * SUN.direction + 3 * across
     discs = [PlacedRun(disc_run(3.0), Pose(facing, before + place)) for place in (np.zeros(3), away)]
-    scene = Composition([PlacedRun(run), PlacedRun(run, Pose(translation=away)), *discs])
+    scene = GaussianComposition([PlacedRun(run), PlacedRun(run, Pose(translation=away)), *discs])
     whole = scene.in_world()
     (first, other) = (np.array(v) for v in scene.cross_visibility(SUN) if v is not None)
     one_camera = cast_shadows(whole, light_rows(SUN.direction), replace(run.light.config.shadow, bias=0.0), 4.0)
@@ -107,7 +107,7 @@ def test_a_scene_made_plain_has_the_visibility_of_its_pictures(method):
 
 def test_a_relightable_scene_made_plain_looks_alike():
     turned = Pose(Rotation.random(rng=np.random.default_rng(3)).as_matrix(), [0.5, 0.4, 0.3], 0.8)
-    scene = Composition([PlacedRun(made_run("map", 1), turned), PlacedRun(made_run("splat", 2))])
+    scene = GaussianComposition([PlacedRun(made_run("map", 1), turned), PlacedRun(made_run("splat", 2))])
     eye = seen_from([3, -2, 1.5])
     picture = scene.predict(eye, SUN)
     plain = render(bake_scene(scene, SUN), Pinhole.of(eye)).image("color")

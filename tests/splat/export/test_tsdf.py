@@ -12,7 +12,7 @@ from spacesim.data.geometry import fibonacci_sphere, look_at, rotation_from_quat
 from spacesim.data.records import Camera
 from spacesim.data.store import load_truth, read_dataset
 from spacesim.splat.export import fusion
-from spacesim.splat.export.fusion import DepthView, Field, Grid, fuse
+from spacesim.splat.export.fusion import DepthView, DistanceField, Grid, fuse
 from spacesim.splat.export.mesh import MeshConfig, bounds, cameras_around, depth_of, mesh_of, select_views, surface
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.start import gaussians_at
@@ -145,12 +145,12 @@ def test_surface_of_any_field_is_closed():
     distance = np.ones((14, 15, 16), np.float32)
     distance[1:-1, 1:-1, 1:-1] = rng.normal(size=(12, 13, 14))
     grid = Grid(np.zeros(3), 0.5, (16, 15, 14))
-    vertices, faces = surface(Field(grid, distance, np.ones_like(distance, bool)))
+    vertices, faces = surface(DistanceField(grid, distance, np.ones_like(distance, bool)))
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
     assert mesh.volume > 0
-    holes = surface(Field(grid, distance, rng.random(distance.shape) > 0.02))
+    holes = surface(DistanceField(grid, distance, rng.random(distance.shape) > 0.02))
     assert 0 < len(holes[1]) < len(faces)
 
 

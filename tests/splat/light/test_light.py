@@ -28,7 +28,7 @@ from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig, cast_shadows
 from spacesim.splat.light.shadow.light_camera import light_rows
 from spacesim.splat.light.shadow.mapping import MappingConfig
-from spacesim.splat.light.shadow.refine import RefineConfig
+from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 from spacesim.splat.raster import tone
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians, gather_entries
@@ -38,7 +38,7 @@ from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import METHODS, PRESETS, LearningRates, TrainConfig, preset
 from spacesim.splat.train.loss.terms import anisotropy
 from spacesim.splat.train.optimizer.adam import Adam
-from spacesim.splat.train.strategies.control import RefinementConfig
+from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.strategies.densify import grow, prune
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
@@ -47,7 +47,7 @@ SUN = np.array([0.48, -0.36, 0.8])
 TOLD = {"sun": Encoding("harmonics", 2), "view": Encoding("positional", 1)}
 FIELD = FieldConfig(features=5, width=12, layers=3, inputs=DirectionsConfig(**TOLD))
 ON_SURFACE = replace(FIELD, inputs=SurfaceConfig(**TOLD))
-REFINE = RefineConfig(features=3, width=8, sun=Encoding("harmonics", 1))
+REFINE = ShadowRefinementConfig(features=3, width=8, sun=Encoding("harmonics", 1))
 CONFIGS = {
     "relight": LightConfig(FIELD),
     "map": LightConfig(FIELD, ShadowConfig(MappingConfig(), 32, refine=REFINE)),
@@ -429,7 +429,7 @@ def test_features_of_another_shape_are_refused(features):
 
 # ---- training ----
 
-REFINEMENT = RefinementConfig(
+REFINEMENT = DensificationConfig(
     refine_start=10,
     refine_every=20,
     pause_after_reset=0,
@@ -441,9 +441,7 @@ REFINEMENT = RefinementConfig(
 
 
 def training(name: str, **changes) -> TrainConfig:
-    shadow = CONFIGS[name].shadow
-    method = {"mapping": "shadow-map", "splatting": "shadow-splat"}[shadow.method.kind] if shadow else "relight"
-    given = {"method": method, "light": CONFIGS[name], "iterations": 60, "checkpoint_every": 25, "init_count": 40}
+    given = {"light": CONFIGS[name], "iterations": 60, "checkpoint_every": 25, "init_count": 40}
     return TrainConfig(**{**given, "refinement": REFINEMENT, **changes})
 
 
@@ -649,7 +647,7 @@ def test_resume_takes_what_an_older_version_did_not_write_for_the_default(small_
 
 def test_vanilla_ignores_suns_and_light_needs_them(small_lit_dataset):
     dark = replace(small_lit_dataset, train=tuple(replace(frame, sun=None) for frame in small_lit_dataset.train))
-    Trainer(dark, replace(training("relight"), method="vanilla", light=None))
+    Trainer(dark, replace(training("relight"), light=None))
     for name in ("relight", "map"):
         said = r"expected sun_direction in every training frame, or .* light\.field\.inputs=view, .*train_"
         with pytest.raises(InputError, match=said):

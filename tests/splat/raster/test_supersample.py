@@ -13,7 +13,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.data.records import Camera
-from spacesim.splat.compose.scene import Composition, PlacedRun
+from spacesim.splat.compose.scene import GaussianComposition, PlacedRun
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.output import OUTPUTS
@@ -169,7 +169,7 @@ def test_a_run_and_a_scene_of_it_draw_the_same(small_lit_dataset, tmp_path, meth
     if linear:  # what is blended is light over black
         expected = srgb_from_linear(boxes(linear_from_srgb(numbers(wide.rgb)), 2))
     np.testing.assert_allclose(alone.rgb, expected, atol=5e-6)
-    scene = Composition([PlacedRun(run)])
+    scene = GaussianComposition([PlacedRun(run)])
     assert scene.supersample == 2
     composed = scene.predict(frame.camera, frame.sun, normals=True)
     for name in ("rgb", "alpha", "depth", "visibility", "normal"):
@@ -179,7 +179,7 @@ def test_a_run_and_a_scene_of_it_draw_the_same(small_lit_dataset, tmp_path, meth
         if name != "visibility" or name in drawn.planes:
             assert np.isfinite(drawn.image(name)).all()
             assert drawn.image(name).shape == (frame.camera.height, frame.camera.width)
-    with_both = Composition([PlacedRun(run), PlacedRun(single)])
+    with_both = GaussianComposition([PlacedRun(run), PlacedRun(single)])
     assert with_both.contents[0] != with_both.contents[1], "a picture depends on it"
 
 

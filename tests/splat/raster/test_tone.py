@@ -119,7 +119,7 @@ def test_a_dataset_tells_how_its_pictures_were_made(told, found):
 
 def linear(**options) -> TrainConfig:
     light = LightConfig(FieldConfig(features=4, width=8), linear=True, **options)
-    return TrainConfig(method="relight", light=light, iterations=3, init_count=100)
+    return TrainConfig(light=light, iterations=3, init_count=100)
 
 
 def test_a_run_takes_tone_and_exposure_of_its_data_and_can_be_exposed_anew(small_lit_dataset, tmp_path):

@@ -144,20 +144,30 @@ def test_an_alternative_that_is_there_keeps_what_it_has():
     assert with_settings(config, {"light.shadow.method": "mapping"}) == config
     bilinear = with_settings(config, {"light.shadow.method": {"filter": "bilinear"}}).light.shadow.method
     assert bilinear == replace(config.light.shadow.method, filter="bilinear")
-    splat = replace(config, method="shadow-splat", light=preset("fast", "shadow-splat").light)
+    splat = replace(config, light=preset("fast", "shadow-splat").light)
     moving = with_settings(splat, {"light.shadow.method": {"kind": "splatting", "gradients": True}})
     assert moving.light.shadow.method == SplattingConfig(gradients=True)
 
 
-def test_light_is_that_of_the_method():
-    for method in METHODS[1:]:
-        light = preset("fast", method).light
+def test_the_light_tells_the_method():
+    for method in METHODS:
+        config = preset("fast", method)
+        assert config.method == config.to_json()["method"] == method
+        assert {replace(preset("fast", other), light=config.light).method for other in METHODS} == {method}
+
+
+def test_a_file_has_the_light_of_its_method():
+    for method in METHODS:
+        written = preset("fast", method).to_json()
         for other in METHODS:
-            if other == method or {other, method} == {"shadow-splat", "baseline-park"}:
-                assert replace(preset("fast", other), light=light).light == light
+            values = {**written, "method": other}
+            if {other, method} <= {"shadow-splat", "baseline-park"} or other == method:
+                assert TrainConfig.from_json(values).method == other
             else:
-                with pytest.raises(InputError, match=f"light: expected .* the method {other}'s, found"):
-                    replace(preset("fast", other), light=light)
+                with pytest.raises(InputError, match=f"config.json: light: expected .* the method {other}'s, found"):
+                    TrainConfig.from_json(values)
+    with pytest.raises(InputError, match=r"light: expected shadow splatting, .*, found shadow splatting as table 4.3"):
+        with_settings(preset("fast", "shadow-splat"), {"light.shadow.method.baseline": True})
 
 
 def test_the_old_word_for_the_baseline_is_known_everywhere(tiny_data, tmp_path):

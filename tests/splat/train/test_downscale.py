@@ -16,7 +16,7 @@ from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import TrainConfig, preset
 from spacesim.splat.train.downscale import covered_color, downscaled_camera, truth_of_squares, valid_squares
 from spacesim.splat.train.stages import LossSettings, TargetImage, picture_loss
-from spacesim.splat.train.strategies.control import RefinementConfig
+from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.trainer import Trainer
 from spacesim.splat.train.view_pass import ViewPass
 from spacesim.splat.train.warm_start import WarmStartConfig
@@ -116,7 +116,9 @@ def test_the_loss_compares_with_squares_over_any_background(bytes_, tone):
 
 # In training
 
-REFINEMENT = RefinementConfig(refine_start=5, refine_every=10, pause_after_reset=0, refine_stop=40, screen_size_stop=0)
+REFINEMENT = DensificationConfig(
+    refine_start=5, refine_every=10, pause_after_reset=0, refine_stop=40, screen_size_stop=0
+)
 CONFIG = TrainConfig(iterations=60, num_downscales=2, resolution_schedule=10, refinement=REFINEMENT, init_count=300)
 
 

@@ -14,7 +14,7 @@ from spacesim.cli import main
 from spacesim.data.errors import InputError
 from spacesim.data.records import Dataset, Sun
 from spacesim.data.store import read_dataset
-from spacesim.splat.compose.scene import Composition, PlacedRun
+from spacesim.splat.compose.scene import GaussianComposition, PlacedRun
 from spacesim.splat.export.ply import read_ply
 from spacesim.splat.export.sweep import sweep
 from spacesim.splat.pose.picture import Drawing
@@ -110,7 +110,7 @@ def test_a_run_without_the_sun_is_drawn_without_one(small_dataset, sunless, tmp_
         np.testing.assert_array_equal(run.predict(camera, Sun.from_angles(azimuth, 20)).rgb, drawn)
     for_pose = Drawing.of(run, None)
     np.testing.assert_array_equal(for_pose.draw(camera, for_pose.shade(camera))[..., :3], drawn)
-    alone = Composition([PlacedRun(run)])
+    alone = GaussianComposition([PlacedRun(run)])
     assert not alone.relightable
     np.testing.assert_allclose(alone.predict(camera).rgb, drawn, atol=1e-5)
     with pytest.raises(InputError, match="found one of the method relight that knows one light only"):

@@ -25,12 +25,12 @@ from spacesim.splat.train import views
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig, preset, with_options
 from spacesim.splat.train.start import distance_warning, initial_gaussians, scale_warning, scene_scale
-from spacesim.splat.train.strategies.control import RefinementConfig
+from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 from spacesim.splat.train.warm_start import WarmStartConfig
 
-REFINEMENT = RefinementConfig(
+REFINEMENT = DensificationConfig(
     refine_start=10, refine_every=20, pause_after_reset=0, reset_every=4, refine_stop=150, screen_size_stop=0
 )
 CONFIG = TrainConfig(iterations=160, checkpoint_every=50, sh_every=40, sh_degree=1, refinement=REFINEMENT)

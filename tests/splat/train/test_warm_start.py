@@ -26,7 +26,7 @@ from spacesim.splat.train.loss.terms import depth_loss, normal_loss, penalty
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.prior import MeshPrior
 from spacesim.splat.train.start import initial_gaussians, object_size, scene_scale
-from spacesim.splat.train.strategies.control import RefinementConfig
+from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.trainer import Trainer
 from spacesim.splat.train.views import TrainingView, TrainingViews
 from spacesim.splat.train.warm_start import (
@@ -293,7 +293,7 @@ def test_no_gaussian_stays_wider_than_its_neighbours_are_near(small_dataset):
 
 # In training
 
-REFINEMENT = RefinementConfig(
+REFINEMENT = DensificationConfig(
     refine_start=5, refine_every=10, pause_after_reset=0, reset_every=20, refine_stop=150, screen_size_stop=0
 )
 WARM = WarmStartConfig(steps=40, decay=20, conservative=20, rescue_every=10)

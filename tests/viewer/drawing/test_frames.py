@@ -10,7 +10,7 @@ from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.eval.pictures import error_colors
 from spacesim.learning.pictures import LIT, SHADOWED
-from spacesim.splat.compose import Composition, Pose
+from spacesim.splat.compose import GaussianComposition, Pose
 from spacesim.viewer.drawing.frames import (
     BUDGET,
     MIN_SIDE,
@@ -66,7 +66,7 @@ def test_a_pixel_is_one_place_whatever_runs_were_trained_with(renderer, state, v
         replace(model, run=replace(model.run, config={**model.run.config, "supersample": 2}))
         for model in renderer.composition.models
     ]
-    finer = SceneRenderer(Composition(models))
+    finer = SceneRenderer(GaussianComposition(models))
     assert finer.composition.supersample == 2
     pictures = [draw_frame(of, state, view, DisplaySettings(side=128)).picture for of in (renderer, finer)]
     np.testing.assert_array_equal(*pictures)
@@ -148,7 +148,7 @@ def test_every_mode_has_a_picture_from_anywhere(renderer, state, mode):
 
 
 def test_what_nobody_predicts_is_told(renderer, state, view):
-    alone = SceneRenderer(Composition(renderer.composition.models[:1]))
+    alone = SceneRenderer(GaussianComposition(renderer.composition.models[:1]))
     frame = draw_frame(alone, SceneState(state.poses[:1], state.sun), view, DisplaySettings("visibility", side=256))
     assert "no visibility" in frame.note
     assert not frame.picture.any()

@@ -15,7 +15,7 @@ from spacesim.splat.light.shadow.bias import Bias, grazing_bias, offset_receiver
 from spacesim.splat.light.shadow.clusters import occlusion_in_clusters
 from spacesim.splat.light.shadow.light_camera import fit_camera
 from spacesim.splat.light.shadow.mapping import MappingConfig, occlusion_by_mapping
-from spacesim.splat.light.shadow.refine import RefineConfig
+from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 from spacesim.splat.light.shadow.splatting import (
     BETA_MIN,
     LEAST_BETA,
@@ -37,6 +37,7 @@ class SplattingConfig:
 
     gradients: bool = False  #: training moves the Gaussians through their shadows, too, where the literature stops it
     beta_min: float = BETA_MIN  #: beta at which a receiver's footprint ends; 4.10 names no end, pictures' is 0.004
+    baseline: bool = False  #: in a light as table 4.3 has it: names the method baseline-park, and changes no picture
 
     def __post_init__(self) -> None:
         check_ranges(self, beta_min=(LEAST_BETA, 0.5))
@@ -54,7 +55,8 @@ class ShadowConfig:
     grazing: Literal["none", "bias", "lift", "both"] = "none"
     reach: float = 2.0  #: of `grazing_bias`, standard deviations
     softness: float = 1e-6  #: epsilon_s of 4.5 as a share of the farthest training camera's distance
-    refine: RefineConfig | None = field(default_factory=RefineConfig)  #: the network that corrects raw shadows (4.3.3)
+    #: the network that corrects raw shadows (4.3.3)
+    refine: ShadowRefinementConfig | None = field(default_factory=ShadowRefinementConfig)
     #: the light camera holds at most four standard deviations of the whole to either side, so that a stray Gaussian
     #: does not take the others' pixels; false: all supports (4.32)
     crop: bool = True

@@ -78,8 +78,8 @@ class ShadowMap:
     alpha: Float  #: 1 - transmittance
     depth: Float  #: sum of weight x z, metres
     square: Float | None  #: of weight x z^2, metres^2, or None
-    width: int
-    height: int
+    width: int  #: pixels
+    height: int  #: pixels
 
 
 def occlusion_by_mapping(
@@ -210,10 +210,10 @@ def _occlusion_at(
 class SunView:
     """What the Sun sees of some Gaussians, to be asked of points that are none."""
 
-    light: ShadowMap
-    camera: Orthographic
+    light: ShadowMap  #: depth and alpha from the Sun
+    camera: Orthographic  #: the light camera
     softness: Float  #: epsilon_s of 4.5, metres
-    config: MappingConfig
+    config: MappingConfig  #: how the map is filtered
 
     @staticmethod
     def of(casters: Gaussians, camera: Orthographic, softness: float, config: MappingConfig) -> "SunView | None":

@@ -15,7 +15,7 @@ SURE = 0.02  #: a raw occlusion nearer to 0 or 1 counts as this near: the networ
 
 
 @dataclass(frozen=True)
-class RefineConfig:
+class ShadowRefinementConfig:
     """Defaults: table 4.2 and the inputs of 4.11."""
 
     features: int = 6  #: learned numbers that each Gaussian has for this network
@@ -41,7 +41,7 @@ class RefineConfig:
 
 
 def refine_inputs(
-    config: RefineConfig, occlusion: Float, features: list[Float], positions: Array3f, info: list[Float]
+    config: ShadowRefinementConfig, occlusion: Float, features: list[Float], positions: Array3f, info: list[Float]
 ) -> list[Float]:
     """The inputs of 4.11 but for the Sun, arrays [M]. positions: Array3f [3, M], model-centred, in training scale
     (4.12);  info: normal alignment, light extent and bias, those in training scale."""
@@ -49,7 +49,7 @@ def refine_inputs(
     return [*inputs, 1 - occlusion, *info] if config.bias_info else inputs
 
 
-def refine_occlusion(config: RefineConfig, occlusion: Float, output: Float) -> Float:
+def refine_occlusion(config: ShadowRefinementConfig, occlusion: Float, output: Float) -> Float:
     """sigma(g), 4.13, which leaves open how the network's output g comes to lie in [0, 1]; or with `residual`
     sigma(logit(occ) + g): a correction in logits, so that one that says 0 changes nothing but occlusions within `SURE`
     of 0 and 1 (ours)."""

@@ -30,9 +30,9 @@ class ViewGradients:
     """Gradients of a scalar by what one view shows: by its splats and by what was blended, by name, see
     `stages.project_views`."""
 
-    camera: Pinhole
-    grad_splats: Splats
-    grad_values: dict[str, list[Float]]
+    camera: Pinhole  #: that the view was drawn from
+    grad_splats: Splats  #: by the splats, as `SplatGradients.splats`
+    grad_values: dict[str, list[Float]]  #: by what was blended: {name: a Float [N] for each channel}
     grad_features: Float | None = None  #: [F * N], of a method of light
     grad_rows: list[Float] = field(default_factory=list)  #: of the first rows, beside what the splats give them
 

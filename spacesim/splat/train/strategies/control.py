@@ -18,14 +18,14 @@ from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.structure import check_choices
 from spacesim.splat.raster.gaussians import Gaussians, stack_rows
 from spacesim.splat.train.optimizer.adam import Adam
-from spacesim.splat.train.strategies.densify import RefinementCounts, append_copies, grow, limit_opacities, prune
+from spacesim.splat.train.strategies.densify import DensificationCounts, append_copies, grow, limit_opacities, prune
 from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD, Strategy
 
 WINDOW = ("gradient", "seen", "radius")  #: statistics since the last densification step
 
 
 @dataclass(frozen=True)
-class RefinementConfig:
+class DensificationConfig:
     """When and by which rules the set of Gaussians is changed, whatever the strategy. Lengths are fractions of the
     scene's scale, screen sizes are radii as fractions of the image's longer side."""
 
@@ -95,7 +95,7 @@ class DensityControl(Strategy):
 
     unseen: tuple[str, ...] = ()  #: of the state, what no observation changes
 
-    def __init__(self, config: RefinementConfig, scene_scale: float, count: int, kept: tuple[str, ...]) -> None:
+    def __init__(self, config: DensificationConfig, scene_scale: float, count: int, kept: tuple[str, ...]) -> None:
         self.config, self.scene_scale, self.kept = config, scene_scale, kept
         self.state = {name: _zeros(count) for name in (*WINDOW, *kept)}
         self._observed = recorded(self._observation)
@@ -118,9 +118,9 @@ class DensityControl(Strategy):
 
     def refine(
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator, leniency: float = 1.0
-    ) -> RefinementCounts:
+    ) -> DensificationCounts:
         config = self.config
-        done = RefinementCounts()
+        done = DensificationCounts()
         since_reset = step % (config.reset_every * config.refine_every)
         active = config.refine_start < step < config.refine_stop
         if config.refines_at(step):
@@ -159,7 +159,7 @@ class DensityControl(Strategy):
 
     def _grow_and_prune(
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator, leniency: float
-    ) -> RefinementCounts:
+    ) -> DensificationCounts:
         config = self.config
         statistics = self._collect_statistics(step, gaussians)
         duplicate, split = self._growing(gaussians, statistics)
@@ -178,16 +178,16 @@ class DensityControl(Strategy):
         if self._outside_is_due(step):
             remove = remove | self._outside(gaussians, statistics)
         added = self._prune_and_fill(gaussians, optimizer, statistics, remove, rng)
-        return RefinementCounts(int(duplicate.sum()), int(split.sum()), int(remove.sum()), added)
+        return DensificationCounts(int(duplicate.sum()), int(split.sum()), int(remove.sum()), added)
 
     def _prune_outside(
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator
-    ) -> RefinementCounts:
+    ) -> DensificationCounts:
         """In the pause after a reset, when opacities tell nothing."""
         statistics = self._collect_statistics(step, gaussians)
         remove = self._outside(gaussians, statistics)
         added = self._prune_and_fill(gaussians, optimizer, statistics, remove, rng)
-        return RefinementCounts(pruned=int(remove.sum()), added=added)
+        return DensificationCounts(pruned=int(remove.sum()), added=added)
 
     def _prune_and_fill(
         self,

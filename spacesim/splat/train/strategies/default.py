@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.train.strategies.control import DensityControl, GaussianStatistics, RefinementConfig
+from spacesim.splat.train.strategies.control import DensificationConfig, DensityControl, GaussianStatistics
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class DefaultStrategyConfig:
 class DefaultStrategy(DensityControl):
     """One threshold for all; whatever is faint goes."""
 
-    def __init__(self, config: RefinementConfig, scene_scale: float, count: int) -> None:
+    def __init__(self, config: DensificationConfig, scene_scale: float, count: int) -> None:
         super().__init__(config, scene_scale, count, kept=())
 
     def _thresholds(self, gaussians: Gaussians, statistics: GaussianStatistics) -> np.ndarray:

@@ -19,14 +19,14 @@ SPLIT_COUNT = 2
 
 
 @dataclass(frozen=True)
-class RefinementCounts:
+class DensificationCounts:
     """What a densification step did, in numbers of Gaussians."""
 
-    duplicated: int = 0
-    split: int = 0
-    pruned: int = 0
-    added: int = 0
-    relocated: int = 0
+    duplicated: int = 0  #: small ones that got a copy
+    split: int = 0  #: large ones that became two
+    pruned: int = 0  #: taken away
+    added: int = 0  #: copies beside these, so that there are enough of them
+    relocated: int = 0  #: dead ones that moved to live ones (`mcmc`)
 
 
 def rearrange(gaussians: Gaussians, optimizer: Adam, index: np.ndarray, fresh: np.ndarray) -> None:

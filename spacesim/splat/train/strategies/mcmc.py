@@ -16,8 +16,8 @@ from spacesim.backend.upload import upload, upload_rows
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes, stack_rows
 from spacesim.splat.train.optimizer.adam import Adam
-from spacesim.splat.train.strategies.control import RefinementConfig
-from spacesim.splat.train.strategies.densify import RefinementCounts, rearrange
+from spacesim.splat.train.strategies.control import DensificationConfig
+from spacesim.splat.train.strategies.densify import DensificationCounts, rearrange
 from spacesim.splat.train.strategies.strategy import Strategy
 
 MAX_COPIES = 51  #: of one Gaussian whose sum of binomials is computed, as the paper's code has it; more count as 51
@@ -28,10 +28,10 @@ OPACITY_GATE_SLOPE = 100.0  #: steepness of the paper's gate: faint Gaussians ji
 @dataclass(frozen=True)
 class McmcConfig:
     """Gaussians as samples of a Markov chain. Schedule and the greatest number of Gaussians are those of
-    `RefinementConfig`, whose other rules do not count here."""
+    `DensificationConfig`, whose other rules do not count here."""
 
     kind: ClassVar[str] = "mcmc"
-    #: of `RefinementConfig`; a strategy without this reads all
+    #: of `DensificationConfig`; a strategy without this reads all
     reads: ClassVar[tuple[str, ...]] = ("refine_every", "max_gaussians", "refine_start", "refine_stop")
 
     min_opacity: float = 0.005  #: at most so opaque is dead
@@ -63,7 +63,7 @@ def compute_relocation(opacity: np.ndarray, scales: np.ndarray, copies: np.ndarr
 class McmcStrategy(Strategy):
     """Without state: who is dead is seen from the opacity."""
 
-    def __init__(self, schedule: RefinementConfig, mcmc: McmcConfig, scene_scale: float) -> None:
+    def __init__(self, schedule: DensificationConfig, mcmc: McmcConfig, scene_scale: float) -> None:
         self.schedule, self.mcmc, self.scene_scale = schedule, mcmc, scene_scale
         self.state: dict[str, Float] = {}
 
@@ -86,21 +86,21 @@ class McmcStrategy(Strategy):
 
     def refine(
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator, leniency: float = 1.0
-    ) -> RefinementCounts:
+    ) -> DensificationCounts:
         schedule = self.schedule
         if not (schedule.refine_start < step < schedule.refine_stop and step % schedule.refine_every == 0):
-            return RefinementCounts()
+            return DensificationCounts()
         opacity = 1 / (1 + np.exp(-np.array(gaussians.logit_opacities, np.float64)))
         dead = opacity <= leniency * self.mcmc.min_opacity
         alive = np.flatnonzero(~dead)
         if len(alive) == 0:
-            return RefinementCounts()
+            return DensificationCounts()
         target = min(int((1 + self.mcmc.growth) * gaussians.count), max(schedule.max_gaussians, gaussians.count))
         fresh = np.concatenate([np.flatnonzero(dead), np.arange(gaussians.count, target)])
         weights = opacity[alive]
         chosen = rng.choice(alive, len(fresh), p=weights / weights.sum())
         self._relocate(gaussians, optimizer, opacity, fresh, chosen)
-        return RefinementCounts(added=target - len(opacity), relocated=int(dead.sum()))
+        return DensificationCounts(added=target - len(opacity), relocated=int(dead.sum()))
 
     def _relocate(
         self, gaussians: Gaussians, optimizer: Adam, opacity: np.ndarray, fresh: np.ndarray, chosen: np.ndarray

@@ -16,7 +16,12 @@ from spacesim.backend.arrays import Bool, Float
 from spacesim.data.errors import InputError, WorkError, check_ranges
 from spacesim.data.mesh import SignedDistance
 from spacesim.splat.raster.gaussians import Gaussians, stack_rows
-from spacesim.splat.train.strategies.control import DensityControl, GaussianStatistics, RefinementConfig, select_parents
+from spacesim.splat.train.strategies.control import (
+    DensificationConfig,
+    DensityControl,
+    GaussianStatistics,
+    select_parents,
+)
 from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD
 
 KNOWN = ("known", "known_x", "known_y", "known_z")
@@ -48,9 +53,9 @@ class MeshAwareConfig:
 class Regions:
     """The partition of 5.2, [N] bool each: exterior, interior, boundary layer."""
 
-    exterior: np.ndarray
-    interior: np.ndarray
-    boundary: np.ndarray
+    exterior: np.ndarray  #: outside of the mesh by more than the outer margin
+    interior: np.ndarray  #: inside of it by more than the inner margin
+    boundary: np.ndarray  #: between both
 
 
 def regions(distance: np.ndarray, exterior_margin: float, interior_margin: float) -> Regions:
@@ -77,7 +82,7 @@ class MeshAwareStrategy(DensityControl):
 
     def __init__(
         self,
-        config: RefinementConfig,
+        config: DensificationConfig,
         mesh_aware: MeshAwareConfig,
         surface: SignedDistance,
         scene_scale: float,

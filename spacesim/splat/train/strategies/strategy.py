@@ -11,7 +11,7 @@ import numpy as np
 from spacesim.backend.arrays import Bool, Float
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.optimizer.adam import Adam
-from spacesim.splat.train.strategies.densify import RefinementCounts
+from spacesim.splat.train.strategies.densify import DensificationCounts
 
 MAX_STEPS = 10**9  #: of any count of iterations that is configured
 MAX_THRESHOLD = 1e6  #: of any threshold or length that is configured
@@ -36,7 +36,7 @@ class Strategy(ABC):
     @abstractmethod
     def refine(
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator, leniency: float = 1.0
-    ) -> RefinementCounts:
+    ) -> DensificationCounts:
         """Refine if it is time to, after `step` finished steps. Changes `gaussians`, `optimizer` and the state.
 
         leniency: factor of the opacity below which a Gaussian is too faint (conservative culling, thesis 5.3)."""

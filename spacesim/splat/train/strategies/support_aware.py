@@ -10,7 +10,12 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.splat.raster.gaussians import Gaussians, stack_rows
-from spacesim.splat.train.strategies.control import DensityControl, GaussianStatistics, RefinementConfig, select_parents
+from spacesim.splat.train.strategies.control import (
+    DensificationConfig,
+    DensityControl,
+    GaussianStatistics,
+    select_parents,
+)
 from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD
 
 SUPPORT_STATISTICS = ("support_count", "support_gradient", "support_radius")  #: c, g and r of 5.10
@@ -94,7 +99,7 @@ def candidates(means: np.ndarray, score: np.ndarray, opacity: np.ndarray, config
     return Candidates(supported & (distance <= reach), off_core)
 
 
-def _first_refinement(config: RefinementConfig, warm_start: int) -> int:
+def _first_refinement(config: DensificationConfig, warm_start: int) -> int:
     """The first step after a warm start of so many that refines."""
     steps = range(0, config.refine_stop, config.refine_every)
     return next((step for step in steps if step > warm_start and config.refines_at(step)), config.refine_stop)
@@ -104,7 +109,12 @@ class SupportAwareStrategy(DensityControl):
     """State beside that of `DensityControl`: the three moving averages of 5.10."""
 
     def __init__(
-        self, config: RefinementConfig, support: SupportAwareConfig, scene_scale: float, count: int, warm_start: int = 0
+        self,
+        config: DensificationConfig,
+        support: SupportAwareConfig,
+        scene_scale: float,
+        count: int,
+        warm_start: int = 0,
     ) -> None:
         """warm_start: steps of a warm start, which keeps densification off"""
         super().__init__(config, scene_scale, count, kept=SUPPORT_STATISTICS)

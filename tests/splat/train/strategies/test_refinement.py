@@ -13,7 +13,7 @@ from spacesim.learning.adam import NetworkAdam, adam_step
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
 from spacesim.splat.train.config import preset, shortened
 from spacesim.splat.train.optimizer.adam import Adam
-from spacesim.splat.train.strategies.control import RefinementConfig
+from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.strategies.default import DefaultStrategy
 from spacesim.splat.train.strategies.densify import grow, limit_opacities, prune, rearrange
 
@@ -102,7 +102,9 @@ def test_opacity_reset_limits_and_forgets():
     np.testing.assert_array_equal(optimizer.moments()[0][0], [1, 2, 3, 4, 5, 6])
 
 
-def refine_once(step: int, config: RefinementConfig, **state) -> tuple[DefaultStrategy, Gaussians, np.ndarray, tuple]:
+def refine_once(
+    step: int, config: DensificationConfig, **state
+) -> tuple[DefaultStrategy, Gaussians, np.ndarray, tuple]:
     model = gaussians()
     scales = np.full((6, 3), np.log(0.001), dtype=np.float32)
     scales[1] = np.log(0.02)  # larger than duplicate_scale
@@ -125,7 +127,7 @@ GRADIENT = [0.01, 0.01, 0.0, 0.0, 0.0, 0.01]  # the sixth is never seen, so its 
 
 
 def test_high_gradients_duplicate_small_and_split_large_gaussians():
-    strategy, model, means, moves = refine_once(1100, RefinementConfig(), gradient=GRADIENT)
+    strategy, model, means, moves = refine_once(1100, DensificationConfig(), gradient=GRADIENT)
     assert moves == (1, 1, 1)  # before the first reset only faint Gaussians are pruned
     assert model.count == 6 + 2 - 1
     np.testing.assert_array_equal(np.array(model.means).T[0], means[0])
@@ -133,15 +135,15 @@ def test_high_gradients_duplicate_small_and_split_large_gaussians():
 
 
 def test_large_gaussians_are_pruned_after_the_first_reset():
-    assert refine_once(4100, RefinementConfig(), gradient=GRADIENT)[3] == (1, 1, 2)
+    assert refine_once(4100, DensificationConfig(), gradient=GRADIENT)[3] == (1, 1, 2)
 
 
 def test_screen_size_splits_and_prunes_until_its_stop():
     radius = [0.0, 0.0, 0.02, 0.0, 0.0, 0.0]
-    config = RefinementConfig(screen_size_stop=5000)
+    config = DensificationConfig(screen_size_stop=5000)
     assert refine_once(1100, config, radius=radius)[3] == (0, 1, 1)
     assert refine_once(5100, config, radius=radius)[3] == (0, 0, 2)
-    wide, radius = RefinementConfig(split_screen_size=1.0), [0.0, 0.0, 0.06, 0.0, 0.0, 0.0]
+    wide, radius = DensificationConfig(split_screen_size=1.0), [0.0, 0.0, 0.06, 0.0, 0.0, 0.0]
     assert refine_once(2900, wide, radius=radius)[3] == (0, 0, 1)  # pruned by size after the first reset alone
     assert refine_once(4100, wide, radius=radius)[3] == (0, 0, 3)
     assert refine_once(4100, replace(wide, screen_size_stop=4000), radius=radius)[3] == (0, 0, 2)
@@ -151,7 +153,7 @@ def test_splitting_by_size_can_ask_for_a_gradient():
     """5.17: of two that are wide on the screen only the one whose gradient is high grows."""
     radius, gradient = [0.0, 0.02, 0.02, 0.0, 0.0, 0.0], [0.0, 0.01, 0.0, 0.0, 0.0, 0.0]
     for which, split in (("all", 2), ("growing", 1)):
-        config = RefinementConfig(split_screen=which)
+        config = DensificationConfig(split_screen=which)
         assert refine_once(1100, config, gradient=gradient, radius=radius)[3] == (0, split, 1)
 
 
@@ -159,12 +161,12 @@ def test_what_is_small_and_wide_on_the_screen_is_duplicated_and_split():
     """As in gsplat: three where there was one, of which two are halves."""
     radius = [0.02, 0.0, 0.0, 0.0, 0.0, 0.0]
     gradient = [0.01, 0.0, 0.0, 0.0, 0.0, 0.0]
-    _, model, means, moves = refine_once(1100, RefinementConfig(), gradient=gradient, radius=radius)
+    _, model, means, moves = refine_once(1100, DensificationConfig(), gradient=gradient, radius=radius)
     assert (moves, model.count) == ((1, 1, 1), 6 + 2 - 1)
     scales = np.exp(np.array(model.log_scales)[0])
     at_first = np.linalg.norm(np.array(model.means).T - means[0], axis=1) < 0.01
     np.testing.assert_allclose(np.sort(scales[at_first]), [0.001 / 1.6, 0.001 / 1.6, 0.001], rtol=1e-5)
-    full = RefinementConfig(max_gaussians=7)  # room for one more, and this would be two
+    full = DensificationConfig(max_gaussians=7)  # room for one more, and this would be two
     assert refine_once(1100, full, gradient=gradient, radius=radius)[3] == (0, 0, 1)
 
 
@@ -186,28 +188,28 @@ def test_the_thesis_splits_by_size_on_the_screen_before_the_first_reset_alone():
 @pytest.mark.parametrize("step", [100, 500, 999, 1150, 3500, 15_000, 20_000])
 def test_no_refinement_out_of_its_time(step):
     """Before the start, off the interval, in the pause after a reset, after the stop (table 5.1)."""
-    _, model, means, moves = refine_once(step, RefinementConfig(), gradient=GRADIENT)
+    _, model, means, moves = refine_once(step, DensificationConfig(), gradient=GRADIENT)
     assert moves == (0, 0, 0)
     np.testing.assert_array_equal(np.array(model.means).T, means)
 
 
 def test_the_reset_comes_every_thirty_refinements():
     for step, reset in ((3000, True), (3100, False), (6000, True)):
-        _, model, _, _ = refine_once(step, RefinementConfig())
+        _, model, _, _ = refine_once(step, DensificationConfig())
         assert (np.array(model.logit_opacities).max() < 0) == reset
 
 
 def test_no_reset_whose_pause_outlasts_refinement():
     for stop, reset in ((3900, False), (4000, True)):
-        _, model, _, _ = refine_once(3000, RefinementConfig(refine_stop=stop))
+        _, model, _, _ = refine_once(3000, DensificationConfig(refine_stop=stop))
         assert (np.array(model.logit_opacities).max() < 0) == reset
 
 
 def test_growth_stops_at_the_maximum_and_prefers_the_largest_gradients():
-    config = RefinementConfig(max_gaussians=7)
+    config = DensificationConfig(max_gaussians=7)
     _, _, _, moves = refine_once(1100, config, gradient=[0.01, 0.02, 0.0, 0.0, 0.0, 0.0])
     assert moves == (0, 1, 1)
-    assert refine_once(1100, RefinementConfig(max_gaussians=6), gradient=GRADIENT)[3] == (0, 0, 1)
+    assert refine_once(1100, DensificationConfig(max_gaussians=6), gradient=GRADIENT)[3] == (0, 0, 1)
 
 
 def test_refinement_over_a_power_of_two_does_not_keep_both_sizes():

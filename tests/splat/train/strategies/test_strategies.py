@@ -15,7 +15,7 @@ from spacesim.data.mesh import SignedDistance
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.config import STRATEGIES, TrainConfig, preset
 from spacesim.splat.train.optimizer.adam import Adam
-from spacesim.splat.train.strategies.control import GaussianStatistics, RefinementConfig, select_parents
+from spacesim.splat.train.strategies.control import DensificationConfig, GaussianStatistics, select_parents
 from spacesim.splat.train.strategies.default import DefaultStrategy, DefaultStrategyConfig
 from spacesim.splat.train.strategies.factory import make_strategy
 from spacesim.splat.train.strategies.mcmc import McmcConfig, McmcStrategy, compute_relocation
@@ -32,7 +32,7 @@ from spacesim.splat.train.strategies.support_aware import (
 from spacesim.splat.train.trainer import Trainer
 from spacesim.splat.train.warm_start import WarmStartConfig
 
-TAU = RefinementConfig().grow_gradient
+TAU = DensificationConfig().grow_gradient
 STEP = 1100  #: a refinement before the first reset: nothing is pruned by size
 TINY, LARGE = np.log(0.001), np.log(0.02)  #: below and above the scale at which Gaussians are split
 
@@ -96,7 +96,7 @@ MESH = MeshAwareConfig(cull_every=2500, exterior_margin=0.1, interior_margin=0.2
 
 def mesh_aware(count: int, config: MeshAwareConfig = MESH) -> tuple[MeshAwareStrategy, Height]:
     height = Height()
-    return MeshAwareStrategy(RefinementConfig(), config, height, scene_scale=1.0, count=count), height
+    return MeshAwareStrategy(DensificationConfig(), config, height, scene_scale=1.0, count=count), height
 
 
 def test_regions_are_those_of_5_2():
@@ -167,7 +167,7 @@ def test_known_sides_change_nothing(meshed):
     """Random walks about a mesh: regions as if each were asked for anew."""
     surface = SignedDistance.of(meshed.root / meshed.mesh_path)
     config = MeshAwareConfig(exterior_margin=0.02, interior_margin=0.1)
-    strategy = MeshAwareStrategy(RefinementConfig(), config, surface, scene_scale=1.0, count=500)
+    strategy = MeshAwareStrategy(DensificationConfig(), config, surface, scene_scale=1.0, count=500)
     rng = np.random.default_rng(0)
     means = rng.uniform(-1, 1, (500, 3))
     survey = strategy._collect_statistics(STEP, model(np.zeros(500)))
@@ -224,7 +224,7 @@ def test_nothing_is_copied_where_no_region_is_valid():
 
 def support_aware(count: int, **changes) -> SupportAwareStrategy:
     config = SupportAwareConfig(**{"min_gaussians": 0, **changes})
-    return SupportAwareStrategy(RefinementConfig(), config, scene_scale=1.0, count=count)
+    return SupportAwareStrategy(DensificationConfig(), config, scene_scale=1.0, count=count)
 
 
 def test_moving_averages_are_a_plain_loop():
@@ -376,7 +376,7 @@ def test_state_follows_duplicates_halves_and_what_is_pruned(kind):
     scales = np.full((3, 6), TINY, np.float32)
     scales[:, 3] = LARGE
     gaussians.log_scales = ad.Array3f(scales)
-    config = RefinementConfig(prune_opacity=0.499)
+    config = DensificationConfig(prune_opacity=0.499)
     if kind == "mesh-aware":
         strategy: Strategy = MeshAwareStrategy(config, replace(MESH, exterior_margin=0.0), Height(), 1.0, 6)
     else:
@@ -399,7 +399,7 @@ def test_lenient_culling_halves_the_opacity_threshold(kind):
     opacity = [0.9, 0.04, 0.02]
     for leniency, left in ((1.0, 1), (0.5, 2)):
         gaussians = model([0.3, 0.3, 0.3], opacity)
-        strategy: Strategy = DefaultStrategy(RefinementConfig(), 1.0, 3)
+        strategy: Strategy = DefaultStrategy(DensificationConfig(), 1.0, 3)
         if kind == "mesh-aware":
             strategy = mesh_aware(3)[0]
         if kind == "support-aware":
@@ -414,7 +414,7 @@ ONE_STEP = "--preset", "demo", "--iterations", 1, "--set", "init_count=50"
 def test_what_is_too_faint_is_an_option(spacesim, tiny_data, tmp_path):
     for least, left in ((0.05, 1), (0.03, 2), (0.005, 3)):
         gaussians = model([0.3, 0.3, 0.3], [0.9, 0.04, 0.02])
-        refine(DefaultStrategy(RefinementConfig(prune_opacity=least), 1.0, 3), gaussians)
+        refine(DefaultStrategy(DensificationConfig(prune_opacity=least), 1.0, 3), gaussians)
         assert gaussians.count == left
     line = ["train", tiny_data, "--out", tmp_path / "run", *ONE_STEP]
     for wrong in ("0", "0.5", "nan"):
@@ -444,10 +444,10 @@ def test_what_is_too_wide_is_an_option(spacesim, tiny_data, tmp_path):
 def test_one_gaussian_is_refined_like_many(kind, count):
     gaussians = model(np.zeros(count))
     made: dict[str, Strategy] = {
-        "default": DefaultStrategy(RefinementConfig(), 1.0, count),
+        "default": DefaultStrategy(DensificationConfig(), 1.0, count),
         "mesh-aware": mesh_aware(count)[0],
         "support-aware": support_aware(count, min_gaussians=40),
-        "mcmc": McmcStrategy(RefinementConfig(), McmcConfig(growth=1.0), 1.0),
+        "mcmc": McmcStrategy(DensificationConfig(), McmcConfig(growth=1.0), 1.0),
     }
     strategy = made[kind]
     show(strategy, [2 * TAU] * count)
@@ -474,7 +474,7 @@ def test_copies_that_share_look_like_one(opacity, copies):
 
 
 def mcmc(**changes) -> McmcStrategy:
-    return McmcStrategy(RefinementConfig(max_gaussians=changes.pop("most", 100)), McmcConfig(**changes), 1.0)
+    return McmcStrategy(DensificationConfig(max_gaussians=changes.pop("most", 100)), McmcConfig(**changes), 1.0)
 
 
 def test_dead_gaussians_move_to_live_ones():
@@ -532,7 +532,7 @@ def test_noise_is_normal_along_the_scales_and_gated_by_opacity():
 
 
 def config_of(strategy: str) -> TrainConfig:
-    refinement = RefinementConfig(
+    refinement = DensificationConfig(
         refine_start=10, refine_every=20, pause_after_reset=20, reset_every=4, refine_stop=150, screen_size_stop=0
     )
     own = {

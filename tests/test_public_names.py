@@ -1,0 +1,42 @@
+"""What `import spacesim` gives: names that are loaded when they are used, and that type checkers know."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_names_are_imported_when_they_are_used():
+    program = """
+import sys
+import spacesim as ss
+heavy = {"numpy", "drjit", "mitsuba", "spacesim.api"}
+assert not heavy & set(sys.modules), sorted(heavy & set(sys.modules))
+from spacesim.data import errors
+import spacesim.cli
+assert "spacesim.api" not in sys.modules
+assert not hasattr(ss, "_repr_html_")
+assert not hasattr(ss, "cli_of_another_name")
+assert "spacesim.api" in sys.modules
+from spacesim import *
+from spacesim import api
+assert (train, InputError) == (api.train, errors.InputError)
+assert set(ss.__all__) | {"__version__"} == set(dir(ss))
+assert [name for name in ss.__all__ if getattr(ss, name) is not getattr(api, name)] == []
+assert not hasattr(ss, "replace")  # of api, but no name of its own
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_type_checkers_see_the_public_names(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text("import spacesim as ss\nreveal_type(ss.read_scene)\nss.trian\nss.replace\n", encoding="utf-8")
+    mypy = Path(sys.executable).with_name("mypy")
+    command = [mypy, "--no-error-summary", "--follow-imports=silent", program]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    lines = done.stdout.splitlines()
+    assert "SceneConfig" in lines[0], done.stdout
+    assert [re.findall(r'no attribute "(\w+)"', line) for line in lines[1:]] == [["trian"], ["replace"]], done.stdout
