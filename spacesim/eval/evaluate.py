@@ -25,6 +25,7 @@ from spacesim.data.records import Dataset, Frame
 from spacesim.eval.align import align
 from spacesim.eval.fit import predict_by_halves
 from spacesim.eval.frame_metrics import (
+    depth_range,
     frame_images,
     frame_light,
     image_groups,
@@ -251,6 +252,7 @@ def _evaluate_frame(
         "name": folder.name,
         "sun": rounded_angles(frame),
         "known_sun": has_known_sun,
+        "depth_range": depth_range(light),
     }
     if unknowns:
         named["fitted"] = fitted
@@ -330,6 +332,7 @@ def _describe(dataset: Dataset, frames: Sequence[Frame], ignored: float) -> Json
         "train_frames": len(dataset.train),
         "suns": count_suns(frames),
         "resolution": [frames[0].camera.width, frames[0].camera.height],
+        "sizes": len({(frame.camera.width, frame.camera.height) for frame in frames}),
         **{key: dataset.scene.get(key) for key in ("scene", "config", "versions")},
     }
 

@@ -132,12 +132,13 @@ def test_layout(make_run, dataset, tmp_path):
     assert metrics["config"]["seed"] == 7
     assert metrics["dataset"]["suns"] == 2
     assert metrics["dataset"]["scene"] == "sphere"
+    assert metrics["dataset"]["sizes"] == 1
     assert metrics["dataset"]["config"] == {"spp": 16, "seed": 1}
     for word in ("Geometry", "LPIPS", "Visibility"):
         assert sum(note.startswith(word) for note in metrics["notes"]) == 1
     for frame in metrics["frames"]:
         folder = tmp_path / "eval" / "frames" / frame["name"]
-        names = {"truth", "prediction", "error", "shadow_truth", "shadow_prediction"}
+        names = {"truth", "prediction", "error", "shadow_truth", "shadow_prediction", "depth_truth", "depth"}
         assert {path.stem for path in folder.glob("*.png")} == names
 
 
