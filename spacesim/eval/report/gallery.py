@@ -179,5 +179,5 @@ def _strip(run: Evaluation, name: str, panels: Panels, captions: Panels, limit: 
 
 def _depth_scale(frame: JsonMapping) -> str:
     """HTML: the ends of a frame's colours in metres."""
-    near, far = (f"{value:.4g} m" for value in frame["depth_range"])
+    near, far = (f"{value:.4g}&nbsp;m" for value in frame["depth_range"])
     return f"<br>{near} {color_bar(depth_colors(np.linspace(0, 1, 17)))} {far}"

@@ -501,7 +501,7 @@ def test_depth_has_a_scale_in_metres(folder):
     deep = another(folder, "deep", scaled)
     text = "".join(page_of(deep).text)
     for far in (8.25, 9.25, 10.25):
-        assert text.count(f"3.125 m  {far} m") == 2
+        assert text.count(f"3.125\u00a0m  {far}\u00a0m") == 2
     assert "Depth" in page_of(deep, another(folder, "other", lambda metrics: metrics.update(run="o"))).text
     older = another(folder, "older", older)
     assert "Depth" not in page_of(older).text
