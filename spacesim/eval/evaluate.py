@@ -45,6 +45,7 @@ from spacesim.eval.notes import (
     explain_light,
     explain_objects,
     explain_other_data,
+    explain_sensor,
 )
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
 from spacesim.eval.objects import compare_object_shapes, object_groups, object_names, swapped_order
@@ -169,6 +170,7 @@ def evaluate(
             *([shape.note] if shape.note else []),
             *([no_map] if no_map else []),
             *explain_ignored(ignored),
+            *explain_sensor(dataset.scene),
             *explain(records, [result.source for result in results], None if network else lpips_sentence, method),
             *explain_light(
                 [result.has_known_sun for result in results],
