@@ -37,7 +37,7 @@ SHA256 = {
 """How the files' SHA-256 begin: torchvision's is in the name, the other was computed from the package."""
 
 SOURCES = {
-    BACKBONE_FILE: f"{BACKBONE_FILE} (https://download.pytorch.org/models/{BACKBONE_FILE})",
+    BACKBONE_FILE: f"{BACKBONE_FILE} (download.pytorch.org/models/{BACKBONE_FILE})",
     LINEAR_FILE: f"{LINEAR_FILE} (lpips/weights/v0.1/ in the package lpips)",
 }
 """Where each is to be had, in words."""

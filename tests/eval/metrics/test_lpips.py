@@ -129,7 +129,7 @@ def test_no_weights_is_none_and_a_sentence(monkeypatch, tmp_path):
     location, sentence = lpips.find_weights()
     assert location is None
     assert "alex.pth" in sentence
-    assert "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth" in sentence
+    assert "(download.pytorch.org/models/alexnet-owt-7be5be79.pth" in sentence
     assert "lpips_weights" in sentence
     assert lpips.load()[0] is None
 
