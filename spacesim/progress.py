@@ -4,10 +4,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import TYPE_CHECKING
 
 from rich import progress
 from rich.console import Console
+from rich.text import Text
 
 if TYPE_CHECKING:
     from spacesim.learning.folder import TrainingProgress
@@ -24,8 +26,11 @@ class Reporter:
         self.first: tuple[float, int] | None = None
         self.last_line = 0.0
 
-    def __call__(self, done: int, total: int, detail: str = "") -> None:
-        """`done` of `total` units are finished."""
+    def __call__(
+        self, done: int, total: int, detail: str = "", left: float | None = None, lower_bound: bool = False
+    ) -> None:
+        """`done` of `total` units are finished. left: seconds that the others will take, where the caller knows better
+        than by the units' mean; lower_bound: or longer"""
         now = time.monotonic()
         if self.first is None:
             self.first = now, done
@@ -33,16 +38,29 @@ class Reporter:
         rate = f"{speed:.1f} {self.unit}/s" if done > self.first[1] else ""
         text = "  ".join(part for part in (rate, detail) if part)
         if self.bar is not None and self.task is not None:
-            self.bar.update(self.task, completed=done, total=total, detail=text)
+            least = "at least " * lower_bound
+            self.bar.update(self.task, completed=done, total=total, detail=text, left=left, least=least)
         elif now - self.last_line >= LINE_EVERY or done == total:
-            left = f"  {(total - done) / speed:.0f} s left" if rate and done < total else ""
-            print(f"{self.title}: {done}/{total}  {text}{left}", file=sys.stderr, flush=True)
+            if left is None and rate:
+                left = (total - done) / speed
+            rest = f"  {'at least ' * lower_bound}{left:.0f} s left" if left is not None and done < total else ""
+            print(f"{self.title}: {done}/{total}  {text}{rest}", file=sys.stderr, flush=True)
             self.last_line = now
 
 
 def report_training(report: Reporter) -> "Callable[[TrainingProgress], None]":
     """What tells `report` of a training's progress."""
-    return lambda p: report(p.iteration, p.iterations, p.words)
+    return lambda p: report(p.iteration, p.iterations, p.words, p.seconds_left, p.lower_bound)
+
+
+class TimeLeftColumn(progress.TimeRemainingColumn):
+    """What the work itself says, else what rich reckons from the units' speed."""
+
+    def render(self, task: progress.Task) -> Text:
+        left = task.fields.get("left")
+        if left is None or task.finished:
+            return super().render(task)
+        return Text(f"{task.fields['least']}{timedelta(seconds=round(left))}", style="progress.remaining")
 
 
 @contextmanager
@@ -57,6 +75,6 @@ def show_progress(title: str, unit: str, quiet: bool = False) -> Iterator[Report
         progress.BarColumn(bar_width=20),
         progress.MofNCompleteColumn(),
     ]
-    columns += [progress.TimeRemainingColumn(), progress.TextColumn("{task.fields[detail]}")]
+    columns += [TimeLeftColumn(), progress.TextColumn("{task.fields[detail]}")]
     with progress.Progress(*columns, console=console) as bar:
         yield Reporter(title, unit, bar)

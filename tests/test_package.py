@@ -1,10 +1,14 @@
-"""The wheel holds what a run of the program needs, and runs without the checkout."""
+"""The wheel holds what a run of the program needs, and runs without the checkout; how the project is cited."""
 
 import shutil
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
+
+import pytest
+
+from spacesim.data.toml import parse
 
 ROOT = Path(__file__).parents[1]
 
@@ -28,3 +32,20 @@ def test_the_wheel_stands_alone(tmp_path):
     done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=alone, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(str(tmp_path / "site"))
+
+
+def test_the_citation_is_that_of_the_package():
+    """In the format's fields that 1.2.0 asks for, by what the project says of itself elsewhere."""
+    yaml = pytest.importorskip("yaml", reason="PyYAML (extra: docs) is not installed")
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    project = parse((ROOT / "pyproject.toml").read_text(encoding="utf-8"), "pyproject.toml").values["project"]
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    assert (citation["title"], citation["abstract"]) == (project["name"], project["description"])
+    for record in (citation, citation["preferred-citation"]):
+        assert (record["version"], record["type"]) == (project["version"], "software")
+    assert (citation["license"], citation["keywords"]) == (project["license"], project["keywords"])
+    year, authors = citation["preferred-citation"]["year"], citation["authors"][0]["name"]
+    assert f"Copyright (c) {year}, {authors[0].lower()}{authors[1:]}" in (ROOT / "LICENSE").read_text(encoding="utf-8")
+    (thesis,) = citation["references"]
+    assert {"type", "title", "authors"} <= set(thesis)
+    assert f'"{thesis["title"]}"' in (ROOT / "README.md").read_text(encoding="utf-8")

@@ -38,4 +38,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError("sun: expected AZ,EL for a run that can be relit and a camera without a Sun, found none")
     seen = run.predict(camera, sun, normals=options.kind == "normal", exposure=options.exposure)
     write_picture(seen, options.kind, options.out)
+    surface = seen.depth[seen.depth > 0]
+    if options.kind == "depth" and options.out.suffix == ".png" and surface.size:
+        print(f"depth: {surface.min():.4g} m is white, {surface.max():.4g} m darkest; .exr has metres", file=sys.stderr)
     interrupts.print_output(options.out)

@@ -25,6 +25,7 @@ from spacesim.data.records import Dataset, Frame
 from spacesim.eval.align import align
 from spacesim.eval.fit import predict_by_halves
 from spacesim.eval.frame_metrics import (
+    depth_range,
     frame_images,
     frame_light,
     image_groups,
@@ -44,6 +45,7 @@ from spacesim.eval.notes import (
     explain_light,
     explain_objects,
     explain_other_data,
+    explain_sensor,
 )
 from spacesim.eval.objects import GROUPS as OBJECT_GROUPS
 from spacesim.eval.objects import compare_object_shapes, object_groups, object_names, swapped_order
@@ -168,6 +170,7 @@ def evaluate(
             *([shape.note] if shape.note else []),
             *([no_map] if no_map else []),
             *explain_ignored(ignored),
+            *explain_sensor(dataset.scene),
             *explain(records, [result.source for result in results], None if network else lpips_sentence, method),
             *explain_light(
                 [result.has_known_sun for result in results],
@@ -251,6 +254,7 @@ def _evaluate_frame(
         "name": folder.name,
         "sun": rounded_angles(frame),
         "known_sun": has_known_sun,
+        "depth_range": depth_range(light),
     }
     if unknowns:
         named["fitted"] = fitted
@@ -330,6 +334,7 @@ def _describe(dataset: Dataset, frames: Sequence[Frame], ignored: float) -> Json
         "train_frames": len(dataset.train),
         "suns": count_suns(frames),
         "resolution": [frames[0].camera.width, frames[0].camera.height],
+        "sizes": len({(frame.camera.width, frame.camera.height) for frame in frames}),
         **{key: dataset.scene.get(key) for key in ("scene", "config", "versions")},
     }
 

@@ -37,6 +37,7 @@ class FrameLight:
     #: [H, W] predicted share of the solar disc that is seen, None where the method predicts none
     visibility: np.ndarray | None
     alpha: np.ndarray  #: [H, W] predicted
+    depth: np.ndarray  #: [H, W] predicted of surfaces, metres; 0 where alpha is below one half
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,8 @@ def frame_images(dataset: Dataset, frame: Frame, prediction: "Prediction") -> tu
 def frame_light(dataset: Dataset, frame: Frame, prediction: "Prediction") -> FrameLight:
     """Raises InputError where the truth that the dataset names is missing or broken."""
     truth = None if frame.gt_path is None else load_truth(dataset, frame)
-    return FrameLight(truth, prediction.visibility, prediction.alpha)
+    depth = np.where(prediction.alpha >= 0.5, np.nan_to_num(prediction.depth), 0)
+    return FrameLight(truth, prediction.visibility, prediction.alpha, depth)
 
 
 def is_photograph(frame: Frame, source: str) -> bool:
@@ -125,8 +127,16 @@ def tally_grazing(light: FrameLight, view: FrameImages) -> Array | None:
     return grazing.tally(light.truth, *levels, light.visibility, view.valid)
 
 
+def depth_range(light: FrameLight) -> tuple[float, float] | None:
+    """(nearest, farthest) true depth, metres, predicted where there is no truth; None where nothing is seen."""
+    depth = light.depth if light.truth is None else light.truth.depth
+    seen = depth[depth > 0]
+    return (float(seen.min()), float(seen.max())) if seen.size else None
+
+
 def write_pictures(folder: Path, view: FrameImages, light: FrameLight, photograph: bool = False) -> None:
-    """Three pictures, two of dark pixels but of photographs, three more where visibility is predicted and known."""
+    """Three pictures, two of dark pixels but of photographs, three more where visibility is predicted and known, and of
+    the depths, `depth_range` in colours."""
     images = {
         "truth": pictures.as_bytes(view.truth),
         "prediction": pictures.as_bytes(view.prediction),
@@ -142,6 +152,11 @@ def write_pictures(folder: Path, view: FrameImages, light: FrameLight, photograp
         images["mask_truth"] = pictures.kinds_picture(classes, mask)
         images["mask_prediction"] = pictures.mask_picture(light.visibility < 0.5, classes, mask)
         images["visibility"] = pictures.visibility_picture(light.visibility, light.alpha)
+    span = depth_range(light)
+    if span is not None:
+        images["depth"] = pictures.depth_picture(light.depth, span)
+        if light.truth is not None:
+            images["depth_truth"] = pictures.depth_picture(light.truth.depth, span)
     for name, picture in images.items():
         write_png(folder / f"{name}.png", picture)
 

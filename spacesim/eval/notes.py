@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from spacesim.data.files import JsonDict
+from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.eval.labels import GROUPS
 from spacesim.splat.fit import Unknown
 
@@ -67,6 +67,18 @@ def explain_ignored(share: float) -> list[str]:
     if share <= 0:
         return []
     return [f"{100 * share:.3g} % of the pixels count nowhere, not in image_full either: nothing is known of them."]
+
+
+def explain_sensor(scene: JsonMapping) -> list[str]:
+    """A sentence where scene.json tells of a sensor with noise."""
+    try:
+        sensor = scene["config"]["camera"]["sensor"]
+        shot = [f"shot noise of a full well of {sensor['full_well_e']:g} electrons"] if sensor["shot_noise"] else []
+        read = [f"read noise of {sensor['read_noise_e']:g} electrons"] if sensor["read_noise_e"] > 0 else []
+    except (KeyError, TypeError, ValueError):
+        return []
+    noise = " and ".join(shot + read)
+    return [f"The true pictures have a sensor's noise, which no model foretells: {noise}."] if noise else []
 
 
 def explain_other_data(trained: Path | None, aligned: Path | None) -> list[str]:

@@ -14,6 +14,8 @@ from spacesim.learning.pictures import LIT, SHADOWED
 ERROR_SCALE = 0.25
 """Mean absolute error of the channels at the bright end of the colour map; more is drawn as that."""
 
+FARTHEST_SHADE = 0.15  #: of the colour map at the farthest depth: the background alone is black
+
 WRONGLY_SHADOWED, WRONGLY_LIT = (213, 94, 0), (86, 180, 233)
 """sRGB colours of shadow masks; the mistakes' are Okabe and Ito's, which colour-blind readers tell apart."""
 
@@ -72,6 +74,18 @@ def visibility_picture(visibility: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     seen = np.clip(visibility, 0, 1)[..., None]
     colors = (np.array(SHADOWED) * (1 - seen) + np.array(LIT) * seen) / 255
     return as_bytes(colors * np.clip(alpha, 0, 1)[..., None])
+
+
+def depth_colors(shares: np.ndarray) -> np.ndarray:
+    """[..., 3] uint8 colours of depths from the nearest, 0, to the farthest, 1: near is bright."""
+    return error_colors(1 - (1 - FARTHEST_SHADE) * np.clip(shares, 0, 1))
+
+
+def depth_picture(depth: np.ndarray, span: tuple[float, float]) -> np.ndarray:
+    """[H, W, 3] uint8 colours of depths [H, W] by the nearest and the farthest of the map, metres; black where there is
+    none."""
+    near, far = span
+    return depth_colors((depth - near) / max(far - near, 1e-9)) * (depth > 0)[..., None].astype(np.uint8)
 
 
 @cache

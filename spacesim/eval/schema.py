@@ -134,6 +134,7 @@ class FrameRecord:
     shadow_full: Values | None  #: those of shadow by luminance over the whole frame
     shadow_mask: Values | None  #: those of predicted visibility
     known_sun: bool | None = None  #: whether training has seen its Sun; None where that is not known
+    depth_range: tuple[float, float] | None = None  #: metres: the ends of its pictures of depth, None: it has none
     ssim: float | None = None  #: at most 1
     lpips: float | None = None  #: None without the network's weights
     mae: float | None = None  #: of sRGB values in [0, 1]
@@ -213,6 +214,7 @@ class DatasetFacts:
     train_frames: int  #: of the dataset, for training
     suns: int  #: of the evaluated frames
     resolution: tuple[int, int]  #: width and height of the first frame, pixels
+    sizes: int = 1  #: how many different ones the frames have
     digest: str | None = None  #: of the evaluated frames
     ignored: float | None = None  #: share of their pixels that count nowhere
     truth: bool | None = None  #: whether it was path-traced

@@ -49,6 +49,8 @@ class TrainingProgress:
     iterations: int  #: how many there will be
     loss: float  #: of the last one
     gaussian_count: int | None = None  #: None of a radiance field
+    seconds_left: float | None = None  #: as `TimeLeft` reckons it; None where nothing is known yet
+    lower_bound: bool = False  #: whether it will take longer than that, as Gaussians are yet to join
 
     @property
     def words(self) -> str:

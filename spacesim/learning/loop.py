@@ -3,6 +3,7 @@
 import logging
 import math
 import shlex
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -25,6 +26,7 @@ from spacesim.learning.folder import (
     versions,
     write_checkpoint,
 )
+from spacesim.learning.forecast import TimeLeft
 from spacesim.learning.tensors import read_tensors, write_tensors
 
 HISTORY_EVERY = 50  #: iterations between two entries of the history
@@ -78,6 +80,10 @@ class TrainingLoop(ABC):
     def gaussian_count(self) -> int | None:
         """None of a model without Gaussians."""
         return None
+
+    def time_left(self) -> TimeLeft:
+        """Of this training, without times yet."""
+        return TimeLeft(self.config.iterations)
 
     def save(self, path: Path) -> None:
         """Write a checkpoint: everything that the next step depends on."""
@@ -143,12 +149,12 @@ class TrainingLoop(ABC):
     ) -> None:
         """Train from `self.iteration` to the end. Raises KeyboardInterrupt after a step and its checkpoint where it is
         asked to stop, WorkError where the loss is not finite."""
-        config = self.config
+        config, left = self.config, self.time_left()
         while self.iteration < config.iterations:
             loss = self.step()
             last = self.iteration == config.iterations
             if self.iteration % HISTORY_EVERY == 0 or last:
-                on_progress(self._record(float(loss[0])))
+                on_progress(self._record(float(loss[0]), left))
             stop = should_stop()
             if stop:
                 self._check(float(loss[0]))
@@ -157,12 +163,14 @@ class TrainingLoop(ABC):
             if stop:
                 raise KeyboardInterrupt
 
-    def _record(self, loss: float) -> TrainingProgress:
+    def _record(self, loss: float, left: TimeLeft) -> TrainingProgress:
         self._check(loss)
         count = self.gaussian_count
+        left.add(self.iteration, time.perf_counter(), count)
         counted = {} if count is None else {"gaussians": count}
         self.history.append({"iteration": self.iteration, "loss": loss, **counted})
-        return TrainingProgress(self.iteration, self.config.iterations, loss, count)
+        forecast = left.seconds(), left.lower_bound
+        return TrainingProgress(self.iteration, self.config.iterations, loss, count, *forecast)
 
     def _check(self, loss: float) -> None:
         if not math.isfinite(loss):

@@ -86,7 +86,7 @@ class FakeRun:
         }
     )
 
-    relightable = False
+    relightable, gaussian_run = False, None
 
     def predict(self, camera, sun):
         frame = next(frame for frame in self.dataset.test if frame.camera is camera)

@@ -24,6 +24,9 @@ from spacesim.eval.evaluate import EvaluateConfig, evaluate, frame_names, summar
 from spacesim.eval.labels import GROUPS
 from spacesim.eval.metrics import image, lpips, shadow
 from spacesim.eval.report.write import write_report
+from spacesim.scenes import read_scene
+from spacesim.scenes.cameras.camera import CameraConfig
+from spacesim.scenes.cameras.sensor import SensorConfig
 
 SIZE = 40
 
@@ -132,12 +135,13 @@ def test_layout(make_run, dataset, tmp_path):
     assert metrics["config"]["seed"] == 7
     assert metrics["dataset"]["suns"] == 2
     assert metrics["dataset"]["scene"] == "sphere"
+    assert metrics["dataset"]["sizes"] == 1
     assert metrics["dataset"]["config"] == {"spp": 16, "seed": 1}
     for word in ("Geometry", "LPIPS", "Visibility"):
         assert sum(note.startswith(word) for note in metrics["notes"]) == 1
     for frame in metrics["frames"]:
         folder = tmp_path / "eval" / "frames" / frame["name"]
-        names = {"truth", "prediction", "error", "shadow_truth", "shadow_prediction"}
+        names = {"truth", "prediction", "error", "shadow_truth", "shadow_prediction", "depth_truth", "depth"}
         assert {path.stem for path in folder.glob("*.png")} == names
 
 
@@ -487,3 +491,18 @@ def test_frames_without_an_object_are_not_fitted(make_run, dataset, tmp_path):
     metrics = evaluate(make_run(), dataset, tmp_path / "eval", EvaluateConfig(fit_gain=True))
     assert metrics["frames"][0]["fitted"] is None
     assert any(note.startswith("In 1 of 4 frames nothing was fitted") for note in metrics["notes"])
+
+
+def test_a_sensor_with_noise_is_told(make_run, dataset, tmp_path):
+    """By scene.json, as `generate` writes it."""
+
+    def notes(sensor, name):
+        config = replace(read_scene("boxsat"), camera=CameraConfig(sensor=sensor)).to_json()
+        noisy = replace(dataset, scene=json.loads(json.dumps({"scene": "boxsat", "config": config})))
+        written = evaluate(make_run(shifted), noisy, tmp_path / name, EvaluateConfig(geometry=None))["notes"]
+        return [note for note in written if "sensor's noise" in note]
+
+    (note,) = notes(SensorConfig(full_well_e=9_000, read_noise_e=3.5), "noisy")
+    assert "shot noise of a full well of 9000 electrons and read noise of 3.5 electrons" in note
+    assert notes(SensorConfig(shot_noise=False, read_noise_e=0), "noiseless") == []
+    assert notes(None, "none") == []

@@ -58,3 +58,11 @@ def test_visibility_picture_goes_from_shadow_to_light():
     assert picture[0, :2].tolist() == [list(pictures.SHADOWED), list(pictures.LIT)]
     assert np.abs(picture[0, 2] - (np.add(pictures.SHADOWED, pictures.LIT)) / 2).max() <= 0.5
     assert picture[0, 3:].tolist() == [[0, 0, 0], list(pictures.LIT)]
+
+
+def test_depth_picture_is_bright_where_it_is_near():
+    depth = np.array([[0, 2.0, 3.0, 4.0, 1.0, 9.0]])
+    picture = pictures.depth_picture(depth, (2.0, 4.0))
+    shades = 1 - np.array([0, 0.5, 1, 0, 1]) * (1 - pictures.FARTHEST_SHADE)  # beyond the ends as at the ends
+    assert picture[0, 0].tolist() == [0, 0, 0]
+    assert picture[0, 1:].tolist() == pictures.error_colors(shades).tolist()

@@ -4,6 +4,7 @@ torch comes with the extra `lpips`. The weights are files of the user's: nothing
 unpickled (`torch.load` with `weights_only=True` accepts tensors alone).
 """
 
+import hashlib
 import importlib.util
 import io
 import os
@@ -24,10 +25,22 @@ if TYPE_CHECKING:
 MAX_WEIGHTS_BYTES = 1 << 30  #: bytes: those of AlexNet take 244 MB
 
 BACKBONE_FILE = "alexnet-owt-7be5be79.pth"
-"""AlexNet on ImageNet, as torchvision publishes it."""
+"""AlexNet on ImageNet, as torchvision publishes it: https://download.pytorch.org/models/ and this name."""
 
 LINEAR_FILE = "alex.pth"
-"""The linear layers, `lpips/weights/v0.1/alex.pth` of the authors' repository."""
+"""The linear layers, `lpips/weights/v0.1/alex.pth` of the authors' repository and of their package lpips 0.1.4."""
+
+SHA256 = {
+    BACKBONE_FILE: "7be5be79",
+    LINEAR_FILE: "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
+}
+"""How the files' SHA-256 begin: torchvision's is in the name, the other was computed from the package."""
+
+SOURCES = {
+    BACKBONE_FILE: f"{BACKBONE_FILE} (download.pytorch.org/models/{BACKBONE_FILE})",
+    LINEAR_FILE: f"{LINEAR_FILE} (lpips/weights/v0.1/ in the package lpips)",
+}
+"""Where each is to be had, in words."""
 
 MIN_SIDE = 31
 """Smallest height and width, pixels, that leave AlexNet's second pooling something to pool."""
@@ -101,7 +114,7 @@ def find_weights(path: Path | None = None) -> tuple[Path | None, str]:
             f"lpips_weights: expected a .safetensors file or a folder with {BACKBONE_FILE} and {LINEAR_FILE}, found "
             f"no {' and no '.join(missing)} in {path}"
         )
-    files = " and ".join(missing)
+    files = " and ".join(SOURCES[name] for name in missing)
     return (
         None,
         f"its weights are missing: put {files} into {folder} or name their folder as lpips_weights",
@@ -146,11 +159,12 @@ def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
 def _read_pth(path: Path) -> "dict[str, Tensor]":
     import torch
 
+    data = read_bytes(path, "a file of tensors", MAX_WEIGHTS_BYTES)
+    expected, found = SHA256[path.name], hashlib.sha256(data).hexdigest()
+    if not found.startswith(expected):
+        raise InputError(f"{path}: expected the published file, whose SHA-256 begins {expected}, found {found}")
     try:
-        file = io.BytesIO(read_bytes(path, "a file of tensors", MAX_WEIGHTS_BYTES))
-        content = torch.load(file, map_location="cpu", weights_only=True)
-    except InputError:
-        raise
+        content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # torch documents none of what it raises on damaged files
         reason = str(error).strip().split("\n")[0]
         raise InputError(f"{path}: expected a file of tensors alone, found another ({reason})") from None

@@ -11,6 +11,7 @@ from spacesim.eval.pictures import (
     SHADOWED,
     WRONGLY_LIT,
     WRONGLY_SHADOWED,
+    depth_colors,
     error_colors,
 )
 from spacesim.eval.report.html import escape, picture
@@ -26,6 +27,7 @@ _PANELS: Panels = {
     "shadow_truth": "Dark pixels, truth",
     "shadow_prediction": "Dark pixels, prediction",
 }
+_DEPTHS: Panels = {"depth_truth": "Truth", "depth": "Prediction"}
 MISTAKES = {
     "lit": LIT,
     "shadowed": SHADOWED,
@@ -37,15 +39,10 @@ MISTAKES = {
 def gallery(runs: Sequence[Evaluation]) -> str:
     """HTML of the frames chosen by PSNR."""
 
-    def psnr(frame: JsonMapping) -> float | None:
-        value: float | None = frame["psnr"]
-        return value
-
     def words(frame: JsonMapping) -> str:
         return "" if frame["psnr"] is None else f"PSNR {frame['psnr']:.2f} dB"
 
-    stops = ", ".join(css(color) for color in error_colors(np.linspace(0, 1, 17)))
-    bar = f'<span class="bar" style="background: linear-gradient(90deg, {stops})"></span>'
+    bar = color_bar(error_colors(np.linspace(0, 1, 17)))
     keys = f'<p class="key"><span>Error, mean of the channels: 0 {bar} {ERROR_SCALE} and more</span></p>'
     panels = dict(_PANELS)
     if all(run.metrics["dataset"].get("truth") is False for run in runs):
@@ -55,7 +52,35 @@ def gallery(runs: Sequence[Evaluation]) -> str:
         panels |= {"shadow_truth": f"Dark pixels, {panels['truth'].lower()}"}
     else:
         panels = {name: label for name, label in panels.items() if not name.startswith("shadow")}
-    return keys + strips(runs, panels, "prediction", psnr, words)
+    return keys + strips(runs, panels, "prediction", _psnr, words)
+
+
+def depths(runs: Sequence[Evaluation]) -> str:
+    """HTML of the depth of frames that have one, each with its scale; "" where a run has no such pictures."""
+
+    def score(frame: JsonMapping) -> float | None:
+        return _psnr(frame) if frame.get("depth_range") else None
+
+    for group in _comparable(runs):
+        frames = ([run.frames.get(name) for run in group] for name in group[0].frames)
+        if not any(all(frame and score(frame) is not None for frame in same) for same in frames):
+            return ""
+    truth = all(_has_pictures(run, "depth_truth") for run in runs)
+    panels = _DEPTHS if truth else {"depth": _DEPTHS["depth"]}
+    return strips(runs, panels, "depth", score, lambda frame: "")
+
+
+def _psnr(frame: JsonMapping) -> float | None:
+    value: float | None = frame["psnr"]
+    return value
+
+
+def _has_pictures(run: Evaluation, panel: str) -> bool:
+    """Whether each frame with depth has one of that name, and the data is not known to lack it."""
+    if panel == "depth_truth" and run.metrics["dataset"].get("truth") is False:
+        return False
+    frames = (frame for frame in run.metrics["frames"] if frame.get("depth_range"))
+    return all((run.folder / "frames" / frame["name"] / f"{panel}.png").is_file() for frame in frames)
 
 
 def strips(
@@ -109,6 +134,12 @@ def swatches(colors: Mapping[str, Sequence[int]]) -> str:
     )
 
 
+def color_bar(colors: np.ndarray) -> str:
+    """HTML of a scale. colors: [N, 3] from its left end in even steps"""
+    stops = ", ".join(css(color) for color in colors)
+    return f'<span class="bar" style="background: linear-gradient(90deg, {stops})"></span>'
+
+
 def css(color: Sequence[int] | np.ndarray) -> str:
     """A colour of three bytes as style sheets write it."""
     return "rgb({}, {}, {})".format(*map(int, color))
@@ -137,10 +168,16 @@ def _strip(run: Evaluation, name: str, panels: Panels, captions: Panels, limit: 
         picture(
             run.folder / "frames" / name / f"{panel}.png",
             f"{label} of {frame['file_path']}, {run.name}",
-            escape(captions[panel]),
+            escape(captions[panel]) + (_depth_scale(frame) if panel in _DEPTHS else ""),
             limit,
         )
         for panel, label in panels.items()
     ]
     three = " three" if len(panels) == 3 else ""
     return f'<div class="{small}strip{three}">{"".join(figures)}</div>'
+
+
+def _depth_scale(frame: JsonMapping) -> str:
+    """HTML: the ends of a frame's colours in metres."""
+    near, far = (f"{value:.4g}&nbsp;m" for value in frame["depth_range"])
+    return f"<br>{near} {color_bar(depth_colors(np.linspace(0, 1, 17)))} {far}"

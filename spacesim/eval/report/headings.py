@@ -68,7 +68,9 @@ def _about(runs: Sequence[Evaluation]) -> str:
     what = "One reconstruction" if len(runs) == 1 else f"{len(runs)} reconstructions"
     against = "the pictures themselves; there is no other truth" if data.get("truth") is False else "the truth"
     width, height = data["resolution"]
-    facts = [f"{width} × {height} pixels"]
+    others = data.get("sizes", 1) - 1
+    also = "" if not others else f" and {others} other size{'s' * (others > 1)}"
+    facts = [f"{width} × {height} pixels{also}"]
     if suns := data["suns"]:
         unseen = (metrics.get("unseen_suns") or {}).get("suns", 0)
         share = "" if unseen == suns else f"{unseen} of them "

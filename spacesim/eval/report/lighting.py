@@ -8,7 +8,7 @@ from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.eval.labels import LOWER
 from spacesim.eval.pictures import ATTACHED, ATTACHED_LIT, LIT, OTHER_CAST, SELF_CAST, SHADOWED
 from spacesim.eval.report.charts import bar_chart
-from spacesim.eval.report.gallery import MISTAKES, Panels, css, strips, sun_of, swatches
+from spacesim.eval.report.gallery import MISTAKES, Panels, color_bar, strips, sun_of, swatches
 from spacesim.eval.report.html import escape, picture, table
 from spacesim.eval.report.read import Evaluation, legend
 
@@ -148,7 +148,7 @@ def _pairs(run: Evaluation, named: bool) -> str:
 
 
 def _visibility_bar() -> str:
-    bar = f'<span class="bar" style="background: linear-gradient(90deg, {css(SHADOWED)}, {css(LIT)})"></span>'
+    bar = color_bar(np.array([SHADOWED, LIT]))
     return f'<p class="key"><span>Predicted visibility: 0 {bar} 1</span></p>'
 
 

@@ -95,6 +95,7 @@ tr.group th { color: var(--muted); font-size: 0.86rem; padding-top: 1rem; }
   vertical-align: -0.1rem; border: 1px solid var(--line); }
 .bar { display: inline-block; width: 11rem; height: 0.75rem; border-radius: 3px; margin: 0 0.5rem;
   vertical-align: -0.08rem; border: 1px solid var(--line); }
+.strip .bar { width: 3.4rem; margin: 0 0.2rem; }
 .strip { display: grid; grid-template-columns: repeat(5, 1fr); gap: 0.7rem; margin: 0 0 1.2rem; }
 .strip.three { grid-template-columns: repeat(3, 1fr); }
 .thirds { display: grid; grid-template-columns: repeat(3, 1fr); gap: 0.7rem; margin: 0 0 1.2rem; }

@@ -6,7 +6,7 @@ import numpy as np
 
 from spacesim.data.files import JsonMapping
 from spacesim.eval.labels import HIGHER, LOWER, Metric
-from spacesim.eval.report.gallery import css
+from spacesim.eval.report.gallery import color_bar
 from spacesim.eval.report.html import escape, picture, table
 from spacesim.eval.report.read import Evaluation
 from spacesim.eval.report.tables import Cell, best_in_bold
@@ -126,8 +126,7 @@ def _pictures(run: Evaluation, named: bool) -> str:
     factor, unit = _unit(geometry["size"])
     within = geometry["precision_recall"]["distance"]
     share = 100 * within / geometry["size"]
-    stops = ", ".join(css(color) for color in np.rint(colors(np.linspace(0, 1, 17))))
-    gradient = f'<span class="bar" style="background: linear-gradient(90deg, {stops})"></span>'
+    gradient = color_bar(np.rint(colors(np.linspace(0, 1, 17))))
     bar = (
         f'<p class="key"><span>Distance: 0 {gradient} '
         f"{SCALE * within * factor:.3g} {unit} and more: {SCALE * share:.2g} % of the object's size; the middle is the "

@@ -63,7 +63,7 @@ class Surfaces:
         if "occlusionTexture" in entry:
             self._notes.drop("baked occlusion is not used, the path tracer finds it", name)
         if entry.get("alphaMode", "OPAQUE") != "OPAQUE":
-            self._notes.drop("transparent surfaces are rendered opaque", name)
+            self._notes.make_opaque(name)
         for extension in entry.get("extensions", {}):
             if extension != "KHR_materials_pbrSpecularGlossiness":
                 self._notes.drop(f"{str(extension)[:60]} is not used", name)

@@ -52,6 +52,7 @@ class MeshReport:
     textures: int  #: how many pictures they have
     dropped: tuple[str, ...]  #: sentences: in the file, not used
     changed: tuple[str, ...]  #: sentences: used, not as in the file
+    opaque: tuple[str, ...]  #: sentences: rendered opaque, transparent in the file
 
     def lines(self) -> list[str]:
         """The report, a line each."""
@@ -62,6 +63,7 @@ class MeshReport:
             f"{self.file}: {counts}, {size} m, {closed}",
             *(f"dropped: {sentence}" for sentence in self.dropped),
             *(f"changed: {sentence}" for sentence in self.changed),
+            *(f"rendered opaque: {sentence}" for sentence in self.opaque),
         ]
 
 
@@ -227,6 +229,7 @@ def _spacecraft(
         textures=len({id(picture) for surface in surfaces if surface for picture in surface.pictures.values()}),
         dropped=notes.sentences("dropped"),
         changed=notes.sentences("changed"),
+        opaque=notes.sentences("opaque"),
     )
     return Spacecraft(name, tuple(parts)), report
 

@@ -186,7 +186,7 @@ def _obj_surface(name: str, values: JsonMapping, image: object, files: _Files, n
             notes.drop(f"{key} of materials is not used", name)
     opacity = min(_numbers(values.get("d"), 1.0)[0], 1.0 - _numbers(values.get("tr"), 0.0)[0])
     if opacity < 1.0:
-        notes.drop("transparent surfaces are rendered opaque", name)
+        notes.make_opaque(name)
     pictures = {}
     if image is not None:
         picture = _picture(image, name, files, notes)

@@ -35,7 +35,7 @@ DEFAULT_PRESET = "grey-paint"  #: preset of parts whose file says nothing of the
 
 
 class Notes:
-    """What a reader dropped and what it changed, collected by kind: each kind becomes one sentence."""
+    """What a reader dropped, changed and made opaque, collected by kind: each kind becomes one sentence."""
 
     def __init__(self) -> None:
         self._kinds: dict[tuple[str, str], dict[str, None]] = {}
@@ -49,8 +49,12 @@ class Notes:
         """Something that is not as in the file."""
         self._kinds.setdefault(("changed", kind), {})[subject] = None
 
+    def make_opaque(self, subject: str) -> None:
+        """A material that lets light through, which is rendered as if it did not."""
+        self._kinds.setdefault(("opaque", "transparent surfaces"), {})[subject] = None
+
     def sentences(self, which: str) -> tuple[str, ...]:
-        """One sentence a kind; at most 5 of its subjects are named. which: "dropped" or "changed"."""
+        """One sentence a kind; at most 5 of its subjects are named. which: "dropped", "changed" or "opaque"."""
         return tuple(_sentence(kind, list(names)) for (group, kind), names in self._kinds.items() if group == which)
 
 

@@ -150,6 +150,12 @@ class TrainConfig:
         weights = {"depth": self.depth_weight, "normal": self.normal_weight}
         return tuple(name for name, weight in weights.items() if weight > 0)
 
+    @property
+    def refine_stop(self) -> int:
+        """Iterations after which Gaussians stay as many: what densification leaves is trained."""
+        stop = self.refinement.refine_stop
+        return stop if stop < self.iterations else 3 * self.iterations // 4
+
     def downscale(self, step: int) -> int:
         """How many pixels of a picture make one, on a side, at `step`, the first of which is 0 (as splatfacto)."""
         return 1 << max(self.num_downscales - step // self.resolution_schedule, 0)

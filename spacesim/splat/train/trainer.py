@@ -22,6 +22,7 @@ from spacesim.data.records import Dataset
 from spacesim.learning.adam import NetworkAdam
 from spacesim.learning.cameras import farthest_camera, focus_point, nearest_camera
 from spacesim.learning.folder import TrainingProgress
+from spacesim.learning.forecast import Growth, TimeLeft
 from spacesim.learning.loop import TrainingLoop
 from spacesim.splat.light.bounce import ALBEDO
 from spacesim.splat.light.model import LightModel, TrainingFrame, is_near, robust_radius
@@ -84,6 +85,12 @@ class Trainer(TrainingLoop):
     def gaussian_count(self) -> int:
         """At this iteration."""
         return self.gaussians.count
+
+    def time_left(self) -> TimeLeft:
+        """See `TrainingLoop.time_left`."""
+        config = self.config
+        growth = Growth(config.refine_stop, config.refinement.max_gaussians)
+        return TimeLeft(config.iterations, growth, lambda step: config.downscale(step) ** -2)
 
     def step(self) -> Float:
         """One update from one view or several, densification if it is time. Returns the mean loss, Float of width 1."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from spacesim.data.images.sheet import font
-from spacesim.eval.pictures import error_colors
+from spacesim.eval.pictures import depth_colors, error_colors
 from spacesim.learning.pictures import LIT, SHADOWED
 
 Bytes = NDArray[np.uint8]
@@ -16,7 +16,6 @@ Bytes = NDArray[np.uint8]
 PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
 """sRGB colours of objects, from the first again for the eighth: Okabe and Ito's, which the colour-blind tell apart."""
 
-FARTHEST_SHADE = 0.15  #: of the colour map at the farthest depth: the background alone is black
 ERROR_SCALE = 0.25  #: mean absolute error of the channels at the bright end, as in reports
 SURFACE = 0.5  #: alpha from which a pixel shows a surface, of depth's range and of ids
 UNKNOWN = (38, 38, 42)  #: sRGB colour of where the truth is not known
@@ -101,7 +100,7 @@ def _colors_by_id(numbers: np.ndarray) -> Bytes:
 @cache
 def _depth_color_map() -> np.ndarray:
     """[_SHADES, 3] float32: the colour map of depths from the nearest to the farthest."""
-    return error_colors(1 - (1 - FARTHEST_SHADE) * np.linspace(0, 1, _SHADES)).astype(np.float32)
+    return depth_colors(np.linspace(0, 1, _SHADES)).astype(np.float32)
 
 
 def _clip_to_unit(values: np.ndarray) -> np.ndarray:
@@ -153,7 +152,7 @@ def add_color_bar(picture: Bytes, depths: tuple[float, float]) -> Bytes:
     page = Image.fromarray(picture)
     draw, size = ImageDraw.Draw(page), 14
     left, right, bottom = 12, 12 + min(240, width - 24), height - 10
-    bar = error_colors(1 - (1 - FARTHEST_SHADE) * np.linspace(0, 1, right - left))
+    bar = depth_colors(np.linspace(0, 1, right - left))
     page.paste(Image.fromarray(np.repeat(bar[None], 10, axis=0)), (left, bottom - 10))
     near, far = (f"{value:.4g} m" for value in depths)
     draw.text((left, bottom - 14), near, (255, 255, 255), font(size), anchor="ls")
@@ -165,7 +164,7 @@ def color_bar_html(depths: tuple[float, float] | None) -> str:
     """The colour map of depths and its ends for the panel."""
     if depths is None:
         return ""
-    stops = error_colors(1 - (1 - FARTHEST_SHADE) * np.linspace(0, 1, 9))
+    stops = depth_colors(np.linspace(0, 1, 9))
     colors = ", ".join(f"rgb({r}, {g}, {b})" for r, g, b in stops.tolist())
     near, far = (f"{value:.4g} m" for value in depths)
     return (

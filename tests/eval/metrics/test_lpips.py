@@ -1,5 +1,6 @@
 """LPIPS against an independent numpy implementation, on AlexNet-shaped random weights."""
 
+import hashlib
 import pickle
 
 import numpy as np
@@ -88,10 +89,18 @@ def reference(prediction, truth, w):
     return total
 
 
+def publish(monkeypatch, folder):
+    """Take the files in a folder for the published ones."""
+    for path in folder.glob("*.pth"):
+        monkeypatch.setitem(lpips.SHA256, path.name, hashlib.sha256(path.read_bytes()).hexdigest())
+
+
 @pytest.mark.parametrize("source", ["single_file", "two_files"])
-def test_agrees_with_numpy(source, weights, pictures, request):
+def test_agrees_with_numpy(source, weights, pictures, request, monkeypatch):
     pytest.importorskip("torch", reason="torch (extra: lpips) is not installed")
     path = request.getfixturevalue(source)
+    if path.is_dir():
+        publish(monkeypatch, path)
     network, sentence = lpips.load(path)
     assert str(path) in sentence
     assert network(*pictures) == pytest.approx(reference(*pictures, weights), rel=1e-5)
@@ -120,6 +129,7 @@ def test_no_weights_is_none_and_a_sentence(monkeypatch, tmp_path):
     location, sentence = lpips.find_weights()
     assert location is None
     assert "alex.pth" in sentence
+    assert "(download.pytorch.org/models/alexnet-owt-7be5be79.pth" in sentence
     assert "lpips_weights" in sentence
     assert lpips.load()[0] is None
 
@@ -150,14 +160,28 @@ def test_wrong_tensors_are_named(weights, tmp_path):
         lpips.load(tmp_path / "cut.safetensors")
 
 
+def test_other_files_than_the_published_ones_are_refused(two_files, monkeypatch, tmp_path):
+    """Damage that leaves tensors would give other distances."""
+    with pytest.raises(InputError, match=r"7be5be79\.pth: expected the published file, whose SHA-256 begins 7be5be79,"):
+        lpips.load(two_files)
+    publish(monkeypatch, two_files)
+    content = bytearray((two_files / "alex.pth").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "alex.pth").write_bytes(content)
+    (tmp_path / "alexnet-owt-7be5be79.pth").symlink_to(two_files / "alexnet-owt-7be5be79.pth")
+    with pytest.raises(InputError, match=r"alex\.pth: expected the published file"):
+        lpips.load(tmp_path)
+
+
 class Exploit:
     def __reduce__(self):
         return (pytest.fail, ("a pickle was run",))
 
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
-def test_pickles_are_refused(two_files, tmp_path):
+def test_pickles_are_refused(two_files, tmp_path, monkeypatch):
     (tmp_path / "alexnet-owt-7be5be79.pth").symlink_to(two_files / "alexnet-owt-7be5be79.pth")
     (tmp_path / "alex.pth").write_bytes(pickle.dumps({"lin0.model.1.weight": Exploit()}))
+    publish(monkeypatch, tmp_path)
     with pytest.raises(InputError, match=r"alex\.pth: expected a file of tensors alone"):
         lpips.load(tmp_path)

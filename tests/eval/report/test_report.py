@@ -269,11 +269,11 @@ def test_pictures_are_the_folders(folder):
     page = page_of(folder)
     assert all(page.values("img", "alt"))
     pictures = [base64.b64decode(value.partition(",")[2]) for value in page.values("img", "src")]
-    assert len(pictures) == 15
+    assert len(pictures) == 21
     shown = {np.asarray(Image.open(io.BytesIO(data))).tobytes() for data in pictures}
     frames = sorted(json.loads((folder / "metrics.json").read_text())["frames"], key=lambda frame: -frame["psnr"])
     for frame in (frames[0], frames[2], frames[-1]):
-        for panel in ("truth", "prediction", "error", "shadow_truth", "shadow_prediction"):
+        for panel in ("truth", "prediction", "error", "shadow_truth", "shadow_prediction", "depth_truth", "depth"):
             assert read_png(folder / "frames" / frame["name"] / f"{panel}.png").tobytes() in shown
 
 
@@ -335,7 +335,7 @@ def test_runs_side_by_side(folder):
     copy = another(folder, "better", better)
     page = page_of(folder, copy)
     text = "".join(page.text)
-    assert len(page.values("img", "src")) == 30
+    assert len(page.values("img", "src")) == 42
     assert text.count("fake") >= 4
     assert text.count("better") >= 4
     best = re.findall(r'class="best">([\d.]+)', (folder.parent / "report.html").read_text())
@@ -424,7 +424,7 @@ def test_photographs_are_spoken_of_as_such(folder):
     assert "Over whole pictures; no silhouette is known" in text
     assert "against the pictures themselves" in text
     assert "Picture" in page.text
-    assert len(page.values("img", "src")) == 9
+    assert len(page.values("img", "src")) == 12
 
 
 def test_what_was_fitted_is_said_beside_the_numbers(folder):
@@ -483,7 +483,35 @@ def test_one_frame_is_shown_once(folder):
     def only(metrics):
         metrics["frames"] = metrics["frames"][:1]
 
-    assert len(page_of(another(folder, "only", only)).values("img", "src")) == 5
+    assert len(page_of(another(folder, "only", only)).values("img", "src")) == 7
+
+
+def test_depth_has_a_scale_in_metres(folder):
+    """That of each frame; none for evaluations without it, nor for a frame that shows nothing."""
+
+    def scaled(metrics):
+        for frame, far in zip(metrics["frames"], (8.25, 9.25, 10.25), strict=False):
+            frame["depth_range"] = [3.125, far]
+        metrics["frames"][3]["depth_range"] = None
+
+    def older(metrics):
+        for frame in metrics["frames"]:
+            del frame["depth_range"]
+
+    deep = another(folder, "deep", scaled)
+    text = "".join(page_of(deep).text)
+    for far in (8.25, 9.25, 10.25):
+        assert text.count(f"3.125\u00a0m  {far}\u00a0m") == 2
+    assert "Depth" in page_of(deep, another(folder, "other", lambda metrics: metrics.update(run="o"))).text
+    older = another(folder, "older", older)
+    assert "Depth" not in page_of(older).text
+    assert "Depth" not in page_of(deep, older).text
+
+
+def test_frames_of_several_sizes_are_said_to_be(folder):
+    many = another(folder, "many", lambda metrics: metrics["dataset"].update(resolution=[640, 480], sizes=3))
+    assert "640 × 480 pixels and 2 other sizes" in "".join(page_of(many).text)
+    assert "other size" not in "".join(page_of(folder).text)
 
 
 def test_what_is_no_evaluation(folder, tmp_path):

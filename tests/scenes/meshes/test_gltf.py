@@ -305,9 +305,12 @@ def test_what_has_no_place_here_is_named(tmp_path):
     )
     square = document.square(material=0)
     document.mesh(square, {"attributes": square["attributes"], "mode": 1})
-    text = "\n".join(read_mesh(document.write(tmp_path / "a.gltf"))[1].dropped)
-    for word in ("emission", "opaque", "occlusion", "clearcoat", "animations", "KHR_lights_punctual", "lines"):
+    report = read_mesh(document.write(tmp_path / "a.gltf"))[1]
+    text = "\n".join(report.dropped)
+    for word in ("emission", "occlusion", "clearcoat", "animations", "KHR_lights_punctual", "lines"):
         assert word in text
+    assert "transparent" not in text
+    assert report.opaque == ("transparent surfaces: lamp",)
 
 
 def test_names_are_plain_and_different(tmp_path):

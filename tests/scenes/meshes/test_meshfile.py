@@ -275,7 +275,9 @@ def test_obj_objects_materials_and_relative_indices(tmp_path):
     paint = parts["Bus"].material
     np.testing.assert_allclose(paint.albedo, [0.2, 0.4, 0.6])
     assert paint.bsdf["roughness"] == pytest.approx(0.02**0.25)  # alpha^2 = 2 / (98 + 2)
-    assert any("opaque" in line for line in report.dropped)
+    assert not any("opaque" in line for line in report.dropped)
+    assert report.opaque == ("transparent surfaces: paint",)
+    assert "rendered opaque: transparent surfaces: paint" in report.lines()
     cells = parts["Panel"].material
     assert cells.bsdf["type"] == "diffuse"
     np.testing.assert_array_equal(cells.images["base_color"], picture)

@@ -22,7 +22,6 @@ from spacesim.viewer.drawing.frames import (
     picture_size,
 )
 from spacesim.viewer.drawing.paint import (
-    FARTHEST_SHADE,
     NEEDED,
     PALETTE,
     Planes,
@@ -327,7 +326,7 @@ def test_pictures_are_what_their_formulas_say(mode):
             expected = np.full(3, 255 * cover)
         elif mode == "depth":
             share = min(max((float(value) - near) / (far - near), 0), 1)
-            expected = cover * (value > 0) * error_colors(np.array(1 - (1 - FARTHEST_SHADE) * share)).astype(float)
+            expected = cover * (value > 0) * error_colors(np.array(1 - 0.85 * share)).astype(float)
         elif mode == "visibility":
             seen = min(max(float(value), 0), 1)
             expected = cover * (seen * np.array(LIT, float) + (1 - seen) * np.array(SHADOWED, float))

@@ -17,11 +17,10 @@ if TYPE_CHECKING:
 
 
 def make_strategy(config: "TrainConfig", dataset: Dataset, scene_scale: float, count: int) -> Strategy:
-    """For `count` Gaussians at the start. What densification leaves is trained: it ends before the training does.
+    """For `count` Gaussians at the start.
 
     Raises InputError where the dataset lacks the mesh that it needs, or has one that is out of place."""
-    stop, iterations = config.refinement.refine_stop, config.iterations
-    schedule = replace(config.refinement, refine_stop=stop if stop < iterations else 3 * iterations // 4)
+    schedule = replace(config.refinement, refine_stop=config.refine_stop)
     strategy = config.strategy
     if isinstance(strategy, MeshAwareConfig):
         distance = SignedDistance.of(dataset.root / known_mesh(dataset, "strategy mesh-aware"))
