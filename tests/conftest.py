@@ -38,17 +38,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
-#: folders of tests whose subject is what threads do together
-ALL_THREADS = (Path(__file__).parent / "splat" / "raster", Path(__file__).parent / "splat" / "train")
-
-
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def _threads(request) -> None:
-    """Test processes side by side share the cores: threads of Dr.Jit that wait for work keep one busy."""
+    """Test processes side by side share the cores: threads of Dr.Jit that wait for work keep one busy. Tests marked
+    `threads` have them all."""
     import drjit
 
     count, processes = len(os.sched_getaffinity(0)), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    together = any(folder in request.path.parents for folder in ALL_THREADS)
+    together = request.node.get_closest_marker("threads") is not None
     drjit.set_thread_count(count if together else max(1, count // processes))
 
 
