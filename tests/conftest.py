@@ -1,8 +1,12 @@
 """One tiny dataset, one tiny run and its evaluation, for the tests of the command line."""
 
-import os
+import cores  # first: before libraries look how many there are
+
+# isort: split
+
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -38,15 +42,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
-@pytest.fixture(autouse=True)
-def _threads(request) -> None:
-    """Test processes side by side share the cores: threads of Dr.Jit that wait for work keep one busy. Tests marked
-    `threads` have them all."""
-    import drjit
+@pytest.fixture(autouse=True, scope="session")
+def _coarse() -> None:
+    """In test processes; the programs that they start have the defaults."""
+    from coarse import compare_coarsely
 
-    count, processes = len(os.sched_getaffinity(0)), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    together = request.node.get_closest_marker("threads") is not None
-    drjit.set_thread_count(count if together else max(1, count // processes))
+    compare_coarsely()
+
+
+@pytest.fixture(autouse=True)
+def _threads(request) -> Iterator[None]:
+    """Tests marked `threads` have all cores."""
+    with cores.all_cores() if request.node.get_closest_marker("threads") else nullcontext():
+        yield
 
 
 @pytest.fixture(scope="session")
