@@ -43,11 +43,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _coarse() -> None:
+def _sooner() -> None:
     """In test processes; the programs that they start have the defaults."""
-    from coarse import compare_coarsely
+    from sooner import spare_work
 
-    compare_coarsely()
+    spare_work()
 
 
 @pytest.fixture(autouse=True)
