@@ -18,20 +18,22 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 LONGEST = (
-    "test_reproduce",
     "test_attack",
     "test_benchmarks",
-    "test_interrupts",
-    "test_robustness",
-    "test_browser",
-    "test_torch",
-    "test_attack_viewer",
     "test_doc_commands",
+    "test_robustness",
     "test_workers",
-    "test_picture_suns",
+    "test_locate",
+    "test_refine_pose",
+    "test_reproduce",
+    "test_browser",
+    "test_generate",
+    "test_interrupts",
     "test_lint",
-    "test_examples",
+    "test_attack_viewer",
     "test_cli",
+    "test_page",
+    "test_nerf_training",
 )
 """Files of tests that take long, the longest first: what is left at the end is short, and processes end together."""
 
