@@ -60,9 +60,13 @@ def plain(record: object) -> Any:
     return [plain(value) for value in record] if isinstance(record, list | tuple) else record
 
 
-@cache
 def kind_of(cls: Any) -> str | None:
     """The word that chooses this class among the alternatives of a union: its class variable `kind`."""
+    return _kind_of(cls)
+
+
+@cache
+def _kind_of(cls: Any) -> str | None:
     tag = cls.__dict__.get("kind")
     return tag if isinstance(tag, str) and all(f.name != "kind" for f in fields(cls)) else None
 
@@ -88,7 +92,8 @@ def choices(hint: object) -> tuple[str, ...]:
 def check_choices(record: object) -> None:
     """Raise InputError "field: expected one of ..., found ..." unless every field of `record` that is annotated with
     `Literal[...]` holds one of these words."""
-    for name, allowed, may_lack in _choices_of(type(record)):
+    cls: Any = type(record)
+    for name, allowed, may_lack in _choices_of(cls):
         value = getattr(record, name)
         if value not in allowed and not (value is None and may_lack):
             raise InputError(

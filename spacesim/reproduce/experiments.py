@@ -205,7 +205,7 @@ def _trained(
 @cache
 def _config_of(
     name: str, method: str, strategy: str, iterations: int, settings: tuple[tuple[str, JsonValue], ...]
-) -> TrainConfig:
+) -> methods.Config:
     """Made once: a page of results asks for it in each of its cells."""
     return _with_settings(dict(settings), with_options(preset(name, method, strategy), iterations=iterations))
 
