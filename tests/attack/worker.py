@@ -14,9 +14,7 @@ from pathlib import Path
 from spacesim.cli import main  # names a libLLVM before drjit is imported
 
 import drjit  # isort: skip
-
-sys.path.append(str(Path(__file__).parents[1]))
-from sooner import spare_work
+from sooner import spare_work  # isort: skip
 
 
 def peak() -> int:
