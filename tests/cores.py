@@ -12,7 +12,7 @@ ALL = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set[int](
 _WORKER, _PROCESSES = os.environ.get("PYTEST_XDIST_WORKER", ""), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 
 if _WORKER and len(ALL) >= _PROCESSES:
-    os.sched_setaffinity(0, sorted(ALL)[int(_WORKER.removeprefix("gw")) :: _PROCESSES])
+    os.sched_setaffinity(0, sorted(ALL)[int(_WORKER.removeprefix("gw")) % _PROCESSES :: _PROCESSES])
 
 
 @contextmanager
