@@ -1,8 +1,12 @@
 """One tiny dataset, one tiny run and its evaluation, for the tests of the command line."""
 
-import os
+import cores  # first: before libraries look how many there are
+
+# isort: split
+
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -14,20 +18,22 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 LONGEST = (
-    "test_reproduce",
     "test_attack",
     "test_benchmarks",
-    "test_interrupts",
-    "test_robustness",
-    "test_browser",
-    "test_torch",
-    "test_attack_viewer",
     "test_doc_commands",
+    "test_robustness",
     "test_workers",
-    "test_picture_suns",
+    "test_locate",
+    "test_refine_pose",
+    "test_reproduce",
+    "test_browser",
+    "test_generate",
+    "test_interrupts",
     "test_lint",
-    "test_examples",
+    "test_attack_viewer",
     "test_cli",
+    "test_page",
+    "test_nerf_training",
 )
 """Files of tests that take long, the longest first: what is left at the end is short, and processes end together."""
 
@@ -38,18 +44,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
-#: folders of tests whose subject is what threads do together
-ALL_THREADS = (Path(__file__).parent / "splat" / "raster", Path(__file__).parent / "splat" / "train")
+@pytest.fixture(autouse=True, scope="session")
+def _sooner() -> None:
+    """In test processes; the programs that they start have the defaults."""
+    from sooner import spare_work
+
+    spare_work()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _threads(request) -> None:
-    """Test processes side by side share the cores: threads of Dr.Jit that wait for work keep one busy."""
-    import drjit
-
-    count, processes = len(os.sched_getaffinity(0)), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    together = any(folder in request.path.parents for folder in ALL_THREADS)
-    drjit.set_thread_count(count if together else max(1, count // processes))
+@pytest.fixture(autouse=True)
+def _threads(request) -> Iterator[None]:
+    """Tests marked `threads` have all cores."""
+    with cores.all_cores() if request.node.get_closest_marker("threads") else nullcontext():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -57,10 +58,13 @@ def name_of(path: Path) -> str:
     return ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
 
 
+_parsed = cache(ast.parse)
+
+
 def imports(path: Path, lazy: bool = True) -> Iterator[str]:
     """Modules and names that a file imports, in full; without `lazy` ones only those at import time."""
     package = ["spacesim", *path.relative_to(PACKAGE).parts[:-1]]
-    pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    pending: list[ast.AST] = [_parsed(path.read_text(encoding="utf-8"))]
     while pending:
         node = pending.pop()
         if isinstance(node, ast.Import):
@@ -157,7 +161,7 @@ def test_folders_are_small():
 
 def options_named(text: str) -> list[str]:
     """Errors of a source that begin with an option of the command line."""
-    raised = [node.exc for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Raise)]
+    raised = [node.exc for node in ast.walk(_parsed(text)) if isinstance(node, ast.Raise)]
     words = [node.args[0] for node in raised if isinstance(node, ast.Call) and node.args]
     parts = [word.values[0] if isinstance(word, ast.JoinedStr) else word for word in words]
     said = [part.value for part in parts if isinstance(part, ast.Constant) and isinstance(part.value, str)]

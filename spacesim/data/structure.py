@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -62,6 +62,11 @@ def plain(record: object) -> Any:
 
 def kind_of(cls: Any) -> str | None:
     """The word that chooses this class among the alternatives of a union: its class variable `kind`."""
+    return _kind_of(cls)
+
+
+@cache
+def _kind_of(cls: Any) -> str | None:
     tag = cls.__dict__.get("kind")
     return tag if isinstance(tag, str) and all(f.name != "kind" for f in fields(cls)) else None
 
@@ -88,15 +93,22 @@ def check_choices(record: object) -> None:
     """Raise InputError "field: expected one of ..., found ..." unless every field of `record` that is annotated with
     `Literal[...]` holds one of these words."""
     cls: Any = type(record)
-    for name, hint in _hints(cls).items():
-        allowed, value = choices(hint), getattr(record, name)
-        if allowed and value not in allowed and not (value is None and NoneType in get_args(hint)):
+    for name, allowed, may_lack in _choices_of(cls):
+        value = getattr(record, name)
+        if value not in allowed and not (value is None and may_lack):
             raise InputError(
                 f"{name}: expected one of {', '.join(allowed)}, found {value!r}{did_you_mean(value, allowed)}"
             )
 
 
-@lru_cache
+@cache
+def _choices_of(cls: type) -> list[tuple[str, tuple[str, ...], bool]]:
+    """(field, its words, whether None is allowed, too) of a dataclass's fields that have `choices`."""
+    hints = _hints(cls).items()
+    return [(name, words, NoneType in get_args(hint)) for name, hint in hints if (words := choices(hint))]
+
+
+@cache
 def _hints(cls: Any) -> dict[str, Any]:
     """Annotations of the fields of a dataclass."""
     hints = get_type_hints(cls)
@@ -105,9 +117,8 @@ def _hints(cls: Any) -> dict[str, Any]:
 
 def keys_of(cls: type, rules: Rules) -> dict[str, Any]:
     """The keys of a table that gives a `cls`, with their annotations."""
-    hints = get_type_hints(cls)
     hidden = {name for owner, name in rules.hidden if issubclass(cls, owner)}
-    return {f.name: hints[f.name] for f in fields(cls) if f.name not in hidden}
+    return {name: hint for name, hint in _hints(cls).items() if name not in hidden}
 
 
 def places_of(cls: type, rules: Rules, at: Keys = ()) -> Iterator[Keys]:

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Literal
 
 from spacesim import methods
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonDict
+from spacesim.data.files import JsonDict, JsonMapping, JsonValue
 from spacesim.data.structure import did_you_mean
 from spacesim.reproduce.size import Size
 from spacesim.reproduce.thesis import Row, Table, thesis
@@ -144,7 +145,7 @@ def experiment_of(size: Size, table: Table, row: Row, variant: Variant, seed: in
 def figure_frames(size: Size) -> list[Work]:
     """Figure 3.2: Gaussians and a radiance field, trained on the same data."""
     config = methods.shortened(methods.preset(size.nerf, "nerf"), size.iterations)
-    field = Experiment(FIELD, "one-sun", _with_settings(size, config), ("frames",))
+    field = Experiment(FIELD, "one-sun", _with_settings(size.settings, config), ("frames",))
     return [_fixed_sun(size, "frames"), field]
 
 
@@ -196,9 +197,17 @@ def _trained(
     seed: int = 0,
 ) -> Experiment:
     """A training on the boxsat under many Suns."""
-    config = _with_settings(size, with_options(preset(name, method, strategy), iterations=size.iterations))
+    config = _config_of(name, method, strategy, size.iterations, tuple(size.settings.items()))
     words = [name, method, *([] if strategy == "default" else [strategy]), *([f"seed-{seed}"] if seed else [])]
     return Experiment("-".join(words), "boxsat", replace(config, seed=config.seed + seed), parts)
+
+
+@cache
+def _config_of(
+    name: str, method: str, strategy: str, iterations: int, settings: tuple[tuple[str, JsonValue], ...]
+) -> methods.Config:
+    """Made once: a page of results asks for it in each of its cells."""
+    return _with_settings(dict(settings), with_options(preset(name, method, strategy), iterations=iterations))
 
 
 def _fixed_sun(size: Size, part: str) -> Experiment:
@@ -206,8 +215,8 @@ def _fixed_sun(size: Size, part: str) -> Experiment:
     return replace(_trained(size, "thesis", "vanilla", parts=(part,)), name=FIXED, data="one-sun")
 
 
-def _with_settings(size: Size, config: methods.Config) -> methods.Config:
-    return methods.with_settings(config, {key: value for key, value in size.settings.items() if _has(config, key)})
+def _with_settings(settings: JsonMapping, config: methods.Config) -> methods.Config:
+    return methods.with_settings(config, {key: value for key, value in settings.items() if _has(config, key)})
 
 
 def _has(config: methods.Config, key: str) -> bool:

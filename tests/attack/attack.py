@@ -30,7 +30,7 @@ PATIENCE = 60.0  #: seconds
 RESTART_AFTER = 1500  #: commands of one process
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(HERE)])}
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT, HERE, HERE.parent)))}
 
 
 @dataclass
@@ -371,6 +371,12 @@ class Killed:
 
 
 _CLI = ("-m", "spacesim.cli")
+_SOONER = """
+import runpy
+from sooner import spare_work
+spare_work()
+runpy.run_module("spacesim.cli", run_name="__main__", alter_sys=True)
+"""
 KILLED = (
     Killed("generate", (*_CLI, "generate", "boat.obj", "--out", "{out}", *corpus.TINY, "--views", "12", "--resume")),
     Killed(
@@ -378,7 +384,7 @@ KILLED = (
         (*_CLI, "generate", "boat.obj", "--out", "{out}", *corpus.TINY, "--views", "12", "--resume", "--workers", "2"),
     ),
     Killed("train", ("-c", TRAINING, "{out}"), ("config.json", "training.json", "checkpoints/seconds.json")),
-    Killed("eval", (*_CLI, "eval", "run", "--data", "data", "--out", "{out}"), ("metrics.json", "report.html")),
+    Killed("eval", ("-c", _SOONER, "eval", "run", "--data", "data", "--out", "{out}"), ("metrics.json", "report.html")),
     Killed("compose", (*_CLI, "compose", "composed.toml", "--out", "{out}")),
 )
 

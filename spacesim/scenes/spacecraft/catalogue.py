@@ -1,6 +1,7 @@
 """The built-in spacecraft by name."""
 
 from collections.abc import Callable
+from functools import cache
 
 from spacesim.data.errors import InputError
 from spacesim.scenes.spacecraft.boxsat import boxsat
@@ -20,8 +21,10 @@ _BUILT_IN: dict[str, Callable[[], Spacecraft]] = {
 SPACECRAFT = tuple(_BUILT_IN)  #: names of the built-in spacecraft
 
 
+@cache
 def spacecraft(name: str) -> Spacecraft:
-    """The built-in spacecraft called `name`; InputError lists the names where there is none."""
+    """The built-in spacecraft called `name`, made once (a quarter of a second): its meshes are not to be changed.
+    InputError lists the names where there is none."""
     if name not in _BUILT_IN:
         raise InputError(f"spacecraft: expected one of {', '.join(SPACECRAFT)}, found {name!r}")
     return _BUILT_IN[name]()

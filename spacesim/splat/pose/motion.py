@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
@@ -15,6 +14,8 @@ from spacesim.splat.pose.picture import Drawing
 def moved(camera: Camera, twist: ArrayLike) -> Camera:
     """The camera after a motion, as `Projection.moved` has it: points go from `camera`'s axes to the moved one's by
     p' = exp([w]) p + v. twist: [6] = (w, v), rotation vector in radians and translation in metres, camera axes."""
+    from scipy.spatial.transform import Rotation  # a third of a second, that training need not wait for
+
     numbers = np.asarray(twist, np.float64)
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = Rotation.from_rotvec(numbers[:3]).as_matrix(), numbers[3:]
@@ -25,6 +26,8 @@ def moved(camera: Camera, twist: ArrayLike) -> Camera:
 
 def twist_between(camera: Camera, other: Camera) -> Array:
     """[6] the motion from `camera` to `other`: the inverse of `moved`, for rotations below pi."""
+    from scipy.spatial.transform import Rotation
+
     motion = other.camera_from_world @ camera.world_from_camera
     return np.concatenate([Rotation.from_matrix(motion[:3, :3]).as_rotvec(), motion[:3, 3]])
 
@@ -66,6 +69,8 @@ class Pivot:
 
     def turned(self, camera: Camera, turn: Array, shift: Array) -> Camera:
         """The camera after a turn (rotation vector [3]) about the point, and a shift [3], metres, both in its axes."""
+        from scipy.spatial.transform import Rotation
+
         middle = self.seen_by(camera)
         return moved(camera, np.concatenate([turn, shift + middle - Rotation.from_rotvec(turn).apply(middle)]))
 

@@ -5,7 +5,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import gaussian_filter
 
 from spacesim.backend.arrays import Float
 from spacesim.data.errors import InputError
@@ -113,5 +112,7 @@ def reduced(planes: np.ndarray, factor: int) -> np.ndarray:
 
 
 def smoothed(planes: np.ndarray, blur: float) -> np.ndarray:
+    from scipy.ndimage import gaussian_filter
+
     smooth: np.ndarray = gaussian_filter(planes, (blur, blur, 0), mode="nearest") if blur else planes
     return smooth

@@ -10,8 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import gaussian_filter, label, map_coordinates
-from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, fibonacci_sphere, look_at
@@ -110,6 +108,8 @@ class ModelViews:
 
     def _placed(self, view: int, turn: float, cut: _Cut, camera: Camera) -> Camera:
         """`camera` before which the model looks as in a view that is turned, moved and scaled to `cut`."""
+        from scipy.spatial.transform import Rotation
+
         drawn, theirs = self.cameras[view], self.cuts[view]
         scale = cut.radius / theirs.radius
         roll = Rotation.from_rotvec([0, 0, turn]).as_matrix()
@@ -209,6 +209,8 @@ def _rank(
     drawing: Drawing, camera: Camera, target: np.ndarray, counts: np.ndarray, sky: np.ndarray
 ) -> tuple[float, Camera]:
     """How far the picture drawn there is from the target, both blurred, and the camera."""
+    from scipy.ndimage import gaussian_filter
+
     drawn = drawing.draw(camera, drawing.shade(camera))
     soft = [gaussian_filter(planes, (1.5, 1.5, 0), mode="nearest") for planes in (drawn, target)]
     return _compared(soft[0], soft[1], counts, sky), camera
@@ -259,6 +261,8 @@ def _cut(light: np.ndarray, alpha: np.ndarray | None, dim: float) -> _Cut | None
 
 def _without_specks(mask: np.ndarray) -> np.ndarray:
     """Without spots that are small against all of it."""
+    from scipy.ndimage import label
+
     spots, _ = label(mask, np.ones((3, 3)))
     sizes = np.bincount(spots.ravel())
     sizes[0] = 0
@@ -268,6 +272,8 @@ def _without_specks(mask: np.ndarray) -> np.ndarray:
 def _patch(cut: _Cut, turn: float) -> np.ndarray:
     """[2, PATCH * PATCH] of mask and brightness about the middle, in units of the radius, turned back; each of length
     1 over the square root of 2."""
+    from scipy.ndimage import gaussian_filter, map_coordinates
+
     steps = (np.arange(PATCH) + 0.5 - PATCH / 2) * (2 * EXTENT / PATCH) * cut.radius
     x, y = np.meshgrid(steps, steps)
     places = [

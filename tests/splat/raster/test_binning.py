@@ -17,6 +17,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
 from spacesim.splat.raster.sort import ordered_lists, segment_ids
 
+pytestmark = pytest.mark.threads
 WAYS = ("cuda", "llvm")
 
 

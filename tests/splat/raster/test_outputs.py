@@ -305,6 +305,7 @@ def test_hostile_values_stay_finite_in_every_output(name, value):
             assert np.isfinite(np.array(plane)).all()
 
 
+@pytest.mark.threads
 @pytest.mark.parametrize("view", VIEWS)
 def test_same_input_same_bits(view):
     def run():

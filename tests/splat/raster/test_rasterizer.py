@@ -22,6 +22,7 @@ from spacesim.splat.reference.rasterizer import real_spherical_harmonics, render
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.trainer import Trainer
 
+pytestmark = pytest.mark.threads
 SIZE = (40, 28)
 
 

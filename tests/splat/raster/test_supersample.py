@@ -183,6 +183,7 @@ def test_a_run_and_a_scene_of_it_draw_the_same(small_lit_dataset, tmp_path, meth
     assert with_both.contents[0] != with_both.contents[1], "a picture depends on it"
 
 
+@pytest.mark.threads
 @pytest.mark.parametrize("warm", [False, True])
 def test_supersampled_training_repeats_to_the_bit_and_resumes(small_lit_dataset, tmp_path, warm):
     changes = {"warm_start": WarmStartConfig(steps=6, decay=6, conservative=3)} if warm else {}

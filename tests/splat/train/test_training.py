@@ -55,6 +55,7 @@ def test_training_learns_views_that_it_has_not_seen(small_dataset, finished):
     assert psnr(finished.gaussians, small_dataset) > psnr(start, small_dataset) + 6
 
 
+@pytest.mark.threads
 def test_same_seed_same_model_to_the_bit(small_dataset, finished, tmp_path):
     again = train(small_dataset, tmp_path / "again", CONFIG)
     name = "model.safetensors"
@@ -126,6 +127,7 @@ def test_checkpoints_that_do_not_fit_are_refused(small_dataset, tmp_path):
     trainer.restore(tmp_path / "good.safetensors")
 
 
+@pytest.mark.threads
 def test_killed_training_is_completed_by_resume(small_dataset, finished, tmp_path):
     """The process dies without warning right after a checkpoint; --resume gives the same model to the bit."""
     script = f"""
@@ -361,6 +363,7 @@ def test_training_starts_with_no_more_gaussians_than_it_may_ever_have(small_data
     assert (trainer.gaussians.count, len(trainer.strategy.state["seen"])) == (25, 25)
 
 
+@pytest.mark.threads
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs processor affinity")
 def test_the_number_of_threads_does_not_show(small_dataset, tmp_path):
     """Round-off gradients of round splats are denormal when squared, and a lone thread does not flush those."""

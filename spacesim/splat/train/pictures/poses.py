@@ -26,7 +26,6 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
@@ -115,6 +114,8 @@ class PoseRefinement:
 
     def _twist(self, picture: int, numbers: Array) -> Array:
         """[6] of `moved`, from the given camera."""
+        from scipy.spatial.transform import Rotation
+
         middle, turn = self.seen[picture], numbers[:3]
         shift = self.distances[picture] * numbers[3:] + middle - Rotation.from_rotvec(turn).apply(middle)
         return np.concatenate([turn, shift])
@@ -135,6 +136,8 @@ class PoseRefinement:
 
     def camera_axes(self, picture: int) -> Array:
         """[3, 3] rotation camera_from_world of the refined camera."""
+        from scipy.spatial.transform import Rotation
+
         turn = Rotation.from_rotvec(self.numbers.values[picture, :3]).as_matrix()
         axes: Array = turn @ self.given[picture].camera_from_world[:3, :3]
         return axes

@@ -10,6 +10,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame, Sun
+from spacesim.splat import sun_search
 from spacesim.splat.fit import estimate_sun, find_unknowns
 from spacesim.splat.sun_search import SPHERE
 from spacesim.splat.train.checkpoint import read_tensors
@@ -31,10 +32,12 @@ def untold(small_dataset):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Few comparisons: one in training, one at its end."""
+    """Few comparisons, with few Suns: one in training, one at its end."""
+    monkeypatch.setattr(sun_search, "SPHERE", 60)
+    monkeypatch.setattr(suns, "SPHERE", 60)
     monkeypatch.setattr(suns, "SEARCHES", (0.5,))
     monkeypatch.setattr(suns, "SHAPE_STEPS", 12)
-    monkeypatch.setattr(suns, "NEAR", 14.0)
+    monkeypatch.setattr(suns, "NEAR", 30.0)
 
 
 class StoppedError(Exception):
@@ -65,7 +68,7 @@ def test_training_estimates_and_resumes_to_the_bit(untold, quick, tmp_path):
     assert [unknown.name for unknown in find_unknowns(whole)] == ["sun"]
 
 
-def test_a_run_tells_the_sun_of_a_new_picture(small_dataset, tmp_path):
+def test_a_run_tells_the_sun_of_a_new_picture(small_dataset, quick, tmp_path):
     """Of any method that is told the Sun; here only that it is one, the same each time, and what is refused."""
     config = replace(CONFIG, sun="given", iterations=10)
     lit = tuple(replace(frame, sun=Sun.from_angles(30, 40)) for frame in small_dataset.train)

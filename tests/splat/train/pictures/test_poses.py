@@ -192,6 +192,7 @@ def test_the_model_stays_while_cameras_find_their_places(small_dataset):
     np.testing.assert_allclose(poses._gauge.shares @ poses.numbers.values.ravel(), common, atol=1e-9)
 
 
+@pytest.mark.threads
 @pytest.mark.parametrize("changes", [{}, {"views_per_step": 3}, {"num_downscales": 1, "supersample": 2}])
 def test_resume_is_the_same_to_the_bit(small_dataset, tmp_path, changes):
     config = replace(CONFIG, exposure_per_picture=True, **changes)
