@@ -141,7 +141,7 @@ def _export_mesh(options: argparse.Namespace) -> None:
 
     holds_colors = mesh_suffix(options.mesh) != ".stl"
     if options.sun is not None and not holds_colors:
-        raise InputError(f"sun: expected a format that holds colours, found {options.mesh}")
+        raise InputError(f"sun: expected a .glb, .obj or .ply, which hold colours, found {options.mesh}")
     frame = FileFrame(options.up or "z", _scale(options), options.recentre)
     settings = {"voxel": options.voxel, "truncation": options.truncation, "views": options.views}
     config = MeshConfig(**{name: value for name, value in settings.items() if value is not None})

@@ -162,7 +162,7 @@ def write_mesh(
 
     path, suffix = Path(path), mesh_suffix(path)
     if colors is not None and suffix == ".stl":
-        raise InputError(f"{path}: expected a format that holds colours, found STL")
+        raise InputError(f"{path}: expected a .glb, .obj or .ply, which hold colours, found STL")
     vertices = vertices @ np.array(UPRIGHT[up or ("y" if suffix == ".glb" else "z")]).T
     if suffix == ".glb":
         _write_glb_mesh(path, vertices, faces, colors)

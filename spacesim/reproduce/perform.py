@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from spacesim.nerf.run import NerfRun
     from spacesim.splat.run import Predictor
 
-Tell = Callable[[int, int, str], None]  #: told how much is done, of how much, and words about it
+Tell = Callable[..., None]  #: told how much is done, of how much, and details, as `spacesim.progress.Reporter` is
 Reporting = Callable[[str, str], AbstractContextManager[Any]]  #: (title, unit) to a `Tell` for the work within
 
 MARKS = 20  #: places of figure 5.5

@@ -195,7 +195,7 @@ def _reporting_to(path: Path, title: str, _unit: str) -> Iterator[Tell]:
     """Tells a file how far the work is."""
     last = 0.0
 
-    def tell(done: int, total: int, _detail: str = "") -> None:
+    def tell(done: int, total: int, *_details: object) -> None:
         nonlocal last
         if time.monotonic() - last >= PROGRESS_EVERY:
             last = time.monotonic()

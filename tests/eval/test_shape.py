@@ -276,7 +276,7 @@ def test_export_where_the_data_is_gone(spacesim, tiny_run, tmp_path):
         ("--mesh OUT/a.ply --voxel 1e-9", ("voxel", "GB")),
         ("--mesh OUT/a.ply --truncation 0", ("truncation",)),
         ("--mesh OUT/a.ply --truncation 1e9", ("truncation", "100")),
-        ("--mesh OUT/a.ply --sun 1,2", ("--sun", "--ply")),
+        ("--mesh OUT/a.stl --sun 1,2", ("--sun", ".glb")),
         ("--mesh OUT/a.ply --views 0", ("views: expected at least 1",)),
         ("--mesh OUT/a.ply --data OUT", ("transforms.json",)),
         ("--ply OUT/a.ply --voxel 1", ("--voxel", "--mesh")),

@@ -16,6 +16,7 @@ import pytest
 from spacesim.data import toml
 from spacesim.data.errors import InputError
 from spacesim.data.structure import keys_of
+from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.build import build
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.rig import RigConfig
@@ -530,7 +531,7 @@ TABLES = {
     **{"The scene": SceneConfig, "[[objects]]": ObjectConfig, "[materials.NAME]": MaterialConfig},
     **{"[sun]": SunConfig, "[earth]": EarthConfig, "[camera]": CameraConfig, "[camera.sensor]": SensorConfig},
     **{f'[rig] kind = "{kind}"': rig for kind, rig in RIGS.items()},
-    "[quality]": QualityConfig,
+    **{"[background]": BackgroundConfig, "[quality]": QualityConfig},
 }
 
 

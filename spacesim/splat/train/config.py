@@ -76,7 +76,7 @@ class TrainConfig:
     """Everything that decides a trained model, apart from the data and the backend. `light` tells the method."""
 
     #: what makes colours: fixed ones, or light: without shadows, by shadow maps, by shadow splatting, or as table 4.3
-    method: Method = field(init=False, default="vanilla")
+    method: Method = field(init=False, repr=False, default="vanilla")
     preset: Preset | None = None  #: the preset that this started from
     init: Init | None = None  #: where Gaussians start; none takes the first of points, mesh, random that can be had
     iterations: int = 7_000  #: steps of training

@@ -23,7 +23,7 @@ from spacesim.splat.raster.render import render
 from spacesim.splat.run import load_run
 from spacesim.splat.train import views
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
-from spacesim.splat.train.config import TrainConfig, preset, with_options
+from spacesim.splat.train.config import TrainConfig, preset, with_options, with_settings
 from spacesim.splat.train.start import distance_warning, initial_gaussians, scale_warning, scene_scale
 from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.train import train
@@ -328,13 +328,21 @@ def test_ply_of_no_gaussians(tmp_path):
 @pytest.mark.parametrize(
     ("option", "value"),
     [
-        *(("iterations", 0), ("method", "magic"), ("init", "dreams"), ("seed", -1), ("sh_degree", 4)),
+        *(("iterations", 0), ("init", "dreams"), ("seed", -1), ("sh_degree", 4)),
         *(("views_per_step", 0), ("views_per_step", 65)),
     ],
 )
 def test_configurations_that_cannot_be(option, value):
     with pytest.raises(InputError, match=f"{option}: expected"):
         with_options(preset("demo"), **{option: value})
+
+
+def test_the_light_tells_the_method():
+    with pytest.raises(InputError, match="method: expected"):
+        with_settings(preset("demo"), {"method": "magic"})
+    with pytest.raises(InputError, match="light: expected shadow mapping, which is the method shadow-map's"):
+        with_settings(preset("demo"), {"method": "shadow-map"})
+    assert replace(preset("demo"), light=preset("demo", "relight").light).method == "relight"
 
 
 def test_presets_and_table_5_1():
