@@ -104,7 +104,7 @@ def test_colors_in_files(tmp_path, suffix):
 
 
 def test_stl_holds_no_colors(tmp_path):
-    with pytest.raises(InputError, match="expected a .glb, .obj or .ply, which hold colours, found STL"):
+    with pytest.raises(InputError, match=r"expected a \.glb, \.obj or \.ply, which hold colours, found STL"):
         write_mesh(tmp_path / "a.stl", np.eye(3), np.array([[0, 1, 2]]), np.ones((3, 3)))
 
 
