@@ -5,19 +5,22 @@ eval, compose, report and import do; `render` rasterizes Gaussians, `Run.render`
 them stands in the layers of docs/explanation/architecture.md.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from spacesim.backend import BackendError
 from spacesim.backend.arrays import Float
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
 from spacesim.data.store import load_depth, load_truth
-from spacesim.data.structure import Rules, did_you_mean, places_of
+from spacesim.data.structure import Rules, did_you_mean, field_value, places_of
 from spacesim.data.toml import dotted
 from spacesim.data.transforms import read_dataset
 from spacesim.learning.rendering import Rendering
@@ -110,7 +113,7 @@ def generate(
     rig: `PoseRig` of cameras of your own, or another `Rig`;  trajectory: a table that cameras follow
         (docs/how-to/trajectory.md)
     options: of the scene, as the command line has them: suns, views (under each Sun), test_suns, test_views,
-        sun=[(azimuth, elevation), ...] in degrees, distance in metres, resolution=256 or (width, height) in pixels,
+        sun=(azimuth, elevation) in degrees or several, distance in metres, resolution=256 or (width, height) in pixels,
         fov_deg, exposure (display value of a radiance of 1 W m^-2 sr^-1), spp (samples a pixel), seed
     progress: called with (frames done, frames in all, name of the frame last done)
 
@@ -187,8 +190,13 @@ def train(
             settings_hint = f"; did you mean settings={{{inner[0]!r}: {value!r:.60}}}?" if inner else ""
             hint = settings_hint or did_you_mean(name, kind.__dataclass_fields__)
             raise InputError(f"{name}: expected a field of {kind.__name__}, found none of that name{hint}")
-    config = methods.shortened(config, options.get("iterations"))
+    if options.get("iterations") is not None:
+        config = methods.shortened(config, field_value(kind, "iterations", options["iterations"]))
+    options = {name: field_value(kind, name, value) for name, value in options.items()}
     config = methods.with_settings(replace(config, **options), settings or {})
+    named = choices.get("method")
+    if named is not None and config.method != methods.preset("fast", named).method:
+        raise InputError(f"light: expected that of the method {named}, found that of {config.method}")
     dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
 
     def tell(state: Any) -> None:
@@ -237,14 +245,14 @@ def evaluate(
     return metrics
 
 
-def write_report(evals: str | Path | list[str | Path], out: str | Path) -> Path:
+def write_report(evals: str | Path | Sequence[str | Path], out: str | Path) -> Path:
     """Write one HTML page about one evaluation, or several side by side; returns its path.
 
     evals: folders that `evaluate` has written. Raises InputError where one holds no evaluation.
     """
     from spacesim.eval.report.write import write_report as write
 
-    folders = evals if isinstance(evals, list) else [evals]
+    folders = [evals] if isinstance(evals, str | Path) else evals
     write([Path(folder) for folder in folders], Path(out))
     return Path(out)
 
@@ -263,13 +271,17 @@ def compose(scene: str | Path | PosedScene, out: str | Path, *, size: int | tupl
 
 
 def render(
-    gaussians: Gaussians, camera: Camera | Projection, *, twist: Float | None = None, **options: Any
+    gaussians: Gaussians,
+    camera: Camera | Projection,
+    *,
+    twist: Float | np.ndarray | Sequence[float] | None = None,
+    **options: Any,
 ) -> RenderOutput:
     """Gaussians seen by a camera, as Dr.Jit arrays: differentiable by every parameter that has gradients enabled.
 
     camera: a record, or one of spacesim.splat.raster.cameras, where arrays hold pose and intrinsics
-    twist: Float [6], moves the camera: a rotation vector (radians), then a translation (metres), in camera axes, which
-        take points from the old camera axes to the new ones; zeros to differentiate by the pose
+    twist: Float [6], or numbers, moves the camera: a rotation vector (radians), then a translation (metres), in camera
+        axes, which take points from the old camera axes to the new ones; zeros to differentiate by the pose
     sh_degree: highest degree of spherical harmonics used; by default all that are stored
     outputs: ("color", "alpha", "depth") by default, also "median_depth" and "normal"; alpha is always there
     features: C arrays [N] of numbers to blend beside them
@@ -279,4 +291,6 @@ def render(
     another output or features of another length, BackendError where no backend can run.
     """
     view = camera if isinstance(camera, Projection) else Pinhole.of(camera)
-    return _render(gaussians, view if twist is None else view.moved(twist), **options)
+    if twist is not None:
+        view = view.moved(upload(np.asarray(twist)) if isinstance(twist, np.ndarray | Sequence) else twist)
+    return _render(gaussians, view, **options)

@@ -52,6 +52,9 @@ def shortened(config: Config, iterations: int | None) -> Config:
 
 def with_settings(config: Config, settings: JsonMapping) -> Config:
     """`config` with fields set by their dotted names. Raises InputError for a name or a value that cannot be."""
+    for name in ("method", "preset"):
+        if name in settings:
+            raise InputError(f"{name}: expected beside the settings, for it sets all that goes with it, found in them")
     if isinstance(config, NerfConfig):
         return nerf.with_settings(config, settings)
     return splat.with_settings(config, settings)

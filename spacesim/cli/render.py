@@ -9,9 +9,9 @@ from spacesim import interrupts
 from spacesim.cli.parser import Parser, add_view, angles, view_of
 from spacesim.cli.printing import KNOWS_ONE_LIGHT
 from spacesim.data.errors import InputError
+from spacesim.learning.prediction import KINDS
 
 SUMMARY, NEEDS_BACKEND = "one picture of a run", True
-KINDS = ("rgb", "depth", "alpha", "normal", "shadow")
 
 
 def add_options(parser: Parser, arguments: Sequence[str]) -> None:

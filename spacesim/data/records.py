@@ -127,7 +127,10 @@ class Sun:
         InputError for other numbers."""
         if value is None or isinstance(value, Sun):
             return value
-        numbers = np.asarray(value, dtype=np.float64)
+        try:
+            numbers = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            numbers = np.zeros(0)
         if numbers.shape == (2,) and np.isfinite(numbers).all() and abs(numbers[1]) <= 90:
             return Sun.from_angles(float(numbers[0]), float(numbers[1]))
         if numbers.shape != (3,):

@@ -121,6 +121,33 @@ def keys_of(cls: type, rules: Rules) -> dict[str, Any]:
     return {name: hint for name, hint in _hints(cls).items() if name not in hidden}
 
 
+def field_value(cls: type, name: str, value: object) -> Any:
+    """`value`, given in Python, as the field `name` of a dataclass wants it: numpy's numbers and arrays as Python's,
+    lists as tuples, records and what no file can say as they are. Raises InputError "name: expected ..., found ..."."""
+    hint = _hints(cls)[name]
+    members = {hint, *get_args(hint)}
+    records = tuple(member for member in members if isinstance(member, type) and is_dataclass(member))
+    if records:
+        if value is not None and not isinstance(value, records):
+            expected = " or ".join(sorted(record.__name__ for record in records))
+            raise InputError(f"{name}: expected a {expected}, found {_short(value)}")
+        return value
+    if not _is_plain(hint):
+        return value
+    return _Reader(Document("", {}, {}), Rules(), cls).value(hint, _as_in_files(value), (name,))
+
+
+def _is_plain(hint: object) -> bool:
+    """Whether a file can say all values of an annotation."""
+    inner = [member for member in get_args(hint) if member not in (NoneType, Ellipsis)]
+    return hint in _NOUNS or get_origin(hint) is Literal or (bool(inner) and all(map(_is_plain, inner)))
+
+
+def _as_in_files(value: object) -> object:
+    value = value.tolist() if hasattr(value, "tolist") else value
+    return [_as_in_files(item) for item in value] if isinstance(value, list | tuple) else value
+
+
 def places_of(cls: type, rules: Rules, at: Keys = ()) -> Iterator[Keys]:
     """Where keys are in a document that gives a `cls`, but for those in lists and in tables with free names."""
     for kind in dict.fromkeys([cls, *rules.kinds.get(cls, {}).values()]):

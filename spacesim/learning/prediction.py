@@ -12,6 +12,9 @@ A_PIXEL = {"cuda": 80, "llvm": 225}
 """Bytes of main memory that a predicted pixel takes at most, until it is written: 160 and then 65 were seen on LLVM."""
 
 
+KINDS = ("rgb", "alpha", "depth", "normal", "shadow")  #: of pictures of a prediction
+
+
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """A rendered view, float32."""

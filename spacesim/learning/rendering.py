@@ -7,9 +7,10 @@ from typing import Protocol
 
 import numpy as np
 
+from spacesim.data.errors import InputError
 from spacesim.data.records import Camera, Sun
 from spacesim.learning.pictures import write_picture
-from spacesim.learning.prediction import Prediction
+from spacesim.learning.prediction import KINDS, Prediction
 
 
 class Predicts(Protocol):
@@ -61,9 +62,11 @@ class Rendering:
     def save(self, path: str | Path, kind: str = "rgb") -> Path:
         """Write a PNG to look at or an EXR to compute with; returns its path.
 
-        kind: "rgb", "alpha", "depth", "normal" or "shadow". Raises InputError for another suffix, and for shadows of a
-        method without.
+        kind: "rgb", "alpha", "depth", "normal" or "shadow". Raises InputError for another, for another suffix, and for
+        shadows of a method without.
         """
+        if kind not in KINDS:
+            raise InputError(f"kind: expected one of {', '.join(KINDS)}, found {kind!r}")
         drawn = replace(self._drawn, normal=self.normal) if kind == "normal" else self._drawn
         write_picture(drawn, kind, Path(path))
         return Path(path)

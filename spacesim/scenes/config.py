@@ -1,12 +1,15 @@
 """What a scene file says: spacecraft and poses, materials, sources, rig, camera, quality."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
+import numpy as np
+
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import JsonDict
+from spacesim.data.structure import field_value
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.rig import FibonacciRig, Rig
@@ -153,8 +156,9 @@ class SceneConfig:
 def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
     """`scene` with its name or seed, or fields of its rig, camera or quality changed by name; None changes nothing.
     `rig` is a rig in place of the scene's own, and `trajectory` the table that such a one follows (`FileRig`).
-    `resolution` may be one number, of a square. `sun` takes the place of the rig's own arrangement, whatever the number
-    of its Suns, and `suns` alone that of `sun`. `background` is a `BackgroundConfig` or the words of one.
+    `resolution` may be one number, of a square, and `sun` one (azimuth, elevation). `sun` takes the place of the rig's
+    own arrangement, whatever the number of its Suns, and `suns` alone that of `sun`. `background` is a
+    `BackgroundConfig` or the words of one.
 
     Raises InputError for a name that this scene's rig does not know, or a value out of range.
     """
@@ -176,10 +180,12 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
         if part is None:
             raise InputError(f"{name}: expected {_options_of(scene, name, names_by_part)}")
         if value is not None:
-            changes[part][name] = (value, value) if name == "resolution" and isinstance(value, int) else value
+            value = (value, value) if name == "resolution" and isinstance(value, int) else value
+            value = [value] if name == "sun" and _is_direction(value) else value
+            of_words = name == "background"  # which is a record or the words of one
+            changes[part][name] = value if of_words else field_value(type(_part(scene, part)), name, value)
     rig = changes["rig"]
     if "sun" in rig:
-        rig["sun"] = tuple((float(azimuth), float(elevation)) for azimuth, elevation in rig["sun"])
         if "suns" in names_by_part["rig"]:
             rig.setdefault("suns", len(rig["sun"]))
     elif "suns" in rig:
@@ -188,6 +194,15 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
         changes[""]["background"] = BackgroundConfig.of(changes[""]["background"])
     parts = {part: replace(getattr(scene, part), **changed) for part, changed in changes.items() if part}
     return replace(scene, **changes[""], **parts)
+
+
+def _part(scene: SceneConfig, name: str) -> object:
+    return getattr(scene, name) if name else scene
+
+
+def _is_direction(value: object) -> bool:
+    """Whether `value` is (azimuth, elevation) of one Sun."""
+    return isinstance(value, Sequence | np.ndarray) and np.shape(value) == (2,)
 
 
 def _options_of(scene: SceneConfig, name: str, names_by_part: Mapping[str, Iterable[str]]) -> str:

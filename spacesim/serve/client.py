@@ -1,6 +1,7 @@
 """A client of `spacesim serve`: one request, one answer."""
 
 import json
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any
 
@@ -24,13 +25,16 @@ class CameraClient:
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.connect(address)
 
-    def picture(self, camera: Camera, sun: Sun | None = None, **options: Any) -> dict[str, np.ndarray]:
-        """The arrays that were asked for, by name. options: exposure (EV), outputs=("rgb", "depth", ...), seed, see
-        spacesim/serve/protocol.py. Raises InputError for what cannot be, WorkError where nobody answers."""
+    def picture(
+        self, camera: Camera, sun: Sun | Sequence[float] | None = None, **options: Any
+    ) -> dict[str, np.ndarray]:
+        """The arrays that were asked for, by name. sun: as for `Run.render`; options: exposure (EV), outputs=("rgb",
+        "depth", ...), seed, see spacesim/serve/protocol.py. Raises InputError for what cannot be, WorkError where
+        nobody answers."""
         lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
         fields = {"camera": {"world_from_camera": camera.world_from_camera.tolist(), **lens}, **options}
-        if sun is not None:
-            fields["sun"] = sun.direction.tolist()
+        if (towards := Sun.of(sun)) is not None:
+            fields["sun"] = towards.direction.tolist()
         self._socket.send(json.dumps({"version": VERSION, "id": 0, **fields}).encode())
         if not self._socket.poll(round(1e3 * self.timeout)):
             raise WorkError(f"{self.address}: expected an answer within {self.timeout:g} s, found none")

@@ -121,6 +121,9 @@ class Gaussians:
     @staticmethod
     def from_numpy(arrays: Mapping[str, np.ndarray]) -> "Gaussians":
         """The inverse of `to_numpy`. Raises ValueError naming the array whose shape does not fit."""
+        for name in ("means", "log_scales", "quaternions", "logit_opacities", "sh"):
+            if name not in arrays:
+                raise ValueError(f"{name}: expected an array, found none")
         count = len(arrays["means"])
         expected: dict[str, tuple[int, ...]] = {
             "means": (count, 3),
