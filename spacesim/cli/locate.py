@@ -24,6 +24,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
+    from spacesim.data.errors import WorkError
     from spacesim.data.records import Sun
     from spacesim.methods import load_run
     from spacesim.progress import show_progress
@@ -47,6 +48,10 @@ def run(options: argparse.Namespace) -> None:
         )
     failed = f", {done.failed} without a pose" if done.failed else ""
     interrupts.print_output(f"{options.out}: {done.pictures} pictures, {done.converged} converged{failed}")
+    if done.failed == done.pictures:
+        raise WorkError(
+            f"{options.images}: expected a picture with a pose to be found, found none; {options.out} says why"
+        )
 
 
 def _within(text: str) -> tuple[float, float]:

@@ -28,7 +28,7 @@ import numpy as np
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import JsonDict
 from spacesim.data.geometry import rotation_from_quaternion
-from spacesim.data.records import Camera, Sun
+from spacesim.data.records import Camera, Sun, check_size
 from spacesim.data.structure import Rules, structure
 from spacesim.data.toml import Document
 
@@ -73,6 +73,7 @@ class CameraFields:
         width, height = self.width, self.height
         if min(width, height) < 1:
             raise InputError(f"camera: expected a size of at least 1x1 pixels, found {width}x{height}")
+        check_size(width, height, "camera")
         if (self.fov_deg is None) == (self.fx is None):
             raise InputError(f"camera: expected either fov_deg or fx, found {'both' if self.fx else 'neither'}")
         if self.fov_deg is not None:

@@ -119,6 +119,9 @@ class CameraServer:
             arrays = draw(self._served, camera, sun, request.exposure, request.outputs, request.seed)
         except (InputError, WorkError, MemoryError) as error:
             return protocol.error_answer(number, " ".join(str(error).split()))
+        except (ArithmeticError, ValueError) as error:  # what nobody foresaw ends this request alone
+            _log.exception("serve: a request failed")
+            return protocol.error_answer(number, f"request: it failed ({' '.join(str(error).split())})")
         return protocol.picture_answer(number, arrays, time.perf_counter() - start)
 
 

@@ -106,18 +106,20 @@ class Simulation:
 
     def update(self, message: bytes) -> None:
         """Take in a VizMessage. Raises InputError for what is none."""
+        bodies, cameras = dict(self._bodies), dict(self._cameras)
         for number, value in wire.fields(message):
             if number == 1:
                 told = [wire.integers(inner) for key, inner in wire.fields(_message(value)) if key == 1]
                 self._frame = max(0, *(frame for frames in told for frame in frames), 0)
             elif number in (2, 3):
                 body = _read_body(value, is_spacecraft=number == 3)
-                self._bodies[body.name] = body
+                bodies[body.name] = body
             elif number == 4:
                 camera = _read_camera(value)
-                self._cameras[camera.number] = camera
-        if len(self._bodies) + len(self._cameras) > MAX_BODIES:
-            raise InputError(f"message: expected at most {MAX_BODIES} bodies and cameras, found more")
+                cameras[camera.number] = camera
+            if len(bodies) + len(cameras) > MAX_BODIES:
+                raise InputError(f"message: expected at most {MAX_BODIES} bodies and cameras, found more")
+        self._bodies, self._cameras = bodies, cameras
 
     def view(self, number: int) -> tuple[Camera, Sun | None]:
         """Camera `number` and the Sun in the target's axes. Raises InputError where bodies are missing."""

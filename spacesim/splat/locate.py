@@ -113,7 +113,8 @@ def _frames(
         if like is None:
             usual = usual or _usual(run, camera)
             like = replace(usual, sun=None)
-        frames.append(replace(like, file_path=name))
+        # its silhouette, mask and truth are of another picture
+        frames.append(Frame(name, like.camera, like.sun, distortion=like.distortion, exposure=like.exposure))
     return frames, None
 
 

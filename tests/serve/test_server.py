@@ -160,6 +160,9 @@ def test_garbage_and_clients_that_hang_up_do_no_harm(ball):
             asked_soon(address, bytes(MAX_FRAME_BYTES + 1))
         for frames in ([b""], [b"", b"", b""], [random.bytes(99)] * 50, [b"SIM_UPDATE"], [b"REQUEST_IMAGE_1"]):
             asked(address, *frames)
+        for size in ({"width": 10**400}, {"height": 10**400}, {"width": 2**20}):
+            huge = json.dumps(REQUEST | {"camera": REQUEST["camera"] | size}).encode()
+            assert b"camera: expected at most" in asked(address, huge)[0]
         assert arrays_of(asked(address, request))["rgb"].any()
 
 

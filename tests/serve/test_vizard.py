@@ -13,7 +13,7 @@ from spacesim.data.images import png_bytes, read_png
 from spacesim.data.records import Camera, Sun
 from spacesim.serve import wire
 from spacesim.serve.server import serving
-from spacesim.serve.vizard import Simulation, depth_colors, rotation_from_mrp
+from spacesim.serve.vizard import MAX_BODIES, Simulation, depth_colors, rotation_from_mrp
 
 
 def varint(number):
@@ -206,6 +206,17 @@ def test_broken_messages_are_told_in_a_sentence(ball, said, words):
     (answer,) = Simulation(ball).answer([b"SIM_UPDATE", b"", b"", said])
     assert answer.startswith(b"ERROR ")
     assert words in answer.decode()
+
+
+def test_no_more_bodies_are_kept_than_there_may_be(ball, flight):
+    simulation = Simulation(ball)
+    simulation.answer([b"SIM_UPDATE", b"", b"", flight[0]])
+    before = simulation.view(1)[0].world_from_camera
+    many = b"".join(spacecraft(str(k), [0.0, 0, 0], np.eye(3)) for k in range(MAX_BODIES + 1))
+    (answer,) = simulation.answer([b"SIM_UPDATE", b"", b"", many])
+    assert b"expected at most" in answer
+    assert simulation.answer([b"SIM_UPDATE", b"", b"", flight[0]]) == [b"OK"]
+    np.testing.assert_array_equal(simulation.view(1)[0].world_from_camera, before)
 
 
 def test_bytes_that_flip_do_no_harm(ball, flight):

@@ -208,6 +208,19 @@ def test_the_command(spacesim, tiny_run, tiny_data, tmp_path):
     assert not (tmp_path / "b.json").exists()
 
 
+def test_an_opaque_picture_needs_no_files_beside_it(spacesim, tiny_run, tiny_data, tmp_path):
+    """Its camera is that of the run's data, whose silhouettes are of other pictures."""
+    picture, out = tmp_path / "opaque.png", tmp_path / "poses.json"
+    PillowImage.open(tiny_data / "images/test_00000.png").convert("RGB").save(picture)
+    done = spacesim("locate", tiny_run, picture, "--out", out)
+    assert done.code == 0, done.errors
+    assert "transform_matrix" in json.loads(out.read_text())["frames"][0]
+    picture.write_bytes(b"no picture")
+    done = spacesim("locate", tiny_run, picture, "--out", tmp_path / "none.json")
+    assert done.code == 1
+    assert "found none" in done.errors[-1]
+
+
 def test_a_datasets_own_poses_are_not_looked_at(tiny_run, tiny_data):
     frames, dataset = _frames(load_run(tiny_run), tiny_data, {}, None)
     assert dataset is not None

@@ -38,7 +38,7 @@ def write_splats(
     elif form == "spz":
         write_spz(placed, path, antialiased, spz_version)
     else:
-        write_usd(placed, path, frame.up)
+        write_usd(placed, path, frame.up, frame.scale)
 
 
 def check_ending(path: Path, form: Form) -> None:

@@ -17,10 +17,10 @@ from spacesim.splat.raster.gaussians import Gaussians
 ROWS = 4096  #: of an array that are made text at once
 
 
-def write_usd(gaussians: Gaussians, path: Path, up: Up = "z") -> None:
+def write_usd(gaussians: Gaussians, path: Path, up: Up = "z", scale: float = 1.0) -> None:
     """Write linear scales, opacities from 0 to 1, unit quaternions (w, x, y, z) and the harmonics of each Gaussian one
-    after the other; colours are sRGB values, which the attribute tells; drawn in the order of depth, as ours are. One
-    unit is a metre. up: which of the file's axes points up, "z" or "y", USD knows no other
+    after the other; colours are sRGB values, which the attribute tells; drawn in the order of depth, as ours are. up:
+    which of the file's axes points up, "z" or "y", USD knows no other;  scale: units a metre, which the file tells
 
     Raises InputError for another one and where the file cannot be written.
     """
@@ -33,7 +33,8 @@ def write_usd(gaussians: Gaussians, path: Path, up: Up = "z") -> None:
     extent = np.stack(corners) if len(means) else np.zeros((0, 3))
     harmonics = arrays["sh"].reshape(-1, 3)
     parts = [
-        f'#usda 1.0\n(\n    defaultPrim = "splats"\n    metersPerUnit = 1\n    upAxis = "{up.upper()}"\n)\n\n'
+        f'#usda 1.0\n(\n    defaultPrim = "splats"\n    metersPerUnit = {1 / scale:.9g}\n'
+        f'    upAxis = "{up.upper()}"\n)\n\n'
         f'def ParticleField3DGaussianSplat "splats"\n{{\n    float3[] extent = ',
         *_text(extent),
         "\n    point3f[] positions = ",

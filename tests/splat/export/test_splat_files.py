@@ -146,6 +146,8 @@ def test_usd_tells_units_colors_and_size(tmp_path):
     write_splats(gaussians, tmp_path / "a.usda", "usd", FileFrame())
     decoded = read_usda(tmp_path / "a.usda")
     assert (decoded.said["metersPerUnit"], decoded.said["colorSpace"]) == ("1", "srgb_rec709_scene")
+    write_splats(gaussians, tmp_path / "cm.usda", "usd", FileFrame(scale=100))
+    assert read_usda(tmp_path / "cm.usda").said["metersPerUnit"] == "0.01"
     low, high = decoded.said["extent"]
     assert (low <= decoded.means.min(axis=0) - 3 * np.exp(-3.2)).all()
     assert (high >= decoded.means.max(axis=0) + 3 * np.exp(-3.2)).all()
