@@ -171,7 +171,7 @@ def _export_mesh(options: argparse.Namespace) -> None:
         with show_progress("export", "pictures") as report:
             colors = color_vertices(surface, cameras, depth, partial(run.predict, sun=sun), config.views, report)
     write_mesh(options.mesh, frame.sized(surface.vertices), surface.faces, colors, options.up)
-    words = "" if colors is None else ", coloured"
+    words = ", coloured" if colors is not None else "; colours need --sun" if holds_colors else ""
     interrupts.print_output(
         f"{options.mesh}: {len(surface.faces)} faces from {surface.views} views, voxels of {surface.voxel:.4g} m{words}"
     )
