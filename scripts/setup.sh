@@ -12,6 +12,7 @@ cd "$(dirname "$0")/.."
 
 WANTED=${1:-base}
 LOCK=requirements/lock.txt
+BASILISK=bsk==2.12.1 # in an environment of its own: what it needs is not what we need
 TORCH_CPU=https://download.pytorch.org/whl/cpu
 LLVM_VERSIONS="22 21 20 19"
 export PIP_NO_INPUT=1 PIP_DISABLE_PIP_VERSION_CHECK=1
@@ -119,6 +120,8 @@ if [ "$WANTED" = test ]; then
         install --no-build-isolation -e ".[$extra]" 2>/dev/null ||
             say "what the extra '$extra' needs cannot be had here; its tests are skipped"
     done
+    { .venv/bin/python -m venv .venv/basilisk && .venv/basilisk/bin/python -m pip install -q "$BASILISK"; } 2>/dev/null ||
+        say "$BASILISK cannot be had here; the tests that fly with it are skipped"
     install torch 2>/dev/null || install --retries 1 --extra-index-url "$TORCH_CPU" torch 2>/dev/null ||
         say "torch's CPU build cannot be had here; the tests that need it (LPIPS) are skipped"
 fi

@@ -15,7 +15,8 @@ from spacesim.serve.server import serving
 from spacesim.serve.vizard import rotation_from_mrp
 
 SCRIPT = Path(__file__).parents[2] / "examples" / "closed_loop" / "basilisk.py"
-PYTHON = os.environ.get("BASILISK_PYTHON", sys.executable)  #: of the environment that has bsk
+OWN = Path(sys.prefix) / "basilisk" / "bin" / "python"  #: where scripts/setup.sh puts it
+PYTHON = os.environ.get("BASILISK_PYTHON", str(OWN) if OWN.exists() else sys.executable)  #: of what has bsk
 STEP, SIZE, FOV = 0.5, (96, 80), np.radians(30.0)
 LEVER, SIGMA_CB = [0.5, -0.3, 0.1], [0.03, -0.04, 0.2]  #: of the second camera
 
