@@ -36,7 +36,7 @@ from spacesim.splat.train.checkpoint import HistoryEntry, read_tensors
 from spacesim.splat.train.config import TrainConfig
 
 
-class Part(Protocol):
+class ComposedModel(Protocol):
     """A model of a composed scene, where it stands."""
 
     @property
@@ -97,7 +97,7 @@ class Predictor(Protocol):
         """Whether the Sun's direction changes what is predicted."""
 
     @property
-    def parts(self) -> Sequence[Part]:
+    def parts(self) -> Sequence[ComposedModel]:
         """The models of a scene, which stand for the dataset's objects in their order; none of a single run."""
 
     @property
@@ -180,7 +180,7 @@ class Run:
         return self.light is not None and self.light.config.field.knows_sun
 
     @property
-    def parts(self) -> tuple[Part, ...]:
+    def parts(self) -> tuple[ComposedModel, ...]:
         """None: it was trained as one."""
         return ()
 

@@ -13,9 +13,9 @@ from spacesim.methods import load_predictor
 from spacesim.nerf.run import NerfRun
 from spacesim.splat.compose import ComposedRun, GaussianComposition, PlacedRun, Pose
 from spacesim.splat.compose.aligned import AlignedRun
-from spacesim.splat.compose.run import PlacedPart
+from spacesim.splat.compose.run import PlacedModel
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.run import Part, Predictor, Run, check_gaussians
+from spacesim.splat.run import ComposedModel, Predictor, Run, check_gaussians
 
 CAMERA = Camera.from_fov(look_at((0, -4, 0), (0, 0, 0)), 24, 16, 40)
 SUN = Sun.from_angles(45, 30)
@@ -45,7 +45,13 @@ def test_predict_is_asked_in_the_same_words(kind):
 
 @pytest.mark.parametrize(
     ("kind", "protocol"),
-    [(Run, Predictor), (AlignedRun, Predictor), (ComposedRun, Predictor), (NerfRun, Predictor), (PlacedPart, Part)],
+    [
+        (Run, Predictor),
+        (AlignedRun, Predictor),
+        (ComposedRun, Predictor),
+        (NerfRun, Predictor),
+        (PlacedModel, ComposedModel),
+    ],
 )
 def test_all_that_is_asked_for_is_there(kind, protocol):
     asked = {name for name in vars(protocol) if not name.startswith("_")}
