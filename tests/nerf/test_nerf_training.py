@@ -59,6 +59,10 @@ def model_bytes(run: NerfRun) -> bytes:
     return (run.path / "model.safetensors").read_bytes()
 
 
+def test_a_run_is_shown_in_a_line(finished):
+    assert repr(finished) == f"NerfRun({str(finished.path)!r}: {finished.config['method']})"
+
+
 def test_training_learns_the_pictures(dataset, finished):
     history = finished.training["history"]
     assert [entry["iteration"] for entry in history] == [50, 100, 150, 200]
