@@ -39,7 +39,7 @@ class NerfCheckpointHeader(CheckpointHeader):
         check_ranges(self, proposal_steps=(0, 2**53))
 
 
-class Trainer(TrainingLoop):
+class NerfTrainer(TrainingLoop):
     """The parameters of a radiance field, their moments, and what is known as empty, one step after another."""
 
     form, header = FORMAT, NerfCheckpointHeader
@@ -122,7 +122,7 @@ class Trainer(TrainingLoop):
 
 
 def box_of(tensors: Mapping[str, np.ndarray]) -> SceneBox:
-    """The box that `Trainer.model_tensors` names. Raises KeyError, or ValueError where it is none."""
+    """The box that `NerfTrainer.model_tensors` names. Raises KeyError, or ValueError where it is none."""
     box = tensors["box"].astype(np.float64)
     if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > 0).all():
         raise ValueError("box: expected a corner and three sides above 0, found others")
