@@ -49,6 +49,14 @@ def test_every_field_has_a_meaning(method, strategy):
     assert {key for key, _ in OPTIONS.values()} <= {field.key for field in found}
 
 
+def test_what_cannot_be_set_is_no_option():
+    found = {field.key for field in fields_of(preset("fine", "baseline-park"))}
+    assert "light.shadow.method.gradients" in found
+    assert "light.shadow.method.baseline" not in found
+    assert "baseline-park" in reference()
+    assert "`baseline`" not in reference()
+
+
 def records_in(record: Any) -> set[str]:
     """Names of the classes of a record and of those within it."""
     inner = [getattr(record, f.name) for f in fields(record)]

@@ -1,9 +1,13 @@
 """What `import spacesim` gives: names that are loaded when they are used, and that type checkers know."""
 
+import ast
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
+
+import spacesim as ss
 
 ROOT = Path(__file__).parents[1]
 
@@ -29,6 +33,13 @@ assert not hasattr(ss, "replace")  # of api, but no name of its own
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_no_other_class_has_the_name_of_a_public_one():
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "spacesim").rglob("*.py")]
+    named = Counter(node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef))
+    assert named["Dataset"] == named["Run"] == 1
+    assert {name: named[name] for name in ss.__all__ if named[name] > 1} == {}
 
 
 def test_type_checkers_see_the_public_names(tmp_path):

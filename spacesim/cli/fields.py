@@ -9,7 +9,7 @@ import io
 import textwrap
 import tokenize
 from collections.abc import Iterator
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -55,11 +55,16 @@ def meanings(cls: Any) -> dict[str, str]:
     return {f.name: result.get(f.name, "") for f in fields(cls)}
 
 
+def options_in(cls: Any) -> list[Field[Any]]:
+    """The fields of a dataclass that can be set: not those whose metadata say `"option": False`."""
+    return [f for f in fields(cls) if f.metadata.get("option", True)]
+
+
 def fields_of(record: object, at: str = "") -> Iterator[ConfigField]:
     """Every field of a record, and of the records in it, with the values that it has."""
     cls: Any = type(record)
     hints, said = get_type_hints(cls), meanings(cls)
-    for f in fields(cls):
+    for f in options_in(cls):
         value, key = getattr(record, f.name), f"{at}{f.name}"
         if is_dataclass(value):
             yield ConfigField(key, type_words(hints[f.name]), kind_of(type(value)) or "", said[f.name])
@@ -98,9 +103,9 @@ def reference(config: object = TrainConfig) -> str:
         lead = " ".join((inspect.getdoc(cls) or "").split("\n\n")[0].split())
         lines = [f"## {cls.__name__}", "", f"{where}{kind}. {lead}" if where else lead, ""]
         hints, said = get_type_hints(cls), meanings(cls)
-        if fields(cls):
+        if options_in(cls):
             lines += ["| key | type | default | meaning |", "|---|---|---|---|"]
-        for f in fields(cls):
+        for f in options_in(cls):
             value = f.default_factory() if f.default_factory is not MISSING else f.default
             default = (kind_of(type(value)) or "") if is_dataclass(value) else _literal(value)
             cells = f"`{f.name}`", type_words(hints[f.name]), f"`{default}`" if default else "", said[f.name]

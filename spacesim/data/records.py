@@ -1,8 +1,9 @@
 """What a dataset is made of: frozen records with units in their fields' docs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,6 +31,13 @@ def check_size(width: int, height: int, name: str) -> None:
     if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
         limit = f"at most {MAX_PIXELS:,} pixels, {MAX_SIDE:,} a side"
         raise InputError(f"{name}: expected {limit}, found {width} x {height}")
+
+
+def planes_repr(record: object, width: int, height: int) -> str:
+    """The `repr` of a dataclass of planes: their size and which of them are there, not their numbers."""
+    cls: Any = type(record)
+    names = [f.name for f in fields(cls) if f.name not in ("width", "height") and getattr(record, f.name) is not None]
+    return f"{cls.__name__}({width} x {height} pixels: {', '.join(names)})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +172,9 @@ class Truth:
     radiance_earth: np.ndarray | None = None  #: [H, W, 3] the Earth's part of `radiance`, where there is an Earth
     radiance_background: np.ndarray | None = None  #: [H, W, 3] of what was drawn behind the objects, as if alone
 
+    def __repr__(self) -> str:
+        return planes_repr(self, self.alpha.shape[1], self.alpha.shape[0])
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -197,6 +208,10 @@ class Dataset:
     missing: tuple[str, ...] = ()
     depth_unit: float = 1e-3  #: metres a step of the pictures of depth
 
+    def __repr__(self) -> str:
+        of = f" of {self.scene['scene']}" if "scene" in self.scene else ""
+        return f"Dataset({str(self.root)!r}: {len(self.train)} training, {len(self.test)} test frames{of})"
+
     @property
     def frames(self) -> tuple[Frame, ...]:
         """All frames, training ones first."""
@@ -210,6 +225,9 @@ class Image:
     rgb: np.ndarray  #: [H, W, 3] float32 sRGB values in [0, 1], straight alpha
     alpha: np.ndarray  #: [H, W] float32
     valid: np.ndarray  #: [H, W] bool, False where `mask_path` says to ignore the pixel
+
+    def __repr__(self) -> str:
+        return planes_repr(self, self.alpha.shape[1], self.alpha.shape[0])
 
     def over(self, background: np.ndarray) -> np.ndarray:
         """[H, W, 3] this image over a background colour [3] or image [H, W, 3] (on sRGB values, as the thesis)."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.backend.memory import check_memory
-from spacesim.data.records import Camera
+from spacesim.data.records import Camera, planes_repr
 
 A_PIXEL = {"cuda": 80, "llvm": 225}
 """Bytes of main memory that a predicted pixel takes at most, until it is written: 160 and then 65 were seen on LLVM."""
@@ -26,8 +26,11 @@ class Prediction:
     #: [H, W, 3] unit vectors in world axes, 0 where there is no surface, or None where not asked for
     normal: np.ndarray | None = None
 
+    def __repr__(self) -> str:
+        return planes_repr(self, self.alpha.shape[1], self.alpha.shape[0])
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class ComposedPrediction(Prediction):
     """A view of a scene. visibility: of models without shadows of their own 1 where no other model is before the
     Sun."""

@@ -13,7 +13,7 @@ from spacesim.learning.pictures import write_picture
 from spacesim.learning.prediction import KINDS, Prediction
 
 
-class Predicts(Protocol):
+class CanPredict(Protocol):
     """What predicts views: a run of any method."""
 
     def predict(
@@ -25,7 +25,7 @@ class Predicts(Protocol):
 class Rendering:
     """A view of a run, drawn when an array of it is asked for first. See `Run.render`."""
 
-    def __init__(self, run: Predicts, camera: Camera, sun: Sun | None, exposure: float | None = None) -> None:
+    def __init__(self, run: CanPredict, camera: Camera, sun: Sun | None, exposure: float | None = None) -> None:
         self.run, self.camera, self.sun, self.exposure = run, camera, sun, exposure
 
     @cached_property

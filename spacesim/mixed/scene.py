@@ -19,7 +19,7 @@ from spacesim.backend.arrays import Bool, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.records import Camera, Sun
-from spacesim.mixed.shadow import FieldsBeside, sun_views
+from spacesim.mixed.shadow import FieldOccluder, sun_views
 from spacesim.mixed.walk import ListedSplats, Segments, blend_segments, listed
 from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.draw import chunks, unit_normals
@@ -65,7 +65,7 @@ class MixedComposition(FieldScene):
         self._views = _SunViews()
 
     def _shaded(self, splats: GaussianComposition) -> GaussianComposition:
-        return splats.shaded_by(FieldsBeside(self._fields))
+        return splats.shaded_by(FieldOccluder(self._fields))
 
     @property
     def gaussian_count(self) -> int:

@@ -20,8 +20,8 @@ TEST = MappingConfig("percentage-closer", radius=0.5)  #: as `Member.cross_shado
 
 
 @dataclass(frozen=True, eq=False)
-class FieldsBeside:
-    """Fields in the Sun's way of Gaussians, see `splat.compose.scene.Beside`."""
+class FieldOccluder:
+    """Fields in the Sun's way of Gaussians, see `splat.compose.scene.SunOccluder`."""
 
     fields: FieldComposition  #: radiance fields where they stand
 

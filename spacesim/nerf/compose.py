@@ -27,8 +27,8 @@ from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, may_shade
 from spacesim.data.records import Camera, Sun
-from spacesim.nerf.draw import Samples, check_chunk, chunks, shown, unit_normals
-from spacesim.nerf.partition import Beside, PlacedField, PlacedFields, Shading, model_rays, partition
+from spacesim.nerf.draw import RaySamples, check_chunk, chunks, shown, unit_normals
+from spacesim.nerf.partition import DeviceSunOccluder, MutualShading, PlacedField, PlacedFields, model_rays, partition
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.sampling.box import SceneBox
 from spacesim.nerf.sampling.rays import Rays, camera_rows
@@ -45,7 +45,7 @@ def draw_chunk(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, n
     merged, segments = seen.merged, fields.segments
     made = volume_weights(merged.density * (merged.high - merged.low), segments)
     rays = Rays(ad.Array3f(0), ad.Array3f(0), ad.Float(0), ad.Float(0), seen.across)
-    planes = shown(made, Samples(merged.low, merged.high, merged.density, merged.color), rays, segments)
+    planes = shown(made, RaySamples(merged.low, merged.high, merged.density, merged.color), rays, segments)
     planes += [sum_rays(made.weights * share, segments) for share in seen.shares]
     if seen.slopes is not None:
         planes += [sum_rays(made.weights * seen.slopes[i], segments) for i in range(3)]
@@ -170,8 +170,8 @@ class FieldComposition(FieldScene):
         seen = (_find_crossing(fields, dr.opaque(ad.UInt32, first), width, count) for first in range(0, size, count))
         return np.flatnonzero(np.concatenate([np.array(part, bool) for part in seen])[:size]).astype(np.uint32)
 
-    def placed(self, camera: Camera, sun: Sun | None, beside: Sequence[Beside | None] = ()) -> PlacedFields:
-        """The models as a camera sees them. beside: what else shades each, see `Shading`"""
+    def placed(self, camera: Camera, sun: Sun | None, beside: Sequence[DeviceSunOccluder | None] = ()) -> PlacedFields:
+        """The models as a camera sees them. beside: what else shades each, see `MutualShading`"""
         shading = None
         if sun is not None and (self._shades or beside):
             spheres = self.spheres
@@ -181,7 +181,7 @@ class FieldComposition(FieldScene):
             ]
             towards = [upload(model.pose.direction_in_model(sun.direction)) for model in self.models]
             eye = upload(camera_rows([camera], SceneBox(np.zeros(3), np.ones(3)))) if beside else None
-            shading = Shading(towards, tuple(casters), eye, list(beside) or [None] * len(self.models))
+            shading = MutualShading(towards, tuple(casters), eye, list(beside) or [None] * len(self.models))
         return PlacedFields(
             tuple(run.networks for run in self._runs),
             [run.parameters for run in self._runs],

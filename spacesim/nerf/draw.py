@@ -27,7 +27,7 @@ inwards."""
 
 
 @dataclass
-class Samples:
+class RaySamples:
     """Of R rays, S samples each: what several fields are merged from, see `compose`."""
 
     low: Float  #: [R S] t
@@ -45,7 +45,7 @@ def sample_field(
     rays: Rays,
     count: int,
     sun: Float | None,
-) -> Samples:
+) -> RaySamples:
     """Intervals of the field's own samples of `count` rays, and what it has there.
 
     filled: see `Occupancy.filled`;  extent: Float [3], of the box;  sun: Float [3], towards it
@@ -58,12 +58,12 @@ def sample_field(
     low, high = t - 0.5 * lengths, t + 0.5 * lengths
     density, color, _ = networks.field.look_up(own, point, direction, towards)
     if not networks.config.casts_shadows:
-        return Samples(low, high, density, color)
+        return RaySamples(low, high, density, color)
     assert towards is not None, "a field that is told the Sun"
     made = volume_weights(density * lengths, samples)
     seen = ray_visibility(networks, parameters, filled, extent, rays, made, low, high, towards)
     visibility = spread(seen, samples)
-    return Samples(low, high, density, mix(color, visibility), visibility)
+    return RaySamples(low, high, density, mix(color, visibility), visibility)
 
 
 def draw_rays(
@@ -92,7 +92,7 @@ def draw_rays(
     return dr.concat(planes)
 
 
-def shown(made: Weights, seen: Samples, rays: Rays, samples: int) -> list[Float]:
+def shown(made: Weights, seen: RaySamples, rays: Rays, samples: int) -> list[Float]:
     """[R] each: colour (3), opacity, expected and median depth along the optical axis, unit of t."""
     planes = [sum_rays(made.weights * seen.color[i], samples) for i in range(3)]
     expected = expected_depth(made.weights, 0.5 * (seen.low + seen.high), samples)

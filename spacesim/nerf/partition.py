@@ -13,7 +13,7 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float, UInt32
-from spacesim.nerf.draw import Samples, sample_field
+from spacesim.nerf.draw import RaySamples, sample_field
 from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks
 from spacesim.nerf.sampling.rays import Rays, pixel_rays
@@ -34,7 +34,7 @@ class Merged:
     intervals: list[UInt32]  #: [R K] of each model, which of its R S intervals a segment lies in; any where in none
 
 
-def merge(models: Sequence[tuple[Samples, int]], rays: int) -> tuple[Merged, int]:
+def merge(models: Sequence[tuple[RaySamples, int]], rays: int) -> tuple[Merged, int]:
     """(the merged partition, its segments a ray) of models' (samples, intervals a ray) (3.2 to 3.6). A model's
     intervals abut; where they end, it has nothing."""
     edges = [_edges(samples, count, rays) for samples, count in models]
@@ -71,7 +71,7 @@ def merge(models: Sequence[tuple[Samples, int]], rays: int) -> tuple[Merged, int
     return Merged(low, high, densities, density, [c * share for c in color], intervals), segments
 
 
-def _edges(samples: Samples, count: int, rays: int) -> Float:
+def _edges(samples: RaySamples, count: int, rays: int) -> Float:
     """[R (S + 1)] boundaries of intervals that abut."""
     index = dr.arange(ad.UInt32, rays * (count + 1))
     ray, k = index // (count + 1), index % (count + 1)
@@ -91,7 +91,7 @@ class PlacedField:
     sun: Float | None  #: [3] towards it in the model's axes, of a field that is told
 
 
-class Beside(Protocol):
+class DeviceSunOccluder(Protocol):
     """What is no field and stands in the Sun's way."""
 
     def visibility(self, points: Array3f) -> Float:
@@ -99,13 +99,13 @@ class Beside(Protocol):
 
 
 @dataclass
-class Shading:
+class MutualShading:
     """What stands between the Sun and the models."""
 
     towards: list[Float]  #: [3] of each model: towards the Sun in its axes
     casters: tuple[tuple[int, ...], ...]  #: of each model, the others that may shade it
     camera: Float | None  #: [16] see `rays.camera_rows`, world, metres; None where there are only fields
-    beside: list[Beside | None]  #: of each model, what there is beside fields
+    beside: list[DeviceSunOccluder | None]  #: of each model, what there is beside fields
 
 
 @dataclass
@@ -117,7 +117,7 @@ class PlacedFields:
     filled: list[Float]  #: of each of the networks, see `Occupancy.filled`
     which: tuple[int, ...]  #: of each model, number among the networks
     models: list[PlacedField]  #: each where it stands
-    shading: Shading | None  #: None where models do not shade each other
+    shading: MutualShading | None  #: None where models do not shade each other
 
     @property
     def segments(self) -> int:
@@ -157,7 +157,7 @@ def partition(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, no
             slopes = field.field.density.slopes(field.of_round(own, 2)[: field.field.split], tape)
             slopes_of.append(_turned(model.turn, slopes) / (model.unit * model.unit))
         low, high, density = seen.low * model.unit, seen.high * model.unit, seen.density / model.unit
-        in_world = Samples(low, high, density, seen.color, seen.visibility)
+        in_world = RaySamples(low, high, density, seen.color, seen.visibility)
         dr.eval(low, high, density, in_world.color, in_world.visibility, slopes_of)
         rays_of.append(rays)
         samples_of.append(in_world)
@@ -188,7 +188,7 @@ def partition(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, no
 
 
 def _visibilities(
-    fields: PlacedFields, rays_of: list[Rays], samples_of: list[Samples], pixel: UInt32, width: UInt32, count: int
+    fields: PlacedFields, rays_of: list[Rays], samples_of: list[RaySamples], pixel: UInt32, width: UInt32, count: int
 ) -> list[Float | None]:
     """Of each model, the share of sunlight [R] that comes through what is not this model to its surface, or None where
     nothing stands before the Sun."""
@@ -227,7 +227,7 @@ def _visibilities(
     return result
 
 
-def surface(samples: Samples, count: int) -> Float:
+def surface(samples: RaySamples, count: int) -> Float:
     """[R] t at which half of the light is gone that a field stops on its own, of `count` samples a ray; any where it
     stops none."""
     made = volume_weights(samples.density * (samples.high - samples.low), count)

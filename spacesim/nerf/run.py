@@ -6,8 +6,8 @@ RUN/model.safetensors  grids, networks, which cells are filled, the box: there o
 RUN/training.json      history, time, backend, versions
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
@@ -23,6 +23,7 @@ from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import read_record
 from spacesim.learning.folder import finished_model, read_described
 from spacesim.learning.prediction import Prediction, check_picture
+from spacesim.learning.record import TrainingRecord
 from spacesim.learning.rendering import Rendering
 from spacesim.learning.tensors import read_tensors
 from spacesim.nerf.config import NerfConfig
@@ -30,22 +31,16 @@ from spacesim.nerf.draw import draw
 from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks
 from spacesim.nerf.sampling.box import SceneBox
-from spacesim.nerf.train.trainer import FORMAT, HistoryEntry, box_of
+from spacesim.nerf.train.trainer import FORMAT, box_of
 
 OPAQUE = 0.5  #: alpha from which on a pixel shows a surface
 
 
-@dataclass(frozen=True)
-class TrainingRecord:
-    """What training.json says: how a run came to be."""
+@dataclass(frozen=True, kw_only=True)
+class NerfTrainingRecord(TrainingRecord):
+    """What training.json says of a run of a radiance field; losses are mean squared errors of colours."""
 
-    history: tuple[HistoryEntry, ...]  #: of some iterations, in order
-    seconds: float  #: of training
     parameters: int  #: numbers that were trained
-    backend: str  #: that trained
-    device: str | None = None  #: that trained
-    command: str | None = None  #: the command line, or None of another caller
-    versions: Mapping[str, str] = field(default_factory=dict)  #: of libraries
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +58,9 @@ class NerfRun:
     gaussians: None = None  #: there are none
     gaussian_count: None = None  #: nor a number of them
     antialiased: bool = False  #: rays see points, not areas of pixels
+
+    def __repr__(self) -> str:
+        return f"NerfRun({str(self.path)!r}: {self.config.get('method')})"
 
     @property
     def backend(self) -> str:
@@ -130,7 +128,7 @@ def load_run(path: str | Path) -> NerfRun:
     path = Path(path)
     model_path = finished_model(path)
     settings, data = read_config(path / "config.json")
-    _, training = read_record(path / "training.json", TrainingRecord)
+    _, training = read_record(path / "training.json", NerfTrainingRecord)
     tensors, _ = read_tensors(model_path, FORMAT)
     networks = Networks(settings)
     try:

@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from spacesim.nerf.run import NerfRun
     from spacesim.splat.run import Predictor
 
-Tell = Callable[..., None]  #: told how much is done, of how much, and details, as `spacesim.progress.Reporter` is
-Reporting = Callable[[str, str], AbstractContextManager[Any]]  #: (title, unit) to a `Tell` for the work within
+ReportCallback = Callable[..., None]  #: takes how much is done, of how much, and details, as `progress.Reporter` does
+Reporting = Callable[[str, str], AbstractContextManager[Any]]  #: (title, unit) to a `ReportCallback` for the work
 
 MARKS = 20  #: places of figure 5.5
 OPAQUE = 0.5  #: alpha from which on pictures of depth show a surface
@@ -218,7 +218,7 @@ def depth_picture(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     return as_bytes(np.where(depth > 0, np.clip(bright, DARKEST, 1), 0))
 
 
-def follow(folder: Path, dataset: Dataset, config: TrainConfig, steps: int, tell: Tell) -> JsonDict:
+def follow(folder: Path, dataset: Dataset, config: TrainConfig, steps: int, tell: ReportCallback) -> JsonDict:
     """{"gaussians": N, "inside": [[step, share of their centres inside the true mesh]]} over the first steps of a
     training (figure 5.5); the folder keeps a checkpoint and what was counted until then."""
     surface = SignedDistance.of(dataset.root / known_mesh(dataset, "the figure"))

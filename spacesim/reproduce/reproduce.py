@@ -30,7 +30,7 @@ from spacesim.reproduce.experiments import (
     parts_known,
 )
 from spacesim.reproduce.page import write_page
-from spacesim.reproduce.perform import Reporting, Tell, data_folder, folder_of, is_done, perform
+from spacesim.reproduce.perform import ReportCallback, Reporting, data_folder, folder_of, is_done, perform
 from spacesim.reproduce.results import Results, Values
 from spacesim.reproduce.size import FULL, Size
 from spacesim.scenes import generate, read_scene
@@ -191,7 +191,7 @@ def _load_performer(needed: tuple[Path, Size], threads: int) -> Callable[[Work],
 
 
 @contextmanager
-def _reporting_to(path: Path, title: str, _unit: str) -> Iterator[Tell]:
+def _reporting_to(path: Path, title: str, _unit: str) -> Iterator[ReportCallback]:
     """Tells a file how far the work is."""
     last = 0.0
 

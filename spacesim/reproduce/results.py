@@ -33,7 +33,7 @@ Values = JsonDict
 
 
 @dataclass(frozen=True)
-class Shown:
+class ResultColumn:
     """A column of ours beside the thesis's."""
 
     variant: Variant  #: which of our trainings: as the thesis has it, or improved
@@ -44,10 +44,10 @@ class Shown:
         return self.variant + ("_unseen" if self.suns == "unseen_suns" else "")
 
 
-def shown_beside(table: Table) -> list[Shown]:
+def result_columns(table: Table) -> list[ResultColumn]:
     """The columns of ours: where the Suns matter, first those that training knows, as in the thesis."""
     suns = ("known_suns", "unseen_suns") if table.by_suns and table.scene == "own" else ("",)
-    return [Shown(variant, which) for which in suns for variant in VARIANTS]
+    return [ResultColumn(variant, which) for which in suns for variant in VARIANTS]
 
 
 class Results:
@@ -113,7 +113,7 @@ class Results:
 
     def table(self, table: Table) -> Values:
         """The thesis's numbers and ours, the best of each column, and what of the thesis's order holds."""
-        columns = shown_beside(table)
+        columns = result_columns(table)
         printed = {row.name: table.printed_numbers(row) for row in table.rows}
         metrics = []
         means: dict[tuple[str, str], dict[str, float | None]] = {}
@@ -139,7 +139,7 @@ class Results:
             "remarks": [{"metric": remark.metric, "text": remark.text} for remark in table.remarks],
         }
 
-    def cell(self, table: Table, row: Row, column: Column, shown: Shown) -> Values:
+    def cell(self, table: Table, row: Row, column: Column, shown: ResultColumn) -> Values:
         """{"mean", "std", "seeds", "state"}: over the frames, and the means over the seeds of these."""
         made = [experiment_of(self.size, table, row, shown.variant, seed) for seed in range(self.seeds)]
         found = [self.evaluation(one, table.scene) for one in made]

@@ -66,7 +66,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Claim:
+class ExpectedRanking:
     """What the thesis says of two rows."""
 
     metric: str  #: group.name of metrics.json
@@ -90,7 +90,7 @@ class Table:
     title: str  #: as printed
     columns: tuple[Column, ...]  #: one for each metric
     rows: tuple[Row, ...]  #: what was trained, a cell for each column
-    claims: tuple[Claim, ...]  #: what the thesis says of its rows
+    claims: tuple[ExpectedRanking, ...]  #: what the thesis says of its rows
     remarks: tuple[Remark, ...] = ()  #: why ours differ
     scene: Literal["own", "pair"] = "own"  #: the trained object alone, or two of it in one scene
     by_suns: bool = True  #: whether its numbers depend on the Suns of the test views

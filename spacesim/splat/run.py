@@ -8,7 +8,7 @@ RUN/cameras.json       poses and gains of the training pictures, where they were
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -23,6 +23,7 @@ from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import read_record
 from spacesim.learning.folder import finished_model, read_described
 from spacesim.learning.prediction import Prediction, check_picture
+from spacesim.learning.record import TrainingRecord
 from spacesim.learning.rendering import Rendering
 from spacesim.splat.light.config import MAX_EXPOSURE
 from spacesim.splat.light.model import LightModel
@@ -32,11 +33,11 @@ from spacesim.splat.raster.project import Projection
 from spacesim.splat.raster.render import render
 from spacesim.splat.raster.supersample import render_supersampled
 from spacesim.splat.raster.tone import adjust_exposure
-from spacesim.splat.train.checkpoint import HistoryEntry, read_tensors
+from spacesim.splat.train.checkpoint import GaussianHistoryEntry, read_tensors
 from spacesim.splat.train.config import TrainConfig
 
 
-class Part(Protocol):
+class ComposedModel(Protocol):
     """A model of a composed scene, where it stands."""
 
     @property
@@ -97,7 +98,7 @@ class Predictor(Protocol):
         """Whether the Sun's direction changes what is predicted."""
 
     @property
-    def parts(self) -> Sequence[Part]:
+    def parts(self) -> Sequence[ComposedModel]:
         """The models of a scene, which stand for the dataset's objects in their order; none of a single run."""
 
     @property
@@ -116,25 +117,16 @@ class Predictor(Protocol):
         that are sRGB values."""
 
 
-@dataclass(frozen=True)
-class TrainingRecord:
-    """What training.json says: how a run came to be."""
+@dataclass(frozen=True, kw_only=True)
+class GaussianTrainingRecord(TrainingRecord):
+    """What training.json says of a run of Gaussians."""
 
-    history: tuple[HistoryEntry, ...]  #: of some iterations, in order
-    seconds: float  #: of training
+    history: tuple[GaussianHistoryEntry, ...]  #: of some iterations, in order
     gaussians: int  #: at the end
-    backend: str  #: that trained
     refinement_seconds: float = 0.0  #: the part of `seconds` that densification took
-    device: str | None = None  #: that trained
-    command: str | None = None  #: the command line, or None of another caller
-    versions: Mapping[str, str] = field(default_factory=dict)  #: of libraries
     poses: Mapping[str, float] | None = None  #: how far training moved them (medians), where it did: degrees, share
     gains: Mapping[str, float] | None = None  #: least and most of the pictures', where they were learned
     suns: Mapping[str, float] | None = None  #: how sure they are, where they were estimated: degrees, median
-
-    def __post_init__(self) -> None:
-        if not self.history:
-            raise InputError("history: expected at least one entry, found none")
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +145,9 @@ class Run:
     light: LightModel | None = None  #: None of a method without light
     #: [E] of every view, None: the mean of the training pictures', if they have any
     embedding: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r}: {self.config.get('method')}, {self.gaussian_count} Gaussians)"
 
     @property
     def gaussian_count(self) -> int:
@@ -180,7 +175,7 @@ class Run:
         return self.light is not None and self.light.config.field.knows_sun
 
     @property
-    def parts(self) -> tuple[Part, ...]:
+    def parts(self) -> tuple[ComposedModel, ...]:
         """None: it was trained as one."""
         return ()
 
@@ -303,7 +298,7 @@ def load_run(path: str | Path) -> Run:
     path = Path(path)
     model_path = finished_model(path)
     train_config, data = read_config(path / "config.json")
-    _, training = read_record(path / "training.json", TrainingRecord)
+    _, training = read_record(path / "training.json", GaussianTrainingRecord)
     config, light_config = {**train_config.to_json(), "data": data}, train_config.light
     tensors, _ = read_tensors(model_path)
     try:

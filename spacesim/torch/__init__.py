@@ -19,7 +19,7 @@ except ImportError:
 
 from spacesim import backend
 from spacesim.torch import arguments
-from spacesim.torch.autograd import DEPTH, OPACITY, Blend, Drawing, Project, pack
+from spacesim.torch.autograd import DEPTH, OPACITY, Blend, BlendInputs, Project, pack
 
 
 class Meta(TypedDict):
@@ -159,7 +159,7 @@ def rasterization(
         visible = radii[..., 0].flatten().nonzero()[:, 0]
         camera_ids, gaussian_ids = visible // count, visible % count
         means2d = pack(means2d, visible)
-    drawing = Drawing(
+    drawing = BlendInputs(
         projected=projected,
         width=width,
         height=height,

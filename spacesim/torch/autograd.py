@@ -29,8 +29,8 @@ from spacesim.torch.projection import (
     TABLE,
     LeafGradients,
     Leaves,
+    NeededGradients,
     ProjectedSplats,
-    Wanted,
     project,
     project_back,
 )
@@ -40,7 +40,7 @@ GAUSSIANS = 4  #: arguments of `Project` that all cameras share: those before th
 
 
 @dataclass
-class Drawing:
+class BlendInputs:
     """What is blended of splats that are projected."""
 
     projected: list[ProjectedSplats]  #: of each camera
@@ -79,7 +79,7 @@ class Project(torch.autograd.Function):
         tensors = ctx.saved_tensors
         if grad_means2d is None and grad_table is None:
             return (None,) * (len(tensors) + 1)
-        wanted = Wanted(*ctx.needs_input_grad[: len(tensors)])
+        wanted = NeededGradients(*ctx.needs_input_grad[: len(tensors)])
         capacity = round_capacity(len(tensors[0]))
         each = []
         for camera, leaves in enumerate(ctx.leaves):
@@ -145,7 +145,7 @@ class Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: FunctionCtx, *arguments: Any) -> tuple[Any, ...]:
-        """means2d and table of `Project`, colours [(C,) N, D] or None;  `Drawing`, in which the same splats are."""
+        """means2d and table of `Project`, colours [(C,) N, D] or None;  `BlendInputs`, in which the same splats are."""
         _, _, colors, drawing = arguments
         ctx.set_materialize_grads(False)
         needed = any(ctx.needs_input_grad)
@@ -184,7 +184,7 @@ class Blend(torch.autograd.Function):
         grad_pictures, grad_alphas = gradients
         if grad_pictures is None and grad_alphas is None:
             return (None,) * 4
-        drawing: Drawing = ctx.drawing
+        drawing: BlendInputs = ctx.drawing
         grad_means2d, grad_table, grad_colors, absolute = [], [], [], []
         for camera, (splats, lists, passes) in enumerate(ctx.passes):
             grad_planes, grad_light = _plane_gradients(
@@ -210,7 +210,7 @@ class Blend(torch.autograd.Function):
 
 
 def _plane_gradients(
-    grad_pictures: Tensor | None, grad_alphas: Tensor | None, drawing: Drawing, camera: int, channels: int
+    grad_pictures: Tensor | None, grad_alphas: Tensor | None, drawing: BlendInputs, camera: int, channels: int
 ) -> tuple[list[Float], Float]:
     """(gradients by the picture's planes, by the light that passes) of one camera, Floats [H * W]."""
     pixels = drawing.width * drawing.height
@@ -234,7 +234,7 @@ def _blend_back(
     passes: Sequence[tuple[BlendResult, int]],
     grad_planes: list[Float],
     grad_light: Float,
-    drawing: Drawing,
+    drawing: BlendInputs,
 ) -> tuple[list[Float], list[Float]]:
     """(gradients by x, y, a, b, c, opacity, and where they are wanted the absolute ones by x and y; by the features)
     of all passes of one camera. passes: (what blending keeps, its channels) of each."""

@@ -37,7 +37,7 @@ class Leaves:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class NeededGradients:
     """Of which leaves gradients are asked for. Each number of a camera costs a sum over all Gaussians."""
 
     means: bool  #: whether of the centres
@@ -158,7 +158,7 @@ def project(leaves: Leaves, settings: RasterSettings, capacity: int) -> Projecte
 def project_back(
     leaves: Leaves,
     settings: RasterSettings,
-    wanted: Wanted,
+    wanted: NeededGradients,
     grad_means2d: Float | None,
     grad_table: Float | None,
     capacity: int,

@@ -1,17 +1,18 @@
-"""One client: what it looks at, the pictures it gets, the truth it asked for. Of the server it knows `Screen` alone."""
+"""One client: what it looks at, the pictures it gets, the truth it asked for. Of the server it knows only
+`ViewerScreen`."""
 
 import threading
 import time
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from spacesim.viewer.drawing.frames import STEPS, Frame, ResolutionControl, draw_frame
+from spacesim.viewer.drawing.frames import STEPS, ResolutionControl, ViewerFrame, draw_frame
 from spacesim.viewer.drawing.loop import AbandonedError, RenderLoop, RenderRequest
 from spacesim.viewer.drawing.paint import Bytes, compare_pictures, paint
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.state import DisplaySettings, SceneState, SharedScene, ViewerCamera
 from spacesim.viewer.truth.tracer import TraceResult
-from spacesim.viewer.truth.truth import Truth, resample
+from spacesim.viewer.truth.truth import ViewerTruth, resample
 
 REPORT_EVERY = 0.25  #: seconds between two statistics while the view moves
 RATE_SMOOTHING = 0.8  #: share of the last estimate of frames a second in the next
@@ -33,7 +34,7 @@ class Statistics:
     status: str  #: sentences for the user, "" for none
 
 
-class Screen(Protocol):
+class ViewerScreen(Protocol):
     """The client's end of a server; any thread may call it."""
 
     def show(self, picture: Bytes, sharp: bool) -> None:
@@ -48,7 +49,7 @@ class TruthSource(Protocol):
 
     def request_truth(
         self, session: "Session", view: ViewerCamera, state: SceneState, settings: DisplaySettings
-    ) -> "Truth | int | str":
+    ) -> "ViewerTruth | int | str":
         """The truth, where it is stored; else the number that answers will bear; or a sentence why there is none."""
 
     def cancel_truth(self, session: "Session") -> None:
@@ -59,18 +60,18 @@ class Session:
     """A client's state, changed from any thread; pictures are made on the render thread."""
 
     def __init__(
-        self, renderer: SceneRenderer, shared: SharedScene, loop: RenderLoop, screen: Screen, source: TruthSource
+        self, renderer: SceneRenderer, shared: SharedScene, loop: RenderLoop, screen: ViewerScreen, source: TruthSource
     ) -> None:
         self._renderer, self._shared, self._loop, self._screen, self._source = renderer, shared, loop, screen, source
         self._lock = threading.RLock()
         self._view: ViewerCamera | None = None
         self._settings = DisplaySettings()
         self._resolution = ResolutionControl.of(renderer)
-        self._truth: Truth | None = None
+        self._truth: ViewerTruth | None = None
         self._pending_request: int | None = None  # number of answers that are awaited
         self._truth_status = ""  # about the truth
         #: in full resolution, or a step there
-        self._last_frame: tuple[ViewerCamera, SceneState, DisplaySettings, Frame] | None = None
+        self._last_frame: tuple[ViewerCamera, SceneState, DisplaySettings, ViewerFrame] | None = None
         self._rate, self._shown_at, self._reported_at = 0.0, 0.0, 0.0
         self._closed = False
 
@@ -122,7 +123,7 @@ class Session:
                 height, width = answer.planes.alpha.shape
                 source = f"path-traced, {answer.samples} sample{'s' * (answer.samples != 1)} a pixel"
                 self._truth_status = f"truth: {source}" + ("" if answer.done else ", more to come")
-                self._truth = Truth(answer.planes, self._view.camera(width, height), source)
+                self._truth = ViewerTruth(answer.planes, self._view.camera(width, height), source)
         self._request_frame(moving=False)
 
     def close(self) -> None:
@@ -176,7 +177,7 @@ class Session:
         self._report(frame, full)
         return full and share < 1 and not frame.note  # which more pixels would say again
 
-    def _next_share(self, last: Frame | None, full: bool) -> float:
+    def _next_share(self, last: ViewerFrame | None, full: bool) -> float:
         """Of the full resolution. last: of the same view, if there is one"""
         if not self._renderer.progressive:
             return 1.0 if full else self._resolution.share
@@ -192,7 +193,7 @@ class Session:
             now = self._view, self._settings.mode, self._settings.side
         return now != (view, settings.mode, settings.side) or not state.same(self._shared.state)
 
-    def _reusable_frame(self, view: ViewerCamera, state: SceneState, settings: DisplaySettings) -> Frame | None:
+    def _reusable_frame(self, view: ViewerCamera, state: SceneState, settings: DisplaySettings) -> ViewerFrame | None:
         """The last picture kept, if it is this one but for its resolution and the comparison with the truth."""
         last = self._last_frame  # which `close` may take away at any moment
         if last is None:
@@ -201,13 +202,15 @@ class Session:
         same = (last_settings.mode, last_settings.side) == (settings.mode, settings.side)
         return frame if same and view.same(last_view) and state.same(last_state) else None
 
-    def _with_truth(self, frame: Frame, view: ViewerCamera, state: SceneState, settings: DisplaySettings) -> Bytes:
+    def _with_truth(
+        self, frame: ViewerFrame, view: ViewerCamera, state: SceneState, settings: DisplaySettings
+    ) -> Bytes:
         with self._lock:
             if not self._is_current(view, state, settings):
                 return frame.picture
             if self._truth is None and self._pending_request is None and not self._truth_status:
                 reply = self._source.request_truth(self, view, state, settings)
-                if isinstance(reply, Truth):
+                if isinstance(reply, ViewerTruth):
                     self._truth, self._truth_status = reply, f"truth: {reply.source}"
                 elif isinstance(reply, int):
                     self._pending_request, self._truth_status = reply, "truth: the path tracer is starting"
@@ -233,7 +236,7 @@ class Session:
         )
         return view is self._view and state.same(self._shared.state) and as_asked
 
-    def _report(self, frame: Frame, full: bool) -> None:
+    def _report(self, frame: ViewerFrame, full: bool) -> None:
         now = time.monotonic()
         gap, self._shown_at = now - self._shown_at, now
         if not full and gap < MAX_FRAME_GAP:

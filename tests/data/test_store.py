@@ -129,6 +129,17 @@ def test_records_and_truth_read_back(root):
             np.testing.assert_array_equal(layer, getattr(expected, field.name), err_msg=field.name)
 
 
+def test_datasets_and_planes_are_shown_in_a_line(root):
+    dataset = read_dataset(root)
+    counts = f"{len(TRAIN)} training, {len(TEST)} test frames"
+    assert repr(dataset) == f"Dataset({str(root)!r}: {counts})"
+    assert repr(replace(dataset, scene={"scene": "boxsat"})) == f"Dataset({str(root)!r}: {counts} of boxsat)"
+    shown = repr(load_truth(dataset, dataset.train[0]))
+    assert shown.startswith(f"Truth({WIDTH} x {HEIGHT} pixels: radiance, alpha, depth, ")
+    assert shown.endswith("shadow)")  # the Earth's part is not there
+    assert repr(load_image(dataset, dataset.train[0])) == f"Image({WIDTH} x {HEIGHT} pixels: rgb, alpha, valid)"
+
+
 def test_read_and_written_again_the_truth_has_the_same_bytes(root, tmp_path):
     for name in TRAIN:
         write_exr(tmp_path / "again.exr", read_exr(root / "gt" / f"{name}.exr"))

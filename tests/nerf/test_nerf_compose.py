@@ -17,7 +17,7 @@ from spacesim.data.records import Camera, Dataset
 from spacesim.data.store import read_dataset
 from spacesim.methods import load_scene
 from spacesim.nerf.compose import FieldComposition
-from spacesim.nerf.draw import Samples
+from spacesim.nerf.draw import RaySamples
 from spacesim.nerf.partition import merge
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.sampling.render import sum_rays, volume_weights
@@ -28,10 +28,10 @@ from spacesim.splat.compose.scene import ComposeConfig, PlacedRun
 RED, GREEN, BLUE = np.eye(3)
 
 
-def samples_of(edges: np.ndarray, density: np.ndarray, color: np.ndarray) -> tuple[Samples, int]:
+def samples_of(edges: np.ndarray, density: np.ndarray, color: np.ndarray) -> tuple[RaySamples, int]:
     """Of edges [R, S + 1], densities [R, S] and colours [R, S, 3]."""
     planes = [upload(color[..., i]) for i in range(3)]
-    return Samples(upload(edges[:, :-1]), upload(edges[:, 1:]), upload(density), planes), density.shape[1]
+    return RaySamples(upload(edges[:, :-1]), upload(edges[:, 1:]), upload(density), planes), density.shape[1]
 
 
 def render_merged(models: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

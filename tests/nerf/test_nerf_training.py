@@ -22,7 +22,7 @@ from spacesim.nerf.run import NerfRun, load_run
 from spacesim.nerf.sampling.box import scene_box
 from spacesim.nerf.train.pixels import training_pixels
 from spacesim.nerf.train.train import train
-from spacesim.nerf.train.trainer import FORMAT, Trainer
+from spacesim.nerf.train.trainer import FORMAT, NerfTrainer
 from spacesim.splat.compose import ComposeConfig, PlacedRun
 
 GRID = GridConfig(4, 8, 48, 12)
@@ -57,6 +57,10 @@ def finished(dataset, tmp_path_factory) -> NerfRun:
 
 def model_bytes(run: NerfRun) -> bytes:
     return (run.path / "model.safetensors").read_bytes()
+
+
+def test_a_run_is_shown_in_a_line(finished):
+    assert repr(finished) == f"NerfRun({str(finished.path)!r}: {finished.config['method']})"
 
 
 def test_training_learns_the_pictures(dataset, finished):
@@ -139,7 +143,7 @@ def test_rays_that_do_not_fit_into_memory_are_told(dataset, finished, monkeypatc
     assert many.ray_bytes * many.rays > 10**12
     monkeypatch.setattr("spacesim.backend.memory.free_memory", lambda needed=0: 10**11)
     with pytest.raises(MemoryError, match="rays: a step of 1048576 rays needs about"):
-        Trainer(dataset, many)
+        NerfTrainer(dataset, many)
     wide = replace(finished, networks=type(finished.networks)(many))
     for drawn in (wide, methods.compose([PlacedRun(wide)])):
         with pytest.raises(MemoryError, match="chunk: a picture by 1048576 rays at once needs about"):
@@ -163,7 +167,7 @@ def test_pictures_beside_the_box_are_left_out_in_one_sentence(dataset, caplog):
 
 
 def test_damaged_checkpoints_are_told_in_one_sentence(dataset, tmp_path):
-    trainer = Trainer(dataset, CONFIG)
+    trainer = NerfTrainer(dataset, CONFIG)
     path = tmp_path / "good.safetensors"
     trainer.save(path)
     tensors, header = read_tensors(path, FORMAT)
@@ -225,10 +229,10 @@ def test_scene_boxes(dataset, tmp_path):
 def test_pictures_of_something_else_are_refused(dataset, tmp_path):
     away = [replace(frame, camera=_turned(frame.camera)) for frame in dataset.train]
     with pytest.raises(InputError, match="rays that all miss it"):
-        Trainer(replace(dataset, train=tuple(away)), CONFIG)
+        NerfTrainer(replace(dataset, train=tuple(away)), CONFIG)
     dark = replace(dataset, train=tuple(replace(frame, sun=None) for frame in dataset.train))
     with pytest.raises(InputError, match="sun_direction in every training frame"):
-        Trainer(dark, replace(CONFIG, method="nerf-relight"))
+        NerfTrainer(dark, replace(CONFIG, method="nerf-relight"))
 
 
 def _turned(camera):

@@ -1,6 +1,7 @@
 """A run and a composed scene are asked for the same things, in the same words."""
 
 import inspect
+import re
 
 import numpy as np
 import pytest
@@ -13,9 +14,11 @@ from spacesim.methods import load_predictor
 from spacesim.nerf.run import NerfRun
 from spacesim.splat.compose import ComposedRun, GaussianComposition, PlacedRun, Pose
 from spacesim.splat.compose.aligned import AlignedRun
-from spacesim.splat.compose.run import PlacedPart
+from spacesim.splat.compose.run import PlacedModel
+from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.run import Part, Predictor, Run, check_gaussians
+from spacesim.splat.raster.render import render
+from spacesim.splat.run import ComposedModel, Predictor, Run, check_gaussians
 
 CAMERA = Camera.from_fov(look_at((0, -4, 0), (0, 0, 0)), 24, 16, 40)
 SUN = Sun.from_angles(45, 30)
@@ -45,7 +48,13 @@ def test_predict_is_asked_in_the_same_words(kind):
 
 @pytest.mark.parametrize(
     ("kind", "protocol"),
-    [(Run, Predictor), (AlignedRun, Predictor), (ComposedRun, Predictor), (NerfRun, Predictor), (PlacedPart, Part)],
+    [
+        (Run, Predictor),
+        (AlignedRun, Predictor),
+        (ComposedRun, Predictor),
+        (NerfRun, Predictor),
+        (PlacedModel, ComposedModel),
+    ],
 )
 def test_all_that_is_asked_for_is_there(kind, protocol):
     asked = {name for name in vars(protocol) if not name.startswith("_")}
@@ -61,6 +70,16 @@ def test_a_run_has_no_parts_and_a_scene_those_of_its_models(run, scene):
     assert np.allclose(right.centre - left.centre, [2, 0, 0])
     assert np.allclose(np.array(right.gaussians.means) - np.array(left.gaussians.means), [[2], [0], [0]], atol=1e-6)
     assert right.antialiased is run.antialiased
+
+
+def test_runs_and_what_they_draw_are_shown_in_a_line(run, scene):
+    assert repr(run) == f"Run({str(run.path)!r}: vanilla, 40 Gaussians)"
+    assert repr(run.predict(CAMERA)) == "Prediction(24 x 16 pixels: rgb, alpha, depth)"
+    assert re.fullmatch(
+        r"ComposedPrediction\(24 x 16 pixels: rgb, alpha, depth.*, id\)", repr(scene.predict(CAMERA, SUN))
+    )
+    drawn = render(run.gaussians, Pinhole.of(CAMERA), outputs=("depth",))
+    assert repr(drawn) == "RenderOutput(24 x 16 pixels: alpha, depth)"
 
 
 def test_one_model_of_gaussians_is_told_from_a_scene(run, scene):

@@ -14,9 +14,9 @@ from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.pose import moved, twist_between
 from spacesim.splat.pose.covariance import sums_of_blocks
 from spacesim.splat.pose.motion import Pivot
-from spacesim.splat.pose.picture import Drawing
+from spacesim.splat.pose.picture import SunlitRun
 from spacesim.splat.pose.refine import _find_starts
-from spacesim.splat.pose.solver import REACH, Level
+from spacesim.splat.pose.solver import REACH, PyramidLevel
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.reference.rasterizer import render_reference
 from spacesim.splat.run import Run
@@ -133,14 +133,14 @@ def test_the_same_seed_gives_the_same_bits(run):
 
 
 def pivot_of(run: Run, camera: Camera = CAMERA) -> Pivot:
-    return Pivot.of(Drawing.of(run, None), camera, (5.0, 0.05))
+    return Pivot.of(SunlitRun.of(run, None), camera, (5.0, 0.05))
 
 
-def level_of(run: Run, target: np.ndarray, camera: Camera = CAMERA, blur: float = 0.0) -> Level:
+def level_of(run: Run, target: np.ndarray, camera: Camera = CAMERA, blur: float = 0.0) -> PyramidLevel:
     """Of the whole picture; black is the background of three channels."""
     target, background = target.astype(np.float32), np.zeros(3, np.float32) if target.shape[2] == 3 else None
     counts = np.ones((*target.shape[:2], 1), np.float32)
-    return Level(Drawing.of(run, None), pivot_of(run, camera), target, counts, background, 1, blur)
+    return PyramidLevel(SunlitRun.of(run, None), pivot_of(run, camera), target, counts, background, 1, blur)
 
 
 def test_how_far_off_a_camera_is(run):
@@ -192,8 +192,8 @@ def test_what_is_wrong_or_at_the_bound_is_not_converged(run):
 def test_derivatives_are_those_of_the_twin(run, known_gaussians):
     """Against the same central differences of its float64 pictures."""
     target, counts = np.zeros((SIZE, SIZE, 4), np.float32), np.ones((SIZE, SIZE, 1), np.float32)
-    drawing = Drawing.of(run, None)
-    level = Level(drawing, pivot_of(run), target, counts, None, 1, 0.0)
+    drawing = SunlitRun.of(run, None)
+    level = PyramidLevel(drawing, pivot_of(run), target, counts, None, 1, 0.0)
     found = level.derivatives(CAMERA, level.picture(CAMERA, None), None, 1.0)
 
     def twin(step: np.ndarray) -> np.ndarray:
@@ -208,8 +208,8 @@ def test_derivatives_are_those_of_the_twin(run, known_gaussians):
 
 
 def test_unknowns_are_the_twists_that_they_say(run):
-    drawing, blank = Drawing.of(run, None), np.zeros((SIZE, SIZE, 3), np.float32)
-    level = Level(drawing, pivot_of(run), blank, np.ones((SIZE, SIZE, 1), np.float32), blank[0, 0], 1, 0.0)
+    drawing, blank = SunlitRun.of(run, None), np.zeros((SIZE, SIZE, 3), np.float32)
+    level = PyramidLevel(drawing, pivot_of(run), blank, np.ones((SIZE, SIZE, 1), np.float32), blank[0, 0], 1, 0.0)
     for k, way in enumerate(np.eye(6)):
         small = twist_between(CAMERA, level._stepped(CAMERA, 1e-5 * way)) / 1e-5
         np.testing.assert_allclose(small, level.twists(CAMERA)[:, k], atol=1e-6)

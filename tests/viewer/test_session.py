@@ -12,7 +12,7 @@ from spacesim.viewer.drawing.paint import Planes
 from spacesim.viewer.session import Session
 from spacesim.viewer.state import SceneState, SharedScene, ViewerCamera
 from spacesim.viewer.truth.tracer import TraceResult
-from spacesim.viewer.truth.truth import Truth
+from spacesim.viewer.truth.truth import ViewerTruth
 
 
 class Screen:
@@ -175,7 +175,7 @@ def test_stored_truth_is_shown_at_once(made):
     session.on_camera_moved(view)
     at_rest(screen)
     white = Planes(np.ones((64, 64), np.float32), rgb=np.ones((64, 64, 3), np.float32))
-    source.found = Truth(white, view.camera(64, 64), "the dataset's frame 3")
+    source.found = ViewerTruth(white, view.camera(64, 64), "the dataset's frame 3")
     session.change_settings(compare="wipe", wipe=1.0)
     wait_for(lambda: screen.pictures[-1][0].min() == 255, "the truth")
     wait_for(lambda: screen.told[-1].status == "truth: the dataset's frame 3", "a word about it")

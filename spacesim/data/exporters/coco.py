@@ -12,7 +12,7 @@ centre of its first pixel, as COCO's do, so they are half a pixel less than ours
 from pathlib import Path
 
 from spacesim.data.exporters.keypoints import NAME, write_body_labels
-from spacesim.data.exporters.labels import OUTSIDE, Instance, Labeller
+from spacesim.data.exporters.labels import OUTSIDE, DatasetLabeller, Instance
 from spacesim.data.exporters.masks import run_lengths
 from spacesim.data.exporters.objects import ExportProgress, frame_camera, new_folder, opaque_picture
 from spacesim.data.files import JsonDict, write_json
@@ -28,10 +28,10 @@ def write_coco(
 ) -> int:
     """Write `dataset` into the new folder `out`; returns how many instances there are.
 
-    keypoints: how many are to be found, or a file, see `body_labels`. Raises InputError as `Labeller` does, where
-    pictures cannot be read, and for a folder that is not empty.
+    keypoints: how many are to be found, or a file, see `body_labels`. Raises InputError as `DatasetLabeller` does,
+    where pictures cannot be read, and for a folder that is not empty.
     """
-    labeller = Labeller(dataset, keypoints)
+    labeller = DatasetLabeller(dataset, keypoints)
     out = new_folder(out)
     categories = [
         {

@@ -44,7 +44,7 @@ class Category:
     body: BodyLabels  #: keypoints and symmetries of the model, in its own axes
 
 
-class Labeller:
+class DatasetLabeller:
     """Labels of the frames of a dataset, whose mesh tells what hides what.
 
     keypoints: how many are to be found, or a file: see `body_labels`. Raises InputError where scene.json or mesh.ply do

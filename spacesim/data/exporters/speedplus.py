@@ -21,7 +21,7 @@ import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.exporters.keypoints import NAME, write_body_labels
-from spacesim.data.exporters.labels import Labeller
+from spacesim.data.exporters.labels import DatasetLabeller
 from spacesim.data.exporters.objects import (
     ExportProgress,
     LabelledObject,
@@ -58,7 +58,7 @@ def write_speedplus(
     SPEED+ does not know, and for a folder that is not empty.
     """
     kept = {} if dataset.scene else _kept_labels(dataset)
-    labeller = None if kept else Labeller(dataset, keypoints)
+    labeller = None if kept else DatasetLabeller(dataset, keypoints)
     if keypoints is not None and labeller is None:
         raise InputError(f"keypoints: expected with a dataset that has a mesh, found {dataset.root}, an import")
     target = select_object(labeller.targets if labeller else [BODY], target_name)

@@ -13,7 +13,7 @@ import tarfile
 from pathlib import Path
 
 from spacesim.data.exporters.keypoints import NAME, write_body_labels
-from spacesim.data.exporters.labels import Instance, Labeller
+from spacesim.data.exporters.labels import DatasetLabeller, Instance
 from spacesim.data.exporters.masks import run_lengths
 from spacesim.data.exporters.objects import ExportProgress, frame_camera, new_folder, opaque_picture
 from spacesim.data.files import JsonDict, json_bytes, read_bytes, write_bytes
@@ -32,10 +32,10 @@ def write_webdataset(
     """Write `dataset` into the new folder `out`; returns how many shards there are. The same dataset gives the same
     bytes.
 
-    keypoints: how many are to be found, or a file, see `body_labels`. Raises InputError as `Labeller` does, where
-    pictures cannot be read, and for a folder that is not empty.
+    keypoints: how many are to be found, or a file, see `body_labels`. Raises InputError as `DatasetLabeller` does,
+    where pictures cannot be read, and for a folder that is not empty.
     """
-    labeller = Labeller(dataset, keypoints)
+    labeller = DatasetLabeller(dataset, keypoints)
     out = new_folder(out)
     names = dict(zip(dataset.frames, frame_names(dataset.frames), strict=True))
     done, shards = 0, 0

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from spacesim.data.exporters.keypoints import NAME, write_body_labels
-from spacesim.data.exporters.labels import Instance, Labeller
+from spacesim.data.exporters.labels import DatasetLabeller, Instance
 from spacesim.data.exporters.masks import outline
 from spacesim.data.exporters.objects import ExportProgress, new_folder, opaque_picture
 from spacesim.data.files import write_bytes
@@ -32,10 +32,10 @@ def write_yolo(
 ) -> int:
     """Write `dataset` into the new folder `out`; returns how many instances there are.
 
-    keypoints: how many are to be found, or a file, see `body_labels`. Raises InputError as `Labeller` does, where
-    pictures cannot be read, and for a folder that is not empty.
+    keypoints: how many are to be found, or a file, see `body_labels`. Raises InputError as `DatasetLabeller` does,
+    where pictures cannot be read, and for a folder that is not empty.
     """
-    labeller = Labeller(dataset, keypoints)
+    labeller = DatasetLabeller(dataset, keypoints)
     out = new_folder(out)
     classes = [category.name for category in labeller.categories]
     most = max(len(body.keypoints) for body in labeller.bodies)

@@ -17,7 +17,7 @@ from spacesim.data.importers.colmap_model import (
 )
 from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.masks import MASK_OPTIONS, MaskFolder
-from spacesim.data.importers.pictures import FrameMaker, View, fitted
+from spacesim.data.importers.pictures import FrameImporter, View, fitted
 from spacesim.data.importers.writing import Progress, frame_names, write_dataset
 from spacesim.data.records import Dataset
 from spacesim.data.transforms import is_file
@@ -53,7 +53,7 @@ def import_colmap(
     paths = _find_pictures(folder, list(projects), connected, images)
     used = [image for image in connected if image.name in paths]
     found_masks = {} if masks is None else MaskFolder(masks).find_all([image.name for image in used])
-    maker = FrameMaker(masked)
+    maker = FrameImporter(masked)
     frames = []
     for name, image in zip(frame_names([image.name for image in used]), used, strict=True):
         path = paths[image.name]

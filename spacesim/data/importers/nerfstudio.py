@@ -23,7 +23,7 @@ from spacesim.data.images import read_png
 from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.lenses import LENS_MODELS, Lens, LensModel
 from spacesim.data.importers.masks import MASKED
-from spacesim.data.importers.pictures import FrameMaker, View, fitted
+from spacesim.data.importers.pictures import FrameImporter, View, fitted
 from spacesim.data.importers.writing import ImportedFrame, Progress, frame_names, write_dataset
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import choose_depth_unit, read_points
@@ -138,7 +138,7 @@ def _unit(path: Path, name: str, values: JsonMapping) -> float:
 
 def _write(dataset: Dataset, extras: _Extras, out: Path, source: JsonMapping, progress: Progress | None) -> Dataset:
     assert source["masked"] in MASKED
-    maker, depths = FrameMaker(source["masked"]), _DepthReader(_common_unit(dataset.root, extras))
+    maker, depths = FrameImporter(source["masked"]), _DepthReader(_common_unit(dataset.root, extras))
     paths = _below_one_folder(dataset.root, [frame.file_path for frame in dataset.frames])
     names = dict(zip(dataset.frames, frame_names(paths), strict=True))
 

@@ -41,7 +41,7 @@ class View:
 
 
 @dataclass
-class FrameMaker:
+class FrameImporter:
     """Makes frames of views. Where a lens is more than Brown-Conrady's, pictures and masks are resampled to the pinhole
     camera in its middle, and what it does not image is unknown."""
 

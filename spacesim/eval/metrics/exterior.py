@@ -21,7 +21,7 @@ HIDDEN = 300  #: points of a piece, none of them visible, after which none is dr
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class SurfaceSamples:
     """Points on a surface that can be seen from outside."""
 
     points: Array  #: [N, 3] metres
@@ -29,7 +29,7 @@ class Samples:
     faces: np.ndarray  #: [N], which they lie on
 
 
-def exterior_samples(vertices: Array, faces: np.ndarray, count: int, seed: int) -> Samples | None:
+def exterior_samples(vertices: Array, faces: np.ndarray, count: int, seed: int) -> SurfaceSamples | None:
     """`count` points, even over what can be seen from far away of a surface, from either side of its faces.
 
     vertices: [V, 3] metres;  faces: [F, 3].  None where there is no area, or next to none of it can be seen.
@@ -58,7 +58,7 @@ def exterior_samples(vertices: Array, faces: np.ndarray, count: int, seed: int) 
         rest.drop_hidden(face, side != 0)
         if rest.drawn == 0 or (count - missing < MIN_VISIBLE_SHARE * rest.drawn and rest.drawn >= count):
             return None
-    return Samples(*(np.concatenate(parts) for parts in zip(*batches, strict=True)))
+    return SurfaceSamples(*(np.concatenate(parts) for parts in zip(*batches, strict=True)))
 
 
 class _CandidateFaces:

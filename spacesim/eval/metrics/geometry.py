@@ -13,7 +13,7 @@ from spacesim.data.files import JsonDict
 from spacesim.data.geometry import Array
 from spacesim.data.mesh import SignedDistance, read_mesh
 from spacesim.data.records import Camera, Dataset
-from spacesim.eval.metrics.exterior import Samples, exterior_samples
+from spacesim.eval.metrics.exterior import SurfaceSamples, exterior_samples
 from spacesim.eval.metrics.solid import filled_beyond, filled_voxels
 from spacesim.nerf.run import NerfRun
 from spacesim.splat.export.fusion import Grid
@@ -56,7 +56,7 @@ class GeometryConfig:
 class Shape:
     """A surface's samples, and how far each is from the other surface's, metres."""
 
-    samples: Samples  #: points on it, with their normals
+    samples: SurfaceSamples  #: points on it, with their normals
     distances: Array  #: [N] metres, from each sample to the nearest of the other surface
 
 

@@ -25,7 +25,7 @@ UNITS = 2.0**30  #: of the sum of absolute gradients of a level
 
 
 @dataclass(frozen=True)
-class Level:
+class GridLevel:
     """One resolution."""
 
     cells: int  #: along the box's longest side
@@ -41,7 +41,7 @@ class HashGrid:
     config: GridConfig  #: levels and sizes
 
     @cached_property
-    def levels(self) -> tuple[Level, ...]:
+    def levels(self) -> tuple[GridLevel, ...]:
         """From coarse to fine."""
         config, first, levels = self.config, 0, []
         growth = (config.finest / config.coarsest) ** (1 / max(config.levels - 1, 1))
@@ -49,7 +49,7 @@ class HashGrid:
             cells = int(np.floor(config.coarsest * growth**i + 1e-6))
             hashed = (cells + 1) ** 3 > 1 << config.log2_size
             size = 1 << config.log2_size if hashed else (cells + 1) ** 3
-            levels.append(Level(cells, first, size, hashed))
+            levels.append(GridLevel(cells, first, size, hashed))
             first += size
         return tuple(levels)
 
@@ -117,7 +117,7 @@ def _power_of_two(value: Float) -> Float:
     return cast("Float", dr.reinterpret_array(ad.Float, bits & ad.UInt32(0x7F800000)))
 
 
-def _corners(level: Level, point: Array3f) -> Iterator[tuple[UInt32, Float, Array3f]]:
+def _corners(level: GridLevel, point: Array3f) -> Iterator[tuple[UInt32, Float, Array3f]]:
     """(place in the table, weight, gradient of the weight by the point) of the 8 vertices around points."""
     scaled = dr.clip(point, 0, 1) * level.cells
     cell = dr.minimum(ad.Array3u(scaled), level.cells - 1)

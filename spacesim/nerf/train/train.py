@@ -7,7 +7,7 @@ from spacesim.data.records import Dataset
 from spacesim.learning.folder import TrainingProgress, describe_data, is_finished, open_folder
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.run import NerfRun, load_run, read_config
-from spacesim.nerf.train.trainer import Trainer
+from spacesim.nerf.train.trainer import NerfTrainer
 
 
 def train(
@@ -21,7 +21,7 @@ def train(
     """Train and write RUN (see `spacesim.nerf.run`); as `spacesim.splat.train.train.train` of Gaussians."""
     out, described = Path(out), {**config.to_json(), "data": describe_data(dataset)}
     if not is_finished(out, described, resume, read_config):
-        trainer = Trainer(dataset, config)
+        trainer = NerfTrainer(dataset, config)
         with open_folder(out, described, resume, read_config):
             trainer.complete(out, on_progress, command)
     return load_run(out)

@@ -15,6 +15,7 @@ from spacesim.data.files import JsonDict
 from spacesim.data.records import Dataset
 from spacesim.learning.adam import corrections
 from spacesim.learning.loop import TrainingLoop
+from spacesim.learning.record import CheckpointHeader
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.fields.model import Networks
 from spacesim.nerf.sampling.box import SceneBox, scene_box
@@ -26,31 +27,22 @@ FORMAT = "spacesim-nerf-1"
 SLOPE = 10.0  #: of the power of proposals' weights as they warm up (Barron et al. 2022, annealing)
 
 
-@dataclass(frozen=True)
-class HistoryEntry:
-    """What training noted of a step."""
+@dataclass(frozen=True, kw_only=True)
+class NerfCheckpointHeader(CheckpointHeader):
+    """What a checkpoint of a radiance field says beside its arrays."""
 
-    iteration: int  #: how many were finished
-    loss: float  #: mean squared error of the last one's colours
-
-
-@dataclass(frozen=True)
-class CheckpointHeader:
-    """What a checkpoint says beside its arrays."""
-
-    iteration: int  #: finished ones
-    history: tuple[HistoryEntry, ...]  #: of some iterations, in order
     proposal_steps: int  #: in which proposals have learned
     format: str = FORMAT  #: by which such files are known
 
     def __post_init__(self) -> None:
-        check_ranges(self, iteration=(0, 2**53), proposal_steps=(0, 2**53))
+        super().__post_init__()
+        check_ranges(self, proposal_steps=(0, 2**53))
 
 
-class Trainer(TrainingLoop):
+class NerfTrainer(TrainingLoop):
     """The parameters of a radiance field, their moments, and what is known as empty, one step after another."""
 
-    form, header = FORMAT, CheckpointHeader
+    form, header = FORMAT, NerfCheckpointHeader
 
     def __init__(self, dataset: Dataset, config: NerfConfig) -> None:
         self.config, self.iteration, self.proposal_steps = config, 0, 0
@@ -107,7 +99,7 @@ class Trainer(TrainingLoop):
         """Steps in which proposals have learned."""
         return {"proposal_steps": self.proposal_steps}
 
-    def put(self, tensors: Mapping[str, np.ndarray], header: CheckpointHeader) -> None:
+    def put(self, tensors: Mapping[str, np.ndarray], header: NerfCheckpointHeader) -> None:
         """See `TrainingLoop.put`; nothing has changed where it raises."""
         parameters = self.networks.parameters(tensors)
         first, second = (
@@ -130,7 +122,7 @@ class Trainer(TrainingLoop):
 
 
 def box_of(tensors: Mapping[str, np.ndarray]) -> SceneBox:
-    """The box that `Trainer.model_tensors` names. Raises KeyError, or ValueError where it is none."""
+    """The box that `NerfTrainer.model_tensors` names. Raises KeyError, or ValueError where it is none."""
     box = tensors["box"].astype(np.float64)
     if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > 0).all():
         raise ValueError("box: expected a corner and three sides above 0, found others")

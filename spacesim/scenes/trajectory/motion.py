@@ -67,7 +67,7 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class Moments:
+class MotionSamples:
     """A motion at N times, as the scene sees it: in the target's frame, metres."""
 
     times: Array  #: [N] seconds
@@ -96,7 +96,7 @@ def merge(motions: Sequence[Motion]) -> Motion:
     return whole
 
 
-def seen_from_target(motion: Motion, times: Array, camera_from_optics: Array, centre: Array) -> Moments:
+def seen_from_target(motion: Motion, times: Array, camera_from_optics: Array, centre: Array) -> MotionSamples:
     """`motion` at `times` [N] in the target's frame.
 
     camera_from_optics: [3, 3] OpenCV camera axes to those whose attitude is told; centre: [3] of the objects, scene
@@ -122,7 +122,7 @@ def seen_from_target(motion: Motion, times: Array, camera_from_optics: Array, ce
         for k in range(count):
             if np.linalg.norm(poses[k, :3, 3] - centre) > 0:
                 poses[k] = look_at(poses[k, :3, 3], centre, up[k])
-    return Moments(
+    return MotionSamples(
         times,
         poses,
         world_from_target,

@@ -25,7 +25,7 @@ from spacesim.scenes.cameras.rig import (
     intermediate_steps,
 )
 from spacesim.scenes.trajectory.ccsds import motion_of
-from spacesim.scenes.trajectory.motion import Moments, Motion, merge, seen_from_target
+from spacesim.scenes.trajectory.motion import Motion, MotionSamples, merge, seen_from_target
 from spacesim.scenes.trajectory.table import read_table
 
 
@@ -98,7 +98,7 @@ class TrajectoryRig(Rig):
 
 
 def planned_views(
-    motion: Motion, moments: Moments, camera: CameraConfig, sun: Sequence[tuple[float, float]]
+    motion: Motion, moments: MotionSamples, camera: CameraConfig, sun: Sequence[tuple[float, float]]
 ) -> list[PlannedView]:
     """A view for each of `moments`. sun: (azimuth, elevation) in the motion's world, where it says no Sun"""
     fixed = Sun.from_angles(*(sun[0] if sun else SINGLE_SUN)).direction

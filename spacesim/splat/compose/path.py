@@ -166,11 +166,12 @@ class PosedScene:
     def _track(self, value: Callable[[Keyframe], T | None], blend: Callable[[T, T, float], T], time: float) -> T | None:
         """What the keyframes that name it say of a value; None where none does."""
         named = [(key.time, named_value) for key in self.keyframes if (named_value := value(key)) is not None]
-        return Track([when for when, _ in named], [what for _, what in named], blend).at(time) if named else None
+        times, values = [when for when, _ in named], [what for _, what in named]
+        return KeyframeTrack(times, values, blend).at(time) if named else None
 
 
 @dataclass(frozen=True, eq=False)
-class Track(Generic[T]):
+class KeyframeTrack(Generic[T]):
     """Values at rising times, seconds; before the first and after the last the value stays."""
 
     times: Sequence[float]  #: seconds, rising

@@ -17,8 +17,8 @@ from spacesim.splat.raster.gaussians import Gaussians
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedPart:
-    """Model number `index` of a composition, see `Part`."""
+class PlacedModel:
+    """Model number `index` of a composition, see `ComposedModel`."""
 
     composition: Any  #: see `ComposedRun`
     index: int
@@ -69,9 +69,9 @@ class ComposedRun:
     training: JsonDict = field(default_factory=dict)  #: nothing, as no training has seen the scene
 
     @property
-    def parts(self) -> tuple[PlacedPart, ...]:
+    def parts(self) -> tuple[PlacedModel, ...]:
         """The models in their order, which is that of the dataset's objects."""
-        return tuple(PlacedPart(self.composition, index) for index in range(len(self.composition.models)))
+        return tuple(PlacedModel(self.composition, index) for index in range(len(self.composition.models)))
 
     @property
     def gaussian_count(self) -> int | None:

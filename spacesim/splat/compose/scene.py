@@ -104,7 +104,7 @@ class DrawnView:
         return np.where(alpha >= COVERED, numbers[np.argmax(np.stack(planes), axis=0)], 0)
 
 
-class Beside(Protocol):
+class SunOccluder(Protocol):
     """What is no Gaussian and stands in the Sun's way."""
 
     @property
@@ -144,7 +144,7 @@ class GaussianComposition:
         self._members = [members[id(model.run)] for model in self.models]
         self._ensemble = Ensemble(sorted((m for m in self._members if m.count), key=lambda member: member.key))
         self._cache = _Cache()
-        self._beside: Beside | None = None
+        self._beside: SunOccluder | None = None
         _log_choices(self.models, self._ensemble)
 
     # ---- what a run is asked for, too ----
@@ -235,7 +235,7 @@ class GaussianComposition:
         other.config, other._cache = config, _Cache()
         return other
 
-    def shaded_by(self, beside: Beside) -> "GaussianComposition":
+    def shaded_by(self, beside: SunOccluder) -> "GaussianComposition":
         """The scene in the shadow of something else, too."""
         other = self.posed([model.pose for model in self.models])
         other._beside = beside
@@ -378,7 +378,7 @@ class GaussianComposition:
         return self._cache.get("between", key, compute)
 
     def _behind(
-        self, beside: Beside, poses: Sequence[Pose], sun: Array, between: list[Float | None]
+        self, beside: SunOccluder, poses: Sequence[Pose], sun: Array, between: list[Float | None]
     ) -> list[Float | None]:
         """v_inter `between` with what `beside` lets through to the Gaussians' centres: light that comes through both is
         the product, so that the ratio of 4.15 is what the others let through."""

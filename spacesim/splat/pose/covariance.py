@@ -4,7 +4,7 @@ import numpy as np
 
 from spacesim.data.geometry import Array
 from spacesim.splat.pose.picture import smoothed
-from spacesim.splat.pose.solver import STEP, Level, State, cauchy_weights, damped, weighed_products
+from spacesim.splat.pose.solver import STEP, PyramidLevel, State, cauchy_weights, damped, weighed_products
 
 SMOOTHING = 0.08  #: of the model's apparent radius: errors are smoothed so far, against noise, for what is next
 WIDE = 4.0  #: steps to either side for the covariance's: jumps of pictures, as of order in depth, look like knowledge
@@ -12,7 +12,7 @@ BLOCK = 8  #: pixels: errors within a square of this side may depend on each oth
 ROUNDING = 1 / 255 / np.sqrt(12)  #: standard deviation of sRGB values of 8 bits
 
 
-def uncertainty(level: Level, state: State) -> tuple[Array, float, float]:
+def uncertainty(level: PyramidLevel, state: State) -> tuple[Array, float, float]:
     """Covariance [6, 6] and root mean square error, see `RefinedPose`; and the shift whose smoothed errors
     are as large, as a share of the model's radius."""
     colors = level.shade(state.camera)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
-from spacesim.splat.pose.picture import Drawing
+from spacesim.splat.pose.picture import SunlitRun
 
 
 def moved(camera: Camera, twist: ArrayLike) -> Camera:
@@ -45,7 +45,7 @@ class Pivot:
     length: float  #: metres that the pose may well be off
 
     @staticmethod
-    def of(drawing: Drawing, camera: Camera, within: tuple[float, float]) -> "Pivot":
+    def of(drawing: SunlitRun, camera: Camera, within: tuple[float, float]) -> "Pivot":
         """Raises InputError where the camera does not see the model."""
         output = drawing.output(camera, drawing.shade(camera), "depth")
         alpha, depth = output.image("alpha"), output.image("depth")

@@ -22,7 +22,7 @@ GAINS = 0.5, 2.0  #: bounds on the picture's sRGB values over the model's: 2.3 s
 
 
 @dataclass(frozen=True, eq=False)
-class Drawing:
+class SunlitRun:
     """A run under one Sun."""
 
     run: Run  #: the trained model
@@ -30,10 +30,10 @@ class Drawing:
     sunlight: Sunlight | None  #: None of a run without light
 
     @staticmethod
-    def of(run: Run, sun: Sun | None) -> "Drawing":
+    def of(run: Run, sun: Sun | None) -> "SunlitRun":
         direction = None if sun is None else sun.direction
         sunlight = run.light.sunlight(run.gaussians, direction) if run.light else None
-        return Drawing(run, direction, sunlight)
+        return SunlitRun(run, direction, sunlight)
 
     def shade(self, camera: Camera) -> list[Float] | None:
         """Colours [N] three times as seen by a camera; None of harmonics, which are summed while drawing."""

@@ -19,8 +19,8 @@ from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Image, Sun
 from spacesim.splat.pose.covariance import uncertainty
 from spacesim.splat.pose.motion import Pivot
-from spacesim.splat.pose.picture import Drawing, background_of, checked_picture, first_gain
-from spacesim.splat.pose.solver import BLURS, REACH, Level, State
+from spacesim.splat.pose.picture import SunlitRun, background_of, checked_picture, first_gain
+from spacesim.splat.pose.solver import BLURS, REACH, PyramidLevel, State
 from spacesim.splat.run import Run, check_gaussians, check_picture
 
 COARSEST = 64  #: pixels that the longer side of the coarsest picture keeps
@@ -97,7 +97,7 @@ def refine_pose(
     target, counts = checked_picture(image, mask, camera)
     _check_numbers(within, starts)
     check_picture(camera)
-    drawing = Drawing.of(run, told)
+    drawing = SunlitRun.of(run, told)
     pivot = Pivot.of(drawing, camera, within)
     background = background_of(target, counts, pivot.alpha)
 
@@ -106,7 +106,7 @@ def refine_pose(
         coarsest *= 2
     halvings = [2**k for k in range(int(np.log2(coarsest)), 0, -1)]
     sizes = [(coarsest, BLURS[0]), *((factor, BLURS[1]) for factor in halvings), (1, 0.0)]
-    levels = [Level(drawing, pivot, target, counts, background, *size) for size in sizes]
+    levels = [PyramidLevel(drawing, pivot, target, counts, background, *size) for size in sizes]
     gain = first_gain(target, counts, background, drawing.draw(camera, drawing.shade(camera)))
     searched = _find_starts(levels[0], gain, starts, seed)
     states = [levels[0].solve(State(candidate, gain), FIRST_ITERATIONS) for candidate in searched]
@@ -119,7 +119,7 @@ def refine_pose(
     return RefinedPose(state.camera, covariance, state.gain, error, trusted, taken)
 
 
-def _find_starts(level: Level, gain: float, starts: int, seed: int) -> list[Camera]:
+def _find_starts(level: PyramidLevel, gain: float, starts: int, seed: int) -> list[Camera]:
     """The best of the given camera and of random ones about it, rolled, in orbit, nearer and farther by up to what it
     may be off, each panned and tilted to fit the picture best."""
     pivot, rng = level.pivot, np.random.default_rng(seed)

@@ -16,7 +16,7 @@ from spacesim.data.geometry import Array, fibonacci_sphere, look_at
 from spacesim.data.images import luminance
 from spacesim.data.records import Camera, Image, Sun
 from spacesim.splat.pose.motion import twist_between
-from spacesim.splat.pose.picture import GAINS, Drawing, checked_picture, reduced
+from spacesim.splat.pose.picture import GAINS, SunlitRun, checked_picture, reduced
 from spacesim.splat.pose.refine import RefinedPose, refine_pose
 from spacesim.splat.run import Run, check_gaussians, check_picture
 
@@ -78,7 +78,7 @@ class ModelViews:
         low, high = np.quantile(points, (0.005, 0.995), axis=0)
         centre, radius = 0.5 * (low + high), 0.55 * float(np.linalg.norm(high - low)) + 1e-6
         distance = radius / np.sin(np.radians(0.5 * FOV_DEG))
-        drawing, cameras, cuts, patches = Drawing.of(run, sun), [], [], []
+        drawing, cameras, cuts, patches = SunlitRun.of(run, sun), [], [], []
         for direction in fibonacci_sphere(DIRECTIONS):
             camera = Camera.from_fov(look_at(centre + distance * direction, centre), SIDE, SIDE, FOV_DEG)
             picture = drawing.draw(camera, drawing.shade(camera))
@@ -161,7 +161,7 @@ def find_pose(
     if cut is None:
         raise InputError("image: expected an object that is brighter than the sky, found none")
     views = views or ModelViews.of(run, told, has_alpha)
-    drawing = Drawing.of(run, told)
+    drawing = SunlitRun.of(run, told)
     starts = [_rank(drawing, pose, small, known, sky) for pose in views.poses(cut, coarse, CANDIDATES)]
     starts.sort(key=lambda pair: pair[0])
     tried: list[tuple[float, RefinedPose]] = []
@@ -198,15 +198,15 @@ def residual_of(
 ) -> float:
     """That of `FoundPose`, of a refined pose."""
     target, counts = checked_picture(image, mask, pose.camera)
-    return _residual(Drawing.of(run, sun), pose.camera, target, counts, _sky(target, counts)[0])
+    return _residual(SunlitRun.of(run, sun), pose.camera, target, counts, _sky(target, counts)[0])
 
 
-def _residual(drawing: Drawing, camera: Camera, target: np.ndarray, counts: np.ndarray, sky: np.ndarray) -> float:
+def _residual(drawing: SunlitRun, camera: Camera, target: np.ndarray, counts: np.ndarray, sky: np.ndarray) -> float:
     return _compared(drawing.draw(camera, drawing.shade(camera)), target, counts, sky)
 
 
 def _rank(
-    drawing: Drawing, camera: Camera, target: np.ndarray, counts: np.ndarray, sky: np.ndarray
+    drawing: SunlitRun, camera: Camera, target: np.ndarray, counts: np.ndarray, sky: np.ndarray
 ) -> tuple[float, Camera]:
     """How far the picture drawn there is from the target, both blurred, and the camera."""
     from scipy.ndimage import gaussian_filter

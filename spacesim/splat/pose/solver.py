@@ -9,7 +9,7 @@ from spacesim.backend.arrays import Float
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
 from spacesim.splat.pose.motion import Pivot, moved
-from spacesim.splat.pose.picture import GAINS, Drawing, reduced, smoothed
+from spacesim.splat.pose.picture import GAINS, SunlitRun, reduced, smoothed
 
 BLURS = 2.0, 0.7  #: pixels, standard deviation: of the coarsest picture at first, and of all but the finest
 OUTLIERS = 1.0, 0.3, 0.2  #: sRGB values, of these and the finest: an error so large counts half
@@ -31,14 +31,14 @@ class State:
     converged: bool = False  #: whether the last step was, at first, shorter than `CONVERGED`
 
 
-class Level:
+class PyramidLevel:
     """The picture at one size. factor: pixels of the whole picture on a side of one of its pixels;  blur: pixels of
     its own, standard deviation. Unknowns [7]: a turn and a shift in steps that move pictures by `STEP` pixels, and
     the logarithm of the gain."""
 
     def __init__(
         self,
-        drawing: Drawing,
+        drawing: SunlitRun,
         pivot: Pivot,
         target: np.ndarray,
         counts: np.ndarray,

@@ -95,7 +95,7 @@ def by_tiles(
         a, b, c = record[2], record[3], record[4]
         powers = exponents(record, lane.x, lane.y, shape)
         transmittance, behind = list(transmittance), list(behind)
-        moments = Moments(dx, dy)
+        moments = PixelMoments(dx, dy)
         absolute_x, absolute_y = ad.Float(0), ad.Float(0)
         grad_features = [ad.Float(0) for _ in range(channels)]
         for p, (i, j) in enumerate(offsets):
@@ -128,7 +128,7 @@ def by_tiles(
     return gather_slots(slots, splats, lists, channels, absolute)
 
 
-class Moments:
+class PixelMoments:
     """Sums over a lane's pixels, column by column, of g, g dx, g dy, g dx^2, g dx dy and g dy^2, with (dx, dy) from the
     splat's centre to the pixel. dx, dy: of the lane's first pixel"""
 

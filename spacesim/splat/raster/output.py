@@ -6,6 +6,7 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend.arrays import Array3f, Float
+from spacesim.data.records import planes_repr
 
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal")
 
@@ -24,6 +25,9 @@ class RenderOutput:
     features: list[Float] | None = (
         None  #: the user's channels, blended like colour: sum of weight x value, so 0 where alpha is 0
     )
+
+    def __repr__(self) -> str:
+        return planes_repr(self, self.width, self.height)
 
     def image(self, name: str) -> np.ndarray:
         """One output by name: [H, W], or [H, W, C] of colour, normal and features; float32.

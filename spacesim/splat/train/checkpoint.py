@@ -9,30 +9,29 @@ import numpy as np
 from spacesim.data.errors import check_ranges
 from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.learning import tensors as files
+from spacesim.learning.record import CheckpointHeader, HistoryEntry
 
 FORMAT = "spacesim-gaussians-1"
 
 
-@dataclass(frozen=True)
-class HistoryEntry:
+@dataclass(frozen=True, kw_only=True)
+class GaussianHistoryEntry(HistoryEntry):
     """What training noted of a step."""
 
-    iteration: int  #: how many were finished
-    loss: float  #: of the last one
     gaussians: int  #: how many there were then
 
 
-@dataclass(frozen=True)
-class CheckpointHeader:
-    """What a checkpoint says beside its arrays."""
+@dataclass(frozen=True, kw_only=True)
+class GaussianCheckpointHeader(CheckpointHeader):
+    """What a checkpoint of Gaussians says beside its arrays."""
 
-    iteration: int  #: finished ones
+    history: tuple[GaussianHistoryEntry, ...]  #: of some iterations, in order
     adam_steps: int  #: finished ones
-    history: tuple[HistoryEntry, ...]  #: of some iterations, in order
     format: str = FORMAT  #: by which such files are known
 
     def __post_init__(self) -> None:
-        check_ranges(self, iteration=(0, 2**53), adam_steps=(0, 2**53))
+        super().__post_init__()
+        check_ranges(self, adam_steps=(0, 2**53))
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], header: JsonMapping) -> None:

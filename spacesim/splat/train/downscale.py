@@ -11,7 +11,7 @@ from spacesim.backend.arrays import Array3f, ArrayT, Bool, Float, UInt32
 from spacesim.data.records import Camera
 from spacesim.splat.raster.supersample import mean_light
 from spacesim.splat.raster.tone import inverse_tone_map
-from spacesim.splat.train.loss.terms import Truth
+from spacesim.splat.train.loss.terms import TruthPlanes
 
 
 def downscaled_camera(camera: Camera, times: int) -> Camera:
@@ -63,13 +63,13 @@ def valid_squares(valid: Bool, size: tuple[int, int], times: int) -> Bool:
     return found
 
 
-def truth_of_squares(truth: Truth, size: tuple[int, int], times: int) -> Truth:
+def truth_of_squares(truth: TruthPlanes, size: tuple[int, int], times: int) -> TruthPlanes:
     """What the planes of `TargetImage.truth` say of squares, in the form that the loss compares with what is blended:
     visibility that is seen in a square (below 0 where there is no surface), so times alpha; the mean depth and the mean
     normal, of unit length, of what surface there is; foreground where half of a square is."""
     if times == 1:
         return truth
-    places, found = _places(size, times), Truth()
+    places, found = _places(size, times), TruthPlanes()
     for name, planes in truth.items():
         if name == "foreground":
             shares = [dr.select(dr.gather(ad.Bool, planes[0], place), ad.Float(1), 0) for place in places]

@@ -16,7 +16,7 @@ from spacesim.splat.raster.supersample import pixel_means
 from spacesim.splat.raster.surface import normals
 from spacesim.splat.raster.tone import inverse_tone_map, tone_map
 from spacesim.splat.train.downscale import covered_color, truth_of_squares, valid_squares
-from spacesim.splat.train.loss.terms import Truth, depth_loss, normal_loss, photometric_loss, visibility_loss
+from spacesim.splat.train.loss.terms import TruthPlanes, depth_loss, normal_loss, photometric_loss, visibility_loss
 from spacesim.splat.train.warm_start import foreground_loss
 
 
@@ -73,7 +73,7 @@ class TargetImage:
     background: Float  #: Float [3]
     valid: Bool  #: Bool [H * W] or of width 1
     #: Floats [H * W] by name, see `TrainingView`, and "foreground": Bool [H * W] and its weight, Float
-    truth: Truth
+    truth: TruthPlanes
     gains: Float | None = None  #: Float [3], of the channels of what is drawn
 
 

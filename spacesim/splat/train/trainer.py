@@ -28,7 +28,7 @@ from spacesim.splat.light.bounce import ALBEDO
 from spacesim.splat.light.model import LightModel, TrainingFrame, is_near, robust_radius
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
-from spacesim.splat.train.checkpoint import FORMAT, CheckpointHeader
+from spacesim.splat.train.checkpoint import FORMAT, GaussianCheckpointHeader
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.optimizer.update import Update
@@ -49,7 +49,7 @@ class Trainer(TrainingLoop):
     """Gaussians, their optimizer and their strategy, and the networks of light where the method has some, one step
     after another."""
 
-    form, header = FORMAT, CheckpointHeader
+    form, header = FORMAT, GaussianCheckpointHeader
 
     def __init__(
         self, dataset: Dataset, config: TrainConfig, first_suns: FirstSuns | None = None, poses: Array | None = None
@@ -217,7 +217,7 @@ class Trainer(TrainingLoop):
         """Steps of Adam."""
         return {"adam_steps": self.optimizer.steps}
 
-    def put(self, tensors: Mapping[str, np.ndarray], header: CheckpointHeader) -> None:
+    def put(self, tensors: Mapping[str, np.ndarray], header: GaussianCheckpointHeader) -> None:
         """See `TrainingLoop.put`."""
         gaussians = Gaussians.from_numpy(tensors)
         if gaussians.count == 0:

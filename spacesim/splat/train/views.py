@@ -14,7 +14,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
-from spacesim.splat.train.loss.terms import Truth
+from spacesim.splat.train.loss.terms import TruthPlanes
 
 log = logging.getLogger(__name__)
 
@@ -79,12 +79,12 @@ class TrainingViews:
         epoch, place = divmod(step, len(self))
         return self[int(self._order(epoch)[place])]
 
-    def pixels(self, view: TrainingView) -> tuple[UInt32, Bool, Truth]:
+    def pixels(self, view: TrainingView) -> tuple[UInt32, Bool, TruthPlanes]:
         """(rgba UInt32 [H * W], valid Bool [H * W] or of width 1, truth as Floats [H * W]) of a view."""
-        pixels: tuple[UInt32, Bool, Truth] = self._device_cache(view.index)
+        pixels: tuple[UInt32, Bool, TruthPlanes] = self._device_cache(view.index)
         return pixels
 
-    def _upload(self, index: int) -> tuple[UInt32, Bool, Truth]:
+    def _upload(self, index: int) -> tuple[UInt32, Bool, TruthPlanes]:
         view = self[index]
         valid = ad.Bool(True) if view.valid is None else upload(view.valid, ad.Bool)
         truth = {name: [upload(plane) for plane in planes] for name, planes in view.truth.items()}

@@ -24,7 +24,7 @@ MIN_SIDE = 64  #: pixels of a side
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ViewerFrame:
     """A picture for a client."""
 
     picture: Bytes  #: [H, W, 3]
@@ -52,7 +52,7 @@ def draw_frame(
     settings: DisplaySettings,
     share: float = 1.0,
     on_chunk: Callable[[], None] | None = None,
-) -> Frame:
+) -> ViewerFrame:
     """The picture of a view in the look's mode, without the truth; black, and a note that says why, of a scene that
     cannot be drawn. on_chunk: see `SceneRenderer.draw`"""
     start = time.perf_counter()
@@ -62,7 +62,7 @@ def draw_frame(
     except InputError as error:
         planes = Planes(np.zeros((camera.height, camera.width)))
         picture, depths, note = _black(camera), None, f"no picture: {error}"
-    return Frame(picture, planes, time.perf_counter() - start, share, depths, note)
+    return ViewerFrame(picture, planes, time.perf_counter() - start, share, depths, note)
 
 
 def draw_mode(

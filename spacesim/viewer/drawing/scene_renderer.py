@@ -23,7 +23,7 @@ MIN_RADIUS = 1e-6  #: metres of a model, where all its Gaussians are in one plac
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class ViewerModel:
     """What handles and cameras need of a model."""
 
     name: str  #: unlike the others'
@@ -51,7 +51,7 @@ class SceneRenderer:
         self.backend = composition.backend
         names = _unique_names([placed.name or placed.run.path.resolve().name for placed in composition.models])
         self.models = tuple(
-            Model(name, *_bounds(placed.run)) for name, placed in zip(names, composition.models, strict=True)
+            ViewerModel(name, *_bounds(placed.run)) for name, placed in zip(names, composition.models, strict=True)
         )
 
     def bounds(self, state: SceneState) -> tuple[Array, float]:

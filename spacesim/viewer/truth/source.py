@@ -22,7 +22,7 @@ from spacesim.viewer.truth.scene import (
     split_scene,
 )
 from spacesim.viewer.truth.tracer import TraceRequest, TraceResult
-from spacesim.viewer.truth.truth import SIDE, TraceQueue, Truth, matching_frame, stored_truth
+from spacesim.viewer.truth.truth import SIDE, TraceQueue, ViewerTruth, matching_frame, stored_truth
 
 
 class TruthService:
@@ -41,7 +41,7 @@ class TruthService:
 
     def request_truth(
         self, session: Session, view: ViewerCamera, state: SceneState, settings: DisplaySettings
-    ) -> Truth | int | str:
+    ) -> ViewerTruth | int | str:
         """See `TruthSource`."""
         models = self._models(state)
         if self._dataset is not None and models is not None:

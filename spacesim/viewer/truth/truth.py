@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class ViewerTruth:
     """The truth of a view."""
 
     planes: Planes  #: what is true
@@ -63,7 +63,7 @@ def _near(first: np.ndarray, second: np.ndarray) -> bool:
     return float(np.linalg.norm(first - second)) < SAME_DIRECTION
 
 
-def stored_truth(dataset: Dataset, number: int, mode: str, models: Sequence[int] = ()) -> Truth | None:
+def stored_truth(dataset: Dataset, number: int, mode: str, models: Sequence[int] = ()) -> ViewerTruth | None:
     """What the dataset holds of a frame for a mode; None where it does not. models: see `model_ids`"""
     frame = dataset.frames[number]
     source = f"the dataset's frame {number}"
@@ -71,8 +71,8 @@ def stored_truth(dataset: Dataset, number: int, mode: str, models: Sequence[int]
         if mode in ("colour", "ellipsoids", "accumulation"):
             image = load_image(dataset, frame)
             rgb = image.over(np.zeros(3)).astype(np.float32)
-            return Truth(Planes(image.alpha, rgb=rgb), frame.camera, source)
-        return Truth(_labels(dataset, frame, models), frame.camera, source)
+            return ViewerTruth(Planes(image.alpha, rgb=rgb), frame.camera, source)
+        return ViewerTruth(_labels(dataset, frame, models), frame.camera, source)
     except InputError as error:
         _log.debug("viewer: no truth of frame %d is stored (%s)", number, error)
         return None

@@ -17,7 +17,7 @@ from tiny import contents
 from spacesim.data.exporters import LabelledObject, write_coco, write_speedplus, write_webdataset, write_yolo
 from spacesim.data.exporters.bop import _spread, _write_models
 from spacesim.data.exporters.keypoints import BodyLabels
-from spacesim.data.exporters.labels import Labeller
+from spacesim.data.exporters.labels import DatasetLabeller
 from spacesim.data.exporters.objects import opaque_picture
 from spacesim.data.exporters.symmetries import find_symmetries
 from spacesim.data.images import read_png
@@ -28,7 +28,7 @@ from spacesim.data.store import load_depth
 @pytest.fixture(scope="module")
 def truth(labelled) -> dict[str, list]:
     """Instances that are seen, by the names of frames."""
-    labeller = Labeller(labelled)
+    labeller = DatasetLabeller(labelled)
     return {
         Path(frame.file_path).stem: [one for one in labeller.instances(frame) if one.area] for frame in labelled.frames
     }

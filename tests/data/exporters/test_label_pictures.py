@@ -8,15 +8,15 @@ import trimesh
 from pycocotools import mask as coco_mask
 
 from spacesim.data.errors import InputError
-from spacesim.data.exporters.labels import HIDDEN, OUTSIDE, VISIBLE, Labeller, project
+from spacesim.data.exporters.labels import HIDDEN, OUTSIDE, VISIBLE, DatasetLabeller, project
 from spacesim.data.exporters.masks import outline, run_lengths
 from spacesim.data.images import read_exr, undistort_points
 from spacesim.data.records import Camera, Frame
 
 
 @pytest.fixture(scope="module")
-def labeller(labelled) -> Labeller:
-    return Labeller(labelled, 40)
+def labeller(labelled) -> DatasetLabeller:
+    return DatasetLabeller(labelled, 40)
 
 
 def masks() -> list[np.ndarray]:

@@ -18,7 +18,7 @@ from spacesim.data.importers.video import frames as frames_of
 from spacesim.data.importers.video import importing
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import Survey, choose, read_frames, survey
-from spacesim.data.importers.video.model import Model, placed, report_of, without_floating
+from spacesim.data.importers.video.model import SfmModel, placed, report_of, without_floating
 from spacesim.data.importers.video.segmentation import segment, segment_sequence
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.eval.align import align
@@ -207,7 +207,7 @@ def test_wrong_folders_are_named(tmp_path):
         import_dataset("images", tmp_path / "in", tmp_path)
 
 
-def model_of(points: np.ndarray, turn: Rotation, scale: float, shift: np.ndarray) -> Model:
+def model_of(points: np.ndarray, turn: Rotation, scale: float, shift: np.ndarray) -> SfmModel:
     """Cameras around points along x, in another frame."""
     poses = np.array(poses_around(5))
     moved = poses.copy()
@@ -215,7 +215,7 @@ def model_of(points: np.ndarray, turn: Rotation, scale: float, shift: np.ndarray
     moved[:, :3, 3] = scale * turn.apply(poses[:, :3, 3]) + shift
     seen = tuple((0, 1, 2) for _ in points)
     count = len(points)
-    return Model(
+    return SfmModel(
         *(tuple("abcde"), moved, FOCAL, (160.0, 120.0), 0.0, *SIZE),
         *(scale * turn.apply(points) + shift, np.zeros((count, 3), np.uint8), np.ones(count), seen, (5,)),
     )
@@ -230,7 +230,7 @@ def test_a_model_is_put_upright_to_scale_and_about_the_object():
     assert (right.world_from_camera[:, 2, 1] < -0.8).all()  # pictures are upright
     np.testing.assert_allclose(np.linalg.det(right.world_from_camera[:, :3, :3]), 1)
 
-    def median(found: Model) -> float:
+    def median(found: SfmModel) -> float:
         return float(np.median(np.linalg.norm(found.positions, axis=1)))
 
     assert median(placed(model, distance=40.0)) == pytest.approx(40)

@@ -24,7 +24,7 @@ from spacesim.splat.compose import (
     save_scene,
     scenefile,
 )
-from spacesim.splat.compose.path import Track, interpolate_view
+from spacesim.splat.compose.path import KeyframeTrack, interpolate_view
 from spacesim.splat.compose.pose import rotation_about
 from spacesim.splat.run import Run
 
@@ -181,7 +181,7 @@ def test_what_is_up_stands_in_the_file(tmp_path):
 
 
 def test_a_track_is_exact_at_its_keys():
-    track = Track([0.0, 0.1, 0.3], [1.0, 2.0, 7.0], lambda a, b, share: a + share * (b - a))
+    track = KeyframeTrack([0.0, 0.1, 0.3], [1.0, 2.0, 7.0], lambda a, b, share: a + share * (b - a))
     assert [track.at(t) for t in (-1, 0, 0.1, 0.3, 9)] == [1, 1, 2, 7, 7]
     assert track.at(0.2) == pytest.approx(4.5)
 

@@ -17,7 +17,7 @@ from spacesim.data.store import read_dataset
 from spacesim.splat.compose.scene import GaussianComposition, PlacedRun
 from spacesim.splat.export.ply import read_ply
 from spacesim.splat.export.sweep import sweep
-from spacesim.splat.pose.picture import Drawing
+from spacesim.splat.pose.picture import SunlitRun
 from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig, preset, with_settings
@@ -108,7 +108,7 @@ def test_a_run_without_the_sun_is_drawn_without_one(small_dataset, sunless, tmp_
     np.testing.assert_array_equal(run.render(camera).rgb, drawn)
     for azimuth in (0, 90):
         np.testing.assert_array_equal(run.predict(camera, Sun.from_angles(azimuth, 20)).rgb, drawn)
-    for_pose = Drawing.of(run, None)
+    for_pose = SunlitRun.of(run, None)
     np.testing.assert_array_equal(for_pose.draw(camera, for_pose.shade(camera))[..., :3], drawn)
     alone = GaussianComposition([PlacedRun(run)])
     assert not alone.relightable

@@ -5,14 +5,14 @@ from PIL import Image, ImageDraw
 
 from spacesim.data.geometry import Array
 from spacesim.data.images.sheet import GAP, WHITE_PAGE, font
-from spacesim.data.importers.video.model import Model
+from spacesim.data.importers.video.model import SfmModel
 
 _SIDE, _TITLE, _LABEL = 460, 26, 22  # pixels
 _CAMERA, _FIRST, _AXIS = (31, 119, 180), (214, 39, 40), (150, 190, 215)
 _VIEWS = (("from above", (0, 1), ("x", "y")), ("from the side", (0, 2), ("x", "z")))
 
 
-def draw_cameras(model: Model) -> np.ndarray:
+def draw_cameras(model: SfmModel) -> np.ndarray:
     """[H, W, 3] uint8: points in their colours, cameras as dots with their optical axes, the first one red."""
     width, height = 2 * _SIDE + 3 * GAP, _SIDE + _TITLE + _LABEL + 2 * GAP
     image = Image.new("RGB", (width, height), WHITE_PAGE.paper)

@@ -21,7 +21,7 @@ from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.masks import MASKED, MaskFolder, read_mask
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import choose, read_frames, survey
-from spacesim.data.importers.video.model import Model, placed, report_of, without_floating
+from spacesim.data.importers.video.model import SfmModel, placed, report_of, without_floating
 from spacesim.data.importers.video.segmentation import segment_sequence
 from spacesim.data.importers.video.sfm import check_focal, reconstruct
 from spacesim.data.importers.writing import ImportedFrame, Progress, check_free, frame_names, write_dataset
@@ -208,7 +208,7 @@ def _hide_background(folder: Path, names: Sequence[str]) -> Path:
 
 
 def _frames(
-    folder: Path, model: Model, has_masks: bool, masked: str, keys: Mapping[str, Mapping[str, JsonValue]]
+    folder: Path, model: SfmModel, has_masks: bool, masked: str, keys: Mapping[str, Mapping[str, JsonValue]]
 ) -> Iterator[ImportedFrame]:
     distortion = (model.k1, 0.0, 0.0, 0.0, 0.0)
     for name, pose in zip(model.names, model.world_from_camera, strict=True):

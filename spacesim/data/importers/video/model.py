@@ -17,7 +17,7 @@ _LEAST_TRACK = 3  # pictures that see a point
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class SfmModel:
     """Poses of pictures, their camera, and points."""
 
     names: tuple[str, ...]  #: of the pictures that have a pose, sorted
@@ -39,7 +39,7 @@ class Model:
         return self.world_from_camera[:, :3, 3]
 
 
-def without_floating(model: Model) -> Model:
+def without_floating(model: SfmModel) -> SfmModel:
     """The model without points that few pictures see or that float away from the others (thesis 6.4.1)."""
     tracks = np.array([len(frames) for frames in model.seen_by])
     kept = np.flatnonzero(tracks >= min(_LEAST_TRACK, tracks.max()))
@@ -56,7 +56,7 @@ def without_floating(model: Model) -> Model:
     )
 
 
-def placed(model: Model, length: float | None = None, distance: float | None = None) -> Model:
+def placed(model: SfmModel, length: float | None = None, distance: float | None = None) -> SfmModel:
     """The model about the origin, z towards where the pictures' upper sides point in the mean, x along the object.
 
     length: metres of the object along its longest axis: of 99 % of the points
@@ -86,7 +86,7 @@ def placed(model: Model, length: float | None = None, distance: float | None = N
     return replace(model, world_from_camera=poses, points=scale * offsets @ rotation.T)
 
 
-def report_of(model: Model, names: Sequence[str]) -> dict[str, JsonValue]:
+def report_of(model: SfmModel, names: Sequence[str]) -> dict[str, JsonValue]:
     """What import tells of it. names: of all pictures."""
     tracks = [len(frames) for frames in model.seen_by]
     centres = np.linalg.norm(model.positions, axis=1)

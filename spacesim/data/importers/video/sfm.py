@@ -17,7 +17,7 @@ import numpy as np
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import Array, degrees_between
-from spacesim.data.importers.video.model import Model
+from spacesim.data.importers.video.model import SfmModel
 
 INSTALL = "pip install 'spacesim[sfm]'"
 SEED = 1
@@ -52,7 +52,7 @@ def reconstruct(
     focal: float | None = None,
     ordered: bool = False,
     progress: Progress | None = None,
-) -> Model:
+) -> SfmModel:
     """Poses of the pictures folder/NAME, all of one camera and of `size` (width, height).
 
     masks: a folder of NAME.png, features are taken where they are not black
@@ -236,7 +236,7 @@ def _map(
     return list(models.values())
 
 
-def _model(model: Any, sizes: list[int]) -> Model:
+def _model(model: Any, sizes: list[int]) -> SfmModel:
     images = sorted((model.images[number] for number in model.reg_image_ids()), key=lambda image: image.name)
     poses = []
     for image in images:
@@ -248,7 +248,7 @@ def _model(model: Any, sizes: list[int]) -> Model:
     numbers = {image.image_id: k for k, image in enumerate(images)}
     seen = [[numbers[e.image_id] for e in point.track.elements if e.image_id in numbers] for point in points]
     focal, cx, cy, k1 = camera.params.tolist()
-    return Model(
+    return SfmModel(
         names=tuple(image.name for image in images),
         world_from_camera=np.array(poses),
         focal=focal,
@@ -272,7 +272,7 @@ def check_focal(focal: float, size: tuple[int, int], name: str, hint: str = "") 
         raise InputError(f"{name}: expected {expected}, found {ratio:.3g}{hint}")
 
 
-def _checked(model: Model, found: Matches, count: int, name: str) -> Model:
+def _checked(model: SfmModel, found: Matches, count: int, name: str) -> SfmModel:
     """Raises InputError for a model that cannot be believed."""
     registered = len(model.names)
     if len(model.points) < 30 or registered < 3:
@@ -299,7 +299,7 @@ def _checked(model: Model, found: Matches, count: int, name: str) -> Model:
     return model
 
 
-def median_angle(model: Model) -> float:
+def median_angle(model: SfmModel) -> float:
     """Degrees between the two rays furthest apart on which the median point is seen."""
     centres = model.world_from_camera[:, :3, 3]
     angles = []
@@ -310,7 +310,7 @@ def median_angle(model: Model) -> float:
     return float(np.median(angles))
 
 
-def _depths(model: Model, k: int) -> float:
+def _depths(model: SfmModel, k: int) -> float:
     """Median depth of all points before camera k."""
     pose: Array = model.world_from_camera[k]
     return float(np.median((model.points - pose[:3, 3]) @ pose[:3, 2]))

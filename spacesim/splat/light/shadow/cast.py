@@ -37,7 +37,8 @@ class SplattingConfig:
 
     gradients: bool = False  #: training moves the Gaussians through their shadows, too, where the literature stops it
     beta_min: float = BETA_MIN  #: beta at which a receiver's footprint ends; 4.10 names no end, pictures' is 0.004
-    baseline: bool = False  #: in a light as table 4.3 has it: names the method baseline-park, and changes no picture
+    #: in a light as table 4.3 has it: names the method baseline-park, and changes no picture
+    baseline: bool = field(default=False, metadata={"option": False})
 
     def __post_init__(self) -> None:
         check_ranges(self, beta_min=(LEAST_BETA, 0.5))

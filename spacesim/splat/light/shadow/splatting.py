@@ -16,7 +16,7 @@ import drjit as dr
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array2f, Array3f, Bool, Float, UInt32
 from spacesim.data.errors import WorkError
-from spacesim.splat.raster.adjoint import Moments, add_to_slots, gather_slots, reduce_mode
+from spacesim.splat.raster.adjoint import PixelMoments, add_to_slots, gather_slots, reduce_mode
 from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
@@ -280,7 +280,7 @@ def _replay(
         share = dr.gather(ad.Float, shares, event, receiver)
         occlusion = dr.gather(ad.Float, walked.occlusion, event, receiver)
         transmittance, behind = list(transmittance), list(behind)
-        moments = Moments(lane.x - record[0], lane.y - record[1])
+        moments = PixelMoments(lane.x - record[0], lane.y - record[1])
         for p, offset in enumerate(offsets):
             unclamped = exp2(powers[p])
             alpha = dr.minimum(unclamped, ALPHA_MAX)

@@ -9,7 +9,7 @@ from spacesim.splat.raster.gaussians import Gaussians, opacities
 from spacesim.splat.train.loss.ssim import ssim
 
 ROUND = 1e-4  #: of a Gaussian's mean scale
-Truth = dict[str, list[Any]]  #: on the device: Floats [H * W] by name; of "foreground" a Bool [H * W] and its weight
+TruthPlanes = dict[str, list[Any]]  #: on the device: Floats [H * W] by name; of "foreground" a Bool and its weight
 
 
 def photometric_loss(prediction: Array3f, target: Array3f, width: int, height: int, ssim_weight: float = 0.2) -> Float:
