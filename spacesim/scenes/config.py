@@ -94,7 +94,7 @@ class MaterialConfig:
 
 @dataclass(frozen=True)
 class QualityConfig:
-    """How carefully frames are rendered. Raises InputError for a value out of range; the upper limits are chosen."""
+    """How carefully frames are rendered. Raises InputError for a value out of range."""
 
     spp: int = 64  #: samples a pixel
     #: of test views, whose noise counts as an error of whatever is evaluated by them, None for four times as many

@@ -104,9 +104,9 @@ def rasterization(
     are int64 [M]; with packed=False [C, N, ...], radii 0 of what is not drawn, and None for the ids. Further width,
     height, n_cameras, n_batches, tile_size, tile_width and tile_height.
 
-    Raises ValueError for what is no tensor, for shapes that do not fit, for tensors on several devices, for a second device in one process and
-    for what is not supported, BackendError where the device's backend cannot run. Without torch, importing this module
-    raises ImportError.
+    Raises ValueError for what is no tensor, for shapes that do not fit, for tensors on several devices, for a second
+    device in one process and for what is not supported, BackendError where the device's backend cannot run. Without
+    torch, importing this module raises ImportError.
     """
     arguments.check_unsupported(
         {

@@ -82,7 +82,8 @@ def check_shapes(
         check_tensor(name, tensor)
     for name, tensor, letter, rest in shapes:
         if tensor.dim() != 1 + len(rest):
-            hint = "; batches are not supported" if tensor.dim() > len(rest) else "; add [None]" if letter == "C" else ""
+            few = "; add [None]" if letter == "C" else ""
+            hint = "; batches are not supported" if tensor.dim() > len(rest) else few
             expected = ", ".join([letter, *map(str, rest)])
             raise ValueError(f"{name}: expected [{expected}], found {list(tensor.shape)}{hint}")
     counts = {"N": len(means), "C": len(viewmats)}

@@ -44,7 +44,7 @@ WEIGHTS = (
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes, splatfacto's values; those of light are chosen. Those of the means and the networks fall
+    """Adam's step sizes; those of the Gaussians are splatfacto's. Those of the means and the networks fall
     exponentially; that of the means is per metre of scene scale."""
 
     means: float = 1.6e-4  #: of the centres, at the start
