@@ -563,7 +563,7 @@ def test_a_setting_that_cannot_be_is_named(spacesim, tiny_data, tmp_path, words,
         ("export RUN --glb OUT.glb --spz-version 4", ["--spz-version: expected with --spz, found without it"]),
         ("export RUN --html OUT.html --recentre", ["--recentre: expected with --ply"]),
         ("export RUN --html OUT.html --up y", ["--up: expected with --ply"]),
-        ("export RUN --mesh OUT.stl --sun 1,2", ["--sun", "holds colours"]),
+        ("export RUN --mesh OUT.stl --sun 1,2", ["--sun", "hold colours"]),
     ],
 )
 def test_bad_usage_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tmp_path, arguments, names):
