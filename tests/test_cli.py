@@ -407,7 +407,10 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ),
         ("--method relight --set light.shadow.bias=5", ["expected light.shadow to be", "; try --method shadow-map"]),
         ("--set nonsense=1", ["--set nonsense: expected one of method,", "'nonsense'; see spacesim train --fields"]),
-        ("--method shadow-map --set light.field.inputs=directions", ["--set light.bounce", "surface"]),
+        (
+            "--method shadow-map --set light.field.inputs=directions",
+            ["--set light.bounce: expected 0 or --set light.field.inputs=surface,"],
+        ),
         ("--set seed", ["--set: expected KEY=VALUE, found 'seed'"]),
         ("--set =3", ["--set: expected KEY=VALUE, found '=3'"]),
         ("--set seed=three", ["--seed: expected a whole number, found 'three'"]),
@@ -454,7 +457,10 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
             "--method shadow-map --set light.shadow.grazing=never",
             ["shadow.grazing: expected one of none, bias, lift, both"],
         ),
-        ("--method relight --set light.tone=filmic", ["--set light.tone: expected linear colours"]),
+        (
+            "--method relight --set light.tone=filmic",
+            ["--set light.tone: expected linear colours (light.linear = true)"],
+        ),
         (
             "--method relight --set light.linear=true --set light.exposure=1e9",
             ["--set light.exposure: expected -40 to 40 EV"],
@@ -557,7 +563,7 @@ def test_a_setting_that_cannot_be_is_named(spacesim, tiny_data, tmp_path, words,
         ("export RUN --glb OUT.glb --spz-version 4", ["--spz-version: expected with --spz, found without it"]),
         ("export RUN --html OUT.html --recentre", ["--recentre: expected with --ply"]),
         ("export RUN --html OUT.html --up y", ["--up: expected with --ply"]),
-        ("export RUN --mesh OUT.stl --sun 1,2", ["--sun", "holds colours"]),
+        ("export RUN --mesh OUT.stl --sun 1,2", ["--sun", "hold colours"]),
     ],
 )
 def test_bad_usage_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tmp_path, arguments, names):
@@ -577,6 +583,9 @@ def test_settings_in_a_sentence_are_told_as_options():
     assert in_flags("seed: expected refine_poses, found max_gaussians", options).endswith(
         "--refine-poses, found max_gaussians"
     )
+    unfinished = "DATA: found an unfinished one; generate with {} completes it"
+    asked = parser(["verify"]).parse_args(["verify", "DATA"])  # which has no --resume; generate has
+    assert in_flags(unfinished.format("resume=True"), asked) == unfinished.format("--resume")
     others = "OUT/config.json: refine_poses: expected another, found b=True"
     assert in_flags(others, options) == others
 

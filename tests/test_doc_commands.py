@@ -284,7 +284,7 @@ def test_options_that_sentences_name_exist(monkeypatch, capsys):
 
 def test_fields_that_sentences_name_exist():
     """Each `--set KEY=VALUE` is taken, and each `light.shadow.bias` is a field, of some method of light."""
-    methods = "shadow-map", "shadow-splat", "relight"
+    methods = "shadow-map", "shadow-splat", "relight", "nerf-relight"
     listed = " ".join(call("train", "--fields", "--method", method).output for method in methods).split()
     named: set[str] = set()
     for path in (*DOCUMENTS, *TUTORIALS):

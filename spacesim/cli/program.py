@@ -139,10 +139,12 @@ def parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
 def in_flags(sentence: str, options: argparse.Namespace) -> str:
     """An error of the library, "iterations: expected ...", with the option in the place of the field that it begins
     with: "--iterations: expected ...", and then also in that of words like test_views. In any sentence "resume=True"
-    becomes "--resume", and "sun=unknown" "--sun unknown", where there is such an option."""
+    becomes "--resume", and where there is such an option "sun=unknown" "--sun unknown"."""
 
     def option(match: re.Match[str]) -> str:
         flag = options.option_of(match[1], options) or options.flags.get(match[1])
+        if not flag and match[0] == "resume=True":  # of another command, which the sentence names
+            return "--resume"
         if not flag:
             return match[0]
         return flag if match[2] == "True" else f"{flag}{'=' if ' ' in flag else ' '}{match[2]}"

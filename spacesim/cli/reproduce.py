@@ -21,7 +21,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     )
     sizes.add_argument("--quick", action="store_true", help="tiny: minutes on two cores, to see that all of it works")
     parser.add_argument(
-        "--seeds", type=int, default=1, metavar="N", help="trainings of each row, whose spread is told (1)"
+        "--seeds", type=int, default=1, metavar="N", help="trainings of each row, whose spread is reported (1)"
     )
     parser.add_argument("--resume", action="store_true", help="go on in DIR, with the same tables or others")
     parser.add_argument("--ray", metavar="ADDRESS", help="on a Ray cluster: auto, HOST:PORT, or local to start one")

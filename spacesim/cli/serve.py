@@ -14,7 +14,8 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="to listen at (this machine alone)")
     parser.add_argument("--port", type=int, default=5556, metavar="N", help="to listen at (5556, Vizard's; 0: any)")
     parser.add_argument("--spp", type=int, metavar="N", help="samples a pixel of a scene (as the scene says)")
-    parser.add_argument("--vizard", action="store_true", help=argparse.SUPPRESS)  # it always speaks to Basilisk, too
+    # Promised to scripts, and without effect: it speaks to Basilisk, too, whether it is given or not.
+    parser.add_argument("--vizard", action="store_true", help=argparse.SUPPRESS)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -15,7 +15,8 @@ def check_ranges(record: object, **ranges: tuple[float, float]) -> None:
     for name, (least, most) in ranges.items():
         value = getattr(record, name)
         if not least <= value <= most:
-            raise InputError(f"{name}: expected {least:g} to {most:g}, found {value!r}")
+            least_word, most_word = (str(end) if isinstance(end, int) else f"{end:g}" for end in (least, most))
+            raise InputError(f"{name}: expected {least_word} to {most_word}, found {value!r}")
 
 
 def expect(condition: bool, name: str, expected: str, found: object) -> None:

@@ -177,7 +177,7 @@ def _say_what_is_missing(path: Path, root: Path) -> str:
     if not path.exists():
         return f"{path}: expected a dataset folder or a transforms.json, found nothing"
     if (root / "scene.json").is_file():
-        return f"{path}: expected transforms.json, found an unfinished one; go on with generate --resume"
+        return f"{path}: expected transforms.json, found an unfinished one; generate with resume=True completes it"
     return f"{path}: expected a dataset folder with a transforms.json, found none in it"
 
 

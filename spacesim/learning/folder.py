@@ -97,7 +97,7 @@ def finished_model(path: Path) -> Path:
     if not (path / "config.json").exists():
         raise InputError(f"{path}: expected a run of `spacesim train`, found no config.json in it")
     if not (path / "model.safetensors").exists():
-        raise InputError(f"{path}: training has not ended; complete it with `spacesim train ... --resume`")
+        raise InputError(f"{path}: training has not ended; train with resume=True completes it")
     return path / "model.safetensors"
 
 

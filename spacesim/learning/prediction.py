@@ -9,7 +9,8 @@ from spacesim.backend.memory import check_memory
 from spacesim.data.records import Camera, planes_repr
 
 A_PIXEL = {"cuda": 80, "llvm": 225}
-"""Bytes of main memory that a predicted pixel takes at most, until it is written: 160 and then 65 were seen on LLVM."""
+"""Bytes of main memory that a predicted pixel takes at most, by measured peaks: on LLVM 160 until it is rendered and 65
+more until it is written."""
 
 
 KINDS = ("rgb", "alpha", "depth", "normal", "shadow")  #: of pictures of a prediction

@@ -61,17 +61,17 @@ class NerfShadowConfig:
 class NerfConfig:
     """Everything that decides a trained radiance field, apart from the data and the backend."""
 
-    method: Method = "nerf"  #: whether colours are told the Sun
+    method: Method = "nerf"  #: whether colours depend on the Sun
     preset: Preset | None = None  #: the preset that this started from
     iterations: int = 2_000  #: steps of training
     seed: int = 0  #: random seed: same seed, same bits
     rays: int = 1_024  #: of a step; a multiple of 512
     samples: int = 16  #: of a ray, of the field itself
     width: int = 32  #: units of hidden layers
-    features: int = 15  #: numbers that the density network tells the colour network of a point
+    features: int = 15  #: numbers of a point that the density network gives the colour network
     color_layers: int = 3  #: matrix products of the colour network
     harmonics: int = 3  #: degree of spherical harmonics of the view's direction
-    #: what colours of `nerf-relight` are told of Sun and view: their directions, or cosines about a normal that each
+    #: what colours of `nerf-relight` are given of Sun and view: their directions, or cosines about a normal that each
     #: place learns (`learning.reflectance`), which serve Suns never seen
     inputs: Literal["directions", "surface"] = "surface"
     sun_harmonics: int = 1  #: of "directions", of the Sun's: more of them tell training's few Suns apart by heart
@@ -114,7 +114,7 @@ class NerfConfig:
 
     @property
     def knows_sun(self) -> bool:
-        """Whether colours are told the Sun."""
+        """Whether colours depend on the Sun."""
         return self.method == "nerf-relight"
 
     @property

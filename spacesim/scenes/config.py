@@ -9,7 +9,7 @@ import numpy as np
 
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import JsonDict
-from spacesim.data.structure import field_value
+from spacesim.data.structure import did_you_mean, field_value
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.rig import FibonacciRig, Rig
@@ -94,7 +94,7 @@ class MaterialConfig:
 
 @dataclass(frozen=True)
 class QualityConfig:
-    """How carefully frames are rendered. Raises InputError for a value out of range; the upper limits are chosen."""
+    """How carefully frames are rendered. Raises InputError for a value out of range."""
 
     spp: int = 64  #: samples a pixel
     #: of test views, whose noise counts as an error of whatever is evaluated by them, None for four times as many
@@ -211,4 +211,5 @@ def _options_of(scene: SceneConfig, name: str, names_by_part: Mapping[str, Itera
     names = names_by_part["rig"] if kinds else set().union(*names_by_part.values())
     whose = f"{scene.name}, whose rig is of kind {rig_kind(scene.rig)}"
     others = f" ({' and '.join(kinds)} know{'s' * (len(kinds) == 1)} {name})" if kinds else ""
-    return f"one of the options {', '.join(sorted(names))} of {whose}{others}"
+    hint = "" if kinds else did_you_mean(name, sorted(names))
+    return f"one of the options {', '.join(sorted(names))} of {whose}{others}{hint}"

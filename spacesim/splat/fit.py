@@ -91,7 +91,7 @@ def estimate_sun(run: Run, image: ArrayLike | Image, camera: Camera, mask: Array
     """
     check_gaussians(run)
     if not run.relightable or run.light is None:
-        raise InputError(f"run: expected one of a method that is told the Sun, found {run.config['method']}")
+        raise InputError(f"run: expected one of a method that takes the Sun, found {run.config['method']}")
     pixels, counts = checked_picture(image, mask, camera)
     rgb = pixels[..., :3]
     seen = pixels[..., 3] if pixels.shape[2] == 4 else run.predict(camera, Sun(np.array([0.0, 0.0, 1.0]))).alpha

@@ -199,7 +199,7 @@ def _finished(out: Path, settings: JsonDict, resume: bool) -> dict[str, JsonDict
     if not out.exists():
         return {}
     if not resume:
-        raise InputError(f"{out}: expected a new file, found one; --resume goes on with it")
+        raise InputError(f"{out}: expected a new file, found one; resume=True goes on with it")
     values = read_json(out, MAX_LIST_BYTES)
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise InputError(f"{out}: expected poses of an interrupted call, found another file")

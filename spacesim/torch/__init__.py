@@ -104,9 +104,9 @@ def rasterization(
     are int64 [M]; with packed=False [C, N, ...], radii 0 of what is not drawn, and None for the ids. Further width,
     height, n_cameras, n_batches, tile_size, tile_width and tile_height.
 
-    Raises ValueError for shapes that do not fit, for tensors on several devices, for a second device in one process and
-    for what is not supported, BackendError where the device's backend cannot run. Without torch, importing this module
-    raises ImportError.
+    Raises ValueError for what is no tensor, for shapes that do not fit, for tensors on several devices, for a second
+    device in one process and for what is not supported, BackendError where the device's backend cannot run. Without
+    torch, importing this module raises ImportError.
     """
     arguments.check_unsupported(
         {
@@ -127,6 +127,8 @@ def rasterization(
     arguments.check_choice("rasterize_mode", rasterize_mode, arguments.RASTERIZE_MODES)
     arguments.check_choice("camera_model", camera_model, arguments.CAMERA_MODELS)
     width, height = index(width), index(height)  # numpy's are no numbers of a recording
+    if tile_size < 1:
+        raise ValueError(f"tile_size: expected at least 1, found {tile_size}")
     count, cameras = arguments.check_shapes(means, quats, scales, opacities, viewmats, Ks, width, height)
     arguments.check_colors(colors, backgrounds, sh_degree, render_mode, means, cameras)
     backend.select("cuda" if means.is_cuda else "llvm")

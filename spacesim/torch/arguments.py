@@ -70,26 +70,38 @@ def check_shapes(
     height: int,
 ) -> tuple[int, int]:
     """(N, C). Raises ValueError naming the argument that does not fit."""
-    for name, matrices, size in (("viewmats", viewmats, 4), ("Ks", Ks, 3)):
-        if matrices.dim() == 2:
-            raise ValueError(f"{name}: expected [C, {size}, {size}], found {list(matrices.shape)}; add [None]")
-    count, cameras, device = len(means), len(viewmats), means.device
-    expected = (
-        ("means", means, (count, 3)),
-        ("quats", quats, (count, 4)),
-        ("scales", scales, (count, 3)),
-        ("opacities", opacities, (count,)),
-        ("viewmats", viewmats, (cameras, 4, 4)),
-        ("Ks", Ks, (cameras, 3, 3)),
+    shapes = (
+        ("means", means, "N", (3,)),
+        ("quats", quats, "N", (4,)),
+        ("scales", scales, "N", (3,)),
+        ("opacities", opacities, "N", ()),
+        ("viewmats", viewmats, "C", (4, 4)),
+        ("Ks", Ks, "C", (3, 3)),
     )
-    for name, tensor, shape in expected:
+    for name, tensor, _, _ in shapes:
+        check_tensor(name, tensor)
+    for name, tensor, letter, rest in shapes:
+        if tensor.dim() != 1 + len(rest):
+            few = "; add [None]" if letter == "C" else ""
+            hint = "; batches are not supported" if tensor.dim() > len(rest) else few
+            expected = ", ".join([letter, *map(str, rest)])
+            raise ValueError(f"{name}: expected [{expected}], found {list(tensor.shape)}{hint}")
+    counts = {"N": len(means), "C": len(viewmats)}
+    for name, tensor, letter, rest in shapes:
+        shape = (counts[letter], *rest)
         if tensor.shape != shape:
-            suffix = "; batches are not supported" if tensor.dim() > len(shape) else ""
-            raise ValueError(f"{name}: expected {list(shape)}, found {list(tensor.shape)}{suffix}")
-        check_device(name, tensor, device)
+            raise ValueError(f"{name}: expected {list(shape)}, found {list(tensor.shape)}")
+        check_device(name, tensor, means.device)
+    count, cameras = counts["N"], counts["C"]
     if count < 1 or cameras < 1 or width < 1 or height < 1:
         raise ValueError(f"means, viewmats: expected at least one each and a picture, found {count} and {cameras}")
     return count, cameras
+
+
+def check_tensor(name: str, found: object) -> None:
+    """Raises ValueError for what is no tensor."""
+    if not isinstance(found, Tensor):
+        raise ValueError(f"{name}: expected a tensor, found {found!r:.60}")
 
 
 def check_device(name: str, tensor: Tensor, device: object) -> None:
@@ -102,9 +114,11 @@ def check_colors(
     colors: Tensor, backgrounds: Tensor | None, sh_degree: int | None, render_mode: str, means: Tensor, cameras: int
 ) -> None:
     """Raises ValueError where colours do not fit the harmonics, the Gaussians or the background."""
+    check_tensor("colors", colors)
     count, shape = len(means), tuple(colors.shape)
     check_device("colors", colors, means.device)
     if backgrounds is not None:
+        check_tensor("backgrounds", backgrounds)
         check_device("backgrounds", backgrounds, means.device)
     if sh_degree is None:
         if shape[:-1] not in ((count,), (cameras, count)):

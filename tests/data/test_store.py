@@ -216,7 +216,7 @@ def test_resume_completes_what_was_left(root, tmp_path):
     (root / "images" / ".train_00001.png.abcd.part").write_bytes(b"half")
     writer = DatasetWriter(root, SCENE, resume=True)
     assert [writer.has_frame(name) for name in TRAIN + TEST] == [False, False, False]
-    assert "go on with generate --resume" in find_unreadable_files(root)[0]
+    assert "generate with resume=True completes it" in find_unreadable_files(root)[0]
     write_dataset(root, resume=True)
     assert contents(root) == whole
 

@@ -252,7 +252,7 @@ def test_folders_that_are_no_dataset(tmp_path):
     with pytest.raises(InputError, match=r"a transforms\.json, found none"):
         read_dataset(tmp_path)
     (tmp_path / "scene.json").write_text("{}")
-    with pytest.raises(InputError, match="unfinished one; go on with generate --resume"):
+    with pytest.raises(InputError, match="unfinished one; generate with resume=True completes it"):
         read_dataset(tmp_path)
 
 

@@ -336,7 +336,7 @@ def test_the_commands(spacesim, tiny_data, tmp_path):
         (["--sun", "unknown"], "--sun: expected with a method of Gaussians"),
         (["--refine-poses"], "--refine-poses: expected with a method of Gaussians"),
         (["--preset", "fine"], "--preset: expected one of demo, fast, thesis, found 'fine'"),
-        (["--set", "rays=100"], "rays: expected 512 to 1.04858e+06, found 100"),
+        (["--set", "rays=100"], "rays: expected 512 to 1048576, found 100"),
         (["--set", "rays=600"], "rays: expected a multiple of 512, found 600"),
         (["--set", "grid.finest=4"], "finest: expected at least coarsest, 16, found 4"),
         (["--set", "sh_degree=2"], "sh_degree"),

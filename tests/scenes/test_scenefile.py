@@ -259,6 +259,8 @@ def test_options():
     for name, value in {"views": 0, "resolution": 0, "sun": [(0, 91)], "teapots": 1, "suns": 0, "seed": -1}.items():
         with pytest.raises(InputError, match=f"^{name}: expected"):
             read_scene("boxsat", **{name: value})
+    with pytest.raises(InputError, match=r"^fov: expected one of the options .*, fov_deg, .*; did you mean fov_deg\?$"):
+        read_scene("boxsat", fov=30)
     with pytest.raises(InputError, match=r"^distance: expected one of the options .*") as refused:
         read_scene("upper-stage", distance=1.0)
     rig = "across, across_phase_deg, altitude_km, duration_s, known_test_views, phase_deg, shared_test_views, size, "

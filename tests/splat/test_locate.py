@@ -144,7 +144,7 @@ def test_a_file_of_poses_reads_back_and_goes_on(run, pictures, tmp_path):
         assert entry["converged"]
         assert 0 <= entry["residual"] < 0.01
         assert np.linalg.eigvalsh(entry["covariance"]).min() > 0
-    with pytest.raises(InputError, match=r"poses\.json: expected a new file, found one; --resume goes on with it"):
+    with pytest.raises(InputError, match=r"poses\.json: expected a new file, found one; resume=True goes on with it"):
         locate(run, pictures, out, rough, camera)
     first = out.read_bytes()
     del (left := json.loads(first))["frames"][1]

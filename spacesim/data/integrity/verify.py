@@ -50,7 +50,7 @@ def has_digests(dataset: Dataset) -> bool:
 def repair_hint(dataset: Dataset) -> str:
     """What to do about faulty files of a dataset, by what has made it; "" where that is not known."""
     if dataset.scene:
-        return "; delete them, generate --resume makes them again"
+        return "; delete them, generate with resume=True makes them again"
     return "; import it again, into a new folder" if (dataset.root / SOURCE).is_file() else ""
 
 
@@ -58,7 +58,7 @@ def _repair_hint(root: Path, error: InputError) -> str:
     """What to do about a broken scene.json or transforms.json of a dataset that `generate` has made."""
     broken = (path for path in (root / "scene.json", root / "transforms.json") if str(path) in str(error))
     if (root / "scene.json").is_file() and any(path.is_file() for path in broken):
-        return "; delete it, generate --resume of the same scene makes it again"
+        return "; delete it, generate of the same scene with resume=True makes it again"
     return ""
 
 

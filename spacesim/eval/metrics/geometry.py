@@ -42,7 +42,7 @@ class GeometryConfig:
     share: float = 0.01  #: of the object's size, the distance of precision, recall and floaters
     voxels: int = 128  #: of the overlap, along the object's size
     seed: int = 0  #: of the samples
-    mesh: MeshConfig = field(default_factory=MeshConfig)  #: how the run's surface is found. All chosen.
+    mesh: MeshConfig = field(default_factory=MeshConfig)  #: how the run's surface is found
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.voxels < 2 or not 0 < self.share < 1:

@@ -46,8 +46,8 @@ def training_pixels(dataset: Dataset, box: SceneBox, suns: bool) -> Pixels:
     for frame in dataset.train:
         if suns and frame.sun is None:
             raise InputError(
-                f"{dataset.root}: expected sun_direction in every training frame, or the method nerf, which is not "
-                f"told the Sun, found none in {frame.file_path}"
+                f"{dataset.root}: expected sun_direction in every training frame, or the method nerf, which takes "
+                f"no Sun, found none in {frame.file_path}"
             )
     parts: list[tuple[np.ndarray, ...]] = []
     outside: list[str] = []

@@ -2,7 +2,7 @@
 directions, is square, uint8 RGB and comes out the same on every call.
 
 Row 0 is the top of the image, where v = 1. Normal maps hold (n + 1) / 2 of tangent-space normals, x along u (to the
-right), y along v (up), as in glTF. All shapes and strengths are chosen.
+right), y along v (up), as in glTF. No shape or strength in them is measured.
 """
 
 from functools import cache

@@ -4,7 +4,8 @@ Body axes: +x the camera looks along, +z the side with cells and star tracker, w
 the middle of the body.
 
 The body has the size of the CubeSat Design Specification (Cal Poly, revision 14.1, 2022) for 6U: 226.3 mm by 100 mm
-by 366 mm with rails 8.5 mm wide. Cells are 40 mm by 80 mm, as common triple-junction ones are. The rest is chosen.
+by 366 mm with rails 8.5 mm wide. Cells are 40 mm by 80 mm, as common triple-junction ones are. The rest is
+that of no real one.
 """
 
 import numpy as np

@@ -6,7 +6,7 @@ Craters have the shape of fresh simple ones (Pike, "Size-dependence in the shape
 moon", 1977: depth 0.196 D, rim height 0.036 D), each made shallower by an age drawn at random, and diameters after
 a power law, N(>D) ~ D^-2, as near saturation (Gault 1970, "Saturation and equilibrium conditions for impact
 cratering on the lunar surface"). Boulders follow N(>D) ~ D^-3, as counted on Itokawa (Michikami et al. 2008, 3.1).
-Form, roughness, numbers and seed are chosen. One facet is about 5 m wide, so nothing smaller is there.
+Form, roughness and numbers are those of no real body. One facet is about 5 m wide, so nothing smaller is there.
 """
 
 from dataclasses import replace

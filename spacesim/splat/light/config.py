@@ -32,13 +32,13 @@ class LightConfig:
         if not 0 <= self.bounce <= MAX_EMITTERS:
             raise InputError(f"bounce: expected 0 to {MAX_EMITTERS}, found {self.bounce}")
         if self.bounce and not self.field.surface:
-            found = "a field that is told directions"
-            raise InputError(f"bounce: expected 0 or field.inputs surface, whose normals it needs, found {found}")
+            found = "a field that takes directions"
+            raise InputError(f"bounce: expected 0 or light.field.inputs=surface, whose normals it needs, found {found}")
         if self.shadow and not self.field.knows_sun:
             raise InputError("field: expected inputs that tell of the Sun, which casts shadows, found view")
         for name in ("tone", "exposure"):
             if getattr(self, name) is not None and not self.linear:
-                raise InputError(f"{name}: expected linear colours (linear = true), found sRGB values")
+                raise InputError(f"{name}: expected linear colours (light.linear = true), found sRGB values")
         check_choices(self)
         if self.exposure is not None and not abs(self.exposure) <= MAX_EXPOSURE:
             raise InputError(f"exposure: expected -{MAX_EXPOSURE} to {MAX_EXPOSURE} EV, found {self.exposure}")

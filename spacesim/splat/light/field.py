@@ -20,17 +20,17 @@ TURNED = 0.2  #: a surface with n . s of at most -TURNED is turned away from the
 
 @dataclass(frozen=True)
 class DirectionsConfig:
-    """The field is told the directions of Sun and view, as in the thesis."""
+    """The field takes the directions of Sun and view, as in the thesis."""
 
     kind: ClassVar[str] = "directions"
 
-    sun: Encoding = field(default_factory=Encoding)  #: how the Sun's direction is told
-    view: Encoding = field(default_factory=Encoding)  #: how the view's direction is told
+    sun: Encoding = field(default_factory=Encoding)  #: how the Sun's direction is encoded
+    view: Encoding = field(default_factory=Encoding)  #: how the view's direction is encoded
 
 
 @dataclass(frozen=True)
 class SurfaceConfig:
-    """Each Gaussian learns a normal, too, and the field is told the cosines of a reflectance model about it
+    """Each Gaussian learns a normal, too, and the field takes the cosines of a reflectance model about it
     (`surface_cosines`): what one side of a body has taught then serves the others, and Suns never seen. Ours.
 
     Directions beside the cosines teach it the Suns of training by heart: by default they say nothing (one constant).
@@ -44,11 +44,11 @@ class SurfaceConfig:
 
 @dataclass(frozen=True)
 class ViewAloneConfig:
-    """The field is told the view's direction alone: 4.2 without s, for pictures that do not name their Sun."""
+    """The field takes the view's direction alone: 4.2 without s, for pictures that do not name their Sun."""
 
     kind: ClassVar[str] = "view"
 
-    view: Encoding = field(default_factory=Encoding)  #: how the view's direction is told
+    view: Encoding = field(default_factory=Encoding)  #: how the view's direction is encoded
 
 
 NO_SUN = Encoding("harmonics", 0)  #: in its place: one constant, as there is no product of nothing
@@ -61,7 +61,7 @@ class FieldConfig:
     features: int = 128  #: learned numbers that each Gaussian has for the network
     width: int = 256  #: units of a hidden layer
     layers: int = 3  #: matrix products: 3 are two hidden layers (the thesis says "depth 3", which can mean either)
-    #: what the network is told of Sun and view: their directions (thesis), cosines about a learned normal, or the view
+    #: what the network is given of Sun and view: their directions (thesis), cosines about a learned normal, or the view
     #: alone, for pictures that do not name their Sun
     inputs: DirectionsConfig | SurfaceConfig | ViewAloneConfig = field(default_factory=DirectionsConfig)
     #: learned numbers that each training picture has for the network, 0 for none; other pictures are drawn with their
@@ -89,7 +89,7 @@ class FieldConfig:
 
     @property
     def surface(self) -> bool:
-        """Whether each Gaussian has a normal, and the network is told the cosines about it."""
+        """Whether each Gaussian has a normal, and the network takes the cosines about it."""
         return isinstance(self.inputs, SurfaceConfig)
 
     @property
@@ -160,7 +160,7 @@ def sun_adjoint(
     grad_encoding: Float,
     batch: PaddedBatch,
 ) -> Float:
-    """Float [3]: gradient of the Sun's direction through what the network is told of it; shadows count as given.
+    """Float [3]: gradient of the Sun's direction through what the network is given of it; shadows count as given.
     grad_items, grad_facing: as in `normals_adjoint`;  grad_encoding: of what `FieldConfig.sun` says, then of whatever
     """
     sun = ad.Array3f(inputs.sun)

@@ -2,10 +2,9 @@
 
 Damped Gauss-Newton steps (Levenberg 1944, Marquardt 1963) on SE(3), from coarse and blurred pictures to the picture
 itself. They start from the best of random poses about the given one, each drawn small and panned to fit the picture by
-correlation: a camera's turn about itself moves what it sees and hardly changes it. Such a step asks for the derivative
-of every pixel, an adjoint gives that of one number: so derivatives are central differences of 12 drawn pictures. Of
-three views tried, Adam on the adjoint's gradient came to nearly the same pose in two, taking twice as long, and ran
-away in the third.
+correlation: a camera's turn about itself moves what it sees and hardly changes it. A step needs the derivatives of
+every pixel, and an adjoint gives those of one number alone: so they are central differences of 12 rendered pictures.
+Adam, which does with the adjoint's gradient, takes twice as long and diverges from some poses.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Tiles of a picture: their shape, the lists of the splats that each blends, and which pixels a lane holds."""
+"""Tiles of a picture: their shape, the lists of the splats that each blends, and which pixels a thread holds."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ STEPS = 8  #: sizes of arrays from one power of two to the next, as a rule
 
 @dataclass(frozen=True)
 class TileShape:
-    """A tile of width x height pixels is blended by `lanes` lanes; each holds `columns` columns of `rows` pixels."""
+    """A tile of width x height pixels is blended by `lanes` threads; each holds `columns` columns of `rows` pixels."""
 
     width: int  #: pixels
     height: int  #: pixels
@@ -21,7 +21,7 @@ class TileShape:
 
     @property
     def pixels(self) -> int:
-        """Pixels a lane."""
+        """Pixels a thread."""
         return self.width * self.height // self.lanes
 
     @property

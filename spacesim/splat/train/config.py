@@ -44,7 +44,7 @@ WEIGHTS = (
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes, splatfacto's values; those of light are chosen. Those of the means and the networks fall
+    """Adam's step sizes; those of the Gaussians are splatfacto's. Those of the means and the networks fall
     exponentially; that of the means is per metre of scene scale."""
 
     means: float = 1.6e-4  #: of the centres, at the start
@@ -123,7 +123,7 @@ class TrainConfig:
         if self.init_box is not None and not 0 < self.init_box <= MAX_BOX:
             raise InputError(f"init_box: expected a number above 0, at most {MAX_BOX:g}, found {self.init_box}")
         if self.init_box is not None and self.init != "random":
-            raise InputError(f"init_box: expected init random beside it, found {self.init}")
+            raise InputError(f"init_box: expected init=random beside it, found {self.init or 'none'}")
         for name in ("iterations", "init_count"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: expected at least 1, found {getattr(self, name)}")
@@ -137,7 +137,7 @@ class TrainConfig:
             check_ranges(self, means_steps=(1, MAX_STEPS))
         check_ranges(self, ssim_weight=(0, 1), seed=(0, 2**63), **{name: (0, MAX_LOSS_WEIGHT) for name in WEIGHTS})
         if self.sun == "unknown" and not (self.light and self.light.field.knows_sun):
-            raise InputError(f"sun: expected a method that is told the Sun, as shadow-map, found {self.method}")
+            raise InputError(f"sun: expected a method that takes the Sun, as shadow-map, found {self.method}")
         if self.visibility_weight > 0 and not (self.light and self.light.shadow):
             raise InputError(f"visibility_weight: expected a method with shadows, found {self.method}")
         if self.prior == "mesh" and not self.shape_terms:

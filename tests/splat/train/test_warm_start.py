@@ -312,7 +312,7 @@ def test_a_box_is_as_wide_as_it_should_be(meshed):
     assert 0.8 < object_size(points) < 1.1
     with pytest.raises(InputError, match="init_box"):
         object_size(replace(points, ply_file_path=None))
-    with pytest.raises(InputError, match="init random"):
+    with pytest.raises(InputError, match="init_box: expected init=random beside it, found mesh"):
         replace(BASE, init="mesh", init_box=10.0)
 
 

@@ -83,7 +83,7 @@ def test_a_run_tells_the_sun_of_a_new_picture(small_dataset, quick, tmp_path):
     with pytest.raises(InputError, match=r"image: expected \["):
         estimate_sun(run, picture[1:], frame.camera)
     plain = train(small_dataset, tmp_path / "plain", replace(preset("demo"), init_count=100, iterations=3))
-    with pytest.raises(InputError, match="run: expected one of a method that is told the Sun, found vanilla"):
+    with pytest.raises(InputError, match="run: expected one of a method that takes the Sun, found vanilla"):
         estimate_sun(plain, picture, frame.camera)
 
 
@@ -125,7 +125,7 @@ def test_first_suns_that_cannot_be_are_told(damage, tmp_path):
 
 
 def test_what_cannot_be_estimated_is_told(small_dataset, tmp_path):
-    with pytest.raises(InputError, match="sun: expected a method that is told the Sun, as shadow-map, found vanilla"):
+    with pytest.raises(InputError, match="sun: expected a method that takes the Sun, as shadow-map, found vanilla"):
         with_settings(preset("demo"), {"sun": "unknown"})
     few = replace(small_dataset, train=small_dataset.train[:3])
     with pytest.raises(InputError, match="sun: expected at least 8 training pictures to estimate it, found 3"):
