@@ -56,7 +56,8 @@ def motion_of(messages: Mapping[str, Sequence[Path]], with_sun: bool = True) -> 
     """What the messages of each body, "camera" and "target", tell together. The Earth is in the centre where
     CENTER_NAME says so; with_sun: in axes of J2000 its Sun is where the Earth's orbit says.
 
-    Raises InputError, naming the file, for what is no such message, and where frames, centres or time systems differ.
+    Raises InputError, naming the file, for what is no such message, where frames, centres or time systems differ, and
+    with_sun for an orbit about another body or in other axes, and for attitudes alone.
     """
     every = [(body, read_message(path)) for body, paths in messages.items() for path in paths]
     orbits = [message for _, message in every if message.kind == "OEM"]
@@ -72,14 +73,19 @@ def motion_of(messages: Mapping[str, Sequence[Path]], with_sun: bool = True) -> 
                 expected = f"the {what.replace('_', ' ')} {getattr(first, what)}, as in {first.path}"
                 raise InputError(f"{other.path}: expected {expected}, found {getattr(other, what)}")
     parts = [_motion(message, body) for body, message in every]
-    if orbits and orbits[0].center == "EARTH":
-        day, ends = orbits[0].day, orbits[0].times[[0, -1]]
+    if orbits and first.center == "EARTH":
+        day, ends = first.day, first.times[[0, -1]]
         parts.append(
             Motion(day, earth=Track("position of the Earth", _distinct(ends), np.zeros((len(_distinct(ends)), 3))))
         )
-        if with_sun and first.frame in J2000_FRAMES:
-            times = orbits[0].times
-            parts.append(Motion(day, sun=Track("direction of the Sun", times, sun_direction(day, times))))
+    if with_sun:
+        if not orbits or first.center != "EARTH" or first.frame not in J2000_FRAMES:
+            known = f"an orbit about EARTH in {', '.join(J2000_FRAMES)}"
+            found = f"an orbit about {first.center} in {first.frame}" if orbits else "attitudes alone"
+            expected = f"sun (--sun), or a table with a Sun, as it is computed for {known} only"
+            raise InputError(f"{first.path}: expected {expected}, found {found}")
+        day, times = first.day, first.times
+        parts.append(Motion(day, sun=Track("direction of the Sun", times, sun_direction(day, times))))
     return merge(parts)
 
 
