@@ -75,9 +75,8 @@ def motion_of(messages: Mapping[str, Sequence[Path]], with_sun: bool = True) -> 
     parts = [_motion(message, body) for body, message in every]
     if orbits and first.center == "EARTH":
         day, ends = first.day, first.times[[0, -1]]
-        parts.append(
-            Motion(day, earth=Track("position of the Earth", _distinct(ends), np.zeros((len(_distinct(ends)), 3))))
-        )
+        earth = Track("position of the Earth", _distinct(ends), np.zeros((len(_distinct(ends)), 3)))
+        parts.append(Motion(day, first.time_system, earth=earth))
     if with_sun:
         if not orbits or first.center != "EARTH" or first.frame not in J2000_FRAMES:
             known = f"an orbit about EARTH in {', '.join(J2000_FRAMES)}"
@@ -85,7 +84,9 @@ def motion_of(messages: Mapping[str, Sequence[Path]], with_sun: bool = True) -> 
             expected = f"sun (--sun), or a table with a Sun, as it is computed for {known} only"
             raise InputError(f"{first.path}: expected {expected}, found {found}")
         day, times = first.day, first.times
-        parts.append(Motion(day, sun=Track("direction of the Sun", times, sun_direction(day, times))))
+        parts.append(
+            Motion(day, first.time_system, sun=Track("direction of the Sun", times, sun_direction(day, times)))
+        )
     return merge(parts)
 
 
@@ -96,9 +97,9 @@ def _distinct(ends: Array) -> Array:
 def _motion(message: Message, body: str) -> Motion:
     if message.kind == "OEM":
         track = Track(str(message.path), message.times, message.values[:, :3], message.values[:, 3:])
-        return Motion(message.day, **{body: track})  # type: ignore[arg-type]
+        return Motion(message.day, message.time_system, **{body: track})  # type: ignore[arg-type]
     turn = Attitude(str(message.path), message.times, message.values)
-    return Motion(message.day, **{f"{body}_turn": turn})  # type: ignore[arg-type]
+    return Motion(message.day, message.time_system, **{f"{body}_turn": turn})  # type: ignore[arg-type]
 
 
 def read_message(path: Path) -> Message:

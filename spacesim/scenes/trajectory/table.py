@@ -106,7 +106,7 @@ def _motion(path: Path, columns: Columns) -> Motion:
             row = int((~(exposure > 0)).argmax())
             raise InputError(f"exposure: expected a number above 0, found {exposure[row]:g} in row {row + 1}")
         tracks["exposure"] = Track("exposure", times, exposure[:, None])
-    return Motion(day, "time_s" in columns or "time_utc" in columns, **tracks)  # type: ignore[arg-type]
+    return Motion(day, timed="time_s" in columns or "time_utc" in columns, **tracks)  # type: ignore[arg-type]
 
 
 def _check_names(path: Path, columns: Columns) -> None:

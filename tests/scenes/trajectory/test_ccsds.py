@@ -270,6 +270,24 @@ def test_frames_whose_sun_is_computed_are_documented(tmp_path, frame):
     assert frame in (Path(__file__).parents[3] / "docs/how-to/trajectory.md").read_text(encoding="utf-8")
 
 
+def test_a_table_beside_messages_of_another_time_system(tmp_path):
+    """UTC and TDB are 69 s apart: never taken for each other, whichever body either tells."""
+    table = tmp_path / "camera.csv"
+    table.write_text(f"time_utc,camera_x_m,camera_y_m,camera_z_m\n{epoch(0)},1,0,0\n{epoch(540)},1,0,0\n")
+    target, camera = TargetSphere(np.zeros(3), 1.0), CameraConfig((16, 16))
+    for system in ("TDB", "TAI"):
+        rig = FileRig(path=str(table), target=(str(oem(tmp_path / "t.oem", TIMES, TIME_SYSTEM=system)),))
+        with pytest.raises(InputError, match=f"rig: expected one time system in all of its files .* UTC and {system}"):
+            plan(rig, target, camera, 0)
+    oem(tmp_path / "t.oem", TIMES)
+    assert len(plan(rig, target, camera, 0)[0]) == 2
+    both = FileRig(
+        camera=(str(oem(tmp_path / "c.oem", TIMES, TIME_SYSTEM="TDB")),),
+        target=(str(oem(tmp_path / "t.oem", TIMES, 1e-6, TIME_SYSTEM="TDB")),),
+    )
+    assert len(plan(both, target, camera, 0)[0]) == len(TIMES)  # Earth and Sun in their system too
+
+
 def test_messages_that_do_not_fit(tmp_path):
     first = oem(tmp_path / "a.oem", TIMES)
 
