@@ -136,6 +136,10 @@ def test_what_is_wrong_is_said_in_one_sentence(tmp_path, name, columns, message)
         ("a.json", b'[{"time_s": 1}, {"time": 2}]', "expected the same columns in every row, found 'time' not in all"),
         ("a.json", b'{"time_s": [1, 2], "exposure": [1]}', "expected columns of one length, found 1 and 2"),
         ("a.json", b'{"time_s": [[1], 2]}', "time_s: expected a number, found '\\[1\\]' in row 1"),
+        ("a.json", b'{"time_s": [0, true, 2]}', "time_s: expected a number, found 'True' in row 2"),
+        ("a.json", b'[{"time_s": false}]', "time_s: expected a number, found 'False' in row 1"),
+        ("a.json", b'{"time_s": [1], "time_s": [2]}', "a.json: expected each column once, found 'time_s' twice"),
+        ("a.json", b'[{"time_s": 1}, {"time_s": 2, "time_s": 3}]', "expected each column once, found 'time_s' twice"),
         ("a.json", b"[]", "expected a header and at least one row, found nothing"),
     ],
 )
