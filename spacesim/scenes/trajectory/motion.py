@@ -18,12 +18,17 @@ from spacesim.scenes.trajectory.tracks import Attitude, Track
 DAY = 86_400.0
 """Seconds."""
 
+MAX_PLACE, MAX_SPEED = 1e15, 299_792_458.0
+"""Metres of a coordinate, 6,700 times the Earth's distance from the Sun, and metres a second of one, light's."""
+
 _CLOCK = ("day", "time_system", "timed")  # fields of a motion that are no tracks
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What is known of a motion; None: nothing. All in one world frame, metres, seconds."""
+    """What is known of a motion; None: nothing. All in one world frame, metres, seconds.
+
+    Raises InputError for positions and velocities that nothing has."""
 
     day: int | None = None  #: from whose midnight times count (a proleptic ordinal), None: a clock of its own
     time_system: str = "UTC"  #: of the calendar: "UTC", "TDB", ...; means nothing to a clock of its own
@@ -35,6 +40,12 @@ class Motion:
     earth: Track | None = None  #: position of the Earth's centre
     sun: Track | None = None  #: direction towards the Sun
     exposure: Track | None = None  #: display value of a radiance of 1 W m^-2 sr^-1
+
+    def __post_init__(self) -> None:
+        for track in (self.camera, self.target, self.earth):
+            if track is not None:
+                _check_size(track.name, track.values, MAX_PLACE, "m")
+                _check_size(track.name, track.values[:0] if track.rates is None else track.rates, MAX_SPEED, "m/s")
 
     @property
     def tracks(self) -> dict[str, Track | Attitude]:
@@ -66,6 +77,15 @@ class Motion:
         minutes, micro = divmod(rest, 60_000_000)
         day = date.fromordinal(self.day) + timedelta(days)
         return f"{day.isoformat()}T{minutes // 60:02d}:{minutes % 60:02d}:{micro / 1e6:09.6f}"
+
+
+def _check_size(name: str, values: Array, most: float, unit: str) -> None:
+    """Raise InputError where one of `values` [N, 3] is beyond `most`."""
+    beyond = (np.abs(values) > most).any(axis=1)
+    if beyond.any():
+        row = int(beyond.argmax())
+        expected = f"up to {most:g} {unit} along an axis"
+        raise InputError(f"{name}: expected {expected}, found {values[row].tolist()} in row {row + 1}")
 
 
 @dataclass(frozen=True, eq=False)

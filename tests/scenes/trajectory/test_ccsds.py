@@ -310,6 +310,13 @@ def test_messages_that_do_not_fit(tmp_path):
     assert motion_of({"camera": [first, icrf]}).camera_turn is not None
 
 
+def test_a_message_of_a_place_that_nothing_has(tmp_path):
+    path = oem(tmp_path / "a.oem", TIMES)
+    path.write_text(path.read_text().replace(" 0.0 ", " 1e300 ", 1))
+    with pytest.raises(InputError, match=r"a.oem: expected up to 1e\+15 m along an axis, found .*1e\+303.* in row 1"):
+        motion_of({"camera": [path]})
+
+
 LINE = "2030-03-01T12:00:00 0 0 0 1"
 
 

@@ -79,6 +79,16 @@ def changed(**columns):
         (changed(time_s=[0.0, 0.0, 1.0]), "times that grow, found in row 2 one that repeats that of row 1"),
         (changed(time_s=[0.0, float("nan"), 1.0]), "expected finite times, found nan in row 2"),
         (changed(camera_y_m=[0.0, float("inf"), 1.0]), r"finite numbers, found \[2.0, inf, 8.0\] in row 2"),
+        (
+            changed(camera_y_m=[0.0, 1e300, 1.0]),
+            r"camera position: expected up to 1e\+15 m .* found \[2.0, 1e\+300, 8.0\] ",
+        ),
+        (changed(camera_y_m=[0.0, 1.0, -1.1e15]), r"expected up to 1e\+15 m along an axis, found .* in row 3"),
+        (
+            changed(**{f"camera_v{a}_m_s": [0, 0, 3e8] for a in "xyz"}),
+            r"camera position: expected up to 2.99792e\+08 m/s along an axis, found .* in row 3",
+        ),
+        (changed(camera_y_m=[0.0, 1.0, 1e15]), None),
         (changed(camera_y_m=[0.0, "x", 1.0]), "camera_y_m: expected a number, found 'x' in row 2"),
         (changed(camera_y_m=[0.0, "", 1.0]), "camera_y_m: expected a number, found '' in row 2"),
         ({k: v for k, v in ROWS.items() if k != "camera_y_m"}, "camera_y_m: expected a column beside camera_x_m"),
