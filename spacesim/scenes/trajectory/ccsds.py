@@ -124,6 +124,10 @@ def _message(path: Path, text: str) -> Message:
     for what, names in (("frame", known), ("time system", systems), ("center", centers)):
         if len(set(names)) > 1:
             raise InputError(f"expected one {what} in all segments, found {' and '.join(sorted(set(names)))}")
+    for segment in () if is_orbit else segments:  # lines of other types have other lengths
+        attitude = _meta(segment.meta, "ATTITUDE_TYPE").upper()
+        if attitude not in QUATERNIONS:
+            raise InputError(f"ATTITUDE_TYPE: expected one of {', '.join(QUATERNIONS)}, found {attitude}")
     day, times, values = 0, np.empty(0), np.empty((0, 6 if is_orbit else 4))
     for number, segment in enumerate(segments):
         of_segment, seconds = read_epochs([line[0] for line in segment.lines], "epoch")
@@ -220,9 +224,6 @@ def _outer(meta: Mapping[str, str]) -> tuple[str, bool]:
 
 def _world_from_body(meta: Mapping[str, str], numbers: Array) -> Array:
     """[N, 4] quaternions (w, x, y, z) of an AEM's [N, 4]. Version 2 has A2B and LAST for all."""
-    kind = _meta(meta, "ATTITUDE_TYPE").upper()
-    if kind not in QUATERNIONS:
-        raise InputError(f"ATTITUDE_TYPE: expected one of {', '.join(QUATERNIONS)}, found {kind}")
     order, direction = meta.get("QUATERNION_TYPE", "LAST").upper(), meta.get("ATTITUDE_DIR", "A2B").upper()
     for key, value, allowed in (
         ("QUATERNION_TYPE", order, ("FIRST", "LAST")),

@@ -336,6 +336,16 @@ LINE = "2030-03-01T12:00:00 0 0 0 1"
             kvn("AEM", {**AEM, "ATTITUDE_TYPE": "SPIN"}, LINE),
             "ATTITUDE_TYPE: expected one of .* found SPIN",
         ),
+        (
+            kvn("AEM", {**AEM, "ATTITUDE_TYPE": "EULER_ANGLE"}, "2030-03-01T12:00:00 10 20 30"),
+            "ATTITUDE_TYPE: expected one of QUATERNION, .* found EULER_ANGLE",
+        ),
+        (
+            "<aem><segment><metadata><REF_FRAME_A>ICRF</REF_FRAME_A><REF_FRAME_B>SC_BODY_1</REF_FRAME_B><TIME_SYSTEM>UTC"
+            "</TIME_SYSTEM><ATTITUDE_TYPE>euler_angle</ATTITUDE_TYPE></metadata><data><attitudeState><eulerAngle><EPOCH>"
+            "2030-03-01T12:00:00</EPOCH><ANGLE_1>1</ANGLE_1></eulerAngle></attitudeState></data></segment></aem>",
+            "ATTITUDE_TYPE: expected one of QUATERNION, .* found EULER_ANGLE",
+        ),
         (kvn("AEM", {**AEM, "ATTITUDE_DIR": "C2D"}, LINE), "ATTITUDE_DIR: expected A2B or B2A, found C2D"),
         (kvn("AEM", AEM, LINE[:-1]), "expected an epoch and 4 numbers, found '2030-03-01T12:00:00 0 0 0'"),
         (kvn("AEM", AEM, LINE.replace(" 1", " x")), "expected numbers in every line of data"),
