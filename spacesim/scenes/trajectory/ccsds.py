@@ -56,7 +56,8 @@ def motion_of(messages: Mapping[str, Sequence[Path]], with_sun: bool = True) -> 
     """What the messages of each body, "camera" and "target", tell together. The Earth is in the centre where
     CENTER_NAME says so; with_sun: in axes of J2000 its Sun is where the Earth's orbit says.
 
-    Raises InputError, naming the file, for what is no such message, and where frames, centres or time systems differ.
+    Raises InputError, naming the file, for what is no such message, where frames, centres or time systems differ, and
+    with_sun for an orbit about another body or in other axes, and for attitudes alone.
     """
     every = [(body, read_message(path)) for body, paths in messages.items() for path in paths]
     orbits = [message for _, message in every if message.kind == "OEM"]
@@ -72,14 +73,20 @@ def motion_of(messages: Mapping[str, Sequence[Path]], with_sun: bool = True) -> 
                 expected = f"the {what.replace('_', ' ')} {getattr(first, what)}, as in {first.path}"
                 raise InputError(f"{other.path}: expected {expected}, found {getattr(other, what)}")
     parts = [_motion(message, body) for body, message in every]
-    if orbits and orbits[0].center == "EARTH":
-        day, ends = orbits[0].day, orbits[0].times[[0, -1]]
+    if orbits and first.center == "EARTH":
+        day, ends = first.day, first.times[[0, -1]]
+        earth = Track("position of the Earth", _distinct(ends), np.zeros((len(_distinct(ends)), 3)))
+        parts.append(Motion(day, first.time_system, earth=earth))
+    if with_sun:
+        if not orbits or first.center != "EARTH" or first.frame not in J2000_FRAMES:
+            known = f"an orbit about EARTH in {', '.join(J2000_FRAMES)}"
+            found = f"an orbit about {first.center} in {first.frame}" if orbits else "attitudes alone"
+            expected = f"sun (--sun), or a table with a Sun, as it is computed for {known} only"
+            raise InputError(f"{first.path}: expected {expected}, found {found}")
+        day, times = first.day, first.times
         parts.append(
-            Motion(day, earth=Track("position of the Earth", _distinct(ends), np.zeros((len(_distinct(ends)), 3))))
+            Motion(day, first.time_system, sun=Track("direction of the Sun", times, sun_direction(day, times)))
         )
-        if with_sun and first.frame in J2000_FRAMES:
-            times = orbits[0].times
-            parts.append(Motion(day, sun=Track("direction of the Sun", times, sun_direction(day, times))))
     return merge(parts)
 
 
@@ -90,9 +97,9 @@ def _distinct(ends: Array) -> Array:
 def _motion(message: Message, body: str) -> Motion:
     if message.kind == "OEM":
         track = Track(str(message.path), message.times, message.values[:, :3], message.values[:, 3:])
-        return Motion(message.day, **{body: track})  # type: ignore[arg-type]
+        return Motion(message.day, message.time_system, **{body: track})  # type: ignore[arg-type]
     turn = Attitude(str(message.path), message.times, message.values)
-    return Motion(message.day, **{f"{body}_turn": turn})  # type: ignore[arg-type]
+    return Motion(message.day, message.time_system, **{f"{body}_turn": turn})  # type: ignore[arg-type]
 
 
 def read_message(path: Path) -> Message:
@@ -117,6 +124,10 @@ def _message(path: Path, text: str) -> Message:
     for what, names in (("frame", known), ("time system", systems), ("center", centers)):
         if len(set(names)) > 1:
             raise InputError(f"expected one {what} in all segments, found {' and '.join(sorted(set(names)))}")
+    for segment in () if is_orbit else segments:  # lines of other types have other lengths
+        attitude = _meta(segment.meta, "ATTITUDE_TYPE").upper()
+        if attitude not in QUATERNIONS:
+            raise InputError(f"ATTITUDE_TYPE: expected one of {', '.join(QUATERNIONS)}, found {attitude}")
     day, times, values = 0, np.empty(0), np.empty((0, 6 if is_orbit else 4))
     for number, segment in enumerate(segments):
         of_segment, seconds = read_epochs([line[0] for line in segment.lines], "epoch")
@@ -213,9 +224,6 @@ def _outer(meta: Mapping[str, str]) -> tuple[str, bool]:
 
 def _world_from_body(meta: Mapping[str, str], numbers: Array) -> Array:
     """[N, 4] quaternions (w, x, y, z) of an AEM's [N, 4]. Version 2 has A2B and LAST for all."""
-    kind = _meta(meta, "ATTITUDE_TYPE").upper()
-    if kind not in QUATERNIONS:
-        raise InputError(f"ATTITUDE_TYPE: expected one of {', '.join(QUATERNIONS)}, found {kind}")
     order, direction = meta.get("QUATERNION_TYPE", "LAST").upper(), meta.get("ATTITUDE_DIR", "A2B").upper()
     for key, value, allowed in (
         ("QUATERNION_TYPE", order, ("FIRST", "LAST")),

@@ -18,12 +18,20 @@ from spacesim.scenes.trajectory.tracks import Attitude, Track
 DAY = 86_400.0
 """Seconds."""
 
+MAX_PLACE, MAX_SPEED = 1e15, 299_792_458.0
+"""Metres of a coordinate, 6,700 times the Earth's distance from the Sun, and metres a second of one, light's."""
+
+_CLOCK = ("day", "time_system", "timed")  # fields of a motion that are no tracks
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What is known of a motion; None: nothing. All in one world frame, metres, seconds."""
+    """What is known of a motion; None: nothing. All in one world frame, metres, seconds.
+
+    Raises InputError for positions and velocities that nothing has."""
 
     day: int | None = None  #: from whose midnight times count (a proleptic ordinal), None: a clock of its own
+    time_system: str = "UTC"  #: of the calendar: "UTC", "TDB", ...; means nothing to a clock of its own
     timed: bool = True  #: False: times are numbers of rows, and there is nothing between them
     camera: Track | None = None  #: position
     camera_turn: Attitude | None = None  #: world_from_camera, or of the body that carries it
@@ -33,11 +41,17 @@ class Motion:
     sun: Track | None = None  #: direction towards the Sun
     exposure: Track | None = None  #: display value of a radiance of 1 W m^-2 sr^-1
 
+    def __post_init__(self) -> None:
+        for track in (self.camera, self.target, self.earth):
+            if track is not None:
+                _check_size(track.name, track.values, MAX_PLACE, "m")
+                _check_size(track.name, track.values[:0] if track.rates is None else track.rates, MAX_SPEED, "m/s")
+
     @property
     def tracks(self) -> dict[str, Track | Attitude]:
         """All that is known."""
         found: dict[str, Track | Attitude | None]
-        found = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("day", "timed")}
+        found = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _CLOCK}
         return {name: track for name, track in found.items() if track is not None}
 
     def times(self) -> Array:
@@ -45,14 +59,13 @@ class Motion:
         is none, or no pose."""
         main = self.camera or self.camera_turn or self.target or self.target_turn
         if main is None:
-            raise InputError("trajectory: expected a pose of the camera or of the target, found none")
+            raise InputError("rig: expected a pose of the camera or of the target, found none")
         first = max(self.tracks.values(), key=lambda track: float(track.times[0]))
         last = min(self.tracks.values(), key=lambda track: float(track.times[-1]))
         common = main.times[(main.times >= first.times[0]) & (main.times <= last.times[-1])]
         if not len(common):
             raise InputError(
-                f"trajectory: expected a time that all of it covers, found that {last.name} ends before "
-                f"{first.name} begins"
+                f"rig: expected a time that all of it covers, found that {last.name} ends before {first.name} begins"
             )
         return common
 
@@ -64,6 +77,15 @@ class Motion:
         minutes, micro = divmod(rest, 60_000_000)
         day = date.fromordinal(self.day) + timedelta(days)
         return f"{day.isoformat()}T{minutes // 60:02d}:{minutes % 60:02d}:{micro / 1e6:09.6f}"
+
+
+def _check_size(name: str, values: Array, most: float, unit: str) -> None:
+    """Raise InputError where one of `values` [N, 3] is beyond `most`."""
+    beyond = (np.abs(values) > most).any(axis=1)
+    if beyond.any():
+        row = int(beyond.argmax())
+        expected = f"up to {most:g} {unit} along an axis"
+        raise InputError(f"{name}: expected {expected}, found {values[row].tolist()} in row {row + 1}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +106,15 @@ def merge(motions: Sequence[Motion]) -> Motion:
     for other in motions[1:]:
         if (whole.day is None) != (other.day is None):
             raise InputError(
-                "trajectory: expected calendar times in all of its files (time_utc in a table), or in none"
+                "rig: expected calendar times in all of its files (time_utc in a table), or in none, found both"
             )
+        if whole.day is not None and whole.time_system != other.time_system:
+            systems = f"{whole.time_system} and {other.time_system}"
+            raise InputError(f"rig: expected one time system in all of its files (a table's is UTC), found {systems}")
         both = sorted(whole.tracks.keys() & other.tracks.keys())
         if both:
             names = f"{whole.tracks[both[0]].name} and {other.tracks[both[0]].name}"
-            raise InputError(f"trajectory: expected one source of each track, found {names}")
+            raise InputError(f"rig: expected one source of each track, found {names}")
         later = DAY * ((other.day or 0) - (whole.day or 0))
         moved = {name: replace(track, times=track.times + later) for name, track in other.tracks.items()}
         whole = replace(whole, timed=whole.timed and other.timed, **moved)  # type: ignore[arg-type]

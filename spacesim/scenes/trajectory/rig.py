@@ -40,7 +40,7 @@ class TrajectoryRig(Rig):
     step_s: float | None = None  #: seconds between training frames, in place of views
     test_views: int = 0  #: frames kept for testing
     #: the Sun as (azimuth, elevation), degrees, in the trajectory's world frame, where it says nothing of the Sun; ()
-    #: SINGLE_SUN
+    #: SINGLE_SUN, of tables alone
     sun: tuple[tuple[float, float], ...] = ()
     #: quaternion that turns OpenCV camera axes (x right, y down, z forward) into those whose attitude is told, such as
     #: the body's that carries the camera; [0, 1, 0, 0]: those of OpenGL and Blender

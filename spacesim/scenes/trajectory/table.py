@@ -106,7 +106,7 @@ def _motion(path: Path, columns: Columns) -> Motion:
             row = int((~(exposure > 0)).argmax())
             raise InputError(f"exposure: expected a number above 0, found {exposure[row]:g} in row {row + 1}")
         tracks["exposure"] = Track("exposure", times, exposure[:, None])
-    return Motion(day, "time_s" in columns or "time_utc" in columns, **tracks)  # type: ignore[arg-type]
+    return Motion(day, timed="time_s" in columns or "time_utc" in columns, **tracks)  # type: ignore[arg-type]
 
 
 def _check_names(path: Path, columns: Columns) -> None:
@@ -155,7 +155,7 @@ def _numbers(columns: Columns, name: str) -> Array:
     values = columns[name]
     try:
         numbers = np.asarray(values, dtype=np.float64)
-        if numbers.shape == (len(values),):
+        if numbers.shape == (len(values),) and not any(isinstance(value, bool) for value in values):
             return numbers
     except (TypeError, ValueError, OverflowError):
         pass
@@ -168,7 +168,7 @@ def _is_number(value: object) -> bool:
         float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         return False
-    return True
+    return not isinstance(value, bool)
 
 
 def _read_columns(path: Path) -> Columns:
@@ -203,8 +203,18 @@ def _csv(path: Path, content: bytes) -> Columns:
 
 
 def _json(path: Path, content: bytes) -> Columns:
+    def once(pairs: list[tuple[str, object]]) -> dict[str, object]:
+        found: dict[str, object] = {}
+        for name, value in pairs:
+            if name in found:
+                raise InputError(f"{path}: expected each column once, found {name!r} twice")
+            found[name] = value
+        return found
+
     try:
-        value = json.loads(content.decode("utf-8"))
+        value = json.loads(content.decode("utf-8"), object_pairs_hook=once)
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON, found text that breaks off or is malformed ({error})") from None
     if isinstance(value, list) and all(isinstance(row, dict) for row in value):

@@ -1,6 +1,7 @@
 """Orbit and attitude ephemeris messages against the motion that they are written from."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from spacesim.scenes.cameras.rig import TargetSphere, plan
 from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.scenefile import scene_text
 from spacesim.scenes.trajectory.ccsds import motion_of, read_message
-from spacesim.scenes.trajectory.ephemeris import sun_direction
+from spacesim.scenes.trajectory.ephemeris import J2000_FRAMES, sun_direction
 from spacesim.scenes.trajectory.epochs import read_epochs
 from spacesim.scenes.trajectory.rig import FileRig
 
@@ -122,13 +123,13 @@ def test_quaternions_in_every_way_that_they_are_written(tmp_path):
     for number, (changes, q) in enumerate(ways):
         path = tmp_path / f"{number}.aem"
         path.write_text(kvn("AEM", {**AEM, **changes}, f"2030-060T12:00:00 {' '.join(map(str, q))}", "1.0"))
-        motion = motion_of({"camera": [path]})
+        motion = motion_of({"camera": [path]}, with_sun=False)
         turn = motion.camera_turn.at(motion.times())[0]
         np.testing.assert_allclose(turn, [[half, -0.5, 0], [0.5, half, 0], [0, 0, 1]], atol=1e-12)
     second = {key: value for key, value in AEM.items() if key not in ("ATTITUDE_DIR", "QUATERNION_TYPE")}
     lines = f"DATA_START\n2030-060T12:00:00 0 0 {s} {c}\nDATA_STOP"
     (tmp_path / "2.aem").write_text(kvn("AEM", second, lines, "2.0"))
-    again = motion_of({"camera": [tmp_path / "2.aem"]})
+    again = motion_of({"camera": [tmp_path / "2.aem"]}, with_sun=False)
     np.testing.assert_allclose(again.camera_turn.at(again.times())[0], turn, atol=1e-12)
 
 
@@ -187,7 +188,7 @@ def test_damaged_files_end_in_a_sentence(tmp_path):
             cut = int(random.integers(0, 4))
             damaged = tmp_path / f"damaged{path.suffix}"
             damaged.write_bytes(whole[:at] + pieces[number % len(pieces)] + whole[at + cut :])
-            rig = FileRig(path=str(damaged)) if path == table else FileRig(camera=(str(damaged),))
+            rig = FileRig(path=str(damaged)) if path == table else FileRig(camera=(str(damaged),), sun=((45.0, 35.0),))
             try:
                 plan(rig, TargetSphere(np.zeros(3), 1.0), CameraConfig((16, 16)), 0)
             except InputError as error:
@@ -238,6 +239,55 @@ def test_a_sun_of_ones_own_takes_the_place(tmp_path):
     np.testing.assert_allclose(plan(rig, target, camera, 0)[0][0].sun.direction, [0, 1, 0], atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("meta", "found"),
+    [
+        ({"REF_FRAME": "TEME"}, "about EARTH in TEME"),
+        ({"REF_FRAME": "ITRF"}, "about EARTH in ITRF"),
+        ({"CENTER_NAME": "MARS"}, "about MARS in EME2000"),
+    ],
+)
+def test_a_sun_that_cannot_be_computed_is_asked_for(tmp_path, meta, found):
+    """Of other axes, other bodies and attitudes alone; with one told they are as good as others."""
+    target, camera = TargetSphere(np.zeros(3), 1.0), CameraConfig((16, 16))
+    rig = FileRig(camera=(str(oem(tmp_path / "a.oem", TIMES, **meta)),))
+    expected = r"expected sun \(--sun\), or a table with a Sun, as it is computed for an orbit about EARTH in EME2000, "
+    with pytest.raises(InputError, match=f"a.oem: {expected}.* only, found an orbit {found}$"):
+        plan(rig, target, camera, 0)
+    view = plan(replace(rig, sun=((90.0, 0.0),)), target, camera, 0)[0][0]
+    np.testing.assert_allclose(view.sun.direction, [0, 1, 0], atol=1e-12)
+    assert (view.earth is None) == ("CENTER_NAME" in meta)
+    alone = FileRig(camera=(str(aem(tmp_path / "a.aem", TIMES)),))
+    with pytest.raises(InputError, match=rf"a.aem: {expected}.* only, found attitudes alone$"):
+        plan(alone, target, camera, 0)
+
+
+@pytest.mark.parametrize("frame", J2000_FRAMES)
+def test_frames_whose_sun_is_computed_are_documented(tmp_path, frame):
+    rig = FileRig(camera=(str(oem(tmp_path / "a.oem", TIMES, REF_FRAME=frame)),))
+    view = plan(rig, TargetSphere(np.zeros(3), 1.0), CameraConfig((16, 16)), 0)[0][0]
+    np.testing.assert_allclose(view.sun.direction, sun_direction(*read_epochs([epoch(0)], "t"))[0], atol=1e-12)
+    assert frame in (Path(__file__).parents[3] / "docs/how-to/trajectory.md").read_text(encoding="utf-8")
+
+
+def test_a_table_beside_messages_of_another_time_system(tmp_path):
+    """UTC and TDB are 69 s apart: never taken for each other, whichever body either tells."""
+    table = tmp_path / "camera.csv"
+    table.write_text(f"time_utc,camera_x_m,camera_y_m,camera_z_m\n{epoch(0)},1,0,0\n{epoch(540)},1,0,0\n")
+    target, camera = TargetSphere(np.zeros(3), 1.0), CameraConfig((16, 16))
+    for system in ("TDB", "TAI"):
+        rig = FileRig(path=str(table), target=(str(oem(tmp_path / "t.oem", TIMES, TIME_SYSTEM=system)),))
+        with pytest.raises(InputError, match=f"rig: expected one time system in all of its files .* UTC and {system}"):
+            plan(rig, target, camera, 0)
+    oem(tmp_path / "t.oem", TIMES)
+    assert len(plan(rig, target, camera, 0)[0]) == 2
+    both = FileRig(
+        camera=(str(oem(tmp_path / "c.oem", TIMES, TIME_SYSTEM="TDB")),),
+        target=(str(oem(tmp_path / "t.oem", TIMES, 1e-6, TIME_SYSTEM="TDB")),),
+    )
+    assert len(plan(both, target, camera, 0)[0]) == len(TIMES)  # Earth and Sun in their system too
+
+
 def test_messages_that_do_not_fit(tmp_path):
     first = oem(tmp_path / "a.oem", TIMES)
 
@@ -260,6 +310,13 @@ def test_messages_that_do_not_fit(tmp_path):
     assert motion_of({"camera": [first, icrf]}).camera_turn is not None
 
 
+def test_a_message_of_a_place_that_nothing_has(tmp_path):
+    path = oem(tmp_path / "a.oem", TIMES)
+    path.write_text(path.read_text().replace(" 0.0 ", " 1e300 ", 1))
+    with pytest.raises(InputError, match=r"a.oem: expected up to 1e\+15 m along an axis, found .*1e\+303.* in row 1"):
+        motion_of({"camera": [path]})
+
+
 LINE = "2030-03-01T12:00:00 0 0 0 1"
 
 
@@ -278,6 +335,16 @@ LINE = "2030-03-01T12:00:00 0 0 0 1"
         (
             kvn("AEM", {**AEM, "ATTITUDE_TYPE": "SPIN"}, LINE),
             "ATTITUDE_TYPE: expected one of .* found SPIN",
+        ),
+        (
+            kvn("AEM", {**AEM, "ATTITUDE_TYPE": "EULER_ANGLE"}, "2030-03-01T12:00:00 10 20 30"),
+            "ATTITUDE_TYPE: expected one of QUATERNION, .* found EULER_ANGLE",
+        ),
+        (
+            "<aem><segment><metadata><REF_FRAME_A>ICRF</REF_FRAME_A><REF_FRAME_B>SC_BODY_1</REF_FRAME_B><TIME_SYSTEM>UTC"
+            "</TIME_SYSTEM><ATTITUDE_TYPE>euler_angle</ATTITUDE_TYPE></metadata><data><attitudeState><eulerAngle><EPOCH>"
+            "2030-03-01T12:00:00</EPOCH><ANGLE_1>1</ANGLE_1></eulerAngle></attitudeState></data></segment></aem>",
+            "ATTITUDE_TYPE: expected one of QUATERNION, .* found EULER_ANGLE",
         ),
         (kvn("AEM", {**AEM, "ATTITUDE_DIR": "C2D"}, LINE), "ATTITUDE_DIR: expected A2B or B2A, found C2D"),
         (kvn("AEM", AEM, LINE[:-1]), "expected an epoch and 4 numbers, found '2030-03-01T12:00:00 0 0 0'"),

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny import contents
 
+from spacesim.cli.program import main
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
 from spacesim.data.store import load_truth
@@ -239,10 +240,31 @@ def test_motions_add_up_on_one_clock():
     assert whole.epoch(20.25) == "0001-04-11T00:00:20.250000"
     with pytest.raises(InputError, match="expected one source of each track, found camera position and camera pos"):
         merge([Motion(camera=place), Motion(camera=place)])
-    with pytest.raises(InputError, match="expected calendar times in all of its files"):
+    with pytest.raises(
+        InputError, match=r"rig: expected one time system in all .* \(a table's is UTC\), found TDB and UTC"
+    ):
+        merge([Motion(day=101, time_system="TDB", camera=place), Motion(day=100, sun=sun)])
+    with pytest.raises(InputError, match="rig: expected calendar times in all of its files"):
         merge([Motion(camera=place), Motion(day=1, sun=sun)])
     with pytest.raises(InputError, match="found that camera position ends before sun direction begins"):
         merge([Motion(camera=place), Motion(sun=sun)]).times()
+
+
+def test_files_of_a_scene_that_do_not_fit_are_no_option(tmp_path, capsys):
+    """The command line names `rig`, not --trajectory, which nobody gave."""
+    write(tmp_path / "p.csv", [[0, 9, 0, 0]], ["time_s", "camera_x_m", "camera_y_m", "camera_z_m"])
+    meta = "CENTER_NAME = EARTH\nREF_FRAME = GCRF\nTIME_SYSTEM = UTC"
+    text = f"CCSDS_OEM_VERS = 2.0\nMETA_START\n{meta}\nMETA_STOP\n2030-03-01T12:00:00 7000 0 0 0 7 0\n"
+    (tmp_path / "t.oem").write_text(text)
+    rig = 'rig = { kind = "file", path = "p.csv", target = ["t.oem"] }'
+    (tmp_path / "s.toml").write_text(f'objects = [{{ spacecraft = "boxsat" }}]\n{rig}\n')
+    assert main(["generate", str(tmp_path / "s.toml"), "--out", str(tmp_path / "data")]) == 2
+    assert (
+        capsys.readouterr()
+        .err.splitlines()[-1]
+        .endswith("rig: expected calendar times in all of its files (time_utc in a table), or in none, found both")
+    )
+    assert not (tmp_path / "data").exists()
 
 
 def test_a_dataset_along_a_table(table, tmp_path):

@@ -79,6 +79,16 @@ def changed(**columns):
         (changed(time_s=[0.0, 0.0, 1.0]), "times that grow, found in row 2 one that repeats that of row 1"),
         (changed(time_s=[0.0, float("nan"), 1.0]), "expected finite times, found nan in row 2"),
         (changed(camera_y_m=[0.0, float("inf"), 1.0]), r"finite numbers, found \[2.0, inf, 8.0\] in row 2"),
+        (
+            changed(camera_y_m=[0.0, 1e300, 1.0]),
+            r"camera position: expected up to 1e\+15 m .* found \[2.0, 1e\+300, 8.0\] ",
+        ),
+        (changed(camera_y_m=[0.0, 1.0, -1.1e15]), r"expected up to 1e\+15 m along an axis, found .* in row 3"),
+        (
+            changed(**{f"camera_v{a}_m_s": [0, 0, 3e8] for a in "xyz"}),
+            r"camera position: expected up to 2.99792e\+08 m/s along an axis, found .* in row 3",
+        ),
+        (changed(camera_y_m=[0.0, 1.0, 1e15]), None),
         (changed(camera_y_m=[0.0, "x", 1.0]), "camera_y_m: expected a number, found 'x' in row 2"),
         (changed(camera_y_m=[0.0, "", 1.0]), "camera_y_m: expected a number, found '' in row 2"),
         ({k: v for k, v in ROWS.items() if k != "camera_y_m"}, "camera_y_m: expected a column beside camera_x_m"),
@@ -136,6 +146,10 @@ def test_what_is_wrong_is_said_in_one_sentence(tmp_path, name, columns, message)
         ("a.json", b'[{"time_s": 1}, {"time": 2}]', "expected the same columns in every row, found 'time' not in all"),
         ("a.json", b'{"time_s": [1, 2], "exposure": [1]}', "expected columns of one length, found 1 and 2"),
         ("a.json", b'{"time_s": [[1], 2]}', "time_s: expected a number, found '\\[1\\]' in row 1"),
+        ("a.json", b'{"time_s": [0, true, 2]}', "time_s: expected a number, found 'True' in row 2"),
+        ("a.json", b'[{"time_s": false}]', "time_s: expected a number, found 'False' in row 1"),
+        ("a.json", b'{"time_s": [1], "time_s": [2]}', "a.json: expected each column once, found 'time_s' twice"),
+        ("a.json", b'[{"time_s": 1}, {"time_s": 2, "time_s": 3}]', "expected each column once, found 'time_s' twice"),
         ("a.json", b"[]", "expected a header and at least one row, found nothing"),
     ],
 )
