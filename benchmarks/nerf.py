@@ -34,7 +34,7 @@ from spacesim.learning.prediction import Prediction
 from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.train.train import train
-from spacesim.nerf.train.trainer import Trainer
+from spacesim.nerf.train.trainer import NerfTrainer
 from spacesim.reproduce.frames import places, views
 from spacesim.splat.compose import ComposeConfig, PlacedRun, Pose
 
@@ -98,7 +98,7 @@ def peer_row(data: Dataset, rays: int, iterations: int, repeats: int) -> common.
 
 def step_time(data: Dataset, run: NerfRun, repeats: int) -> common.Timing:
     """Of a step of the trained model, in turns of `proposals_every`, whose steps differ."""
-    trainer = Trainer(data, replace(run.networks.config, occupancy_every=10**6))
+    trainer = NerfTrainer(data, replace(run.networks.config, occupancy_every=10**6))
     trainer.parameters = [value + 0 for value in run.parameters]
     trainer.filled = run.filled + 0
     dr.eval(trainer.parameters, trainer.filled)

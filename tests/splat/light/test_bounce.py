@@ -240,7 +240,7 @@ def test_presets_bounce_where_shadows_are_known(name):
 
 
 def test_impossible_bounces_are_named():
-    with pytest.raises(InputError, match=r"bounce: expected 0 or field\.inputs surface"):
+    with pytest.raises(InputError, match=r"bounce: expected 0 or light\.field\.inputs=surface"):
         LightConfig(FieldConfig(), bounce=10)
     for bounce in (-1, 2**14 + 1):
         with pytest.raises(InputError, match=f"bounce: expected 0 to 16384, found {bounce}"):
