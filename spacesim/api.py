@@ -190,13 +190,12 @@ def train(
             settings_hint = f"; did you mean settings={{{inner[0]!r}: {value!r:.60}}}?" if inner else ""
             hint = settings_hint or did_you_mean(name, kind.__dataclass_fields__)
             raise InputError(f"{name}: expected a field of {kind.__name__}, found none of that name{hint}")
-    if options.get("iterations") is not None:
-        config = methods.shortened(config, field_value(kind, "iterations", options["iterations"]))
     options = {name: field_value(kind, name, value) for name, value in options.items()}
+    before = config.method
+    config = methods.shortened(config, options.get("iterations"))
     config = methods.with_settings(replace(config, **options), settings or {})
-    named = choices.get("method")
-    if named is not None and config.method != methods.preset("fast", named).method:
-        raise InputError(f"light: expected that of the method {named}, found that of {config.method}")
+    if "method" in choices and config.method != before:
+        raise InputError(f"light: expected that of the method {before}, found that of {config.method}")
     dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
 
     def tell(state: Any) -> None:

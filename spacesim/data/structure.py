@@ -65,7 +65,7 @@ def kind_of(cls: Any) -> str | None:
     return _kind_of(cls)
 
 
-@cache
+@cache  # behind a function whose argument type checkers take to be any class
 def _kind_of(cls: Any) -> str | None:
     tag = cls.__dict__.get("kind")
     return tag if isinstance(tag, str) and all(f.name != "kind" for f in fields(cls)) else None
