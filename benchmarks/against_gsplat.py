@@ -209,7 +209,7 @@ def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainC
     state = strategy.initialize_state(scene_scale=schedule.scene_scale)
     for index in range(config.iterations):
         view = schedule.views.at_step(index)
-        optimizers["means"].param_groups[0]["lr"] = next(iter(schedule.rates(index)))
+        optimizers["means"].param_groups[0]["lr"] = schedule.rates(index)[0]
         renamed = {
             "means": splats["means"],
             "log_scales": splats["scales"],

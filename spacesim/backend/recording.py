@@ -5,6 +5,7 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache, update_wrapper
+from operator import attrgetter
 from typing import Any, Generic, ParamSpec, TypeVar, overload
 
 P = ParamSpec("P")
@@ -82,16 +83,16 @@ class Recorded(Generic[P, R]):
 
         update_wrapper(self, function)
         self.traced, self._elements, self._names = function, elements, _Names()
-        now = self._now = _Arguments()
+        now = self._now = _Arguments(function)
 
-        def replay(_: str, arrays: list[Any]) -> Any:
-            _made.count += 1
-            rest = iter(arrays)
-            return function(*_joined(now.arguments, rest), **_joined(now.named, rest))
+        # Dr.Jit walks through what a function has from outside at every call, but not through its defaults.
+        def replay(_: str, arrays: list[Any], trace: Callable[[list[Any]], Any] = now.trace) -> Any:
+            return trace(arrays)
 
         # who looks around for hours makes more recordings than are kept, and need not hear of it
         self._frozen = dr.freeze(replay, limit=limit, warn_after=2**31 - 1)
-        self._has_gradients, self._flag, self._scope = dr.grad_enabled, dr.flag, dr.JitFlag.FreezingScope
+        self._width, self._has_gradients = dr.width, dr.grad_enabled
+        self._flag, self._scope = dr.flag, dr.JitFlag.FreezingScope
 
     def __call__(self, *arguments: P.args, **named: P.kwargs) -> R:
         if self._flag(self._scope):
@@ -100,7 +101,11 @@ class Recorded(Generic[P, R]):
         kind = _split(arguments, arrays)
         if named:
             kind = kind, _split(named, arrays)
-        about_one = self._elements is not None and self._elements(arrays, *arguments, **named) == 1
+        elements = self._elements
+        if elements is elements_of_first:
+            about_one = not arrays or self._width(arrays[0]) == 1
+        else:
+            about_one = elements is not None and elements(arrays, *arguments, **named) == 1
         if about_one or self._has_gradients(arrays):
             return self.traced(*arguments, **named)
         name, now = self._names[kind], self._now
@@ -116,21 +121,23 @@ class Recorded(Generic[P, R]):
                 gc.enable()
 
 
-class _Counter:
-    """Of recordings; to Dr.Jit an object that never changes, where a number would make every call a new one."""
-
-    count = 0
-
-
-_made = _Counter()
+_recordings = 0  # that were made
 
 
 class _Arguments:
-    """Of the call that may be traced now; to Dr.Jit an object that never changes."""
+    """Of the call of a function that may be traced now."""
 
-    def __init__(self) -> None:
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
         self.arguments: tuple[Any, ...] = ()
         self.named: dict[str, Any] = {}
+
+    def trace(self, arrays: list[Any]) -> Any:
+        """Call the function with `arrays` in place of the arguments' own."""
+        global _recordings
+        _recordings += 1
+        rest = iter(arrays)
+        return self.function(*_joined(self.arguments, rest), **_joined(self.named, rest))
 
 
 class _Names(dict[Any, str]):
@@ -169,10 +176,10 @@ def _split(value: Any, arrays: list[Any]) -> Any:
     constant = _constants.get(id(value))
     if constant is not None:
         return constant[1]
-    names = _names(kind)  # type: ignore[arg-type]
-    if names is not None:
+    values_of = _values_of(kind)  # type: ignore[arg-type]
+    if values_of is not None:
         before = len(arrays)
-        kinds = _split_each([getattr(value, name) for name in names], arrays)
+        kinds = _split_each(values_of(value), arrays)
         if len(arrays) > before or not _is_constant(value):
             return kind, kinds
         if len(_constants) >= MAX_KEYS:
@@ -231,6 +238,17 @@ def _names(kind: object) -> tuple[str, ...] | None:
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else None
 
 
+@cache
+def _values_of(kind: object) -> Callable[[object], tuple[Any, ...]] | None:
+    """What tells the fields of a dataclass, in the order of `_names`; None for any other type."""
+    names = _names(kind)
+    if names is None:
+        return None
+    if len(names) > 1:
+        return attrgetter(*names)
+    return lambda value: tuple(getattr(value, name) for name in names)
+
+
 def recordings() -> int:
     """How many recordings the functions of `recorded` have made: once warm, it stands still."""
-    return _made.count
+    return _recordings

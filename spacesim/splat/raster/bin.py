@@ -82,7 +82,8 @@ def bin_splats(
     """
     boxes_of, lists_of = (_boxes, _count) if select() == "cuda" else (_rank, _expand)
     grid, count = _Grid.of(width, height, tile_shape()), dr.width(splats.x)
-    splats, footprints = dr.detach(splats), dr.detach(footprints)
+    if dr.grad_enabled(list(vars(splats).values())):  # to detach a record takes long
+        splats = dr.detach(splats)
     pairs = 0
     if count > 0:
         capacity = round_capacity(count)

@@ -6,7 +6,7 @@ A step takes one view or several forward and backward (`view_pass`), moves all p
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -118,16 +118,15 @@ class Trainer(TrainingLoop):
         if warm is not None and warm.active(done - 1):
             warm.after_step(done, self.gaussians, self.optimizer)
             return
-        timed = done % self.config.refinement.refine_every == 0
-        if timed:
-            dr.sync_thread()  # what the steps before have left to compute is not densification's
+        if done % self.config.refinement.refine_every:
+            return
+        dr.sync_thread()  # what the steps before have left to compute is not densification's
         start = time.perf_counter()
         rng = np.random.default_rng([self.config.seed, 2, done])
         leniency = 1.0 if warm is None else warm.config.leniency(done)
         self.strategy.refine(done, self.gaussians, self.optimizer, rng, leniency)
-        if timed:
-            dr.sync_thread()
-            self.seconds["refinement"] += time.perf_counter() - start
+        dr.sync_thread()
+        self.seconds["refinement"] += time.perf_counter() - start
 
     def _forward_backward(self, rows: list[Float], degree: int, number: int) -> ViewResult:
         """Forward, loss, backward for one view, `number` of the training."""
@@ -265,16 +264,15 @@ class Trainer(TrainingLoop):
             return np.zeros(3, np.float32)
         return np.random.default_rng([config.seed, 3, index]).uniform(size=3).astype(np.float32)
 
-    def rates(self, index: int) -> Iterator[float]:
+    def rates(self, index: int) -> list[float]:
         """The step size of each row."""
         rates, means = self.config.rates, self.means_rate(index)
         if self.config.warm_start is not None:
             means = self.config.warm_start.means_rate(index, means, self._start_radius)
-        yield from ([means] * 3 + [rates.log_scales] * 3 + [rates.quaternions] * 4 + [rates.logit_opacities])
+        shape = [means] * 3 + [rates.log_scales] * 3 + [rates.quaternions] * 4 + [rates.logit_opacities]
         if self.gaussians.features is not None:
-            yield rates.features
-        else:
-            yield from [rates.sh_constant] * 3 + [rates.sh_rest] * (len(self.gaussians.sh) - 3)
+            return [*shape, rates.features]
+        return shape + [rates.sh_constant] * 3 + [rates.sh_rest] * (len(self.gaussians.sh) - 3)
 
     def means_rate(self, index: int) -> float:
         """Metres; falls exponentially over `means_steps`, which begin after a warm start that has larger ones."""

@@ -14,7 +14,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
 from spacesim.learning.adam import adam_step
 from spacesim.splat.raster.cameras import Pinhole
-from spacesim.splat.raster.gaussians import SH_C0, Gaussians
+from spacesim.splat.raster.gaussians import ROWS, SH_C0, Gaussians
 from spacesim.splat.raster.project import Splats, project
 from spacesim.splat.raster.render import harmonics, is_unclamped
 from spacesim.splat.train.loss.terms import penalty
@@ -97,7 +97,10 @@ def _replace(
 ) -> None:
     """Put a part's new rows and moments in the place of the old ones, which nobody holds any longer."""
     rows[optimizer.slices[number]], optimizer.arrays[number] = moved, moments
-    gaussians.replace(rows)
+    if number == 0:
+        gaussians.replace(rows)
+    else:
+        gaussians.sh = ad.ArrayXf(rows[ROWS["sh"]])
 
 
 def _move_own(

@@ -37,7 +37,8 @@ class Strategy(ABC):
     def refine(
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator, leniency: float = 1.0
     ) -> DensificationCounts:
-        """Refine if it is time to, after `step` finished steps. Changes `gaussians`, `optimizer` and the state.
+        """Refine if it is time to, after `step` finished steps, a multiple of `refine_every`. Changes `gaussians`,
+        `optimizer` and the state.
 
         leniency: factor of the opacity below which a Gaussian is too faint (conservative culling, thesis 5.3)."""
 
