@@ -3,7 +3,8 @@
 python benchmarks/torch_door.py [--sizes 31622x512,...] [--peers gsplat] [--repeats 15] [--store FILE.npz] [--json]
 
 A picture with its gradients, by all parameters of the Gaussians, for one camera: harmonics of degree 3, colour and
-alpha. "own" is `render` with Dr.Jit's gradients. With --peers gsplat the largest differences from its pictures and
+alpha. "own" is `render` with Dr.Jit's gradients. Both are handed the same gradients of the picture and of alpha: a loss
+is its user's, in torch or elsewhere. With --peers gsplat the largest differences from its pictures and
 gradients are told, too; that needs CUDA. --store writes what gsplat makes of a small scene, which
 tests/test_torch.py holds ours against.
 """
@@ -20,6 +21,8 @@ import numpy as np
 from rasterizer import load_peer
 
 from spacesim import backend
+from spacesim.backend.arrays import Float
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.records import Camera
 from spacesim.splat.raster.gaussians import Gaussians
@@ -54,12 +57,15 @@ def main() -> None:
     rows, found = [], []
     for count, side in common.parse_sizes(options.sizes):
         leaves, camera = _scene(torch, count, side, device)
-        ours = _timed(partial(_own, leaves, camera), options.repeats, torch, device)
-        door = _timed(partial(_through, torch, rasterization, leaves, camera), options.repeats, torch, device)
+        weights = np.random.default_rng(1).normal(size=(side, side, 4)).astype(np.float32)
+        planes = [upload(plane) for plane in weights.reshape(-1, 4).T]
+        given = [torch.tensor(part, device=device)[None] for part in (weights[..., :3].copy(), weights[..., 3:].copy())]
+        ours = _timed(partial(_own, leaves, camera, planes), options.repeats, torch, device)
+        door = _timed(partial(_through, torch, rasterization, leaves, camera, given), options.repeats, torch, device)
         row: common.Row = {"Gaussians": count, "pixels": side, "own, ms": ours.median, "torch, ms": door.median}
         row["torch / own"] = door.median / ours.median
         if peer is not None:
-            theirs = _timed(partial(_through, torch, peer, leaves, camera), options.repeats, torch, device)
+            theirs = _timed(partial(_through, torch, peer, leaves, camera, given), options.repeats, torch, device)
             row |= {"gsplat, ms": theirs.median, "torch / gsplat": door.median / theirs.median}
             for mode in MODES:
                 different = _differences(torch, rasterization, peer, leaves, camera, mode)
@@ -93,8 +99,8 @@ def _scene(torch: Any, count: int, side: int, device: str) -> tuple[dict[str, An
     return leaves, camera
 
 
-def _own(leaves: dict[str, Any], camera: Camera) -> None:
-    """A picture by `render`, and gradients, without torch in between."""
+def _own(leaves: dict[str, Any], camera: Camera, weights: list[Float]) -> None:
+    """A picture by `render`, and gradients, without torch in between. weights: gradients of its planes, of alpha"""
     if not hasattr(_own, "arrays") or _own.arrays.count != len(leaves["means"]):  # type: ignore[attr-defined]
         plain = {name: leaves[name].detach().cpu().numpy() for name in NAMES}
         opacity = plain["opacities"]
@@ -112,19 +118,19 @@ def _own(leaves: dict[str, Any], camera: Camera) -> None:
         dr.disable_grad(parameter)
         dr.enable_grad(parameter)
     output = render(model, Pinhole.of(camera), outputs=("color", "alpha"))
-    total = sum((dr.sum(dr.square(plane)) for plane in output.color), dr.sum(output.alpha))
-    dr.backward(total)
+    planes = [*output.color, output.alpha]
+    dr.backward(sum(dr.sum(plane * weight) for plane, weight in zip(planes, weights, strict=True)))
     gradients = [dr.grad(parameter) for parameter in model.parameters().values()]
     dr.eval(gradients)
     dr.sync_thread()
 
 
-def _through(torch: Any, rasterization: Any, leaves: dict[str, Any], camera: Camera) -> None:
-    """A picture by a function of gsplat's signature, and gradients."""
+def _through(torch: Any, rasterization: Any, leaves: dict[str, Any], camera: Camera, given: list[Any]) -> None:
+    """A picture by a function of gsplat's signature, and gradients. given: those of the picture and of alpha"""
     picture, alpha, _ = rasterization(
         **leaves, width=camera.width, height=camera.height, sh_degree=3, packed=False, render_mode="RGB"
     )
-    torch.autograd.grad(picture.square().sum() + alpha.sum(), [leaves[name] for name in NAMES])
+    torch.autograd.grad([picture, alpha], [leaves[name] for name in NAMES], given)
 
 
 def _timed(work: Any, repeats: int, torch: Any, device: str) -> common.Timing:
