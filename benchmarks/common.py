@@ -26,6 +26,7 @@ from spacesim.eval.report.html import escape
 
 if TYPE_CHECKING:
     from spacesim.eval.evaluate import EvaluateConfig
+    from spacesim.splat.run import Run
     from spacesim.splat.train.config import TrainConfig
 
 WARM_UP = 5  #: calls that do not count
@@ -161,6 +162,21 @@ def sphere_arrays(count: int, seed: int = 0) -> dict[str, np.ndarray]:
         "logit_opacities": rng.normal(size=count),
         "sh": 0.3 * rng.normal(size=(count, 16, 3)),
     }
+
+
+def sphere_run(count: int, seed: int = 0) -> "Run":
+    """Such splats with features, relit and with shadows by networks that nobody has trained."""
+    from spacesim.splat.light.model import LightModel, TrainingFrame
+    from spacesim.splat.raster.gaussians import Gaussians
+    from spacesim.splat.run import Run
+    from spacesim.splat.train.config import preset
+
+    config = preset("demo", "shadow-map").light
+    assert config is not None
+    features = np.random.default_rng(seed).normal(size=(count, config.features)).astype(np.float32)
+    arrays = {**sphere_arrays(count, seed), "sh": np.zeros((count, 0, 3)), "features": features}
+    light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, DISTANCE, 1.0), seed)
+    return Run(Path(f"sphere{seed}"), {"method": "shadow-map"}, {}, Gaussians.from_numpy(arrays), 0, light)
 
 
 def camera_from(direction: Sequence[float], pixels: int) -> Camera:

@@ -60,10 +60,7 @@ def main() -> None:
 def served_splats(path: str | None, count: int) -> tuple[Served, float]:
     """(what is served, metres from which it is seen whole)."""
     if path is None:
-        from viewer import spheres
-
-        (placed, _) = spheres(2 * count).renderer.composition.models
-        return PredictedRun(placed.run), 1.2 * common.DISTANCE
+        return PredictedRun(common.sphere_run(count)), 1.2 * common.DISTANCE
     served = load_served(path)
     assert isinstance(served, PredictedRun)
     gaussians = served.run.gaussians

@@ -36,10 +36,6 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Sun
 from spacesim.progress import show_progress
 from spacesim.splat.compose import GaussianComposition, PlacedRun, Pose
-from spacesim.splat.light.model import LightModel, TrainingFrame
-from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.run import Run
-from spacesim.splat.train.config import preset
 from spacesim.viewer.drawing.frames import draw_frame, picture_size
 from spacesim.viewer.drawing.memory import give_back
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
@@ -96,16 +92,10 @@ def main() -> None:
 
 def spheres(count: int) -> ViewerSetup:
     """Two relightable spheres of half the Gaussians each, one above the other."""
-    config = preset("demo", "shadow-map").light
-    assert config is not None
-    placed = []
-    for k, height in enumerate((-0.9, 0.9)):
-        arrays = {**common.sphere_arrays(count // 2, k), "sh": np.zeros((count // 2, 0, 3))}
-        rng = np.random.default_rng(k)
-        arrays["features"] = rng.normal(size=(count // 2, config.features)).astype(np.float32)
-        light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, common.DISTANCE, 1.0), k)
-        run = Run(Path(f"sphere{k}"), {"method": "shadow-map"}, {}, Gaussians.from_numpy(arrays), 0, light)
-        placed.append(PlacedRun(run, Pose(translation=np.array([0.0, 0, height]), scale=0.8), f"sphere {k}"))
+    placed = [
+        PlacedRun(common.sphere_run(count // 2, k), Pose(np.eye(3), np.array([0.0, 0, height]), 0.8), f"sphere {k}")
+        for k, height in enumerate((-0.9, 0.9))
+    ]
     renderer = SceneRenderer(GaussianComposition(placed))
     poses = tuple(one.pose for one in placed)
     return ViewerSetup(renderer, SceneState(poses, Sun.from_angles(45, 60)), (None, None), None, Path())
