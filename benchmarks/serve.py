@@ -2,12 +2,12 @@
 
     python benchmarks/serve.py [RUN|SCENE.toml] [--gaussians 15000] [--side 512] [--spp 16] [--requests 10000]
 
-Without a run the splats are the sphere of the other benchmarks, relit and with shadows. The scene is boxsat,
-path-traced. Each is served by a thread of this process; the camera goes round. "latency" is from a request to its
-picture, one at a time; "pictures/s" is with four requests on their way, and "CPU" what each of these takes of all cores
-together, client included, which other work on the machine changes least. Then --requests small pictures of the splats
-are asked for by four clients at once: how many came back, in order, and by how much the memory of the process grew from
-a tenth of them on, free memory given back before each reading.
+Without a run the splats are the sphere of the other benchmarks, relit and with shadows. The scene is boxsat, path-
+traced. Each is served by a thread of this process; the camera goes round, and the Sun too where it "moves". "latency"
+is from a request to its picture, one at a time; "pictures/s" is with four requests on their way, and "CPU" what each of
+these takes of all cores together, client included, which other work on the machine changes least. Then --requests small
+pictures of the splats are asked for by four clients at once: how many came back, in order, and by how much the memory
+of the process grew from a tenth of them on, free memory given back before each reading.
 """
 
 import gc
@@ -45,12 +45,15 @@ def main() -> None:
     import_zmq()
     backend.select(options.backend)
     splats, reach = served_splats(options.path, options.gaussians)
+    traced = load_served("boxsat", options.spp)
+    side, repeats = options.side, options.repeats
     rows = [
-        {"served": splats.names[0], **speed(splats, reach, options.side, options.repeats)},
-        {
-            "served": f"boxsat, {options.spp} samples",
-            **speed(load_served("boxsat", options.spp), 10.0, options.side, options.repeats),
-        },
+        {"served": name, "the Sun": "moves" if moves else "stays", **speed(what, away, side, repeats, moves)}
+        for name, what, away, moves in (
+            (splats.names[0], splats, reach, False),
+            (splats.names[0], splats, reach, True),
+            (f"boxsat, {options.spp} samples", traced, 10.0, False),
+        )
     ]
     many = [lasting(splats, reach, options.requests)] if options.requests else []
     title = f"Pictures of {options.side} x {options.side}"
@@ -70,38 +73,39 @@ def served_splats(path: str | None, count: int) -> tuple[Served, float]:
     return served, 3.0 * float(np.percentile(places, 99))
 
 
-def views(reach: float, side: int) -> Iterator[Camera]:
-    """Round and round, never the same twice."""
+def views(reach: float, side: int, sun_moves: bool = False) -> Iterator[tuple[Camera, Sun]]:
+    """Round and round, never the same twice; the Sun stays or moves."""
     k = 0
     while True:
         angle = 0.1 * k
         place = reach * np.array([np.cos(angle), np.sin(angle), 0.3])
-        yield Camera.from_fov(look_at(place, np.zeros(3)), side, side, 30.0)
+        sun = Sun.from_angles(7.0 * k % 360, 25) if sun_moves else SUN
+        yield Camera.from_fov(look_at(place, np.zeros(3)), side, side, 30.0), sun
         k += 1
 
 
-def speed(served: Served, reach: float, side: int, repeats: int) -> dict[str, Any]:
+def speed(served: Served, reach: float, side: int, repeats: int, sun_moves: bool) -> dict[str, Any]:
     """Latency and rate."""
-    cameras, waits = views(reach, side), []
+    asked, waits = views(reach, side, sun_moves), []
     with serving(served) as address:
         with CameraClient(address, timeout=PATIENCE / 1e3) as client:
             for _ in range(common.WARM_UP + repeats):
-                camera, start = next(cameras), time.perf_counter()
-                client.picture(camera, SUN)
+                (camera, sun), start = next(asked), time.perf_counter()
+                client.picture(camera, sun)
                 waits.append(time.perf_counter() - start)
         start, busy = time.perf_counter(), time.process_time()
-        asked_together(address, cameras, repeats, clients=1)
+        asked_together(address, asked, repeats, clients=1)
         rate, cpu = repeats / (time.perf_counter() - start), (time.process_time() - busy) / repeats
     return {"latency, ms": str(common.Timing.of(waits[common.WARM_UP :])), "pictures/s": rate, "CPU, ms": 1e3 * cpu}
 
 
 def lasting(served: Served, reach: float, requests: int) -> dict[str, Any]:
     """How many of so many requests were answered in order, how fast, and by how much memory grew."""
-    cameras = views(reach, SMALL)
+    asked = views(reach, SMALL)
     with serving(served) as address:
-        asked_together(address, cameras, max(1, requests // 10), CLIENTS)
+        asked_together(address, asked, max(1, requests // 10), CLIENTS)
         before, start = settled(), time.perf_counter()
-        answered = asked_together(address, cameras, requests, CLIENTS)
+        answered = asked_together(address, asked, requests, CLIENTS)
         rate, grown = answered / (time.perf_counter() - start), settled() - before
     return {"requests": requests, "answered": answered, "a second": rate, "memory grew, MB": grown / 1e6}
 
@@ -113,7 +117,7 @@ def settled() -> float:
     return common.resident()
 
 
-def asked_together(address: str, cameras: Iterator[Camera], requests: int, clients: int) -> int:
+def asked_together(address: str, asked: Iterator[tuple[Camera, Sun]], requests: int, clients: int) -> int:
     """Requests of several clients, each with AHEAD on their way; how many were answered in order. Raises WorkError
     where an answer stays out or is an error."""
     zmq, answered = import_zmq(), 0
@@ -133,17 +137,17 @@ def asked_together(address: str, cameras: Iterator[Camera], requests: int, clien
                     raise WorkError(told["error"])
                 answered += told["id"] == k - AHEAD * clients and len(arrays) == 1
             if k < requests:
-                socket.send(request(k, next(cameras)))
+                socket.send(request(k, *next(asked)))
         for socket in sockets:
             socket.close()
     return answered
 
 
-def request(number: int, camera: Camera) -> bytes:
+def request(number: int, camera: Camera, sun: Sun) -> bytes:
     """As clients write it."""
     lens = {name: getattr(camera, name) for name in ("width", "height", "fx")}
     fields = {"camera": {"world_from_camera": camera.world_from_camera.tolist(), **lens}}
-    return json.dumps({"version": 1, "id": number, "sun": SUN.direction.tolist(), **fields}).encode()
+    return json.dumps({"version": 1, "id": number, "sun": sun.direction.tolist(), **fields}).encode()
 
 
 if __name__ == "__main__":

@@ -96,6 +96,15 @@ class _PictureCache:
 
 
 @dataclass
+class _LastSunlight:
+    """The Sun that was asked for last: cameras move more often than it does."""
+
+    read: list[Float]  #: the arrays that it was made of
+    sun: bytes | None  #: its direction
+    sunlight: Sunlight
+
+
+@dataclass
 class LightGradients:
     """Gradients of a loss by what light depends on."""
 
@@ -124,6 +133,7 @@ class LightModel:
         self._training_frame = ad.Float([*np.asarray(frame.centre, np.float32), frame.scale])
         self._encodings = lru_cache(maxsize=SUNS)(self._encode_sun)
         self._cache = _PictureCache([], None, [], [])
+        self._last_sunlight = _LastSunlight([], None, Sunlight(None, []))
 
     @staticmethod
     def initial(config: LightConfig, frame: TrainingFrame, seed: int, pictures: int = 0) -> "LightModel":
@@ -169,10 +179,21 @@ class LightModel:
         return Shading(colors, visibility[0] if visibility else None, shadows, inputs, batch, tape, picture)
 
     def sunlight(self, gaussians: Gaussians, sun: np.ndarray | None) -> Sunlight:
-        """Visibility, and light that bounces, under one Sun, for any number of pictures."""
-        shadows = self.shadows(gaussians, sun)
-        if shadows is None and not self.config.bounce:
+        """Visibility, and light that bounces, under one Sun, for any number of pictures; at once where it was asked for
+        last and nothing has changed."""
+        if self.config.shadow is None and not self.config.bounce:
             return Sunlight(None, [])
+        read, direction = [*gaussians.rows(), *self.weights], None if sun is None else np.asarray(sun).tobytes()
+        last, numbers = self._last_sunlight, [array.index for array in read]
+        if dr.grad_enabled(read):
+            return self._sunlight(gaussians, sun)
+        if direction != last.sun or numbers != [array.index for array in last.read]:
+            sunlight = self._sunlight(gaussians, sun)
+            last = self._last_sunlight = _LastSunlight([ad.Float(array) for array in read], direction, sunlight)
+        return last.sunlight
+
+    def _sunlight(self, gaussians: Gaussians, sun: np.ndarray | None) -> Sunlight:
+        shadows = self.shadows(gaussians, sun)
         batch = PaddedBatch.of(gaussians.count, still=True)
         _, of_refine = split_weights(self.config, self.weights)
         inputs = self._inputs(gaussians, None, self.encode_sun(sun), shadows)

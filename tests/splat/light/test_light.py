@@ -320,6 +320,22 @@ def test_encodings_are_those_of_scipy_and_numpy(kind):
     np.testing.assert_array_equal(numbers(encoding.of_one(vectors[3]))[:1], rows[3, :1].astype(np.float32))
 
 
+def test_a_sun_that_stays_is_asked_for_once():
+    light = model("map")
+    splats = gaussians(60, light.config.features)
+    first = light.sunlight(splats, SUN)
+    assert light.sunlight(splats, SUN.copy()) is first, "computed again for another camera"
+    moved = light.sunlight(splats, -SUN)
+    assert moved is not first
+    splats.means += 0.1  # in place
+    changed = light.sunlight(splats, -SUN)
+    assert changed is not moved
+    light.weights[-1] = light.weights[-1] + 1
+    assert light.sunlight(splats, -SUN) is not changed
+    dr.enable_grad(splats.log_scales)
+    assert light.sunlight(splats, -SUN) is not light.sunlight(splats, -SUN), "gradients would be lost"
+
+
 @pytest.mark.parametrize("by_vectors", [False, True])
 @pytest.mark.parametrize("name", CONFIGS)
 def test_pictures_have_the_colors_that_are_trained(monkeypatch, name, by_vectors):
