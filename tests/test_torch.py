@@ -225,6 +225,29 @@ def test_planes_and_radii_leave_out_what_is_beyond_them():
     _, alpha, meta = rasterization(**leaves, **size, radius_clip=1e6)
     assert not alpha.any()
     assert not meta["radii"].any()
+    radii = rasterization(**leaves, **size)[2]["radii"]
+    middle = float(radii[radii > 0].float().median()) + 0.5  # gsplat compares whole pixels with it
+    kept = rasterization(**leaves, **size, radius_clip=middle)[2]["radii"]
+    assert torch.equal(kept, radii * (radii > middle).any(dim=-1, keepdim=True))
+    assert 0 < (kept > 0).sum() < (radii > 0).sum()
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_what_is_returned_may_be_changed_in_place(cameras):
+    """As gsplat's own trainer does with masks."""
+    leaves = as_floats(scene())
+    leaves |= {name: leaves[name][:cameras] for name in ("viewmats", "Ks")}
+    means = leaves["means"].requires_grad_()
+    picture, alpha, meta = rasterization(**leaves, width=SIDE, height=SIDE, sh_degree=3, packed=False)
+    (whole,) = torch.autograd.grad(picture[:, : SIDE // 2].sum(), means, retain_graph=True)
+    picture[:, SIDE // 2 :] = 0
+    alpha.clamp_(0, 0.5)
+    meta["opacities"].mul_(1.0)
+    (masked,) = torch.autograd.grad(picture.sum(), means, retain_graph=True)
+    torch.testing.assert_close(masked, whole)
+    (gradient,) = torch.autograd.grad(alpha.square().sum(), means, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.square().sum().backward()
 
 
 def test_gradients_of_positions_on_the_screen():
@@ -341,9 +364,11 @@ def test_numbers_that_cannot_be_drawn_harm_no_others():
         ({"quats": torch.zeros(60, 3)}, r"quats: expected \[60, 4\], found \[60, 3\]"),
         ({"quats": torch.zeros(60, 3)}, r"found \[60, 3\]$"),
         ({"means": torch.zeros(2, 60, 3)}, r"means: expected \[N, 3\], found \[2, 60, 3\]; batches are not supported"),
-        ({"quats": None}, "quats: expected a tensor, found None"),
-        ({"colors": [1.0]}, r"colors: expected a tensor, found \[1.0\]"),
+        ({"quats": None}, "quats: expected a tensor, found one of type NoneType"),
+        ({"colors": [1.0]}, "colors: expected a tensor, found one of type list"),
         ({"tile_size": 0}, "tile_size: expected at least 1, found 0"),
+        ({"height": 0}, "height: expected at least 1, found 0"),
+        ({"width": 64.0}, "width: expected a whole number, found 64.0"),
         ({"viewmats": torch.eye(4)}, r"viewmats: expected \[C, 4, 4\], found \[4, 4\]; add \[None\]"),
         ({"Ks": torch.eye(3)}, r"Ks: expected \[C, 3, 3\], found \[3, 3\]; add \[None\]"),
         ({"backgrounds": torch.zeros(2, 4)}, r"backgrounds: expected \[2, 3\], found \[2, 4\]"),
@@ -354,6 +379,13 @@ def test_what_does_not_fit_is_told(changes, words):
     changes = {key: value.to(DEVICE) if torch.is_tensor(value) else value for key, value in changes.items()}
     with pytest.raises(ValueError, match=words):
         rasterization(**{**leaves, "width": SIDE, "height": SIDE, "sh_degree": 1, **changes})
+
+
+def test_a_tensor_without_memory_is_told():
+    leaves = as_floats(scene())
+    words = "means: expected a tensor on a CPU or on CUDA, found one on meta"
+    with pytest.raises(ValueError, match=words):
+        rasterization(**{**leaves, "means": leaves["means"].to("meta")}, width=SIDE, height=SIDE, sh_degree=1)
 
 
 def test_same_tensors_same_bits():

@@ -8,7 +8,6 @@ Tensors on a CUDA device run on CUDA, others on the CPU, one of the two in a pro
 spinning and take cores from the kernels: `torch.set_num_threads(1)`.
 """
 
-from operator import index
 from typing import TypedDict
 
 try:
@@ -83,7 +82,7 @@ def rasterization(
     rolling_shutter: object = None,
     viewmats_rs: Tensor | None = None,
 ) -> Results:
-    """Render N Gaussians with C cameras, differentiable by every tensor that requires gradients.
+    """Render N Gaussians with C cameras, differentiable once by every tensor that requires gradients.
 
     means: [N, 3] metres;  quats: [N, 4] (w, x, y, z), of any length;  scales: [N, 3] standard deviations, metres
     opacities: [N] in [0, 1]
@@ -126,10 +125,9 @@ def rasterization(
     arguments.check_choice("render_mode", render_mode, arguments.RENDER_MODES)
     arguments.check_choice("rasterize_mode", rasterize_mode, arguments.RASTERIZE_MODES)
     arguments.check_choice("camera_model", camera_model, arguments.CAMERA_MODELS)
-    width, height = index(width), index(height)  # numpy's are no numbers of a recording
-    if tile_size < 1:
-        raise ValueError(f"tile_size: expected at least 1, found {tile_size}")
-    count, cameras = arguments.check_shapes(means, quats, scales, opacities, viewmats, Ks, width, height)
+    sizes = {"width": width, "height": height, "tile_size": tile_size}
+    width, height, tile_size = (arguments.checked_size(name, size) for name, size in sizes.items())
+    count, cameras = arguments.check_shapes(means, quats, scales, opacities, viewmats, Ks)
     arguments.check_colors(colors, backgrounds, sh_degree, render_mode, means, cameras)
     backend.select("cuda" if means.is_cuda else "llvm")
     settings = arguments.raster_settings(

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import index
+from typing import SupportsIndex
 
 from torch import Tensor
 
@@ -59,6 +61,17 @@ def check_choice(name: str, found: str, known: Sequence[str]) -> None:
         raise ValueError(f"{name}: expected one of {', '.join(known)}, found {found!r}")
 
 
+def checked_size(name: str, value: SupportsIndex) -> int:
+    """A size in pixels, also numpy's, as Python's number. Raises ValueError for what is no whole number above 0."""
+    try:
+        size = index(value)
+    except TypeError:
+        raise ValueError(f"{name}: expected a whole number, found {value!r:.60}") from None
+    if size < 1:
+        raise ValueError(f"{name}: expected at least 1, found {size}")
+    return size
+
+
 def check_shapes(
     means: Tensor,
     quats: Tensor,
@@ -66,8 +79,6 @@ def check_shapes(
     opacities: Tensor,
     viewmats: Tensor,
     Ks: Tensor,
-    width: int,
-    height: int,
 ) -> tuple[int, int]:
     """(N, C). Raises ValueError naming the argument that does not fit."""
     shapes = (
@@ -93,15 +104,17 @@ def check_shapes(
             raise ValueError(f"{name}: expected {list(shape)}, found {list(tensor.shape)}")
         check_device(name, tensor, means.device)
     count, cameras = counts["N"], counts["C"]
-    if count < 1 or cameras < 1 or width < 1 or height < 1:
-        raise ValueError(f"means, viewmats: expected at least one each and a picture, found {count} and {cameras}")
+    if count < 1 or cameras < 1:
+        raise ValueError(f"means, viewmats: expected at least one each, found {count} and {cameras}")
     return count, cameras
 
 
 def check_tensor(name: str, found: object) -> None:
     """Raises ValueError for what is no tensor."""
     if not isinstance(found, Tensor):
-        raise ValueError(f"{name}: expected a tensor, found {found!r:.60}")
+        raise ValueError(f"{name}: expected a tensor, found one of type {type(found).__name__}")
+    if found.device.type not in ("cpu", "cuda"):
+        raise ValueError(f"{name}: expected a tensor on a CPU or on CUDA, found one on {found.device}")
 
 
 def check_device(name: str, tensor: Tensor, device: object) -> None:

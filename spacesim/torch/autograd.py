@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import torch
 from torch import Tensor
-from torch.autograd.function import FunctionCtx
+from torch.autograd.function import FunctionCtx, once_differentiable
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float
@@ -23,7 +23,7 @@ from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import BlendResult
 from spacesim.splat.raster.render import FEATURES_PER_PASS
 from spacesim.splat.raster.tiles import TileLists, round_capacity
-from spacesim.torch.convert import column, columns, rows, to_floats, to_table, to_tensor
+from spacesim.torch.convert import as_base, column, columns, rows, to_floats, to_table, to_tensor
 from spacesim.torch.projection import (
     INTRINSICS,
     TABLE,
@@ -73,6 +73,7 @@ class Project(torch.autograd.Function):
         return means2d, table, radii, found
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: FunctionCtx, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         """Gradients of the tensors."""
         grad_means2d, grad_table = gradients[:2]
@@ -179,6 +180,7 @@ class Blend(torch.autograd.Function):
         return _stack(pictures), _stack(alphas)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: FunctionCtx, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         """Gradients of means2d, table and colours."""
         grad_pictures, grad_alphas = gradients
@@ -276,4 +278,4 @@ def _of(tensor: Tensor, camera: int) -> Tensor:
 
 def _stack(tensors: Sequence[Tensor]) -> Tensor:
     """[C, ...]; of one camera without a copy."""
-    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
+    return as_base(tensors[0][None]) if len(tensors) == 1 else torch.stack(list(tensors))

@@ -53,6 +53,13 @@ def rows(values: list[NumberT], size: int, count: int, capacity: int | None = No
     return target
 
 
+def as_base(tensor: Tensor) -> Tensor:
+    """The same memory, shape and strides, but to torch no view of another tensor: what an operation of torch's returns
+    may then be changed in place by whoever called it."""
+    base = torch.empty(0, dtype=tensor.dtype, device=tensor.device)
+    return base.set_(tensor.untyped_storage(), tensor.storage_offset(), tensor.shape, tensor.stride())
+
+
 def to_table(flat: Float | Int32, count: int, size: int) -> Tensor:
     """The first `count` rows of a flat array of at least as many rows of `size`: a tensor [count, size]."""
     return to_tensor(flat).as_strided((count, size), (size, 1))

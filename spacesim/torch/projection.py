@@ -211,7 +211,7 @@ def _splats_of(inputs: _Inputs, settings: RasterSettings) -> tuple[Splats, Footp
         settings.antialiased,
     )
     if settings.radius_clip > 0:
-        small = dr.maximum(footprints.half_width, footprints.half_height) <= settings.radius_clip
+        small = dr.ceil(dr.maximum(footprints.half_width, footprints.half_height)) <= settings.radius_clip
         footprints.visible &= ~small
     if settings.degree is None or not inputs.harmonics:
         return splats, footprints, []
