@@ -5,7 +5,7 @@ eval, compose, report and import do; `render` rasterizes Gaussians, `Run.render`
 them stands in the layers of docs/explanation/architecture.md.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -180,9 +180,13 @@ def train(
     choices = {name: word for name, word in names.items() if word is not None}
     if config is None:
         config = methods.preset(choices.pop("preset", "fast"), **choices)
+    elif not isinstance(config, TrainConfig | NerfConfig):
+        raise InputError(f"config: expected what `preset` returns, found {config!r:.60}")
     elif choices:
         name, word = next(iter(choices.items()))
         raise InputError(f"{name}: expected none beside a configuration, found {word!r}")
+    if settings is not None and not isinstance(settings, Mapping):
+        raise InputError(f"settings: expected {{name: value}}, found {settings!r:.60}")
     kind = type(config)
     for name, value in options.items():
         if name not in kind.__dataclass_fields__:
@@ -287,9 +291,11 @@ def render(
     antialiased: with Mip-Splatting's 2D filter; see docs/how-to/gradients.md for all of these
 
     `RenderOutput.to_numpy()` gives (colour [H, W, 3], alpha [H, W], depth [H, W] in metres). Raises ValueError for
-    another output or features of another length, BackendError where no backend can run.
+    another output or degree, features or a twist of another length, BackendError where no backend can run.
     """
     view = camera if isinstance(camera, Projection) else Pinhole.of(camera)
     if twist is not None:
+        if len(twist) != 6:
+            raise ValueError(f"twist: expected 6 numbers, found {len(twist)}")
         view = view.moved(upload(np.asarray(twist)) if isinstance(twist, np.ndarray | Sequence) else twist)
     return _render(gaussians, view, **options)

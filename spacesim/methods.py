@@ -5,7 +5,7 @@ Which family a method is of is told by its name, and of a run by the method that
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonMapping, read_json
@@ -24,6 +24,18 @@ if TYPE_CHECKING:
 
 METHODS = (*splat.METHODS, *nerf.METHODS)
 Config = TrainConfig | NerfConfig
+
+
+@overload
+def preset(name: str = "fast", method: splat.Method = "vanilla", strategy: str | None = None) -> TrainConfig: ...
+
+
+@overload
+def preset(name: str, method: nerf.Method, strategy: None = None) -> NerfConfig: ...
+
+
+@overload
+def preset(name: str = "fast", method: str = "vanilla", strategy: str | None = None) -> Config: ...
 
 
 def preset(name: str = "fast", method: str = "vanilla", strategy: str | None = None) -> Config:

@@ -31,6 +31,9 @@ def test_options_of_scenes_that_cannot_be(name, value):
         ({"iterations": 2.5}, "iterations: expected a whole number, found 2.5"),
         ({"light": {"bounce": 2}}, "light: expected a LightConfig, found a table"),
         ({"init": "dreams"}, "init: expected one of mesh, points, random, found 'dreams'"),
+        ({"config": "demo"}, "config: expected what `preset` returns, found 'demo'"),
+        ({"config": {"iterations": 3}}, "config: expected what `preset` returns, found {'iterations': 3}"),
+        ({"settings": "seed=5"}, "settings: expected {name: value}, found 'seed=5'"),
         ({"settings": {"preset": "demo"}}, "preset: expected beside the settings"),
         ({"settings": {"method": "relight"}}, "method: expected beside the settings"),
         ({"method": "nerf", "settings": {"method": "nerf-relight"}}, "method: expected beside the settings"),
@@ -58,3 +61,33 @@ def test_pictures_and_poses(tiny_run, tiny_data, tmp_path):
     assert not np.array_equal(moved.to_numpy()[1], still.to_numpy()[1])
     with pytest.raises(ValueError, match=r"^log_scales: expected an array, found none"):
         ss.Gaussians.from_numpy({"means": np.zeros((1, 3))})
+
+
+def test_pictures_that_cannot_be(tiny_run, tiny_data, tmp_path):
+    run, frame = ss.load_run(tiny_run), ss.read_dataset(tiny_data).test[0]
+    wrong = [
+        (r"twist: expected 6 numbers, found 5", lambda: ss.render(run.gaussians, frame.camera, twist=[0] * 5)),
+        (
+            r"outputs: expected some of .*, found 'color'",
+            lambda: ss.render(run.gaussians, frame.camera, outputs="color"),
+        ),
+        (r"sh_degree: expected 0 to", lambda: ss.render(run.gaussians, frame.camera, sh_degree=-1)),
+        (r"sh_degree: expected 0 to", lambda: ss.render(run.gaussians, frame.camera, sh_degree=5)),
+        (r"count, radius, scale: expected", lambda: ss.Gaussians.random(-1, 1.0, 0.1)),
+        (r"count, radius, scale: expected", lambda: ss.Gaussians.random(3, float("nan"), 0.1)),
+        (r"camera: expected a whole number of pixels", lambda: ss.Camera(np.eye(4), 4.5, 4, 1, 1, 1, 1)),
+        (r"position: expected three finite numbers", lambda: ss.Camera.look_at([0, 0, np.nan], [0, 0, 0], 4, 4, 40)),
+        (r"target: expected three finite numbers", lambda: ss.Camera.look_at([0, 0, 1], "abc", 4, 4, 40)),
+        (r"world_from_camera: expected a finite", lambda: ss.PoseRig(np.full((2, 4, 4), np.nan))),
+        (r".*: expected a folder for an evaluation, found a dataset", lambda: ss.evaluate(run, tiny_data, tiny_data)),
+    ]
+    for said, call in wrong:
+        with pytest.raises((ss.InputError, ValueError), match=f"^{said}"):
+            call()
+    assert sorted(path.name for path in tmp_path.iterdir()) == []
+
+
+def test_an_address_that_is_none():
+    pytest.importorskip("zmq", reason="pyzmq is not installed")
+    with pytest.raises(ss.InputError, match=r"^address: expected one such as tcp://127.0.0.1:5556, found 'foo'"):
+        ss.CameraClient("foo")

@@ -59,6 +59,8 @@ class Camera:
         rotation = pose[:3, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
             raise InputError("world_from_camera: expected a rotation in its upper left [3, 3], found none")
+        if not all(isinstance(side, int | np.integer) for side in (self.width, self.height)):
+            raise InputError(f"camera: expected a whole number of pixels, found {self.width} x {self.height}")
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: expected a size of at least 1x1 pixels, found {self.width}x{self.height}")
         check_size(self.width, self.height, "camera")
@@ -106,6 +108,9 @@ class Camera:
     ) -> "Camera":
         """A camera at `position` [3] that looks at `target` [3], metres, its picture upright towards `up`; see
         `from_fov`. Raises InputError where both are one place, too."""
+        for name, place in (("position", position), ("target", target), ("up", up)):
+            if np.shape(place) != (3,) or not np.isfinite(np.asarray(place, np.float64)).all():
+                raise InputError(f"{name}: expected three finite numbers, found {place!r}")
         if not np.linalg.norm(np.subtract(target, position)) > 0:
             raise InputError(f"position: expected another place than the target, found {np.asarray(position).tolist()}")
         return Camera.from_fov(look_at(position, target, up), width, height, fov_x_deg)

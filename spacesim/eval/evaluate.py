@@ -295,6 +295,8 @@ def _sun_group(results: Sequence[FrameResult]) -> JsonDict | None:
 
 def _prepare(out: Path) -> None:
     """Make the folder and take away numbers and map of an earlier call: a folder that has numbers is complete."""
+    if (out / "transforms.json").exists() or (out / "config.json").exists():
+        raise InputError(f"{out}: expected a folder for an evaluation, found a dataset or a run")
     try:
         out.mkdir(parents=True, exist_ok=True)
         for name in ("metrics.json", density.NAME):

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from spacesim.data.errors import WorkError
+from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Camera, Sun
 from spacesim.serve.protocol import VERSION, arrays_of, import_zmq
 
 
 class CameraClient:
     """Asks a camera that answers (docs/how-to/closed-loop.md); `with` closes it. timeout: seconds to wait. Raises
-    InputError where pyzmq is not installed."""
+    InputError where pyzmq is not installed, and for an address that is none."""
 
     def __init__(self, address: str = "tcp://127.0.0.1:5556", timeout: float = 60.0) -> None:
         zmq = import_zmq()
@@ -23,7 +23,12 @@ class CameraClient:
         for option in (zmq.REQ_RELAXED, zmq.REQ_CORRELATE):  # after a timeout it can ask again
             self._socket.setsockopt(option, 1)
         self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.connect(address)
+        try:
+            self._socket.connect(address)
+        except zmq.ZMQError as error:
+            raise InputError(
+                f"address: expected one such as tcp://127.0.0.1:5556, found {address!r} ({error})"
+            ) from None
 
     def picture(
         self, camera: Camera, sun: Sun | Sequence[float] | None = None, **options: Any

@@ -17,7 +17,7 @@ from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.data.records import Camera, Image, Sun
 from spacesim.splat.compose.aligned import AlignedRun
 from spacesim.splat.pose import checked_picture
-from spacesim.splat.run import Prediction, Predictor, Run, check_gaussians
+from spacesim.splat.run import Prediction, Predictor, check_gaussians
 from spacesim.splat.sun_search import SmallPicture, SunEstimate, SunFinder
 
 SATURATED = 254.5 / 255  #: sRGB value from which on a pixel says only that it is bright
@@ -26,6 +26,7 @@ VARIANCE, MAX_AXES = 0.99, 16  #: share of the training embeddings' variance tha
 STEP = 0.1  #: standard deviations along an axis, of a finite difference
 ITERATIONS, HALVINGS = 4, 4  #: Gauss-Newton steps, and how often each is halved until it helps
 HALF = 0.5  #: least alpha of a pixel that counts, and least share of such ones in a small picture's
+DARK = 0.02  #: sRGB value, below which nothing of a picture is lit
 ENOUGH = 1e-3  #: a step that lowers the cost by less than this share is the last
 
 
@@ -80,7 +81,9 @@ def find_unknowns(run: Predictor, gain: bool = False) -> tuple[Unknown, ...]:
     return tuple(unknowns)
 
 
-def estimate_sun(run: Run, image: ArrayLike | Image, camera: Camera, mask: ArrayLike | None = None) -> SunEstimate:
+def estimate_sun(
+    run: Predictor, image: ArrayLike | Image, camera: Camera, mask: ArrayLike | None = None
+) -> SunEstimate:
     """The Sun under which the model of `run` looks most like a picture: its direction, and how sure that is.
 
     image: [H, W, 3] sRGB values, float in [0, 1] or uint8, or [H, W, 4] with straight alpha; or what `load_image` gives
@@ -89,7 +92,7 @@ def estimate_sun(run: Run, image: ArrayLike | Image, camera: Camera, mask: Array
     directions are compared, shadows included, on a picture of 64 pixels; the picture's exposure is taken for that of
     the training pictures. Raises InputError where the run knows no Sun, for no such picture, and where none counts.
     """
-    check_gaussians(run)
+    run = check_gaussians(run)
     if not run.relightable or run.light is None:
         raise InputError(f"run: expected one of a method that takes the Sun, found {run.config['method']}")
     pixels, counts = checked_picture(image, mask, camera)
@@ -98,6 +101,8 @@ def estimate_sun(run: Run, image: ArrayLike | Image, camera: Camera, mask: Array
     shown = (seen >= HALF) & (counts[..., 0] > 0)
     if not shown.any():
         raise InputError("image: expected a picture of the object, found no pixel that counts")
+    if rgb[shown].max() < DARK:
+        raise InputError("image: expected light on the object, found none")
     picture = SmallPicture.of(camera, Image(rgb, np.ones_like(seen), shown), least=HALF)
     return SunFinder(run.gaussians, run.light, run.antialiased, run.curve).estimate(picture)
 

@@ -203,7 +203,7 @@ def import_viser() -> ModuleType:
 
 
 def _serve(host: str, port: int) -> "viser.ViserServer":
-    """viser's server, which lets through what `gate` does and says nothing."""
+    """viser's server, which answers requests that are allowed and says nothing."""
     viser = import_viser()
     for name in ("websockets.server", "asyncio"):
         logging.getLogger(name).addFilter(DebugLogFilter())

@@ -81,7 +81,7 @@ def motion_of(messages: Mapping[str, Sequence[Path]], with_sun: bool = True) -> 
         if not orbits or first.center != "EARTH" or first.frame not in J2000_FRAMES:
             known = f"an orbit about EARTH in {', '.join(J2000_FRAMES)}"
             found = f"an orbit about {first.center} in {first.frame}" if orbits else "attitudes alone"
-            expected = f"sun (--sun), or a table with a Sun, as it is computed for {known} only"
+            expected = f"a sun of the rig, or a table with a Sun, as it is computed for {known} only"
             raise InputError(f"{first.path}: expected {expected}, found {found}")
         day, times = first.day, first.times
         parts.append(

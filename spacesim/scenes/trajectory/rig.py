@@ -182,9 +182,11 @@ class PoseRig(Rig):
     exposure: ArrayLike | None = None  #: [N]
 
     def __post_init__(self) -> None:
-        self._poses("world_from_camera", self.world_from_camera)
         if not len(self._poses("world_from_camera", self.world_from_camera)):
             raise InputError("world_from_camera: expected at least one pose, found none")
+        for name in ("world_from_camera", "test"):
+            for pose in self._poses(name, getattr(self, name)):
+                CameraConfig().at(pose)
         self._suns(False)
         self._suns(True)
         check_exposures(self._numbers("exposure", self.exposure))

@@ -312,7 +312,7 @@ class GaussianComposition:
         return lit.gaussians, lit.colors
 
     def lit(self, camera: Camera, sun: Sun | None) -> LitGaussians:
-        """`lit_gaussians` with visibility and owners."""
+        """`lit_gaussians` with visibility and shares of models."""
         poses = [model.pose for model in self.placed]
         colors, visibility = self._shade_members(poses, camera, sun)
         shown = display_colors(colors, self._ensemble.curve, None)

@@ -78,8 +78,10 @@ def suns_around(count: int = FRAMES, elevation_deg: float | None = None, azimuth
 
 def resize_camera(camera: Camera, size: int | tuple[int, int]) -> Camera:
     """The camera with an image of another size, pixels: its longer side, or (width, height). All that it saw stays in
-    the picture; where the shape differs, it sees more on two sides. Raises InputError for a size below 1."""
+    the picture; where the shape differs, it sees more on two sides. Raises InputError for another size."""
     sides = size if isinstance(size, tuple) else (size, size)
+    if len(sides) != 2 or not all(isinstance(side, int) for side in sides):
+        raise InputError(f"size: expected whole pixels, or (width, height), found {size!r}")
     if min(sides) < 1:
         raise InputError(f"size: expected at least 1 pixel a side, found {'x'.join(map(str, sides))}")
     scale = min(sides[0] / camera.width, sides[1] / camera.height)

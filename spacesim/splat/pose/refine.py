@@ -20,7 +20,7 @@ from spacesim.splat.pose.covariance import uncertainty
 from spacesim.splat.pose.motion import Pivot
 from spacesim.splat.pose.picture import SunlitRun, background_of, checked_picture, first_gain
 from spacesim.splat.pose.solver import BLURS, REACH, PyramidLevel, State
-from spacesim.splat.run import Run, check_gaussians, check_picture
+from spacesim.splat.run import Predictor, check_gaussians, check_picture
 
 COARSEST = 64  #: pixels that the longer side of the coarsest picture keeps
 ENOUGH = 0.05, 0.005  #: pixels: shorter steps end a coarse level, and the finest one
@@ -56,7 +56,7 @@ class RefinedPose:
 
 
 def refine_pose(
-    run: Run,
+    run: Predictor,
     image: ArrayLike | Image,
     camera: Camera,
     sun: Sun | Sequence[float] | None = None,
@@ -89,7 +89,7 @@ def refine_pose(
     Raises InputError where the picture, the mask or the numbers are not as above, where the run needs a Sun and none is
     told, and where the camera does not see the model.
     """
-    check_gaussians(run)
+    run = check_gaussians(run)
     told = Sun.of(sun)
     if told is None and run.relightable:
         raise InputError(f"sun: expected its direction for a run of {run.config['method']}, found none")

@@ -18,7 +18,7 @@ from spacesim.data.records import Camera, Image, Sun
 from spacesim.splat.pose.motion import twist_between
 from spacesim.splat.pose.picture import GAINS, SunlitRun, checked_picture, reduced
 from spacesim.splat.pose.refine import RefinedPose, refine_pose
-from spacesim.splat.run import Run, check_gaussians, check_picture
+from spacesim.splat.run import Predictor, Run, check_gaussians, check_picture
 
 DIRECTIONS = 300  #: from which the model is drawn: 12 degrees apart
 TURNS = 36  #: about the line of sight
@@ -130,7 +130,7 @@ class ModelViews:
 
 
 def find_pose(
-    run: Run,
+    run: Predictor,
     image: ArrayLike | Image,
     camera: Camera,
     sun: Sun | Sequence[float] | None = None,
@@ -146,7 +146,7 @@ def find_pose(
 
     Raises InputError as `refine_pose` does, and where nothing in the picture is brighter than its sky.
     """
-    check_gaussians(run)
+    run = check_gaussians(run)
     told = Sun.of(sun)
     if told is None and run.relightable:
         raise InputError(f"sun: expected its direction for a run of {run.config['method']}, found none")

@@ -104,7 +104,9 @@ class Gaussians:
     @staticmethod
     def random(count: int, radius: float, scale: float, seed: int = 0) -> "Gaussians":
         """`count` grey, half-transparent balls, evenly within a sphere of `radius` metres about the origin; scale:
-        their standard deviation, metres."""
+        their standard deviation, metres. Raises ValueError for numbers that no Gaussians have."""
+        if count < 0 or not (0 < radius < np.inf and 0 < scale < np.inf):
+            raise ValueError(f"count, radius, scale: expected finite numbers above 0, found {count}, {radius}, {scale}")
         rng = np.random.default_rng(seed)
         directions = rng.normal(size=(count, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)

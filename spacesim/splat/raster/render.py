@@ -37,15 +37,17 @@ def render(
     outputs: of `OUTPUTS`, what to compute; alpha is always there
     features: C arrays [N] (a list, or an ArrayXf [C, N]) to blend beside them; values not finite count as 0
     antialiased: see `project`
-    Raises ValueError for another output, or features of another length.
+    Raises ValueError for another output or degree, or features of another length.
     """
-    unknown = [name for name in outputs if name not in OUTPUTS]
+    unknown = [outputs] if isinstance(outputs, str) else [name for name in outputs if name not in OUTPUTS]
     if unknown:
         raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
     feature_list = [] if features is None else [ad.Float(feature) for feature in features]
     wrong_widths = [dr.width(feature) for feature in feature_list if dr.width(feature) not in (1, gaussians.count)]
     if wrong_widths:
         raise ValueError(f"features: expected arrays of {gaussians.count}, found one of {wrong_widths[0]}")
+    if sh_degree is not None and not 0 <= sh_degree <= max(gaussians.sh_degree, 0):
+        raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, as stored, found {sh_degree}")
     if gaussians.count == 0:
         return _empty_output(camera, outputs, None if features is None else len(feature_list))
 

@@ -74,7 +74,7 @@ def import_video(
     source = _source("video", src, asked, frames=frames)
     check_free(out, source)
     with _workspace() as folder:
-        tell = _Teller(progress, ("look", *_STAGES))
+        tell = _StageProgress(progress, ("look", *_STAGES))
         seen = survey((frame.picture for frame in read_frames(src)), lambda count: tell("look", 0, 1, f"frame {count}"))
         chosen = choose(seen, frames)
         if len(chosen) < LEAST:
@@ -110,7 +110,7 @@ def import_images(src: Path, out: Path, *, progress: Progress | None = None, **o
         raise InputError(f"{src}: expected at least {LEAST} pictures, found {len(paths)}")
     names = [f"{name}.png" for name in frame_names([path.relative_to(src).as_posix() for path in paths])]
     with _workspace() as folder:
-        tell = _Teller(progress, ("look", *_STAGES))
+        tell = _StageProgress(progress, ("look", *_STAGES))
         size = None
         for k, (path, name) in enumerate(zip(paths, names, strict=True)):
             tell("look", k, len(paths), name)
@@ -131,7 +131,7 @@ def _import(
     ordered: bool,
     asked: ImportOptions,
     source: dict[str, JsonValue],
-    tell: "_Teller",
+    tell: "_StageProgress",
     facts: dict[str, JsonValue],
 ) -> Dataset:
     """Of pictures in folder/pictures, all of one size. keys: of each picture by its name, what transforms.json has of
@@ -168,7 +168,7 @@ def _import(
     )
 
 
-def _find_masks(folder: Path, names: Sequence[str], asked: ImportOptions, tell: "_Teller") -> bool:
+def _find_masks(folder: Path, names: Sequence[str], asked: ImportOptions, tell: "_StageProgress") -> bool:
     """Write folder/masks/NAME, 255 the object; False where the background stays."""
     if asked.masks is not None and str(asked.masks) == NO_MASKS:
         return False
@@ -235,7 +235,7 @@ def _source(kind: str, src: Path, asked: ImportOptions, **more: JsonValue) -> di
     return {"kind": kind, "source": str(src), **more, **options}
 
 
-class _Teller:
+class _StageProgress:
     """Tells a `Progress` of stages as parts of one whole."""
 
     def __init__(self, progress: Progress | None, stages: Sequence[str]) -> None:

@@ -78,6 +78,9 @@ def test_a_run_tells_the_sun_of_a_new_picture(small_dataset, quick, tmp_path):
     estimate = estimate_sun(run, picture, frame.camera)
     assert np.linalg.norm(estimate.direction) == pytest.approx(1)
     np.testing.assert_array_equal(estimate_sun(run, picture, frame.camera).direction, estimate.direction)
+    black = np.concatenate([0 * picture[..., :3], picture[..., 3:]], axis=-1)
+    with pytest.raises(InputError, match="image: expected light on the object, found none"):
+        estimate_sun(run, black, frame.camera)
     with pytest.raises(InputError, match="no pixel that counts"):
         estimate_sun(run, np.zeros_like(picture), frame.camera)
     with pytest.raises(InputError, match=r"image: expected \["):
