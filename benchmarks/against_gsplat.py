@@ -240,4 +240,4 @@ def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainC
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

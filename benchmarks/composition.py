@@ -140,9 +140,9 @@ def evaluated_twice(row: Row, run: Run, pair: Dataset, out: Path, shapes: bool) 
 def table_row(name: str, metrics: Mapping[str, Any], which: str) -> common.Row:
     """Means over one boxsat's pixels."""
     summaries = [_of(metrics, which, group, metric) for _, group, metric in COLUMNS]
-    found = dict(zip((heading for heading, _, _ in COLUMNS), shown(summaries), strict=True))
+    cells = dict(zip((heading for heading, _, _ in COLUMNS), shown(summaries), strict=True))
     error = _of(metrics, which, "shadow_mask", "error_rate")
-    return {"row": name, **found, "mask error": "" if error is None else f"{error:.4f}"}
+    return {"row": name, **cells, "mask error": "" if error is None else f"{error:.4f}"}
 
 
 def shown(values: Any) -> list[str]:
@@ -162,4 +162,4 @@ def _of(metrics: Mapping[str, Any], which: str, group: str, metric: str) -> floa
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

@@ -42,9 +42,9 @@ def model(points: list[Point]) -> tuple[dict[str, float], float]:
     """
     work = np.array([[1, p.pairs / 1e6, p.gaussians / 1e6, p.pixels**2 / 1e6] for p in points])
     times = np.array([p.milliseconds for p in points])
-    found, _ = nnls(work / times[:, None], np.ones(len(points)))
+    coefficients, _ = nnls(work / times[:, None], np.ones(len(points)))
     names = ("fixed", "a million pairs", "a million Gaussians", "a million pixels")
-    return dict(zip(names, found.tolist(), strict=True)), float(np.abs(work @ found / times - 1).max())
+    return dict(zip(names, coefficients.tolist(), strict=True)), float(np.abs(work @ coefficients / times - 1).max())
 
 
 def summary(points: list[Point]) -> dict[str, float]:

@@ -77,13 +77,13 @@ def followed(folder: Path, data: Dataset, config: TrainConfig, views: int) -> li
     chosen = test_views(data, views)
     trainer, points = None, []
     for path in sorted(kept.glob("step_*.safetensors")):
-        found = path.with_suffix(".json")
-        if not found.exists():
+        scores_path = path.with_suffix(".json")
+        if not scores_path.exists():
             trainer = trainer or Trainer(data, config)
             trainer.restore(path)
             there = replace(run, gaussians=trainer.gaussians, light=trainer.light)
-            write_json(found, {"iteration": trainer.iteration, **quality(there, data, chosen)})
-        points.append(read_json(found))
+            write_json(scores_path, {"iteration": trainer.iteration, **quality(there, data, chosen)})
+        points.append(read_json(scores_path))
     return [*points, {"iteration": config.iterations, **quality(run, data, chosen)}]
 
 
@@ -102,12 +102,12 @@ def test_views(data: Dataset, views: int) -> dict[str, list[Frame]]:
 
 def quality(run: Run, data: Dataset, chosen: dict[str, list[Frame]]) -> common.Row:
     """Mean PSNR over the silhouettes under each kind of Sun, dB, and Gaussians."""
-    found: common.Row = {}
+    means: common.Row = {}
     for name, frames in chosen.items():
         views = [frame_images(data, frame, run.predict(frame.camera, frame.sun))[0] for frame in frames]
         scores = [image.psnr(view.prediction, view.truth, view.silhouette) for view in views]
-        found[f"PSNR, {name}"] = float(np.mean([score for score in scores if score is not None]))
-    return {**found, "Gaussians": run.gaussian_count}
+        means[f"PSNR, {name}"] = float(np.mean([score for score in scores if score is not None]))
+    return {**means, "Gaussians": run.gaussian_count}
 
 
 def chart(rows: Sequence[common.Row]) -> str:
@@ -122,4 +122,4 @@ def chart(rows: Sequence[common.Row]) -> str:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

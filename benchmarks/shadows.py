@@ -70,13 +70,13 @@ def main() -> None:
     if unknown:
         sys.exit(f"--rows: expected some of {', '.join((*ROWS, *table))}, found {unknown[0]!r}")
     dataset = read_dataset(options.data or make_data(options.out / "data"))
-    judge = EvaluateConfig(geometry=None) if options.no_geometry else EvaluateConfig()
+    evaluation = EvaluateConfig(geometry=None) if options.no_geometry else EvaluateConfig()
     results: dict[str, Any] = {}
     for name, (kind, config) in table.items():
         if kind in wanted or name in wanted:
             config = with_options(config, iterations=options.iterations)
-            results[name] = common.measured(name, config, judge, dataset, options.out / name)
-    evaluated = [options.out / name / "eval" for name, found in results.items() if "note" not in found]
+            results[name] = common.measured(name, config, evaluation, dataset, options.out / name)
+    evaluated = [options.out / name / "eval" for name, result in results.items() if "note" not in result]
     if evaluated:
         write_report(evaluated, options.out / "report.html")
     tables = {
@@ -128,9 +128,9 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "none, surface, bounce", with_bounce(relit, splatted.light.bounce)
     yield "map, surface, no bounce", with_bounce(mapped, 0)
     yield "splat, surface, no bounce", with_bounce(splatted, 0)
-    told = ShadowRefinementConfig(width=refine_of(splatted).width)
-    yield "splat, surface, refinement told the Sun", with_shadow(splatted, refine=told)
-    yield "splat, surface, no bounce, refinement told the Sun", with_bounce(with_shadow(splatted, refine=told), 0)
+    with_sun = ShadowRefinementConfig(width=refine_of(splatted).width)
+    yield "splat, surface, refinement told the Sun", with_shadow(splatted, refine=with_sun)
+    yield "splat, surface, no bounce, refinement told the Sun", with_bounce(with_shadow(splatted, refine=with_sun), 0)
     if splatted.supersample == 1:
         yield "none, surface, 2x2 samples", replace(relit, supersample=2)
         yield "splat, surface, 2x2 samples", replace(splatted, supersample=2)
@@ -209,13 +209,13 @@ def row(name: str, metrics: dict[str, Any], part: str) -> common.Row:
     """Means over the frames of known or unseen Suns."""
     if "note" in metrics:
         return {"method": name, "Gaussians": metrics["note"]}
-    found: common.Row = {"method": name, "Gaussians": metrics["model"]["gaussians"]}
+    cells: common.Row = {"method": name, "Gaussians": metrics["model"]["gaussians"]}
     for heading, group, metric, *what in COLUMNS:
         value = ((metrics.get(part) or {}).get(group) or {}).get(metric)
         number = None if value is None else value[what[0] if what else "mean"]
-        found[heading] = "" if number is None else f"{number:.{2 if metric == 'psnr' else 4}f}"
-    return found
+        cells[heading] = "" if number is None else f"{number:.{2 if metric == 'psnr' else 4}f}"
+    return cells
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

@@ -51,7 +51,7 @@ def main() -> None:
     device = "cuda" if name == "cuda" else "cpu"
     if device == "cpu":
         torch.set_num_threads(1)
-    rows, found = [], []
+    rows, differences = [], []
     for count, side in common.parse_sizes(options.sizes):
         leaves, camera = _scene(torch, count, side, device)
         ours = _timed(partial(_own, leaves, camera), options.repeats, torch, device)
@@ -63,13 +63,13 @@ def main() -> None:
             row |= {"gsplat, ms": theirs.median, "torch / gsplat": door.median / theirs.median}
             for mode in MODES:
                 different = _differences(torch, rasterization, peer, leaves, camera, mode)
-                found.append({"Gaussians": count, **mode, **different})
+                differences.append({"Gaussians": count, **mode, **different})
         rows.append(row)
     if options.json:
-        print(json.dumps({"rows": rows, "differences": found}, indent=1))
+        print(json.dumps({"rows": rows, "differences": differences}, indent=1))
         return
     print(common.table(rows, options.markdown))
-    for one in found:
+    for one in differences:
         print(one)
 
 
@@ -144,7 +144,7 @@ def _differences(
 ) -> dict[str, float]:
     """Largest absolute differences of pictures and alphas, shares of pixels that differ by more than some (a splat
     whose alpha is all but 1/255 may count with one alone), relative norms of differences of gradients."""
-    found = []
+    results = []
     weights = None
     for function in (one, other):
         own = {name: leaf.detach().clone().requires_grad_(name != "Ks") for name, leaf in leaves.items()}
@@ -156,14 +156,14 @@ def _differences(
         if weights is None:
             weights = torch.randn(both.shape, device=both.device, generator=torch.Generator(both.device).manual_seed(1))
         (weights[..., :3] * both[..., :3] + weights[..., -1:] * both[..., -1:]).sum().backward()
-        found.append((picture.detach(), alpha.detach(), {name: own[name].grad for name in (*NAMES, "viewmats")}))
-    (a, alpha_a, by_a), (b, alpha_b, by_b) = found
+        results.append((picture.detach(), alpha.detach(), {name: own[name].grad for name in (*NAMES, "viewmats")}))
+    (a, alpha_a, by_a), (b, alpha_b, by_b) = results
     off = torch.where(alpha_b > 0.01, a - b, 0 * a).abs().amax(dim=-1).flatten()
-    told = {"picture": float(off.max()), "alpha": float((alpha_a - alpha_b).abs().max())}
-    told |= {f"pixels off by {bound:g}": float((off > bound).float().mean()) for bound in (1e-4, 1e-3)}
+    differences = {"picture": float(off.max()), "alpha": float((alpha_a - alpha_b).abs().max())}
+    differences |= {f"pixels off by {bound:g}": float((off > bound).float().mean()) for bound in (1e-4, 1e-3)}
     for name, gradient in by_b.items():
-        told[f"gradient {name}"] = float((by_a[name] - gradient).norm() / gradient.norm())
-    return told
+        differences[f"gradient {name}"] = float((by_a[name] - gradient).norm() / gradient.norm())
+    return differences
 
 
 def _stored(torch: Any, peer: Any) -> dict[str, np.ndarray]:
@@ -171,7 +171,7 @@ def _stored(torch: Any, peer: Any) -> dict[str, np.ndarray]:
     two cameras of 32 x 24 pixels."""
     rng = np.random.default_rng(7)
     cameras = [Camera.look_at([3.5, 1, 1 - k], [0, 0, 0], 32, 24, 40) for k in range(2)]
-    found = {
+    arrays = {
         "means": 0.6 * rng.normal(size=(40, 3)),
         "quats": rng.normal(size=(40, 4)),
         "scales": rng.uniform(0.05, 0.3, (40, 3)),
@@ -182,8 +182,8 @@ def _stored(torch: Any, peer: Any) -> dict[str, np.ndarray]:
         "backgrounds": rng.uniform(size=(2, 3)),
         "weights": rng.normal(size=(2, 24, 32, 5)),
     }
-    inputs = {name: array.astype(np.float32) for name, array in found.items()}
-    found = dict(inputs)
+    inputs = {name: array.astype(np.float32) for name, array in arrays.items()}
+    arrays = dict(inputs)
     for number, mode in enumerate(MODES):
         own = {name: torch.tensor(array, device="cuda") for name, array in inputs.items()}
         weights = own.pop("weights")
@@ -192,10 +192,10 @@ def _stored(torch: Any, peer: Any) -> dict[str, np.ndarray]:
         leaves = {name: tensor.requires_grad_(name != "Ks") for name, tensor in own.items()}
         picture, alpha, _ = peer(**leaves, width=32, height=24, sh_degree=3, packed=False, **mode)
         ((weights[..., : picture.shape[-1]] * picture).sum() + (weights[..., 4:] * alpha).sum()).backward()
-        found |= {f"{number}.picture": picture.detach(), f"{number}.alpha": alpha.detach()}
-        found |= {f"{number}.by.{name}": leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-    return {name: array if isinstance(array, np.ndarray) else array.cpu().numpy() for name, array in found.items()}
+        arrays |= {f"{number}.picture": picture.detach(), f"{number}.alpha": alpha.detach()}
+        arrays |= {f"{number}.by.{name}": leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    return {name: array if isinstance(array, np.ndarray) else array.cpu().numpy() for name, array in arrays.items()}
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

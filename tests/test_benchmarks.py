@@ -177,7 +177,7 @@ def test_what_cannot_be_measured_is_refused(arguments, sentence, monkeypatch, ca
 
     monkeypatch.setattr(sys, "argv", ["training.py", *arguments])
     with pytest.raises(SystemExit) as ended:
-        common.told(training.main)
+        common.run_main(training.main)
     assert sentence in capsys.readouterr().err + str(ended.value)
 
 
@@ -190,7 +190,7 @@ def test_what_was_measured_is_told_before_a_file_that_cannot_be_written(tmp_path
         where = str(tmp_path / "file" / "x")
         monkeypatch.setattr(sys, "argv", ["rasterizer.py", "--sizes", "100x16", "--repeats", "1", option, where])
         with pytest.raises(SystemExit, match="2"):
-            common.told(rasterizer.main)
+            common.run_main(rasterizer.main)
         told = capsys.readouterr()
         assert "Kernels, ms" in told.out
         assert f"{where}: cannot be written" in told.err

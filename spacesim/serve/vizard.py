@@ -87,7 +87,7 @@ class Simulation:
         self._bodies: dict[str, Body] = {}
         self._cameras: dict[int, MountedCamera] = {}
         self._frame = 0
-        self._told = ""
+        self._last_warning = ""
 
     def answer(self, frames: Sequence[bytes]) -> list[bytes] | None:
         """Frames of the answer; None where this is none of Basilisk's words."""
@@ -109,8 +109,8 @@ class Simulation:
         bodies, cameras = dict(self._bodies), dict(self._cameras)
         for number, value in wire.fields(message):
             if number == 1:
-                told = [wire.integers(inner) for key, inner in wire.fields(_message(value)) if key == 1]
-                self._frame = max(0, *(frame for frames in told for frame in frames), 0)
+                numbers = [wire.integers(inner) for key, inner in wire.fields(_message(value)) if key == 1]
+                self._frame = max(0, *(frame for frames in numbers for frame in frames), 0)
             elif number in (2, 3):
                 body = _read_body(value, is_spacecraft=number == 3)
                 bodies[body.name] = body
@@ -188,9 +188,9 @@ class Simulation:
 
     def _tell(self, sentence: str) -> None:
         """Once: Basilisk asks again and again."""
-        if sentence != self._told:
+        if sentence != self._last_warning:
             _log.warning("Basilisk gets no picture: %s", sentence)
-        self._told = sentence
+        self._last_warning = sentence
 
 
 def depth_colors(depth: Array, far: float) -> np.ndarray:
