@@ -556,7 +556,7 @@ def test_background_of_a_model_that_shows_nothing(small_lit):
 
     data = read_dataset(small_lit)
     unseen = Gaussians.from_numpy({**common.sphere_arrays(10), "logit_opacities": np.full(10, -20.0)})
-    inside, outside, holes, *psnr = background.judge(unseen, data)
+    inside, outside, holes, *psnr = background.measured_errors(unseen, data)
     assert (inside, outside, holes) == (0, 0, 1)
     pictures = [load_image(data, frame).over(np.zeros(3)) for frame in data.test]
     light = [load_image(data, frame).over(np.ones(3)) for frame in data.test]
