@@ -56,7 +56,7 @@ class Timing:
         return f"{self.median:.2f} ({self.low:.2f} to {self.high:.2f})"
 
 
-def arguments(text: str, sizes: str | None = None) -> argparse.ArgumentParser:
+def arguments(text: str | None, sizes: str | None = None) -> argparse.ArgumentParser:
     """A parser with the options that every benchmark has. text: the script's docstring."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", choices=backend.NAMES, default="auto")

@@ -84,7 +84,9 @@ def main() -> None:
         else:
             data = data or shadows.make_data(options.out / "data", resolution=options.resolution)
             config = with_options(row.config, iterations=options.iterations)
-            run = trained(options.out / row.run / "run", read_dataset(data), config, row.run, show_progress)
+            result = trained(options.out / row.run / "run", read_dataset(data), config, row.run, show_progress)
+            assert isinstance(result, Run)
+            run = result
         results[row.name] = evaluated_twice(row, run, pair, options.out / "pairs", not options.no_geometry)
     write_report([options.out / "pairs" / name for name in results], options.out / "pairs/report.html")
     tables = {
@@ -156,7 +158,7 @@ def shown(values: Any) -> list[str]:
 
 def _of(metrics: Mapping[str, Any], which: str, group: str, metric: str) -> float | None:
     """Mean over the frames that show the boxsat."""
-    one = next((entry for entry in metrics["objects"] or [] if entry["name"] == which), {})
+    one: Mapping[str, Any] = next((entry for entry in metrics["objects"] or [] if entry["name"] == which), {})
     value = (one.get(group) or {}).get(metric)
     return None if value is None else float(value["mean"])
 

@@ -69,11 +69,14 @@ def _turns(lanes: int, function: Callable[[Any], Any]) -> None:
     """CHAINS independent chains of TURNS calls in each lane."""
     start = dr.opaque(ad.Float, 0.5, lanes)
 
+    def goes_on(i: Any, _values: list[Any]) -> Any:
+        return i < TURNS
+
     def turn(i: Any, values: list[Any]) -> Any:
         return i + 1, [function(value) for value in values]
 
     values = [start + k for k in range(CHAINS)]
-    _, values = dr.while_loop((ad.UInt32(0), values), lambda i, _: i < TURNS, turn, mode="symbolic", label="turns")
+    _, values = dr.while_loop((ad.UInt32(0), values), goes_on, turn, mode="symbolic", label="turns")
     dr.eval(sum(values[1:], values[0]))
 
 

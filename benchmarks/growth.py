@@ -1,5 +1,6 @@
 """How a time grows with the work: slopes on logarithmic axes, a linear model, and a chart of both as SVG."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,7 +136,7 @@ def describe(name: str, points: list[Point]) -> str:
     return f"{compact(first.gaussians)} Gaussians on {first.pixels}² to {last.pixels}² pixels"
 
 
-def decades(values: list[float]) -> tuple[float, float]:
+def decades(values: Sequence[float]) -> tuple[float, float]:
     """The nearest of 1, 2 and 5 times a power of ten below and above all values."""
     steps = [factor * 10.0**power for power in range(-6, 12) for factor in (1, 2, 5)]
     return max(s for s in steps if s <= min(values)), min(s for s in steps if s > max(values))

@@ -95,7 +95,7 @@ def evaluated_frames(dataset: Dataset, count: int) -> tuple[list[Frame], str]:
         return list(by_sun.values())[::-1][:count], "unseen Suns"
     if not dataset.test:
         raise InputError(f"{dataset.root}: expected test frames, found none")
-    return dataset.test[:count], "test frames"
+    return list(dataset.test[:count]), "test frames"
 
 
 def opened(browser: Browser, path: Path, width: int, height: int) -> Page:

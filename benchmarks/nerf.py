@@ -56,7 +56,7 @@ def main() -> None:
     name = backend.select(options.backend)
     data = read_dataset(options.data or common.generated("boxsat", options.out / "data", **SCENE, **SAMPLES))
     config = methods.shortened(methods.preset(options.preset, "nerf"), options.iterations)
-    config = replace(config, rays=options.rays)  # type: ignore[type-var]
+    config = replace(config, rays=options.rays)
     run, duration = trained(data, options.out / "run", config)
     rows = [
         {"": f"spacesim, {options.preset}", **trained_row(step_time(data, run, options.repeats), duration, run, data)}
@@ -131,7 +131,7 @@ def trained_row(step: common.Timing, duration: float, model: Any, data: Dataset)
 def frame_rows(run: NerfRun, data: Dataset, pixels: int) -> Iterator[common.Row]:
     """Of one model as cameras of the data see it, and of some from where all of them fit."""
     for count in MODELS:
-        placed = [PlacedRun(run, Pose(translation=place)) for place in places(data)[:count]]
+        placed = [PlacedRun(run, Pose(translation=place)) for place in places(data)[:count]]  # type: ignore[arg-type]
         scene = run if count == 1 else FieldComposition(placed, ComposeConfig("none"))
         frames = data.test[:9] if count == 1 else views(data)
         seconds = [_timed(scene, _sized(frame, pixels)) for frame in (*frames[:2], *frames)][2:]

@@ -66,14 +66,19 @@ def followed(folder: Path, data: Dataset, config: TrainConfig, views: int) -> li
     kept = folder / "kept"
     kept.mkdir(parents=True, exist_ok=True)
 
-    def keep(_progress: TrainingProgress) -> None:
+    def keep_checkpoints() -> None:
         for path in (folder / "run" / "checkpoints").glob("step_*.safetensors"):
             if not (kept / path.name).exists():
                 os.link(path, kept / path.name)
 
     with show_progress(f"train {config.method}", "iterations") as report:
         tell = report_training(report)
-        run = train(data, folder / "run", config, True, lambda progress: (keep(progress), tell(progress))[1])
+
+        def follow(progress: TrainingProgress) -> None:
+            keep_checkpoints()
+            tell(progress)
+
+        run = train(data, folder / "run", config, True, follow)
     chosen = test_views(data, views)
     trainer, points = None, []
     for path in sorted(kept.glob("step_*.safetensors")):
@@ -112,7 +117,9 @@ def quality(run: Run, data: Dataset, chosen: dict[str, list[Frame]]) -> common.R
 
 def chart(rows: Sequence[common.Row]) -> str:
     """SVG that stands alone: PSNR of each method and kind of Sun against iterations."""
-    names = {(row["method"], key): [] for row in rows for key in row if key.startswith("PSNR")}
+    names: dict[tuple[str, str], list[tuple[float, float]]] = {
+        (row["method"], key): [] for row in rows for key in row if key.startswith("PSNR")
+    }
     for row in rows:
         for (method, key), points in names.items():
             if row["method"] == method:

@@ -118,14 +118,14 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, supervised", replace(mapped, visibility_weight=0.1)
     yield "splat, surface, supervised", replace(splatted, visibility_weight=0.1)
     yield "map, surface, light of twice the size", with_shadow(mapped, size=2 * shadow_of(mapped).size)
-    yield "map, surface, linear", replace(mapped, light=replace(mapped.light, linear=True))
-    yield "map, surface, linear, filmic", replace(mapped, light=replace(mapped.light, linear=True, tone="filmic"))
+    yield "map, surface, linear", replace(mapped, light=replace(light_of(mapped), linear=True))
+    yield "map, surface, linear, filmic", replace(mapped, light=replace(light_of(mapped), linear=True, tone="filmic"))
     moving = SplattingConfig(gradients=True)
     yield "splat, surface, gradients", with_shadow(splatted, method=moving)
     both = with_shadow(replace(splatted, visibility_weight=0.1), method=moving)
     yield "splat, surface, supervised, gradients", both
     yield "splat, surface, lifted alone, supervised, gradients", with_shadow(both, grazing="lift")
-    yield "none, surface, bounce", with_bounce(relit, splatted.light.bounce)
+    yield "none, surface, bounce", with_bounce(relit, light_of(splatted).bounce)
     yield "map, surface, no bounce", with_bounce(mapped, 0)
     yield "splat, surface, no bounce", with_bounce(splatted, 0)
     with_sun = ShadowRefinementConfig(width=refine_of(splatted).width)
@@ -150,8 +150,7 @@ def finer(config: TrainConfig) -> TrainConfig:
 
 def with_bounce(config: TrainConfig, emitters: int) -> TrainConfig:
     """`config` with one bounce of light from so many Gaussians."""
-    assert config.light is not None
-    return replace(config, light=replace(config.light, bounce=emitters))
+    return replace(config, light=replace(light_of(config), bounce=emitters))
 
 
 def as_thesis(config: TrainConfig) -> TrainConfig:
@@ -177,21 +176,24 @@ def as_ours(config: TrainConfig) -> TrainConfig:
         return config
     fast = preset("fast", config.method)
     ours, refine = shadow_of(fast), replace(refine_of(fast), width=refine_of(config).width)
-    config = with_bounce(config, fast.light.bounce)
+    config = with_bounce(config, light_of(fast).bounce)
     return with_shadow(config, bias=ours.bias, grazing=ours.grazing, method=ours.method, refine=refine)
 
 
 def with_shadow(config: TrainConfig, **changes: Any) -> TrainConfig:
     """`config` with another configuration of its shadows."""
-    light: LightConfig | None = config.light
-    assert light is not None
-    return replace(config, light=replace(light, shadow=replace(shadow_of(config), **changes)))
+    return replace(config, light=replace(light_of(config), shadow=replace(shadow_of(config), **changes)))
+
+
+def light_of(config: TrainConfig) -> LightConfig:
+    assert config.light is not None
+    return config.light
 
 
 def shadow_of(config: TrainConfig) -> ShadowConfig:
-    assert config.light is not None
-    assert config.light.shadow is not None
-    return config.light.shadow
+    shadow = light_of(config).shadow
+    assert shadow is not None
+    return shadow
 
 
 def refine_of(config: TrainConfig) -> ShadowRefinementConfig:

@@ -59,8 +59,10 @@ def make(folder: Path, frames: int = 600, height: int = 300, seed: int = 0, spp:
         import_speedplus(folder / "speedplus", folder / "data")
     data = read_dataset(folder / "data")
     if not (folder / "told/transforms.json").exists():
-        splits = [[_labelled(made, data, *pair) for pair in zip(*sets, strict=True)] for sets in _splits(made, data)]
-        write_dataset(folder / "told", *splits, {"kind": "told", "source": str(folder / "data")})
+        train, test = (
+            [_labelled(made, data, *pair) for pair in zip(*sets, strict=True)] for sets in _splits(made, data)
+        )
+        write_dataset(folder / "told", train, test, {"kind": "told", "source": str(folder / "data")})
     return SpeedplusData(made, data, read_dataset(folder / "told"))
 
 

@@ -27,7 +27,12 @@ from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
-MODES = ({}, {"rasterize_mode": "antialiased"}, {"camera_model": "ortho"}, {"render_mode": "RGB+ED"})
+MODES: tuple[dict[str, Any], ...] = (
+    {},
+    {"rasterize_mode": "antialiased"},
+    {"camera_model": "ortho"},
+    {"render_mode": "RGB+ED"},
+)
 
 
 def main() -> None:
@@ -44,7 +49,7 @@ def main() -> None:
     gsplat = load_peer(options.peers, name, "gsplat")
     peer = gsplat and gsplat.rasterization
     if options.store is not None and peer is not None:
-        np.savez_compressed(options.store, **_stored(torch, peer))
+        np.savez_compressed(options.store, **_stored(torch, peer))  # type: ignore[arg-type]
         return
     from spacesim.torch import rasterization
 
@@ -95,7 +100,7 @@ def _scene(torch: Any, count: int, side: int, device: str) -> tuple[dict[str, An
 
 def _own(leaves: dict[str, Any], camera: Camera) -> None:
     """A picture by `render`, and gradients, without torch in between."""
-    if not hasattr(_own, "arrays") or _own.arrays.count != len(leaves["means"]):  # type: ignore[attr-defined]
+    if not hasattr(_own, "arrays") or _own.arrays.count != len(leaves["means"]):
         plain = {name: leaves[name].detach().cpu().numpy() for name in NAMES}
         opacity = plain["opacities"]
         _own.arrays = Gaussians.from_numpy(  # type: ignore[attr-defined]
@@ -112,6 +117,7 @@ def _own(leaves: dict[str, Any], camera: Camera) -> None:
         dr.disable_grad(parameter)
         dr.enable_grad(parameter)
     output = render(model, Pinhole.of(camera), outputs=("color", "alpha"))
+    assert output.color is not None
     total = sum((dr.sum(dr.square(plane)) for plane in output.color), dr.sum(output.alpha))
     dr.backward(total)
     gradients = [dr.grad(parameter) for parameter in model.parameters().values()]
@@ -171,19 +177,19 @@ def _stored(torch: Any, peer: Any) -> dict[str, np.ndarray]:
     two cameras of 32 x 24 pixels."""
     rng = np.random.default_rng(7)
     cameras = [Camera.look_at([3.5, 1, 1 - k], [0, 0, 0], 32, 24, 40) for k in range(2)]
-    arrays = {
+    values = {
         "means": 0.6 * rng.normal(size=(40, 3)),
         "quats": rng.normal(size=(40, 4)),
         "scales": rng.uniform(0.05, 0.3, (40, 3)),
         "opacities": rng.uniform(0.1, 0.95, 40),
         "colors": 0.4 * rng.normal(size=(40, 16, 3)),
         "viewmats": np.stack([camera.camera_from_world for camera in cameras]),
-        "Ks": np.stack([[[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]] for c in cameras]),
+        "Ks": np.array([[[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]] for c in cameras]),
         "backgrounds": rng.uniform(size=(2, 3)),
         "weights": rng.normal(size=(2, 24, 32, 5)),
     }
-    inputs = {name: array.astype(np.float32) for name, array in arrays.items()}
-    arrays = dict(inputs)
+    inputs = {name: array.astype(np.float32) for name, array in values.items()}
+    arrays: dict[str, Any] = dict(inputs)
     for number, mode in enumerate(MODES):
         own = {name: torch.tensor(array, device="cuda") for name, array in inputs.items()}
         weights = own.pop("weights")

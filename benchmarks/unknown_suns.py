@@ -91,8 +91,8 @@ def without_suns(data: Dataset, out: Path) -> Dataset:
                 Path(frame.file_path).stem, paths[0], frame.camera, frame.distortion, silhouette=paths[1]
             )
 
-        groups = [list(map(without_sun, group)) for group in (data.train, data.test)]
-        write_dataset(out, *groups, {"kind": "untold", "source": str(data.root)})
+        train, test = (list(map(without_sun, group)) for group in (data.train, data.test))
+        write_dataset(out, train, test, {"kind": "untold", "source": str(data.root)})
     return read_dataset(out)
 
 

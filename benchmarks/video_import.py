@@ -94,15 +94,15 @@ def main() -> None:
     film = options.out / "film.mp4"
     write_bytes(film, encoded([opaque(data, frame) for data, frame in truth]))
     rows = []
-    for name, import_options in (("told", {"fov": FOV}), ("estimated", {})):
+    for name, fov in ("told", FOV), ("estimated", None):
         folder = options.out / f"import-{name}"
         start = time.perf_counter()
         try:
             if not (folder / "transforms.json").exists():
                 with show_progress("import", "%") as report:
-                    import_dataset("video", film, folder, report, length=LENGTH, **import_options)
+                    import_dataset("video", film, folder, report, length=LENGTH, fov=fov)
             row = compared(read_dataset(folder), truth)
-            note = {"seconds": time.perf_counter() - start}
+            note: common.Row = {"seconds": time.perf_counter() - start}
         except (InputError, WorkError) as error:
             row, note = {}, {"note": str(error)}
         rows.append({"field of view": name, **row, **note})

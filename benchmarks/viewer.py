@@ -24,6 +24,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import common
@@ -135,11 +136,13 @@ def draws(show: ViewerSetup, side: int, repeats: int) -> list[common.Row]:
 
     counter = itertools.count()
     settings = DisplaySettings(side=side)
+
+    def draw_elsewhere(mode: str) -> None:
+        there = replace(still, world_from_camera=next(camera))
+        draw_frame(show.renderer, show.state, there, replace(settings, mode=mode))
+
     works: dict[str, common.Work] = {
-        f"{mode}, another camera": lambda mode=mode: draw_frame(
-            show.renderer, show.state, replace(still, world_from_camera=next(camera)), replace(settings, mode=mode)
-        )
-        for mode in show.renderer.modes
+        f"{mode}, another camera": partial(draw_elsewhere, mode) for mode in show.renderer.modes
     }
     works["colour, another Sun"] = lambda: draw_frame(
         show.renderer, replace(show.state, sun=next(sun)), still, settings
