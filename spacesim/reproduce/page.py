@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ QUICK = (
 )
 NONE = '<span class="none">{}</span>'
 VERDICTS = {True: "holds", False: '<span class="best">fails</span>', None: NONE.format("–")}
-FIGURES: Mapping[str, Callable[[Path, Any], str]] = {
+FIGURES: Mapping[str, Callable[[Path, Sequence[JsonMapping]], str]] = {
     "figure-3.2": frame_times,
     "figure-4.2": relighting,
     "figure-4.3": fixed_sun,

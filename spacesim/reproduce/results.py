@@ -25,7 +25,7 @@ from spacesim.reproduce.experiments import (
 )
 from spacesim.reproduce.perform import folder_of, is_done
 from spacesim.reproduce.size import Size
-from spacesim.reproduce.thesis import Column, Row, Table, best, holds, pairs, thesis
+from spacesim.reproduce.thesis import Column, ExpectedRanking, Row, Table, best, holds, pairs, thesis
 
 PICTURES = ("psnr", "ssim", "lpips", "mae")
 SHAPE = ("chamfer", "hausdorff99", "iou")
@@ -247,7 +247,7 @@ def _over(frames: Sequence[JsonMapping], name: str) -> dict[str, float] | None:
 Means = Mapping[tuple[str, str], Mapping[str, float | None]]
 
 
-def _claim(table: Table, claim: Any, keys: Sequence[str], means: Means) -> Values:
+def _claim(table: Table, claim: ExpectedRanking, keys: Sequence[str], means: Means) -> Values:
     column = next(column for column in table.columns if column.metric == claim.metric)
     verdicts = {key: holds(column, means[key, claim.metric], claim.better, claim.worse) for key in keys}
     return {"text": f"{column.heading}: {claim.better} {column.comparison} {claim.worse}", "holds": verdicts}

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from spacesim.data.files import JsonDict
 from spacesim.data.images.tone import STANDARD_EXPOSURE, as_bytes, display_values
 from spacesim.data.records import Camera, Sun
 from spacesim.serve.protocol import OUTPUTS, Output
+
+if TYPE_CHECKING:
+    from spacesim.scenes import SceneConfig
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +66,7 @@ class TracedScene:
 
     outputs = OUTPUTS
 
-    def __init__(self, config: Any, spp: int | None = None) -> None:
+    def __init__(self, config: "SceneConfig", spp: int | None = None) -> None:
         from spacesim.scenes import Renderer, build
         from spacesim.scenes.background.draw import Background
 

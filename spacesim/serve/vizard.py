@@ -18,7 +18,6 @@ import logging
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -209,7 +208,7 @@ def depth_colors(depth: Array, far: float) -> np.ndarray:
 
 def _read_body(value: Value, is_spacecraft: bool) -> Body:
     name, parent = "", ""
-    lists: dict[int, list[Any]] = {2: [], 4: []}
+    lists: dict[int, list[float]] = {2: [], 4: []}
     for number, inner in wire.fields(_message(value)):
         if number == 1:
             name = wire.text(inner)
@@ -226,7 +225,7 @@ def _read_body(value: Value, is_spacecraft: bool) -> Body:
 def _read_camera(value: Value) -> MountedCamera:
     texts: dict[int, str] = {2: ""}
     numbers: dict[int, list[int]] = {1: [0], 4: [], 16: [0]}
-    lists: dict[int, list[Any]] = {3: [], 7: [], 8: [], 17: []}
+    lists: dict[int, list[float]] = {3: [], 7: [], 8: [], 17: []}
     for number, inner in wire.fields(_message(value)):
         if number in texts:
             texts[number] = wire.text(inner)

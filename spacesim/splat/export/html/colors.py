@@ -12,7 +12,6 @@ directions   of all others: the Sun's and, by spherical harmonics, the view's. P
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -153,11 +152,11 @@ class _Directions:
         shadows = light.config.shadow is not None
         self.unshadowed = upload(np.ones(gaussians.count)) if shadows else None
 
-    def conditions(self, rng: np.random.Generator) -> list[Any]:
+    def conditions(self, rng: np.random.Generator) -> list[np.ndarray]:
         """`CONDITIONS` of them."""
         return list(normalize(rng.normal(size=(CONDITIONS, 2, 3))))
 
-    def colors(self, condition: Any) -> np.ndarray:
+    def colors(self, condition: np.ndarray | tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """float32 [N, 3]."""
         sun, direction = condition
         # a camera of parallel rays sees every Gaussian in one direction
