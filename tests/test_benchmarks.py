@@ -665,7 +665,7 @@ def test_data_like_speedplus_have_no_suns_but_those_that_are_told(command, place
     made = speedplus_data.make(place / "data", 4, 30, spp=2)  # all there
     assert made.data.scene == {}
     assert len({tuple(frame.sun.direction) for frame in made.made.frames}) == 5
-    for truth, frame, told in zip(made.made.frames, made.data.frames, made.told.frames, strict=True):
+    for truth, frame, told in zip(made.made.frames, made.data.frames, made.labelled.frames, strict=True):
         assert frame.sun is None
         assert frame.silhouette_path is None
         assert frame.file_path == told.file_path
@@ -673,7 +673,7 @@ def test_data_like_speedplus_have_no_suns_but_those_that_are_told(command, place
         np.testing.assert_allclose(frame.camera.world_from_camera, truth.camera.world_from_camera, atol=1e-12)
         np.testing.assert_array_equal(frame.camera.world_from_camera, told.camera.world_from_camera)
         assert (load_image(made.data, frame).alpha == 1).all()
-        assert load_image(made.told, told).alpha.min() == 0
+        assert load_image(made.labelled, told).alpha.min() == 0
 
 
 @smallest(
