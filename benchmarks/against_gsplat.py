@@ -74,7 +74,7 @@ def main() -> None:
         raise InputError("--data: expected a dataset to train on, found none")
     backend.select("cuda")
     if options.what == "picture":
-        result = [compare_pictures(count, size) for count, size in ((1_000, 256), (31_622, 1024))]
+        result: object = [compare_pictures(count, size) for count, size in ((1_000, 256), (31_622, 1024))]
     else:
         result = compare_training(options.data, options.iterations)
     print(json.dumps(result, indent=1))
@@ -100,6 +100,7 @@ def compare_pictures(count: int, size: int) -> dict[str, Any]:
         dr.enable_grad(parameter)
     output = render(ours, Pinhole.of(camera))
     weights = rng.normal(size=(size, size, 4)).astype(np.float32)
+    assert output.color is not None
     planes = [*output.color, output.alpha]
     columns = [ad.Float(np.ascontiguousarray(weights[..., c].ravel())) for c in range(4)]
     dr.backward(sum((dr.sum(w * p) for w, p in zip(columns, planes, strict=True)), ad.Float(0)))
@@ -240,4 +241,4 @@ def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainC
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

@@ -44,9 +44,9 @@ def main() -> None:
         if options.trial is not None:
             _once_more(root, place / "once", options.seed, options.trial)
             return
-        found = _attacked(options, root, place)
-    finds = [find for _, tally in found for find in tally.finds]
-    rows = [{"": name, "tried": t.tried, "held": t.held, "finds": len(t.finds)} for name, t in found]
+        tallies = _attacked(options, root, place)
+    finds = [find for _, tally in tallies for find in tally.finds]
+    rows = [{"": name, "tried": t.tried, "held": t.held, "finds": len(t.finds)} for name, t in tallies]
     if options.json:
         print(json.dumps({"seed": options.seed, "rows": rows, "finds": finds}, indent=1))
     else:
@@ -69,27 +69,27 @@ def _attacked(options: argparse.Namespace, root: Path, place: Path) -> list[tupl
         ),
         ("flipped bits", options.bits, lambda work, tell: attack.attack_bits(root, work, seed, options.bits, tell)),
     ]
-    found = []
+    tallies = []
     for number, (name, count, do) in enumerate(parts):
         if count:
             work = place / str(number)
             work.mkdir()
-            found.append((name, do(work, _teller(name, count))))
+            tallies.append((name, do(work, _teller(name, count))))
     if options.viewer > 0:
         (place / "viewer").mkdir()
         result = attack_viewer.attack(seed, max(options.viewer, 0.1), place / "viewer")
-        found.append(("the viewer", attack.Tally(sum(result.tried.values()), result.finds)))
-    return found
+        tallies.append(("the viewer", attack.Tally(sum(result.tried.values()), result.finds)))
+    return tallies
 
 
 def _teller(name: str, count: int) -> attack.Tell:
-    last, told = time.monotonic(), 0
+    last, printed = time.monotonic(), 0
 
     def tell(tally: attack.Tally) -> None:
-        nonlocal last, told
-        for find in tally.finds[told:]:
+        nonlocal last, printed
+        for find in tally.finds[printed:]:
             print(find, file=sys.stderr, flush=True)
-        told = len(tally.finds)
+        printed = len(tally.finds)
         if time.monotonic() - last >= EVERY or tally.tried == count:
             last = time.monotonic()
             print(f"{name}: {tally.tried}/{count}, {len(tally.finds)} finds", file=sys.stderr, flush=True)
@@ -117,4 +117,4 @@ def _quietly(work: Callable[[], Any]) -> Any:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

@@ -42,7 +42,7 @@ def main() -> None:
     for name, against_alpha in (("random", True), ("black", False)):
         trainer = Trainer(dataset, replace(config, random_background=against_alpha))
         trainer.run(lambda progress: None, lambda: None)
-        rows[name] = dict(zip(columns, judge(trainer.gaussians, dataset).tolist(), strict=True))
+        rows[name] = dict(zip(columns, measured_errors(trainer.gaussians, dataset).tolist(), strict=True))
         rows[name]["gaussians"] = trainer.gaussians.count
     if options.json:
         print(json.dumps(rows, indent=1))
@@ -55,7 +55,7 @@ def main() -> None:
         )
 
 
-def judge(gaussians: Gaussians, dataset: Dataset) -> np.ndarray:
+def measured_errors(gaussians: Gaussians, dataset: Dataset) -> np.ndarray:
     """Means over the test views of the five figures that `main` prints."""
     rows = []
     for frame in dataset.test:
@@ -71,4 +71,4 @@ def judge(gaussians: Gaussians, dataset: Dataset) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

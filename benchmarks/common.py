@@ -57,7 +57,7 @@ class Timing:
         return f"{self.median:.2f} ({self.low:.2f} to {self.high:.2f})"
 
 
-def arguments(text: str, sizes: str | None = None) -> argparse.ArgumentParser:
+def arguments(text: str | None, sizes: str | None = None) -> argparse.ArgumentParser:
     """A parser with the options that every benchmark has. text: the script's docstring."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", choices=backend.NAMES, default="auto")
@@ -95,7 +95,7 @@ def parse_sizes(text: str) -> list[tuple[int, int]]:
     return sizes
 
 
-def told(main: Callable[[], None]) -> None:
+def run_main(main: Callable[[], None]) -> None:
     """Run a benchmark; what its user can mend ends it with a sentence and code 2, what cannot be done with code 1."""
     try:
         main()
@@ -117,7 +117,7 @@ def generated(scene: str, out: Path, **options: Any) -> Path:
 def measured(
     name: str,
     config: "TrainConfig",
-    judge: "EvaluateConfig",
+    evaluation: "EvaluateConfig",
     dataset: Dataset,
     folder: Path,
     truth: Dataset | None = None,
@@ -131,7 +131,10 @@ def measured(
         run = trained(folder / "run", dataset, config, name, show_progress)
     except WorkError as error:
         return {"note": str(error)}
-    return {**evaluated(run, truth or dataset, folder / "eval", judge, name, show_progress), "training": run.training}
+    return {
+        **evaluated(run, truth or dataset, folder / "eval", evaluation, name, show_progress),
+        "training": run.training,
+    }
 
 
 def standalone(drawn: str, names: Sequence[str]) -> str:
@@ -195,15 +198,15 @@ def synchronise() -> None:
 
 def seconds(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP) -> dict[str, list[float]]:
     """Of each work, device synchronised before and after; they take turns, so that all see the same machine."""
-    found: dict[str, list[float]] = {name: [] for name in works}
+    durations: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(warm_up + repeats):
         for name, work in works.items():
             synchronise()
             start = time.perf_counter()
             work()
             synchronise()
-            found[name].append(time.perf_counter() - start)
-    return {name: values[warm_up:] for name, values in found.items()}
+            durations[name].append(time.perf_counter() - start)
+    return {name: values[warm_up:] for name, values in durations.items()}
 
 
 def interleaved(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP) -> dict[str, Timing]:
@@ -264,10 +267,10 @@ def machine() -> dict[str, str]:
 def _gpu() -> str:
     query = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
     try:
-        told = subprocess.run(query, capture_output=True, text=True, check=True).stdout.splitlines()
+        lines = subprocess.run(query, capture_output=True, text=True, check=True).stdout.splitlines()
     except (OSError, subprocess.CalledProcessError):
         return "an NVIDIA GPU"
-    return told[0].replace(", ", ", driver ")
+    return lines[0].replace(", ", ", driver ")
 
 
 def _cpu() -> str:

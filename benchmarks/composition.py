@@ -84,7 +84,9 @@ def main() -> None:
         else:
             data = data or shadows.make_data(options.out / "data", resolution=options.resolution)
             config = with_options(row.config, iterations=options.iterations)
-            run = trained(options.out / row.run / "run", read_dataset(data), config, row.run, show_progress)
+            result = trained(options.out / row.run / "run", read_dataset(data), config, row.run, show_progress)
+            assert isinstance(result, Run)
+            run = result
         results[row.name] = evaluated_twice(row, run, pair, options.out / "pairs", not options.no_geometry)
     write_report([options.out / "pairs" / name for name in results], options.out / "pairs/report.html")
     tables = {
@@ -140,9 +142,9 @@ def evaluated_twice(row: Row, run: Run, pair: Dataset, out: Path, shapes: bool) 
 def table_row(name: str, metrics: Mapping[str, Any], which: str) -> common.Row:
     """Means over one boxsat's pixels."""
     summaries = [_of(metrics, which, group, metric) for _, group, metric in COLUMNS]
-    found = dict(zip((heading for heading, _, _ in COLUMNS), shown(summaries), strict=True))
+    cells = dict(zip((heading for heading, _, _ in COLUMNS), shown(summaries), strict=True))
     error = _of(metrics, which, "shadow_mask", "error_rate")
-    return {"row": name, **found, "mask error": "" if error is None else f"{error:.4f}"}
+    return {"row": name, **cells, "mask error": "" if error is None else f"{error:.4f}"}
 
 
 def shown(values: Any) -> list[str]:
@@ -156,10 +158,10 @@ def shown(values: Any) -> list[str]:
 
 def _of(metrics: Mapping[str, Any], which: str, group: str, metric: str) -> float | None:
     """Mean over the frames that show the boxsat."""
-    one = next((entry for entry in metrics["objects"] or [] if entry["name"] == which), {})
+    one: Mapping[str, Any] = next((entry for entry in metrics["objects"] or [] if entry["name"] == which), {})
     value = (one.get(group) or {}).get(metric)
     return None if value is None else float(value["mean"])
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

@@ -169,4 +169,4 @@ def describe(report: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

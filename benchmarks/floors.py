@@ -69,11 +69,14 @@ def _turns(lanes: int, function: Callable[[Any], Any]) -> None:
     """CHAINS independent chains of TURNS calls in each lane."""
     start = dr.opaque(ad.Float, 0.5, lanes)
 
+    def goes_on(i: Any, _values: list[Any]) -> Any:
+        return i < TURNS
+
     def turn(i: Any, values: list[Any]) -> Any:
         return i + 1, [function(value) for value in values]
 
     values = [start + k for k in range(CHAINS)]
-    _, values = dr.while_loop((ad.UInt32(0), values), lambda i, _: i < TURNS, turn, mode="symbolic", label="turns")
+    _, values = dr.while_loop((ad.UInt32(0), values), goes_on, turn, mode="symbolic", label="turns")
     dr.eval(sum(values[1:], values[0]))
 
 
@@ -104,9 +107,9 @@ def profiles(sizes: list[tuple[int, int]], repeats: int) -> tuple[dict[str, Any]
     for count, pixels in sizes:
         device, rows = profile(count, pixels, min(repeats, REPEATS))
         report.append({"gaussians": count, "pixels": pixels, "device": device, "rows": rows})
-        told = f"{device.bandwidth / 1e9:.0f} GB/s, {device.operations / 1e9:.0f} G multiply-adds/s"
-        told += f", {device.specials / 1e9:.0f} G exponentials/s"
-        tables[f"{count:,} Gaussians, {pixels} x {pixels} pixels ({told})"] = rows
+        speeds = f"{device.bandwidth / 1e9:.0f} GB/s, {device.operations / 1e9:.0f} G multiply-adds/s"
+        speeds += f", {device.specials / 1e9:.0f} G exponentials/s"
+        tables[f"{count:,} Gaussians, {pixels} x {pixels} pixels ({speeds})"] = rows
     return {"profiles": report}, tables
 
 
@@ -132,13 +135,15 @@ def profile(count: int, pixels: int, repeats: int) -> tuple[Device, list[common.
     return device, [*stages, rest, step, {"stage": "trainer's step, on the clock (median)", "ms": clock.median}]
 
 
-def _row(stage: str, found: common.Kernels, whole: common.Kernels, by_bytes: float, by_operations: float) -> common.Row:
+def _row(
+    stage: str, kernels: common.Kernels, whole: common.Kernels, by_bytes: float, by_operations: float
+) -> common.Row:
     return {
         "stage": stage,
-        "launches": found.launches,
-        "ms": found.least,
-        "of the step": f"{found.least / whole.least:.0%}",
+        "launches": kernels.launches,
+        "ms": kernels.least,
+        "of the step": f"{kernels.least / whole.least:.0%}",
         "floor by bytes, ms": by_bytes,
         "floor by operations, ms": by_operations,
-        "floor / time": f"{max(by_bytes, by_operations) / found.least:.0%}",
+        "floor / time": f"{max(by_bytes, by_operations) / kernels.least:.0%}",
     }

@@ -1,5 +1,6 @@
 """How a time grows with the work: slopes on logarithmic axes, a linear model, and a chart of both as SVG."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,9 +43,9 @@ def model(points: list[Point]) -> tuple[dict[str, float], float]:
     """
     work = np.array([[1, p.pairs / 1e6, p.gaussians / 1e6, p.pixels**2 / 1e6] for p in points])
     times = np.array([p.milliseconds for p in points])
-    found, _ = nnls(work / times[:, None], np.ones(len(points)))
+    coefficients, _ = nnls(work / times[:, None], np.ones(len(points)))
     names = ("fixed", "a million pairs", "a million Gaussians", "a million pixels")
-    return dict(zip(names, found.tolist(), strict=True)), float(np.abs(work @ found / times - 1).max())
+    return dict(zip(names, coefficients.tolist(), strict=True)), float(np.abs(work @ coefficients / times - 1).max())
 
 
 def summary(points: list[Point]) -> dict[str, float]:
@@ -135,7 +136,7 @@ def describe(name: str, points: list[Point]) -> str:
     return f"{compact(first.gaussians)} Gaussians on {first.pixels}² to {last.pixels}² pixels"
 
 
-def decades(values: list[float]) -> tuple[float, float]:
+def decades(values: Sequence[float]) -> tuple[float, float]:
     """The nearest of 1, 2 and 5 times a power of ten below and above all values."""
     steps = [factor * 10.0**power for power in range(-6, 12) for factor in (1, 2, 5)]
     return max(s for s in steps if s <= min(values)), min(s for s in steps if s > max(values))

@@ -56,7 +56,7 @@ def main() -> None:
     backend.select(options.backend)
     run = load_run(options.run)
     dataset = read_dataset(options.data or Path(run.config["data"]["path"]))
-    frames, what = judged(dataset, options.suns)
+    frames, what = evaluated_frames(dataset, options.suns)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "page.html"
         start = time.perf_counter()
@@ -85,7 +85,7 @@ def main() -> None:
     common.emit({"page": size, "rates": rates, "suns": near, "means": means, "worst_loss": worst}, tables, options)
 
 
-def judged(dataset: Dataset, count: int) -> tuple[list[Frame], str]:
+def evaluated_frames(dataset: Dataset, count: int) -> tuple[list[Frame], str]:
     """The first test frame of each of `count` Suns at most that training has not seen, or, where there are none, the
     first test frames; which of these they are."""
     known = known_suns(dataset.test, dataset.train)
@@ -95,7 +95,7 @@ def judged(dataset: Dataset, count: int) -> tuple[list[Frame], str]:
         return list(by_sun.values())[::-1][:count], "unseen Suns"
     if not dataset.test:
         raise InputError(f"{dataset.root}: expected test frames, found none")
-    return dataset.test[:count], "test frames"
+    return list(dataset.test[:count]), "test frames"
 
 
 def opened(browser: Browser, path: Path, width: int, height: int) -> Page:
@@ -108,7 +108,7 @@ def opened(browser: Browser, path: Path, width: int, height: int) -> Page:
 def rate(page: Page, what: str, move: str, seconds: float) -> common.Row:
     """Frames a second while something moves; each is read back, so it is finished."""
     page.send("Page.bringToFront")
-    frames, took, share = page.evaluate(
+    frames, milliseconds, share = page.evaluate(
         f"""new Promise(done => {{
             const {{ gl }} = controls.renderer, pixel = new Uint8Array(4);
             let frames = -3, start;
@@ -122,7 +122,7 @@ def rate(page: Page, what: str, move: str, seconds: float) -> common.Row:
             }};
             step(); }})"""
     )
-    return {"what moves": what, "frames/s": round(1000 * frames / took, 1), "share of the width drawn": share}
+    return {"what moves": what, "frames/s": round(1000 * frames / milliseconds, 1), "share of the width drawn": share}
 
 
 def nearness(page: Page, run: Run, dataset: Dataset, frame: Frame) -> common.Row:
@@ -140,7 +140,7 @@ def nearness(page: Page, run: Run, dataset: Dataset, frame: Frame) -> common.Row
 
 def picture(page: Page, camera: Camera, sun: np.ndarray) -> np.ndarray:
     """[H, W, 3] in [0, 1]: what the page draws for a camera under a Sun [3], over black."""
-    told = {
+    view = {
         "axes": camera.camera_from_world[:3, :3].ravel().tolist(),
         "eye": camera.position.tolist(),
         "lens": [camera.fx, camera.fy, camera.cx, camera.cy],
@@ -149,7 +149,7 @@ def picture(page: Page, camera: Camera, sun: np.ndarray) -> np.ndarray:
         f"""(() => {{
             const {{ canvas }} = controls.renderer;
             Object.assign(canvas, {{ width: {camera.width}, height: {camera.height} }});
-            controls.renderer.draw({json.dumps(told)}, {json.dumps(np.asarray(sun).tolist())});
+            controls.renderer.draw({json.dumps(view)}, {json.dumps(np.asarray(sun).tolist())});
             return canvas.toDataURL(); }})()"""
     )
     shown = Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGBA")
@@ -158,4 +158,4 @@ def picture(page: Page, camera: Camera, sun: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

@@ -104,7 +104,7 @@ def measure_frame(count: int, pixels: int, method: str, options: Any) -> common.
         row["of the thesis's"] = row["frames/s"] / THESIS[count]
     row |= {"shadows": shadows, "field": clock["shade"].median - shadows}
     row["draw"] = clock["frame"].median - clock["shade"].median
-    return row | {f"{part}, kernels": found.milliseconds for part, found in kernels.items()}
+    return row | {f"{part}, kernels": times.milliseconds for part, times in kernels.items()}
 
 
 def measure_step(count: int, pixels: int, method: str, options: Any) -> common.Row:
@@ -122,4 +122,4 @@ def measure_step(count: int, pixels: int, method: str, options: Any) -> common.R
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

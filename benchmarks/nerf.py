@@ -56,9 +56,11 @@ def main() -> None:
     name = backend.select(options.backend)
     data = read_dataset(options.data or common.generated("boxsat", options.out / "data", **SCENE, **SAMPLES))
     config = methods.shortened(methods.preset(options.preset, "nerf"), options.iterations)
-    config = replace(config, rays=options.rays)  # type: ignore[type-var]
-    run, took = trained(data, options.out / "run", config)
-    rows = [{"": f"spacesim, {options.preset}", **trained_row(step_time(data, run, options.repeats), took, run, data)}]
+    config = replace(config, rays=options.rays)
+    run, duration = trained(data, options.out / "run", config)
+    rows = [
+        {"": f"spacesim, {options.preset}", **trained_row(step_time(data, run, options.repeats), duration, run, data)}
+    ]
     if options.peers and load_peer(options.peers, name, "peer_nerfacc"):
         rows += measured_apart(data, options.rays, config.iterations, options.repeats)
     frames = list(frame_rows(run, data, options.pixels))
@@ -92,8 +94,8 @@ def peer_row(data: Dataset, rays: int, iterations: int, repeats: int) -> common.
     theirs = Training(data, rays, iterations)
     start = time.perf_counter()
     theirs.run()
-    took = time.perf_counter() - start
-    return {"": "nerfacc", **trained_row(step_timing(theirs.step, 2, repeats), took, theirs, data)}
+    duration = time.perf_counter() - start
+    return {"": "nerfacc", **trained_row(step_timing(theirs.step, 2, repeats), duration, theirs, data)}
 
 
 def step_time(data: Dataset, run: NerfRun, repeats: int) -> common.Timing:
@@ -116,20 +118,20 @@ def step_timing(step: Callable[[], Any], turn: int, repeats: int) -> common.Timi
     return common.Timing.of(np.array(common.seconds({"": several}, repeats)[""]) / turn)
 
 
-def trained_row(step: common.Timing, took: float, model: Any, data: Dataset) -> common.Row:
+def trained_row(step: common.Timing, duration: float, model: Any, data: Dataset) -> common.Row:
     whole, inside = [], []
     for frame in data.test:
-        found, _ = frame_images(data, frame, model.predict(frame.camera))
-        whole.append(image.psnr(found.prediction, found.truth))
-        inside.append(image.psnr(found.prediction, found.truth, found.silhouette))
+        images, _ = frame_images(data, frame, model.predict(frame.camera))
+        whole.append(image.psnr(images.prediction, images.truth))
+        inside.append(image.psnr(images.prediction, images.truth, images.silhouette))
     quality = {"PSNR": _mean(whole), "over the silhouette": _mean(inside)}
-    return {"step, ms": step.median, "training, s": took, **quality}
+    return {"step, ms": step.median, "training, s": duration, **quality}
 
 
 def frame_rows(run: NerfRun, data: Dataset, pixels: int) -> Iterator[common.Row]:
     """Of one model as cameras of the data see it, and of some from where all of them fit."""
     for count in MODELS:
-        placed = [PlacedRun(run, Pose(translation=place)) for place in places(data)[:count]]
+        placed = [PlacedRun(run, Pose(translation=place)) for place in places(data)[:count]]  # type: ignore[arg-type]
         scene = run if count == 1 else FieldComposition(placed, ComposeConfig("none"))
         frames = data.test[:9] if count == 1 else views(data)
         seconds = [_timed(scene, _sized(frame, pixels)) for frame in (*frames[:2], *frames)][2:]
@@ -154,4 +156,4 @@ def _mean(values: list[float | None]) -> float:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

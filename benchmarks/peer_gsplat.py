@@ -159,13 +159,13 @@ def device_milliseconds(work: Any, repeats: int = 7) -> float | None:
         work()
     torch.cuda.synchronize()
     try:
-        with profile(activities=[ProfilerActivity.CUDA]) as found:
+        with profile(activities=[ProfilerActivity.CUDA]) as profiler:
             for _ in range(repeats):
                 work()
             torch.cuda.synchronize()
     except (RuntimeError, AssertionError):
         return None
-    microseconds = sum(getattr(event, "self_device_time_total", 0) for event in found.key_averages())
+    microseconds = sum(getattr(event, "self_device_time_total", 0) for event in profiler.key_averages())
     return 1e-3 * microseconds / repeats if microseconds > 0 else None
 
 

@@ -106,9 +106,9 @@ class Training:
             return self.density_at(at(start, end, ray))[0]
 
         def density_and_color(start: Any, end: Any, ray: Any) -> Any:
-            found, features = self.density_at(at(start, end, ray))
-            told = torch.cat([(directions[ray] + 1) / 2, features], -1)
-            return torch.sigmoid(self.color(told).float()), found
+            sigma, features = self.density_at(at(start, end, ray))
+            inputs = torch.cat([(directions[ray] + 1) / 2, features], -1)
+            return torch.sigmoid(self.color(inputs).float()), sigma
 
         size = self.step_size
         rays, low, high = self.estimator.sampling(
@@ -128,7 +128,7 @@ class Training:
             for i in range(0, len(directions), 8192)
         ]
         rgb, alpha, depth = (
-            torch.cat(found).view(camera.height, camera.width, -1).cpu().numpy() for found in zip(*parts, strict=True)
+            torch.cat(planes).view(camera.height, camera.width, -1).cpu().numpy() for planes in zip(*parts, strict=True)
         )
         return Prediction(rgb, alpha[..., 0], depth[..., 0], None, None)
 

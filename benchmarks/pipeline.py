@@ -43,8 +43,8 @@ class Pipeline:
 
     def project(self) -> None:
         """Gaussians to ellipses on the screen and colours."""
-        found = self._project(self.gaussians.rows(), self.camera, DEGREE, False, (), 1.0)
-        self.splats, self.footprints, self.color = *found[:2], found[2]["color"]
+        projected = self._project(self.gaussians.rows(), self.camera, DEGREE, False, (), 1.0)
+        self.splats, self.footprints, self.color = *projected[:2], projected[2]["color"]
 
     def bin(self) -> None:
         """Ellipses to lists of tiles."""

@@ -57,7 +57,7 @@ def main() -> None:
         name: list(measured(run, data, [data.test[k] for k in chosen], picture, options.starts, options.seed))
         for name, picture in PICTURES.items()
     }
-    rows = [summary(name, group, some) for name, found in views.items() for group, some in groups(found)]
+    rows = [summary(name, group, some) for name, results in views.items() for group, some in groups(results)]
     title = f"From {DEGREES:g} degrees and {100 * SHARE:g} % of the distance off, {options.starts} starts"
     common.emit({"rows": rows, "views": views}, {title: rows}, options)
 
@@ -155,12 +155,12 @@ def groups(views: list[common.Row]) -> list[tuple[str, list[common.Row]]]:
 def summary(name: str, group: str, views: list[common.Row]) -> common.Row:
     """Medians and 90th percentiles."""
     before, after = (np.array([view[when] for view in views]) for when in ("before", "after"))
-    found = (after[:, 0] < GOOD_DEGREES) & (after[:, 1] < GOOD_PERCENT)
+    good = (after[:, 0] < GOOD_DEGREES) & (after[:, 1] < GOOD_PERCENT)
     row: common.Row = {"picture": name, "views": f"{len(views)} {group}"}
     row["before, deg"], row["before, %"] = np.median(before, axis=0).tolist()
     for title, share in ("median", 50), ("90th", 90):
         row[f"{title}, deg"], row[f"{title}, %"] = np.percentile(after, share, axis=0).tolist()
-    row["within 0.5 deg, 0.5 %"] = float(found.mean())
+    row["within 0.5 deg, 0.5 %"] = float(good.mean())
     converged = np.array([view["converged"] for view in views])
     row["converged"] = float(converged.mean())
     row["wrong of these"] = float((after[converged].max(axis=1) > WRONG).mean()) if converged.any() else 0.0
@@ -170,4 +170,4 @@ def summary(name: str, group: str, views: list[common.Row]) -> common.Row:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

@@ -120,20 +120,20 @@ def refined(
 
 def summary(case: str, views: list[common.Row]) -> common.Row:
     off = np.array([view["off"] for view in views])
-    found = off.max(axis=1) < WRONG
+    correct = off.max(axis=1) < WRONG
     converged = np.array([view["converged"] for view in views])
     middle = np.median(np.where(np.isfinite(off), off, 180.0), axis=0)
     return {
         "case": case,
         "views": len(views),
-        "found": float(found.mean()),
+        "found": float(correct.mean()),
         "median, deg": float(middle[0]),
         "median, %": float(middle[1]),
         "converged": float(converged.mean()),
-        "wrong of converged": float((~found[converged]).mean()) if converged.any() else 0.0,
+        "wrong of converged": float((~correct[converged]).mean()) if converged.any() else 0.0,
         "s a view": float(np.mean([view["s"] for view in views])),
     }
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

@@ -63,7 +63,7 @@ def rows_of(data: Dataset, options: argparse.Namespace) -> Iterator[common.Row]:
 
     plain = with_options(preset(options.preset, options.method), iterations=options.iterations)
     refined = with_settings(replace(plain, refine_poses=True), dict(map(parse_setting, options.set)))
-    judge = EvaluateConfig(geometry=None)
+    evaluation = EvaluateConfig(geometry=None)
     cases = [("true", 0.0, plain)]
     for degrees in map(float, filter(None, options.degrees.split(","))):
         cases += [(f"off by {degrees:g}, refined", degrees, refined), (f"off by {degrees:g}", degrees, plain)]
@@ -71,26 +71,26 @@ def rows_of(data: Dataset, options: argparse.Namespace) -> Iterator[common.Row]:
     for name, degrees, config in cases:
         given = disturbed(data, degrees, options.seed)
         folder = options.out / name.replace(", ", "-").replace(" ", "-")
-        found = common.measured(name, config, judge, given, folder)
-        psnr = found["image"]["psnr"]["mean"] if "image" in found else float("nan")
-        row = {"cameras": name, "PSNR, dB": psnr, "aligned, dB": psnr, "SSIM": found["image"]["ssim"]["mean"]}
+        metrics = common.measured(name, config, evaluation, given, folder)
+        psnr = metrics["image"]["psnr"]["mean"] if "image" in metrics else float("nan")
+        row = {"cameras": name, "PSNR, dB": psnr, "aligned, dB": psnr, "SSIM": metrics["image"]["ssim"]["mean"]}
         cameras = [frame.camera for frame in given.train]
         if config.refine_poses:
             cameras = list(cameras_of(folder / "run" / "cameras.json"))
-            row["aligned, dB"] = aligned_psnr(data, cameras, folder, judge)
-        seconds = found["training"]["seconds"]
+            row["aligned, dB"] = aligned_psnr(data, cameras, folder, evaluation)
+        seconds = metrics["training"]["seconds"]
         if config.refine_poses:
             seconds += read_json(folder / "run" / "poses" / "training.json")["seconds"]
         yield row | errors(cameras, [frame.camera for frame in data.train]) | {"s": seconds}
 
 
-def aligned_psnr(data: Dataset, cameras: list[Camera], folder: Path, judge: EvaluateConfig) -> float:
+def aligned_psnr(data: Dataset, cameras: list[Camera], folder: Path, evaluation: EvaluateConfig) -> float:
     """Of the run in a folder, whose world is laid upon the true one by its training cameras."""
     frames = zip(data.train, cameras, strict=True)
     own = replace(data, train=tuple(replace(frame, camera=camera) for frame, camera in frames), test=())
-    judge, run = replace(judge, align=own), load_run(folder / "run")
-    found = evaluated(run, data, folder / "eval-aligned", judge, f"{folder.name}, aligned", show_progress)
-    return float(found["image"]["psnr"]["mean"])
+    evaluation, run = replace(evaluation, align=own), load_run(folder / "run")
+    metrics = evaluated(run, data, folder / "eval-aligned", evaluation, f"{folder.name}, aligned", show_progress)
+    return float(metrics["image"]["psnr"]["mean"])
 
 
 def disturbed(data: Dataset, degrees: float, seed: int) -> Dataset:
@@ -144,4 +144,4 @@ def errors(cameras: list[Camera], true: list[Camera]) -> common.Row:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

@@ -84,12 +84,12 @@ def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:
         turn = {stage: work} | ({f"gsplat {stage}": theirs[stage]} if stage in theirs else {})
         times |= common.interleaved(turn, repeats)
     kernels = common.kernels_in_turn(works)
-    sums = {stage: found.milliseconds for stage, found in kernels.items()}
+    sums = {stage: kernel.milliseconds for stage, kernel in kernels.items()}
     result: dict[str, Any] = {"gaussians": count, "pixels": pixels, **arguments_of(ours)}
     result["clock"] = {stage: times[stage] for stage in STAGES}
     result["kernels"] = sums | {"sum": sum(sums[stage] for stage in STAGES if stage != "frame")}
     result["least kernels"] = sum(kernels[stage].least for stage in STAGES if stage != "frame")
-    result["launches"] = {stage: found.launches for stage, found in kernels.items()}
+    result["launches"] = {stage: kernel.launches for stage, kernel in kernels.items()}
     if theirs:
         clock = {stage: times[f"gsplat {stage}"] for stage in theirs}
         result["gsplat"] = {"pairs": frame.pairs, "clock": clock}
@@ -107,17 +107,17 @@ def add_peer_kernels(result: dict[str, Any], peer: Any) -> None:
 def ratios(result: dict[str, Any]) -> dict[str, float | None]:
     """Ours over gsplat's: a frame on the clock and by kernels; binning, forward and backward likewise."""
     ours, theirs = result, result["gsplat"]
-    found: dict[str, float | None] = {
+    quotients: dict[str, float | None] = {
         "frame, clock": ours["clock"]["frame"].median / theirs["clock"]["frame"].median,
         "bin + forward + backward, clock": sum(ours["clock"][s].median for s in SHARED)
         / sum(theirs["clock"][s].median for s in SHARED),
     }
     device = theirs["kernels"]
     if None not in device.values():
-        found["frame, kernels"] = ours["kernels"]["frame"] / device["frame"]
+        quotients["frame, kernels"] = ours["kernels"]["frame"] / device["frame"]
         sums = sum(ours["kernels"][s] for s in SHARED), sum(device[s] for s in SHARED)
-        found["bin + forward + backward, kernels"] = sums[0] / sums[1]
-    return found
+        quotients["bin + forward + backward, kernels"] = sums[0] / sums[1]
+    return quotients
 
 
 def clock_row(result: dict[str, Any]) -> common.Row:
@@ -141,12 +141,12 @@ def peer_row(result: dict[str, Any]) -> common.Row:
     row["frame, ratio"] = result["ratios"]["frame, clock"]
     for stage in (*SHARED, "frame"):
         other = theirs["kernels"][stage]
-        told = "-" if other is None else f"{other:.2f}"
-        row[f"{stage}, kernels"] = f"{result['kernels'][stage]:.2f} / {told}"
+        text = "-" if other is None else f"{other:.2f}"
+        row[f"{stage}, kernels"] = f"{result['kernels'][stage]:.2f} / {text}"
     row["b + f + b, kernels, ratio"] = result["ratios"].get("bin + forward + backward, kernels", "-")
     row["b + f + b, clock, ratio"] = result["ratios"]["bin + forward + backward, clock"]
     return row
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

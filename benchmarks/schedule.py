@@ -66,24 +66,29 @@ def followed(folder: Path, data: Dataset, config: TrainConfig, views: int) -> li
     kept = folder / "kept"
     kept.mkdir(parents=True, exist_ok=True)
 
-    def keep(_progress: TrainingProgress) -> None:
+    def keep_checkpoints() -> None:
         for path in (folder / "run" / "checkpoints").glob("step_*.safetensors"):
             if not (kept / path.name).exists():
                 os.link(path, kept / path.name)
 
     with show_progress(f"train {config.method}", "iterations") as report:
         tell = report_training(report)
-        run = train(data, folder / "run", config, True, lambda progress: (keep(progress), tell(progress))[1])
+
+        def follow(progress: TrainingProgress) -> None:
+            keep_checkpoints()
+            tell(progress)
+
+        run = train(data, folder / "run", config, True, follow)
     chosen = test_views(data, views)
     trainer, points = None, []
     for path in sorted(kept.glob("step_*.safetensors")):
-        found = path.with_suffix(".json")
-        if not found.exists():
+        scores_path = path.with_suffix(".json")
+        if not scores_path.exists():
             trainer = trainer or Trainer(data, config)
             trainer.restore(path)
             there = replace(run, gaussians=trainer.gaussians, light=trainer.light)
-            write_json(found, {"iteration": trainer.iteration, **quality(there, data, chosen)})
-        points.append(read_json(found))
+            write_json(scores_path, {"iteration": trainer.iteration, **quality(there, data, chosen)})
+        points.append(read_json(scores_path))
     return [*points, {"iteration": config.iterations, **quality(run, data, chosen)}]
 
 
@@ -102,17 +107,19 @@ def test_views(data: Dataset, views: int) -> dict[str, list[Frame]]:
 
 def quality(run: Run, data: Dataset, chosen: dict[str, list[Frame]]) -> common.Row:
     """Mean PSNR over the silhouettes under each kind of Sun, dB, and Gaussians."""
-    found: common.Row = {}
+    means: common.Row = {}
     for name, frames in chosen.items():
         views = [frame_images(data, frame, run.predict(frame.camera, frame.sun))[0] for frame in frames]
         scores = [image.psnr(view.prediction, view.truth, view.silhouette) for view in views]
-        found[f"PSNR, {name}"] = float(np.mean([score for score in scores if score is not None]))
-    return {**found, "Gaussians": run.gaussian_count}
+        means[f"PSNR, {name}"] = float(np.mean([score for score in scores if score is not None]))
+    return {**means, "Gaussians": run.gaussian_count}
 
 
 def chart(rows: Sequence[common.Row]) -> str:
     """SVG that stands alone: PSNR of each method and kind of Sun against iterations."""
-    names = {(row["method"], key): [] for row in rows for key in row if key.startswith("PSNR")}
+    names: dict[tuple[str, str], list[tuple[float, float]]] = {
+        (row["method"], key): [] for row in rows for key in row if key.startswith("PSNR")
+    }
     for row in rows:
         for (method, key), points in names.items():
             if row["method"] == method:
@@ -122,4 +129,4 @@ def chart(rows: Sequence[common.Row]) -> str:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

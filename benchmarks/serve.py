@@ -132,10 +132,10 @@ def asked_together(address: str, asked: Iterator[tuple[Camera, Sun]], requests: 
                 if not socket.poll(PATIENCE):
                     raise WorkError(f"request {k - AHEAD * clients}: expected an answer, found none")
                 header, *arrays = socket.recv_multipart()
-                told = json.loads(header)
-                if "error" in told:
-                    raise WorkError(told["error"])
-                answered += told["id"] == k - AHEAD * clients and len(arrays) == 1
+                answer = json.loads(header)
+                if "error" in answer:
+                    raise WorkError(answer["error"])
+                answered += answer["id"] == k - AHEAD * clients and len(arrays) == 1
             if k < requests:
                 socket.send(request(k, *next(asked)))
         for socket in sockets:
@@ -151,4 +151,4 @@ def request(number: int, camera: Camera, sun: Sun) -> bytes:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

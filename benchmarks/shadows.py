@@ -70,13 +70,13 @@ def main() -> None:
     if unknown:
         sys.exit(f"--rows: expected some of {', '.join((*ROWS, *table))}, found {unknown[0]!r}")
     dataset = read_dataset(options.data or make_data(options.out / "data"))
-    judge = EvaluateConfig(geometry=None) if options.no_geometry else EvaluateConfig()
+    evaluation = EvaluateConfig(geometry=None) if options.no_geometry else EvaluateConfig()
     results: dict[str, Any] = {}
     for name, (kind, config) in table.items():
         if kind in wanted or name in wanted:
             config = with_options(config, iterations=options.iterations)
-            results[name] = common.measured(name, config, judge, dataset, options.out / name)
-    evaluated = [options.out / name / "eval" for name, found in results.items() if "note" not in found]
+            results[name] = common.measured(name, config, evaluation, dataset, options.out / name)
+    evaluated = [options.out / name / "eval" for name, result in results.items() if "note" not in result]
     if evaluated:
         write_report(evaluated, options.out / "report.html")
     tables = {
@@ -118,19 +118,19 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, supervised", replace(mapped, visibility_weight=0.1)
     yield "splat, surface, supervised", replace(splatted, visibility_weight=0.1)
     yield "map, surface, light of twice the size", with_shadow(mapped, size=2 * shadow_of(mapped).size)
-    yield "map, surface, linear", replace(mapped, light=replace(mapped.light, linear=True))
-    yield "map, surface, linear, filmic", replace(mapped, light=replace(mapped.light, linear=True, tone="filmic"))
+    yield "map, surface, linear", replace(mapped, light=replace(light_of(mapped), linear=True))
+    yield "map, surface, linear, filmic", replace(mapped, light=replace(light_of(mapped), linear=True, tone="filmic"))
     moving = SplattingConfig(gradients=True)
     yield "splat, surface, gradients", with_shadow(splatted, method=moving)
     both = with_shadow(replace(splatted, visibility_weight=0.1), method=moving)
     yield "splat, surface, supervised, gradients", both
     yield "splat, surface, lifted alone, supervised, gradients", with_shadow(both, grazing="lift")
-    yield "none, surface, bounce", with_bounce(relit, splatted.light.bounce)
+    yield "none, surface, bounce", with_bounce(relit, light_of(splatted).bounce)
     yield "map, surface, no bounce", with_bounce(mapped, 0)
     yield "splat, surface, no bounce", with_bounce(splatted, 0)
-    told = ShadowRefinementConfig(width=refine_of(splatted).width)
-    yield "splat, surface, refinement told the Sun", with_shadow(splatted, refine=told)
-    yield "splat, surface, no bounce, refinement told the Sun", with_bounce(with_shadow(splatted, refine=told), 0)
+    with_sun = ShadowRefinementConfig(width=refine_of(splatted).width)
+    yield "splat, surface, refinement told the Sun", with_shadow(splatted, refine=with_sun)
+    yield "splat, surface, no bounce, refinement told the Sun", with_bounce(with_shadow(splatted, refine=with_sun), 0)
     if splatted.supersample == 1:
         yield "none, surface, 2x2 samples", replace(relit, supersample=2)
         yield "splat, surface, 2x2 samples", replace(splatted, supersample=2)
@@ -150,8 +150,7 @@ def finer(config: TrainConfig) -> TrainConfig:
 
 def with_bounce(config: TrainConfig, emitters: int) -> TrainConfig:
     """`config` with one bounce of light from so many Gaussians."""
-    assert config.light is not None
-    return replace(config, light=replace(config.light, bounce=emitters))
+    return replace(config, light=replace(light_of(config), bounce=emitters))
 
 
 def as_thesis(config: TrainConfig) -> TrainConfig:
@@ -177,21 +176,24 @@ def as_ours(config: TrainConfig) -> TrainConfig:
         return config
     fast = preset("fast", config.method)
     ours, refine = shadow_of(fast), replace(refine_of(fast), width=refine_of(config).width)
-    config = with_bounce(config, fast.light.bounce)
+    config = with_bounce(config, light_of(fast).bounce)
     return with_shadow(config, bias=ours.bias, grazing=ours.grazing, method=ours.method, refine=refine)
 
 
 def with_shadow(config: TrainConfig, **changes: Any) -> TrainConfig:
     """`config` with another configuration of its shadows."""
-    light: LightConfig | None = config.light
-    assert light is not None
-    return replace(config, light=replace(light, shadow=replace(shadow_of(config), **changes)))
+    return replace(config, light=replace(light_of(config), shadow=replace(shadow_of(config), **changes)))
+
+
+def light_of(config: TrainConfig) -> LightConfig:
+    assert config.light is not None
+    return config.light
 
 
 def shadow_of(config: TrainConfig) -> ShadowConfig:
-    assert config.light is not None
-    assert config.light.shadow is not None
-    return config.light.shadow
+    shadow = light_of(config).shadow
+    assert shadow is not None
+    return shadow
 
 
 def refine_of(config: TrainConfig) -> ShadowRefinementConfig:
@@ -209,13 +211,13 @@ def row(name: str, metrics: dict[str, Any], part: str) -> common.Row:
     """Means over the frames of known or unseen Suns."""
     if "note" in metrics:
         return {"method": name, "Gaussians": metrics["note"]}
-    found: common.Row = {"method": name, "Gaussians": metrics["model"]["gaussians"]}
+    cells: common.Row = {"method": name, "Gaussians": metrics["model"]["gaussians"]}
     for heading, group, metric, *what in COLUMNS:
         value = ((metrics.get(part) or {}).get(group) or {}).get(metric)
         number = None if value is None else value[what[0] if what else "mean"]
-        found[heading] = "" if number is None else f"{number:.{2 if metric == 'psnr' else 4}f}"
-    return found
+        cells[heading] = "" if number is None else f"{number:.{2 if metric == 'psnr' else 4}f}"
+    return cells
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

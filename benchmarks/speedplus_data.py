@@ -40,7 +40,7 @@ class SpeedplusData:
 
     made: Dataset  #: as generated: no noise, with the Suns and all truth
     data: Dataset  #: as imported: pictures and poses alone
-    told: Dataset  #: `data` with the Suns and silhouettes of `made`
+    labelled: Dataset  #: `data` with the Suns and silhouettes of `made`
 
 
 def make(folder: Path, frames: int = 600, height: int = 300, seed: int = 0, spp: int = 64) -> SpeedplusData:
@@ -59,8 +59,10 @@ def make(folder: Path, frames: int = 600, height: int = 300, seed: int = 0, spp:
         import_speedplus(folder / "speedplus", folder / "data")
     data = read_dataset(folder / "data")
     if not (folder / "told/transforms.json").exists():
-        told = [[_told(made, data, *pair) for pair in zip(*sets, strict=True)] for sets in _splits(made, data)]
-        write_dataset(folder / "told", *told, {"kind": "told", "source": str(folder / "data")})
+        train, test = (
+            [_labelled(made, data, *pair) for pair in zip(*sets, strict=True)] for sets in _splits(made, data)
+        )
+        write_dataset(folder / "told", train, test, {"kind": "told", "source": str(folder / "data")})
     return SpeedplusData(made, data, read_dataset(folder / "told"))
 
 
@@ -81,7 +83,7 @@ def _splits(*datasets: Dataset) -> list[list[tuple[Frame, ...]]]:
     return [[dataset.train for dataset in datasets], [dataset.test for dataset in datasets]]
 
 
-def _told(made: Dataset, data: Dataset, known: Frame, frame: Frame) -> ImportedFrame:
+def _labelled(made: Dataset, data: Dataset, known: Frame, frame: Frame) -> ImportedFrame:
     """A frame as imported, with what is known of it."""
     name = Path(frame.file_path).stem
     if Path(known.file_path).stem != name or known.silhouette_path is None:
@@ -117,4 +119,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

@@ -56,7 +56,7 @@ def main() -> None:
         name: common.measured(name, config, EvaluateConfig(), dataset, options.out / folder_of(name))
         for name, config in chosen.items()
     }
-    evaluated = [options.out / folder_of(name) / "eval" for name, found in results.items() if "note" not in found]
+    evaluated = [options.out / folder_of(name) / "eval" for name, metrics in results.items() if "note" not in metrics]
     if evaluated:
         write_report(evaluated, options.out / "report.html")
     tables = tables_of(results)
@@ -122,7 +122,7 @@ def tables_of(results: dict[str, Any]) -> dict[str, list[common.Row]]:
         "Size and speed (table 5.6)": size,
     }
     return {
-        title: [{"strategy": name, **printed(columns(found))} for name, found in results.items()]
+        title: [{"strategy": name, **printed(columns(metrics))} for name, metrics in results.items()]
         for title, columns in titles.items()
     }
 
@@ -134,14 +134,14 @@ def printed(values: common.Row) -> common.Row:
     }
 
 
-def pictures(found: dict[str, Any]) -> common.Row:
-    image = found.get("image") or {}
+def pictures(metrics: dict[str, Any]) -> common.Row:
+    image = metrics.get("image") or {}
     return {heading: (image.get(name) or {}).get("mean") for heading, name in PICTURES.items()}
 
 
-def shape(found: dict[str, Any]) -> common.Row:
+def shape(metrics: dict[str, Any]) -> common.Row:
     """Chamfer in square metres, Hausdorff distance in metres, and what the thesis does not have."""
-    geometry = found.get("geometry") or {}
+    geometry = metrics.get("geometry") or {}
     overlap, floaters = geometry.get("precision_recall") or {}, geometry.get("floaters") or {}
     return {
         "Chamfer": geometry.get("chamfer"),
@@ -154,10 +154,10 @@ def shape(found: dict[str, Any]) -> common.Row:
     }
 
 
-def size(found: dict[str, Any]) -> common.Row:
-    if "note" in found:
-        return {"Gaussians": found["note"]}
-    model, training = found["model"], found["training"]
+def size(metrics: dict[str, Any]) -> common.Row:
+    if "note" in metrics:
+        return {"Gaussians": metrics["note"]}
+    model, training = metrics["model"], metrics["training"]
     return {
         "Gaussians": model["gaussians"],
         "MB": f"{model['bytes'] / 1e6:.1f}",
@@ -168,4 +168,4 @@ def size(found: dict[str, Any]) -> common.Row:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

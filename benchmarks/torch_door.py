@@ -30,7 +30,12 @@ from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
-MODES = ({}, {"rasterize_mode": "antialiased"}, {"camera_model": "ortho"}, {"render_mode": "RGB+ED"})
+MODES: tuple[dict[str, Any], ...] = (
+    {},
+    {"rasterize_mode": "antialiased"},
+    {"camera_model": "ortho"},
+    {"render_mode": "RGB+ED"},
+)
 
 
 def main() -> None:
@@ -47,14 +52,14 @@ def main() -> None:
     gsplat = load_peer(options.peers, name, "gsplat")
     peer = gsplat and gsplat.rasterization
     if options.store is not None and peer is not None:
-        np.savez_compressed(options.store, **_stored(torch, peer))
+        np.savez_compressed(options.store, **_stored(torch, peer))  # type: ignore[arg-type]
         return
     from spacesim.torch import rasterization
 
     device = "cuda" if name == "cuda" else "cpu"
     if device == "cpu":
         torch.set_num_threads(1)
-    rows, found = [], []
+    rows, differences = [], []
     for count, side in common.parse_sizes(options.sizes):
         leaves, camera = _scene(torch, count, side, device)
         weights = np.random.default_rng(1).normal(size=(side, side, 4)).astype(np.float32)
@@ -69,13 +74,13 @@ def main() -> None:
             row |= {"gsplat, ms": theirs.median, "torch / gsplat": door.median / theirs.median}
             for mode in MODES:
                 different = _differences(torch, rasterization, peer, leaves, camera, mode)
-                found.append({"Gaussians": count, **mode, **different})
+                differences.append({"Gaussians": count, **mode, **different})
         rows.append(row)
     if options.json:
-        print(json.dumps({"rows": rows, "differences": found}, indent=1))
+        print(json.dumps({"rows": rows, "differences": differences}, indent=1))
         return
     print(common.table(rows, options.markdown))
-    for one in found:
+    for one in differences:
         print(one)
 
 
@@ -101,7 +106,7 @@ def _scene(torch: Any, count: int, side: int, device: str) -> tuple[dict[str, An
 
 def _own(leaves: dict[str, Any], camera: Camera, weights: list[Float]) -> None:
     """A picture by `render`, and gradients, without torch in between. weights: gradients of its planes, of alpha"""
-    if not hasattr(_own, "arrays") or _own.arrays.count != len(leaves["means"]):  # type: ignore[attr-defined]
+    if not hasattr(_own, "arrays") or _own.arrays.count != len(leaves["means"]):
         plain = {name: leaves[name].detach().cpu().numpy() for name in NAMES}
         opacity = plain["opacities"]
         _own.arrays = Gaussians.from_numpy(  # type: ignore[attr-defined]
@@ -118,6 +123,7 @@ def _own(leaves: dict[str, Any], camera: Camera, weights: list[Float]) -> None:
         dr.disable_grad(parameter)
         dr.enable_grad(parameter)
     output = render(model, Pinhole.of(camera), outputs=("color", "alpha"))
+    assert output.color is not None
     planes = [*output.color, output.alpha]
     dr.backward(sum(dr.sum(plane * weight) for plane, weight in zip(planes, weights, strict=True)))
     gradients = [dr.grad(parameter) for parameter in model.parameters().values()]
@@ -150,7 +156,7 @@ def _differences(
 ) -> dict[str, float]:
     """Largest absolute differences of pictures and alphas, shares of pixels that differ by more than some (a splat
     whose alpha is all but 1/255 may count with one alone), relative norms of differences of gradients."""
-    found = []
+    results = []
     weights = None
     for function in (one, other):
         own = {name: leaf.detach().clone().requires_grad_(name != "Ks") for name, leaf in leaves.items()}
@@ -162,14 +168,14 @@ def _differences(
         if weights is None:
             weights = torch.randn(both.shape, device=both.device, generator=torch.Generator(both.device).manual_seed(1))
         (weights[..., :3] * both[..., :3] + weights[..., -1:] * both[..., -1:]).sum().backward()
-        found.append((picture.detach(), alpha.detach(), {name: own[name].grad for name in (*NAMES, "viewmats")}))
-    (a, alpha_a, by_a), (b, alpha_b, by_b) = found
+        results.append((picture.detach(), alpha.detach(), {name: own[name].grad for name in (*NAMES, "viewmats")}))
+    (a, alpha_a, by_a), (b, alpha_b, by_b) = results
     off = torch.where(alpha_b > 0.01, a - b, 0 * a).abs().amax(dim=-1).flatten()
-    told = {"picture": float(off.max()), "alpha": float((alpha_a - alpha_b).abs().max())}
-    told |= {f"pixels off by {bound:g}": float((off > bound).float().mean()) for bound in (1e-4, 1e-3)}
+    differences = {"picture": float(off.max()), "alpha": float((alpha_a - alpha_b).abs().max())}
+    differences |= {f"pixels off by {bound:g}": float((off > bound).float().mean()) for bound in (1e-4, 1e-3)}
     for name, gradient in by_b.items():
-        told[f"gradient {name}"] = float((by_a[name] - gradient).norm() / gradient.norm())
-    return told
+        differences[f"gradient {name}"] = float((by_a[name] - gradient).norm() / gradient.norm())
+    return differences
 
 
 def _stored(torch: Any, peer: Any) -> dict[str, np.ndarray]:
@@ -177,19 +183,19 @@ def _stored(torch: Any, peer: Any) -> dict[str, np.ndarray]:
     two cameras of 32 x 24 pixels."""
     rng = np.random.default_rng(7)
     cameras = [Camera.look_at([3.5, 1, 1 - k], [0, 0, 0], 32, 24, 40) for k in range(2)]
-    found = {
+    values = {
         "means": 0.6 * rng.normal(size=(40, 3)),
         "quats": rng.normal(size=(40, 4)),
         "scales": rng.uniform(0.05, 0.3, (40, 3)),
         "opacities": rng.uniform(0.1, 0.95, 40),
         "colors": 0.4 * rng.normal(size=(40, 16, 3)),
         "viewmats": np.stack([camera.camera_from_world for camera in cameras]),
-        "Ks": np.stack([[[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]] for c in cameras]),
+        "Ks": np.array([[[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]] for c in cameras]),
         "backgrounds": rng.uniform(size=(2, 3)),
         "weights": rng.normal(size=(2, 24, 32, 5)),
     }
-    inputs = {name: array.astype(np.float32) for name, array in found.items()}
-    found = dict(inputs)
+    inputs = {name: array.astype(np.float32) for name, array in values.items()}
+    arrays: dict[str, Any] = dict(inputs)
     for number, mode in enumerate(MODES):
         own = {name: torch.tensor(array, device="cuda") for name, array in inputs.items()}
         weights = own.pop("weights")
@@ -198,10 +204,10 @@ def _stored(torch: Any, peer: Any) -> dict[str, np.ndarray]:
         leaves = {name: tensor.requires_grad_(name != "Ks") for name, tensor in own.items()}
         picture, alpha, _ = peer(**leaves, width=32, height=24, sh_degree=3, packed=False, **mode)
         ((weights[..., : picture.shape[-1]] * picture).sum() + (weights[..., 4:] * alpha).sum()).backward()
-        found |= {f"{number}.picture": picture.detach(), f"{number}.alpha": alpha.detach()}
-        found |= {f"{number}.by.{name}": leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-    return {name: array if isinstance(array, np.ndarray) else array.cpu().numpy() for name, array in found.items()}
+        arrays |= {f"{number}.picture": picture.detach(), f"{number}.alpha": alpha.detach()}
+        arrays |= {f"{number}.by.{name}": leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    return {name: array if isinstance(array, np.ndarray) else array.cpu().numpy() for name, array in arrays.items()}
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

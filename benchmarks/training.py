@@ -102,12 +102,12 @@ def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:
                 label = f"gsplat, SSIM by {ssim}, Adam {'fused' if fused else 'plain'}"
                 works[label] = peer.Step(arrays, views, RATES, SSIM_WEIGHT, ssim, fused)
         times = common.interleaved(works, repeats, WARM_UP)
-        found = common.kernels(trainer.step)
+        kernels = common.kernels(trainer.step)
     if trainer.gaussians.count != count or trainer.iteration >= NEVER:
         raise AssertionError("a step of the benchmark has refined")
     pairs = Pipeline(arrays, dataset.train[0].camera).lists.pairs
     result: dict[str, Any] = {"gaussians": count, "pixels": pixels, "pairs": pairs, "clock": times}
-    result |= {"kernels": found.milliseconds, "launches": found.launches}
+    result |= {"kernels": kernels.milliseconds, "launches": kernels.launches}
     result["ratios"] = {k: times["spacesim"].median / t.median for k, t in times.items() if k != "spacesim"}
     return result
 
@@ -150,4 +150,4 @@ def has_fused_ssim() -> bool:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

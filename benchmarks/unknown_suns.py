@@ -48,18 +48,18 @@ def main() -> None:
 
 
 def rows_of(data: speedplus_data.SpeedplusData, options: argparse.Namespace) -> Iterator[common.Row]:
-    untold = without_suns(data.told, options.out / "untold")
-    judge = EvaluateConfig(geometry=None)
+    without = without_suns(data.labelled, options.out / "untold")
+    evaluation = EvaluateConfig(geometry=None)
     for name, config in configurations(options).items():
         if name not in common.row_names(options.rows):
             continue
         folder = options.out / name
-        found = common.measured(name, config, judge, data.told if name == "told" else untold, folder)
-        if "note" in found:
-            yield {"Suns": name, **found}
+        metrics = common.measured(name, config, evaluation, data.labelled if name == "told" else without, folder)
+        if "note" in metrics:
+            yield {"Suns": name, **metrics}
             continue
-        row = {"Suns": name, "PSNR, dB": found["image"]["psnr"]["mean"], "SSIM": found["image"]["ssim"]["mean"]}
-        row |= {"Gaussians": found["model"]["gaussians"], "s": found["training"]["seconds"]}
+        row = {"Suns": name, "PSNR, dB": metrics["image"]["psnr"]["mean"], "SSIM": metrics["image"]["ssim"]["mean"]}
+        row |= {"Gaussians": metrics["model"]["gaussians"], "s": metrics["training"]["seconds"]}
         yield row | (sun_errors(folder / "run" / "cameras.json", data.made) if name == "unknown" else {})
 
 
@@ -79,30 +79,30 @@ def configurations(options: argparse.Namespace) -> dict[str, TrainConfig]:
     }
 
 
-def without_suns(told: Dataset, out: Path) -> Dataset:
+def without_suns(data: Dataset, out: Path) -> Dataset:
     """The same pictures and silhouettes without Suns."""
     if not (out / "transforms.json").exists():
         shutil.rmtree(out, ignore_errors=True)
 
-        def untold(frame: Frame) -> ImportedFrame:
+        def without_sun(frame: Frame) -> ImportedFrame:
             assert frame.silhouette_path is not None
-            paths = told.root / frame.file_path, told.root / frame.silhouette_path
+            paths = data.root / frame.file_path, data.root / frame.silhouette_path
             return ImportedFrame(
                 Path(frame.file_path).stem, paths[0], frame.camera, frame.distortion, silhouette=paths[1]
             )
 
-        groups = [list(map(untold, group)) for group in (told.train, told.test)]
-        write_dataset(out, *groups, {"kind": "untold", "source": str(told.root)})
+        train, test = (list(map(without_sun, group)) for group in (data.train, data.test))
+        write_dataset(out, train, test, {"kind": "untold", "source": str(data.root)})
     return read_dataset(out)
 
 
 def sun_errors(path: Path, made: Dataset) -> common.Row:
     """Of a run's estimates (cameras.json), degrees."""
     frames = read_json(path)["frames"]
-    found = np.array([frame["sun_direction"] for frame in frames])
+    directions = np.array([frame["sun_direction"] for frame in frames])
     sigmas = np.array([frame["sun_sigma_deg"] for frame in frames])
     true = np.array([frame.sun.direction for frame in made.train if frame.sun is not None])
-    errors = degrees_between((found * true).sum(axis=1))
+    errors = degrees_between((directions * true).sum(axis=1))
     return {
         "Sun off, deg": float(np.median(errors)),
         "mean": float(errors.mean()),
@@ -114,4 +114,4 @@ def sun_errors(path: Path, made: Dataset) -> common.Row:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

@@ -94,15 +94,15 @@ def main() -> None:
     film = options.out / "film.mp4"
     write_bytes(film, encoded([opaque(data, frame) for data, frame in truth]))
     rows = []
-    for name, wishes in (("told", {"fov": FOV}), ("estimated", {})):
+    for name, fov in ("told", FOV), ("estimated", None):
         folder = options.out / f"import-{name}"
         start = time.perf_counter()
         try:
             if not (folder / "transforms.json").exists():
                 with show_progress("import", "%") as report:
-                    import_dataset("video", film, folder, report, length=LENGTH, **wishes)
+                    import_dataset("video", film, folder, report, length=LENGTH, fov=fov)
             row = compared(read_dataset(folder), truth)
-            note = {"seconds": time.perf_counter() - start}
+            note: common.Row = {"seconds": time.perf_counter() - start}
         except (InputError, WorkError) as error:
             row, note = {}, {"note": str(error)}
         rows.append({"field of view": name, **row, **note})
@@ -180,35 +180,35 @@ def trainings_of(options: argparse.Namespace, truth: list[TrueFrame]) -> Iterato
     true = true_dataset(options.out / "truth", own, truth)
     plain = with_options(preset(options.preset, "vanilla"), iterations=options.iterations)
     plain = with_settings(plain, dict(map(parse_setting, options.set)))
-    judge = EvaluateConfig(geometry=None)
+    evaluation = EvaluateConfig(geometry=None)
     seen, best = seen_by(own, true), float("nan")
-    for name, config, data, judged in (
+    for name, config, data, truth_data in (
         ("true", plain, true, true),
         ("found", plain, own, seen),
         ("found, refined", replace(plain, refine_poses=True), own, seen),
     ):
         folder = options.out / name.replace(", ", "-")
-        found = common.measured(name, config, judge, data, folder, judged)
-        if "note" in found:
-            yield {"poses and masks": name, "note": found["note"]}
+        metrics = common.measured(name, config, evaluation, data, folder, truth_data)
+        if "note" in metrics:
+            yield {"poses and masks": name, "note": metrics["note"]}
             continue
-        psnr = aligned = found["image"]["psnr"]["mean"]
+        psnr = aligned = metrics["image"]["psnr"]["mean"]
         if name == "true":
             best = psnr
         else:
-            aligned_judge, run = replace(judge, align=own), load_run(folder / "run")
-            moved = evaluated(run, true, folder / "eval-aligned", aligned_judge, f"{name}, aligned", show_progress)
+            aligned_evaluation, run = replace(evaluation, align=own), load_run(folder / "run")
+            moved = evaluated(run, true, folder / "eval-aligned", aligned_evaluation, f"{name}, aligned", show_progress)
             aligned = moved["image"]["psnr"]["mean"]
         yield {
             "poses and masks": name,
             "PSNR, dB": psnr,
             "below true, dB": best - psnr,
             "aligned, dB": aligned,
-            "SSIM": found["image"]["ssim"]["mean"],
-            "test views": len(found["frames"]),
+            "SSIM": metrics["image"]["ssim"]["mean"],
+            "test views": len(metrics["frames"]),
             "iterations": config.iterations,
-            "Gaussians": found["model"]["gaussians"],
-            "s": found["training"]["seconds"],
+            "Gaussians": metrics["model"]["gaussians"],
+            "s": metrics["training"]["seconds"],
         }
 
 
@@ -266,4 +266,4 @@ def true_mask(frame: TrueFrame) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

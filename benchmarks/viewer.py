@@ -24,6 +24,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import common
@@ -125,21 +126,24 @@ def draws(show: ViewerSetup, side: int, repeats: int) -> list[common.Row]:
 
     counter = itertools.count()
     settings = DisplaySettings(side=side)
+
+    def draw_elsewhere(mode: str) -> None:
+        there = replace(still, world_from_camera=next(camera))
+        draw_frame(show.renderer, show.state, there, replace(settings, mode=mode))
+
     works: dict[str, common.Work] = {
-        f"{mode}, another camera": lambda mode=mode: draw_frame(
-            show.renderer, show.state, replace(still, world_from_camera=next(camera)), replace(settings, mode=mode)
-        )
-        for mode in show.renderer.modes
+        f"{mode}, another camera": partial(draw_elsewhere, mode) for mode in show.renderer.modes
     }
     works["colour, another Sun"] = lambda: draw_frame(
         show.renderer, replace(show.state, sun=next(sun)), still, settings
     )
     works["colour, another pose"] = lambda: draw_frame(show.renderer, turned(), still, settings)
-    found: dict[str, common.Timing] = {}
+    timings: dict[str, common.Timing] = {}
     for name, work in works.items():  # one after another: what a change leaves as it was is not computed again
-        found |= common.interleaved({name: work}, repeats)
+        timings |= common.interleaved({name: work}, repeats)
     return [
-        {"picture": name, "ms": str(timing), "frames/s": f"{1e3 / timing.median:.1f}"} for name, timing in found.items()
+        {"picture": name, "ms": str(timing), "frames/s": f"{1e3 / timing.median:.1f}"}
+        for name, timing in timings.items()
     ]
 
 
@@ -151,7 +155,7 @@ def rate(viewer: Viewer, mode: str, side: int, lasts: float) -> common.Row:
     client.use("Resolution", str(min((one for one in SIDES if one >= side), default=SIDES[-1])))
     start, count, shares = time.monotonic(), 0, []
     while (now := time.monotonic()) < start + lasts:
-        client.look(next(camera))
+        client.look_from(next(camera))
         client.picture()
         if now > start + lasts / 2:
             count += 1
@@ -173,7 +177,7 @@ def rest(viewer: Viewer, side: int, repeats: int) -> common.Row:
     for _ in range(common.WARM_UP + repeats):
         _finish(viewer, client)
         start = time.perf_counter()
-        client.look(next(camera))
+        client.look_from(next(camera))
         client.picture()
         first.append(time.perf_counter() - start)
         while Image.open(io.BytesIO(client.shown)).size != full:
@@ -210,7 +214,7 @@ def look_around(viewer: Viewer, lasts: float, clients: int, side: int) -> common
                 kept.append((now, _cache(viewer), backend.recordings()))
             report(min(int(now), int(lasts)), int(lasts), f"{sizes[-1]:.0f} MiB")
             time.sleep(min(EVERY, lasts / 20))
-        told, _ = visitors.communicate(timeout=PATIENCE)
+        output, _ = visitors.communicate(timeout=PATIENCE)
     if visitors.returncode != 0:
         raise WorkError(f"visitor.py ended with code {visitors.returncode}")
     half = kept[len(kept) // 2 :]
@@ -218,7 +222,7 @@ def look_around(viewer: Viewer, lasts: float, clients: int, side: int) -> common
     return {
         "seconds": round(lasts),
         "clients": clients,
-        "frames": sum(json.loads(told)["pictures"]),
+        "frames": sum(json.loads(output)["pictures"]),
         "MiB at most": round(max(sizes)),
         "MiB kept after each tenth": ", ".join(f"{size:.0f}" for _, size, _ in kept),
         "recordings": ", ".join(str(count) for _, _, count in kept),
@@ -228,17 +232,17 @@ def look_around(viewer: Viewer, lasts: float, clients: int, side: int) -> common
 
 def _cache(viewer: Viewer) -> float:
     """MiB once what is free has gone back to the system."""
-    found, done = [], threading.Event()
+    sizes, done = [], threading.Event()
 
     def read() -> None:
         gc.collect()
         give_back()
-        found.append(_megabytes())
+        sizes.append(_megabytes())
         done.set()
 
     viewer.loop.submit(read)
     done.wait(PATIENCE)
-    return found[0]
+    return sizes[0]
 
 
 def _megabytes() -> float:
@@ -251,4 +255,4 @@ def _megabytes() -> float:
 
 
 if __name__ == "__main__":
-    common.told(main)
+    common.run_main(main)

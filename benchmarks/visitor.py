@@ -70,7 +70,7 @@ class Visitor:
         self.files = 0  # that were sent whole
         self.shown = b""  # the last picture, a file
 
-    def look(self, pose: np.ndarray) -> None:
+    def look_from(self, pose: np.ndarray) -> None:
         """Look from a pose [4, 4]."""
         place, turn = pose[:3, 3], quaternion_from_rotation(pose[:3, :3])
         width, height = self.window
@@ -91,7 +91,7 @@ class Visitor:
         """Look from where the viewer proposes, until there is a picture and a panel: (position, what is looked at)."""
         self.picture(lambda: len(self.first) == 2)
         place, centre = self.first["position"], self.first["look_at"]
-        self.look(look_at(place, centre))
+        self.look_from(look_at(place, centre))
         while "Mode" not in self.controls:
             self.picture(lambda: "Mode" in self.controls)
         return place, centre
@@ -208,7 +208,7 @@ def visit(url: str, number: int, side: int, until: float) -> int:
             place, centre = visitor.begin()
             camera = places(centre, float(np.linalg.norm(place - centre)), int(rng.integers(1000)))
             while time.monotonic() < leave:
-                visitor.look(next(camera))
+                visitor.look_from(next(camera))
                 visitor.picture()
                 count += 1
                 if rng.random() < SHARE:

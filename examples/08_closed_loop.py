@@ -1,4 +1,6 @@
-"""A closed loop with `spacesim serve boxsat`: each picture decides where the camera looks next.
+"""8. Close a loop: each picture of `spacesim serve` decides where the camera looks next.
+
+python examples/08_closed_loop.py     some seconds beside `spacesim serve boxsat`, which answers it; writes nothing
 
 The camera starts turned away and takes the centroid of what is bright for the direction of the target.
 """

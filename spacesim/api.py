@@ -23,6 +23,7 @@ from spacesim.data.store import load_depth, load_truth
 from spacesim.data.structure import Rules, did_you_mean, field_value, places_of
 from spacesim.data.toml import dotted
 from spacesim.data.transforms import read_dataset
+from spacesim.learning.folder import TrainingProgress
 from spacesim.learning.rendering import Rendering
 from spacesim.methods import load_predictor, load_run, load_scene, preset
 from spacesim.nerf.config import NerfConfig
@@ -202,7 +203,7 @@ def train(
         raise InputError(f"light: expected that of the method {before}, found that of {config.method}")
     dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
 
-    def tell(state: Any) -> None:
+    def tell(state: TrainingProgress) -> None:
         if progress is not None:
             progress(state.iteration, state.iterations, state.words)
 

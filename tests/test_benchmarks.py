@@ -177,7 +177,7 @@ def test_what_cannot_be_measured_is_refused(arguments, sentence, monkeypatch, ca
 
     monkeypatch.setattr(sys, "argv", ["training.py", *arguments])
     with pytest.raises(SystemExit) as ended:
-        common.told(training.main)
+        common.run_main(training.main)
     assert sentence in capsys.readouterr().err + str(ended.value)
 
 
@@ -190,7 +190,7 @@ def test_what_was_measured_is_told_before_a_file_that_cannot_be_written(tmp_path
         where = str(tmp_path / "file" / "x")
         monkeypatch.setattr(sys, "argv", ["rasterizer.py", "--sizes", "100x16", "--repeats", "1", option, where])
         with pytest.raises(SystemExit, match="2"):
-            common.told(rasterizer.main)
+            common.run_main(rasterizer.main)
         told = capsys.readouterr()
         assert "Kernels, ms" in told.out
         assert f"{where}: cannot be written" in told.err
@@ -556,7 +556,7 @@ def test_background_of_a_model_that_shows_nothing(small_lit):
 
     data = read_dataset(small_lit)
     unseen = Gaussians.from_numpy({**common.sphere_arrays(10), "logit_opacities": np.full(10, -20.0)})
-    inside, outside, holes, *psnr = background.judge(unseen, data)
+    inside, outside, holes, *psnr = background.measured_errors(unseen, data)
     assert (inside, outside, holes) == (0, 0, 1)
     pictures = [load_image(data, frame).over(np.zeros(3)) for frame in data.test]
     light = [load_image(data, frame).over(np.ones(3)) for frame in data.test]
@@ -665,7 +665,7 @@ def test_data_like_speedplus_have_no_suns_but_those_that_are_told(command, place
     made = speedplus_data.make(place / "data", 4, 30, spp=2)  # all there
     assert made.data.scene == {}
     assert len({tuple(frame.sun.direction) for frame in made.made.frames}) == 5
-    for truth, frame, told in zip(made.made.frames, made.data.frames, made.told.frames, strict=True):
+    for truth, frame, told in zip(made.made.frames, made.data.frames, made.labelled.frames, strict=True):
         assert frame.sun is None
         assert frame.silhouette_path is None
         assert frame.file_path == told.file_path
@@ -673,7 +673,7 @@ def test_data_like_speedplus_have_no_suns_but_those_that_are_told(command, place
         np.testing.assert_allclose(frame.camera.world_from_camera, truth.camera.world_from_camera, atol=1e-12)
         np.testing.assert_array_equal(frame.camera.world_from_camera, told.camera.world_from_camera)
         assert (load_image(made.data, frame).alpha == 1).all()
-        assert load_image(made.told, told).alpha.min() == 0
+        assert load_image(made.labelled, told).alpha.min() == 0
 
 
 @smallest(

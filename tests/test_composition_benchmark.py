@@ -45,5 +45,5 @@ def test_what_cannot_be_is_refused(benchmark, arguments, sentence, monkeypatch, 
     if benchmark == "viewer":
         pytest.importorskip("viser", reason="viser is not installed")
     with pytest.raises(SystemExit) as ended:
-        common.told(importlib.import_module(benchmark).main)
+        common.run_main(importlib.import_module(benchmark).main)
     assert sentence in capsys.readouterr().err + str(ended.value)

@@ -34,11 +34,11 @@ class ConfigField:
 def meanings(cls: Any) -> dict[str, str]:
     """{field: what it means} of a dataclass: of each the comment `#: ...` on its own lines, or on those above it."""
     source = textwrap.dedent(inspect.getsource(cls))
-    said: dict[int, str] = {}
+    comments: dict[int, str] = {}
     alone: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT and token.string.startswith("#:"):
-            said[token.start[0]] = token.string[2:].strip()
+            comments[token.start[0]] = token.string[2:].strip()
             if token.line.lstrip().startswith("#:"):
                 alone.add(token.start[0])
     (owner,) = ast.parse(source).body
@@ -46,12 +46,12 @@ def meanings(cls: Any) -> dict[str, str]:
     result = {}
     for node in owner.body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            lines = [line for line in range(node.lineno, (node.end_lineno or node.lineno) + 1) if line in said]
+            lines = [line for line in range(node.lineno, (node.end_lineno or node.lineno) + 1) if line in comments]
             above = node.lineno - 1
             while above in alone:
                 lines.insert(0, above)
                 above -= 1
-            result[node.target.id] = " ".join(said[line] for line in lines)
+            result[node.target.id] = " ".join(comments[line] for line in lines)
     return {f.name: result.get(f.name, "") for f in fields(cls)}
 
 
@@ -63,14 +63,14 @@ def options_in(cls: Any) -> list[Field[Any]]:
 def fields_of(record: object, at: str = "") -> Iterator[ConfigField]:
     """Every field of a record, and of the records in it, with the values that it has."""
     cls: Any = type(record)
-    hints, said = get_type_hints(cls), meanings(cls)
+    hints, meaning = get_type_hints(cls), meanings(cls)
     for f in options_in(cls):
         value, key = getattr(record, f.name), f"{at}{f.name}"
         if is_dataclass(value):
-            yield ConfigField(key, type_words(hints[f.name]), kind_of(type(value)) or "", said[f.name])
+            yield ConfigField(key, type_words(hints[f.name]), kind_of(type(value)) or "", meaning[f.name])
             yield from fields_of(value, f"{key}.")
         else:
-            yield ConfigField(key, type_words(hints[f.name]), _literal(value), said[f.name])
+            yield ConfigField(key, type_words(hints[f.name]), _literal(value), meaning[f.name])
 
 
 def type_words(hint: object) -> str:
@@ -102,13 +102,13 @@ def reference(config: object = TrainConfig) -> str:
         kind = f" (`{kind_of(cls)}`)" if kind_of(cls) else ""
         lead = " ".join((inspect.getdoc(cls) or "").split("\n\n")[0].split())
         lines = [f"## {cls.__name__}", "", f"{where}{kind}. {lead}" if where else lead, ""]
-        hints, said = get_type_hints(cls), meanings(cls)
+        hints, meaning = get_type_hints(cls), meanings(cls)
         if options_in(cls):
             lines += ["| key | type | default | meaning |", "|---|---|---|---|"]
         for f in options_in(cls):
             value = f.default_factory() if f.default_factory is not MISSING else f.default
             default = (kind_of(type(value)) or "") if is_dataclass(value) else _literal(value)
-            cells = f"`{f.name}`", type_words(hints[f.name]), f"`{default}`" if default else "", said[f.name]
+            cells = f"`{f.name}`", type_words(hints[f.name]), f"`{default}`" if default else "", meaning[f.name]
             lines.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
         parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"

@@ -4,11 +4,11 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from spacesim import interrupts
 from spacesim.cli.parser import Parser
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonValue
 
 SUMMARY, NEEDS_BACKEND = "reconstruct a dataset with Gaussian splatting or a radiance field", True
 OPTIONS = {
@@ -112,7 +112,7 @@ def run(options: argparse.Namespace) -> None:
     )
 
 
-def parse_setting(text: str) -> tuple[str, Any]:
+def parse_setting(text: str) -> tuple[str, JsonValue]:
     """(key, value) of "KEY=VALUE"; the value is one of TOML, or a bare word. Raises InputError for another text."""
     from spacesim.data.toml import parse
 

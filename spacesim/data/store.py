@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -327,7 +327,7 @@ def find_unreadable_files(path: Path) -> list[str]:
         return [str(error)]
     problems = [f"{dataset.root / name}: expected an image file, found none" for name in dataset.missing]
 
-    def check(load: Any, *arguments: Any) -> None:
+    def check(load: Callable[..., object], *arguments: object) -> None:
         try:
             load(*arguments)
         except InputError as error:

@@ -142,7 +142,7 @@ def read_views(path: Path) -> dict[str, Frame]:
     entries = meta.get("frames", [{"file_path": ""}])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{path}: expected a list of frames, found another value")
-    found = {}
+    frames = {}
     for entry in entries:
         values = _without_nulls({**meta, **entry})
         name = str(values.get("file_path", ""))
@@ -154,10 +154,10 @@ def read_views(path: Path) -> dict[str, Frame]:
             camera, lens, sun = _read_camera(values, path), _read_distortion(values), _read_sun(values)
         except InputError as error:
             raise InputError(f"{path}: frame {name}: {error}" if name else f"{path}: {error}") from None
-        found[name] = Frame(name, camera, sun, distortion=lens)
-    if not found:
+        frames[name] = Frame(name, camera, sun, distortion=lens)
+    if not frames:
         raise InputError(f"{path}: expected frames with a transform_matrix, found none")
-    return found
+    return frames
 
 
 def read_sun(path: Path, file_path: str) -> Sun | None:

@@ -123,8 +123,8 @@ def explain_objects(
         notes.append(f"{have}: objects have the data's names.")
     if models is not None and nearest:
         order, in_order = ", ".join(map(str, nearest)), ", ".join(map(str, names))
-        stand = f"{', '.join(models)} stand where objects {order} of the data are"
-        notes.append(f"{stand} and are evaluated as objects {in_order}: put the models in the objects' order.")
+        mismatch = f"{', '.join(models)} stand where objects {order} of the data are"
+        notes.append(f"{mismatch} and are evaluated as objects {in_order}: put the models in the objects' order.")
     counts = {name: sum(name in record["objects"] for record in records) for name in names.values()}
     return notes + [
         f"{name} is in {count} of {len(records)} frames; its numbers are over these."

@@ -73,8 +73,8 @@ def _digest(dataset: Dataset) -> str | None:
         return None
 
 
-def _same(digest: str | None, told: object) -> bool:
-    return digest is not None and same_digest(digest, str(told))
+def _same(digest: str | None, recorded: object) -> bool:
+    return digest is not None and same_digest(digest, str(recorded))
 
 
 def count_suns(frames: Sequence[Frame]) -> int:

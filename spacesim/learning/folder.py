@@ -168,9 +168,9 @@ def _check_resumable(out: Path, described: JsonDict, resume: bool, read_config: 
         config, data = read_config(out / "config.json")
     except InputError:
         values = read_json(out / "config.json")
-        method, found = values.get("method") if isinstance(values, dict) else None, described["method"]
-        if isinstance(method, str) and method != found:  # of another family, whose configurations have other fields
-            raise _started_with(out, "method", method, found) from None
+        method, expected = values.get("method") if isinstance(values, dict) else None, described["method"]
+        if isinstance(method, str) and method != expected:  # of another family, whose configurations have other fields
+            raise _started_with(out, "method", method, expected) from None
         raise
     data["path"] = described["data"]["path"]  # it may have moved
     if same_digest(str(data.get("digest")), described["data"]["digest"]):

@@ -87,8 +87,8 @@ def _fit(pixels: np.ndarray, gaussians: np.ndarray, times: np.ndarray, weights: 
     columns = np.stack([pixels, gaussians], axis=1) / scale
     normal = columns.T @ (weights[:, None] * columns) + PRIOR * np.eye(2)
     right = columns.T @ (weights * times / unit) + PRIOR * 0.5
-    found = np.linalg.solve(normal, right)
-    if found.min() < 0:
-        found = np.where(found > 0, 1.0, 0.0)
-    a, b = unit * found / scale
+    coefficients = np.linalg.solve(normal, right)
+    if coefficients.min() < 0:
+        coefficients = np.where(coefficients > 0, 1.0, 0.0)
+    a, b = unit * coefficients / scale
     return float(a), float(b)

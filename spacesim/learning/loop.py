@@ -92,8 +92,8 @@ class TrainingLoop(ABC):
 
     def restore(self, path: Path) -> None:
         """Continue from what `save` wrote. Raises InputError where the file does not fit."""
-        tensors, said = read_tensors(path, self.form)
-        header: Any = structure(self.header, Document(f"{path}: header", said, {}), Rules())
+        tensors, metadata = read_tensors(path, self.form)
+        header: Any = structure(self.header, Document(f"{path}: header", metadata, {}), Rules())
         if header.iteration > self.config.iterations:
             raise InputError(f"{path}: expected an iteration up to {self.config.iterations}, found {header.iteration}")
         try:

@@ -180,7 +180,7 @@ def partition(fields: PlacedFields, pixel: UInt32, width: UInt32, count: int, no
     if fields.shading is not None or fields.self_shadows:
         seen_sun = ad.Float(0)
         for share, others, samples, interval in zip(shares, lit, samples_of, merged.intervals, strict=True):
-            own_light: Any = share if others is None else share * spread(others, segments)
+            own_light: Float = share if others is None else share * spread(others, segments)
             if samples.visibility is not None:
                 own_light *= dr.gather(ad.Float, samples.visibility, interval)
             seen_sun += own_light

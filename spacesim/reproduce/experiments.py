@@ -100,14 +100,14 @@ def datasets_for(size: Size, parts: Iterable[str], work: Iterable[Work]) -> list
 
 def experiments_for(size: Size, parts: Iterable[str], seeds: int) -> list[Work]:
     """What the tables and figures need, each once: first what the thesis has, cheap and dear, then ours."""
-    found: dict[str, Work] = {}
+    works: dict[str, Work] = {}
     for part in parts:
         for one in _of_part(size, part, seeds):
-            before = found.get(one.name)
+            before = works.get(one.name)
             if isinstance(one, Experiment) and isinstance(before, Experiment):
                 one = replace(one, parts=tuple(dict.fromkeys((*before.parts, *one.parts))))
-            found[one.name] = one
-    return list(found.values())
+            works[one.name] = one
+    return list(works.values())
 
 
 def _of_part(size: Size, part: str, seeds: int) -> list[Work]:

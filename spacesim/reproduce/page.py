@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ QUICK = (
 )
 NONE = '<span class="none">{}</span>'
 VERDICTS = {True: "holds", False: '<span class="best">fails</span>', None: NONE.format("–")}
-FIGURES: Mapping[str, Callable[[Path, Any], str]] = {
+FIGURES: Mapping[str, Callable[[Path, Sequence[JsonMapping]], str]] = {
     "figure-3.2": frame_times,
     "figure-4.2": relighting,
     "figure-4.3": fixed_sun,
@@ -31,10 +30,10 @@ def write_page(root: Path, values: JsonMapping) -> Path:
     """Write the page about what reproduce.json has; returns its path."""
     done = sum(one["state"] == "finished" for one in values["experiments"])
     body = [_header(values, done), section("How large", _conditions(values), "What the thesis had, and what this is.")]
-    tables = {found.number: found for found in thesis().tables}
+    tables = {known.number: known for known in thesis().tables}
     for one in values["tables"]:
-        found = tables[one["number"]]
-        body.append(section(f"Table {found.number}", _table(found, one, values["seeds"])))
+        known = tables[one["number"]]
+        body.append(section(f"Table {known.number}", _table(known, one, values["seeds"])))
     figures = values["figures"]
     names = [name for name in values["parts"] if name.startswith("figure")]
     for name in names:
@@ -108,14 +107,14 @@ def _conditions(values: JsonMapping) -> str:
 
 def _iterations(values: JsonMapping, preset: str) -> str:
     """Of the trainings of tables, by preset."""
-    found = {
+    iterations = {
         one["preset"]: f"{one['iterations']:,} ({one['preset']})"
         for one in values["experiments"]
         if {"own", "pair"} & set(one["parts"])
         and (one["preset"] == "thesis") == (preset == "thesis")
         and one["data"] == "boxsat"
     }
-    return ", ".join(found.values()) or "none"
+    return ", ".join(iterations.values()) or "none"
 
 
 def _table(known: Table, values: JsonMapping, seeds: int) -> str:
@@ -147,13 +146,13 @@ def _table(known: Table, values: JsonMapping, seeds: int) -> str:
 
 def _headings(presets: Mapping[str, str]) -> list[str]:
     """HTML above the columns of ours, by their keys."""
-    told_apart = any(key.endswith("_unseen") for key in presets)
-    found = []
+    has_unseen = any(key.endswith("_unseen") for key in presets)
+    headings = []
     for key, preset in presets.items():
         variant = "as the thesis" if key.startswith("thesis") else "improved"
-        suns = ", unseen Suns" if key.endswith("_unseen") else ", known Suns" if told_apart else ""
-        found.append(f"Ours,<br>{variant}<br><small>{escape(preset)}{suns}</small>")
-    return found
+        suns = ", unseen Suns" if key.endswith("_unseen") else ", known Suns" if has_unseen else ""
+        headings.append(f"Ours,<br>{variant}<br><small>{escape(preset)}{suns}</small>")
+    return headings
 
 
 def _cell(column: Column, cell: JsonMapping, is_best: bool, seeds: int) -> str:
@@ -162,8 +161,8 @@ def _cell(column: Column, cell: JsonMapping, is_best: bool, seeds: int) -> str:
         return NONE.format({"null": "–"}.get(cell["state"], cell["state"]))
     text = escape(column.cell(cell["mean"], cell.get("std")))
     text = f'<span class="best">{text}</span>' if is_best else text
-    if seeds > 1 and len(found := cell.get("seeds", [])) > 1:
-        text += f"<br><small>{len(found)} seeds ± {escape(column.printed(float(np.std(found))))}</small>"
+    if seeds > 1 and len(means := cell.get("seeds", [])) > 1:
+        text += f"<br><small>{len(means)} seeds ± {escape(column.printed(float(np.std(means))))}</small>"
     return text
 
 
@@ -172,7 +171,7 @@ def _orderings(values: JsonMapping) -> str:
     presets = values["presets"]
     rows = [[escape(one["text"]), *(VERDICTS[one["holds"][key]] for key in presets)] for one in values["orderings"]]
     shares = [values["in_order"][key] for key in presets]
-    counts = [f"{held} of {told}" if told else VERDICTS[None] for held, told in shares]
+    counts = [f"{held} of {comparable}" if comparable else VERDICTS[None] for held, comparable in shares]
     rows.append(["All pairs of rows, over all columns, in the thesis's order", *counts])
     head = ["", *_headings(presets)]
     return f'<div class="dense">{table("What the thesis says, and whether ours does", head, [("", rows)])}</div>'

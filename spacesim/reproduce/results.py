@@ -25,7 +25,7 @@ from spacesim.reproduce.experiments import (
 )
 from spacesim.reproduce.perform import folder_of, is_done
 from spacesim.reproduce.size import Size
-from spacesim.reproduce.thesis import Column, Row, Table, best, holds, pairs, thesis
+from spacesim.reproduce.thesis import Column, ExpectedRanking, Row, Table, best, holds, pairs, thesis
 
 PICTURES = ("psnr", "ssim", "lpips", "mae")
 SHAPE = ("chamfer", "hausdorff99", "iou")
@@ -142,8 +142,8 @@ class Results:
     def cell(self, table: Table, row: Row, column: Column, shown: ResultColumn) -> Values:
         """{"mean", "std", "seeds", "state"}: over the frames, and the means over the seeds of these."""
         made = [experiment_of(self.size, table, row, shown.variant, seed) for seed in range(self.seeds)]
-        found = [self.evaluation(one, table.scene) for one in made]
-        values = [value_of(one, table, column.metric, shown.suns) for one in found if one is not None]
+        evaluations = [self.evaluation(one, table.scene) for one in made]
+        values = [value_of(one, table, column.metric, shown.suns) for one in evaluations if one is not None]
         known = [value for value in values if value is not None]
         if not known:
             state = "failed" if any(self.state(one) == "failed" for one in made) else "not run"
@@ -157,10 +157,10 @@ class Results:
         """Of Gaussians, then of the radiance field: milliseconds a frame by the number of models, and how many times
         what Gaussians take, where the same device drew both."""
         works = figure_frames(self.size)
-        found = [(work, self.file(work, "frames/frames.json")) for work in works]
-        first = found[0][1]
+        timings = [(work, self.file(work, "frames/frames.json")) for work in works]
+        first = timings[0][1]
         rows = []
-        for work, frames in found:
+        for work, frames in timings:
             same = first and frames and (first["device"], first["pixels"]) == (frames["device"], frames["pixels"])
             times = [own / least for own, least in zip(frames["ms"], first["ms"], strict=True)] if same else None
             rows.append({"name": work.name, "state": self.state(work), "frames": frames, "times": times})
@@ -189,23 +189,23 @@ class Results:
         rows = []
         for work in figure_fixed_sun(self.size):
             assert isinstance(work, Experiment)
-            found, views = self.evaluation(work, "one-sun"), self.file(work, "one-sun/views.json")
+            metrics, views = self.evaluation(work, "one-sun"), self.file(work, "one-sun/views.json")
             row: Values = {"name": work.name, "state": self.state(work), "views": views}
-            if found is not None:
-                lit = [frame for frame in found["frames"] if frame["file_path"] in views["fully_lit"]]
+            if metrics is not None:
+                lit = [frame for frame in metrics["frames"] if frame["file_path"] in views["fully_lit"]]
                 row |= {
                     "fully_lit": {name: _over(lit, name) for name in PICTURES},
-                    "all": {name: _over(found["frames"], name) for name in PICTURES},
-                    "shape": {name: (found["geometry"] or {}).get(name) for name in SHAPE},
-                    "frames": [len(lit), len(found["frames"])],
+                    "all": {name: _over(metrics["frames"], name) for name in PICTURES},
+                    "shape": {name: (metrics["geometry"] or {}).get(name) for name in SHAPE},
+                    "frames": [len(lit), len(metrics["frames"])],
                 }
             rows.append(row)
         return rows
 
     def curves(self) -> list[Values]:
         """Of each start: the share of Gaussians inside the true mesh by steps."""
-        found = [(work, self.file(work, "curve.json")) for work in curves(self.size)]
-        return [{"name": work.name, "state": self.state(work), **(curve or {})} for work, curve in found]
+        files = [(work, self.file(work, "curve.json")) for work in curves(self.size)]
+        return [{"name": work.name, "state": self.state(work), **(curve or {})} for work, curve in files]
 
 
 def value_of(metrics: JsonMapping, table: Table, path: str, suns: str) -> tuple[float, float | None] | None:
@@ -217,25 +217,25 @@ def value_of(metrics: JsonMapping, table: Table, path: str, suns: str) -> tuple[
     where = metrics.get(suns) if suns else metrics
     if table.scene == "pair":
         where = next((one for one in metrics["objects"] or [] if one["name"] == "second"), None)
-    found = ((where or {}).get(group) or {}).get(name)
-    return None if found is None else (found["mean"], found["std"])
+    summary = ((where or {}).get(group) or {}).get(name)
+    return None if summary is None else (summary["mean"], summary["std"])
 
 
 def _model_value(metrics: JsonMapping, name: str) -> float:
     model = metrics["model"]
     seconds = max(model["render_ms"], 1e-6) / 1e3
-    found = {
+    numbers = {
         "gaussians": model["gaussians"],
         "megabytes": model["bytes"] / 1e6,
         "seconds": seconds,
         "rate": 1 / seconds,
     }
-    return float(found[name])
+    return float(numbers[name])
 
 
 def _mean(metrics: JsonMapping, group: str, name: str) -> float | None:
-    found = (metrics.get(group) or {}).get(name)
-    return None if found is None else float(found["mean"])
+    summary = (metrics.get(group) or {}).get(name)
+    return None if summary is None else float(summary["mean"])
 
 
 def _over(frames: Sequence[JsonMapping], name: str) -> dict[str, float] | None:
@@ -247,20 +247,20 @@ def _over(frames: Sequence[JsonMapping], name: str) -> dict[str, float] | None:
 Means = Mapping[tuple[str, str], Mapping[str, float | None]]
 
 
-def _claim(table: Table, claim: Any, keys: Sequence[str], means: Means) -> Values:
+def _claim(table: Table, claim: ExpectedRanking, keys: Sequence[str], means: Means) -> Values:
     column = next(column for column in table.columns if column.metric == claim.metric)
-    found = {key: holds(column, means[key, claim.metric], claim.better, claim.worse) for key in keys}
-    return {"text": f"{column.heading}: {claim.better} {column.comparison} {claim.worse}", "holds": found}
+    verdicts = {key: holds(column, means[key, claim.metric], claim.better, claim.worse) for key in keys}
+    return {"text": f"{column.heading}: {claim.better} {column.comparison} {claim.worse}", "holds": verdicts}
 
 
 def _best(column: Column, keys: Sequence[str], means: Means) -> Values:
     """Whether the best row of the thesis, or one of several, is among our best."""
     theirs = best(column, means["printed", column.metric])
-    found = {}
+    verdicts = {}
     for key in keys:
         ours = means[key, column.metric]
-        found[key] = None if None in ours.values() else bool(best(column, ours) & theirs)
-    return {"text": f"{column.heading}: {' or '.join(sorted(theirs))} best", "holds": found}
+        verdicts[key] = None if None in ours.values() else bool(best(column, ours) & theirs)
+    return {"text": f"{column.heading}: {' or '.join(sorted(theirs))} best", "holds": verdicts}
 
 
 def _in_order(table: Table, key: str, means: Means) -> list[int]:

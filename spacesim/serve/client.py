@@ -3,11 +3,11 @@
 import json
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.files import JsonValue
 from spacesim.data.records import Camera, Sun
 from spacesim.serve.protocol import VERSION, arrays_of, import_zmq
 
@@ -31,7 +31,7 @@ class CameraClient:
             ) from None
 
     def picture(
-        self, camera: Camera, sun: Sun | Sequence[float] | None = None, **options: Any
+        self, camera: Camera, sun: Sun | Sequence[float] | None = None, **options: JsonValue
     ) -> dict[str, np.ndarray]:
         """The arrays that were asked for, by name. sun: as for `Run.render`; options: exposure (EV), outputs=("rgb",
         "depth", ...), seed, see spacesim/serve/protocol.py. Raises InputError for what cannot be, WorkError where

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -14,6 +14,10 @@ from spacesim.data.files import JsonDict
 from spacesim.data.images.tone import STANDARD_EXPOSURE, as_bytes, display_values
 from spacesim.data.records import Camera, Sun
 from spacesim.serve.protocol import OUTPUTS, Output
+
+if TYPE_CHECKING:
+    from spacesim.scenes import SceneConfig
+    from spacesim.splat.run import Predictor
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +67,7 @@ class TracedScene:
 
     outputs = OUTPUTS
 
-    def __init__(self, config: Any, spp: int | None = None) -> None:
+    def __init__(self, config: "SceneConfig", spp: int | None = None) -> None:
         from spacesim.scenes import Renderer, build
         from spacesim.scenes.background.draw import Background
 
@@ -125,7 +129,7 @@ class PredictedRun:
 
     outputs: tuple[Output, ...] = ("rgb", "alpha", "depth", "normal", "visibility", "object_id")
 
-    def __init__(self, run: Any) -> None:
+    def __init__(self, run: "Predictor") -> None:
         self.run = run
         path = Path(run.path).resolve()
         name = path.stem if path.suffix == ".toml" else path.parent.name if path.name == "run" else path.name
@@ -144,11 +148,11 @@ class PredictedRun:
         seen = self.run.predict(camera, sun, normals="normal" in outputs, exposure=exposure)
         arrays = {"rgb": as_bytes(seen.rgb), "alpha": seen.alpha, "depth": seen.depth, "normal": seen.normal}
         arrays |= {"visibility": seen.visibility, "object_id": getattr(seen, "id", None)}
+        there = {name: array for name, array in arrays.items() if array is not None}
         for name in outputs:
-            if arrays.get(name) is None:
-                there = [key for key, array in arrays.items() if array is not None]
+            if name not in there:
                 raise InputError(f"outputs: expected some of {', '.join(there)} of {self.names[0]}, found {name}")
-        return {name: arrays[name] for name in outputs}
+        return {name: there[name] for name in outputs}
 
 
 def load_served(what: str | Path, spp: int | None = None) -> Served:

@@ -172,10 +172,10 @@ def arrays_of(frames: Sequence[bytes]) -> dict[str, np.ndarray]:
         header = json.loads(frames[0])
         if "error" in header:
             raise InputError(str(header["error"]))
-        found = zip(header.get("arrays", []), frames[1:], strict=True)
+        described = zip(header.get("arrays", []), frames[1:], strict=True)
         return {
             item["name"]: np.frombuffer(frame, np.dtype(item["dtype"]).newbyteorder("<")).reshape(item["shape"])
-            for item, frame in found
+            for item, frame in described
         }
     except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
         if isinstance(error, InputError):

@@ -18,7 +18,6 @@ import logging
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -87,7 +86,7 @@ class Simulation:
         self._bodies: dict[str, Body] = {}
         self._cameras: dict[int, MountedCamera] = {}
         self._frame = 0
-        self._told = ""
+        self._last_warning = ""
 
     def answer(self, frames: Sequence[bytes]) -> list[bytes] | None:
         """Frames of the answer; None where this is none of Basilisk's words."""
@@ -109,8 +108,8 @@ class Simulation:
         bodies, cameras = dict(self._bodies), dict(self._cameras)
         for number, value in wire.fields(message):
             if number == 1:
-                told = [wire.integers(inner) for key, inner in wire.fields(_message(value)) if key == 1]
-                self._frame = max(0, *(frame for frames in told for frame in frames), 0)
+                numbers = [wire.integers(inner) for key, inner in wire.fields(_message(value)) if key == 1]
+                self._frame = max(0, *(frame for frames in numbers for frame in frames), 0)
             elif number in (2, 3):
                 body = _read_body(value, is_spacecraft=number == 3)
                 bodies[body.name] = body
@@ -188,9 +187,9 @@ class Simulation:
 
     def _tell(self, sentence: str) -> None:
         """Once: Basilisk asks again and again."""
-        if sentence != self._told:
+        if sentence != self._last_warning:
             _log.warning("Basilisk gets no picture: %s", sentence)
-        self._told = sentence
+        self._last_warning = sentence
 
 
 def depth_colors(depth: Array, far: float) -> np.ndarray:
@@ -209,7 +208,7 @@ def depth_colors(depth: Array, far: float) -> np.ndarray:
 
 def _read_body(value: Value, is_spacecraft: bool) -> Body:
     name, parent = "", ""
-    lists: dict[int, list[Any]] = {2: [], 4: []}
+    lists: dict[int, list[float]] = {2: [], 4: []}
     for number, inner in wire.fields(_message(value)):
         if number == 1:
             name = wire.text(inner)
@@ -226,7 +225,7 @@ def _read_body(value: Value, is_spacecraft: bool) -> Body:
 def _read_camera(value: Value) -> MountedCamera:
     texts: dict[int, str] = {2: ""}
     numbers: dict[int, list[int]] = {1: [0], 4: [], 16: [0]}
-    lists: dict[int, list[Any]] = {3: [], 7: [], 8: [], 17: []}
+    lists: dict[int, list[float]] = {3: [], 7: [], 8: [], 17: []}
     for number, inner in wire.fields(_message(value)):
         if number in texts:
             texts[number] = wire.text(inner)

@@ -53,11 +53,11 @@ def integers(value: Value) -> list[int]:
     """Of a field of kind int64, repeated ones packed or one of them."""
     if isinstance(value, int):
         return [_signed(value)]
-    position, found = 0, []
+    position, numbers = 0, []
     while position < len(value):
         number, position = _varint(value, position)
-        found.append(_signed(number))
-    return found
+        numbers.append(_signed(number))
+    return numbers
 
 
 def double(value: Value) -> float:

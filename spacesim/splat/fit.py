@@ -279,13 +279,13 @@ def _most_likely(small: _Reduced, light: PictureLight, weights: Array, first: tu
         step, cost = np.linalg.solve(curvature, slope), error / noise + float(numbers @ numbers)
         for _ in range(HALVINGS):
             there = numbers + step
-            found = squares(small.drawn(light, there)) / noise + float(there @ there)
-            if found < cost:
+            new_cost = squares(small.drawn(light, there)) / noise + float(there @ there)
+            if new_cost < cost:
                 break
             step = 0.5 * step
         else:
             return numbers
         numbers = there
-        if found > (1 - ENOUGH) * cost:
+        if new_cost > (1 - ENOUGH) * cost:
             break
     return numbers

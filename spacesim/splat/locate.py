@@ -57,8 +57,8 @@ def locate(
     be resumed, or of other work. What is wrong with one picture is told of that.
     """
     check_gaussians(run)
-    told = {} if start is None else read_views(start)
-    frames, dataset = _frames(run, images, told, camera)
+    start_frames = {} if start is None else read_views(start)
+    frames, dataset = _frames(run, images, start_frames, camera)
     for frame in frames:
         if run.relightable and sun is None and frame.sun is None:
             method = run.config["method"]
@@ -78,7 +78,7 @@ def locate(
         for done, frame in enumerate(frames, start=1):
             if frame.file_path not in entries:
                 light = sun or frame.sun
-                guess = _guess(told, frame)
+                guess = _guess(start_frames, frame)
                 entries[frame.file_path] = _entry(run, images, dataset, frame, guess, light, within, views)
                 if time.monotonic() - saved > SAVE_EVERY:
                     _write(out, settings, entries)
@@ -92,7 +92,7 @@ def locate(
 
 
 def _frames(
-    run: Run, images: Path, told: Mapping[str, Frame], camera: Path | None
+    run: Run, images: Path, start_frames: Mapping[str, Frame], camera: Path | None
 ) -> tuple[list[Frame], Dataset | None]:
     """Pictures with their intrinsics, lenses and Suns, and the dataset where they are one. Poses mean nothing."""
     if (images / "transforms.json").is_file() or images.suffix == ".json":
@@ -109,7 +109,7 @@ def _frames(
     usual: Frame | None = None
     frames = []
     for name in names:
-        like = _match(told, name)
+        like = _match(start_frames, name)
         if like is None:
             usual = usual or _usual(run, camera)
             like = replace(usual, sun=None)
@@ -128,16 +128,16 @@ def _usual(run: Run, camera: Path | None) -> Frame:
     return read_dataset(data).train[0]
 
 
-def _match(told: Mapping[str, Frame], name: str) -> Frame | None:
+def _match(start_frames: Mapping[str, Frame], name: str) -> Frame | None:
     """The frame of that path; else the one of that file name, if it is alone."""
-    if name in told:
-        return told[name]
-    same = [frame for path, frame in told.items() if PurePosixPath(path).name == PurePosixPath(name).name]
+    if name in start_frames:
+        return start_frames[name]
+    same = [frame for path, frame in start_frames.items() if PurePosixPath(path).name == PurePosixPath(name).name]
     return same[0] if len(same) == 1 else None
 
 
-def _guess(told: Mapping[str, Frame], frame: Frame) -> Camera | None:
-    like = _match(told, frame.file_path)
+def _guess(start_frames: Mapping[str, Frame], frame: Frame) -> Camera | None:
+    like = _match(start_frames, frame.file_path)
     return None if like is None else replace(frame.camera, world_from_camera=like.camera.world_from_camera)
 
 
@@ -158,16 +158,16 @@ def _entry(
         has_alpha = bool(image.alpha.min() < 1)
         if guess is not None:
             pose = refine_pose(run, image, guess, sun, within=within)
-            found = FoundPose(pose, residual_of(run, image, pose, sun), False)
+            result = FoundPose(pose, residual_of(run, image, pose, sun), False)
         else:
             key = None if sun is None else sun.direction.tobytes(), has_alpha
             if key not in views:
                 views.clear()
                 views[key] = ModelViews.of(run, sun, has_alpha)
-            found = find_pose(run, image, frame.camera, sun, views=views[key])
+            result = find_pose(run, image, frame.camera, sun, views=views[key])
     except InputError as error:
         return {"file_path": frame.file_path, "failed": str(error)}
-    pose, camera = found.pose, found.pose.camera
+    pose, camera = result.pose, result.pose.camera
     entry: JsonDict = {
         "file_path": frame.file_path,
         "transform_matrix": camera.opengl.tolist(),
@@ -182,8 +182,8 @@ def _entry(
         **dict(zip(("k1", "k2", "p1", "p2", "k3"), frame.distortion, strict=False)),
         "covariance": pose.covariance.tolist(),
         "converged": pose.converged,
-        "ambiguous": found.ambiguous,
-        "residual": found.residual,
+        "ambiguous": result.ambiguous,
+        "residual": result.residual,
         "error": pose.error,
         "gain": pose.gain,
         "iterations": pose.iterations,

@@ -249,7 +249,7 @@ class ShapeSearch:
         self, pictures: Sequence[SmallPicture], progress: Callable[[int, int], None] = lambda done, total: None
     ) -> Array:
         """[V, SPHERE] of the pictures under the lattice's Suns, after `ALTERNATIONS`."""
-        total, found = (1 + ALTERNATIONS) * len(pictures), np.zeros((len(pictures), SPHERE))
+        total, losses = (1 + ALTERNATIONS) * len(pictures), np.zeros((len(pictures), SPHERE))
         lowest = np.zeros(len(MEAN_COSINES))
         for i, picture in enumerate(pictures):
             surface = self._surface(picture, upload(self.albedo.astype(np.float32)))
@@ -259,11 +259,11 @@ class ShapeSearch:
         for turn in range(1, 1 + ALTERNATIONS):
             albedo, sums = upload(self.albedo.astype(np.float32)), np.zeros((2, self.gaussians.count))
             for i, picture in enumerate(pictures):
-                found[i], target = self._compare(picture, albedo)
+                losses[i], target = self._compare(picture, albedo)
                 sums += self._spread_back(picture, target)
                 progress(turn * len(pictures) + i + 1, total)
             self.albedo *= np.clip((sums[0] + 1e-3) / (sums[1] + 1e-3), 0.3, 3)
-        return found
+        return losses
 
     def _occlusion(self, sun: Array, config: ShadowConfig, distance: float) -> Float:
         return cast_shadows(self.gaussians, light_rows(sun), config, distance).occlusion

@@ -48,17 +48,17 @@ def check_unsupported(arguments: Mapping[str, object]) -> None:
     """Raises ValueError for the first argument that asks for something: each is False or None where it does not."""
     for name, value in arguments.items():
         if name == "rolling_shutter":
-            asked = value is not None and getattr(value, "name", "GLOBAL") != "GLOBAL"
+            is_set = value is not None and getattr(value, "name", "GLOBAL") != "GLOBAL"
         else:
-            asked = value is not None and not (isinstance(value, int) and not value)
-        if asked:
+            is_set = value is not None and not (isinstance(value, int) and not value)
+        if is_set:
             raise ValueError(f"{name}: not supported by spacesim.torch.rasterization, leave it out")
 
 
-def check_choice(name: str, found: str, known: Sequence[str]) -> None:
-    """Raises ValueError where `found` is not one of `known`."""
-    if found not in known:
-        raise ValueError(f"{name}: expected one of {', '.join(known)}, found {found!r}")
+def check_choice(name: str, value: str, known: Sequence[str]) -> None:
+    """Raises ValueError where `value` is not one of `known`."""
+    if value not in known:
+        raise ValueError(f"{name}: expected one of {', '.join(known)}, found {value!r}")
 
 
 def checked_size(name: str, value: SupportsIndex) -> int:
@@ -109,12 +109,12 @@ def check_shapes(
     return count, cameras
 
 
-def check_tensor(name: str, found: object) -> None:
+def check_tensor(name: str, value: object) -> None:
     """Raises ValueError for what is no tensor."""
-    if not isinstance(found, Tensor):
-        raise ValueError(f"{name}: expected a tensor, found one of type {type(found).__name__}")
-    if found.device.type not in ("cpu", "cuda"):
-        raise ValueError(f"{name}: expected a tensor on a CPU or on CUDA, found one on {found.device}")
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{name}: expected a tensor, found one of type {type(value).__name__}")
+    if value.device.type not in ("cpu", "cuda"):
+        raise ValueError(f"{name}: expected a tensor on a CPU or on CUDA, found one on {value.device}")
 
 
 def check_device(name: str, tensor: Tensor, device: object) -> None:

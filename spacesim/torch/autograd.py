@@ -65,12 +65,12 @@ class Project(torch.autograd.Function):
         ctx.settings, ctx.leaves = settings, _leaves(tensors)
         count = len(tensors[0])
         capacity = round_capacity(count)
-        found: list[ProjectedSplats] = [project(leaves, settings, capacity) for leaves in ctx.leaves]
-        means2d = _stack([to_table(one.means2d, count, 2) for one in found])
-        table = _stack([to_table(one.table, count, TABLE) for one in found])
-        radii = _stack([to_table(one.radii, count, 2) for one in found])
+        projected: list[ProjectedSplats] = [project(leaves, settings, capacity) for leaves in ctx.leaves]
+        means2d = _stack([to_table(one.means2d, count, 2) for one in projected])
+        table = _stack([to_table(one.table, count, TABLE) for one in projected])
+        radii = _stack([to_table(one.radii, count, 2) for one in projected])
         ctx.mark_non_differentiable(radii)
-        return means2d, table, radii, found
+        return means2d, table, radii, projected
 
     @staticmethod
     @once_differentiable
@@ -85,8 +85,8 @@ class Project(torch.autograd.Function):
         each = []
         for camera, leaves in enumerate(ctx.leaves):
             centres, rest = (None if one is None else to_floats(_of(one, camera)) for one in (grad_means2d, grad_table))
-            found = project_back(leaves, ctx.settings, wanted, centres, rest, capacity)
-            each.append(_gradient_tensors(found, tensors))
+            leaf_gradients = project_back(leaves, ctx.settings, wanted, centres, rest, capacity)
+            each.append(_gradient_tensors(leaf_gradients, tensors))
         harmonic = tensors[GAUSSIANS]
         shared = GAUSSIANS + (harmonic is None or harmonic.dim() == 3)
         results = [
@@ -116,19 +116,19 @@ def _leaves(tensors: Sequence[Tensor]) -> list[Leaves]:
     ]
 
 
-def _gradient_tensors(found: LeafGradients, tensors: Sequence[Tensor]) -> list[Tensor | None]:
+def _gradient_tensors(grads: LeafGradients, tensors: Sequence[Tensor]) -> list[Tensor | None]:
     """Gradients of one camera in the shapes of `Project`'s tensors, None of those that were not wanted."""
     means, quats, scales, opacities, harmonic, *_ = tensors
     results: list[Tensor | None] = []
-    named = (found.means, means), (found.quats, quats), (found.scales, scales), (found.opacities, opacities)
-    for flat, tensor in (*named, (found.harmonics, harmonic)):
+    named = (grads.means, means), (grads.quats, quats), (grads.scales, scales), (grads.opacities, opacities)
+    for flat, tensor in (*named, (grads.harmonics, harmonic)):
         if flat is None:
             results.append(None)
             continue
         shape = tensor.shape if tensor.dim() < 4 else tensor.shape[1:]
         strides = (1,) if len(shape) == 1 else (shape[1], 1) if len(shape) == 2 else (3 * shape[1], 3, 1)
         results.append(to_tensor(flat).as_strided(shape, strides))
-    for numbers, places, size in ((found.viewmat, range(16), 4), (found.intrinsics, INTRINSICS, 3)):
+    for numbers, places, size in ((grads.viewmat, range(16), 4), (grads.intrinsics, INTRINSICS, 3)):
         results.append(None if numbers is None else _matrix(numbers, places, size))
     return results
 
@@ -247,11 +247,11 @@ def _blend_back(
         own, grad_planes = grad_planes[:channels], grad_planes[channels:]
         if sums:
             grad_light = _zeros(drawing.width * drawing.height)  # light that passes counts once
-        found = backward(splats, blended, lists, size, own, grad_light, absolute)
-        s = found.splats
-        numbers = [s.x, s.y, s.a, s.b, s.c, s.opacity, *([found.absolute_x, found.absolute_y] if absolute else [])]
+        grads = backward(splats, blended, lists, size, own, grad_light, absolute)
+        s = grads.splats
+        numbers = [s.x, s.y, s.a, s.b, s.c, s.opacity, *([grads.absolute_x, grads.absolute_y] if absolute else [])]
         sums = [one + other for one, other in zip(sums, numbers, strict=True)] if sums else numbers
-        features += found.features
+        features += grads.features
     return sums, features
 
 

@@ -180,13 +180,13 @@ def project_back(
                 total += value * column(given, i, size, count)
     if dr.grad_enabled(total):
         dr.backward(total)
-    found: dict[str, Any] = {name: [dr.grad(value) for value in group] for name, group in known.items()}
+    gradients: dict[str, Any] = {name: [dr.grad(value) for value in group] for name, group in known.items()}
     for name, size in (("means", 3), ("quats", 4), ("scales", 3), ("opacities", 1)):
-        if name in found:
-            found[name] = rows(found[name], size, count, capacity)
-    if "harmonics" in found:
-        found["harmonics"] = rows(found["harmonics"], dr.width(leaves.harmonics) // count, count, capacity)
-    return LeafGradients(**found)
+        if name in gradients:
+            gradients[name] = rows(gradients[name], size, count, capacity)
+    if "harmonics" in gradients:
+        gradients["harmonics"] = rows(gradients["harmonics"], dr.width(leaves.harmonics) // count, count, capacity)
+    return LeafGradients(**gradients)
 
 
 def _splats_of(inputs: _Inputs, settings: RasterSettings) -> tuple[Splats, Footprints, list[Float]]:

@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
 
@@ -92,7 +92,7 @@ class DisplaySettings:
             object.__setattr__(self, name, value)
 
 
-def clamp(value: Any, least: float, most: float, otherwise: float) -> float:
+def clamp(value: SupportsFloat | str, least: float, most: float, otherwise: float) -> float:
     """`value` as a number from `least` to `most`; `otherwise` where it is no number."""
     try:
         number = float(value)

@@ -80,24 +80,24 @@ def body_labels(
     given: how many keypoints are to be found, or a file that tells them; None is keypoints.json beside the mesh, else
     `COUNT`. What the file does not tell is found. Raises InputError where the file is broken or names other objects.
     """
-    told: dict[int, BodyLabels] = {}
+    entries: dict[int, BodyLabels] = {}
     path = given if isinstance(given, Path) else dataset.root / NAME
     if isinstance(given, Path) or (given is None and path.is_file()):
-        told = {entry.id: entry for entry in read_record(path, _File, Rules(), MAX_JSON_BYTES)[0].objects}
-        others = sorted(told.keys() - {target.id for target in targets})
+        entries = {entry.id: entry for entry in read_record(path, _File, Rules(), MAX_JSON_BYTES)[0].objects}
+        others = sorted(entries.keys() - {target.id for target in targets})
         if others:
             raise InputError(f"{path}: expected objects of {dataset.root}, found {others[0]}")
     count = given if isinstance(given, int) else COUNT
     of_model: dict[int, BodyLabels] = {}
     numbers = model_numbers(targets)
     for number, target in zip(numbers, targets, strict=True):
-        entry = told.get(target.id)
+        entry = entries.get(target.id)
         if entry is not None and not of_model.setdefault(number, entry).is_like(entry):
             raise InputError(f"{path}: expected the same of objects of one shape, found others of object {target.id}")
     for number, target in zip(numbers, targets, strict=True):
         if number not in of_model:
-            found = find_keypoints(target.vertices, target.faces, count)
-            points = {f"k{k}": (float(x), float(y), float(z)) for k, (x, y, z) in enumerate(found, start=1)}
+            keypoints = find_keypoints(target.vertices, target.faces, count)
+            points = {f"k{k}": (float(x), float(y), float(z)) for k, (x, y, z) in enumerate(keypoints, start=1)}
             symmetries = find_symmetries(target.vertices, target.faces)
             of_model[number] = BodyLabels(target.id, points, target.name, *symmetries)
     return [
@@ -172,6 +172,6 @@ def _candidates(points: Array, low: Array, size: float) -> tuple[Array, Array]:
     keys = (cells[:, 0] * CELLS + cells[:, 1]) * CELLS + cells[:, 2]
     order = np.lexsort((*np.round(points.T / size, 6), -arms, keys))
     first = order[np.r_[True, np.diff(keys[order]) > 0]]
-    found = points[first]
-    first = first[np.lexsort(np.round(found.T / size, 6))]
+    farthest = points[first]
+    first = first[np.lexsort(np.round(farthest.T / size, 6))]
     return points[first], arms[first] * size

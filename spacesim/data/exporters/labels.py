@@ -66,21 +66,21 @@ class DatasetLabeller:
     @property
     def categories(self) -> list[Category]:
         """In the order of their numbers."""
-        found: dict[int, Category] = {}
+        categories: dict[int, Category] = {}
         for number, target, body in zip(self._numbers, self.targets, self.bodies, strict=True):
-            found.setdefault(number, Category(number, target.name, body))
-        return list(found.values())
+            categories.setdefault(number, Category(number, target.name, body))
+        return list(categories.values())
 
     def instances(self, frame: Frame) -> list[Instance]:
         """All objects, those that are not seen, too. Raises InputError where the object numbers are missing."""
         if frame.id_path is None:
             raise InputError(f"{self.dataset.root}: expected object numbers of {frame.file_path}, found no id_path")
         numbers = read_labels(self.dataset.root / frame.id_path, frame.camera)
-        found = []
+        instances = []
         for target, category, body in zip(self.targets, self._numbers, self.bodies, strict=True):
             mask = numbers == target.id
-            found.append(Instance(target, category, mask, bounding_box(mask), self.keypoints(frame, target, body)))
-        return found
+            instances.append(Instance(target, category, mask, bounding_box(mask), self.keypoints(frame, target, body)))
+        return instances
 
     def keypoints(self, frame: Frame, target: LabelledObject, body: BodyLabels) -> Array:
         """[K, 3] as of `Instance`; 0 each outside of the picture."""

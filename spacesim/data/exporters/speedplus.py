@@ -71,7 +71,7 @@ def write_speedplus(
         write_png(out / "synthetic/images" / name, opaque_picture(dataset, frame), durable=False)
         mask = None
         if labeller is not None:
-            (instance,) = (found for found in labeller.instances(frame) if found.target is target)
+            (instance,) = (one for one in labeller.instances(frame) if one.target is target)
             mask, points[name] = instance.mask, instance.keypoints.tolist()
         elif frame.silhouette_path is not None:
             mask = read_labels(dataset.root / frame.silhouette_path, frame.camera) > 0

@@ -62,11 +62,11 @@ def sample_surface(vertices: Array, faces: np.ndarray, count: int) -> Array:
     corners = corners[np.lexsort(corners.reshape(-1, 9).T)]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     ends = np.cumsum(areas)
-    picked = np.minimum(np.searchsorted(ends, ends[-1] * (np.arange(count) + 0.5) / count), len(ends) - 1)
+    triangle = np.minimum(np.searchsorted(ends, ends[-1] * (np.arange(count) + 0.5) / count), len(ends) - 1)
     share = np.random.default_rng(0).random((count, 2))
     share = np.where(share.sum(axis=1, keepdims=True) > 1, 1 - share, share)
-    along = corners[picked, 1:] - corners[picked, :1]
-    points: Array = corners[picked, 0] + (share[..., None] * along).sum(axis=1)
+    along = corners[triangle, 1:] - corners[triangle, :1]
+    points: Array = corners[triangle, 0] + (share[..., None] * along).sum(axis=1)
     return points
 
 
@@ -122,14 +122,14 @@ def _is_new(turn: Rotation, others: list[Rotation]) -> bool:
     return all((turn.inv() * other).magnitude() > 1e-3 for other in others)
 
 
-def _group(found: list[Rotation], has_axis: bool) -> list[Rotation]:
+def _group(turns: list[Rotation], has_axis: bool) -> list[Rotation]:
     """All products, without the identity, in the order in which they are found."""
     if has_axis:
-        return found
-    group, before = list(found), -1
+        return turns
+    group, before = list(turns), -1
     while before != len(group) <= 120:
         before = len(group)
-        for turn in found:
+        for turn in turns:
             for other in list(group):
                 product = turn * other
                 if product.magnitude() > 1e-3 and _is_new(product, group):

@@ -52,13 +52,13 @@ def import_colmap(
     projects = dict.fromkeys([src, folder.parent, folder.parent.parent])
     paths = _find_pictures(folder, list(projects), connected, images)
     used = [image for image in connected if image.name in paths]
-    found_masks = {} if masks is None else MaskFolder(masks).find_all([image.name for image in used])
+    mask_paths = {} if masks is None else MaskFolder(masks).find_all([image.name for image in used])
     maker = FrameImporter(masked)
     frames = []
     for name, image in zip(frame_names([image.name for image in used]), used, strict=True):
         path = paths[image.name]
         lens = fitted(model.cameras[image.camera], path)
-        frames.append(maker.frame(View(name, path, image.world_from_camera, lens, found_masks.get(image.name))))
+        frames.append(maker.frame(View(name, path, image.world_from_camera, lens, mask_paths.get(image.name))))
     source = {
         "kind": "colmap",
         "source": str(src),
@@ -115,22 +115,22 @@ def _find_pictures(
         raise InputError(f"images: expected a folder, found {'a file' if given.exists() else 'none'} at {given}")
     places = [given] if given is not None else [p for project in projects for p in (project / "images", project)]
     for place in places:
-        found = {image.name: place / image.name for image in images if is_file(place / image.name)}
-        if found:
+        paths = {image.name: place / image.name for image in images if is_file(place / image.name)}
+        if paths:
             break
     else:
         where = given or places[0]
         raise InputError(
             f"{where}: expected the pictures of {folder} ({images[0].name}), found none; name their folder (images)"
         )
-    if len(found) < len(images):
-        first = next(image.name for image in images if image.name not in found)
-        lacking = len(images) - len(found)
+    if len(paths) < len(images):
+        first = next(image.name for image in images if image.name not in paths)
+        lacking = len(images) - len(paths)
         _log.warning(
             "%s: %d of %d images of the model have no file and are left out, %s first",
             place, lacking, len(images), first[:200],
         )  # fmt: skip
-    return found
+    return paths
 
 
 def _start_points(

@@ -48,17 +48,17 @@ class MaskFolder:
     def find_all(self, names: Iterable[str]) -> dict[str, Path]:
         """Masks of pictures. Logs how many have none; raises InputError where none has one."""
         names = list(names)
-        found = {name: path for name in names if (path := self.find(name)) is not None}
-        if not found:
+        paths = {name: path for name in names if (path := self.find(name)) is not None}
+        if not paths:
             raise InputError(f"masks: expected masks named like the pictures ({names[0]}), found none in {self.folder}")
-        if len(found) < len(names):
-            first = next(name for name in names if name not in found)
-            lacking = len(names) - len(found)
+        if len(paths) < len(names):
+            first = next(name for name in names if name not in paths)
+            lacking = len(names) - len(paths)
             _log.warning(
                 "%s: %d of %d pictures have no mask and count as a whole, %s first",
                 self.folder, lacking, len(names), first,
             )  # fmt: skip
-        return found
+        return paths
 
 
 def read_mask(path: Path, width: int, height: int) -> np.ndarray:
@@ -83,11 +83,11 @@ def read_silhouette(path: Path, width: int, height: int) -> np.ndarray:
 
 
 def _scaled(path: Path, white: np.ndarray, width: int, height: int) -> np.ndarray:
-    found_height, found_width = white.shape
-    if (found_width, found_height) == (width, height):
+    mask_height, mask_width = white.shape
+    if (mask_width, mask_height) == (width, height):
         return white
-    if abs(found_width * height - found_height * width) > max(found_width, found_height, width, height):
+    if abs(mask_width * height - mask_height * width) > max(mask_width, mask_height, width, height):
         expected = f"{width}x{height} pixels, or a multiple or fraction, as its picture"
-        raise InputError(f"{path}: expected {expected}, found {found_width}x{found_height}")
+        raise InputError(f"{path}: expected {expected}, found {mask_width}x{mask_height}")
     resized = PillowImage.fromarray(white.astype(np.uint8)).resize((width, height), PillowImage.Resampling.NEAREST)
     return np.asarray(resized) > 0

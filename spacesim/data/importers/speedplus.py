@@ -107,7 +107,7 @@ def import_speedplus(
     pictures, lists = _lists(src, domain)
     intrinsics = _read_camera(src, lists[0])
     splits = [_read_labels(path) for path in lists]
-    found = sum(map(len, splits))
+    labelled = sum(map(len, splits))
     if max_distance is not None:
         splits = [[one for one in labels if np.linalg.norm(one.position) <= max_distance] for labels in splits]
     near = sum(map(len, splits))
@@ -115,7 +115,7 @@ def import_speedplus(
     there = sum(map(len, splits))
     if not splits[0]:
         within = "" if max_distance is None else f" within {max_distance:g} m"
-        raise InputError(f"{lists[0]}: expected pictures{within} in {pictures}, found none of {found} labels")
+        raise InputError(f"{lists[0]}: expected pictures{within} in {pictures}, found none of {labelled} labels")
     if there < near:
         _log.warning("%s: %d of %d pictures are missing, their frames are skipped", pictures, near - there, near)
     if count is not None:
@@ -125,9 +125,9 @@ def import_speedplus(
     files = [one.filename for labels in splits for one in labels]
     if twice := next((name for name, count in Counter(files).items() if count > 1), ""):
         raise InputError(f"{lists[0]}: expected each image once, found {twice} twice, in it or in {lists[-1].name}")
-    found_masks = MaskFolder(folder).find_all(files) if masks or folder.is_dir() else {}
+    mask_paths = MaskFolder(folder).find_all(files) if masks or folder.is_dir() else {}
     names = dict(zip(files, frame_names(files), strict=True))
-    maker = _FrameMaker(pictures, names, intrinsics, size, found_masks, masked)
+    maker = _FrameMaker(pictures, names, intrinsics, size, mask_paths, masked)
     train, test = (list(map(maker.frame, labels)) for labels in [*splits, []][:2])
     options = {"domain": domain, "max_distance": max_distance, "count": count, "scale": scale, "seed": seed}
     options |= {"masks": None if masks is None else str(masks), "masked": masked}

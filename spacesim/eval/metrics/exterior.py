@@ -160,14 +160,14 @@ class ExteriorView:
         def hidden(k: UInt32, side: Float) -> Bool:
             return (k < dr.gather(mi.UInt32, last, mi.UInt32(0))) & (side == 0)
 
-        def look(k: UInt32, side: Float) -> tuple[UInt32, Float]:
+        def test_direction(k: UInt32, side: Float) -> tuple[UInt32, Float]:
             towards = dr.gather(mi.Vector3f, table, k)
             facing = dr.select(dr.dot(normal, towards) >= 0, mi.Float(1), mi.Float(-1))
             free = ~self.scene.ray_test(mi.Ray3f(start + LIFT * facing * normal, towards))
             return k + 1, dr.select(free, facing, side)
 
         state = dr.zeros(mi.UInt32, len(points)), dr.zeros(mi.Float, len(points))
-        _, side = dr.while_loop(state, hidden, look, mode="symbolic", label="sight")
+        _, side = dr.while_loop(state, hidden, test_direction, mode="symbolic", label="sight")
         return np.array(side).astype(np.int8)
 
 

@@ -74,7 +74,7 @@ def filled_beyond(vertices: Array, faces: np.ndarray, grid: Grid) -> float:
 def _apart(low: Array, high: Array, gap: float) -> list[np.ndarray]:
     """Indices of boxes from `low` to `high` [N, 3], in sets between which planes across the axes leave more than `gap`
     metres free. Boxes that touch are in one set."""
-    pending, found = [np.arange(len(low))] if len(low) else [], []
+    pending, groups = [np.arange(len(low))] if len(low) else [], []
     while pending:
         index = pending.pop()
         for axis in range(3):
@@ -85,8 +85,8 @@ def _apart(low: Array, high: Array, gap: float) -> list[np.ndarray]:
                 pending += np.split(order, cuts)
                 break
         else:
-            found.append(index)
-    return found
+            groups.append(index)
+    return groups
 
 
 def _on_lattice(low: Array, high: Array, grid: Grid) -> Grid:

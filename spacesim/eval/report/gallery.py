@@ -109,12 +109,12 @@ def strips(
             frame = group[0].frames[name]
             parts.append(f"<h3>{title} <small>{escape(frame['file_path'])}{sun_of(frame)}</small></h3>")
             for run in group:
-                said = words(run.frames[name])
+                summary = words(run.frames[name])
                 if len(runs) > 1:
-                    parts.append(f"<h4>{run.label} <small>{said}</small></h4>")
+                    parts.append(f"<h4>{run.label} <small>{summary}</small></h4>")
                 captions = dict(panels)
-                if len(runs) == 1 and said:
-                    captions[score_panel] += f", {said}"
+                if len(runs) == 1 and summary:
+                    captions[score_panel] += f", {summary}"
                 parts.append(_strip(run, name, panels, captions, limit))
     return "".join(parts)
 

@@ -97,8 +97,8 @@ def aligned_words(runs: Sequence[Evaluation]) -> str:
     """How runs were brought into the axes of the data."""
     words = ""
     for run in runs:
-        if found := run.metrics.get("alignment"):
+        if fit := run.metrics.get("alignment"):
             who = "Moved" if len(runs) == 1 else f"{run.name} was moved"
-            words += f" {escape(who)} into the axes and scale of the data by {found['inliers']} of {found['cameras']} "
-            words += f"matching cameras, which then differ by {100 * found['rms_over_distance']:.2g} % of the distance."
+            words += f" {escape(who)} into the axes and scale of the data by {fit['inliers']} of {fit['cameras']} "
+            words += f"matching cameras, which then differ by {100 * fit['rms_over_distance']:.2g} % of the distance."
     return words

@@ -136,8 +136,8 @@ def _pairs(run: Evaluation, named: bool) -> str:
             for side in ("truth", "prediction")
         )
         rate = _rate(frame, "error_rate")
-        said = "no lit or cast-shadow pixel" if rate is None else f"error rate {rate:.4f}"
-        parts.append(f'<div class="pair{small}">{images}<p>{escape(name + sun_of(frame))}<br>{said}</p></div>')
+        summary = "no lit or cast-shadow pixel" if rate is None else f"error rate {rate:.4f}"
+        parts.append(f'<div class="pair{small}">{images}<p>{escape(name + sun_of(frame))}<br>{summary}</p></div>')
     which = "Every frame" if len(places) == len(names) else f"{len(places)} of {len(names)} frames"
     title = (
         f"{run.label} <small>{which}, truth left, prediction right</small>"

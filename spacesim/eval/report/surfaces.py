@@ -132,12 +132,12 @@ def _pictures(run: Evaluation, named: bool) -> str:
         f"{SCALE * within * factor:.3g} {unit} and more: {SCALE * share:.2g} % of the object's size; the middle is the "
         "named distance</span></p>"
     )
-    said = {
+    captions = {
         "truth": ("Truth", "by its distance from the reconstruction: what is missing"),
         "reconstruction": ("Reconstruction", "by its distance from the truth: what is too much"),
     }
     parts = [f"<h3>{run.label}</h3>" if named else "", bar]
-    for name, (label, meaning) in said.items():
+    for name, (label, meaning) in captions.items():
         figures = [
             picture(
                 run.folder / "geometry" / f"{name}_{view}.png", f"{label} {meaning}, view {view}, {run.name}", "", WIDTH

@@ -71,10 +71,10 @@ class HashGrid:
         """`outputs` Floats [N] at points [3, N] in [0, 1]^3."""
         rows: list[Float] = []
         for level in self.levels:
-            found = ad.Array2f(0)
+            features = ad.Array2f(0)
             for vertex, weight, _ in _corners(level, point):
-                found = dr.fma(dr.gather(ad.Array2f, table, vertex), weight, found)
-            rows += list(found)
+                features = dr.fma(dr.gather(ad.Array2f, table, vertex), weight, features)
+            rows += list(features)
         return rows
 
     def adjoint(self, point: Array3f, gradients: list[Float]) -> Float:

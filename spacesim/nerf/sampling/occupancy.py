@@ -51,7 +51,7 @@ class Occupancy:
         count = dr.maximum(dr.ceil((rays.far - rays.near) / step), 0)
         k = dr.zeros(ad.Float, dr.width(rays.near))
 
-        def look(k: Float, first: Float, last: Float) -> tuple[Float, Float, Float]:
+        def step_cell(k: Float, first: Float, last: Float) -> tuple[Float, Float, Float]:
             t = rays.near + (k + 0.5) * step
             place = dr.fma(rays.direction, t, rays.origin) * n
             cell = ad.Array3u(dr.clip(place, 0, n - 1))
@@ -63,7 +63,7 @@ class Occupancy:
         def goes_on(k: Float, first: Float, last: Float) -> Bool:
             return k < count
 
-        _, first, last = dr.while_loop((k, first, last), goes_on, look)
+        _, first, last = dr.while_loop((k, first, last), goes_on, step_cell)
         crosses = last >= first
         near = dr.select(crosses, dr.maximum(rays.near, first - step), rays.near)
         far = dr.select(crosses, dr.minimum(rays.far, last + step), rays.far)

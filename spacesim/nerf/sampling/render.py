@@ -61,9 +61,9 @@ def median_depth(made: Weights, low: Float, high: Float, samples: int) -> Float:
     """[R] t at which half of the light is gone, exact where densities are constant in intervals; 0 where more than
     half gets through. low, high: [R S] t"""
     passed = sum_rays(dr.select(made.behind > 0.5, ad.UInt32(1), ad.UInt32(0)), samples)
-    found = passed < samples
+    reached = passed < samples
     place: UInt32 = dr.arange(ad.UInt32, dr.width(passed)) * samples + dr.minimum(passed, samples - 1)
     first, last, tau = (dr.gather(ad.Float, value, place) for value in (low, high, made.tau))
     thickness_before = -dr.log(dr.gather(ad.Float, made.behind, place)) - tau
     share = dr.clip((LN2 - thickness_before) / dr.maximum(tau, 1e-12), 0, 1)
-    return dr.select(found, dr.fma(share, last - first, first), 0)
+    return dr.select(reached, dr.fma(share, last - first, first), 0)

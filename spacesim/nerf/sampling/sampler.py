@@ -74,15 +74,15 @@ def last_at_most(values: Float, first: UInt32, count: int, target: Float) -> UIn
 
 def count_below(values: Float, first: UInt32, count: int, target: Float, equal: bool = False) -> UInt32:
     """[N] how many of `count` rising values from `first` [N] on are below `target` [N], or also equal to it."""
-    found = dr.zeros(ad.UInt32, dr.width(target))
+    below = dr.zeros(ad.UInt32, dr.width(target))
     step = 1 << (count.bit_length() - 1)
     while step:
-        place = found + step
+        place = below + step
         inside = place <= count
         value = dr.gather(ad.Float, values, first + place - 1, inside)
-        found = dr.select(inside & ((value <= target) if equal else (value < target)), place, found)
+        below = dr.select(inside & ((value <= target) if equal else (value < target)), place, below)
         step >>= 1
-    return found
+    return below
 
 
 def intervals(edges: Float, rays: int, samples: int) -> tuple[Float, Float, UInt32]:

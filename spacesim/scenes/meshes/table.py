@@ -3,6 +3,7 @@
 import io
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -222,6 +223,6 @@ def _numbers(value: Any, default: float) -> list[float]:
     return numbers if numbers and all(map(math.isfinite, numbers)) else [default]
 
 
-def _color(values: Any) -> Color:
+def _color(values: Iterable[float]) -> Color:
     red, green, blue = (clip_to_unit(float(v)) for v in values)
     return red, green, blue

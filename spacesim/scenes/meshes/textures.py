@@ -6,10 +6,9 @@ import io
 import math
 import unicodedata
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -145,7 +144,7 @@ def check_picture(data: bytes, what: str, notes: Notes) -> None:
         raise FileNotFoundError(what) from None
 
 
-def _rgb_picture(image: Any, what: str, notes: Notes) -> np.ndarray:
+def _rgb_picture(image: Image.Image, what: str, notes: Notes) -> np.ndarray:
     if image.mode.startswith(("I", "F")):  # 16-bit grey; Pillow's own conversion would clip it
         values = np.asarray(image, dtype=np.float64)
         grey = np.clip(values / (257.0 if image.mode.startswith("I") else 1.0 / 255.0), 0, 255)
@@ -178,7 +177,7 @@ class Surface:
     wrap: str = "repeat"  #: "repeat", "clamp" or "mirror"
     matt: bool = False  #: without gloss and metal, an ideally diffuse surface
 
-    def tinted(self, tint: Any) -> "Surface":
+    def tinted(self, tint: Iterable[float]) -> "Surface":
         """The same under a factor [3] on its colour."""
         red, green, blue = (float(a) * clip_to_unit(b) for a, b in zip(self.base_color, tint, strict=True))
         return replace(self, base_color=(red, green, blue))

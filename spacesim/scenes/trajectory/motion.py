@@ -50,9 +50,9 @@ class Motion:
     @property
     def tracks(self) -> dict[str, Track | Attitude]:
         """All that is known."""
-        found: dict[str, Track | Attitude | None]
-        found = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _CLOCK}
-        return {name: track for name, track in found.items() if track is not None}
+        tracks: dict[str, Track | Attitude | None]
+        tracks = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _CLOCK}
+        return {name: track for name, track in tracks.items() if track is not None}
 
     def times(self) -> Array:
         """[N] the times of the camera's track, else the target's, that all tracks cover. Raises InputError where there

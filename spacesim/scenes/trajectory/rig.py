@@ -154,8 +154,8 @@ class FileRig(TrajectoryRig):
         parts = [read_table(Path(self.path))] if self.path else []
         if self.camera or self.target:
             of = {"camera": [Path(name) for name in self.camera], "target": [Path(name) for name in self.target]}
-            said = bool(self.sun) or any(part.sun is not None for part in parts)
-            parts.append(motion_of(of, with_sun=not said))
+            has_sun = bool(self.sun) or any(part.sun is not None for part in parts)
+            parts.append(motion_of(of, with_sun=not has_sun))
         motion = merge(parts)
         if not motion.tracks.keys() & {"camera", "camera_turn", "target", "target_turn"}:
             raise InputError(f"{self.path}: expected a pose of the camera or of the target, found no column of either")

@@ -74,14 +74,14 @@ class SpiceRig(TrajectoryRig):
         epochs = first + (times - begin)
 
         def positions(name: str, body: str) -> Track:
-            found = [_answer(name, spice.spkpos, body, et, self.frame, "NONE", self.target)[0] for et in epochs]
-            return Track(f"{name} {body}", times, 1e3 * np.array(found))
+            rows = [_answer(name, spice.spkpos, body, et, self.frame, "NONE", self.target)[0] for et in epochs]
+            return Track(f"{name} {body}", times, 1e3 * np.array(rows))
 
         def turns(name: str, frame: str) -> Attitude | None:
             if not frame:
                 return None
-            found = [_answer(name, spice.pxform, frame, self.frame, et) for et in epochs]
-            return Attitude(f"{name} {frame}", times, np.stack([quaternion_from_rotation(turn) for turn in found]))
+            rows = [_answer(name, spice.pxform, frame, self.frame, et) for et in epochs]
+            return Attitude(f"{name} {frame}", times, np.stack([quaternion_from_rotation(turn) for turn in rows]))
 
         def has_earth() -> bool:
             """Kernels of a mission to elsewhere may not have it."""

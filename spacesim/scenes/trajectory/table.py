@@ -46,13 +46,13 @@ _log = logging.getLogger(__name__)
 
 def _groups() -> dict[tuple[str, ...], str]:
     """{columns that belong together: what they are, in words}."""
-    found: dict[tuple[str, ...], str] = {("time_s",): "time", ("time_utc",): "time", ("exposure",): "exposure"}
-    found[("sun_x", "sun_y", "sun_z")] = "sun"
+    groups: dict[tuple[str, ...], str] = {("time_s",): "time", ("time_utc",): "time", ("exposure",): "exposure"}
+    groups[("sun_x", "sun_y", "sun_z")] = "sun"
     for body in _BODIES:
         for unit in METRES:
-            found[tuple(f"{body}_{axis}_{unit}" for axis in "xyz")] = f"{body} position"
-            found[tuple(f"{body}_v{axis}_{unit}_s" for axis in "xyz")] = f"{body} velocity"
-    return found | {tuple(f"{turn}_q{part}" for part in "wxyz"): turn for turn in _TURNS}
+            groups[tuple(f"{body}_{axis}_{unit}" for axis in "xyz")] = f"{body} position"
+            groups[tuple(f"{body}_v{axis}_{unit}_s" for axis in "xyz")] = f"{body} velocity"
+    return groups | {tuple(f"{turn}_q{part}" for part in "wxyz"): turn for turn in _TURNS}
 
 
 GROUPS = _groups()
@@ -128,17 +128,17 @@ def _check_names(path: Path, columns: Columns) -> None:
         others.append(name)
     if others:
         _log.info("%s: columns that mean nothing here: %s", path, ", ".join(others)[:200])
-    said: dict[str, str] = {}
+    first_column: dict[str, str] = {}
     for names, what in GROUPS.items():
-        found = [name for name in names if name in columns]
-        if found and len(found) < len(names):
+        present = [name for name in names if name in columns]
+        if present and len(present) < len(names):
             missing = next(name for name in names if name not in columns)
-            raise InputError(f"{missing}: expected a column beside {found[0]}, found none")
+            raise InputError(f"{missing}: expected a column beside {present[0]}, found none")
         meaning = f"attitude of the {what.replace('world', '').replace('_from_', '')}" if "_from_" in what else what
-        if found and meaning in said:
-            raise InputError(f"{found[0]}: expected one way to say the {meaning}, found {said[meaning]} too")
-        if found:
-            said[meaning] = found[0]
+        if present and meaning in first_column:
+            raise InputError(f"{present[0]}: expected one way to say the {meaning}, found {first_column[meaning]} too")
+        if present:
+            first_column[meaning] = present[0]
     lengths = {len(values) for values in columns.values()}
     if len(lengths) > 1:
         raise InputError(f"{path}: expected columns of one length, found {min(lengths)} and {max(lengths)}")
@@ -204,12 +204,12 @@ def _csv(path: Path, content: bytes) -> Columns:
 
 def _json(path: Path, content: bytes) -> Columns:
     def once(pairs: list[tuple[str, object]]) -> dict[str, object]:
-        found: dict[str, object] = {}
+        columns: dict[str, object] = {}
         for name, value in pairs:
-            if name in found:
+            if name in columns:
                 raise InputError(f"{path}: expected each column once, found {name!r} twice")
-            found[name] = value
-        return found
+            columns[name] = value
+        return columns
 
     try:
         value = json.loads(content.decode("utf-8"), object_pairs_hook=once)

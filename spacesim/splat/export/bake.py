@@ -79,8 +79,8 @@ def _fit(terms: Array, weights: np.ndarray, colors: np.ndarray) -> Array:
     for _ in range(ROUNDS):
         sums = np.einsum("vk,vcm->mkc", terms, weights[:, None] * (wanted - 0.5), optimize=True)
         harmonics = inverse @ sums
-        found = np.einsum("vk,mkc->vcm", terms, harmonics, optimize=True) + 0.5
-        wanted = np.where((colors <= BLACK) & (found < colors), found, colors)
+        approximation = np.einsum("vk,mkc->vcm", terms, harmonics, optimize=True) + 0.5
+        wanted = np.where((colors <= BLACK) & (approximation < colors), approximation, colors)
     return np.asarray(harmonics)
 
 

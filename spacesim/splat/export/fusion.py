@@ -162,7 +162,7 @@ def _add(
     def has_more(view: UInt32, _total: object, _weight: object) -> Bool:
         return view < last
 
-    def look(view: UInt32, total: Float, weight: Float) -> tuple[UInt32, Float, Float]:
+    def add_view(view: UInt32, total: Float, weight: Float) -> tuple[UInt32, Float, Float]:
         def number(i: int) -> Float:
             return dr.gather(ad.Float, batch.numbers, 18 * view + i)
 
@@ -185,7 +185,7 @@ def _add(
         return view + 1, total + share * dr.minimum(above, 1), weight + share
 
     state = dr.zeros(ad.UInt32, count), *sums
-    _, total, weight = dr.while_loop(state, has_more, look, mode="symbolic", label="fuse")
+    _, total, weight = dr.while_loop(state, has_more, add_view, mode="symbolic", label="fuse")
     dr.eval(total, weight)
     return total, weight
 

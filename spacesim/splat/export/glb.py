@@ -39,9 +39,9 @@ def write_gaussian_glb(gaussians: Gaussians, path: Path) -> None:
     for degree in range(gaussians.sh_degree + 1):
         for k in range(2 * degree + 1):
             attributes[f"{NAME}:SH_DEGREE_{degree}_COEF_{k}"] = arrays["sh"][:, degree * degree + k]
-    said = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    said |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
-    write_glb(path, attributes, POINTS, None, {"extensions": {NAME: said}}, {"extensionsUsed": [NAME]})
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    extension |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+    write_glb(path, attributes, POINTS, None, {"extensions": {NAME: extension}}, {"extensionsUsed": [NAME]})
 
 
 def opacity_of(logits: np.ndarray) -> np.ndarray:

@@ -46,9 +46,9 @@ def sums_of_blocks(columns: np.ndarray, errors: np.ndarray, weights: np.ndarray)
     for top in range(0, errors.shape[0], BLOCK):
         band = np.s_[top : top + BLOCK]
         weighed = columns[:, band] * weights[band, :, None]
-        for found, sums in (
+        for rows, sums in (
             (scores, np.einsum("ihwc,hwc->wi", weighed, errors[band], dtype=np.float64)),
             (normals, np.einsum("ihwc,jhwc->wij", weighed, columns[:, band], dtype=np.float64)),
         ):
-            found.append(np.add.reduceat(sums, starts, axis=0))
+            rows.append(np.add.reduceat(sums, starts, axis=0))
     return np.concatenate(scores), np.concatenate(normals)

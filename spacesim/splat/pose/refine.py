@@ -90,13 +90,13 @@ def refine_pose(
     told, and where the camera does not see the model.
     """
     run = check_gaussians(run)
-    told = Sun.of(sun)
-    if told is None and run.relightable:
+    checked_sun = Sun.of(sun)
+    if checked_sun is None and run.relightable:
         raise InputError(f"sun: expected its direction for a run of {run.config['method']}, found none")
     target, counts = checked_picture(image, mask, camera)
     _check_numbers(within, starts)
     check_picture(camera)
-    drawing = SunlitRun.of(run, told)
+    drawing = SunlitRun.of(run, checked_sun)
     pivot = Pivot.of(drawing, camera, within)
     background = background_of(target, counts, pivot.alpha)
 

@@ -96,15 +96,15 @@ class ModelViews:
         turns = 2 * np.pi * np.arange(TURNS) / TURNS
         seen = np.array([_patch(cut, turn) for turn in turns])
         likeness = np.einsum("tkp,dkp->dt", seen, self.patches, optimize=True)
-        found: list[Camera] = []
+        poses: list[Camera] = []
         for place in np.argsort(-likeness, axis=None, kind="stable")[: 40 * count]:
             view, turn = np.unravel_index(int(place), likeness.shape)
             there = self._placed(int(view), float(turns[turn]), cut, camera)
-            if all(_degrees(there, other) > APART for other in found):
-                found.append(there)
-                if len(found) == count:
+            if all(_degrees(there, other) > APART for other in poses):
+                poses.append(there)
+                if len(poses) == count:
                     break
-        return found
+        return poses
 
     def _placed(self, view: int, turn: float, cut: _Cut, camera: Camera) -> Camera:
         """`camera` before which the model looks as in a view that is turned, moved and scaled to `cut`."""
@@ -147,8 +147,8 @@ def find_pose(
     Raises InputError as `refine_pose` does, and where nothing in the picture is brighter than its sky.
     """
     run = check_gaussians(run)
-    told = Sun.of(sun)
-    if told is None and run.relightable:
+    checked_sun = Sun.of(sun)
+    if checked_sun is None and run.relightable:
         raise InputError(f"sun: expected its direction for a run of {run.config['method']}, found none")
     check_picture(camera)
     target, counts = checked_picture(image, mask, camera)
@@ -160,8 +160,8 @@ def find_pose(
     cut = _cut(np.abs(small[..., :3] - sky) * known, small[..., 3] if has_alpha else None, dim)
     if cut is None:
         raise InputError("image: expected an object that is brighter than the sky, found none")
-    views = views or ModelViews.of(run, told, has_alpha)
-    drawing = SunlitRun.of(run, told)
+    views = views or ModelViews.of(run, checked_sun, has_alpha)
+    drawing = SunlitRun.of(run, checked_sun)
     starts = [_rank(drawing, pose, small, known, sky) for pose in views.poses(cut, coarse, CANDIDATES)]
     starts.sort(key=lambda pair: pair[0])
     tried: list[tuple[float, RefinedPose]] = []
@@ -171,9 +171,9 @@ def find_pose(
             break
         try:
             placed = replace(camera, world_from_camera=start.world_from_camera)
-            refined = refine_pose(run, image, placed, told, mask, WITHIN, 2, seed)
+            refined = refine_pose(run, image, placed, checked_sun, mask, WITHIN, 2, seed)
             if not refined.converged:  # it may have gone as far as it may: on from there
-                refined = refine_pose(run, image, refined.camera, told, mask, WITHIN, 1, seed)
+                refined = refine_pose(run, image, refined.camera, checked_sun, mask, WITHIN, 1, seed)
         except InputError as error:  # of a pose from which nothing is seen
             failure = error
             continue

@@ -12,7 +12,8 @@ STEPS = 8  #: sizes of arrays from one power of two to the next, as a rule
 
 @dataclass(frozen=True)
 class TileShape:
-    """A tile of width x height pixels is blended by `lanes` threads; each holds `columns` columns of `rows` pixels."""
+    """A tile of width x height pixels is blended by `lanes` SIMD lanes, on CUDA threads; each holds `columns` columns
+    of `rows` pixels."""
 
     width: int  #: pixels
     height: int  #: pixels

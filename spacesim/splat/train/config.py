@@ -249,8 +249,10 @@ def warm_start(name: str) -> WarmStartConfig:
 
 @cache
 def _sections(name: str) -> JsonMapping:
-    """The tables of a preset's file."""
-    return read_document(ASSETS / f"{name}.toml").values
+    """The tables of a preset's file, over those of its base where it has one."""
+    tables = dict(read_document(ASSETS / f"{name}.toml").values)
+    base = tables.pop("base", None)
+    return tables if base is None else merged(_sections(base), tables)
 
 
 def merged(first: JsonMapping, second: JsonMapping) -> JsonDict:

@@ -57,10 +57,10 @@ def valid_squares(valid: Bool, size: tuple[int, int], times: int) -> Bool:
     """Bool [N], or of width 1 as `valid` is: squares of which every pixel counts."""
     if times == 1 or dr.width(valid) == 1:
         return valid
-    found = ad.Bool(True)
+    all_valid = ad.Bool(True)
     for place in _places(size, times):
-        found &= dr.gather(ad.Bool, valid, place)
-    return found
+        all_valid &= dr.gather(ad.Bool, valid, place)
+    return all_valid
 
 
 def truth_of_squares(truth: TruthPlanes, size: tuple[int, int], times: int) -> TruthPlanes:
@@ -69,11 +69,11 @@ def truth_of_squares(truth: TruthPlanes, size: tuple[int, int], times: int) -> T
     normal, of unit length, of what surface there is; foreground where half of a square is."""
     if times == 1:
         return truth
-    places, found = _places(size, times), TruthPlanes()
+    places, result = _places(size, times), TruthPlanes()
     for name, planes in truth.items():
         if name == "foreground":
             shares = [dr.select(dr.gather(ad.Bool, planes[0], place), ad.Float(1), 0) for place in places]
-            found[name] = [_sum(shares) >= 0.5 * times**2, *planes[1:]]
+            result[name] = [_sum(shares) >= 0.5 * times**2, *planes[1:]]
             continue
         values = [ad.ArrayXf([dr.gather(ad.Float, plane, place) for plane in planes]) for place in places]
         if name == "visibility":
@@ -81,14 +81,14 @@ def truth_of_squares(truth: TruthPlanes, size: tuple[int, int], times: int) -> T
             nearest = values[0][0]
             for value in values[1:]:
                 nearest = dr.maximum(nearest, value[0])
-            found[name] = [dr.select(nearest >= 0, seen, -1)]
+            result[name] = [dr.select(nearest >= 0, seen, -1)]
         elif name == "depth":
             counts = [dr.select(value[0] > 0, ad.Float(1), 0) for value in values]
-            found[name] = [_sum([value[0] for value in values]) / dr.maximum(_sum(counts), 1)]
+            result[name] = [_sum([value[0] for value in values]) / dr.maximum(_sum(counts), 1)]
         else:
             total = ad.Array3f(sum(values[1:], values[0]))
-            found[name] = list(total * dr.rcp(dr.maximum(dr.norm(total), 1e-6)))
-    return found
+            result[name] = list(total * dr.rcp(dr.maximum(dr.norm(total), 1e-6)))
+    return result
 
 
 def _sum(values: list[ArrayT]) -> ArrayT:

@@ -251,7 +251,9 @@ def test_a_sun_that_cannot_be_computed_is_asked_for(tmp_path, meta, found):
     """Of other axes, other bodies and attitudes alone; with one told they are as good as others."""
     target, camera = TargetSphere(np.zeros(3), 1.0), CameraConfig((16, 16))
     rig = FileRig(camera=(str(oem(tmp_path / "a.oem", TIMES, **meta)),))
-    expected = r"expected a sun of the rig, or a table with a Sun, as it is computed for an orbit about EARTH in EME2000, "
+    expected = (
+        "expected a sun of the rig, or a table with a Sun, as it is computed for an orbit about EARTH in EME2000, "
+    )
     with pytest.raises(InputError, match=f"a.oem: {expected}.* only, found an orbit {found}$"):
         plan(rig, target, camera, 0)
     view = plan(replace(rig, sun=((90.0, 0.0),)), target, camera, 0)[0][0]

@@ -69,9 +69,9 @@ def import_video(
     distance of the cameras where neither `length` nor `distance` is known. Raises InputError as `read_frames` and
     `reconstruct` do, and where `out` is not free.
     """
-    asked = ImportOptions(**options)
+    settings = ImportOptions(**options)
     expect(LEAST <= frames <= 5000, "frames", f"{LEAST} to 5000", frames)
-    source = _source("video", src, asked, frames=frames)
+    source = _source("video", src, settings, frames=frames)
     check_free(out, source)
     with _workspace() as folder:
         tell = _StageProgress(progress, ("look", *_STAGES))
@@ -90,9 +90,9 @@ def import_video(
                 if frame.picture.shape != size:
                     raise InputError(f"{src}: expected pictures of one size, found another from frame {number} on")
                 name = f"frame_{number:06d}.png"
-                write_png(folder / "pictures" / name, _scaled(frame.picture, asked.height), durable=False)
+                write_png(folder / "pictures" / name, _scaled(frame.picture, settings.height), durable=False)
                 keys[name] = {"source_index": number} | ({} if frame.time is None else {"time": frame.time})
-        return _import(src, out, folder, keys, True, asked, source, tell, {"frames_of_video": len(seen.motion)})
+        return _import(src, out, folder, keys, True, settings, source, tell, {"frames_of_video": len(seen.motion)})
 
 
 def import_images(src: Path, out: Path, *, progress: Progress | None = None, **options: Any) -> Dataset:
@@ -100,10 +100,10 @@ def import_images(src: Path, out: Path, *, progress: Progress | None = None, **o
 
     options: fields of `ImportOptions`. Raises InputError as `import_video` does, and for pictures of several sizes.
     """
-    asked = ImportOptions(**options)
+    settings = ImportOptions(**options)
     if not src.is_dir():
         raise InputError(f"{src}: expected a folder of pictures, found {'a file' if src.exists() else 'nothing'}")
-    source = _source("images", src, asked)
+    source = _source("images", src, settings)
     check_free(out, source)
     paths = sorted(p for p in src.rglob("*") if p.suffix.lower() in _SUFFIXES and not p.name.startswith("."))
     if len(paths) < LEAST:
@@ -119,8 +119,8 @@ def import_images(src: Path, out: Path, *, progress: Progress | None = None, **o
             if pixels.shape[:2] != size:
                 expected = f"{size[1]}x{size[0]} pixels as the first picture has"
                 raise InputError(f"{path}: expected {expected}, found {pixels.shape[1]}x{pixels.shape[0]}")
-            write_png(folder / "pictures" / name, _scaled(pixels, asked.height), durable=False)
-        return _import(src, out, folder, {name: {} for name in names}, False, asked, source, tell, {})
+            write_png(folder / "pictures" / name, _scaled(pixels, settings.height), durable=False)
+        return _import(src, out, folder, {name: {} for name in names}, False, settings, source, tell, {})
 
 
 def _import(
@@ -129,7 +129,7 @@ def _import(
     folder: Path,
     keys: Mapping[str, Mapping[str, JsonValue]],
     ordered: bool,
-    asked: ImportOptions,
+    settings: ImportOptions,
     source: dict[str, JsonValue],
     tell: "_StageProgress",
     facts: dict[str, JsonValue],
@@ -138,19 +138,19 @@ def _import(
     it besides"""
     names = list(keys)
     width, height = Image.open(folder / "pictures" / names[0]).size
-    focal = None if asked.fov is None else 0.5 * width / math.tan(math.radians(0.5 * asked.fov))
+    focal = None if settings.fov is None else 0.5 * width / math.tan(math.radians(0.5 * settings.fov))
     if focal is not None:
         check_focal(focal, (width, height), "fov")
-    has_masks = _find_masks(folder, names, asked, tell)
+    has_masks = _find_masks(folder, names, settings, tell)
     features = _hide_background(folder, names) if has_masks else None
     shown = folder / ("features" if has_masks else "pictures")
     work = folder / "work"
     work.mkdir()
     try:
-        found = reconstruct(shown, names, (width, height), work, features, focal, ordered, tell)
+        reconstruction = reconstruct(shown, names, (width, height), work, features, focal, ordered, tell)
     except InputError as error:
         raise InputError(str(error).replace(f"{shown.name}: ", f"{src}: ", 1)) from None
-    model = placed(without_floating(found), asked.length, asked.distance)
+    model = placed(without_floating(reconstruction), settings.length, settings.distance)
     if len(model.names) < REGISTERED * len(names):
         _log.warning(
             "%s: %d of %d pictures have a pose; the others are left out (structure.json names them)",
@@ -158,22 +158,22 @@ def _import(
         )  # fmt: skip
     stream = io.BytesIO()
     Image.fromarray(draw_cameras(model)).save(stream, format="PNG")
-    unit = "metres" if asked.length or asked.distance else "median distance of the cameras"
+    unit = "metres" if settings.length or settings.distance else "median distance of the cameras"
     report = {**facts, "unit": unit, **report_of(model, names)}
     files = {"structure.json": json_bytes(report), "cameras.png": stream.getvalue()}
-    frames = list(_frames(folder, model, has_masks, asked.masked, keys))
+    frames = list(_frames(folder, model, has_masks, settings.masked, keys))
     points = (model.points, model.colors)
     return write_dataset(
         out, frames, None, source, points, files, lambda done, total, name: tell("write", done, total, name)
     )
 
 
-def _find_masks(folder: Path, names: Sequence[str], asked: ImportOptions, tell: "_StageProgress") -> bool:
+def _find_masks(folder: Path, names: Sequence[str], settings: ImportOptions, tell: "_StageProgress") -> bool:
     """Write folder/masks/NAME, 255 the object; False where the background stays."""
-    if asked.masks is not None and str(asked.masks) == NO_MASKS:
+    if settings.masks is not None and str(settings.masks) == NO_MASKS:
         return False
-    if asked.masks is not None:
-        given = MaskFolder(Path(asked.masks)).find_all(names)
+    if settings.masks is not None:
+        given = MaskFolder(Path(settings.masks)).find_all(names)
         masks = []
         for k, name in enumerate(names):
             tell("cut out", k, len(names), name)
@@ -230,8 +230,8 @@ def _frames(
         )
 
 
-def _source(kind: str, src: Path, asked: ImportOptions, **more: JsonValue) -> dict[str, JsonValue]:
-    options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(asked).items()}
+def _source(kind: str, src: Path, settings: ImportOptions, **more: JsonValue) -> dict[str, JsonValue]:
+    options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(settings).items()}
     return {"kind": kind, "source": str(src), **more, **options}
 
 

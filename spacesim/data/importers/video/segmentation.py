@@ -208,11 +208,11 @@ def _follow(image: np.ndarray, other: np.ndarray, mask: np.ndarray) -> np.ndarra
     prior = 2.0 * np.clip(signed / reach, -1, 1)  # log-odds
     odds = prior + _color_odds(image, other[mask], image[surroundings])
     odds = np.where(sure, 2 * _ODDS, np.where(surroundings, -2 * _ODDS, odds))
-    found = _walk(image, odds)
-    main = _largest(found & ~surroundings)
+    object_mask = _walk(image, odds)
+    main = _largest(object_mask & ~surroundings)
     if not main.any():
         return _placed(mask, box, inside.shape)
-    return _placed(_whole(main, found & ~surroundings), box, inside.shape)
+    return _placed(_whole(main, object_mask & ~surroundings), box, inside.shape)
 
 
 def _before_earth(image: np.ndarray) -> np.ndarray:
@@ -237,9 +237,9 @@ def _before_earth(image: np.ndarray) -> np.ndarray:
             return mask
         prior = np.clip(2.0 - outside / max(3.0, 0.1 * _size_of(mask)), -4, 1)
         odds = prior + _color_odds(image, image[mask], image[far])
-        found = _walk(image, np.where(border | far, -2 * _ODDS, odds))
-        main = _largest(found)
-        mask = _whole(main, found) if main.any() else main
+        object_mask = _walk(image, np.where(border | far, -2 * _ODDS, odds))
+        main = _largest(object_mask)
+        mask = _whole(main, object_mask) if main.any() else main
     return mask
 
 

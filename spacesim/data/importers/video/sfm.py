@@ -76,22 +76,22 @@ def reconstruct(
         reader.camera_params = f"{focal},{size[0] / 2},{size[1] / 2},0"
     _find_features(colmap, database, folder, names, reader, report)
     _match(colmap, database, len(names), ordered, report)
-    found = _matches(colmap, database)
-    if found.features < _LEAST_FEATURES:
+    matches = _matches(colmap, database)
+    if matches.features < _LEAST_FEATURES:
         raise InputError(
-            f"{folder.name}: expected at least {_LEAST_FEATURES} features in a picture, found {found.features:.0f} in "
-            "the median one: too dark, too blurred or too small an object"
+            f"{folder.name}: expected at least {_LEAST_FEATURES} features in a picture, found {matches.features:.0f} "
+            "in the median one: too dark, too blurred or too small an object"
         )
-    if found.pairs < len(names) // 2:
+    if matches.pairs < len(names) // 2:
         raise InputError(
             f"{folder.name}: expected neighbouring pictures to share {_LEAST_MATCHES} matches or more, found "
-            f"{found.pairs} such pairs of {len(names)} pictures: too few matches"
+            f"{matches.pairs} such pairs of {len(names)} pictures: too few matches"
         )
     models = _map(colmap, database, folder, workspace, focal, len(names), report)
     if not models:
-        raise InputError(f"{folder.name}: {_why_none(found)}")
+        raise InputError(f"{folder.name}: {_why_none(matches)}")
     models.sort(key=lambda model: -model.num_reg_images())
-    return _checked(_model(models[0], [m.num_reg_images() for m in models]), found, len(names), folder.name)
+    return _checked(_model(models[0], [m.num_reg_images() for m in models]), matches, len(names), folder.name)
 
 
 def _library() -> ModuleType:
@@ -272,11 +272,11 @@ def check_focal(focal: float, size: tuple[int, int], name: str, hint: str = "") 
         raise InputError(f"{name}: expected {expected}, found {ratio:.3g}{hint}")
 
 
-def _checked(model: SfmModel, found: Matches, count: int, name: str) -> SfmModel:
+def _checked(model: SfmModel, matches: Matches, count: int, name: str) -> SfmModel:
     """Raises InputError for a model that cannot be believed."""
     registered = len(model.names)
     if len(model.points) < 30 or registered < 3:
-        raise InputError(f"{name}: {_why_none(found)}")
+        raise InputError(f"{name}: {_why_none(matches)}")
     angle = median_angle(model)
     if angle < _LEAST_ANGLE:
         raise InputError(
@@ -316,13 +316,13 @@ def _depths(model: SfmModel, k: int) -> float:
     return float(np.median((model.points - pose[:3, 3]) @ pose[:3, 2]))
 
 
-def _why_none(found: Matches) -> str:
-    if found.pairs and found.flat_pairs > _FLAT * found.pairs:
+def _why_none(matches: Matches) -> str:
+    if matches.pairs and matches.flat_pairs > _FLAT * matches.pairs:
         return (
-            f"expected cameras that move around the object, found {found.flat_pairs} of {found.pairs} pairs of "
+            f"expected cameras that move around the object, found {matches.flat_pairs} of {matches.pairs} pairs of "
             "pictures that a rotation or a plane explains: no parallax"
         )
     return (
-        f"expected pictures that fit together, found {found.pairs} pairs with matches and no poses that agree with "
+        f"expected pictures that fit together, found {matches.pairs} pairs with matches and no poses that agree with "
         "them: too few matches"
     )

@@ -12,7 +12,6 @@ directions   of all others: the Sun's and, by spherical harmonics, the view's. P
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -120,8 +119,8 @@ class _Cosines:
         """float32 [N, 3]."""
         batch, field = self.batch, self.field
         numbers = [*np.array(field.view(ad.Array3f(0, 0, 1))).ravel(), *condition]
-        told = ad.Float([float(number) for number in numbers])  # no constants of a kernel: others compile nothing
-        rows = [dr.gather(ad.Float, told, ad.UInt32(i)) for i in range(len(numbers))]
+        inputs = ad.Float([float(number) for number in numbers])  # no constants of a kernel: others compile nothing
+        rows = [dr.gather(ad.Float, inputs, ad.UInt32(i)) for i in range(len(numbers))]
         items = batch.matrix(rows, mlp.round_up_rows(len(rows)))
         shared = self.light.encode_sun(None).field_encoding
         output, _ = mlp.forward(field.shape, self.weights, items, shared, self.first_layer)
@@ -153,18 +152,18 @@ class _Directions:
         shadows = light.config.shadow is not None
         self.unshadowed = upload(np.ones(gaussians.count)) if shadows else None
 
-    def conditions(self, rng: np.random.Generator) -> list[Any]:
+    def conditions(self, rng: np.random.Generator) -> list[np.ndarray]:
         """`CONDITIONS` of them."""
         return list(normalize(rng.normal(size=(CONDITIONS, 2, 3))))
 
-    def colors(self, condition: Any) -> np.ndarray:
+    def colors(self, condition: np.ndarray | tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """float32 [N, 3]."""
         sun, direction = condition
         # a camera of parallel rays sees every Gaussian in one direction
         camera = OrthographicCamera.from_extent(look_at(-direction, np.zeros(3)), 4, 4, 1.0)
-        told = sun if self.light.config.field.knows_sun else None
+        sun_or_none = sun if self.light.config.field.knows_sun else None
         light = Sunlight(self.unshadowed, [])
-        colors, _ = self.light.shade_picture(self.gaussians, Orthographic.of(camera), told, sunlight=light)
+        colors, _ = self.light.shade_picture(self.gaussians, Orthographic.of(camera), sun_or_none, sunlight=light)
         return np.stack([np.array(color) for color in colors], axis=1)
 
     def table(self, inverse: np.ndarray, report: Callable[[], None]) -> np.ndarray:

@@ -122,13 +122,13 @@ def _page(run: Run, about: JsonDict, arrays: Arrays) -> str:
         packed.append(content)
     name = run.path.resolve().name
     caption = f"{run.config['method']}, {about['count']:,} Gaussians, made by spacesim"
-    told = json.dumps(about | {"arrays": described}, sort_keys=True).replace("<", "\\u003c")
+    metadata = json.dumps(about | {"arrays": described}, sort_keys=True).replace("<", "\\u003c")
     parts = {
         "name": html.escape(name),
         "caption": html.escape(caption),
         "style": _asset("page.css"),
         "script": "\n".join(_asset(script) for script in SCRIPTS),
-        "about": told,
+        "about": metadata,
         "data": base64.b64encode(zlib.compress(b"".join(packed), 9)).decode(),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], _asset("page.html"))

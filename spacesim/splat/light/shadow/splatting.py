@@ -9,12 +9,11 @@ The adjoint is by hand: it replays the lists from their ends, as `blend.backward
 """
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Array2f, Array3f, Bool, Float, UInt32
+from spacesim.backend.arrays import Array2f, Array3f, Bool, Float, NumberT, UInt32
 from spacesim.data.errors import WorkError
 from spacesim.splat.raster.adjoint import PixelMoments, add_to_slots, gather_slots, reduce_mode
 from spacesim.splat.raster.bin import bin_splats
@@ -151,7 +150,7 @@ def _events(
     index = dr.select(receives, event, event - capacity)
     live = index < count
 
-    def joined(of_receivers: Any, of_blockers: Any) -> Any:
+    def joined(of_receivers: NumberT, of_blockers: NumberT) -> NumberT:
         receiver = dr.gather(type(of_receivers), of_receivers, index, live & receives)
         return dr.select(receives, receiver, dr.gather(type(of_blockers), of_blockers, index, live & ~receives))
 

@@ -128,29 +128,29 @@ class LearnedPictures:
 
     def summary(self) -> dict[str, dict[str, float]]:
         """For training.json: medians of how far poses moved, the range of gains, how sure Suns are."""
-        told: dict[str, dict[str, float]] = {}
+        summary: dict[str, dict[str, float]] = {}
         if self.poses:
             degrees, share = np.median(self.poses.moves(), axis=0).tolist()
-            told["poses"] = {"degrees": degrees, "share_of_distance": share}
+            summary["poses"] = {"degrees": degrees, "share_of_distance": share}
         if self.exposures:
             gains = self.exposures.all_gains().mean(axis=1)
-            told["gains"] = {"least": float(gains.min()), "most": float(gains.max())}
+            summary["gains"] = {"least": float(gains.min()), "most": float(gains.max())}
         if self.suns:
-            told["suns"] = {"sigma_deg": float(np.median(self.suns.sigmas))}
-        return told
+            summary["suns"] = {"sigma_deg": float(np.median(self.suns.sigmas))}
+        return summary
 
     def sentences(self) -> list[str]:
         """What the log says at the end."""
-        told, sentences = self.summary(), []
-        if "poses" in told:
-            degrees, share = told["poses"].values()
+        summary, sentences = self.summary(), []
+        if "poses" in summary:
+            degrees, share = summary["poses"].values()
             sentences.append(f"poses moved by {degrees:.2g} degrees, {100 * share:.2g} % of the distance (median)")
-        if "gains" in told:
-            least, most = told["gains"].values()
+        if "gains" in summary:
+            least, most = summary["gains"].values()
             sentences.append(f"pictures' gains are from {least:.2f} to {most:.2f}")
-        if "suns" in told:
+        if "suns" in summary:
             sentences.append(
-                f"Suns are estimated to {told['suns']['sigma_deg']:.1f} degrees (median of their own sigma)"
+                f"Suns are estimated to {summary['suns']['sigma_deg']:.1f} degrees (median of their own sigma)"
             )
         return sentences
 

@@ -105,12 +105,12 @@ class PoseRefinement:
 
     def moves(self) -> Array:
         """[V, 2] how far each camera was turned, degrees, and moved, share of the distance."""
-        found = []
+        moves = []
         for picture, (camera, distance) in enumerate(zip(self.given, self.distances, strict=True)):
             there = self.camera(picture)
             turn = np.linalg.norm(twist_between(camera, there)[:3])
-            found.append([np.degrees(turn), np.linalg.norm(there.position - camera.position) / distance])
-        return np.array(found)
+            moves.append([np.degrees(turn), np.linalg.norm(there.position - camera.position) / distance])
+        return np.array(moves)
 
     def _twist(self, picture: int, numbers: Array) -> Array:
         """[6] of `moved`, from the given camera."""

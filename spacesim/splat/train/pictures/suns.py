@@ -91,19 +91,19 @@ class SunEstimation:
         if steps not in self._steps:
             return
         finder = SunFinder(gaussians, light, antialiased, light.config.curve)
-        found = self.directions()
-        for place, picture in enumerate(self.order if self.order is not None else range(len(found))):
-            before = found[self.order[place - 1]] if self.order is not None and place else None
-            near = finder.neighbours(found[picture], NEAR)
+        directions = self.directions()
+        for place, picture in enumerate(self.order if self.order is not None else range(len(directions))):
+            before = directions[self.order[place - 1]] if self.order is not None and place else None
+            near = finder.neighbours(directions[picture], NEAR)
             estimate = finder.estimate(
                 _small_picture(self.dataset, self.dataset.train[picture]),
                 [*near, *self.choices[picture]],
                 lambda direction, before=before: _turn_cost(direction, before),  # type: ignore[misc]
             )
-            found[picture], self.sigmas[picture] = estimate.direction, estimate.sigma_deg
-        moved = degrees_between((found * self.directions()).sum(axis=1))
+            directions[picture], self.sigmas[picture] = estimate.direction, estimate.sigma_deg
+        moved = degrees_between((directions * self.directions()).sum(axis=1))
         log.info("Suns compared with the model: moved by %.1f degrees (median)", np.median(moved))
-        self.numbers.values = found
+        self.numbers.values = directions
         self.numbers.first[:] = 0
 
     def described(self, picture: int) -> dict[str, JsonValue]:
