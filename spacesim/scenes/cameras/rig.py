@@ -3,8 +3,8 @@
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +65,9 @@ class PlannedView:
     exposure: float | None = None  #: display value of a radiance of 1 W m^-2 sr^-1
     earth: Array | None = None  #: [3] from the world's origin to the Earth's centre, metres
     sky_from_world: Array | None = None  #: [3, 3] to the axes in which stars stand still; None: the world's
+    objects: Mapping[int, Array] = field(
+        default_factory=dict
+    )  #: [4, 4] rigid world_from_object of those moved, by number
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,9 +32,10 @@ from spacesim.scenes.trajectory.table import read_table
 @dataclass(frozen=True)
 class TrajectoryRig(Rig):
     """Camera and target move as a trajectory says. The dataset is in the target's frame: cameras, Sun and Earth move
-    about a target that stands still. Where no attitude of the camera is told it looks at the target, the world's z
-    upwards; where no Sun is told, `sun` says it. Test frames lie halfway between training frames; of a trajectory
-    without times they are some of its rows, held out. Raises InputError for a value out of range."""
+    about a target that stands still, and so do objects of the scene whose own poses are told. Where no attitude of the
+    camera is told it looks at the target, the world's z upwards; where no Sun is told, `sun` says it. Test frames lie
+    halfway between training frames; of a trajectory without times they are some of its rows, held out. Raises
+    InputError for a value out of range."""
 
     views: int = 0  #: training frames, evenly over the time that is covered; 0: at the trajectory's own times
     step_s: float | None = None  #: seconds between training frames, in place of views
@@ -113,6 +114,7 @@ def planned_views(
             None if moments.exposure is None else float(moments.exposure[k]),
             None if moments.earth is None else moments.earth[k],
             moments.turn[k],
+            {number: poses[k] for number, poses in moments.objects.items()},
         )
         for k in range(len(moments.times))
     ]
@@ -157,7 +159,7 @@ class FileRig(TrajectoryRig):
             said = bool(self.sun) or any(part.sun is not None for part in parts)
             parts.append(motion_of(of, with_sun=not said))
         motion = merge(parts)
-        if not motion.tracks.keys() & {"camera", "camera_turn", "target", "target_turn"}:
+        if not (motion.tracks.keys() & {"camera", "camera_turn", "target", "target_turn"} or motion.bodies):
             raise InputError(f"{self.path}: expected a pose of the camera or of the target, found no column of either")
         return motion
 
