@@ -33,6 +33,7 @@ from spacesim.scenes.lights.earth import EARTH_RADIUS_KM
 from spacesim.scenes.lights.eclipse import visible_fraction
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
+from spacesim.scenes.trajectory.rig import TrajectoryRig
 
 SCHEMA = 2  #: of scene.json
 COARSE_DEPTH = 0.01  #: of the scene's size: longer steps of depth pictures are told
@@ -76,8 +77,10 @@ def generate(
         more = {name: {**keys, "sunlit_fraction": sunlit[name]} for name, keys in sweep.keys.items()}
         lens, mesh = config.camera.distortion, sweep.scene.mesh
         dataset = writer.finish(*listed, points, colors, mesh, lens, lambda d: write_overview(d.root, d), more)
-        free = isinstance(config.rig, RandomRig) and config.rig.max_phase_deg is None
-        hint = "max_phase_deg = 90 keeps the Sun on the camera's side, clear of the Earth" if free else ""
+        free = isinstance(config.rig, RandomRig | TrajectoryRig) and config.rig.max_phase_deg is None
+        kept = isinstance(config.rig, RandomRig)
+        what = "keeps the Sun on the camera's side, clear of the Earth" if kept else "in [rig] leaves them out"
+        hint = f"max_phase_deg = 90 {what}" if free else ""
         warn_of_dark_frames(sunlit, {name: keys.get("sun_visibility") == 0 for name, keys in more.items()}, hint)
         return dataset
 
