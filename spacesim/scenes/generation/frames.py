@@ -1,5 +1,6 @@
 """Frames from the path tracer to the disk: rendering goes on while threads encode and write."""
 
+import gc
 import math
 import os
 import platform
@@ -150,6 +151,7 @@ class FrameMaker:
         """That of the scene, or one of the scene as the frame has it."""
         if not spec.objects:
             return self._renderer
+        gc.collect()  # those of frames before are held by cycles: 8 MB each
         job = self._job
         scene = moved(job.scene, spec.objects)
         return Renderer(scene, job.quality.spp, job.quality.max_depth, job.camera.distortion)
