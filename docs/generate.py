@@ -1,5 +1,5 @@
-"""Makes the pages of docs/reference that are read off the code: api, options, scene-fields, materials and
-command-line.
+"""Makes the pages of docs/reference that are read off the code: api, options, scene-fields, materials,
+command-line and serve-protocol.
 
 mkdocs calls `on_files` (a hook of mkdocs.yml): the pages are made while the site is built and lie in no folder.
 
@@ -34,6 +34,7 @@ def pages() -> dict[str, str]:
         "reference/scene-fields.md": scene_page(),
         "reference/materials.md": materials_page(),
         "reference/command-line.md": command_page(),
+        "reference/serve-protocol.md": protocol_page(),
     }
 
 
@@ -342,6 +343,24 @@ def command_page() -> str:
         "names the file or option, what was expected and what was found.",
         block(overview),
         *(f"## spacesim {' '.join(name)}\n\n{block(help_of(*name))}" for name in names),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def protocol_page() -> str:
+    """What `spacesim serve` is asked and answers: the protocol's own words, its records, the arrays."""
+    from spacesim.data.structure import Rules, keys_of
+    from spacesim.serve import protocol
+
+    source = inspect.getsource(protocol)
+    arrays = textwrap.dedent(source.partition("Output = Literal[\n")[2].partition("\n]")[0])
+    records = {"A request": protocol.PictureRequest, "Its camera": protocol.CameraFields}
+    parts = [
+        "# Protocol of spacesim serve",
+        "Generated from `spacesim/serve/protocol.py`; [how to use it](../how-to/closed-loop.md).",
+        block(inspect.getdoc(protocol) or ""),
+        *(f"## {title}\n\n{record_entry(cls, keys_of(cls, Rules()))}" for title, cls in records.items()),
+        f"## Arrays\n\n{block(arrays, 'python')}",
     ]
     return "\n\n".join(parts) + "\n"
 

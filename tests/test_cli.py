@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tiny import GENERATE, TRAIN
+from tiny import GENERATE, TRAIN, contents
 
 from spacesim.cli.parser import view_of
 from spacesim.cli.program import in_flags, parser
@@ -357,6 +357,32 @@ def test_export(spacesim, tiny_run, tmp_path):
     assert (done.code, done.output) == (0, f"{out}: 300 Gaussians\n")
     means = read_ply(out).to_numpy()["means"]
     assert np.array_equal(means, load_run(tiny_run).gaussians.to_numpy()["means"])
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (("export", "--ply"), "mesh.ply"),
+        (("export", "--mesh"), "points.ply"),
+        (("export", "--html"), "scene.json"),
+        (("render", "--out"), "images/test_00000.png"),
+    ],
+)
+def test_files_of_a_dataset_are_not_overwritten_and_others_are(spacesim, tiny_run, tiny_data, tmp_path, words, name):
+    data = tmp_path / "data"
+    shutil.copytree(tiny_data, data)
+    (tmp_path / "link").symlink_to(data)
+    command, option = words
+    few = ("--views", 3, "--voxel", 0.1) if option == "--mesh" else ()
+    before = contents(data)
+    for path in (data / name, tmp_path / "link" / name):
+        assert spacesim(command, tiny_run, option, path, *few).is_refusal(path, "no dataset's own")
+    assert contents(data) == before
+    other = data / f"of_mine{Path(name).suffix}"
+    other.write_bytes(b"old")
+    if option != "--html":  # which takes its time
+        assert spacesim(command, tiny_run, option, other, *few).code == 0
+        assert len(other.read_bytes()) > 100
 
 
 @pytest.mark.parametrize("form", ["glb", "spz", "usd"])

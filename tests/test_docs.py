@@ -14,6 +14,7 @@ from types import ModuleType
 import pytest
 
 import spacesim as ss
+from spacesim.serve import protocol
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -109,7 +110,8 @@ def test_documents_that_the_code_names_are_there(source):
     assert [name for name in named if name not in KNOWN and not (ROOT / name).exists()] == []
 
 
-KNOWN = {f"docs/reference/{name}.md" for name in ("api", "options", "scene-fields", "materials", "command-line")}
+GENERATED = "api", "options", "scene-fields", "materials", "command-line", "serve-protocol"
+KNOWN = {f"docs/reference/{name}.md" for name in GENERATED}
 
 
 def test_names_of_generated_pages():
@@ -244,6 +246,19 @@ def test_the_reference_has_every_field_and_command():
     )
     assert len(rows) >= 16
     assert [name for name in rows if f"\n| `{name}` | " not in generated()["reference/materials.md"]] == []
+
+
+def test_the_reference_has_every_field_of_the_protocol():
+    """With its type and its meaning."""
+    page = generated()["reference/serve-protocol.md"]
+    for record in (protocol.PictureRequest, protocol.CameraFields):
+        entry = page.partition(f"{inspect.getdoc(record)}\n")[2].partition("\n## ")[0]
+        for f in fields(record):
+            assert re.search(rf"^(#: .+\n)?{f.name}: \w.*", entry, re.MULTILINE), f.name
+            found = re.search(rf"(?:^#: (.+)\n)?^{f.name}: .*?(?:  #: (.+))?$", entry, re.MULTILINE)
+            assert any(found.groups()), f.name
+    for name in protocol.OUTPUTS:
+        assert re.search(rf'^"{name}",  # \[H, W.*\] (uint8|float32|int32)', page, re.MULTILINE), name
 
 
 def named_in_docstrings() -> set[str]:

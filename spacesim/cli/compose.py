@@ -9,6 +9,7 @@ from spacesim import interrupts
 from spacesim.cli.parser import Parser, resolution
 from spacesim.cli.printing import WANTS_FILTER
 from spacesim.data.errors import InputError
+from spacesim.data.integrity.manifest import check_unlisted
 
 SUMMARY, NEEDS_BACKEND = "several runs in one scene: pictures, depth, object numbers, shadows, a video", True
 
@@ -29,6 +30,8 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.splat.compose.scene import GaussianComposition
     from spacesim.splat.export.ply import write_ply
 
+    if options.ply is not None:
+        check_unlisted(options.ply)
     interrupts.set_resume_command("the same command")
     scene = load_scene(options.scene)
     if options.ply is not None and not isinstance(scene.composition, GaussianComposition):

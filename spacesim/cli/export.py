@@ -11,6 +11,7 @@ from spacesim import backend, interrupts
 from spacesim.cli.parser import Parser, angles
 from spacesim.cli.printing import KNOWS_ONE_LIGHT, WANTS_FILTER
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.integrity.manifest import check_unlisted
 
 if TYPE_CHECKING:
     from spacesim.splat.export.splats import Form
@@ -78,6 +79,9 @@ def run(options: argparse.Namespace) -> None:
     if options.mesh is None:
         for name in ("data", "views", "voxel", "truncation"):
             _check_absent(name, getattr(options, name), ("mesh",))
+    for name in (*SPLATS, "mesh", "html"):
+        if getattr(options, name) is not None:
+            check_unlisted(getattr(options, name))
     if labels is not None:
         _export_labels(options, labels)
     elif options.mesh is not None:

@@ -9,6 +9,7 @@ from spacesim import interrupts
 from spacesim.cli.parser import Parser, add_view, angles, view_of
 from spacesim.cli.printing import KNOWS_ONE_LIGHT
 from spacesim.data.errors import InputError
+from spacesim.data.integrity.manifest import check_unlisted
 from spacesim.learning.prediction import KINDS
 
 SUMMARY, NEEDS_BACKEND = "one picture of a run", True
@@ -28,6 +29,7 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.learning.pictures import write_picture
     from spacesim.methods import load_run
 
+    check_unlisted(options.out)
     run = load_run(options.path)
     sun = Sun.from_angles(*options.sun) if options.sun else None
     if sun is not None and not run.relightable:

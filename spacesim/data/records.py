@@ -1,6 +1,6 @@
 """What a dataset is made of: frozen records with units in their fields' docs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -197,6 +197,8 @@ class Frame:
     time: float | None = None  #: when it was taken, in any unit: pictures of one film
     distortion: tuple[float, ...] = ()  #: Brown-Conrady k1, k2, p1, p2, k3 of the stored image; () for none
     exposure: float | None = None  #: of a picture of `generate` that has its own; None: that of scene.json
+    #: world_from_object [4, 4], by number, of objects that stand elsewhere than scene.json says
+    objects: Mapping[int, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -226,12 +226,41 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
             raise InputError("expected an image file, found something else")
         camera, distortion, sun = _read_camera(values, image), _read_distortion(values), _read_sun(values)
         time = _number(entry, "time") if entry.get("time") is not None else None
+        objects = _read_objects(entry)
     except InputError as error:
         raise InputError(f"{source}: frame {file_path}: {error}") from None
     paths = {key: _path(source, entry, key) for key in TRUTH_PATHS}
     exposure = entry.get("exposure")  # others mean all kinds of things by it
     own = float(exposure) if isinstance(exposure, int | float) and 0 < exposure < math.inf else None
-    return Frame(file_path, camera, sun, **paths, time=time, distortion=distortion, exposure=own)
+    return Frame(file_path, camera, sun, **paths, time=time, distortion=distortion, exposure=own, objects=objects)
+
+
+def _read_objects(entry: Json) -> dict[int, np.ndarray]:
+    """{number: world_from_object [4, 4]} of a frame whose objects move; others mean all kinds of things by the key."""
+    listed = entry.get("objects")
+    found = {}
+    for item in listed if isinstance(listed, list) else ():
+        if isinstance(item, dict) and "world_from_object" in item:
+            try:
+                pose = np.asarray(item["world_from_object"], np.float64)
+                number = int(item["id"])
+            except (KeyError, TypeError, ValueError, OverflowError):
+                pose, number = np.empty(0), 0
+            if pose.shape != (4, 4) or not np.isfinite(pose).all() or number < 1:
+                raise InputError(
+                    "expected an id and a world_from_object of 4x4 finite numbers in objects, found others"
+                )
+            found[number] = pose
+    return found
+
+
+def check_still(dataset: Dataset) -> Dataset:
+    """`dataset`; raises InputError where its objects move, which no model of one shape can show."""
+    moving = [frame.file_path for frame in dataset.frames if frame.objects]
+    if moving:
+        expected = "expected objects that stand still to each other"
+        raise InputError(f"{dataset.root}: {expected}, found {len(moving)} frames that move some, {moving[0]} first")
+    return dataset
 
 
 def _read_camera(values: Json, image: Path) -> Camera:

@@ -22,6 +22,7 @@ from spacesim.data.files import JsonDict, remove_leftovers, write_json
 from spacesim.data.geometry import Array
 from spacesim.data.identity import frame_names, frames_digest
 from spacesim.data.records import Dataset, Frame
+from spacesim.data.transforms import check_still
 from spacesim.eval.align import align
 from spacesim.eval.fit import predict_by_halves
 from spacesim.eval.frame_metrics import (
@@ -96,7 +97,7 @@ def evaluate(
     Raises InputError where there is no frame to evaluate or the dataset is broken, WorkError where a prediction is not
     finite.
     """
-    config = config or EvaluateConfig()
+    config, dataset = config or EvaluateConfig(), check_still(dataset)
     frames = {"test": dataset.test, "train": dataset.train, "all": dataset.frames}[config.split]
     if not frames:
         raise InputError(f"{dataset.root}: expected frames in the split {config.split}, found none")

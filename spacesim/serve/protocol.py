@@ -13,8 +13,10 @@ A request is one frame, a JSON object:
     seed      a whole number that makes the noise, 0 by default
 
 An answer is a JSON object with version, id, seconds that drawing took, and arrays [{name, dtype, shape}], then a frame
-for each array: its numbers, little-endian, the last index fastest. A request that cannot be met is answered by one
-frame, with version, id, and error, a sentence.
+for each array: its numbers, little-endian, the last index fastest. What is served is one frame, with version, id,
+served (its name), kind ("scene" or "run"), spp (samples a pixel, of a scene) or method (of a run), relightable (whether
+it takes a Sun) and outputs (names of arrays that it may have; a request for one that it lacks is told which it has). A
+request that cannot be met is answered by one frame, with version, id, and error, a sentence.
 """
 
 import json

@@ -14,12 +14,14 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import MAX_LIST_BYTES, JsonDict, read_json, write_json
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Sun
+from spacesim.data.store import intrinsics_of
 from spacesim.data.transforms import read_dataset, read_views
 from spacesim.splat.pose.refine import refine_pose
 from spacesim.splat.pose.search import FoundPose, ModelViews, find_pose, residual_of
 from spacesim.splat.run import Run, check_gaussians
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+_LENS = "k1", "k2", "p1", "p2", "k3"
 SAVE_EVERY = 10.0  #: seconds between two writings of the file
 Progress = Callable[[int, int, str], None]  #: pictures done, of how many, name of the last
 
@@ -54,7 +56,7 @@ def locate(
     resume: keep what an interrupted call has found
 
     Raises InputError where files cannot be read, where a run needs a Sun and none is told, or `out` is there and not to
-    be resumed, or of other work. What is wrong with one picture is told of that.
+    be resumed, or of other work or cameras. What is wrong with one picture is told of that.
     """
     check_gaussians(run)
     start_frames = {} if start is None else read_views(start)
@@ -72,6 +74,11 @@ def locate(
         "sun": None if sun is None else sun.direction.tolist(),
     }
     entries = _finished(out, settings, resume)
+    for frame in frames:
+        lens = _intrinsics(frame.camera, frame.distortion)
+        entry = entries.get(frame.file_path, lens)
+        if {key: entry[key] for key in (*intrinsics_of(frame.camera), *_LENS) if key in entry} != lens:
+            raise InputError(f"{out}: expected poses found with the same camera, found others for {frame.file_path}")
     views: dict[tuple[bytes | None, bool], ModelViews] = {}
     saved = time.monotonic()
     try:
@@ -171,15 +178,7 @@ def _entry(
     entry: JsonDict = {
         "file_path": frame.file_path,
         "transform_matrix": camera.opengl.tolist(),
-        **{
-            "w": camera.width,
-            "h": camera.height,
-            "fl_x": camera.fx,
-            "fl_y": camera.fy,
-            "cx": camera.cx,
-            "cy": camera.cy,
-        },
-        **dict(zip(("k1", "k2", "p1", "p2", "k3"), frame.distortion, strict=False)),
+        **_intrinsics(camera, frame.distortion),
         "covariance": pose.covariance.tolist(),
         "converged": pose.converged,
         "ambiguous": result.ambiguous,
@@ -192,6 +191,10 @@ def _entry(
     if sun is not None:
         entry["sun_direction"] = sun.direction.tolist()
     return entry
+
+
+def _intrinsics(camera: Camera, distortion: Sequence[float]) -> JsonDict:
+    return {**intrinsics_of(camera), **dict(zip(_LENS, distortion, strict=False))}
 
 
 def _finished(out: Path, settings: JsonDict, resume: bool) -> dict[str, JsonDict]:

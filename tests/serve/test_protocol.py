@@ -1,13 +1,28 @@
 """Requests as they are read, and answers as they are written and read."""
 
+import inspect
 import json
+import re
+from dataclasses import fields
 
 import numpy as np
 import pytest
+from serving import CAMERA as CAMERA_SEEN
+from serving import SUN
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at, quaternion_from_rotation
-from spacesim.serve.protocol import MAX_REQUEST_BYTES, arrays_of, error_answer, picture_answer, read_request
+from spacesim.serve import protocol
+from spacesim.serve.protocol import (
+    MAX_REQUEST_BYTES,
+    CameraFields,
+    PictureRequest,
+    arrays_of,
+    error_answer,
+    facts_answer,
+    picture_answer,
+    read_request,
+)
 
 CAMERA = {"position": [0, 0, -5], "rotation_wxyz": [1, 0, 0, 0], "width": 8, "height": 6, "fov_deg": 90}
 
@@ -23,6 +38,52 @@ def test_a_request_is_read():
     assert camera.position.tolist() == [0, 0, -5]
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((4, 4, 4, 3))
     assert request.direction.direction.tolist() == [0, 0, 1]
+
+
+def documented() -> str:
+    return " ".join(protocol.__doc__.split())
+
+
+def names_in(value) -> set[str]:
+    """Keys of a JSON object, of those in it, too."""
+    if isinstance(value, list):
+        return set().union(*map(names_in, value))
+    return set(value).union(*map(names_in, value.values())) if isinstance(value, dict) else set()
+
+
+def test_every_field_of_a_request_is_documented_and_no_other():
+    asked, answered = documented().split("An answer is")
+    asked = asked.partition("a JSON object:")[2]
+    known = {f.name for record in (PictureRequest, CameraFields) for f in fields(record)} | {"version", "id"}
+    assert [name for name in sorted(known) if not re.search(rf"\b{name}\b", asked)] == []
+    told = re.findall(r"^    (\w+)  +\S", protocol.__doc__, re.MULTILINE)
+    assert set(told) == {f.name for f in fields(PictureRequest)} | {"version", "id"}
+    assert answered
+
+
+def test_every_field_of_an_answer_is_documented(ball, traced):
+    answered = documented().split("An answer is")[1]
+    made = [
+        picture_answer(1, {"rgb": np.zeros((2, 3, 3), np.uint8)}, 0.1),
+        error_answer(1, "no"),
+        *(facts_answer(1, served.facts) for served in (ball, traced)),
+    ]
+    names = set().union(*(names_in(json.loads(answer[0])) for answer in made))
+    assert len(names) > 10
+    assert [name for name in sorted(names) if not re.search(rf"\b{name}\b", answered)] == []
+
+
+def test_arrays_have_the_types_that_are_documented(ball, traced):
+    said = re.findall(r'^    "(\w+)",  # \[(H, W(?:, 3)?)\] (.+)$', inspect.getsource(protocol), re.MULTILINE)
+    assert [name for name, _, _ in said] == list(protocol.OUTPUTS)
+    for served, outputs in ((ball, ("rgb", "alpha", "depth", "normal")), (traced, protocol.OUTPUTS)):
+        assert set(outputs) <= set(served.facts["outputs"])
+        arrays = served.draw(CAMERA_SEEN, SUN, None, outputs, 0)
+        for name, shape, words in said:
+            if name in arrays:
+                ends = {"H, W": (), "H, W, 3": (3,)}[shape]
+                assert arrays[name].shape == (CAMERA_SEEN.height, CAMERA_SEEN.width, *ends), name
+                assert re.search(rf"\b{arrays[name].dtype.name}\b", words.partition(":")[0]), name
 
 
 def test_a_pose_is_a_matrix_or_a_quaternion():

@@ -160,6 +160,25 @@ def test_a_file_of_poses_reads_back_and_goes_on(run, pictures, tmp_path):
     assert max(errors(read_views(tmp_path / "one.json")["1.png"].camera, camera_at(1))) < 0.3
 
 
+def test_poses_of_another_camera_are_not_gone_on_with(run, pictures, tmp_path):
+    """The same intrinsics in another file are the same camera; others in a file of the same name are not."""
+    one, camera, copy = pictures / "1.png", tmp_path / "camera.json", tmp_path / "copy.json"
+    out = tmp_path / "poses.json"
+    locate(run, one, out, None, camera)
+    first = out.read_bytes()
+    shutil.copy(camera, copy)
+    locate(run, one, out, None, copy, resume=True)
+    assert out.read_bytes() == first
+    meta = json.loads(camera.read_text())
+    for change in ({"fl_x": 1.01 * meta["fl_x"]}, {"k1": 0.01}):
+        camera.write_text(json.dumps({**meta, **change}))
+        with pytest.raises(
+            InputError, match=r"poses\.json: expected poses found with the same camera, found .* 1\.png"
+        ):
+            locate(run, one, out, None, camera, resume=True)
+    assert out.read_bytes() == first
+
+
 def test_an_interrupted_call_has_written_what_it_found(run, pictures, tmp_path):
     def stop(done: int, total: int, name: str) -> None:
         if done == 1:

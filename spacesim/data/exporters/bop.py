@@ -84,8 +84,10 @@ def write_bop(
         scene = out / split / "000000"
         cameras, poses, infos = {}, {}, {}
         for image, frame in enumerate(frames):
-            cameras[str(image)], infos[str(image)] = _write_frame(scene, image, dataset, frame, targets, find)
-            poses[str(image)] = [_pose(frame.camera, *pair) for pair in zip(targets, models, strict=True)]
+            placed = [target.at(frame) for target in targets]
+            finder = outline(placed) if frame.objects else find
+            cameras[str(image)], infos[str(image)] = _write_frame(scene, image, dataset, frame, targets, finder)
+            poses[str(image)] = [_pose(frame.camera, *pair) for pair in zip(placed, models, strict=True)]
             done += 1
             if progress is not None:
                 progress(done, len(dataset.frames), frame.file_path)

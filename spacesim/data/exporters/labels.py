@@ -52,16 +52,11 @@ class DatasetLabeller:
     """
 
     def __init__(self, dataset: Dataset, keypoints: int | Path | None = None) -> None:
-        import igl
-
         self.dataset = dataset
         self.targets = labelled_objects(dataset)
         self.bodies = body_labels(dataset, self.targets, keypoints)
         self._numbers = model_numbers(self.targets)
-        vertices, faces = _placed(self.targets)
-        self._vertices, self._faces = vertices, drawable_faces(vertices, faces)
-        self._tree = igl.AABB()
-        self._tree.init(self._vertices, self._faces)
+        self._placed = _Placed(self.targets)
 
     @property
     def categories(self) -> list[Category]:
@@ -76,13 +71,15 @@ class DatasetLabeller:
         if frame.id_path is None:
             raise InputError(f"{self.dataset.root}: expected object numbers of {frame.file_path}, found no id_path")
         numbers = read_labels(self.dataset.root / frame.id_path, frame.camera)
+        targets = [target.at(frame) for target in self.targets]
+        placed = _Placed(targets) if frame.objects else self._placed
         instances = []
-        for target, category, body in zip(self.targets, self._numbers, self.bodies, strict=True):
-            mask = numbers == target.id
-            instances.append(Instance(target, category, mask, bounding_box(mask), self.keypoints(frame, target, body)))
+        for target, category, body in zip(targets, self._numbers, self.bodies, strict=True):
+            mask, points = numbers == target.id, self._keypoints(frame, target, body, placed)
+            instances.append(Instance(target, category, mask, bounding_box(mask), points))
         return instances
 
-    def keypoints(self, frame: Frame, target: LabelledObject, body: BodyLabels) -> Array:
+    def _keypoints(self, frame: Frame, target: LabelledObject, body: BodyLabels, placed: "_Placed") -> Array:
         """[K, 3] as of `Instance`; 0 each outside of the picture."""
         pose, camera = target.world_from_object, frame.camera
         world = body.points @ pose[:3, :3].T + pose[:3, 3]
@@ -90,7 +87,7 @@ class DatasetLabeller:
         towards = camera.position - world
         clear = CLEARANCE * float(np.ptp(target.vertices, axis=0).max()) / np.linalg.norm(towards, axis=1)
         origins = np.ascontiguousarray(world + clear[:, None] * towards)
-        faces, reach, _ = self._tree.intersect_ray_first(self._vertices, self._faces, origins, towards)
+        faces, reach = placed.first_hits(origins, towards)
         free = (faces < 0) | (reach >= 1 - clear)
         state = np.where(inside, np.where(free, VISIBLE, HIDDEN), OUTSIDE)
         return np.column_stack([np.where(inside[:, None], pixels, 0), state])
@@ -123,11 +120,23 @@ def project(points: Array, frame: Frame) -> tuple[Array, np.ndarray]:
     return np.column_stack([u, v]), inside
 
 
-def _placed(targets: Sequence[LabelledObject]) -> tuple[Array, np.ndarray]:
-    """Vertices [V, 3] in the world and faces [F, 3] of all."""
-    vertices, faces, first = [], [], 0
-    for target in targets:
-        vertices.append(target.vertices @ target.world_from_object[:3, :3].T + target.world_from_object[:3, 3])
-        faces.append(target.faces + first)
-        first += len(target.vertices)
-    return np.ascontiguousarray(np.concatenate(vertices)), np.concatenate(faces).astype(np.int64)
+class _Placed:
+    """Objects in the world, as rays meet them."""
+
+    def __init__(self, targets: Sequence[LabelledObject]) -> None:
+        import igl
+
+        vertices, faces, first = [], [], 0
+        for target in targets:
+            vertices.append(target.vertices @ target.world_from_object[:3, :3].T + target.world_from_object[:3, 3])
+            faces.append(target.faces + first)
+            first += len(target.vertices)
+        self._vertices = np.ascontiguousarray(np.concatenate(vertices))
+        self._faces = drawable_faces(self._vertices, np.concatenate(faces).astype(np.int64))
+        self._tree = igl.AABB()
+        self._tree.init(self._vertices, self._faces)
+
+    def first_hits(self, origins: Array, directions: Array) -> tuple[np.ndarray, Array]:
+        """([N] face that a ray meets first, -1 for none; [N] where, in lengths of its direction)."""
+        faces, reach, _ = self._tree.intersect_ray_first(self._vertices, self._faces, origins, directions)
+        return faces, reach

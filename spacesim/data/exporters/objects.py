@@ -1,7 +1,7 @@
 """What every exporter needs of a dataset: the objects with their poses and meshes, and opaque pictures."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,15 @@ class LabelledObject:
     world_from_object: Array  #: [4, 4] rigid, metres
     vertices: Array  #: [V, 3] metres, body frame, as large as in the scene
     faces: np.ndarray  #: [F, 3]
+
+    def at(self, frame: Frame) -> "LabelledObject":
+        """The object where a frame has it. Raises InputError for a pose that cannot be."""
+        if self.id not in frame.objects:
+            return self
+        pose = frame.objects[self.id]
+        if not _is_similarity(pose):
+            raise InputError(f"{frame.file_path}: expected a pose of object {self.id}, found another matrix")
+        return replace(self, world_from_object=_rigid(pose))
 
     def camera_from_object(self, camera: Camera) -> Array:
         """[4, 4] rigid, OpenCV's camera axes, metres."""
@@ -55,9 +64,7 @@ def labelled_objects(dataset: Dataset) -> list[LabelledObject]:
     targets = []
     first_vertex = first_face = 0
     for (number, name), pose, (vertices, faces) in zip(names, poses, sizes, strict=True):
-        scale = np.cbrt(np.linalg.det(pose[:3, :3]))
-        rigid = pose.copy()
-        rigid[:3, :3] /= scale
+        rigid = _rigid(pose)
         world = np.asarray(mesh.vertices[first_vertex : first_vertex + vertices])
         object_faces = np.asarray(mesh.faces[first_face : first_face + faces]) - first_vertex
         if object_faces.min() < 0 or object_faces.max() >= vertices or not (np.ptp(world, axis=0) > 0).any():
@@ -65,6 +72,12 @@ def labelled_objects(dataset: Dataset) -> list[LabelledObject]:
         targets.append(LabelledObject(number, name, rigid, (world - rigid[:3, 3]) @ rigid[:3, :3], object_faces))
         first_vertex, first_face = first_vertex + vertices, first_face + faces
     return targets
+
+
+def _rigid(pose: Array) -> Array:
+    rigid = pose.copy()
+    rigid[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
+    return rigid
 
 
 def _is_similarity(pose: Array) -> bool:

@@ -71,7 +71,7 @@ def write_speedplus(
         write_png(out / "synthetic/images" / name, opaque_picture(dataset, frame), durable=False)
         mask = None
         if labeller is not None:
-            (instance,) = (one for one in labeller.instances(frame) if one.target is target)
+            (instance,) = (one for one in labeller.instances(frame) if one.target.id == target.id)
             mask, points[name] = instance.mask, instance.keypoints.tolist()
         elif frame.silhouette_path is not None:
             mask = read_labels(dataset.root / frame.silhouette_path, frame.camera) > 0
@@ -101,7 +101,7 @@ def _kept_labels(dataset: Dataset) -> dict[str, JsonDict]:
 
 def _label(name: str, frame: Frame, target: LabelledObject, kept: JsonDict | None = None) -> JsonDict:
     """kept: written as it is, where it says the frame's pose"""
-    pose = target.camera_from_object(frame.camera)
+    pose = target.at(frame).camera_from_object(frame.camera)
     if kept is not None:
         try:
             if np.array_equal(camera_that_sees(*(kept[key] for key in LABEL)), frame.camera.world_from_camera):

@@ -3,8 +3,8 @@
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +65,9 @@ class PlannedView:
     exposure: float | None = None  #: display value of a radiance of 1 W m^-2 sr^-1
     earth: Array | None = None  #: [3] from the world's origin to the Earth's centre, metres
     sky_from_world: Array | None = None  #: [3, 3] to the axes in which stars stand still; None: the world's
+    objects: Mapping[int, Array] = field(
+        default_factory=dict
+    )  #: [4, 4] rigid world_from_object of those moved, by number
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,13 +248,7 @@ class RandomRig(RigConfig):
         _expect_metres(near=self.near, far=self.far, sigma=self.sigma)
         if self.near is not None and self.far is not None:
             expect(self.near <= self.far, "far", f"at least near, {self.near:g} m", self.far)
-        if self.max_phase_deg is not None:
-            fits = 1 <= self.max_phase_deg <= 180
-            expect(fits, "max_phase_deg", "an angle from 1 to 180 degrees", self.max_phase_deg)
-        if self.min_phase_deg is not None:
-            most = 180.0 if self.max_phase_deg is None else self.max_phase_deg
-            fits = 0 <= self.min_phase_deg <= most - 1
-            expect(fits, "min_phase_deg", f"an angle from 0 to {most - 1:g} degrees", self.min_phase_deg)
+        check_phases(self.min_phase_deg, self.max_phase_deg)
         expect(not (self.random_suns and self.sun), "random_suns", "false where sun names the Suns", True)
         if self.random_suns and (self.suns, self.test_suns) != (1, 0):
             found = f"{self.suns} suns and {self.test_suns} test_suns"
@@ -410,6 +407,15 @@ class FlyAroundRig(RigConfig):
             return PlannedView(camera.at(pose), turned)
 
         return _views_on_path(self, self.sun_directions(seed), at, closed)
+
+
+def check_phases(least: float | None, most: float | None) -> None:
+    """Raise InputError unless `min_phase_deg` and `max_phase_deg`, None for no limit, leave a range of a degree."""
+    if most is not None:
+        expect(1 <= most <= 180, "max_phase_deg", "an angle from 1 to 180 degrees", most)
+    if least is not None:
+        below = (180.0 if most is None else most) - 1
+        expect(0 <= least <= below, "min_phase_deg", f"an angle from 0 to {below:g} degrees", least)
 
 
 def plan(rig: Rig, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:

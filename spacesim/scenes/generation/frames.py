@@ -1,12 +1,13 @@
 """Frames from the path tracer to the disk: rendering goes on while threads encode and write."""
 
+import gc
 import math
 import os
 import platform
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from spacesim.scenes.background.draw import Background
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.exposure import record_image
 from spacesim.scenes.config import QualityConfig
+from spacesim.scenes.generation.moves import moved
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
@@ -46,6 +48,7 @@ class FrameSpec:
     earth: EarthConfig | None = None  #: None: where the scene says, if it has one at all
     sunlight: float = 1.0  #: factor on the Sun's light, of an Earth that the scene does not have
     sky_from_world: Array | None = None  #: [3, 3], None: stars stand still in the world
+    objects: Mapping[int, Array] = field(default_factory=dict)  #: rigid poses [4, 4] of those moved, by number
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +135,7 @@ class FrameMaker:
                     while waiting and (waiting[0].done() or len(waiting) >= self._most):
                         yield waiting.popleft().result()
                     seed = (self._job.seed, spec.index)
-                    truth = self._renderer.render(spec.camera, spec.sun, seed, spec.spp, spec.earth)
+                    truth = self._renderer_of(spec).render(spec.camera, spec.sun, seed, spec.spp, spec.earth)
                     truth = dim(truth, spec.sunlight)
                     if self._background is not None:
                         where = spec.earth, spec.sky_from_world
@@ -143,6 +146,15 @@ class FrameMaker:
                     yield waiting.popleft().result()
             finally:
                 pool.shutdown(cancel_futures=True)
+
+    def _renderer_of(self, spec: FrameSpec) -> Renderer:
+        """That of the scene, or one of the scene as the frame has it."""
+        if not spec.objects:
+            return self._renderer
+        gc.collect()  # those of frames before are held by cycles: 8 MB each
+        job = self._job
+        scene = moved(job.scene, spec.objects)
+        return Renderer(scene, job.quality.spp, job.quality.max_depth, job.camera.distortion)
 
     def _write(self, spec: FrameSpec, truth: Truth) -> str:
         seed, behind = (self._job.seed, spec.index), truth.radiance_background

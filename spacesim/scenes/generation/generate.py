@@ -26,12 +26,14 @@ from spacesim.scenes.config import SceneConfig
 from spacesim.scenes.generation.estimate import LONG, Estimate, measure, samples
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, raw_suffixes, versions, writing_threads
 from spacesim.scenes.generation.lighting import sunlit_fractions, warn_of_dark_frames
+from spacesim.scenes.generation.moves import cameras_inside, poses_in
 from spacesim.scenes.generation.overview import write_overview
 from spacesim.scenes.generation.points import sample_surface_points
 from spacesim.scenes.lights.earth import EARTH_RADIUS_KM
 from spacesim.scenes.lights.eclipse import visible_fraction
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
+from spacesim.scenes.trajectory.rig import TrajectoryRig
 
 SCHEMA = 2  #: of scene.json
 COARSE_DEPTH = 0.01  #: of the scene's size: longer steps of depth pictures are told
@@ -75,8 +77,10 @@ def generate(
         more = {name: {**keys, "sunlit_fraction": sunlit[name]} for name, keys in sweep.keys.items()}
         lens, mesh = config.camera.distortion, sweep.scene.mesh
         dataset = writer.finish(*listed, points, colors, mesh, lens, lambda d: write_overview(d.root, d), more)
-        free = isinstance(config.rig, RandomRig) and config.rig.max_phase_deg is None
-        hint = "max_phase_deg = 90 keeps the Sun on the camera's side, clear of the Earth" if free else ""
+        free = isinstance(config.rig, RandomRig | TrajectoryRig) and config.rig.max_phase_deg is None
+        kept = isinstance(config.rig, RandomRig)
+        what = "keeps the Sun on the camera's side, clear of the Earth" if kept else "in [rig] leaves them out"
+        hint = f"max_phase_deg = 90 {what}" if free else ""
         warn_of_dark_frames(sunlit, {name: keys.get("sun_visibility") == 0 for name, keys in more.items()}, hint)
         return dataset
 
@@ -221,7 +225,8 @@ class _DatasetPlan:
         threads = writing_threads(1)
         self.job = Job(self.scene, config.camera, quality, config.seed, Path(), threads, config.background)
         self.job = replace(self.job, depth_unit=depth_unit(self.scene, [*self.train, *self.test]))
-        inside = self.renderer.inside(np.stack([spec.camera.position for spec in self.specs]))
+        positions = np.stack([spec.camera.position for spec in self.specs])
+        inside = cameras_inside(self.scene, self.renderer, positions, [spec.objects for spec in self.specs])
         if inside.any():
             name = self.specs[int(inside.argmax())].name
             field = "distance" if hasattr(config.rig, "distance") else "rig"
@@ -238,7 +243,9 @@ class _DatasetPlan:
             sunlight = visible_fraction(view.sun.direction, view.earth, self.scene.sun.angular_radius)
         elif view.earth is not None and earth is not None:  # which hides the Sun as it is traced
             earth = replace(earth, **_place_of(view.earth))
-        return FrameSpec(index, name, view.camera, view.sun, spp, view.exposure, earth, sunlight, view.sky_from_world)
+        return FrameSpec(
+            index, name, view.camera, view.sun, spp, view.exposure, earth, sunlight, view.sky_from_world, view.objects
+        )
 
     def _keys_of(self, view: PlannedView) -> dict[str, JsonValue]:
         """What transforms.json says of a frame beside its camera and its Sun's direction."""
@@ -249,6 +256,10 @@ class _DatasetPlan:
         if earth is not None:
             visible = visible_fraction(view.sun.direction, earth, self.scene.sun.angular_radius)
         keys: dict[str, JsonValue] = {"time": view.time, "epoch": view.epoch, "exposure": view.exposure}
+        if view.objects:
+            poses = poses_in(self.scene, view.objects)
+            moves = [{"id": number, "world_from_object": poses[number - 1].tolist()} for number in view.objects]
+            keys["objects"] = moves
         return {key: value for key, value in {**keys, "sun_visibility": visible}.items() if value is not None}
 
 
@@ -291,14 +302,23 @@ def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedVi
 
 def depth_unit(scene: Scene, named: NamedViews) -> float:
     """Metres a step of depth pictures, with which 16 bits reach all that the views may see."""
+    still, farthest = _corners(scene), 0.0
+    alone = [_corners(replace(scene, objects=(replace(item, world_from_object=np.eye(4)),))) for item in scene.objects]
+    for _, view in named:
+        points, forward = still, view.camera.world_from_camera[:3, 2]
+        if view.objects:
+            placed = zip(alone, poses_in(scene, view.objects), strict=True)
+            points = np.concatenate([corners @ pose[:3, :3].T + pose[:3, 3] for corners, pose in placed])
+        farthest = max(farthest, float((points @ forward).max() - view.camera.position @ forward))
+    return choose_depth_unit(farthest)
+
+
+def _corners(scene: Scene) -> Array:
+    """[N, 3] vertices of the convex hull, of all that lies in a plane all."""
     points: Array = scene.mesh.vertices
     with suppress(QhullError):
         points = points[ConvexHull(points).vertices]
-    farthest = 0.0
-    for _, view in named:
-        forward = view.camera.world_from_camera[:3, 2]
-        farthest = max(farthest, float((points @ forward).max() - view.camera.position @ forward))
-    return choose_depth_unit(farthest)
+    return points
 
 
 def _mesh_counts(scene: Scene, object_id: int) -> dict[str, int]:

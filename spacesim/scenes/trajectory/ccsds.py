@@ -1,14 +1,15 @@
 """Orbit and attitude ephemeris messages, KVN or XML: CCSDS 502.0-B-2 and B-3 (OEM), 504.0-B-1 and B-2 (AEM).
 
 Of an OEM the state vectors are read (not covariances and accelerations), of an AEM quaternions. Between epochs
-positions are cubic by their velocities and attitudes are slerped, whatever INTERPOLATION says; where segments meet in
-an epoch, the later one counts there.
+positions are cubic by their velocities and attitudes are slerped, whatever INTERPOLATION says (the log then tells);
+where segments meet in an epoch, the later one counts there.
 
 A quaternion of an AEM takes coordinates from one frame into the other: of a rotation by phi about e, which turns the
 axes of the first frame into those of the second, it is (e sin(phi/2), cos(phi/2)). As a matrix that turns vectors it
 takes coordinates back, from the second frame into the first.
 """
 
+import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,6 +29,10 @@ from spacesim.scenes.trajectory.tracks import Attitude, Track
 QUATERNIONS = ("QUATERNION", "QUATERNION/DERIVATIVE", "QUATERNION/RATE", "QUATERNION/ANGVEL")
 """Attitude types whose lines begin with a quaternion."""
 
+OURS = {"OEM": ("HERMITE", "3", "cubic by their velocities"), "AEM": ("LINEAR", "1", "slerped")}
+"""Interpolation between epochs, its degree, and in words."""
+
+_log = logging.getLogger(__name__)
 _VERSION = re.compile(r"CCSDS_(\w+)_VERS\s*=\s*(\S+)")
 _BODY = re.compile(r"(SC_BODY|SC_BUS|INSTRUMENT|CAMERA|ACTUATOR|SENSOR)")  # frames of a spacecraft's own
 
@@ -128,6 +133,7 @@ def _message(path: Path, text: str) -> Message:
         attitude = _meta(segment.meta, "ATTITUDE_TYPE").upper()
         if attitude not in QUATERNIONS:
             raise InputError(f"ATTITUDE_TYPE: expected one of {', '.join(QUATERNIONS)}, found {attitude}")
+    _tell_of_interpolation(path, kind, segments)
     day, times, values = 0, np.empty(0), np.empty((0, 6 if is_orbit else 4))
     for number, segment in enumerate(segments):
         of_segment, seconds = read_epochs([line[0] for line in segment.lines], "epoch")
@@ -141,6 +147,17 @@ def _message(path: Path, text: str) -> Message:
         keep = len(times) - bool(number)
         times, values = np.concatenate([times[:keep], seconds]), np.concatenate([values[:keep], numbers])
     return Message(path, kind, known[0], systems[0], centers[0], day, times, values)
+
+
+def _tell_of_interpolation(path: Path, kind: str, segments: Sequence[_Segment]) -> None:
+    """One warning where a message asks for another interpolation than ours."""
+    method, degree, words = OURS[kind]
+    for segment in segments:
+        asked = segment.meta.get("INTERPOLATION" if kind == "OEM" else "INTERPOLATION_METHOD", "").upper()
+        of_degree = segment.meta.get("INTERPOLATION_DEGREE", degree)
+        if asked and (asked, of_degree) != (method, degree):
+            _log.warning("%s: asks for %s of degree %s between epochs; they are %s", path, asked, of_degree, words)
+            return
 
 
 def _read_xml(text: str) -> tuple[str, list[_Segment]]:

@@ -2,11 +2,12 @@
 
 The world is whatever frame the file is in. The scene's own frame is that of the target: its body axes, with the origin
 where the target is. So a dataset shows a target that stands still, which is what it is trained on, whatever it does in
-the world. Where nothing is said of the target, the scene's frame is the world.
+the world. Where nothing is said of the target, the scene's frame is the world. Other objects of the scene move in it
+where their own poses are told.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from datetime import date, timedelta
 
 import numpy as np
@@ -21,7 +22,7 @@ DAY = 86_400.0
 MAX_PLACE, MAX_SPEED = 1e15, 299_792_458.0
 """Metres of a coordinate, 6,700 times the Earth's distance from the Sun, and metres a second of one, light's."""
 
-_CLOCK = ("day", "time_system", "timed")  # fields of a motion that are no tracks
+_OTHERS = ("day", "time_system", "timed", "bodies")  # fields of a motion that are no tracks
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +41,12 @@ class Motion:
     earth: Track | None = None  #: position of the Earth's centre
     sun: Track | None = None  #: direction towards the Sun
     exposure: Track | None = None  #: display value of a radiance of 1 W m^-2 sr^-1
+    #: of other objects of the scene, by their numbers K: positions as "targetK", world_from_object as "targetK_turn"
+    bodies: Mapping[str, Track | Attitude] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for track in (self.camera, self.target, self.earth):
-            if track is not None:
+        for track in (self.camera, self.target, self.earth, *self.bodies.values()):
+            if isinstance(track, Track):
                 _check_size(track.name, track.values, MAX_PLACE, "m")
                 _check_size(track.name, track.values[:0] if track.rates is None else track.rates, MAX_SPEED, "m/s")
 
@@ -51,13 +54,15 @@ class Motion:
     def tracks(self) -> dict[str, Track | Attitude]:
         """All that is known."""
         tracks: dict[str, Track | Attitude | None]
-        tracks = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _CLOCK}
-        return {name: track for name, track in tracks.items() if track is not None}
+        tracks = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _OTHERS}
+        return {name: track for name, track in tracks.items() if track is not None} | dict(self.bodies)
 
     def times(self) -> Array:
         """[N] the times of the camera's track, else the target's, that all tracks cover. Raises InputError where there
         is none, or no pose."""
-        main = self.camera or self.camera_turn or self.target or self.target_turn
+        main = (
+            self.camera or self.camera_turn or self.target or self.target_turn or next(iter(self.bodies.values()), None)
+        )
         if main is None:
             raise InputError("rig: expected a pose of the camera or of the target, found none")
         first = max(self.tracks.values(), key=lambda track: float(track.times[0]))
@@ -98,6 +103,7 @@ class MotionSamples:
     sun: Array | None  #: [N, 3] unit, towards the Sun
     earth: Array | None  #: [N, 3] to the Earth's centre
     exposure: Array | None  #: [N]
+    objects: Mapping[int, Array] = field(default_factory=dict)  #: [N, 4, 4] rigid, of objects that move, by number
 
 
 def merge(motions: Sequence[Motion]) -> Motion:
@@ -117,7 +123,8 @@ def merge(motions: Sequence[Motion]) -> Motion:
             raise InputError(f"rig: expected one source of each track, found {names}")
         later = DAY * ((other.day or 0) - (whole.day or 0))
         moved = {name: replace(track, times=track.times + later) for name, track in other.tracks.items()}
-        whole = replace(whole, timed=whole.timed and other.timed, **moved)  # type: ignore[arg-type]
+        bodies = {**whole.bodies, **{name: moved.pop(name) for name in other.bodies}}
+        whole = replace(whole, timed=whole.timed and other.timed, bodies=bodies, **moved)  # type: ignore[arg-type]
     return whole
 
 
@@ -125,9 +132,10 @@ def seen_from_target(motion: Motion, times: Array, camera_from_optics: Array, ce
     """`motion` at `times` [N] in the target's frame.
 
     camera_from_optics: [3, 3] OpenCV camera axes to those whose attitude is told; centre: [3] of the objects, scene
-    frame, which a camera looks at, the world's z upwards, where no attitude of it is told. Raises InputError for a time
-    that is not covered.
+    frame, which a camera looks at, the world's z upwards, where no attitude of it is told; the target's origin where
+    others move. Raises InputError for a time that is not covered.
     """
+    centre = np.zeros(3) if motion.bodies else centre
     count = len(times)
     still, unturned = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
     place = motion.target.at(times) if motion.target else still
@@ -147,6 +155,13 @@ def seen_from_target(motion: Motion, times: Array, camera_from_optics: Array, ce
         for k in range(count):
             if np.linalg.norm(poses[k, :3, 3] - centre) > 0:
                 poses[k] = look_at(poses[k, :3, 3], centre, up[k])
+    objects = {}
+    for name in motion.bodies:
+        if not name.endswith("_turn"):
+            pose, turned = np.tile(np.eye(4), (count, 1, 1)), motion.bodies.get(f"{name}_turn")
+            pose[:, :3, 3] = to_target(motion.bodies[name].at(times) - place)
+            pose[:, :3, :3] = target_from_world @ (turned.at(times) if turned else unturned)
+            objects[int(name.removeprefix("target"))] = pose
     return MotionSamples(
         times,
         poses,
@@ -154,4 +169,5 @@ def seen_from_target(motion: Motion, times: Array, camera_from_optics: Array, ce
         normalize(to_target(motion.sun.at(times))) if motion.sun else None,
         to_target(motion.earth.at(times) - place) if motion.earth else None,
         motion.exposure.at(times)[:, 0] if motion.exposure else None,
+        objects,
     )

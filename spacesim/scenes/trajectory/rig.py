@@ -1,6 +1,7 @@
 """Rigs that follow a trajectory: of files, or of arrays from Python."""
 
 import hashlib
+import logging
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import JsonDict
-from spacesim.data.geometry import Array, rotation_from_quaternion
+from spacesim.data.geometry import Array, normalize, rotation_from_quaternion
 from spacesim.data.records import Sun
 from spacesim.scenes.cameras.camera import EXPOSURES, CameraConfig
 from spacesim.scenes.cameras.rig import (
@@ -22,19 +23,25 @@ from spacesim.scenes.cameras.rig import (
     Rig,
     TargetSphere,
     Views,
+    check_phases,
     intermediate_steps,
 )
+from spacesim.scenes.lights.earth import EARTH_RADIUS_KM
+from spacesim.scenes.lights.eclipse import visible_fraction
 from spacesim.scenes.trajectory.ccsds import motion_of
 from spacesim.scenes.trajectory.motion import Motion, MotionSamples, merge, seen_from_target
 from spacesim.scenes.trajectory.table import read_table
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class TrajectoryRig(Rig):
     """Camera and target move as a trajectory says. The dataset is in the target's frame: cameras, Sun and Earth move
-    about a target that stands still. Where no attitude of the camera is told it looks at the target, the world's z
-    upwards; where no Sun is told, `sun` says it. Test frames lie halfway between training frames; of a trajectory
-    without times they are some of its rows, held out. Raises InputError for a value out of range."""
+    about a target that stands still, and so do objects of the scene whose own poses are told. Where no attitude of the
+    camera is told it looks at the target, the world's z upwards; where no Sun is told, `sun` says it. Test frames lie
+    halfway between training frames; of a trajectory without times they are some of its rows, held out. Raises
+    InputError for a value out of range."""
 
     views: int = 0  #: training frames, evenly over the time that is covered; 0: at the trajectory's own times
     step_s: float | None = None  #: seconds between training frames, in place of views
@@ -45,6 +52,10 @@ class TrajectoryRig(Rig):
     #: quaternion that turns OpenCV camera axes (x right, y down, z forward) into those whose attitude is told, such as
     #: the body's that carries the camera; [0, 1, 0, 0]: those of OpenGL and Blender
     body_from_camera_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    #: least and greatest angle between Sun and camera as the target sees them; none: any. With either, frames beyond,
+    #: and those whose Sun has its centre behind the Earth, are left out
+    min_phase_deg: float | None = None
+    max_phase_deg: float | None = None  #: as `min_phase_deg`
 
     def __post_init__(self) -> None:
         for name in ("views", "test_views"):
@@ -56,6 +67,7 @@ class TrajectoryRig(Rig):
         for azimuth, elevation in self.sun:
             possible = math.isfinite(azimuth) and -90 <= elevation <= 90
             expect(possible, "sun", "a finite azimuth and an elevation from -90 to 90 degrees", (azimuth, elevation))
+        check_phases(self.min_phase_deg, self.max_phase_deg)
         length = math.hypot(*self.body_from_camera_wxyz)
         expect(abs(length - 1) < 1e-3, "body_from_camera_wxyz", "a quaternion of length 1", length)
 
@@ -67,8 +79,7 @@ class TrajectoryRig(Rig):
         motion = self.motion()
         if motion.sun is not None and self.sun:
             raise InputError(f"sun: expected none beside the trajectory's own, found {list(self.sun[0])}")
-        train, test = self._times(motion)
-        return self._views(motion, train, target, camera), self._views(motion, test, target, camera)
+        return self._views_at(motion, self._times(motion), target, camera)
 
     def _times(self, motion: Motion) -> tuple[Array, Array]:
         """Of training and of testing."""
@@ -92,6 +103,38 @@ class TrajectoryRig(Rig):
         between = intermediate_steps(len(own), self.test_views, closed=False)
         return own, np.interp(between, np.arange(len(own)), own)
 
+    def _views_at(
+        self, motion: Motion, times: tuple[Array, Array], target: TargetSphere, camera: CameraConfig
+    ) -> Views:
+        """At the times of training and of testing, without those that the limits leave out."""
+        train, test = (self._views(motion, some, target, camera) for some in times)
+        if (self.min_phase_deg, self.max_phase_deg) == (None, None):
+            return train, test
+        centre = np.zeros(3) if motion.bodies else target.centre
+        kept, kept_test = ([view for view in some if self._is_kept(view, centre, target)] for some in (train, test))
+        count, left = len(train) + len(test), len(kept) + len(kept_test)
+        if not kept:
+            field = "min_phase_deg" if self.max_phase_deg is None else "max_phase_deg"
+            expected = "a training frame in range whose Sun the Earth does not hide"
+            raise InputError(f"{field}: expected {expected}, found none of {len(train)}")
+        if left < count:
+            _log.warning(
+                "trajectory: %d of %d frames are left out, by their phase angle or as the Earth hides the Sun",
+                count - left,
+                count,
+            )
+        return kept, kept_test
+
+    def _is_kept(self, view: PlannedView, centre: Array, target: TargetSphere) -> bool:
+        towards = normalize(view.camera.position - centre)
+        cosine = min(max(float(view.sun.direction @ towards), -1.0), 1.0)
+        most = 180.0 if self.max_phase_deg is None else self.max_phase_deg
+        earth = view.earth
+        if earth is None and target.earth is not None:
+            earth = 1e3 * EARTH_RADIUS_KM * target.earth.distance * target.earth.direction
+        lit = earth is None or visible_fraction(view.sun.direction, earth, 0.0) > 0
+        return lit and (self.min_phase_deg or 0.0) <= math.degrees(math.acos(cosine)) <= most
+
     def _views(self, motion: Motion, times: Array, target: TargetSphere, camera: CameraConfig) -> list[PlannedView]:
         mount = rotation_from_quaternion(self.body_from_camera_wxyz)
         return planned_views(motion, seen_from_target(motion, times, mount, target.centre), camera, self.sun)
@@ -113,6 +156,7 @@ def planned_views(
             None if moments.exposure is None else float(moments.exposure[k]),
             None if moments.earth is None else moments.earth[k],
             moments.turn[k],
+            {number: poses[k] for number, poses in moments.objects.items()},
         )
         for k in range(len(moments.times))
     ]
@@ -157,7 +201,7 @@ class FileRig(TrajectoryRig):
             has_sun = bool(self.sun) or any(part.sun is not None for part in parts)
             parts.append(motion_of(of, with_sun=not has_sun))
         motion = merge(parts)
-        if not motion.tracks.keys() & {"camera", "camera_turn", "target", "target_turn"}:
+        if not (motion.tracks.keys() & {"camera", "camera_turn", "target", "target_turn"} or motion.bodies):
             raise InputError(f"{self.path}: expected a pose of the camera or of the target, found no column of either")
         return motion
 

@@ -63,7 +63,7 @@ class SpiceRig(TrajectoryRig):
         with _loaded(self.kernels) as spice:
             train, test = rig._times(self._motion(spice, np.empty(0)))
             motion = self._motion(spice, np.concatenate([train, test]))  # exactly there: nothing is interpolated
-        return self._views(motion, train, target, camera), self._views(motion, test, target, camera)
+        return self._views_at(motion, (train, test), target, camera)
 
     def _motion(self, spice: ModuleType, times: Array) -> Motion:
         """What the kernels say at `times` [M] and at both ends, in seconds since midnight before the start."""

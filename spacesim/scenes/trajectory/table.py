@@ -5,6 +5,7 @@
     camera_vx_m_s camera_vy_m_s camera_vz_m_s                    velocity; _km_s
     world_from_camera_qw world_from_camera_qx ..._qy ..._qz      attitude, a quaternion; or camera_from_world_qw ...
     target_...  world_from_target_q... | target_from_world_q...  the same of the target
+    target2_...  world_from_target2_q... | target2_from_world_q...  of the scene's object 2, if it moves
     earth_x_m earth_y_m earth_z_m                                position of the Earth's centre; _km
     sun_x sun_y sun_z                                            direction towards the Sun, of any length
     exposure                                                     display value of a radiance of 1 W m^-2 sr^-1
@@ -38,25 +39,22 @@ SUFFIXES = (".csv", ".json", ".parquet")
 _BODIES = ("camera", "target", "earth")
 _TURNS = ("world_from_camera", "camera_from_world", "world_from_target", "target_from_world")
 _OURS = re.compile(r"(time|camera|target|earth|sun|exposure|world_from)(_|\d|$)")
-_TARGETS = re.compile(r"(world_from_)?target_?\d")
+_TARGETS = re.compile(r"(?:world_from_)?(target(\d+))_")
 Columns = Mapping[str, Sequence[object]]  #: of a table, by name
 
 _log = logging.getLogger(__name__)
 
 
-def _groups() -> dict[tuple[str, ...], str]:
-    """{columns that belong together: what they are, in words}."""
+def _groups(others: Sequence[str] = ()) -> dict[tuple[str, ...], str]:
+    """{columns that belong together: what they are, in words}. others: objects beside the target, "target2", ..."""
     groups: dict[tuple[str, ...], str] = {("time_s",): "time", ("time_utc",): "time", ("exposure",): "exposure"}
     groups[("sun_x", "sun_y", "sun_z")] = "sun"
-    for body in _BODIES:
+    for body in (*_BODIES, *others):
         for unit in METRES:
             groups[tuple(f"{body}_{axis}_{unit}" for axis in "xyz")] = f"{body} position"
             groups[tuple(f"{body}_v{axis}_{unit}_s" for axis in "xyz")] = f"{body} velocity"
-    return groups | {tuple(f"{turn}_q{part}" for part in "wxyz"): turn for turn in _TURNS}
-
-
-GROUPS = _groups()
-NAMES = tuple(name for group in GROUPS for name in group)
+    turns = (*_TURNS, *(turn for name in others for turn in (f"world_from_{name}", f"{name}_from_world")))
+    return groups | {tuple(f"{turn}_q{part}" for part in "wxyz"): turn for turn in turns}
 
 
 def read_table(path: Path) -> Motion:
@@ -69,8 +67,10 @@ def read_table(path: Path) -> Motion:
 
 
 def _motion(path: Path, columns: Columns) -> Motion:
-    _check_names(path, columns)
-    present = {what: names for names, what in GROUPS.items() if any(name in columns for name in names)}
+    others = _other_targets(columns)
+    groups = _groups(others)
+    _check_names(path, columns, groups)
+    present = {what: names for names, what in groups.items() if any(name in columns for name in names)}
     count = len(next(iter(columns.values()), ()))
     day, times = None, np.arange(count, dtype=np.float64)
     if "time_utc" in columns:
@@ -78,7 +78,7 @@ def _motion(path: Path, columns: Columns) -> Motion:
     elif "time_s" in columns:
         times = _numbers(columns, "time_s")
     tracks: dict[str, Track | Attitude] = {}
-    for body in _BODIES:
+    for body in (*_BODIES, *others):
         if f"{body} position" in present:
             place = _vectors(columns, present[f"{body} position"])
             speed = present.get(f"{body} velocity")
@@ -91,6 +91,8 @@ def _motion(path: Path, columns: Columns) -> Motion:
                 q = np.stack([_numbers(columns, name) for name in present[turn]], axis=-1)
                 q = q if turn.startswith("world") else q * (1, -1, -1, -1)
                 tracks[f"{body}_turn"] = Attitude(turn, times, q)
+        if body in others and body not in tracks:
+            raise InputError(f"{body}_x_m: expected a position beside its attitude, found none")
     if "sun" in present:
         sun = np.stack([_numbers(columns, name) for name in present["sun"]], axis=-1)
         least, most = SUN_LENGTHS
@@ -106,33 +108,42 @@ def _motion(path: Path, columns: Columns) -> Motion:
             row = int((~(exposure > 0)).argmax())
             raise InputError(f"exposure: expected a number above 0, found {exposure[row]:g} in row {row + 1}")
         tracks["exposure"] = Track("exposure", times, exposure[:, None])
-    return Motion(day, timed="time_s" in columns or "time_utc" in columns, **tracks)  # type: ignore[arg-type]
+    bodies = {name: tracks.pop(name) for name in list(tracks) if name.removesuffix("_turn") in others}
+    timed = "time_s" in columns or "time_utc" in columns
+    return Motion(day, timed=timed, bodies=bodies, **tracks)  # type: ignore[arg-type]
 
 
-def _check_names(path: Path, columns: Columns) -> None:
+def _other_targets(columns: Columns) -> list[str]:
+    """Objects beside the target that have columns, "target2" for the scene's second, in the order of their numbers.
+    Raises InputError for a number below 2."""
+    found = {int(match[2]): match for name in columns if (match := _TARGETS.match(name))}
+    for number, match in found.items():
+        if number < 2 or match[1] != f"target{number}":
+            raise InputError(f"{match[0]}: expected target, or target2 for the scene's second object, found {match[1]}")
+    return [f"target{number}" for number in sorted(found)]
+
+
+def _check_names(path: Path, columns: Columns, groups: Mapping[tuple[str, ...], str]) -> None:
     """Raise InputError for a column that looks like one of ours and is none, for a part of a vector, for two that say
     the same, and for columns of different lengths."""
+    names = [name for group in groups for name in group]
     others = []
     for name in columns:
-        if name in NAMES:
+        if name in names:
             continue
-        if _TARGETS.match(name):
-            raise InputError(
-                f"{name}: expected one target, found another; a dataset shows objects that stand still to each other"
-            )
-        if unit := re.fullmatch(rf"((?:{'|'.join(_BODIES)})_v?[xyz])(?:_(\w+))?", name):
+        if unit := re.fullmatch(rf"((?:{'|'.join(_BODIES)}|target\d+)_v?[xyz])(?:_(\w+))?", name):
             units = "m or km" if "_v" not in unit[1] else "m_s or km_s"
             raise InputError(f"{name}: expected a unit of {units} at its end, found {unit[2] or 'none'}")
         if _OURS.match(name) or "_from_world" in name:
-            raise InputError(f"{name}: expected a column that is known, found this{did_you_mean(name, NAMES)}")
+            raise InputError(f"{name}: expected a column that is known, found this{did_you_mean(name, names)}")
         others.append(name)
     if others:
         _log.info("%s: columns that mean nothing here: %s", path, ", ".join(others)[:200])
     first_column: dict[str, str] = {}
-    for names, what in GROUPS.items():
-        present = [name for name in names if name in columns]
-        if present and len(present) < len(names):
-            missing = next(name for name in names if name not in columns)
+    for group, what in groups.items():
+        present = [name for name in group if name in columns]
+        if present and len(present) < len(group):
+            missing = next(name for name in group if name not in columns)
             raise InputError(f"{missing}: expected a column beside {present[0]}, found none")
         meaning = f"attitude of the {what.replace('world', '').replace('_from_', '')}" if "_from_" in what else what
         if present and meaning in first_column:

@@ -12,6 +12,7 @@ from spacesim.data.files import write_json
 from spacesim.data.images.tone import tone_and_exposure
 from spacesim.data.records import Dataset
 from spacesim.data.store import write_points
+from spacesim.data.transforms import check_still
 from spacesim.learning.cameras import farthest_camera, focus_point
 from spacesim.learning.folder import TrainingProgress, check_folder, describe_data, is_finished, open_folder
 from spacesim.splat.run import Run, load_run, read_config
@@ -39,7 +40,7 @@ def train(
     Ctrl-C on the command line leaves a checkpoint of the step that it came in. Raises InputError where `out` holds a
     run and `resume` is not asked for, or one of another configuration, or where another training is at work in it.
     """
-    out, config = Path(out), _with_tone_and_exposure(config, dataset)
+    out, config = Path(out), _with_tone_and_exposure(config, check_still(dataset))
     described = {**config.to_json(), "data": describe_data(dataset)}
     if is_finished(out, described, resume, read_config):
         return load_run(out)

@@ -133,6 +133,26 @@ def test_quaternions_in_every_way_that_they_are_written(tmp_path):
     np.testing.assert_allclose(again.camera_turn.at(again.times())[0], turn, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("write", "meta", "told"),
+    [
+        (oem, {}, None),
+        (oem, {"INTERPOLATION": "HERMITE", "INTERPOLATION_DEGREE": "3"}, None),
+        (oem, {"INTERPOLATION": "Lagrange", "INTERPOLATION_DEGREE": "7"}, "LAGRANGE of degree 7 .* cubic by their"),
+        (oem, {"INTERPOLATION": "HERMITE", "INTERPOLATION_DEGREE": "5"}, "HERMITE of degree 5 .* cubic by their"),
+        (aem, {"INTERPOLATION_METHOD": "LINEAR", "INTERPOLATION_DEGREE": "1"}, None),
+        (aem, {"INTERPOLATION_METHOD": "HERMITE", "INTERPOLATION_DEGREE": "7"}, "HERMITE of degree 7 .* slerped"),
+    ],
+)
+def test_another_interpolation_than_ours_is_told_once(tmp_path, caplog, write, meta, told):
+    one, other = write(tmp_path / "1", TIMES, **meta), write(tmp_path / "2", range(540, 601, 60), **meta)
+    (tmp_path / "two").write_text(one.read_text() + other.read_text().partition("\n\n")[2])
+    read_message(tmp_path / "two")
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) == (told is not None)
+    assert told is None or re.search(f"^{tmp_path}/two: asks for {told}", lines[0])
+
+
 def test_segments_that_meet(tmp_path):
     one, two = oem(tmp_path / "1", range(0, 121, 60)), oem(tmp_path / "2", range(120, 301, 60))
     both = tmp_path / "both.oem"

@@ -288,6 +288,47 @@ def test_a_dataset_along_a_table(table, tmp_path):
         generate(read_scene(scene, **SMALL, test_views=1), tmp_path / "a", resume=True)
 
 
+PLACES = [(9, 0, 0), (0, 9, 0), (-9, 0, 0), (0, -9, 0)]  # the Sun in +x: phase angles 0, 90, 180, 90
+
+
+def circle(path, earth=None):
+    names = ["camera_x_m", "camera_y_m", "camera_z_m", "sun_x", "sun_y", "sun_z"]
+    names += [f"earth_{axis}_km" for axis in "xyz"] if earth else []
+    return write(path, [[*place, 1, 0, 0, *(earth[k] if earth else ())] for k, place in enumerate(PLACES)], names)
+
+
+@pytest.mark.parametrize(
+    ("limits", "kept"),
+    [({}, [0, 1, 2, 3]), ({"max_phase_deg": 91}, [0, 1, 3]), ({"min_phase_deg": 89}, [1, 2, 3])],
+)
+def test_frames_beyond_a_phase_angle_are_left_out(tmp_path, limits, kept, caplog):
+    path = circle(tmp_path / "p.csv")
+    train, _ = plan(FileRig(path=str(path), **limits), TARGET, CAMERA, 0)
+    assert [PLACES.index(tuple(view.camera.position.round(6))) for view in train] == kept
+    told = ["trajectory: 1 of 4 frames are left out, by their phase angle or as the Earth hides the Sun"]
+    assert [record.getMessage() for record in caplog.records] == (told if limits else [])
+
+
+def test_frames_whose_sun_the_earth_hides_are_left_out(tmp_path, caplog):
+    aside, before = (0, 0, -7000), (7000, 10, 0)
+    path = circle(tmp_path / "p.csv", [aside, before, aside, aside])
+    train, test = plan(FileRig(path=str(path), max_phase_deg=180, test_views=1), TARGET, CAMERA, 0)
+    assert len(train) + len(test) == 3
+    assert not any(np.allclose(view.camera.position, PLACES[1]) for view in train + test)
+    hidden = replace(TARGET, earth=EarthConfig(azimuth_deg=0, elevation_deg=0))
+    with pytest.raises(InputError, match=r"max_phase_deg: expected a training frame in range .*, found none of 4"):
+        plan(FileRig(path=str(circle(tmp_path / "q.csv")), max_phase_deg=120), hidden, CAMERA, 0)
+    with pytest.raises(InputError, match="min_phase_deg: expected an angle from 0 to 29 degrees, found 40"):
+        FileRig(path="p.csv", min_phase_deg=40, max_phase_deg=30)
+
+
+def test_dark_frames_of_a_trajectory_are_counted_with_what_leaves_them_out(tmp_path, caplog):
+    generate(read_scene("boxsat", **SMALL, trajectory=circle(tmp_path / "p.csv")), tmp_path / "data")
+    told = [record.getMessage() for record in caplog.records if "in the dark" in record.getMessage()]
+    assert len(told) == 1
+    assert told[0].endswith("max_phase_deg = 90 in [rig] leaves them out")
+
+
 def test_an_exposure_for_each_frame(tmp_path):
     names = ["camera_x_m", "camera_y_m", "camera_z_m", "exposure"]
     path = write(tmp_path / "p.csv", [[9, 2, 1, x] for x in (0.0023, 0.0046, 0.00115)], names)

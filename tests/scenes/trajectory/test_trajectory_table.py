@@ -96,7 +96,7 @@ def changed(**columns):
         (changed(target_x_ft=[0, 0, 0]), "target_x_ft: expected a unit of m or km at its end, found ft"),
         (changed(camera_vx_m=[0, 0, 0]), "camera_vx_m: expected a unit of m_s or km_s at its end, found m"),
         (changed(target_x=[0, 0, 0]), "target_x: expected a unit of m or km at its end, found none"),
-        (changed(target2_x_m=[0, 0, 0]), "target2_x_m: expected one target, found another"),
+        (changed(target2_x_m=[0, 0, 0]), "target2_y_m: expected a column beside target2_x_m"),
         (changed(sun_azimuth=[0, 0, 0]), "sun_azimuth: expected a column that is known"),
         (changed(camera_from_world_q0=[0, 0, 0]), "camera_from_world_q0: .*did you mean camera_from_world_q[wxyz]"),
         (
