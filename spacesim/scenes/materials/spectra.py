@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from unittest.mock import Mock
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -136,6 +135,8 @@ def _sunlight(low: float, high: float) -> tuple[Array, Array]:
 def _colour_science() -> ModuleType:
     """colour-science, without its warning that Matplotlib is missing and without the mocks of Matplotlib that it
     would leave behind for everyone else."""
+    from unittest.mock import Mock  # 0.1 s
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import colour

@@ -4,8 +4,6 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
-from scipy.spatial.transform import Rotation, Slerp
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
@@ -44,6 +42,8 @@ class Track:
         if len(self.times) == 1:
             return np.repeat(self.values, len(times), axis=0)
         if self.rates is not None:
+            from scipy.interpolate import CubicHermiteSpline  # 0.2 s, that most commands need not wait for
+
             spline: Array = CubicHermiteSpline(self.times, self.values, self.rates)(times)
             return spline
         return np.stack([np.interp(times, self.times, column) for column in self.values.T], axis=-1)
@@ -75,6 +75,8 @@ class Attitude:
     def at(self, times: Array) -> Array:
         """[M, 3, 3] rotations at `times` [M]. Raises InputError for a time before the first or after the last."""
         check_covered(self, times)
+        from scipy.spatial.transform import Rotation, Slerp
+
         rotations = Rotation.from_quat(self.quaternions[:, [1, 2, 3, 0]])
         if len(self.times) == 1:
             return np.repeat(rotations.as_matrix(), len(times), axis=0)

@@ -74,10 +74,12 @@ def test_a_sheet_and_a_ball_have_keypoints_too():
         (trimesh.creation.box((1, 2, 3)), 3, 0),
         (trimesh.creation.cylinder(1, 3, sections=64), 1, 1),
         (trimesh.creation.cone(1, 3, sections=64), 0, 1),
-        (trimesh.util.concatenate([part.mesh for part in spacecraft("boxsat").parts]), 0, 0),
+        ("boxsat", 0, 0),
     ],
 )
 def test_symmetries(mesh, discrete, continuous):
+    if isinstance(mesh, str):
+        mesh = trimesh.util.concatenate([part.mesh for part in spacecraft(mesh).parts])
     mesh = mesh.copy()
     mesh.apply_translation([3, 0, 1])
     matrices, axes = find_symmetries(mesh.vertices, mesh.faces)
