@@ -65,9 +65,8 @@ class PlannedView:
     exposure: float | None = None  #: display value of a radiance of 1 W m^-2 sr^-1
     earth: Array | None = None  #: [3] from the world's origin to the Earth's centre, metres
     sky_from_world: Array | None = None  #: [3, 3] to the axes in which stars stand still; None: the world's
-    objects: Mapping[int, Array] = field(
-        default_factory=dict
-    )  #: [4, 4] rigid world_from_object of those moved, by number
+    #: [4, 4] rigid world_from_object of those moved, by number
+    objects: Mapping[int, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
