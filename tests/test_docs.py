@@ -167,7 +167,7 @@ def test_the_reference_has_what_public_names_take_and_give():
     named = {cls.__name__: cls for cls in generator().named_by(ss)}
     assert set(named) == {
         *("ComposedModel", "GaussianComposition", "Keyframe", "LightModel", "ModelViews", "Networks", "Orbit"),
-        *("PlannedView", "Prediction", "Projection", "Rig", "SceneBox", "SceneFrame", "TargetSphere"),
+        *("PlannedView", "Prediction", "Predictor", "Projection", "Rig", "SceneBox", "SceneFrame", "TargetSphere"),
     }
     for name, cls in named.items():
         entry = re.search(
