@@ -10,8 +10,23 @@ from spacesim.data.errors import InputError
 
 SUMMARY, NEEDS_BACKEND = "path-trace a dataset with its truth", False
 _SCENE_OPTIONS = (
-    *("suns", "views", "test_suns", "test_views", "known_test_views", "shared_test_views", "sun", "distance"),
-    *("resolution", "exposure", "spp", "test_spp", "seed", "units", "up", "background", "trajectory"),
+    "suns",
+    "views",
+    "test_suns",
+    "test_views",
+    "known_test_views",
+    "shared_test_views",
+    "sun",
+    "distance",
+    "resolution",
+    "exposure",
+    "spp",
+    "test_spp",
+    "seed",
+    "units",
+    "up",
+    "background",
+    "trajectory",
 )
 
 

@@ -169,8 +169,14 @@ class TrainingLoop(ABC):
         left.add(self.iteration, time.perf_counter(), count)
         counted = {} if count is None else {"gaussians": count}
         self.history.append({"iteration": self.iteration, "loss": loss, **counted})
-        forecast = left.seconds(), left.lower_bound
-        return TrainingProgress(self.iteration, self.config.iterations, loss, count, *forecast)
+        return TrainingProgress(
+            self.iteration,
+            self.config.iterations,
+            loss,
+            gaussian_count=count,
+            seconds_left=left.seconds(),
+            lower_bound=left.lower_bound,
+        )
 
     def _check(self, loss: float) -> None:
         if not math.isfinite(loss):

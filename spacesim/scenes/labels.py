@@ -46,8 +46,8 @@ class Labeller:
     def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
         """All fields of Truth but radiance and alpha."""
         disc = self._directions.few(sun, self._sun.limb)
-        inputs = KernelCamera.of(camera, self._units), kernel_input(sun.direction), disc
-        numbers, ids, points = self._centres(self._scene, self._parts, *inputs)
+        seen = KernelCamera.of(camera, self._units)
+        numbers, ids, points = self._centres(self._scene, self._parts, seen, kernel_input(sun.direction), disc)
         labels = _images(numbers, ids, camera)
         self._refine(points, sun, labels)
         return labels
@@ -103,8 +103,8 @@ class Labeller:
             capacity = min(most, max(1024, 1 << (len(piece) - 1).bit_length()))
             padded = np.zeros(capacity, np.uint32)
             padded[: len(piece)] = piece
-            inputs = disc, points, uint(padded), dr.opaque(uint, len(piece))
-            values = self._penumbrae(self._scene, self._parts, *inputs, capacity)
+            count = dr.opaque(uint, len(piece))
+            values = self._penumbrae(self._scene, self._parts, disc, points, uint(padded), count, capacity)
             pieces.append(values.numpy().reshape(2, -1)[:, : len(piece)])
         visibility, shadow = np.concatenate(pieces, axis=1)
         return visibility, shadow.astype(np.uint8)

@@ -67,9 +67,18 @@ class KernelCamera:
         origin = units.points(position)
         near = max(0.0, -float(origin @ axes[2]) - 1.1 * RADIUS)
         right, down, forward, start = (kernel_input(x) for x in (*axes, origin + near * axes[2]))
-        lengths = kernel_input(near), kernel_input(1 / units.scale)
-        focal, centre = ([kernel_input(x) for x in pair] for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
-        return cls(camera.width, camera.height, right, down, forward, start, *lengths, focal, centre)
+        return cls(
+            width=camera.width,
+            height=camera.height,
+            right=right,
+            down=down,
+            forward=forward,
+            start=start,
+            near=kernel_input(near),
+            metre=kernel_input(1 / units.scale),
+            focal=[kernel_input(camera.fx), kernel_input(camera.fy)],
+            centre=[kernel_input(camera.cx), kernel_input(camera.cy)],
+        )
 
     def rays(
         self, pixel: UInt32, offset: mt.Point2f, distortion: Sequence[float]

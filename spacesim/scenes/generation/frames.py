@@ -138,8 +138,9 @@ class FrameMaker:
                     truth = self._renderer_of(spec).render(spec.camera, spec.sun, seed, spec.spp, spec.earth)
                     truth = dim(truth, spec.sunlight)
                     if self._background is not None:
-                        where = spec.earth, spec.sky_from_world
-                        behind = self._background.radiance(spec.camera, spec.sun, spec.index, *where)
+                        behind = self._background.radiance(
+                            spec.camera, spec.sun, spec.index, spec.earth, spec.sky_from_world
+                        )
                         truth = replace(truth, radiance_background=behind)
                     waiting.append(pool.submit(self._write, spec, truth))
                 while waiting:

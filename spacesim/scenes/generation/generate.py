@@ -72,11 +72,18 @@ def generate(
             _warn_of_coarse_depth(writer.depth_unit, sweep.scene)
             _make_missing(writer, sweep.specs, lambda left: _make_frames(make, job, left, sweep.renderer), progress)
         points, colors = sample_surface_points(sweep.renderer, config.quality.points, config.seed)
-        listed = _view_records(sweep.train), _view_records(sweep.test)
         sunlit = sunlit_fractions(job.root, [spec.name for spec in sweep.specs])
         more = {name: {**keys, "sunlit_fraction": sunlit[name]} for name, keys in sweep.keys.items()}
-        lens, mesh = config.camera.distortion, sweep.scene.mesh
-        dataset = writer.finish(*listed, points, colors, mesh, lens, lambda d: write_overview(d.root, d), more)
+        dataset = writer.finish(
+            _view_records(sweep.train),
+            _view_records(sweep.test),
+            points,
+            colors,
+            sweep.scene.mesh,
+            distortion=config.camera.distortion,
+            overview=lambda d: write_overview(d.root, d),
+            more=more,
+        )
         free = isinstance(config.rig, RandomRig | TrajectoryRig) and config.rig.max_phase_deg is None
         kept = isinstance(config.rig, RandomRig)
         what = "keeps the Sun on the camera's side, clear of the Earth" if kept else "in [rig] leaves them out"

@@ -231,7 +231,7 @@ class LightModel:
         """From the gradients of the dimmed colours (3 arrays [N]) and, where visibility is seen on its own, of the
         visibility [N]. by_sun: also the gradient of the Sun's direction"""
         grad_visibilities = [] if grad_visibility is None else [grad_visibility]
-        arguments = (
+        grad_features, grad_weights, grad_occlusion, by_encoding, grad_sun = kernels.adjoint(
             self.config,
             self.weights,
             shading.inputs,
@@ -241,7 +241,6 @@ class LightModel:
             grad_visibilities,
             by_sun,
         )
-        grad_features, grad_weights, grad_occlusion, by_encoding, grad_sun = kernels.adjoint(*arguments)
         grad_geometry = shading.shadows.adjoint(grad_occlusion[0]) if grad_occlusion and shading.shadows else []
         by_embeddings = [self._embedding_gradient(gradient, shading.picture) for gradient in by_encoding]
         return LightGradients(grad_features, grad_weights, by_embeddings, grad_geometry, grad_sun)

@@ -264,9 +264,14 @@ def _field_inputs(inputs: ShadingInputs) -> FieldInputs:
 
 
 def _scatterers(config: LightConfig, inputs: ShadingInputs) -> Scatterers:
-    rows = inputs.features, config.field.features, config.albedos
     return Scatterers(
-        *rows, inputs.means, inputs.rotations_and_scales[1], inputs.logits, towards_sun(inputs.sun.light_axes)
+        inputs.features,
+        normals=config.field.features,
+        albedos=config.albedos,
+        means=inputs.means,
+        log_scales=inputs.rotations_and_scales[1],
+        logit_opacities=inputs.logits,
+        sun=towards_sun(inputs.sun.light_axes),
     )
 
 

@@ -255,8 +255,12 @@ def _cut(light: np.ndarray, alpha: np.ndarray | None, dim: float) -> _Cut | None
     weight = mask.astype(np.float32) if alpha is None else alpha * mask
     rows, columns = np.indices(mask.shape) + 0.5
     area = float(weight.sum())
-    middle = float((weight * columns).sum() / area), float((weight * rows).sum() / area)
-    return _Cut(*middle, float(np.sqrt(area / np.pi)), np.stack([weight, bright * mask], axis=-1))
+    return _Cut(
+        column=float((weight * columns).sum() / area),
+        row=float((weight * rows).sum() / area),
+        radius=float(np.sqrt(area / np.pi)),
+        planes=np.stack([weight, bright * mask], axis=-1),
+    )
 
 
 def _without_specks(mask: np.ndarray) -> np.ndarray:

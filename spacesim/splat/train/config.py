@@ -37,8 +37,13 @@ MAX_LEARNING_RATE, MAX_LOSS_WEIGHT = 1e3, 1e6  #: of learning rates and of weigh
 MAX_BOX = 1e6  #: of `init_box`
 MOST_DOWNSCALES = 4  #: halvings of a picture: a pixel then is the mean of 256
 WEIGHTS = (
-    *("visibility_weight", "isotropy_weight", "opacity_weight", "scale_weight", "flatten_weight"),
-    *("depth_weight", "normal_weight"),
+    "visibility_weight",
+    "isotropy_weight",
+    "opacity_weight",
+    "scale_weight",
+    "flatten_weight",
+    "depth_weight",
+    "normal_weight",
 )
 
 

@@ -63,8 +63,16 @@ class Trainer(TrainingLoop):
         self.scene_scale = scene_scale(dataset)
         features = config.light.features if config.light else 0
         count = min(config.init_count, config.refinement.max_gaussians)
-        start = count, config.sh_degree, config.seed, features, config.init_box, config.splatfacto_start
-        self.gaussians = initial_gaussians(dataset, config.init, *start)
+        self.gaussians = initial_gaussians(
+            dataset,
+            config.init,
+            count=count,
+            sh_degree=config.sh_degree,
+            seed=config.seed,
+            features=features,
+            box=config.init_box,
+            like_splatfacto=config.splatfacto_start,
+        )
         self.optimizer = Adam(self.gaussians.rows())
         self.light = self._initial_light(dataset)
         self.light_optimizer = NetworkAdam(_learned(self.light))

@@ -317,10 +317,11 @@ class _Occlusion(dr.CustomOp):
         # Sizes in arrays: dr.freeze (1.5) takes one number for another where both have occurred among the arguments.
         self.size = dr.opaque(ad.UInt32, image_size[0]), dr.opaque(ad.UInt32, image_size[1])
         self.count = dr.width(blockers.x)
-        splats = dr.detach(blockers), dr.detach(receivers)
         count = dr.opaque(ad.UInt32, self.count)
         self.capacity = round_capacity(self.count)
-        self.events, boxes = _events(*splats, blocker_boxes, receiver_boxes, count, self.capacity)
+        self.events, boxes = _events(
+            dr.detach(blockers), dr.detach(receivers), blocker_boxes, receiver_boxes, count, self.capacity
+        )
         self.lists = bin_splats(self.events, boxes, *image_size)
         if self.lists.capacity == 0:
             return dr.opaque(ad.Float, 0, self.count)

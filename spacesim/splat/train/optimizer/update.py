@@ -64,14 +64,15 @@ class Update:
         Harmonics of no degree up to `degree` have never had a gradient: they stay as they are.
         """
         assert optimizer.count == gaussians.count, "moments of other Gaussians"
-        how = degree, factors, penalties, self.antialiased, self.scale
         rows = [ad.Float(row) for row in gaussians.rows()]  # a row taken from an array keeps all of that array
         means, packed = rows[:3], (optimizer.arrays[0], optimizer.layouts[0])
         cameras = [view.camera for view in views]
         grad_features = [view.grad_features for view in views if view.grad_features is not None]
         of_own = [_without_features(view) for view in views]
         views.clear()
-        grad_sums, *moved = self._own(rows, optimizer.slices[0].stop, packed, of_own, *how)
+        grad_sums, *moved = self._own(
+            rows, optimizer.slices[0].stop, packed, of_own, degree, factors, penalties, self.antialiased, self.scale
+        )
         del packed, of_own
         _replace(gaussians, optimizer, rows, 0, *moved)
         if gaussians.features is not None:

@@ -35,8 +35,14 @@ class LearnedPictures:
         if config.refine_poses:
             known = config.init in ("points", "mesh") or bool(dataset.ply_file_path or dataset.mesh_path)
             anchor = known and config.init != "random" and config.warm_start is None
-            how = rates.poses, steps, config.antialiased, anchor, config.views_per_step
-            self.poses = PoseRefinement(dataset, *how)
+            self.poses = PoseRefinement(
+                dataset,
+                rate=rates.poses,
+                iterations=steps,
+                antialiased=config.antialiased,
+                anchor=anchor,
+                views=config.views_per_step,
+            )
             if poses is not None:
                 self.poses.stay(poses)
         self.exposures = Exposures(len(dataset.train), rates.gains, steps) if config.exposure_per_picture else None
