@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, direction_from_angles, look_at, normalize
 from spacesim.data.records import Camera, Sun
+from spacesim.learning.rendering import Rendering
 from spacesim.splat.compose.pose import Pose, interpolate_pose, interpolate_rotation, slerp
 from spacesim.splat.compose.scene import GaussianComposition
 
@@ -128,6 +129,21 @@ class PosedScene:
             raise InputError(f"{source}: expected a camera, found none; add a table [camera]")
         view = self.orbit.view(share) if self.orbit else self._view(self.camera, time)
         return SceneFrame(time, self.posed_at(time), view.of(self.camera) if view else self.camera, self.sun_at(time))
+
+    def render(
+        self,
+        camera: Camera | None = None,
+        sun: Sun | Sequence[float] | None = None,
+        exposure: float | None = None,
+        time: float = 0.0,
+    ) -> Rendering:
+        """What a camera sees of the scene at a time, seconds: as `Run.render`. camera, sun: by default the scene's own
+        then. Raises InputError where one is needed and nobody has said which."""
+        camera = self.at(time).camera if camera is None else camera
+        direction, composition = Sun.of(sun) or self.sun_at(time), self.posed_at(time)
+        if direction is None and composition.relightable:
+            raise InputError(f"sun: expected its direction for {composition.path or 'the scene'}, found none")
+        return Rendering(composition, camera, direction, exposure)
 
     def sun_at(self, time: float) -> Sun | None:
         """The Sun at a time, seconds; None where nobody has said."""

@@ -205,6 +205,22 @@ def whole_scene(tmp_path: Path) -> PosedScene:
     return PosedScene(composition, Sun.from_angles(41.5, -12.25), camera, keys, None, 5, 12.5)
 
 
+def test_a_scene_is_seen_as_arrays(tmp_path):
+    scene = whole_scene(tmp_path)
+    view, there = scene.render(time=0.2), scene.at(0.2)
+    drawn = there.composition.predict(there.camera, there.sun, normals=True)
+    for name in ("rgb", "alpha", "depth", "visibility", "normal"):
+        np.testing.assert_array_equal(getattr(view, name), getattr(drawn, name))
+    other = scene.render(there.camera, sun=(10, 80), time=0.2)
+    assert not np.array_equal(other.rgb, view.rgb)
+    np.testing.assert_array_equal(other.alpha, view.alpha)
+    dark = PosedScene(scene.composition, None, scene.camera)
+    with pytest.raises(InputError, match=r"sun: expected its direction for .*, found none"):
+        dark.render()
+    with pytest.raises(InputError, match="expected a camera, found none"):
+        PosedScene(scene.composition).render()
+
+
 def test_a_saved_scene_gives_the_same_pictures_to_the_bit(tmp_path):
     scene = whole_scene(tmp_path)
     save_scene(tmp_path / "saved.toml", scene)
