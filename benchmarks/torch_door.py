@@ -10,7 +10,6 @@ tests/test_torch.py holds ours against.
 """
 
 import json
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -65,13 +64,17 @@ def main() -> None:
         weights = np.random.default_rng(1).normal(size=(side, side, 4)).astype(np.float32)
         planes = [upload(plane) for plane in weights.reshape(-1, 4).T]
         given = [torch.tensor(part, device=device)[None] for part in (weights[..., :3].copy(), weights[..., 3:].copy())]
-        ours = _timed(partial(_own, leaves, camera, planes), options.repeats, torch, device)
-        door = _timed(partial(_through, torch, rasterization, leaves, camera, given), options.repeats, torch, device)
-        row: common.Row = {"Gaussians": count, "pixels": side, "own, ms": ours.median, "torch, ms": door.median}
-        row["torch / own"] = door.median / ours.median
+        works = {
+            "own": partial(_own, leaves, camera, planes),
+            "torch": partial(_through, torch, rasterization, leaves, camera, given),
+        }
         if peer is not None:
-            theirs = _timed(partial(_through, torch, peer, leaves, camera, given), options.repeats, torch, device)
-            row |= {"gsplat, ms": theirs.median, "torch / gsplat": door.median / theirs.median}
+            works["gsplat"] = partial(_through, torch, peer, leaves, camera, given)
+        times = {name: timing.median for name, timing in common.interleaved(works, options.repeats).items()}
+        row: common.Row = {"Gaussians": count, "pixels": side, **{f"{name}, ms": time for name, time in times.items()}}
+        row["torch / own"] = times["torch"] / times["own"]
+        if peer is not None:
+            row["torch / gsplat"] = times["torch"] / times["gsplat"]
             for mode in MODES:
                 different = _differences(torch, rasterization, peer, leaves, camera, mode)
                 differences.append({"Gaussians": count, **mode, **different})
@@ -137,18 +140,6 @@ def _through(torch: Any, rasterization: Any, leaves: dict[str, Any], camera: Cam
         **leaves, width=camera.width, height=camera.height, sh_degree=3, packed=False, render_mode="RGB"
     )
     torch.autograd.grad([picture, alpha], [leaves[name] for name in NAMES], given)
-
-
-def _timed(work: Any, repeats: int, torch: Any, device: str) -> common.Timing:
-    seconds = []
-    for number in range(common.WARM_UP + repeats):
-        start = time.perf_counter()
-        work()
-        if device == "cuda":
-            torch.cuda.synchronize()
-        if number >= common.WARM_UP:
-            seconds.append(time.perf_counter() - start)
-    return common.Timing.of(seconds)
 
 
 def _differences(
