@@ -91,8 +91,7 @@ class Recorded(Generic[P, R]):
 
         # who looks around for hours makes more recordings than are kept, and need not hear of it
         self._frozen = dr.freeze(replay, limit=limit, warn_after=2**31 - 1)
-        self._width, self._has_gradients = dr.width, dr.grad_enabled
-        self._flag, self._scope = dr.flag, dr.JitFlag.FreezingScope
+        self._has_gradients, self._flag, self._scope = dr.grad_enabled, dr.flag, dr.JitFlag.FreezingScope
 
     def __call__(self, *arguments: P.args, **named: P.kwargs) -> R:
         if self._flag(self._scope):
@@ -101,11 +100,7 @@ class Recorded(Generic[P, R]):
         kind = _split(arguments, arrays)
         if named:
             kind = kind, _split(named, arrays)
-        elements = self._elements
-        if elements is elements_of_first:
-            about_one = not arrays or self._width(arrays[0]) == 1
-        else:
-            about_one = elements is not None and elements(arrays, *arguments, **named) == 1
+        about_one = self._elements is not None and self._elements(arrays, *arguments, **named) == 1
         if about_one or self._has_gradients(arrays):
             return self.traced(*arguments, **named)
         name, now = self._names[kind], self._now

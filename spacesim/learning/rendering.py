@@ -1,5 +1,6 @@
 """A view of a run as numpy arrays, for who asks `Run.render`."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +21,15 @@ class CanPredict(Protocol):
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> Prediction:
         """Render one view; see `spacesim.splat.run.Predictor`."""
+
+
+def checked_sun(sun: Sun | Sequence[float] | None, needed: bool, whose: str) -> Sun | None:
+    """The Sun that somebody has told, as `Sun.of` takes it. needed: by what is drawn, which `whose` names. Raises
+    InputError where it is needed and nobody has told."""
+    direction = Sun.of(sun)
+    if direction is None and needed:
+        raise InputError(f"sun: expected its direction for {whose}, found none")
+    return direction
 
 
 class Rendering:

@@ -24,7 +24,7 @@ from spacesim.data.structure import read_record
 from spacesim.learning.folder import finished_model, read_described
 from spacesim.learning.prediction import Prediction, check_picture
 from spacesim.learning.record import TrainingRecord
-from spacesim.learning.rendering import Rendering
+from spacesim.learning.rendering import Rendering, checked_sun
 from spacesim.learning.tensors import read_tensors
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.draw import draw
@@ -116,8 +116,7 @@ class NerfRun:
         return draw(self.networks, self.parameters, self.filled, self.box, camera, towards, normals)
 
     def _check(self, sun: Sun | None, exposure: float | None) -> None:
-        if sun is None and self.relightable:
-            raise InputError(f"sun: expected its direction for a run of {self.config['method']}, found none")
+        checked_sun(sun, self.relightable, f"a run of {self.config['method']}")
         if exposure is not None:
             raise InputError(f"exposure: expected a run trained in linear light (light.linear), found {self.path}")
 

@@ -24,7 +24,7 @@ from spacesim.data.structure import read_record
 from spacesim.learning.folder import finished_model, read_described
 from spacesim.learning.prediction import Prediction, check_picture
 from spacesim.learning.record import TrainingRecord
-from spacesim.learning.rendering import Rendering
+from spacesim.learning.rendering import Rendering, checked_sun
 from spacesim.splat.light.config import MAX_EXPOSURE
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.gaussians import Gaussians
@@ -199,9 +199,7 @@ class Run:
         knows the light of its pictures alone;  exposure: EV, of a run whose colours are linear
         Raises InputError where a run needs the Sun and none is told.
         """
-        direction = Sun.of(sun)
-        if direction is None and self.relightable:
-            raise InputError(f"sun: expected its direction for a run of {self.config['method']}, found none")
+        direction = checked_sun(sun, self.relightable, f"a run of {self.config['method']}")
         return Rendering(self, camera, direction, exposure)
 
     def with_embedding(self, embedding: np.ndarray) -> "Run":

@@ -310,7 +310,10 @@ def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedVi
 def depth_unit(scene: Scene, named: NamedViews) -> float:
     """Metres a step of depth pictures, with which 16 bits reach all that the views may see."""
     still, farthest = _corners(scene), 0.0
-    alone = [_corners(replace(scene, objects=(replace(item, world_from_object=np.eye(4)),))) for item in scene.objects]
+    alone: list[Array] = []
+    if any(view.objects for _, view in named):
+        own = [replace(item, world_from_object=np.eye(4)) for item in scene.objects]
+        alone = [_corners(replace(scene, objects=(item,))) for item in own]
     for _, view in named:
         points, forward = still, view.camera.world_from_camera[:3, 2]
         if view.objects:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, direction_from_angles, look_at, normalize
 from spacesim.data.records import Camera, Sun
-from spacesim.learning.rendering import Rendering
+from spacesim.learning.rendering import Rendering, checked_sun
 from spacesim.splat.compose.pose import Pose, interpolate_pose, interpolate_rotation, slerp
 from spacesim.splat.compose.scene import GaussianComposition
 
@@ -140,9 +140,9 @@ class PosedScene:
         """What a camera sees of the scene at a time, seconds: as `Run.render`. camera, sun: by default the scene's own
         then. Raises InputError where one is needed and nobody has said which."""
         camera = self.at(time).camera if camera is None else camera
-        direction, composition = Sun.of(sun) or self.sun_at(time), self.posed_at(time)
-        if direction is None and composition.relightable:
-            raise InputError(f"sun: expected its direction for {composition.path or 'the scene'}, found none")
+        composition = self.posed_at(time)
+        whose = str(composition.path or "the scene")
+        direction = checked_sun(self.sun_at(time) if sun is None else sun, composition.relightable, whose)
         return Rendering(composition, camera, direction, exposure)
 
     def sun_at(self, time: float) -> Sun | None:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Image, Sun
+from spacesim.learning.rendering import checked_sun
 from spacesim.splat.pose.covariance import uncertainty
 from spacesim.splat.pose.motion import Pivot
 from spacesim.splat.pose.picture import SunlitRun, background_of, checked_picture, first_gain
@@ -90,13 +91,11 @@ def refine_pose(
     told, and where the camera does not see the model.
     """
     run = check_gaussians(run)
-    checked_sun = Sun.of(sun)
-    if checked_sun is None and run.relightable:
-        raise InputError(f"sun: expected its direction for a run of {run.config['method']}, found none")
+    direction = checked_sun(sun, run.relightable, f"a run of {run.config['method']}")
     target, counts = checked_picture(image, mask, camera)
     _check_numbers(within, starts)
     check_picture(camera)
-    drawing = SunlitRun.of(run, checked_sun)
+    drawing = SunlitRun.of(run, direction)
     pivot = Pivot.of(drawing, camera, within)
     background = background_of(target, counts, pivot.alpha)
 

@@ -15,6 +15,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, fibonacci_sphere, look_at
 from spacesim.data.images import luminance
 from spacesim.data.records import Camera, Image, Sun
+from spacesim.learning.rendering import checked_sun
 from spacesim.splat.pose.motion import twist_between
 from spacesim.splat.pose.picture import GAINS, SunlitRun, checked_picture, reduced
 from spacesim.splat.pose.refine import RefinedPose, refine_pose
@@ -147,9 +148,7 @@ def find_pose(
     Raises InputError as `refine_pose` does, and where nothing in the picture is brighter than its sky.
     """
     run = check_gaussians(run)
-    checked_sun = Sun.of(sun)
-    if checked_sun is None and run.relightable:
-        raise InputError(f"sun: expected its direction for a run of {run.config['method']}, found none")
+    direction = checked_sun(sun, run.relightable, f"a run of {run.config['method']}")
     check_picture(camera)
     target, counts = checked_picture(image, mask, camera)
     factor = max(1, max(camera.width, camera.height) // COARSE)
@@ -160,8 +159,8 @@ def find_pose(
     cut = _cut(np.abs(small[..., :3] - sky) * known, small[..., 3] if has_alpha else None, dim)
     if cut is None:
         raise InputError("image: expected an object that is brighter than the sky, found none")
-    views = views or ModelViews.of(run, checked_sun, has_alpha)
-    drawing = SunlitRun.of(run, checked_sun)
+    views = views or ModelViews.of(run, direction, has_alpha)
+    drawing = SunlitRun.of(run, direction)
     starts = [_rank(drawing, pose, small, known, sky) for pose in views.poses(cut, coarse, CANDIDATES)]
     starts.sort(key=lambda pair: pair[0])
     tried: list[tuple[float, RefinedPose]] = []
@@ -171,9 +170,9 @@ def find_pose(
             break
         try:
             placed = replace(camera, world_from_camera=start.world_from_camera)
-            refined = refine_pose(run, image, placed, checked_sun, mask, WITHIN, 2, seed)
+            refined = refine_pose(run, image, placed, direction, mask, WITHIN, 2, seed)
             if not refined.converged:  # it may have gone as far as it may: on from there
-                refined = refine_pose(run, image, refined.camera, checked_sun, mask, WITHIN, 1, seed)
+                refined = refine_pose(run, image, refined.camera, direction, mask, WITHIN, 1, seed)
         except InputError as error:  # of a pose from which nothing is seen
             failure = error
             continue
