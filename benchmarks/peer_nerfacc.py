@@ -114,6 +114,9 @@ class Training:
         rays, low, high = self.estimator.sampling(
             origins, directions, sigma_fn=density, render_step_size=size, stratified=training
         )
+        if len(low) == 0:  # tiny-cuda-nn takes no empty batch
+            nothing = torch.zeros(len(origins), 1, device=DEVICE)
+            return background.expand(len(origins), 3), nothing, nothing, 0
         parts = nerfacc.rendering(
             low, high, rays, n_rays=len(origins), rgb_sigma_fn=density_and_color, render_bkgd=background
         )
