@@ -28,7 +28,7 @@ from spacesim.learning.rendering import Rendering, checked_sun
 from spacesim.splat.light.config import MAX_EXPOSURE
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.output import RenderOutput
+from spacesim.splat.raster.output import RenderOutput, over_alpha, planes_image
 from spacesim.splat.raster.project import Projection
 from spacesim.splat.raster.render import render
 from spacesim.splat.raster.supersample import render_supersampled
@@ -239,10 +239,10 @@ class Run:
             embedding=self.embedding,
         )
         output = render_supersampled(lit, camera, self.supersample, colors=3, linear=self.curve is not None)
-        drawn, alpha = output.image("features"), output.image("alpha")
-        visible = np.zeros_like(alpha)
-        visibility = np.divide(drawn[..., 3], alpha, out=visible, where=alpha > 0) if drawn.shape[2] > 3 else None
-        rgb = drawn[..., :3]
+        features = output.features or []
+        visible = [over_alpha(plane, output.alpha) for plane in features[3:]]
+        visibility = planes_image(visible, output.width, output.height)[..., 0] if visible else None
+        rgb = planes_image(features[:3], output.width, output.height)
         if self.curve:
             rgb = adjust_exposure(rgb, self.curve[0], stops_more)
         return _prediction(output, rgb, visibility, normals)
@@ -288,7 +288,7 @@ def draw_lit(
 
 def _prediction(output: RenderOutput, rgb: np.ndarray, visibility: np.ndarray | None, normals: bool) -> Prediction:
     alpha, depth = output.image("alpha"), output.image("depth")
-    return Prediction(np.ascontiguousarray(rgb), alpha, depth, visibility, output.image("normal") if normals else None)
+    return Prediction(rgb, alpha, depth, visibility, output.image("normal") if normals else None)
 
 
 def load_run(path: str | Path) -> Run:

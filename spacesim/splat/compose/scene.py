@@ -29,7 +29,7 @@ from spacesim.splat.compose.pose import Pose
 from spacesim.splat.light.shadow.cast import CrossShadow, cast_cross_shadows
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.output import RenderOutput
+from spacesim.splat.raster.output import RenderOutput, over_alpha, planes_image
 from spacesim.splat.raster.render import render
 from spacesim.splat.raster.supersample import render_supersampled
 from spacesim.splat.raster.tone import adjust_exposure
@@ -90,18 +90,17 @@ class DrawnView:
             return self.output.image(name)
         if name not in self.planes:
             raise ValueError(f"name: expected one of the outputs asked for, found {name!r}")
-        shape = self.output.height, self.output.width
-        planes = [np.array(plane, dtype=np.float32).reshape(shape) for plane in self.planes[name]]
+        size, planes = (self.output.width, self.output.height), self.planes[name]
         if name == "rgb":
-            rgb = np.stack(planes, axis=-1)
+            rgb = planes_image(planes, *size)
             return adjust_exposure(rgb, self.curve[0], stops) if self.curve else rgb
-        alpha = self.output.image("alpha")
         if name == "visibility":
-            return np.divide(planes[0], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+            return planes_image([over_alpha(planes[0], self.output.alpha)], *size)[..., 0]
         if not planes:
-            return np.zeros(shape, np.int32)
+            return np.zeros(size[::-1], np.int32)
         numbers = np.array(self.order, np.int32) + 1
-        return np.where(alpha >= COVERED, numbers[np.argmax(np.stack(planes), axis=0)], 0)
+        shares = planes_image(planes, *size)
+        return np.where(self.output.image("alpha") >= COVERED, numbers[np.argmax(shares, axis=-1)], 0)
 
 
 class SunOccluder(Protocol):
@@ -187,7 +186,7 @@ class GaussianComposition:
         drawn = self.draw(camera, sun, [*names, *(("normal",) if normals else ())])
         visibility = drawn.image("visibility") if "visibility" in drawn.planes else None
         normal = drawn.image("normal") if normals else None
-        rgb = np.ascontiguousarray(drawn.image("rgb", stops))
+        rgb = drawn.image("rgb", stops)
         return ComposedPrediction(
             rgb, drawn.image("alpha"), drawn.image("depth"), visibility, normal, drawn.image("id")
         )

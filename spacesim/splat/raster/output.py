@@ -1,10 +1,12 @@
 """What rendering gives: the planes of a picture, and what blended values are for its pixels."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
 
+from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float
 from spacesim.data.records import planes_repr
 
@@ -38,11 +40,9 @@ class RenderOutput:
         if planes is None:
             available = [output for output in (*OUTPUTS, "features") if getattr(self, output) is not None]
             raise ValueError(f"name: expected one of the outputs asked for ({', '.join(available)}), found {name!r}")
-        shape = (self.height, self.width)
         if name in ("alpha", "depth", "median_depth"):
-            return np.array(planes, dtype=np.float32).reshape(shape)
-        stacked = [np.array(plane, dtype=np.float32).reshape(shape) for plane in planes]
-        return np.stack(stacked, axis=-1) if stacked else np.zeros((*shape, 0), np.float32)
+            return planes_image([planes], self.width, self.height)[..., 0]
+        return planes_image(list(planes), self.width, self.height)
 
     def to_numpy(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(colour [H, W, 3], alpha [H, W], depth [H, W] in metres), float32.
@@ -62,6 +62,12 @@ class RenderOutput:
         if self.color is None:
             raise ValueError("outputs: expected color for over, found none")
         return self.color + (1 - self.alpha) * background
+
+
+def planes_image(planes: Sequence[Float], width: int, height: int) -> np.ndarray:
+    """[H, W, C] float32 of C planes [H * W], put beside each other on the device and copied to the host at once."""
+    flat = dr.ravel(ad.ArrayXf(planes)) if planes else ad.Float()
+    return np.array(flat, dtype=np.float32).reshape(height, width, len(planes))
 
 
 def over_alpha(weighted: Float, alpha: Float) -> Float:

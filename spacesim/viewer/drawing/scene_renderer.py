@@ -15,6 +15,7 @@ from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
 from spacesim.splat.compose import GaussianComposition
 from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.output import planes_image
 from spacesim.viewer.drawing.ellipsoids import draw_ellipsoids
 from spacesim.viewer.drawing.paint import NEEDED, Planes
 from spacesim.viewer.state import MODES, SceneState
@@ -75,9 +76,9 @@ class SceneRenderer:
         if mode == "ellipsoids":
             gaussians, colors = scene.lit_gaussians(camera, state.sun)
             blended = draw_ellipsoids(gaussians, colors, Pinhole.of(camera))
-            shape = camera.height, camera.width
-            rgb = np.stack([np.array(plane).reshape(shape) for plane in blended.planes], axis=-1)
-            return Planes(1 - np.array(blended.transmittance).reshape(shape), rgb=rgb)
+            size = camera.width, camera.height
+            rgb, transmittance = planes_image(blended.planes, *size), planes_image([blended.transmittance], *size)
+            return Planes(1 - transmittance[..., 0], rgb=rgb)
         outputs = {"rgb": "rgb", "depth": "depth", "visibility": "visibility", "normal": "normal", "object_id": "id"}
         name = NEEDED[mode]
         drawn = scene.draw(camera, state.sun, [outputs[name]] if name in outputs else [], supersample=1)
