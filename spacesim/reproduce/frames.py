@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 #: of the models, in widths of the picture that one just fills: one in the middle, four around it that do not touch
 PLACES = ((0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0))
 FARTHER = 3.1  #: times: the distance from which one just fills the picture
-VIEWS = 9  #: frames of each scene, each from another test view; the median counts
-WARM_UP = 2  #: frames before these: kernels are compiled for the first one, and again for what the second finds changed
+VIEWS = 9  #: frames of each scene, each from another test view, drawn before once; the median counts
 
 
 def time_frames(run: "Run | NerfRun", dataset: Dataset, tell: Callable[[int, int, str], None]) -> dict[str, JsonValue]:
@@ -37,7 +36,7 @@ def time_frames(run: "Run | NerfRun", dataset: Dataset, tell: Callable[[int, int
     medians = []
     for count in range(1, len(models) + 1):
         scene = compose(models[:count], ComposeConfig("none"))
-        for frame in frames[:WARM_UP]:
+        for frame in frames:  # kernels are compiled, and recorded for each length of the tile lists
             scene.predict(frame.camera, frame.sun)
         seconds = []
         for frame in frames:
