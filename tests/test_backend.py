@@ -427,3 +427,47 @@ def test_upload_reads_nothing_beyond_the_array(count):
         values[:] = 1
         assert np.array(dr.select(upload(values, kind) == kind(1), backend.ad.Float(2), 3)).tolist() == [2] * count
         del values
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Dr.Jit's library may have other names")
+def test_numbers_are_read_without_synchronising():
+    import drjit as dr
+
+    from spacesim.backend.readback import AsyncNumber, can_read_async
+
+    assert can_read_async()
+    ad = backend.ad
+    for turn in range(3):
+        squares = dr.square(dr.arange(ad.UInt64, 1000 + turn))
+        dr.eval(squares)
+        first, last = AsyncNumber(squares, 3), AsyncNumber(squares, 999 + turn)
+        del squares
+        assert (last.wait(), first.wait()) == ((999 + turn) ** 2, 9)
+
+
+@pytest.mark.gpu
+def test_a_number_is_there_before_the_work_that_follows_is_done():
+    if backend.select() != "cuda":
+        pytest.skip("needs a CUDA device")
+    import drjit as dr
+    from drjit.cuda import Event
+
+    from spacesim.backend.readback import AsyncNumber
+
+    def launch(sines: int) -> None:
+        values = dr.arange(backend.ad.Float, 2**24) + dr.opaque(backend.ad.Float, 0)
+        for _ in range(sines):
+            values = dr.sin(values)
+        dr.eval(values)
+
+    launch(3000)  # compiled
+    dr.sync_thread()
+    squares = dr.square(dr.arange(backend.ad.UInt64, 1000))
+    dr.eval(squares)
+    number, end = AsyncNumber(squares, 30), Event(enable_timing=False)
+    for _ in range(4):
+        launch(3000)
+    end.record()
+    assert number.wait() == 900
+    assert not end.query()
+    end.wait()

@@ -276,6 +276,15 @@ def test_torch_door_tells_both_ways_and_goes_on_without_its_peer(command):
     assert report["differences"] == []
 
 
+@smallest("async_lists.py --backend llvm --sizes 300x32 --methods vanilla,shadow-map --preset demo --repeats 2 --json")
+def test_both_ways_to_lists_are_measured(command):
+    rows = json.loads(call(command))["rows"]
+    assert [row["method"] for row in rows] == ["vanilla", "shadow-map"]
+    for row in rows:
+        assert min(row[f"{what}, async / wait"] for what in ("in a row", "host", "alone")) > 0
+        assert row["again"] == 0
+
+
 @smallest("training.py --backend llvm --sizes 300x32 --repeats 2 --markdown")
 def test_training_tells_a_step_and_what_was_not_measured(command):
     output = call(command)

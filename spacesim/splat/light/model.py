@@ -25,6 +25,7 @@ from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shading import ShadingInputs, ShadingTape, SunEncoding, split_weights
 from spacesim.splat.light.shadow.cast import Shadows, cast_shadows
 from spacesim.splat.light.shadow.light_camera import SUNS, light_rows
+from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians
 
@@ -152,14 +153,16 @@ class LightModel:
         terms: SunEncoding = self._encodings(*(float(value) for value in (ANY_SUN if sun is None else sun)))
         return terms
 
-    def shadows(self, gaussians: Gaussians, sun: np.ndarray | None) -> Shadows | None:
+    def shadows(
+        self, gaussians: Gaussians, sun: np.ndarray | None, make_lists: MakeLists = bin_splats
+    ) -> Shadows | None:
         """Raw occlusion of each Gaussian, by one light camera in training and in pictures: the refinement corrects what
         it was trained on. None for a model without shadows."""
         config = self.config.shadow
         if config is None:
             return None
         assert sun is not None, "what casts shadows is told the Sun"
-        return cast_shadows(gaussians, self.encode_sun(sun).light_axes, config, self.frame.distance)
+        return cast_shadows(gaussians, self.encode_sun(sun).light_axes, config, self.frame.distance, make_lists)
 
     def shade(
         self,
@@ -167,11 +170,12 @@ class LightModel:
         camera: Projection,
         sun: np.ndarray | None,
         picture: int | None = None,
+        make_lists: MakeLists = bin_splats,
     ) -> Shading:
         """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes; None
         where the field is not told. picture: number of the training picture whose embedding the field reads; None: it
-        reads the mean one."""
-        shadows = self.shadows(gaussians, sun)
+        reads the mean one. make_lists: of the Sun's picture"""
+        shadows = self.shadows(gaussians, sun, make_lists)
         embedding = self._mean_embedding() if picture is None else self._embedding(picture)
         inputs = self._inputs(gaussians, camera, self._with_embedding(sun, embedding), shadows)
         batch = PaddedBatch.of(gaussians.count)

@@ -9,6 +9,7 @@ in no list. How the lists are put in order depends on the backend, the order doe
 - LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile; both sorts are stable.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ import drjit as dr
 
 from spacesim.backend import ad, free_memory, recorded, select
 from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
+from spacesim.backend.readback import AsyncNumber
 from spacesim.data.errors import WorkError
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats
 from spacesim.splat.raster.sort import ordered_lists, segment_ids
@@ -26,7 +28,7 @@ MAX_SORTED_LENGTH = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists
 PACKET = 16  #: lanes that run together on a CPU with AVX-512; elsewhere fewer
 MAX_SHARES = 64  #: at most: no fewer than the parts into which Dr.Jit divides a launch, two a thread, as a rule
 FEW = 2  #: sizes of the lists of pictures from one power of two to the next
-LONG = 2**22  #: pairs from which on lists of pictures have no more room than others: a gigabyte
+LONG = 2**22  #: pairs from which on lists of pictures have no more capacity than others: a gigabyte
 MAX_PAIRS = {"cuda": 0.9 * 2**30, "llvm": 0.9 * 2**29}  #: records hold four or eight numbers a pair, arrays 2^32
 PICTURE_BYTES = 200, 85  #: a pair (lists, sorting, blending), a pixel (colour, transmittance and what blending keeps of
 #: them): measured on LLVM, 90 to 210 a pair, as the rounding of arrays has it
@@ -66,6 +68,10 @@ class _Boxes:
     pair_ends: UInt64
 
 
+MakeLists = Callable[[Splats, Footprints, int, int], TileLists]
+"""`bin_splats` or another way to the same lists: (splats, footprints, width, height) to lists."""
+
+
 def bin_splats(
     splats: Splats,
     footprints: Footprints,
@@ -80,25 +86,64 @@ def bin_splats(
 
     Between its two parts, both recorded, the host waits for the number of pairs, which says how large arrays must be.
     """
-    boxes_of, lists_of = (_boxes, _count) if select() == "cuda" else (_rank, _expand)
-    grid, count = _Grid.of(width, height, tile_shape()), dr.width(splats.x)
-    if dr.grad_enabled(list(vars(splats).values())):  # to detach a record takes long
-        splats = dr.detach(splats)
-    pairs = 0
-    if count > 0:
-        capacity = round_capacity(count)
-        boxes: _Boxes = boxes_of(splats, footprints, dr.opaque(ad.UInt32, count), capacity, grid)
-        pairs = int(boxes.pair_ends[capacity - 1])
-    _check_memory(pairs, width * height, *(TRAINING_BYTES[select()] if training else PICTURE_BYTES))
-    if pairs == 0:
+    return bin_counted(splats, footprints, width, height, few_sizes, training)[0]
+
+
+def bin_counted(
+    splats: Splats,
+    footprints: Footprints,
+    width: int,
+    height: int,
+    few_sizes: bool = False,
+    training: bool = False,
+) -> tuple[TileLists, int]:
+    """`bin_splats`, and how many pairs boxes have, which the lists' capacity is enough for."""
+    splats = _detached(splats)
+    boxes, grid, count = _find_boxes(splats, footprints, width, height)
+    pairs = 0 if boxes is None else int(boxes.pair_ends[round_capacity(count) - 1])
+    check_memory(pairs, width * height, training)
+    if pairs == 0 or boxes is None:
         none, of_splats = dr.zeros(ad.UInt32, grid.tiles), dr.zeros(ad.UInt32, max(count, 1))
-        return TileLists(none, none, none, none, of_splats, of_splats, 0, grid.columns, grid.rows, grid.shape)
+        return TileLists(none, none, none, none, of_splats, of_splats, 0, grid.columns, grid.rows, grid.shape), 0
     steps = FEW if few_sizes and pairs < LONG else STEPS
-    lists: TileLists = lists_of(splats, footprints, boxes, round_capacity(pairs, steps), capacity, grid)
-    return lists
+    return _make_lists(splats, footprints, boxes, round_capacity(pairs, steps), grid), pairs
 
 
-def _check_memory(pairs: int, pixels: int, bytes_a_pair: int, bytes_a_pixel: int) -> None:
+def bin_async(
+    splats: Splats, footprints: Footprints, width: int, height: int, capacity: int
+) -> tuple[TileLists, AsyncNumber]:
+    """`bin_counted` without a wait: lists with a `capacity` for so many pairs. Where there are more, which the number
+    says later, they are empty. There must be a splat. Whether there is memory, `check_memory` says."""
+    splats = _detached(splats)
+    boxes, grid, count = _find_boxes(splats, footprints, width, height)
+    assert boxes is not None, "lists without splats have no capacity"
+    pairs = AsyncNumber(boxes.pair_ends, round_capacity(count) - 1)  # copied before what comes next
+    return _make_lists(splats, footprints, boxes, capacity, grid), pairs
+
+
+def _find_boxes(splats: Splats, footprints: Footprints, width: int, height: int) -> tuple[_Boxes | None, _Grid, int]:
+    """(boxes, None of no splats; the image's tiles; how many splats)."""
+    grid, count = _Grid.of(width, height, tile_shape()), dr.width(splats.x)
+    if count == 0:
+        return None, grid, 0
+    boxes_of = _boxes if select() == "cuda" else _rank
+    return boxes_of(splats, footprints, dr.opaque(ad.UInt32, count), round_capacity(count), grid), grid, count
+
+
+def _make_lists(splats: Splats, footprints: Footprints, boxes: _Boxes, capacity: int, grid: _Grid) -> TileLists:
+    """Lists with a capacity for so many pairs."""
+    lists_of = _count if select() == "cuda" else _expand
+    splat_capacity = round_capacity(dr.width(splats.x))
+    return lists_of(splats, footprints, boxes, capacity, splat_capacity, grid)
+
+
+def _detached(splats: Splats) -> Splats:
+    return dr.detach(splats) if dr.grad_enabled(list(vars(splats).values())) else splats  # to detach takes long
+
+
+def check_memory(pairs: int, pixels: int, training: bool) -> None:
+    """Raises WorkError where lists of so many pairs cannot be made, or find no place in memory, see `bin_splats`."""
+    bytes_a_pair, bytes_a_pixel = TRAINING_BYTES[select()] if training else PICTURE_BYTES
     needed = pairs * bytes_a_pair + pixels * bytes_a_pixel
     most = MAX_PAIRS[select()]
     if pairs > most:
@@ -162,17 +207,18 @@ def _count(
 ) -> TileLists:
     """Lists that are ordered one by one."""
     slot = dr.arange(ad.UInt32, capacity)
-    total = ad.UInt32(dr.gather(ad.UInt64, boxes.pair_ends, ad.UInt32(splat_capacity - 1)))
+    fits, total = _pairs_that_fit(boxes, capacity, splat_capacity)
     splat = segment_ids(
-        boxes.pair_ends, dr.minimum(slot, total - 1), splat_capacity
+        boxes.pair_ends, dr.minimum(slot, dr.maximum(total, 1) - 1), splat_capacity
     )  # beyond the last pair: that one's splat
+    splat = dr.minimum(splat, splat_capacity - 1)  # where there are no pairs
     before = ad.UInt32(dr.gather(ad.UInt64, boxes.pair_ends, splat)) - dr.gather(ad.UInt32, boxes.count, splat)
     tile = _tile_of(splats, boxes, splat, slot - before, slot < total, grid)
     key = dr.gather(ad.UInt32, footprints.order, splat)
-    first_slot = ad.UInt32(boxes.pair_ends) - boxes.count
-    dr.eval(first_slot)
+    first_slot, slot_count = ad.UInt32(boxes.pair_ends) - boxes.count, dr.select(fits, boxes.count, 0)
+    dr.eval(first_slot, slot_count)
     splat, slot, start, end = ordered_lists(tile, key, splat, grid.tiles, capacity)
-    return TileLists(splat, slot, start, end, first_slot, boxes.count, capacity, grid.columns, grid.rows, grid.shape)
+    return TileLists(splat, slot, start, end, first_slot, slot_count, capacity, grid.columns, grid.rows, grid.shape)
 
 
 @recorded
@@ -188,17 +234,18 @@ def _expand(
     # Mark each splat's first pair with its rank, then a running maximum fills in the rest.
     splat_rank = dr.arange(ad.UInt32, splat_capacity)
     assert boxes.order is not None
+    fits, total = _pairs_that_fit(boxes, capacity, splat_capacity)
+    slot_count = dr.select(fits, boxes.count, 0)
     pairs_of = dr.gather(ad.UInt32, boxes.count, boxes.order)
     first = ad.UInt32(boxes.pair_ends) - pairs_of
-    dr.eval(first)
+    dr.eval(first, slot_count)
     rank = dr.zeros(ad.UInt32, capacity)
-    dr.scatter(rank, splat_rank, first, active=pairs_of > 0)
+    dr.scatter(rank, splat_rank, first, active=(pairs_of > 0) & fits)
     rank = dr.prefix_reduce(dr.ReduceOp.Max, rank, exclusive=False)
     first_slot = dr.zeros(ad.UInt32, splat_capacity)
     dr.scatter(first_slot, first, boxes.order)
 
     slot = dr.arange(ad.UInt32, capacity)
-    total = ad.UInt32(dr.gather(ad.UInt64, boxes.pair_ends, ad.UInt32(splat_capacity - 1)))
     splat = dr.gather(ad.UInt32, boxes.order, rank)
     within = slot - dr.gather(ad.UInt32, first, rank)
     tile = _tile_of(splats, boxes, splat, within, slot < total, grid)
@@ -213,8 +260,15 @@ def _expand(
     dr.scatter(place, dr.arange(ad.UInt32, capacity), slot)
     dr.eval(splat, slot, start, end, first_slot, order, place)
     return TileLists(
-        splat, slot, start, end, first_slot, boxes.count, capacity, grid.columns, grid.rows, grid.shape, order, place
+        splat, slot, start, end, first_slot, slot_count, capacity, grid.columns, grid.rows, grid.shape, order, place
     )
+
+
+def _pairs_that_fit(boxes: _Boxes, capacity: int, splat_capacity: int) -> tuple[Bool, UInt32]:
+    """Whether `capacity` is enough for all pairs, of width 1; how many they are, 0 where it is not."""
+    pairs = dr.gather(ad.UInt64, boxes.pair_ends, ad.UInt32(splat_capacity - 1))
+    fits = pairs <= capacity
+    return fits, ad.UInt32(dr.select(fits, pairs, 0))
 
 
 def _longest_first(length: UInt32, shape: TileShape) -> UInt32:

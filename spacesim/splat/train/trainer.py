@@ -26,6 +26,7 @@ from spacesim.learning.forecast import Growth, TimeLeft
 from spacesim.learning.loop import TrainingLoop
 from spacesim.splat.light.bounce import ALBEDO
 from spacesim.splat.light.model import LightModel, TrainingFrame, is_near, robust_radius
+from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.train.checkpoint import FORMAT, GaussianCheckpointHeader
@@ -38,7 +39,7 @@ from spacesim.splat.train.prior import MeshPrior
 from spacesim.splat.train.stages import TargetImage, update_light
 from spacesim.splat.train.start import initial_gaussians, scene_scale, surface_normals
 from spacesim.splat.train.strategies.factory import make_strategy
-from spacesim.splat.train.view_pass import ViewPass, ViewResult
+from spacesim.splat.train.view_pass import RenderedView, ViewLoss, ViewPass, ViewResult
 from spacesim.splat.train.views import TrainingView, TrainingViews
 from spacesim.splat.train.warm_start import Attraction, WarmStart
 
@@ -122,6 +123,12 @@ class Trainer(TrainingLoop):
 
     def _refine(self) -> None:
         """After a step: the strategy refines the set of Gaussians, or the warm start does while it lasts."""
+        before = self.gaussians.logit_opacities
+        self._refine_gaussians()
+        if self.gaussians.logit_opacities.index != before.index:
+            self._view_pass.lists.after_refinement()
+
+    def _refine_gaussians(self) -> None:
         warm, done = self.warm_start, self.iteration
         if warm is not None and warm.active(done - 1):
             warm.after_step(done, self.gaussians, self.optimizer)
@@ -140,11 +147,13 @@ class Trainer(TrainingLoop):
         """Forward, loss, backward for one view, `number` of the training."""
         view, view_pass = self.pictures.shown(self.views.at_step(number)), self._view_pass
         watched = self.strategy.observes_step(self.iteration + 1) and not self._warming(self.iteration)
-        downscale = self.config.downscale(self.iteration)
-        drawn = view_pass.forward(self.gaussians, rows, self.light, view, degree, downscale, watched)
         attraction = self._attraction(view)
-        loss = view_pass.loss(drawn, self._target_image(number, view, attraction), view.camera)
-        grad_splats = view_pass.backward(drawn, loss, absolute=watched)
+        target = self._target_image(number, view, attraction)
+        drawn, loss, grad_splats = self._splat_gradients(rows, degree, view, target, watched)
+        if not view_pass.lists.all_fit():
+            del drawn, loss, grad_splats  # of lists that are empty, and memory is short
+            with view_pass.lists.synchronous():
+                drawn, loss, grad_splats = self._splat_gradients(rows, degree, view, target, watched)
         self.pictures.learn(self.iteration, view, rows, drawn, loss, grad_splats, self.scene_scale)
         if watched:
             self.strategy.observe(*view_pass.watched(drawn, grad_splats))
@@ -152,6 +161,15 @@ class Trainer(TrainingLoop):
         result = view_pass.to_gradients(drawn, loss, grad_splats, self.light, grad_rows)
         self.pictures.learn_sun(self.iteration, view, result.by_sun)
         return result
+
+    def _splat_gradients(
+        self, rows: list[Float], degree: int, view: TrainingView, target: TargetImage, watched: bool
+    ) -> tuple[RenderedView, ViewLoss, SplatGradients]:
+        """Of a view: what was drawn, its loss, gradients by its splats. Changes nothing."""
+        view_pass, downscale = self._view_pass, self.config.downscale(self.iteration)
+        drawn = view_pass.forward(self.gaussians, rows, self.light, view, degree, downscale, watched)
+        loss = view_pass.loss(drawn, target, view.camera)
+        return drawn, loss, view_pass.backward(drawn, loss, absolute=watched)
 
     def _warming(self, index: int) -> bool:
         """Whether the warm start keeps densification off in step number `index`, the first of which is 0."""

@@ -5,19 +5,20 @@ change length from step to step, stand between them.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Bool, Float
 from spacesim.data.records import Camera
 from spacesim.splat.light.model import LightModel, Shading
 from spacesim.splat.raster.adjoint import SplatGradients
-from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole, Splats
 from spacesim.splat.raster.records import BlendResult
 from spacesim.splat.raster.supersample import upsampled_camera
 from spacesim.splat.raster.tiles import TileLists
+from spacesim.splat.train.async_lists import AsyncTileLists
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.downscale import downscaled_camera
 from spacesim.splat.train.optimizer.update import ViewGradients
@@ -83,10 +84,13 @@ class ViewResult:
 
 
 class ViewPass:
-    """Forward and backward of views, one after another. scale: of the scene, metres, the unit of depth"""
+    """Forward and backward of views, one after another. scale: of the scene, metres, the unit of depth
+
+    lists: makes the tile lists; nothing may be kept of a view before it has said that they `all_fit`
+    """
 
     def __init__(self, config: TrainConfig, scale: float) -> None:
-        self.config, self.scale = config, scale
+        self.config, self.scale, self.lists = config, scale, AsyncTileLists()
         terms = LossSettings(
             config.ssim_weight,
             config.visibility_weight,
@@ -119,14 +123,16 @@ class ViewPass:
         splats, footprints, values, radii = self._project(
             rows, camera, degree, config.antialiased, config.shape_terms, self.scale, watched
         )
-        shading = light.shade(gaussians, camera, view.sun, picture=view.index) if light else None
+        of_sun = partial(self.lists.make, "sun", view.index)
+        shading = light.shade(gaussians, camera, view.sun, view.index, of_sun) if light else None
         if shading:
             values["color"] = shading.colors
             if config.visibility_weight > 0 and shading.visibility is not None:
                 values["visibility"] = [shading.visibility]
-        lists = bin_splats(splats, footprints, camera.width, camera.height, training=True)
+        size = camera.width, camera.height
+        lists = self.lists.make("picture", view.index, splats, footprints, *size, training=True)
         planes = [value for group in values.values() for value in group]
-        blended = forward(splats, planes, lists, camera.width, camera.height, adjoint=True)
+        blended = forward(splats, planes, lists, *size, adjoint=True)
         channels = {name: len(group) for name, group in values.items()}
         return RenderedView(camera, downscale, radii, channels, shading, BlendTape(splats, lists, blended))
 

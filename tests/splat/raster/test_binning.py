@@ -145,6 +145,24 @@ def test_nobody_seen_is_no_list(way):
     assert lists.capacity == 0
 
 
+@pytest.mark.parametrize("spare", [0, 1, 5000])
+def test_lists_made_without_a_wait_are_the_same_where_they_fit(way, spare):
+    """And empty where they do not; the capacity may be exact or much too large."""
+    splats, footprints = projected(900, 70, 50)
+    known, pairs = binning.bin_counted(splats, footprints, 70, 50)
+    lists, number = binning.bin_async(splats, footprints, 70, 50, pairs + spare)
+    assert number.wait() == pairs > sum(map(len, listed(lists))) > 900
+    assert listed(lists) == listed(known)
+    np.testing.assert_array_equal(np.array(lists.slot_count), np.array(known.slot_count))
+    for less in (1, pairs // 2, pairs - 1):
+        lists, number = binning.bin_async(splats, footprints, 70, 50, less)
+        assert number.wait() == pairs
+        assert sum(map(len, listed(lists))) == np.array(lists.slot_count).sum() == 0
+    hidden = dataclasses.replace(footprints, visible=dr.zeros(ad.Bool, 900))
+    lists, number = binning.bin_async(splats, hidden, 70, 50, pairs)
+    assert number.wait() == sum(map(len, listed(lists))) == 0
+
+
 @pytest.mark.parametrize("runs", [(4, 16), (4, 4096), (64, 4096), (8, 8)])
 @pytest.mark.parametrize(
     "lengths", [[1], [0, 5, 0], [300, 0, 17, 1, 64], [16, 4, 15, 17, 3], [2000, 3, 1500], [0, 0, 1]]

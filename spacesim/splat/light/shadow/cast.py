@@ -22,6 +22,7 @@ from spacesim.splat.light.shadow.splatting import (
     differentiable_occlusion,
     occlusion_by_splatting,
 )
+from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
 
@@ -110,17 +111,22 @@ class Shadows:
         return [dr.grad(row) for row in rows]
 
 
-def cast_shadows(gaussians: Gaussians, light: Float, config: ShadowConfig, distance: float) -> Shadows:
+def cast_shadows(
+    gaussians: Gaussians, light: Float, config: ShadowConfig, distance: float, make_lists: MakeLists = bin_splats
+) -> Shadows:
     """Raw occlusion (4.6, 4.10) of N Gaussians by each other, with one light camera. light: Float [9] of `light_rows`;
-    distance: metres, of the farthest training camera."""
+    distance: metres, of the farthest training camera;  make_lists: of the light's picture"""
     rows = gaussians.shape_rows()
     camera = _fit(rows, light, config.size, config.crop)
     bias, points = _receivers(rows, camera, *_numbers(config), config.grazing)
     if isinstance(config.method, MappingConfig):
         softness = config.softness * distance
-        occlusion = occlusion_by_mapping(gaussians, camera, bias.bias, softness, config.method, points)
+        occlusion = occlusion_by_mapping(
+            gaussians, camera, bias.bias, softness, config.method, points, make_lists=make_lists
+        )
     else:
-        occlusion = occlusion_by_splatting(gaussians, camera, bias.bias, points, beta_min=_beta_min(config))
+        ends = _beta_min(config)
+        occlusion = occlusion_by_splatting(gaussians, camera, bias.bias, points, beta_min=ends, make_lists=make_lists)
     return Shadows(occlusion, rows, camera, bias, points, _beta_min(config))
 
 

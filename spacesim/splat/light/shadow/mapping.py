@@ -16,7 +16,7 @@ from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.data.errors import InputError
 from spacesim.data.structure import check_choices
 from spacesim.splat.light.shadow.light_camera import drawable_mask
-from spacesim.splat.raster.bin import bin_splats
+from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.blend import blend_lists
 from spacesim.splat.raster.cameras import Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
@@ -90,6 +90,7 @@ def occlusion_by_mapping(
     config: MappingConfig | None = None,
     points: Array3f | None = None,
     casters: Gaussians | None = None,
+    make_lists: MakeLists = bin_splats,
 ) -> Float:
     """Float [N] in [0, 1]: raw occlusion by the depth test (thesis 4.4 to 4.6), 0 = sees the Sun. Detached.
 
@@ -107,7 +108,7 @@ def occlusion_by_mapping(
     rows = [dr.detach(row) for row in gaussians.shape_rows()]
     casting = [] if casters is None else [dr.detach(row) for row in casters.shape_rows()]
     splats, footprints = _prepare(casting or rows, camera, config.antialiased)
-    lists = bin_splats(splats, footprints, camera.width, camera.height)
+    lists = make_lists(splats, footprints, camera.width, camera.height)
     if lists.capacity == 0:
         return dr.opaque(ad.Float, 0, gaussians.count)
     points, bias = None if points is None else dr.detach(points), dr.detach(bias)

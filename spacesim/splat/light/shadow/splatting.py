@@ -16,7 +16,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array2f, Array3f, Bool, Float, NumberT, UInt32
 from spacesim.data.errors import WorkError
 from spacesim.splat.raster.adjoint import PixelMoments, add_to_slots, gather_slots, reduce_mode
-from spacesim.splat.raster.bin import bin_splats
+from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats, _sortable, project
@@ -45,6 +45,7 @@ def occlusion_by_splatting(
     antialiased: bool = False,
     receives: Bool | None = None,
     beta_min: float = BETA_MIN,
+    make_lists: MakeLists = bin_splats,
 ) -> Float:
     """Float [N] in [0, 1], detached: the share of sunlight that is blocked before it reaches each Gaussian.
 
@@ -62,7 +63,8 @@ def occlusion_by_splatting(
     bias of another length, WorkError where memory is short.
     """
     rows = [dr.detach(row) for row in gaussians.shape_rows()]
-    return differentiable_occlusion(Gaussians.from_rows(rows), camera, bias, points, antialiased, receives, beta_min)
+    detached = Gaussians.from_rows(rows)
+    return differentiable_occlusion(detached, camera, bias, points, antialiased, receives, beta_min, make_lists)
 
 
 def differentiable_occlusion(
@@ -73,6 +75,7 @@ def differentiable_occlusion(
     antialiased: bool = False,
     receives: Bool | None = None,
     beta_min: float = BETA_MIN,
+    make_lists: MakeLists = bin_splats,
 ) -> Float:
     """`occlusion_by_splatting` with gradients (reverse mode) by means, log scales, quaternions and opacities, of the
     blockers' alpha and the receivers' beta. Who is before whom, the bias, and by how much `points` are off the centres
@@ -90,7 +93,7 @@ def differentiable_occlusion(
     blockers, receivers, blocker_boxes, receiver_boxes = prepared
     size = camera.width, camera.height
     try:
-        return dr.custom(_Occlusion, blockers, receivers, blocker_boxes, receiver_boxes, size)
+        return dr.custom(_Occlusion, blockers, receivers, blocker_boxes, receiver_boxes, size, make_lists)
     except RuntimeError as error:  # Dr.Jit wraps what is raised in there
         raise error.__cause__ if isinstance(error.__cause__, WorkError) else error from None
 
@@ -313,6 +316,7 @@ class _Occlusion(dr.CustomOp):
         blocker_boxes: Footprints,
         receiver_boxes: Footprints,
         image_size: tuple[int, int],
+        make_lists: MakeLists,
     ) -> Float:
         # Sizes in arrays: dr.freeze (1.5) takes one number for another where both have occurred among the arguments.
         self.size = dr.opaque(ad.UInt32, image_size[0]), dr.opaque(ad.UInt32, image_size[1])
@@ -322,7 +326,7 @@ class _Occlusion(dr.CustomOp):
         self.events, boxes = _events(
             dr.detach(blockers), dr.detach(receivers), blocker_boxes, receiver_boxes, count, self.capacity
         )
-        self.lists = bin_splats(self.events, boxes, *image_size)
+        self.lists = make_lists(self.events, boxes, *image_size)
         if self.lists.capacity == 0:
             return dr.opaque(ad.Float, 0, self.count)
         self.walked = _walk(self.events, self.lists, self.size, self.capacity)

@@ -1,0 +1,112 @@
+"""Numbers of the device's that the host reads without a wait for all that the device was asked for since.
+
+To read an array synchronises with the device. Here the device copies an entry to memory of the host's as soon as the
+array is there, and an event says when. Dr.Jit has the events for Python, the copy in C++ alone: `can_read_async` says
+whether its library has that by the names of Dr.Jit 1.5 on Linux and macOS.
+"""
+
+import ctypes
+import importlib
+import threading
+from ctypes import c_int, c_size_t, c_uint32, c_uint64, c_void_p
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from spacesim.backend.arrays import UInt64
+from spacesim.backend.selection import load_drjit, select
+
+BYTES = 8  #: of an entry
+_LIBRARIES = "libdrjit-core.so", "libdrjit-core.dylib"
+_FUNCTIONS: dict[str, tuple[str, Any, tuple[Any, ...]]] = {
+    "allocate": ("_Z10jit_malloc10JitBackendmi", c_void_p, (c_uint32, c_size_t, c_int)),
+    "copy": ("_Z16jit_memcpy_async10JitBackendPvPKvm", None, (c_uint32, c_void_p, c_void_p, c_size_t)),
+    "address": ("_Z12jit_var_datajPPv", c_uint32, (c_uint32, c_void_p)),
+    "release": ("_Z20jit_var_dec_ref_implj", None, (c_uint32,)),
+}
+"""Name in the library, which tells the types of the arguments, what it returns, and these types."""
+_FUNCTIONS_OF_CUDA: dict[str, tuple[str, Any, tuple[Any, ...]]] = {
+    "context": ("_Z16jit_cuda_contextv", c_void_p, ()),
+    "push": ("_Z21jit_cuda_push_contextPv", None, (c_void_p,)),
+    "pop": ("_Z20jit_cuda_pop_contextv", c_void_p, ()),
+}
+_SHARED = 1  # memory that the host reads and the device writes; on CUDA its pages are locked: a copy to others waits
+
+
+class AsyncNumber:
+    """Entry `index` of an evaluated array UInt64 [N], read once with `wait`, by the thread that made it."""
+
+    def __init__(self, array: UInt64, index: int) -> None:
+        """Raises RuntimeError where `can_read_async` is false."""
+        functions = _functions()
+        if functions is None:
+            raise RuntimeError("this Dr.Jit does not copy numbers to the host while the device goes on")
+        backend = load_drjit().backend_v(array).value
+        free = _local.free
+        self._slot = free.pop() if free else _HostSlot(functions["allocate"](backend, BYTES, _SHARED))
+        start = c_void_p()
+        variable = functions["address"](array.index, ctypes.byref(start))
+        functions["copy"](backend, self._slot.address, (start.value or 0) + BYTES * index, BYTES)
+        functions["release"](variable)
+        self._slot.record(functions)
+
+    def wait(self) -> int:
+        """The number. Waits for what was asked of the device before this was made, and for nothing else."""
+        self._slot.event.wait()
+        number = c_uint64.from_address(self._slot.address).value
+        _local.free.append(self._slot)
+        return number
+
+
+def can_read_async() -> bool:
+    """Whether Dr.Jit has what `AsyncNumber` needs."""
+    return _functions() is not None
+
+
+class _HostSlot:
+    """Memory of the host's for one entry, and an event. Never given back: slots are few, and used again."""
+
+    def __init__(self, address: int) -> None:
+        self.address = address
+        self.event = importlib.import_module(f"drjit.{select()}").Event(enable_timing=False)
+
+    def record(self, functions: dict[str, Any]) -> None:
+        """Record the event behind what the device has been asked for. Dr.Jit's other functions make the device's
+        context current, this one does not in 1.5."""
+        if "push" not in functions:
+            self.event.record()
+            return
+        functions["push"](functions["context"]())
+        try:
+            self.event.record()
+        finally:
+            functions["pop"]()
+
+
+class _FreeSlots(threading.local):
+    """Of a thread, whose stream the events belong to."""
+
+    def __init__(self) -> None:
+        self.free: list[_HostSlot] = []
+
+
+_local = _FreeSlots()
+
+
+@cache
+def _functions() -> dict[str, Any] | None:
+    """Of Dr.Jit's library, by name; None where one is missing."""
+    folder = Path(str(load_drjit().__file__)).parent
+    path = next((folder / name for name in _LIBRARIES if (folder / name).exists()), None)
+    if path is None or not hasattr(importlib.import_module(f"drjit.{select()}"), "Event"):
+        return None
+    functions: dict[str, Any] = {}
+    wanted = _FUNCTIONS | (_FUNCTIONS_OF_CUDA if select() == "cuda" else {})
+    try:
+        library = ctypes.CDLL(str(path))  # the one that is loaded
+        for name, (symbol, result, arguments) in wanted.items():
+            functions[name] = library[symbol]
+            functions[name].restype, functions[name].argtypes = result, arguments
+    except (OSError, AttributeError):
+        return None
+    return functions

@@ -1,0 +1,208 @@
+"""Lists made without a wait: the same training to the bit, whatever the forecasts are worth."""
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from splats import random_splats
+
+from spacesim.backend import ad, select
+from spacesim.data.errors import WorkError
+from spacesim.data.geometry import look_at
+from spacesim.data.records import Camera
+from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Pinhole, project
+from spacesim.splat.raster.tiles import round_capacity
+from spacesim.splat.train import async_lists
+from spacesim.splat.train.async_lists import ENOUGH, HISTORY, AsyncTileLists, PairForecast
+from spacesim.splat.train.config import TrainConfig, preset
+from spacesim.splat.train.strategies.control import DensificationConfig
+from spacesim.splat.train.trainer import Trainer
+
+REFINEMENT = DensificationConfig(
+    refine_start=20, refine_every=30, pause_after_reset=0, reset_every=4, refine_stop=240, screen_size_stop=0
+)
+CONFIG = TrainConfig(iterations=300, checkpoint_every=100, sh_every=40, sh_degree=1, refinement=REFINEMENT)
+
+
+def known(changes: list[float], pairs: int = 1000) -> PairForecast:
+    """A forecast that has seen a view "a" once and other views change so."""
+    forecast = PairForecast()
+    forecast.observe("a", pairs)
+    for i, change in enumerate(changes):
+        forecast.observe(i, 10_000)
+        forecast.observe(i, round(change * 10_000))
+    return forecast
+
+
+def test_a_view_is_thought_to_change_as_the_latest_did_at_most():
+    assert known([1.0, 1.5, 1.2, 0.5], 10_000).capacity_for("a") == round_capacity(int(1.02 * 15_000))
+    later = known([1.5] + [1.1] * HISTORY, 10_000)
+    assert later.capacity_for("a") == round_capacity(int(1.02 * 1.1 * 10_000))
+
+
+def test_there_is_no_forecast_of_what_nobody_knows():
+    assert known([1.0] * (ENOUGH - 1)).capacity_for("a") is None
+    forecast = known([1.0] * ENOUGH)
+    assert forecast.capacity_for("a") is not None
+    assert forecast.capacity_for("new") is None
+    forecast.observe("a", 0)
+    assert forecast.capacity_for("a") is None  # it shows nothing: nobody knows how much it will show
+
+
+def test_after_a_refinement_views_are_compared_with_those_that_it_has_changed():
+    forecast = known([1.0] * ENOUGH, 10_000)
+    for view in range(ENOUGH + 1):
+        forecast.observe(view, 10_000)
+    forecast.after_refinement()
+    assert forecast.capacity_for("a") is None
+    for view in range(ENOUGH):
+        assert forecast.capacity_for(ENOUGH) is None
+        forecast.observe(view, 20_000)
+    assert forecast.capacity_for(ENOUGH) == round_capacity(int(1.02 * 20_000))
+    assert forecast.capacity_for(0) is None  # seen since
+    for view in range(ENOUGH):
+        forecast.observe(view, 20_000)
+    assert forecast.capacity_for(0) == round_capacity(int(1.02 * 20_000))
+
+
+class Counted(AsyncTileLists):
+    """Counts lists that were made without a wait, of which kinds of pictures, and steps whose lists were too small."""
+
+    def __init__(self, backends: tuple[str, ...]) -> None:
+        super().__init__(backends)
+        self.made, self.again, self.kinds = 0, 0, set()
+
+    def make(self, kind, *arguments, **named):
+        before = len(self._pending)
+        lists = super().make(kind, *arguments, **named)
+        if len(self._pending) > before:
+            self.made += 1
+            self.kinds.add(kind)
+        return lists
+
+    def all_fit(self):
+        fits = super().all_fit()
+        self.again += not fits
+        return fits
+
+
+def trained(dataset, config, steps: int, lists: AsyncTileLists, start=None) -> tuple[Trainer, list[float]]:
+    trainer = Trainer(dataset, config)
+    if start is not None:
+        trainer.restore(start)
+    trainer._view_pass.lists = lists
+    return trainer, [float(trainer.step()[0]) for _ in range(steps)]
+
+
+def check_same(one: Trainer, other: Trainer) -> None:
+    for tensors, others in (one.model_tensors(), other.model_tensors()), (one.state_tensors(), other.state_tensors()):
+        assert tensors.keys() == others.keys()
+        for name, values in tensors.items():
+            np.testing.assert_array_equal(values, others[name], err_msg=name)
+
+
+@pytest.fixture
+def tight(monkeypatch):
+    """Every third forecast is of ten pairs."""
+    calls, capacity_for = [], PairForecast.capacity_for
+
+    def too_little(self, view):
+        calls.append(view)
+        capacity = capacity_for(self, view)
+        return capacity if capacity is None or len(calls) % 3 else 10
+
+    monkeypatch.setattr(async_lists.PairForecast, "capacity_for", too_little)
+
+
+@pytest.mark.threads
+def test_steps_without_a_wait_teach_the_same_to_the_bit(small_dataset, tmp_path):
+    plain, losses = trained(small_dataset, CONFIG, 300, Counted(()))
+    free, other = trained(small_dataset, CONFIG, 300, lists := Counted((select(),)))
+    assert lists.made > 200
+    assert lists.again < 10
+    assert plain.gaussians.count != 60  # refined
+    assert other == losses
+    check_same(plain, free)
+
+    half, _ = trained(small_dataset, CONFIG, 145, Counted((select(),)))
+    half.save(tmp_path / "checkpoint.safetensors")
+    on, other = trained(small_dataset, CONFIG, 155, lists := Counted((select(),)), tmp_path / "checkpoint.safetensors")
+    assert lists.made > 90
+    assert other == losses[145:]
+    check_same(plain, on)
+
+
+@pytest.mark.threads
+@pytest.mark.usefixtures("tight")
+def test_steps_with_too_small_lists_are_taken_again(small_dataset):
+    plain, losses = trained(small_dataset, CONFIG, 150, Counted(()))
+    free, other = trained(small_dataset, CONFIG, 150, lists := Counted((select(),)))
+    assert lists.again > 30
+    assert other == losses
+    check_same(plain, free)
+
+
+@pytest.mark.threads
+@pytest.mark.parametrize(("method", "wrong"), [("shadow-map", False), ("shadow-map", True), ("shadow-splat", True)])
+def test_shadows_and_networks_learn_the_same_to_the_bit(small_lit_dataset, method, wrong, request):
+    if wrong:
+        request.getfixturevalue("tight")
+    config = replace(preset("demo", method), iterations=300, init_count=200, refinement=REFINEMENT)
+    plain, losses = trained(small_lit_dataset, config, 70, Counted(()))
+    free, other = trained(small_lit_dataset, config, 70, lists := Counted((select(),)))
+    assert lists.kinds == {"sun", "picture"}
+    assert (lists.again > 10) == wrong
+    assert other == losses
+    check_same(plain, free)
+
+
+def test_several_views_a_step_teach_the_same_to_the_bit(small_dataset):
+    config = replace(CONFIG, views_per_step=2)
+    plain, losses = trained(small_dataset, config, 40, Counted(()))
+    free, other = trained(small_dataset, config, 40, lists := Counted((select(),)))
+    assert lists.made > 40
+    assert other == losses
+    check_same(plain, free)
+
+
+def test_who_leaves_the_picture_is_listed_exactly():
+    """Lists of nobody have a form of their own, which the forecast cannot give."""
+    camera = Camera.from_fov(look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0]), 40, 40, 40)
+    splats, boxes = project(Gaussians.from_numpy(random_splats(50, 0, degree=0)), Pinhole.of(camera))
+    dr.eval(splats, boxes)
+    lists = AsyncTileLists((select(),))
+    for view in [*range(ENOUGH + 1)] * 2:
+        shown = lists.make("picture", view, splats, boxes, 40, 40)
+    assert lists.all_fit()
+    assert shown.pairs > 0
+    hidden = replace(boxes, visible=dr.opaque(ad.Bool, False, 50))
+    assert lists.make("picture", 0, splats, hidden, 40, 40).capacity > 0
+    assert not lists.all_fit()
+    with lists.synchronous():
+        assert lists.make("picture", 0, splats, hidden, 40, 40).capacity == 0
+    assert lists.all_fit()
+
+
+def test_where_a_forecast_does_not_fit_into_memory_pairs_are_counted(small_dataset, monkeypatch):
+    """A forecast may say more than there are."""
+
+    def full(*_arguments, **_named):
+        raise WorkError("no memory")
+
+    lists = Counted((select(),))
+    trainer, _ = trained(small_dataset, CONFIG, 19, lists)
+    assert lists.made > 0
+    monkeypatch.setattr(async_lists, "check_memory", full)
+    made = lists.made
+    trainer.step()
+    assert lists.made == made + 1  # as large as those before
+    lists._checked.clear()
+    trainer.step()
+    assert lists.made == made + 1
+
+
+def test_only_where_it_pays():
+    assert AsyncTileLists().is_async == (select() == "cuda")
+    assert not AsyncTileLists(()).is_async
