@@ -12,7 +12,8 @@ from spacesim.data.files import JsonDict
 from spacesim.data.structure import did_you_mean, field_value
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.cameras.camera import CameraConfig
-from spacesim.scenes.cameras.rig import FibonacciRig, Rig
+from spacesim.scenes.cameras.rig import Rig
+from spacesim.scenes.cameras.sphere_rigs import FibonacciRig
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.lights.sun import SunConfig
 from spacesim.scenes.rigs import kinds_with, rig_kind

@@ -2,7 +2,9 @@
 
 from dataclasses import fields
 
-from spacesim.scenes.cameras.rig import ApproachRig, FibonacciRig, FlyAroundRig, PolarArcRig, RandomRig, Rig
+from spacesim.scenes.cameras.path_rigs import ApproachRig, FlyAroundRig
+from spacesim.scenes.cameras.rig import Rig
+from spacesim.scenes.cameras.sphere_rigs import FibonacciRig, PolarArcRig, RandomRig
 from spacesim.scenes.trajectory.rig import FileRig
 from spacesim.scenes.trajectory.spice import SpiceRig
 

@@ -21,7 +21,8 @@ from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import DEPTH_UNIT, DatasetWriter, FrameWriter, choose_depth_unit
 from spacesim.data.transforms import MILLIMETRE
 from spacesim.scenes.build import build
-from spacesim.scenes.cameras.rig import PlannedView, RandomRig, TargetSphere, plan
+from spacesim.scenes.cameras.rig import PlannedView, TargetSphere, plan
+from spacesim.scenes.cameras.sphere_rigs import RandomRig
 from spacesim.scenes.config import SceneConfig
 from spacesim.scenes.generation.estimate import LONG, Estimate, measure, samples
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, raw_suffixes, versions, writing_threads

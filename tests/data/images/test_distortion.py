@@ -12,7 +12,7 @@ from spacesim.data.records import Camera, Sun
 from spacesim.data.store import load_truth, read_dataset
 from spacesim.scenes import Renderer, build, generate, read_scene
 from spacesim.scenes.cameras.camera import CameraConfig
-from spacesim.scenes.cameras.rig import FibonacciRig
+from spacesim.scenes.cameras.sphere_rigs import FibonacciRig
 from spacesim.scenes.config import ObjectConfig, QualityConfig
 
 BARREL = (-0.35, 0.12, 0.004, -0.003, 0.0)

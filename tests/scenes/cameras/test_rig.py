@@ -8,13 +8,9 @@ from spacesim.data.geometry import fibonacci_sphere, normalize
 from spacesim.scenes import build, read_scene
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.orbit import mean_motion
+from spacesim.scenes.cameras.path_rigs import ApproachRig, FlyAroundRig
 from spacesim.scenes.cameras.rig import (
     SINGLE_SUN,
-    ApproachRig,
-    FibonacciRig,
-    FlyAroundRig,
-    PolarArcRig,
-    RandomRig,
     RigConfig,
     TargetSphere,
     fitting_distance,
@@ -23,6 +19,7 @@ from spacesim.scenes.cameras.rig import (
     plan,
     training_suns,
 )
+from spacesim.scenes.cameras.sphere_rigs import FibonacciRig, PolarArcRig, RandomRig
 from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.rigs import RIGS
