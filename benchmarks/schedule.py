@@ -82,7 +82,7 @@ def followed(folder: Path, data: Dataset, config: TrainConfig, views: int) -> li
     chosen = test_views(data, views)
     trainer, points = None, []
     for path in sorted(kept.glob("step_*.safetensors")):
-        scores_path = path.with_suffix(".json")
+        scores_path = path.with_name(f"{path.stem}_{views}_views.json")
         if not scores_path.exists():
             trainer = trainer or Trainer(data, config)
             trainer.restore(path)

@@ -254,8 +254,12 @@ def test_a_schedule_is_followed_and_goes_on(command, place, small_lit):
     assert [row["iteration"] for row in rows] == [50, 100, 110]
     assert all(row["Gaussians"] > 0 and 0 < row["PSNR, unseen Suns"] < 60 for row in rows)
     assert len(list(ElementTree.parse(place / "curve.svg").iter(f"{SVG}path"))) >= 1
-    (place / "out/vanilla/kept/step_00000100.json").unlink()
+    scores = place / "out/vanilla/kept/step_00000100_1_views.json"
+    scores.unlink()
     assert json.loads(call(command))["rows"] == rows
+    scores.write_text("{}")  # of so many views alone
+    more = ["2" if before == "--views" else word for before, word in zip(["", *command], command, strict=False)]
+    assert json.loads(call(more))["rows"] == rows, "there is but one test view"
 
 
 def slope_of(rows, time_of):

@@ -27,8 +27,9 @@ from spacesim.splat.light.field import DirectionsConfig, FieldConfig, SurfaceCon
 from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig, cast_shadows
 from spacesim.splat.light.shadow.light_camera import light_rows
-from spacesim.splat.light.shadow.mapping import MappingConfig
+from spacesim.splat.light.shadow.mapping import MappingConfig, occlusion_by_mapping
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
+from spacesim.splat.light.shadow.splatting import occlusion_by_splatting
 from spacesim.splat.raster import tone
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians, gather_entries
@@ -380,6 +381,24 @@ def test_a_refinement_as_printed_begins_as_any_network():
     last = [LightModel.initial(CONFIGS[name], trained, 0).weights[-2] for name in ("gradients", "printed")]
     assert not numbers(last[0]).any()
     assert numbers(last[1]).std() > 0.1
+
+
+@pytest.mark.parametrize("method", [MappingConfig(), SplattingConfig()], ids=lambda method: method.kind)
+def test_the_refinement_is_told_the_bias_that_was_applied(method):
+    """What is told gives the raw occlusion again; epsilon_s of 4.5 is a share of the farthest camera's distance."""
+    shadow = ShadowConfig(method, 32, bias=4.0, grazing="both", softness=0.02)
+    light = LightModel.initial(LightConfig(FIELD, shadow), TrainingFrame(np.zeros(3), 2.0, 7.0, 3.0), 0)
+    splats = gaussians(200, light.config.features)
+    shadows = light.shadows(splats, SUN)
+
+    def occlusion(bias) -> np.ndarray:
+        if isinstance(method, MappingConfig):
+            return numbers(occlusion_by_mapping(splats, shadows.camera, bias, 0.02 * 7, method, shadows.points))
+        return numbers(occlusion_by_splatting(splats, shadows.camera, bias, shadows.points))
+
+    _, _, told = shadows.info
+    np.testing.assert_allclose(occlusion(told), numbers(shadows.occlusion), atol=1e-6)
+    assert np.abs(occlusion(0.5 * told) - numbers(shadows.occlusion)).max() > 0.1
 
 
 def scattered(name: str) -> tuple[LightModel, Gaussians]:

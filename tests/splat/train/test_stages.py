@@ -1,9 +1,12 @@
 """What refinement watches of a picture."""
 
+from types import SimpleNamespace
+
 import drjit as dr
 import numpy as np
 import pytest
 
+from spacesim.backend import ad
 from spacesim.data.records import Camera
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole, project
@@ -70,6 +73,9 @@ def test_who_has_faded_still_counts_as_seen():
     drawn = view_pass.forward(gaussians, gaussians.rows(), None, view, degree=0, downscale=1, watched=True)
     radius = np.array(drawn.radii)
     assert (radius > 0).tolist() == [True, True, False]
+    slopes = ad.Float([0.0, 1e-3, 0.0])
+    seen = view_pass.watched(drawn, SimpleNamespace(absolute_x=slopes, absolute_y=slopes))[2]
+    assert np.array(seen).tolist() == [True, True, False]
     assert (
         view_pass.forward(gaussians, gaussians.rows(), None, view, degree=0, downscale=1, watched=False).radii is None
     )

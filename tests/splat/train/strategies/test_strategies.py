@@ -334,6 +334,32 @@ def test_backfill_copies_supported_gaussians_nearest_to_the_core():
     assert [len(np.array(v)) for v in strategy.state.values()] == [30] * 6
 
 
+@pytest.mark.parametrize(
+    ("what", "value", "worth"),
+    [("count", 0.9, 0.1), ("gradient", 0.8, 0.1625), ("radius", 0.2, 0.15), ("away", 0.5, 0.2)],
+)
+def test_backfill_score_of_5_22(what, value, worth):
+    """Of 21 one is copied. Two are most opaque, one of which has less of one thing: by (5.12) and (5.22) that is
+    `worth` so much, which 0.75 of its greater opacity makes up for or does not. The others stand 1 away from the
+    centre, on both sides, so that the reach is 1.25, and 0.5 away counts 0.5 * 0.4."""
+    for side in (-1, 1):
+        support = {"count": np.ones(21), "gradient": np.ones(21), "radius": np.ones(21)}
+        means, opacity = np.array([0.0, 0.0, 0.0, *[1.0, -1.0] * 9]), np.full(21, 0.31)
+        opacity[:2] = 0.4, 0.4 + worth / 0.75 + 0.004 * side
+        if what == "away":
+            opacity[2] = opacity[1]  # so that the centre stays
+            means[1:3], support["count"][2] = (value, -value), 0.9
+        else:
+            support[what][1] = value
+        strategy = support_aware(21, min_gaussians=22, backfill_start=1000)
+        supported(strategy, *support.values())
+        gaussians = model(means, opacity)
+        kept = {name: np.array(strategy.state[name]) for name in SUPPORT_STATISTICS}
+        statistics = GaussianStatistics(STEP, *np.zeros((2, 21)), opacity, np.ones(21), kept)
+        parents = strategy._parents(gaussians, statistics, np.zeros(21, bool), np.random.default_rng(0))
+        assert parents.tolist() == [1 if side > 0 else 0]
+
+
 def test_backfill_invents_nothing():
     for opacity, step in ((0.2, STEP), (0.5, 1000)):
         strategy, gaussians = cloud(opacity)
