@@ -1,11 +1,11 @@
 """How good a model is, and how large, over the thesis's 200,000 iterations.
 
-    python benchmarks/schedule.py --out OUT [--data DATA] [--methods shadow-map,vanilla] [--preset thesis]
-                                  [--iterations 200000] [--views 40] [--svg FILE] [--json]
+    python benchmarks/schedule.py --out OUT [--data DATA] [--methods shadow-map,vanilla] [--strategy default]
+                                  [--preset thesis] [--iterations 200000] [--views 40] [--svg FILE] [--json]
 
 boxsat, 100 Suns x 20 views of 256 pixels, test views under these and under 20 Suns never seen; or a dataset of yours.
-Each method's run is OUT/METHOD/run. PSNR over the silhouette, of so many test views under each kind of Sun, and the
-number of Gaussians at every 40th of the training. What was interrupted goes on where it was.
+Each method's run is OUT/METHOD-STRATEGY/run. PSNR over the silhouette, of so many test views under each kind of Sun, and
+the number of Gaussians at every 40th of the training. What was interrupted goes on where it was.
 """
 
 import os
@@ -28,7 +28,7 @@ from spacesim.learning.folder import TrainingProgress
 from spacesim.learning.loop import HISTORY_EVERY
 from spacesim.progress import report_training, show_progress
 from spacesim.splat.run import Run
-from spacesim.splat.train.config import TrainConfig, preset, with_options
+from spacesim.splat.train.config import STRATEGIES, TrainConfig, preset, with_options
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 
@@ -43,6 +43,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="where data and runs are, or are made")
     parser.add_argument("--data", type=Path, help="a dataset in place of its own")
     parser.add_argument("--methods", default="shadow-map,vanilla", help="commas between")
+    parser.add_argument("--strategy", default="default", choices=STRATEGIES)
     parser.add_argument("--preset", default="thesis")
     parser.add_argument("--iterations", type=common.positive, help="default: the preset's")
     parser.add_argument("--views", type=common.positive, default=40, help="test views of each kind of Sun")
@@ -52,10 +53,11 @@ def main() -> None:
     data = read_dataset(options.data or common.generated("boxsat", options.out / "data", **SCENE, **SAMPLES))
     rows = []
     for method in common.row_names(options.methods):
-        config = with_options(preset(options.preset, method), iterations=options.iterations)
+        config = with_options(preset(options.preset, method, options.strategy), iterations=options.iterations)
         every = max(config.iterations // POINTS, HISTORY_EVERY)
-        curve = followed(options.out / method, data, replace(config, checkpoint_every=every), options.views)
-        rows += [{"method": method, **point} for point in curve]
+        folder = options.out / f"{method}-{options.strategy}"
+        curve = followed(folder, data, replace(config, checkpoint_every=every), options.views)
+        rows += [{"method": method, "strategy": options.strategy, **point} for point in curve]
     if options.svg:
         write_bytes(options.svg, chart(rows).encode())
     common.emit({"rows": rows}, {f"Over the iterations, preset {options.preset}": rows}, options)

@@ -245,8 +245,8 @@ def test_rasterizer_tells_growth_and_goes_on_without_its_peer(command, place):
 
 
 @smallest(
-    "schedule.py --out out --data DATA --methods vanilla --preset demo --iterations 110 --views 1 --svg curve.svg"
-    " --backend llvm --json"
+    "schedule.py --out out --data DATA --methods vanilla --strategy mesh-aware --preset demo --iterations 110 --views 1"
+    " --svg curve.svg --backend llvm --json"
 )
 def test_a_schedule_is_followed_and_goes_on(command, place, small_lit):
     (place / "DATA").symlink_to(small_lit)
@@ -254,7 +254,7 @@ def test_a_schedule_is_followed_and_goes_on(command, place, small_lit):
     assert [row["iteration"] for row in rows] == [50, 100, 110]
     assert all(row["Gaussians"] > 0 and 0 < row["PSNR, unseen Suns"] < 60 for row in rows)
     assert len(list(ElementTree.parse(place / "curve.svg").iter(f"{SVG}path"))) >= 1
-    scores = place / "out/vanilla/kept/step_00000100_1_views.json"
+    scores = place / "out/vanilla-mesh-aware/kept/step_00000100_1_views.json"
     scores.unlink()
     assert json.loads(call(command))["rows"] == rows
     scores.write_text("{}")  # of so many views alone
