@@ -4,8 +4,8 @@
                                   [--preset thesis] [--iterations 200000] [--views 40] [--svg FILE] [--json]
 
 boxsat, 100 Suns x 20 views of 256 pixels, test views under these and under 20 Suns never seen; or a dataset of yours.
-Each method's run is OUT/METHOD-STRATEGY/run. PSNR over the silhouette, of so many test views under each kind of Sun, and
-the number of Gaussians at every 40th of the training. What was interrupted goes on where it was.
+A run is OUT/METHOD-STRATEGY/run. PSNR over the silhouette, of so many test views under each kind of Sun, and the
+number of Gaussians at every 40th of the training. What was interrupted goes on where it was.
 """
 
 import os
