@@ -16,7 +16,7 @@ METHODS: tuple[str, ...] = get_args(Method)
 PRESETS: tuple[str, ...] = get_args(Preset)
 ASSET = Path(__file__).parents[1] / "assets" / "presets" / "nerf.toml"
 CHUNK = 512  #: samples of which networks read a multiple, see `field.Columns`
-MAX_STEPS, MAX_RAYS, MAX_SAMPLES = 10_000_000, 2**20, 1024
+MAX_STEPS, MAX_RAYS, MAX_SAMPLES, MAX_CELLS = 10_000_000, 2**20, 1024, 2**16
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,16 @@ class GridConfig:
 
     levels: int = 8  #: resolutions
     coarsest: int = 16  #: cells along the box's longest side, of the first level
-    finest: int = 256  #: of the last level; those between grow by one factor
+    #: of the last level, None: as many as pictures have pixels there, as finer ones learn each picture by heart; those
+    #: between grow by one factor
+    finest: int | None = None
     log2_size: int = 15  #: vertices that a level stores at most, as a power of 2; beyond that they share by a hash
 
     def __post_init__(self) -> None:
-        check_ranges(self, levels=(1, 32), coarsest=(1, 4096), finest=(1, 2**16), log2_size=(4, 24))
+        check_ranges(self, levels=(1, 32), coarsest=(1, 4096), log2_size=(4, 24))
+        if self.finest is None:
+            return
+        check_ranges(self, finest=(1, MAX_CELLS))
         if self.finest < self.coarsest:
             raise InputError(f"finest: expected at least coarsest, {self.coarsest}, found {self.finest}")
 

@@ -22,8 +22,9 @@ from spacesim.nerf.run import NerfRun, load_run
 from spacesim.nerf.sampling.box import scene_box
 from spacesim.nerf.train.pixels import training_pixels
 from spacesim.nerf.train.train import train
-from spacesim.nerf.train.trainer import FORMAT, NerfTrainer
+from spacesim.nerf.train.trainer import FORMAT, NerfTrainer, fit_grid
 from spacesim.splat.compose import ComposeConfig, PlacedRun
+from spacesim.splat.raster.supersample import upsampled_camera
 
 GRID = GridConfig(4, 8, 48, 12)
 CONFIG = NerfConfig(
@@ -224,6 +225,21 @@ def test_scene_boxes(dataset, tmp_path):
     assert (by_cameras.low + by_cameras.size > by_mesh.low).all()
     np.testing.assert_allclose(by_cameras.size, by_cameras.side)
     assert scene_box(dataset, 0.1).side == pytest.approx(1.2 * by_mesh.side)
+
+
+def test_a_grid_is_as_fine_as_the_pictures(dataset, tmp_path):
+    """Unless the configuration says how fine; a run knows what it was, and goes on with the same configuration."""
+    box, camera = scene_box(dataset, CONFIG.margin), dataset.train[0].camera
+    away = camera.world_from_camera[:3, 2] @ (box.low + 0.5 * box.size - camera.position)
+    side = camera.fx * box.side / away  # all cameras look at the middle from as far away
+    assert fit_grid(CONFIG, dataset) == CONFIG
+    config = replace(CONFIG, grid=replace(GRID, finest=None), iterations=10)
+    assert fit_grid(config, dataset).grid.finest == pytest.approx(side, rel=0.05)
+    twice = [replace(frame, camera=upsampled_camera(frame.camera, 2)) for frame in dataset.train]
+    assert fit_grid(config, replace(dataset, train=tuple(twice))).grid.finest == pytest.approx(2 * side, rel=0.05)
+    run = train(dataset, tmp_path / "run", config)
+    assert run.networks.config.grid.finest == fit_grid(config, dataset).grid.finest
+    assert train(dataset, tmp_path / "run", config, resume=True).training == run.training
 
 
 def test_pictures_of_something_else_are_refused(dataset, tmp_path):

@@ -44,6 +44,7 @@ class HashGrid:
     def levels(self) -> tuple[GridLevel, ...]:
         """From coarse to fine."""
         config, first, levels = self.config, 0, []
+        assert config.finest is not None, "a grid that fits its pictures"
         growth = (config.finest / config.coarsest) ** (1 / max(config.levels - 1, 1))
         for i in range(config.levels):
             cells = int(np.floor(config.coarsest * growth**i + 1e-6))

@@ -35,6 +35,14 @@ class SceneBox:
         return (points - self.low) / self.side
 
 
+def pixels_across(box: SceneBox, dataset: Dataset) -> float:
+    """How many pixels the box's longest side has in training pictures, seen from the side; their median."""
+    centre = box.low + 0.5 * box.size
+    away = [float(np.linalg.norm(frame.camera.position - centre)) for frame in dataset.train]
+    pixels = [frame.camera.fx * box.side / max(metres, 1e-9) for frame, metres in zip(dataset.train, away, strict=True)]
+    return float(np.median(pixels))
+
+
 def scene_box(dataset: Dataset, margin: float) -> SceneBox:
     """Around the dataset's mesh, else its points, wider by `margin` times its longest side on each; else a cube about
     the point that the cameras look at, as wide as the nearest of them is far."""

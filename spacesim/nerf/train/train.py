@@ -8,7 +8,7 @@ from spacesim.data.transforms import check_still
 from spacesim.learning.folder import TrainingProgress, describe_data, is_finished, open_folder
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.run import NerfRun, load_run, read_config
-from spacesim.nerf.train.trainer import NerfTrainer
+from spacesim.nerf.train.trainer import NerfTrainer, fit_grid
 
 
 def train(
@@ -20,7 +20,8 @@ def train(
     command: Sequence[str] = (),
 ) -> NerfRun:
     """Train and write RUN (see `spacesim.nerf.run`); as `spacesim.splat.train.train.train` of Gaussians."""
-    out, described = Path(out), {**config.to_json(), "data": describe_data(check_still(dataset))}
+    config = fit_grid(config, check_still(dataset))
+    out, described = Path(out), {**config.to_json(), "data": describe_data(dataset)}
     if not is_finished(out, described, resume, read_config):
         trainer = NerfTrainer(dataset, config)
         with open_folder(out, described, resume, read_config):
