@@ -141,6 +141,15 @@ def test_the_book_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= MAX_LINES
 
 
+TABLES = "choose.md", "radiance-fields.md"  #: how-to pages that are longer: to look things up in
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.glob("how-to/*.md")), ids=of)
+def test_how_to_pages_have_forty_lines(page):
+    lines = page.read_text(encoding="utf-8").splitlines()
+    assert (len(lines) > 40) == (page.name in TABLES)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=of)
 def test_pages_tell_no_history(page):
     text = page.read_text(encoding="utf-8").lower()

@@ -142,12 +142,14 @@ def read_request(frame: bytes) -> tuple[Identity, PictureRequest | InputError]:
     number, version = values.pop("id", None), values.pop("version", None)
     if not (number is None or type(number) in (str, int)):
         return None, InputError("id: expected text or a whole number, found another value")
-    if version != VERSION or type(version) is not int:
-        return number, InputError(f"version: expected {VERSION}, found {version!s:.60}")
     try:
+        if version != VERSION or type(version) is not int:
+            return number, InputError(f"version: expected {VERSION}, found {version!s:.60}")
         return number, structure(PictureRequest, Document("", values, {}), Rules())
     except InputError as error:
         return number, error
+    except RecursionError:  # brackets that can just be read, but not be told of
+        return number, InputError("request: expected a few brackets within each other, found hundreds")
 
 
 def picture_answer(number: Identity, arrays: Arrays, seconds: float) -> list[bytes]:

@@ -144,6 +144,14 @@ def test_garbage_is_told_in_a_sentence(frame):
     assert isinstance(request, InputError)
 
 
+@pytest.mark.parametrize("name", ["camera", "seed", "version"])
+def test_brackets_within_brackets_are_told_in_a_sentence(name):
+    """However many: some depths can be read and not be written."""
+    for depth in range(700, 1100):
+        _, request = read_request(b'{"version": 1, "%s": %s%s}' % (name.encode(), b"[" * depth, b"]" * depth))
+        assert isinstance(request, InputError)
+
+
 def test_an_answer_is_read_as_it_was_written():
     arrays = {"rgb": np.arange(24, dtype=np.uint8).reshape(2, 4, 3), "depth": np.ones((2, 4), ">f4")[:, ::2]}
     frames = picture_answer("a", arrays, 0.25)

@@ -159,8 +159,19 @@ def check_phases(least: float | None, most: float | None) -> None:
 
 
 def plan(rig: Rig, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
-    """The training and the test views of a rig. Random streams are derived from (seed, purpose, index)."""
-    return rig.views_of(target, camera, seed)
+    """The training and the test views of a rig. Random streams are derived from (seed, purpose, index). Raises
+    InputError where a rig of somebody's own gives something else, or no training view."""
+    views = rig.views_of(target, camera, seed)
+    if not (
+        isinstance(views, tuple | list) and len(views) == 2 and all(isinstance(some, list | tuple) for some in views)
+    ):
+        raise InputError(f"rig: expected two lists, of training and test views, found {type(views).__name__}")
+    wrong = next((view for some in views for view in some if not isinstance(view, PlannedView)), None)
+    if wrong is not None:
+        raise InputError(f"rig: expected a PlannedView for each frame, found {type(wrong).__name__}")
+    if not views[0]:
+        raise InputError("rig: expected at least one training view, found none")
+    return list(views[0]), list(views[1])
 
 
 def training_suns(count: int, angles: Sequence[tuple[float, float]] = ()) -> list[Sun]:

@@ -83,20 +83,22 @@ class SpiceRig(TrajectoryRig):
             rows = [_answer(name, spice.pxform, frame, self.frame, et) for et in epochs]
             return Attitude(f"{name} {frame}", times, np.stack([quaternion_from_rotation(turn) for turn in rows]))
 
-        def has_earth() -> bool:
-            """Kernels of a mission to elsewhere may not have it."""
+        def tells_earth(et: float) -> bool:
             try:
-                _answer("earth", spice.spkpos, "EARTH", first, self.frame, "NONE", self.target)
+                _answer("earth", spice.spkpos, "EARTH", et, self.frame, "NONE", self.target)
             except InputError:
                 return False
             return True
+
+        # Kernels of a mission to elsewhere may not have it. Those that have it at some epoch must have it at all.
+        has_earth = any(tells_earth(et) for et in epochs)
 
         return Motion(
             day,
             camera=positions("camera", self.camera),
             camera_turn=turns("camera_frame", self.camera_frame),
             target_turn=turns("target_frame", self.target_frame),
-            earth=positions("earth", "EARTH") if has_earth() else None,
+            earth=positions("earth", "EARTH") if has_earth else None,
             sun=None if self.sun else positions("sun", "SUN"),
         )
 

@@ -113,3 +113,23 @@ def test_what_is_no_rig(tmp_path):
     skewed[1, 0, 0] = 3
     with pytest.raises(InputError, match="world_from_camera: expected a rotation"):
         ss.generate("boxsat", tmp_path / "data", rig=ss.PoseRig(skewed), **SMALL)
+
+
+@pytest.mark.parametrize(
+    ("views", "message"),
+    [
+        (([], []), "rig: expected at least one training view, found none"),
+        ((POSES, []), "rig: expected two lists, of training and test views, found tuple"),
+        ((list(POSES), []), "rig: expected a PlannedView for each frame, found ndarray"),
+        ([], "rig: expected two lists, of training and test views, found list"),
+        (None, "rig: expected two lists, of training and test views, found NoneType"),
+    ],
+)
+def test_what_a_rig_of_ones_own_must_give(tmp_path, views, message):
+    @dataclass(frozen=True)
+    class Odd(Rig):
+        def views_of(self, target, camera, seed):
+            return views
+
+    with pytest.raises(InputError, match=message):
+        ss.generate("boxsat", tmp_path / "data", rig=Odd(), **SMALL)

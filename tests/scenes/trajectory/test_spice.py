@@ -191,6 +191,25 @@ def test_what_kernels_do_not_tell(kernels, options, message):
     assert spice.ktotal("ALL") == 0
 
 
+def test_an_earth_that_is_not_covered(kernels, tmp_path):
+    """Without it there are no eclipses, so it is not left out where kernels tell it for a part of the time."""
+    for kernel in kernels[:2]:
+        spice.furnsh(kernel)
+    first, last = spice.str2et(START), spice.str2et(STOP)
+    spice.kclear()
+    name = str(tmp_path / "f.bsp")
+    handle = spice.spkopn(name, "test", 0)
+    for body, begin, end, ahead in ((-2000, first, last, 0), (-1000, first, last, 1e-9), (399, first + 60, last, 1e-5)):
+        times = np.linspace(begin, end, 41)
+        orbit = states(times, ahead, height=1.5e8)
+        spice.spkw13(handle, body, 10, "J2000", begin, end, "test", 7, len(times), orbit, times)
+    spice.spkcls(handle)
+    with pytest.raises(InputError, match=r"earth: expected kernels that tell it, found SPICE\(SPKINSUFFDATA\)"):
+        plan(rig((*kernels[:2], name)), TARGET, CAMERA, 0)
+    covered = plan(rig((*kernels[:2], name), start="2030-03-01T12:02:00"), TARGET, CAMERA, 0)[0]
+    assert all(view.earth is not None for view in covered)
+
+
 def test_an_attitude_that_is_not_covered(kernels):
     without = tuple(kernel for kernel in kernels if not kernel.endswith(".bc"))
     with pytest.raises(InputError, match=r"target_frame: .* found SPICE\(NOFRAMECONNECT\)"):
