@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from spacesim.data.errors import InputError
-from spacesim.data.mesh import WRITTEN, SignedDistance, load_trimesh, read_mesh, write_mesh
+from spacesim.data.mesh import WRITTEN, SignedDistance, load_mesh, read_mesh, write_mesh
 
 
 def queries(count: int = 4000, reach: float = 2.0) -> np.ndarray:
@@ -207,4 +207,4 @@ def test_a_file_of_no_points_is_said_to_be_empty(tmp_path):
     lines = ["ply", "format ascii 1.0", "element vertex 0", *(f"property float {axis}" for axis in "xyz"), "end_header"]
     (tmp_path / "a.ply").write_text("\n".join([*lines, ""]))
     with pytest.raises(InputError, match=r"a\.ply: expected a mesh, found a file .* \(there is nothing in it\)"):
-        load_trimesh(tmp_path / "a.ply")
+        load_mesh(tmp_path / "a.ply")
