@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forks import Forked
 from PIL import Image
 from safetensors.numpy import save
 from tiny import GENERATE, PROGRAM, PROGRESS, SPARING, contents, outcome
@@ -56,9 +57,9 @@ train(read_dataset(sys.argv[3]), Path(sys.argv[4]), {CONFIG!r})
 
 def kill(program: str, moment: int, after: bool, *arguments: object) -> None:
     """Run a program that gets SIGKILL before or after it has put its file number `moment` in place."""
-    command = [sys.executable, "-c", KILLED + program, moment, "after" if after else "before", *arguments]
-    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, timeout=100)
-    assert done.returncode == -signal.SIGKILL, done.stderr
+    process = Forked(["-c", KILLED + program, moment, "after" if after else "before", *arguments])
+    _, errors = process.communicate()
+    assert process.returncode == -signal.SIGKILL, errors
 
 
 # --- kill -9 ---------------------------------------------------------------------------------------------------------
