@@ -12,6 +12,7 @@ import numpy as np
 R = TypeVar("R")
 SAMPLES, VOXELS = 4_000, 48
 POINTS = 2_000
+SIZE = 120, 90  #: of pictures of shapes, pixels
 
 
 def spare_work() -> None:
@@ -43,11 +44,13 @@ def spare_datasets() -> None:
 
 
 def spare_shapes() -> None:
-    """They are compared by fewer points where nobody says by how many."""
+    """They are compared by fewer points where nobody says by how many, and drawn smaller."""
+    from spacesim.eval import shape
     from spacesim.eval.metrics.geometry import GeometryConfig
 
     _, share, _, *rest = GeometryConfig.__init__.__defaults__
     GeometryConfig.__init__.__defaults__ = (SAMPLES, share, VOXELS, *rest)
+    shape.WIDTH, shape.HEIGHT = SIZE
 
 
 def _remembered(function: Callable[..., R]) -> Callable[..., R]:
