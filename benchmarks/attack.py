@@ -17,6 +17,7 @@ from typing import Any
 
 import common
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "attack"))
 
 import attack

@@ -605,7 +605,7 @@ def test_the_page_tells_its_size_its_speed_and_how_near_it_is(command, tiny_run,
 @smallest(
     "viewer.py --backend llvm --gaussians 200 --side 64 --repeats 1 --moving 0.5 --seconds 1 --clients 1 --json",
     "viewer.py RUN --backend llvm --side 64 --repeats 1 --moving 0.5 --seconds 0 --json",
-    "viewer.py FIELD --backend llvm --side 64 --repeats 1 --moving 2.5 --seconds 0 --json",
+    "viewer.py FIELD --backend llvm --side 64 --repeats 1 --moving 0.8 --seconds 0 --json",
 )
 def test_viewer_tells_pictures_rates_and_memory(command, tiny_run, tiny_field, place):
     pytest.importorskip("viser", reason="viser is not installed")
@@ -695,7 +695,7 @@ def test_data_like_speedplus_have_no_suns_but_those_that_are_told(command, place
 )
 def test_unknown_suns_are_compared_with_true_ones(command, place, monkeypatch):
     for module in (sun_search, suns):  # a lattice of few Suns
-        monkeypatch.setattr(module, "SPHERE", 60)
+        monkeypatch.setattr(module, "SPHERE", 24)
     rows = {row["Suns"]: row for row in json.loads(call(command))["rows"]}
     assert list(rows) == ["told", "unknown", "vanilla"]
     assert 0 <= rows["unknown"]["Sun off, deg"] <= 180

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tiny import GENERATE, TRAIN, contents
+from tiny import GENERATE, PROGRAM, TRAIN, contents
 
 from spacesim.cli.parser import view_of
 from spacesim.cli.program import in_flags, parser
@@ -271,7 +271,8 @@ def test_eval_writes_numbers_pictures_and_a_page(tiny_eval):
 
 
 def test_json_of_eval_stands_alone(tiny_run, tiny_data, tmp_path):
-    command = [sys.executable, "-m", "spacesim.cli", "eval", tiny_run, "--data", tiny_data, "--out", tmp_path / "eval"]
+    program = PROGRAM.replace("spare_datasets", "spare_shapes")
+    command = [sys.executable, "-c", program, "eval", tiny_run, "--data", tiny_data, "--out", tmp_path / "eval"]
     done = subprocess.run([*command, "--json", "--split", "train"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == json.loads((tmp_path / "eval/metrics.json").read_text())

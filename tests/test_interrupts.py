@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from tiny import GENERATE, TRAIN
+from tiny import GENERATE, PROGRAM, TRAIN
 
 STOPPED = "spacesim: stopped\n"
 RESUMABLE = "spacesim: stopped; what was finished is kept, --resume goes on from there\n"
@@ -149,7 +149,7 @@ def test_a_closed_standard_output_is_no_news(tiny_data, arguments):
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
 def test_what_was_made_is_there_though_it_cannot_be_said(tiny_data, tmp_path):
     with open(FULL, "w") as full:
-        done = run("-m", "spacesim.cli", "generate", "boxsat", "--out", tmp_path / "data", *GENERATE, stdout=full)
+        done = run("-c", PROGRAM, "generate", "boxsat", "--out", tmp_path / "data", *GENERATE, stdout=full)
     assert done.returncode == 1
     assert done.stderr.splitlines(keepends=True)[-1] == NO_SPACE
     made, expected = (

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forks import Forked
 from PIL import Image
 from safetensors.numpy import save
-from tiny import GENERATE, PROGRESS, contents, outcome
+from tiny import GENERATE, PROGRAM, PROGRESS, SPARING, contents, outcome
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.store import find_unreadable_files, load_truth, read_dataset, write_points
@@ -44,7 +45,7 @@ def dying(*paths):
 
 os.replace = dying
 """
-GENERATING = "from spacesim.cli import main; main(sys.argv[3:])"
+GENERATING = f"{SPARING}from spacesim.cli import main; main(sys.argv[3:])"
 TRAINING = f"""
 from pathlib import Path
 from spacesim.data.store import read_dataset
@@ -56,9 +57,9 @@ train(read_dataset(sys.argv[3]), Path(sys.argv[4]), {CONFIG!r})
 
 def kill(program: str, moment: int, after: bool, *arguments: object) -> None:
     """Run a program that gets SIGKILL before or after it has put its file number `moment` in place."""
-    command = [sys.executable, "-c", KILLED + program, moment, "after" if after else "before", *arguments]
-    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, timeout=100)
-    assert done.returncode == -signal.SIGKILL, done.stderr
+    process = Forked(["-c", KILLED + program, moment, "after" if after else "before", *arguments])
+    _, errors = process.communicate()
+    assert process.returncode == -signal.SIGKILL, errors
 
 
 # --- kill -9 ---------------------------------------------------------------------------------------------------------
@@ -197,7 +198,7 @@ def test_a_second_run_in_the_same_folder_is_refused_and_harms_nothing(spacesim, 
     """The first is stopped amid its frames, then killed: its lock goes with it."""
     out = tmp_path / "data"
     arguments = ["generate", "boxsat", "--out", str(out), *GENERATE]
-    first = subprocess.Popen([sys.executable, "-m", "spacesim.cli", *arguments], stderr=subprocess.DEVNULL)
+    first = subprocess.Popen([sys.executable, "-c", PROGRAM, *arguments], stderr=subprocess.DEVNULL)
     try:
         while not list(out.glob("gt/*.exr")):
             assert first.poll() is None, "it should have been stopped before its end"

@@ -13,6 +13,13 @@ from spacesim.cli import main
 GENERATE = ("--views", "6", "--test-views", "2", "--resolution", "40", "--spp", "4")
 TRAIN = ("--preset", "demo", "--iterations", "50", "--set", "init_count=300")
 TRAIN_FIELD = ("--preset", "demo", "--iterations", "60", "--set=rays=512", "--set=samples=12", "--set=chunk=2048")
+SPARING = f"""import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from sooner import spare_datasets
+spare_datasets()
+"""
+#: the command line in a process of its own, for `python -c`, which makes the same datasets as tests in theirs
+PROGRAM = f"{SPARING}import runpy; runpy.run_module('spacesim.cli', run_name='__main__', alter_sys=True)"
 PROGRESS = re.compile(r"(generate|train|evaluate|sweep|compose|export): \d+/\d+ ")
 
 

@@ -3,8 +3,8 @@
 import io
 import re
 import struct
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,9 +29,8 @@ PARSED = 30  #: bytes of memory that a byte of a mesh file takes while it is rea
 
 def read_mesh(path: Path) -> tuple[Array, np.ndarray]:
     """(vertices [V, 3] metres, faces [F, 3] int64) of a mesh file. Raises InputError where it holds none."""
-    mesh = load_trimesh(path)
-    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(getattr(mesh, "faces", ()), np.int64)
-    faces = drawable_faces(vertices, faces)
+    mesh = load_mesh(path)
+    vertices, faces = mesh.vertices, drawable_faces(mesh.vertices, mesh.faces)
     if len(faces) == 0:
         raise InputError(
             f"{path}: expected a mesh, found no face with an area and corners within {MAX_COORDINATE:g} m in it"
@@ -39,17 +38,59 @@ def read_mesh(path: Path) -> tuple[Array, np.ndarray]:
     return vertices, faces
 
 
-def load_trimesh(path: Path, kind: str | None = None) -> Any:
-    """What trimesh makes of one of the READ formats by itself: a mesh, or points; files beside it, such as textures,
-    are not opened. kind: one of READ, by default the ending of the name. Raises InputError where it cannot be read,
-    MemoryError where it does not fit into memory."""
-    import trimesh  # here and below: half a second, that whoever reads no mesh need not wait
+@dataclass(frozen=True, eq=False)
+class RawMesh:
+    """What a mesh file holds, as it stands there."""
 
+    vertices: Array  #: [V, 3]
+    faces: np.ndarray  #: [F, 3] int64; [0, 3] of points alone
+    colors: np.ndarray | None  #: [V, 3] uint8, where its vertices have colours
+
+
+def load_mesh(path: Path, kind: str | None = None) -> RawMesh:
+    """One of the READ formats by itself: files beside it, such as textures, are not opened. kind: one of READ, by
+    default the ending of the name. Raises InputError where it cannot be read, MemoryError where it does not fit into
+    memory."""
     path = Path(path)
     content, kind = read_bytes(path, "a mesh"), kind or path.suffix.lower()
     if kind not in READ:
         raise InputError(f"{path}: expected a mesh in {', '.join(READ)}, found {kind or 'no ending'!r}")
     check_memory(PARSED * len(content), f"{path}: reading it")
+    return (_plain_ply(content) if kind == ".ply" else None) or _load_trimesh(path, kind, content)
+
+
+def _plain_ply(content: bytes) -> RawMesh | None:
+    """A PLY file of corners, faces and colours alone, as datasets have. None where anything else is in it or it is not
+    whole, which trimesh then tells of: importing that takes half a second."""
+    header = _PLAIN_PLY.match(content)
+    if header is None:
+        return None
+    count, is_colored, face_count = int(header[1]), header[2] is not None, int(header[3] or 0)
+    vertex = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3 if is_colored else 0)])
+    face = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+    start = header.end() + count * vertex.itemsize
+    if count == 0 or start + face_count * face.itemsize != len(content):
+        return None
+    vertices = np.frombuffer(content, vertex, count, header.end())
+    faces = np.frombuffer(content, face, face_count, start)
+    corners = faces["corners"].astype(np.int64)
+    if not ((faces["count"] == 3) & ((corners >= 0) & (corners < count)).all(axis=1)).all():
+        return None
+    return RawMesh(vertices["xyz"].astype(np.float64), corners, vertices["rgb"].copy() if is_colored else None)
+
+
+_PLAIN_PLY = re.compile(
+    rb"ply\nformat binary_little_endian 1\.0\n(?:comment [^\n]*\n)*element vertex (\d{1,12})\n"
+    rb"property float x\nproperty float y\nproperty float z\n"
+    rb"(property uchar red\nproperty uchar green\nproperty uchar blue\n)?"
+    rb"(?:element face (\d{1,12})\nproperty list uchar int vertex_indices\n)?end_header\n"
+)
+
+
+def _load_trimesh(path: Path, kind: str, content: bytes) -> RawMesh:
+    """What trimesh makes of it."""
+    import trimesh  # here and below: half a second, that whoever reads no mesh need not wait
+
     try:
         check_header_counts(kind[1:], content)
         force = None if kind == ".ply" else "mesh"
@@ -68,7 +109,10 @@ def load_trimesh(path: Path, kind: str | None = None) -> Any:
     except Exception as error:  # trimesh documents none of what it raises
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: expected a mesh, found a file that cannot be read as one ({reason})") from None
-    return loaded
+    faces = np.asarray(getattr(loaded, "faces", np.zeros((0, 3))), np.int64)
+    colors = np.asarray(loaded.visual.vertex_colors) if loaded.visual.kind == "vertex" else np.empty(0)
+    colored = colors.ndim == 2  # a cloud without colours claims to have none a vertex
+    return RawMesh(np.asarray(loaded.vertices, np.float64), faces, colors[:, :3].astype(np.uint8) if colored else None)
 
 
 class MeshFolderResolver:

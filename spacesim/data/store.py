@@ -31,7 +31,7 @@ from spacesim.data.files import (
 from spacesim.data.images import Undistortion, load_image, read_exr, read_png, write_exr, write_png
 from spacesim.data.integrity.manifest import check_manifest, read_manifest, write_manifest
 from spacesim.data.integrity.whole import is_whole
-from spacesim.data.mesh import check_points, load_trimesh
+from spacesim.data.mesh import check_points, load_mesh
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
 from spacesim.data.transforms import DEPTH_UNITS, MILLIMETRE, dataset_of, read_dataset
 
@@ -310,13 +310,10 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises InputError where the file is missing, cut off, no PLY, or holds positions that are not finite or
     beyond 1e9 m.
     """
-    cloud = load_trimesh(path, ".ply")
-    points = np.asarray(cloud.vertices, np.float64)
-    check_points(points, path)
-    colors = np.asarray(cloud.visual.vertex_colors) if cloud.visual.kind == "vertex" else np.empty(0)
-    if colors.ndim != 2:  # a cloud without colours claims to have none a vertex
-        return points, np.full((len(points), 3), 128, np.uint8)
-    return points, colors[:, :3].astype(np.uint8)
+    cloud = load_mesh(path, ".ply")
+    check_points(cloud.vertices, path)
+    grey = np.full(cloud.vertices.shape, 128, np.uint8)
+    return cloud.vertices, grey if cloud.colors is None else cloud.colors
 
 
 def find_unreadable_files(path: Path) -> list[str]:

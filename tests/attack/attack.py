@@ -24,10 +24,11 @@ from typing import Any
 
 import corpus
 import mutations
+from forks import Forked
 
 HEADROOM = 2 << 30  #: bytes that damaged input may take beyond what the honest one does
 PATIENCE = 60.0  #: seconds
-RESTART_AFTER = 1500  #: commands of one process
+RESTART_AFTER = 2000  #: commands of one process
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT, HERE, HERE.parent)))}
@@ -370,22 +371,20 @@ class Killed:
     changes: tuple[str, ...] = ()
 
 
-_CLI = ("-m", "spacesim.cli")
-_SOONER = """
+_SPARING = """
 import runpy
-from sooner import spare_work
-spare_work()
+import sooner
+sooner.{}()
 runpy.run_module("spacesim.cli", run_name="__main__", alter_sys=True)
 """
+_GENERATE = ("-c", _SPARING.format("spare_datasets"), "generate", "boat.obj", "--out", "{out}", *corpus.TINY)
+_EVAL = ("-c", _SPARING.format("spare_shapes"), "eval")
 KILLED = (
-    Killed("generate", (*_CLI, "generate", "boat.obj", "--out", "{out}", *corpus.TINY, "--views", "12", "--resume")),
-    Killed(
-        "generate --workers 2",
-        (*_CLI, "generate", "boat.obj", "--out", "{out}", *corpus.TINY, "--views", "12", "--resume", "--workers", "2"),
-    ),
+    Killed("generate", (*_GENERATE, "--views", "12", "--resume")),
+    Killed("generate --workers 2", (*_GENERATE, "--views", "12", "--resume", "--workers", "2")),
     Killed("train", ("-c", TRAINING, "{out}"), ("config.json", "training.json", "checkpoints/seconds.json")),
-    Killed("eval", ("-c", _SOONER, "eval", "run", "--data", "data", "--out", "{out}"), ("metrics.json", "report.html")),
-    Killed("compose", (*_CLI, "compose", "composed.toml", "--out", "{out}")),
+    Killed("eval", (*_EVAL, "run", "--data", "data", "--out", "{out}"), ("metrics.json", "report.html")),
+    Killed("compose", ("-m", "spacesim.cli", "compose", "composed.toml", "--out", "{out}")),
 )
 
 
@@ -423,11 +422,8 @@ def _undisturbed(one: Killed, root: Path, place: Path) -> tuple[dict[str, bytes]
     return found, seconds
 
 
-def _process(one: Killed, folder: Path, out: Path) -> "subprocess.Popen[bytes]":
-    words = [sys.executable, *(word.replace("{out}", str(out)) for word in one.words)]
-    return subprocess.Popen(
-        words, cwd=folder, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
-    )
+def _process(one: Killed, folder: Path, out: Path) -> Forked:
+    return Forked([word.replace("{out}", str(out)) for word in one.words], folder, **ENVIRONMENT)
 
 
 def _end_and_resume(

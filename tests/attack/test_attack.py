@@ -1,5 +1,6 @@
 """The attack at its smallest: nothing is found. And it would find what it looks for."""
 
+import os
 import re
 import shutil
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ def root(tmp_path_factory) -> Path:
 
 
 def test_damaged_inputs_and_wrong_command_lines(root, tmp_path):
-    found = attack_inputs(root, tmp_path, SEED, 2000)
+    found = attack_inputs(root, tmp_path, SEED, 2000, processes=len(os.sched_getaffinity(0)))
     assert found.finds == []
     assert (found.tried, found.held) == (2000, 2000)
 
@@ -82,7 +83,7 @@ def weak(tmp_path_factory) -> Iterator[Worker]:
         ("traceback", "traceback: .*IndexError"),
         ("code", "exit code 7"),
         ("abort", "the process died .signal 6"),
-        ("sleep", "took more than 3 s"),
+        ("sleep", "took more than 2 s"),
         ("memory", r"took 1\.[0-9] GB more than honest input"),
         ("short", "asked for more memory than there is"),
         ("runtime", "unexplained: .*of no known reason"),
@@ -91,7 +92,7 @@ def weak(tmp_path_factory) -> Iterator[Worker]:
 def test_it_finds(weak, tmp_path, monkeypatch, way, words):
     assert verdict(weak.run(["doctor"], tmp_path)) is None
     if way == "sleep":
-        monkeypatch.setattr(attack, "PATIENCE", 3.0)
+        monkeypatch.setattr(attack, "PATIENCE", 2.0)
     found = verdict(weak.run([way], tmp_path))
     monkeypatch.setattr(attack, "PATIENCE", 60.0)
     assert verdict(weak.run(["doctor"], tmp_path)) is None, "it is started anew"
@@ -128,7 +129,7 @@ def test_it_finds_bytes_that_are_called_whole(root, tmp_path, monkeypatch):
 def test_it_finds_what_a_kill_has_spoilt(root, tmp_path, monkeypatch):
     """A command whose output depends on how often it was started."""
     counting = "import os, sys; out = sys.argv[1]; os.makedirs(out, exist_ok=True); open(out + '/a', 'a').write('x')"
-    slow = f"{counting}; import time; time.sleep(1.5)"
+    slow = f"{counting}; import time; time.sleep(0.5)"
     monkeypatch.setattr(attack, "KILLED", (attack.Killed("counting", ("-c", slow, "{out}")),))
     found = attack_kills(root, tmp_path, SEED, 3)
     assert len(found.finds) == 3

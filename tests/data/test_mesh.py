@@ -1,11 +1,14 @@
 """Signed distance against closed forms, against exact winding numbers, and for meshes that are not whole."""
 
+import sys
+
 import numpy as np
 import pytest
 import trimesh
 
 from spacesim.data.errors import InputError
-from spacesim.data.mesh import WRITTEN, SignedDistance, load_trimesh, read_mesh, write_mesh
+from spacesim.data.mesh import WRITTEN, SignedDistance, _plain_ply, load_mesh, read_mesh, write_mesh
+from spacesim.data.store import write_points
 
 
 def queries(count: int = 4000, reach: float = 2.0) -> np.ndarray:
@@ -207,4 +210,61 @@ def test_a_file_of_no_points_is_said_to_be_empty(tmp_path):
     lines = ["ply", "format ascii 1.0", "element vertex 0", *(f"property float {axis}" for axis in "xyz"), "end_header"]
     (tmp_path / "a.ply").write_text("\n".join([*lines, ""]))
     with pytest.raises(InputError, match=r"a\.ply: expected a mesh, found a file .* \(there is nothing in it\)"):
-        load_trimesh(tmp_path / "a.ply")
+        load_mesh(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("kind", ["mesh", "points", "colored points"])
+def test_plain_ply_is_read_as_trimesh_reads_it(tmp_path, monkeypatch, kind):
+    """And without importing that, which takes longer than all else that small commands do."""
+    path, sphere = tmp_path / "a.ply", trimesh.creation.icosphere(2)
+    if kind == "mesh":
+        write_mesh(path, sphere.vertices, sphere.faces)
+    else:
+        write_points(path, sphere.vertices, np.random.default_rng(0).integers(0, 256, sphere.vertices.shape, np.uint8))
+    if kind == "points":
+        head, body = path.read_bytes().split(b"property uchar red")[0], sphere.vertices.astype("<f4").tobytes()
+        path.write_bytes(head + b"end_header\n" + body)
+    with monkeypatch.context() as patch:
+        patch.setattr("spacesim.data.mesh._plain_ply", lambda content: None)
+        theirs = load_mesh(path)
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    ours = load_mesh(path)
+    for name in ("vertices", "faces", "colors"):
+        mine, other = getattr(ours, name), getattr(theirs, name)
+        assert (mine is None) == (other is None)
+        if mine is not None:
+            assert mine.dtype == other.dtype
+            np.testing.assert_array_equal(mine, other)
+    assert (len(ours.vertices), len(ours.faces)) == (162, 320 if kind == "mesh" else 0)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: data[:-1],
+        lambda data: data + b"\0",
+        lambda data: data[:-13] + b"\4" + data[-12:],
+        lambda data: data.replace(b"vertex 162", b"vertex 163"),
+        lambda data: data.replace(b"face 320", b"face 319"),
+    ],
+)
+def test_plain_ply_that_is_not_whole_is_left_to_trimesh(tmp_path, damage):
+    sphere = trimesh.creation.icosphere(2)
+    write_mesh(tmp_path / "a.ply", sphere.vertices, sphere.faces)
+    content = (tmp_path / "a.ply").read_bytes()
+    assert _plain_ply(content) is not None
+    assert _plain_ply(damage(content)) is None
+
+
+def test_faces_of_corners_that_are_not_there_are_left_to_trimesh():
+    for corner in (-1, 3):
+        data = b"".join(
+            [
+                b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n",
+                b"property float x\nproperty float y\nproperty float z\n",
+                b"element face 1\nproperty list uchar int vertex_indices\nend_header\n",
+                np.eye(3, dtype="<f4").tobytes(),
+                b"\3" + np.array([0, 1, corner], "<i4").tobytes(),
+            ]
+        )
+        assert _plain_ply(data) is None

@@ -121,7 +121,7 @@ def test_what_is_masked_does_not_count(run):
 
 
 def test_the_same_seed_gives_the_same_bits(run):
-    one, other, third = (refine_pose(run, picture(run), off(1), seed=seed) for seed in (5, 5, 6))
+    one, other = (refine_pose(run, picture(run), off(1), seed=5) for _ in range(2))
     np.testing.assert_array_equal(one.camera.world_from_camera, other.camera.world_from_camera)
     np.testing.assert_array_equal(one.covariance, other.covariance)
     assert (one.gain, one.error, one.iterations) == (other.gain, other.error, other.iterations)
@@ -129,7 +129,7 @@ def test_the_same_seed_gives_the_same_bits(run):
     searched = [_find_starts(level, 1.0, 3, seed)[1].world_from_camera for seed in (5, 5, 6)]
     np.testing.assert_array_equal(searched[0], searched[1])
     assert not np.allclose(searched[0], searched[2])
-    assert isinstance(third, RefinedPose)
+    assert isinstance(one, RefinedPose)
 
 
 def pivot_of(run: Run, camera: Camera = CAMERA) -> Pivot:

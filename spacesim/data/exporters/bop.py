@@ -15,9 +15,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
@@ -36,6 +36,9 @@ from spacesim.data.files import JsonDict, write_bytes, write_json
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
+
+if TYPE_CHECKING:
+    import trimesh
 
 MM = 1000.0
 HALF = 0.5  # from our pixel coordinates to those of BOP
@@ -168,6 +171,8 @@ def _depth_scale(farthest: float) -> float:
 
 
 def _write_models(out: Path, targets: list[LabelledObject], models: list[int], bodies: Sequence[BodyLabels]) -> None:
+    import trimesh  # half a second, that evaluating need not wait
+
     infos: JsonDict = {}
     for number in dict.fromkeys(models):
         target, body = targets[models.index(number)], bodies[models.index(number)]
@@ -198,9 +203,11 @@ def _write_models(out: Path, targets: list[LabelledObject], models: list[int], b
         write_json(out / folder / "models_info.json", infos)
 
 
-def _spread(points: np.ndarray, faces: np.ndarray, diameter: float) -> trimesh.Trimesh:
+def _spread(points: np.ndarray, faces: np.ndarray, diameter: float) -> "trimesh.Trimesh":
     """The mesh with edges of at most `EDGE` diameters, and where it has more than `MOST_VERTICES`, those in a cell of a
     grid merged, as fine as will do."""
+    import trimesh
+
     edge, merged, corners = EDGE * diameter, points, faces
     for share in (0.1, 0.2, 0.4):
         if len(merged) <= MOST_VERTICES:

@@ -5,14 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import holds_files
 from spacesim.data.geometry import Array
 from spacesim.data.images import read_exr, read_png
 from spacesim.data.images.tone import TONES, as_bytes, display_values
-from spacesim.data.mesh import MAX_COORDINATE, check_points, load_trimesh
+from spacesim.data.mesh import MAX_COORDINATE, check_points, load_mesh
 from spacesim.data.records import Camera, Dataset, Frame
 
 ExportProgress = Callable[[int, int, str], None]  #: frames done, frames in all, name of the frame
@@ -55,8 +54,8 @@ def labelled_objects(dataset: Dataset) -> list[LabelledObject]:
     except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(f"{path}: expected objects, their poses and shares of mesh.ply, found none") from None
     source = dataset.root / (dataset.mesh_path or "mesh.ply")
-    mesh = load_trimesh(source)
-    if not isinstance(mesh, trimesh.Trimesh):
+    mesh = load_mesh(source)
+    if not len(mesh.faces):
         raise InputError(f"{source}: expected the mesh of the dataset, found points without faces")
     check_points(mesh.vertices, source, MAX_COORDINATE)
     if not objects or [sum(size) for size in zip(*sizes, strict=True)] != [len(mesh.vertices), len(mesh.faces)]:
@@ -65,8 +64,8 @@ def labelled_objects(dataset: Dataset) -> list[LabelledObject]:
     first_vertex = first_face = 0
     for (number, name), pose, (vertices, faces) in zip(names, poses, sizes, strict=True):
         rigid = _rigid(pose)
-        world = np.asarray(mesh.vertices[first_vertex : first_vertex + vertices])
-        object_faces = np.asarray(mesh.faces[first_face : first_face + faces]) - first_vertex
+        world = mesh.vertices[first_vertex : first_vertex + vertices]
+        object_faces = mesh.faces[first_face : first_face + faces] - first_vertex
         if object_faces.min() < 0 or object_faces.max() >= vertices or not (np.ptp(world, axis=0) > 0).any():
             raise InputError(f"{source}: expected a mesh with a size as object {number}, found none")
         targets.append(LabelledObject(number, name, rigid, (world - rigid[:3, 3]) @ rigid[:3, :3], object_faces))

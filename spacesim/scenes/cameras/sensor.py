@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from spacesim.data.errors import expect
 
@@ -58,6 +57,8 @@ class SensorConfig:
     def expose(self, light: np.ndarray, random: np.random.Generator) -> NDArray[np.uint16]:
         """Digital numbers of linear `light` [H, W], or [H, W, C] for a sensor a channel, of which 1 fills the well."""
         if self.psf_sigma_px > 0:  # what lies beyond the border is taken to be as bright as the border
+            from scipy.ndimage import gaussian_filter  # a tenth of a second, that cameras without it need not wait
+
             axes = (self.psf_sigma_px, self.psf_sigma_px, 0.0)[: light.ndim]
             light = gaussian_filter(light, axes, mode="nearest", truncate=5.0)
         electrons = np.clip(self.full_well_e * light + self.dark_e, 0, _MAX_ELECTRONS)

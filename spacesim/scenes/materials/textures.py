@@ -8,8 +8,6 @@ right), y along v (up), as in glTF. No shape or strength in them is measured.
 from functools import cache
 
 import numpy as np
-from scipy.fft import irfft2, rfft2
-from scipy.ndimage import gaussian_filter
 
 from spacesim.data.geometry import Array
 from spacesim.data.images import srgb_from_linear
@@ -23,6 +21,8 @@ Color = tuple[float, float, float]
 @cache
 def crinkle() -> np.ndarray:
     """Normal map of crinkled foil: flat facets of several sizes that meet in sharp creases, RMS slope 0.22."""
+    from scipy.ndimage import gaussian_filter  # here and below: a tenth of a second, that plain scenes need not wait
+
     height = np.zeros((FOIL_SIZE, FOIL_SIZE))
     for seed, (count, strength) in enumerate([(126, 1.0), (540, 0.45), (2340, 0.2)]):
         height += strength * _facets(count, seed, FOIL_SIZE) / np.sqrt(count)
@@ -100,6 +100,8 @@ def _facets(count: int, seed: int, size: int) -> Array:
 
 def _noise(exponent: float, seed: int) -> Array:
     """Periodic noise [SIZE, SIZE] of amplitude 1 / frequency**`exponent`, mean 0, deviation 1."""
+    from scipy.fft import irfft2, rfft2
+
     white = np.random.default_rng(seed).normal(size=(SIZE, SIZE))
     frequency = np.hypot(np.fft.fftfreq(SIZE)[:, None], np.fft.rfftfreq(SIZE)[None]) * SIZE
     frequency[0, 0] = np.inf

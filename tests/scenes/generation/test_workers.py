@@ -3,7 +3,6 @@
 import importlib.util
 import os
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from forks import Forked
 from tiny import contents
 
 from spacesim.data.errors import InputError, WorkError
@@ -20,7 +20,7 @@ from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, writin
 from spacesim.scenes.generation.generate import _DatasetPlan
 from spacesim.scenes.generation.workers import make_in_processes
 
-OPTIONS = {"views": 60, "test_views": 0, "resolution": (24, 24), "spp": 4, "points": 100}
+OPTIONS = {"views": 30, "test_views": 0, "resolution": (24, 24), "spp": 4, "points": 100}
 CONFIG = read_scene("boxsat", **OPTIONS)
 
 
@@ -63,11 +63,11 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="lo
 
 @needs_proc
 def test_killed_workers_are_replaced_and_the_bytes_are_those_of_one_process(whole, tmp_path):
-    """After every tenth frame one of two workers is killed, four in all."""
+    """After every fifth frame one of two workers is killed, four in all."""
     root, killed = tmp_path / "data", []
 
     def kill(done: int, *_: object) -> None:
-        if done % 10 == 0 and len(killed) < 4:
+        if done % 5 == 0 and len(killed) < 4:
             victim = min(workers_of(os.getpid()))
             os.kill(victim, signal.SIGKILL)
             killed.append(victim)
@@ -87,12 +87,12 @@ def test_workers_end_with_their_parent_and_resume_completes(whole, tmp_path, end
         "import sys; from pathlib import Path; from spacesim.scenes import generate, read_scene;"
         f"generate(read_scene('boxsat', **{OPTIONS!r}), Path(sys.argv[1]), True, workers=2)"
     )
-    process = subprocess.Popen([sys.executable, "-c", code, str(root)], stderr=subprocess.PIPE)
+    process = Forked(["-c", code, root])
     while len(list(root.glob("gt/*.exr"))) < 8:
         assert process.poll() is None, process.communicate()[1]
         time.sleep(0.002)
     workers = workers_of(process.pid)
-    process.send_signal(end)
+    os.kill(process.pid, end)
     process.communicate(timeout=20)
     assert len(workers) == 2
     deadline = time.monotonic() + 3
