@@ -32,6 +32,7 @@ QUATERNIONS = ("QUATERNION", "QUATERNION/DERIVATIVE", "QUATERNION/RATE", "QUATER
 OURS = {"OEM": ("HERMITE", "3", "cubic by their velocities"), "AEM": ("LINEAR", "1", "slerped")}
 """Interpolation between epochs, its degree, and in words."""
 
+EPOCH_ROUNDING = 1e-3  #: seconds
 _log = logging.getLogger(__name__)
 _VERSION = re.compile(r"CCSDS_(\w+)_VERS\s*=\s*(\S+)")
 _BODY = re.compile(r"(SC_BODY|SC_BUS|INSTRUMENT|CAMERA|ACTUATOR|SENSOR)")  # frames of a spacecraft's own
@@ -146,6 +147,7 @@ def _message(path: Path, text: str) -> Message:
             raise InputError(f"expected segments of which each begins where the last one ends, found two that {how}")
         keep = len(times) - bool(number)
         times, values = np.concatenate([times[:keep], seconds]), np.concatenate([values[:keep], numbers])
+    _warn_of_missing_data(path, segments[-1].meta, day, times[-1])
     return Message(path, kind, known[0], systems[0], centers[0], day, times, values)
 
 
@@ -158,6 +160,16 @@ def _tell_of_interpolation(path: Path, kind: str, segments: Sequence[_Segment]) 
         if asked and (asked, of_degree) != (method, degree):
             _log.warning("%s: asks for %s of degree %s between epochs; they are %s", path, asked, of_degree, words)
             return
+
+
+def _warn_of_missing_data(path: Path, meta: Mapping[str, str], day: int, last: float) -> None:
+    """One warning where data end before the metadata say, as those of a file that was cut off do. last: seconds of the
+    last epoch since midnight of `day`"""
+    if stop := meta.get("STOP_TIME"):
+        day_of_stop, seconds = read_epochs([stop], "STOP_TIME")
+        early = DAY * (day_of_stop - day) + float(seconds[0]) - last
+        if early > EPOCH_ROUNDING:
+            _log.warning("%s: its data end %.3f s before its STOP_TIME, %s; is it whole?", path, early, stop)
 
 
 def _read_xml(text: str) -> tuple[str, list[_Segment]]:

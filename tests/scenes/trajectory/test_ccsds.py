@@ -153,6 +153,16 @@ def test_another_interpolation_than_ours_is_told_once(tmp_path, caplog, write, m
     assert told is None or re.search(f"^{tmp_path}/two: asks for {told}", lines[0])
 
 
+def test_a_message_that_was_cut_off_is_told_of(tmp_path, caplog):
+    whole = oem(tmp_path / "whole.oem", range(0, 601, 60))
+    read_message(whole)
+    assert not caplog.records
+    (tmp_path / "cut.oem").write_text(whole.read_text().partition(epoch(540))[0])
+    assert len(read_message(tmp_path / "cut.oem").times) == 9
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert line.endswith("cut.oem: its data end 120.000 s before its STOP_TIME, 2030-03-01T12:10:00; is it whole?")
+
+
 def test_segments_that_meet(tmp_path):
     one, two = oem(tmp_path / "1", range(0, 121, 60)), oem(tmp_path / "2", range(120, 301, 60))
     both = tmp_path / "both.oem"
