@@ -21,8 +21,8 @@ from spacesim.nerf.config import GridConfig, NerfConfig, ProposalConfig, preset,
 from spacesim.nerf.run import NerfRun, load_run
 from spacesim.nerf.sampling.box import scene_box
 from spacesim.nerf.train.pixels import training_pixels
-from spacesim.nerf.train.train import train
-from spacesim.nerf.train.trainer import FORMAT, NerfTrainer, fit_grid
+from spacesim.nerf.train.train import fit_grid, train
+from spacesim.nerf.train.trainer import FORMAT, NerfTrainer
 from spacesim.splat.compose import ComposeConfig, PlacedRun
 from spacesim.splat.raster.supersample import upsampled_camera
 

@@ -1,7 +1,7 @@
 """The training loop of a radiance field: `step`, a look at what is empty now and then, checkpoints."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
@@ -16,9 +16,9 @@ from spacesim.data.records import Dataset
 from spacesim.learning.adam import corrections
 from spacesim.learning.loop import TrainingLoop
 from spacesim.learning.record import CheckpointHeader
-from spacesim.nerf.config import MAX_CELLS, NerfConfig
+from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.fields.model import Networks
-from spacesim.nerf.sampling.box import SceneBox, pixels_across, scene_box
+from spacesim.nerf.sampling.box import SceneBox, scene_box
 from spacesim.nerf.sampling.sampler import step_key
 from spacesim.nerf.train.pixels import training_pixels
 from spacesim.nerf.train.step import StepNumbers, look_around, step
@@ -45,7 +45,6 @@ class NerfTrainer(TrainingLoop):
     form, header = FORMAT, NerfCheckpointHeader
 
     def __init__(self, dataset: Dataset, config: NerfConfig) -> None:
-        config = fit_grid(config, dataset)
         self.config, self.iteration, self.proposal_steps = config, 0, 0
         check_free_memory(config.ray_bytes * config.rays, f"rays: a step of {config.rays} rays")
         self.box = scene_box(dataset, config.margin)
@@ -120,15 +119,6 @@ class NerfTrainer(TrainingLoop):
 
     def _key(self, number: int) -> UInt32:
         return dr.opaque(ad.UInt32, step_key(self.config.seed, number))
-
-
-def fit_grid(config: NerfConfig, dataset: Dataset) -> NerfConfig:
-    """With as many cells along the box as training pictures have pixels there, where `grid.finest` does not say."""
-    if config.grid.finest is not None or not dataset.train:
-        return config
-    pixels = pixels_across(scene_box(dataset, config.margin), dataset)
-    cells = min(max(round(pixels), config.grid.coarsest), MAX_CELLS)
-    return replace(config, grid=replace(config.grid, finest=cells))
 
 
 def box_of(tensors: Mapping[str, np.ndarray]) -> SceneBox:
