@@ -28,7 +28,7 @@ from spacesim.splat.raster.supersample import upsampled_camera
 
 GRID = GridConfig(4, 8, 48, 12)
 CONFIG = NerfConfig(
-    iterations=200,
+    iterations=250,
     rate=3e-2,
     rays=512,
     samples=10,
@@ -66,7 +66,7 @@ def test_a_run_is_shown_in_a_line(finished):
 
 def test_training_learns_the_pictures(dataset, finished):
     history = finished.training["history"]
-    assert [entry["iteration"] for entry in history] == [50, 100, 150, 200]
+    assert [entry["iteration"] for entry in history] == [50, 100, 150, 200, 250]
     errors = []
     for frame in dataset.train:
         drawn, image = finished.predict(frame.camera), load_image(dataset, frame)
@@ -76,6 +76,15 @@ def test_training_learns_the_pictures(dataset, finished):
     error, power = np.mean(errors, axis=0)
     assert error < 0.5 * power
     assert np.array(finished.filled).mean() < 1  # some of the box is known as empty
+
+
+@pytest.mark.parametrize(("iterations", "share"), [(200, 1 / 20), (100_000, 1 / 100), (5, 1)])
+def test_the_step_size_grows_to_its_full(dataset, iterations, share):
+    trainer = NerfTrainer(dataset, replace(CONFIG, iterations=iterations, rate_final=CONFIG.rate))
+    before = [np.array(values) for values in trainer.parameters]
+    trainer.step()
+    moved = max(np.abs(np.array(after) - was).max() for after, was in zip(trainer.parameters, before, strict=True))
+    assert moved == pytest.approx(CONFIG.rate * share, rel=1e-3)
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(dataset, finished, tmp_path):
@@ -178,7 +187,7 @@ def test_damaged_checkpoints_are_told_in_one_sentence(dataset, tmp_path):
         (tensors | {"field.grid": tensors["field.grid"][:-2]}, header, "field.grid: expected"),
         (tensors | {"adam.first.00": np.full_like(tensors["adam.first.00"], np.nan)}, header, "finite"),
         (tensors | {"box": tensors["box"] + 1}, header, "scene box"),
-        (tensors, header | {"iteration": 10**6}, "expected an iteration up to 200"),
+        (tensors, header | {"iteration": 10**6}, "expected an iteration up to 250"),
         (tensors, header | {"history": 3}, "history"),
     ]
     for content, told, words in broken:

@@ -24,6 +24,9 @@ from spacesim.nerf.train.pixels import training_pixels
 from spacesim.nerf.train.step import StepNumbers, look_around, step
 
 FORMAT = "spacesim-nerf-1"
+#: first steps, at most a tenth of all, in which the step size grows to its full: at full size at once, every unit of a
+#: colour network may come to give 0 for good, and the field stays black
+RATE_WARM_UP = 100
 SLOPE = 10.0  #: of the power of proposals' weights as they warm up (Barron et al. 2022, annealing)
 
 
@@ -66,6 +69,7 @@ class NerfTrainer(TrainingLoop):
         self.proposal_steps += learn
         done = index / max(config.iterations - 1, 1)
         rate = config.rate ** (1 - done) * config.rate_final**done if config.rate_final > 0 else config.rate
+        rate *= min((index + 1) / max(min(RATE_WARM_UP, config.iterations // 10), 1), 1)
         begun = 1.0 if warm else index / config.warm_up
         numbers = StepNumbers(
             self._key(index),
