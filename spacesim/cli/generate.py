@@ -27,6 +27,7 @@ _SCENE_OPTIONS = (
     "up",
     "background",
     "trajectory",
+    "min_sunlit",
 )
 
 
@@ -49,6 +50,9 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
         "--sun", type=angles, action="append", metavar="AZ,EL", help="a training Sun, degrees; repeatable"
     )
     parser.add_argument("--trajectory", metavar="FILE", help="follow a table: .csv, .json or .parquet")
+    parser.add_argument(
+        "--min-sunlit", type=float, metavar="SHARE", help="leave out frames that show less of the object in sunlight"
+    )
     parser.add_argument("--distance", type=float, metavar="M", help="metres from the cameras to the target's centre")
     parser.add_argument("--resolution", type=resolution, metavar="PX", help="pixels of each side, or WIDTHxHEIGHT")
     parser.add_argument("--fov", type=float, metavar="DEG", help="angle that the image's width covers")
