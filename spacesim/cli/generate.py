@@ -101,8 +101,10 @@ def run(options: argparse.Namespace) -> None:
     backend.select(options.backend)
     with show_progress("generate", "frames") as report:
         if options.frames is not None:
-            made, count = generate_part(scene, options.out, options.frames, report, options.workers, options.ray)
-            interrupts.print_output(f"{options.out}: {made} of {count} frames; --resume completes it")
+            part = generate_part(scene, options.out, options.frames, report, options.workers, options.ray)
+            made, count, complete = part
+            then = "the dataset is complete" if complete else "--resume completes it"
+            interrupts.print_output(f"{options.out}: {made} of {count} frames; {then}")
             return
         dataset = generate(scene, options.out, options.resume, report, options.workers, options.ray)
     interrupts.print_output(

@@ -108,10 +108,10 @@ def generate_part(
     progress: GenerationProgress | None = None,
     workers: int = 1,
     ray: str | None = None,
-) -> tuple[int, int]:
+) -> tuple[int, int, bool]:
     """Render some frames of a dataset into the folder `out`, where others may make theirs at the same time; returns
-    (number of frames of this part, of all). `generate` with resume completes the dataset once all parts are there, and
-    its bytes are the same as without parts.
+    (number of frames of this part, of all, whether the dataset has been completed and lacks none). `generate` with
+    resume completes the dataset once all parts are there, and its bytes are the same as without parts.
 
     frames: (first, end) among all frames, training ones first, as slices have them; None: up to the last. Parts made in
     folders of their own can be copied into one. Raises as `generate`.
@@ -130,7 +130,8 @@ def generate_part(
         alone.enter_context(lock_folder(job.root, shared=True))
         writer = DatasetWriter(Path(out), described, True, raw_suffixes(sweep.job.camera), shared=True)
         _make_missing(writer, specs, lambda left: make(job, left), progress)
-    return len(specs), count
+    completed = (job.root / "transforms.json").exists()
+    return len(specs), count, completed and all(writer.has_frame(spec.name) for spec in sweep.specs)
 
 
 def _check_processes(workers: int, ray: str | None) -> None:

@@ -233,7 +233,7 @@ def test_bad_scene_folder_and_camera_are_refused(made, tmp_path):
 def test_parts_make_the_same_dataset_as_one_run(made, tmp_path, spacesim):
     """Two at once in one folder, one in a folder of its own that is copied, then one command that completes it."""
     root, apart = tmp_path / "data", tmp_path / "apart"
-    assert generate_part(boxsat(), root, (0, 2)) == (2, 6)
+    assert generate_part(boxsat(), root, (0, 2)) == (2, 6, False)
     with lock_folder(root, shared=True):  # as another part holds it
         generate_part(boxsat(), root, (2, 3))
         (root / "id/.other.part").write_bytes(b"of another part, in the making")
@@ -246,6 +246,9 @@ def test_parts_make_the_same_dataset_as_one_run(made, tmp_path, spacesim):
     assert not (root / "transforms.json").exists()
     generate(boxsat(), root, resume=True)
     assert contents(root) == contents(made)
+    assert generate_part(boxsat(), root, (0, 2)) == (2, 6, True)
+    (root / "id/test_00001.png").unlink()
+    assert generate_part(boxsat(), root, (0, 2)) == (2, 6, False)
     with pytest.raises(InputError, match="'spp' differs"):
         generate_part(boxsat(spp=5), root, (0, 1))
     with pytest.raises(InputError, match=r"frames: expected A:B, A from 0 to 5, .* found '6:'"):
@@ -257,6 +260,8 @@ def test_parts_make_the_same_dataset_as_one_run(made, tmp_path, spacesim):
         done = spacesim(*small, tmp_path / "b", "--frames", part)
         assert (done.code, done.output) == (0, f"{tmp_path / 'b'}: 3 of 6 frames; --resume completes it\n")
     assert spacesim(*small, tmp_path / "b", "--resume").code == 0
+    done = spacesim(*small, tmp_path / "b", "--frames", "0:3")
+    assert (done.code, done.output) == (0, f"{tmp_path / 'b'}: 3 of 6 frames; the dataset is complete\n")
     assert spacesim(*small, tmp_path / "c").code == 0
     assert contents(tmp_path / "b") == contents(tmp_path / "c")
     assert spacesim(*small, tmp_path / "d", "--frames", "1-2").is_refusal("--frames", "A:B")
@@ -346,8 +351,8 @@ def test_parts_resume_and_workers_leave_out_the_same_frames(lit_and_dark, tmp_pa
     config = replace(lit_and_dark[0], min_sunlit=0.4)
     generate(config, tmp_path / "a")
     count = len(frames_of(tmp_path / "a"))
-    assert generate_part(config, tmp_path / "b", (3, 6)) == (3, count)
-    assert generate_part(config, tmp_path / "b", (count - 2, None)) == (2, count)
+    assert generate_part(config, tmp_path / "b", (3, 6)) == (3, count, False)
+    assert generate_part(config, tmp_path / "b", (count - 2, None)) == (2, count, False)
     assert estimate(config, tmp_path / "b").frames == count - 5
     generate(config, tmp_path / "b", resume=True, workers=2)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
