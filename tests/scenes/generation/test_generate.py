@@ -302,17 +302,28 @@ def frames_of(root):
     return json.loads((root / "transforms.json").read_text())["frames"]
 
 
-def test_the_share_in_sunlight_is_known_before_a_frame_is_made(lit_and_dark):
-    """To the pixel: a share that is far from the limit is that of a coarse picture."""
+def test_the_share_in_sunlight_is_known_before_a_frame_is_made(lit_and_dark, monkeypatch):
+    """To the pixel; where it is far from the limit by small pictures alone."""
     config, root = lit_and_dark
-    sweep = _DatasetPlan(config)
+    sweep, sizes = _DatasetPlan(config), []
+    labels = sweep.renderer.labels
+
+    def counted(camera, *others):
+        sizes.append((camera.width, camera.height))
+        return labels(camera, *others)
+
+    monkeypatch.setattr(sweep.renderer, "labels", counted)
     shares = [frame["sunlit_fraction"] for frame in frames_of(root)]
     assert len({share for share in shares if share}) > 10
     for spec, share in zip(sweep.specs, shares, strict=True):
         assert is_sunlit(sweep.renderer, spec, share or 1e-9) == bool(share)
         assert not is_sunlit(sweep.renderer, spec, (share or 0) + 1e-6)
+        assert sizes[-1] == (160, 120)
         for least in (0.05, 0.3, 0.6, 0.9):
             assert is_sunlit(sweep.renderer, spec, least) == ((share or 0) >= least)
+            if share is not None and abs(share - least) > 0.4:
+                assert sizes[-1] in ((64, 48), (128, 96))
+    assert (64, 48) in sizes
 
 
 def test_frames_with_less_in_sunlight_are_left_out(lit_and_dark, tmp_path, caplog):
