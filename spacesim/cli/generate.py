@@ -27,6 +27,7 @@ _SCENE_OPTIONS = (
     "up",
     "background",
     "trajectory",
+    "min_sunlit",
 )
 
 
@@ -49,6 +50,9 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
         "--sun", type=angles, action="append", metavar="AZ,EL", help="a training Sun, degrees; repeatable"
     )
     parser.add_argument("--trajectory", metavar="FILE", help="follow a table: .csv, .json or .parquet")
+    parser.add_argument(
+        "--min-sunlit", type=float, metavar="SHARE", help="leave out frames that show less of the object in sunlight"
+    )
     parser.add_argument("--distance", type=float, metavar="M", help="metres from the cameras to the target's centre")
     parser.add_argument("--resolution", type=resolution, metavar="PX", help="pixels of each side, or WIDTHxHEIGHT")
     parser.add_argument("--fov", type=float, metavar="DEG", help="angle that the image's width covers")
@@ -97,8 +101,10 @@ def run(options: argparse.Namespace) -> None:
     backend.select(options.backend)
     with show_progress("generate", "frames") as report:
         if options.frames is not None:
-            made, count = generate_part(scene, options.out, options.frames, report, options.workers, options.ray)
-            interrupts.print_output(f"{options.out}: {made} of {count} frames; --resume completes it")
+            part = generate_part(scene, options.out, options.frames, report, options.workers, options.ray)
+            made, count, complete = part
+            then = "the dataset is complete" if complete else "--resume completes it"
+            interrupts.print_output(f"{options.out}: {made} of {count} frames; {then}")
             return
         dataset = generate(scene, options.out, options.resume, report, options.workers, options.ray)
     interrupts.print_output(

@@ -131,6 +131,9 @@ class SceneConfig:
     rig: Rig = field(default_factory=FibonacciRig)  #: where cameras and Suns stand
     camera: CameraConfig = field(default_factory=CameraConfig)  #: that takes the pictures
     quality: QualityConfig = field(default_factory=QualityConfig)  #: samples and points
+    #: frames of whose object less than this share is sunlit, and those that show none, are left out; those that stay
+    #: are numbered from 0
+    min_sunlit: float = 0.0
     folder: Path | None = field(default=None, compare=False)  #: where relative paths of meshes begin
 
     def __post_init__(self) -> None:
@@ -143,6 +146,7 @@ class SceneConfig:
         if self.background is not None and self.background.placement == "fixed" and self.earth is None:
             raise InputError("background: expected an [earth] in the scene for placement fixed, found none")
         expect(0 <= self.seed <= MAX_SEED, "seed", f"0 to {MAX_SEED}", self.seed)
+        expect(0 <= self.min_sunlit < 1, "min_sunlit", "a share from 0 to below 1", self.min_sunlit)
 
     def to_json(self) -> JsonDict:
         """Plain JSON values, without the folder: a dataset does not depend on where its scene file lay."""
@@ -151,12 +155,14 @@ class SceneConfig:
         rig = {key: value for key, value in values["rig"].items() if value or key not in _UNLESS_ASKED_FOR}
         if self.background is None:
             del values["background"]
+        if not self.min_sunlit:
+            del values["min_sunlit"]
         return {**values, "rig": {"kind": rig_kind(self.rig), **rig}}
 
 
 def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
-    """`scene` with its name or seed, or fields of its rig, camera or quality changed by name; None changes nothing.
-    `rig` is a rig in place of the scene's own, and `trajectory` the table that such a one follows (`FileRig`).
+    """`scene` with its name, seed or min_sunlit, or fields of its rig, camera or quality changed by name; None changes
+    nothing. `rig` is a rig in place of the scene's own, and `trajectory` the table that such a one follows (`FileRig`).
     `resolution` may be one number, of a square, and `sun` one (azimuth, elevation). `sun` takes the place of the rig's
     own arrangement, whatever the number of its Suns, and `suns` alone that of `sun`. `background` is a
     `BackgroundConfig` or the words of one.
@@ -173,7 +179,7 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
         scene = replace(scene, rig=rig_given)
     changes: dict[str, JsonDict] = {"": {}, "rig": {}, "camera": {}, "quality": {}}
     names_by_part = {
-        part: {f.name for f in fields(getattr(scene, part))} if part else {"name", "seed", "background"}
+        part: {f.name for f in fields(getattr(scene, part))} if part else {"name", "seed", "background", "min_sunlit"}
         for part in changes
     }
     for name, value in options.items():

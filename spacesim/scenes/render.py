@@ -58,6 +58,7 @@ class Renderer:
         mi = backend.mitsuba()
         self.scene = scene
         self.spp = spp
+        self._max_depth = max_depth
         self._distortion = tuple(distortion)
         self._loaded = load(scene)
         self._earth = scene.earth  # where it is now
@@ -65,6 +66,10 @@ class Renderer:
         self._sampler = mi.load_dict({"type": "independent"})
         self._labeller = Labeller(scene, self._loaded, distortion)
         self._sums = record_on_cuda(self._trace_paths)
+
+    def of(self, scene: Scene) -> "Renderer":
+        """The same of another scene."""
+        return Renderer(scene, self.spp, self._max_depth, self._distortion)
 
     def render(
         self, camera: Camera, sun: Sun, seed: Sequence[int], spp: int | None = None, earth: EarthConfig | None = None
@@ -102,9 +107,9 @@ class Renderer:
         self._loaded.point(sun, None if earth == self._earth else earth)
         self._earth = earth
 
-    def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
-        """All fields of what `render` returns but radiance and alpha, which take no paths."""
-        self._point(sun)
+    def labels(self, camera: Camera, sun: Sun, earth: EarthConfig | None = None) -> dict[str, np.ndarray]:
+        """All fields of what `render` returns but radiance and alpha, which take no paths. earth: as in `render`."""
+        self._point(sun, earth)
         return self._labeller.labels(camera, sun)
 
     def _launch_passes(self, scene: mt.Scene, camera: Camera, seed: Sequence[int], spp: int) -> list[Float]:

@@ -256,7 +256,15 @@ def test_options():
     assert read_scene("telescope", sun=[(1, 2)]).rig.suns == 1
     again = read_scene("upper-stage", suns=3)
     assert (again.rig.sun, again.rig.suns) == ((), 3)
-    for name, value in {"views": 0, "resolution": 0, "sun": [(0, 91)], "teapots": 1, "suns": 0, "seed": -1}.items():
+    for name, value in {
+        "views": 0,
+        "resolution": 0,
+        "sun": [(0, 91)],
+        "teapots": 1,
+        "suns": 0,
+        "seed": -1,
+        "min_sunlit": 1,
+    }.items():
         with pytest.raises(InputError, match=f"^{name}: expected"):
             read_scene("boxsat", **{name: value})
     with pytest.raises(InputError, match=r"^fov: expected one of the options .*, fov_deg, .*; did you mean fov_deg\?$"):

@@ -1,6 +1,5 @@
 """Frames from the path tracer to the disk: rendering goes on while threads encode and write."""
 
-import gc
 import math
 import os
 import platform
@@ -23,7 +22,7 @@ from spacesim.scenes.background.draw import Background
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.exposure import record_image
 from spacesim.scenes.config import QualityConfig
-from spacesim.scenes.generation.moves import moved
+from spacesim.scenes.generation.moves import as_moved
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
@@ -100,9 +99,14 @@ def dim(truth: Truth, sunlight: float) -> Truth:
         return truth
     factor = np.float32(sunlight)
     visibility = factor * truth.sun_visibility
-    hidden = (truth.shadow == SHADOW_LIT) & (visibility < 0.5)
-    shadow = np.where(hidden, np.uint8(SHADOW_SELF_CAST), truth.shadow)
+    shadow = shadow_under(visibility, truth.shadow)
     return replace(truth, radiance=factor * truth.radiance, sun_visibility=visibility, shadow=shadow)
+
+
+def shadow_under(visibility: np.ndarray, shadow: np.ndarray) -> np.ndarray:
+    """Classes [H, W] where no more of the Sun's disc is seen than `visibility` [H, W] says."""
+    hidden = (shadow == SHADOW_LIT) & (visibility < 0.5)
+    return np.where(hidden, np.uint8(SHADOW_SELF_CAST), shadow)
 
 
 class FrameMaker:
@@ -135,7 +139,8 @@ class FrameMaker:
                     while waiting and (waiting[0].done() or len(waiting) >= self._most):
                         yield waiting.popleft().result()
                     seed = (self._job.seed, spec.index)
-                    truth = self._renderer_of(spec).render(spec.camera, spec.sun, seed, spec.spp, spec.earth)
+                    renderer = as_moved(self._renderer, spec.objects)
+                    truth = renderer.render(spec.camera, spec.sun, seed, spec.spp, spec.earth)
                     truth = dim(truth, spec.sunlight)
                     if self._background is not None:
                         behind = self._background.radiance(
@@ -147,15 +152,6 @@ class FrameMaker:
                     yield waiting.popleft().result()
             finally:
                 pool.shutdown(cancel_futures=True)
-
-    def _renderer_of(self, spec: FrameSpec) -> Renderer:
-        """That of the scene, or one of the scene as the frame has it."""
-        if not spec.objects:
-            return self._renderer
-        gc.collect()  # those of frames before are held by cycles: 8 MB each
-        job = self._job
-        scene = moved(job.scene, spec.objects)
-        return Renderer(scene, job.quality.spp, job.quality.max_depth, job.camera.distortion)
 
     def _write(self, spec: FrameSpec, truth: Truth) -> str:
         seed, behind = (self._job.seed, spec.index), truth.radiance_background

@@ -23,10 +23,10 @@ from spacesim.data.transforms import MILLIMETRE
 from spacesim.scenes.build import build
 from spacesim.scenes.cameras.rig import PlannedView, TargetSphere, plan
 from spacesim.scenes.cameras.sphere_rigs import RandomRig
-from spacesim.scenes.config import SceneConfig
+from spacesim.scenes.config import QualityConfig, SceneConfig
 from spacesim.scenes.generation.estimate import LONG, Estimate, measure, samples
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, raw_suffixes, versions, writing_threads
-from spacesim.scenes.generation.lighting import sunlit_fractions, warn_of_dark_frames
+from spacesim.scenes.generation.lighting import is_sunlit, sunlit_fractions, warn_of_dark_frames
 from spacesim.scenes.generation.moves import cameras_inside, poses_in
 from spacesim.scenes.generation.overview import write_overview
 from spacesim.scenes.generation.points import sample_surface_points
@@ -65,7 +65,7 @@ def generate(
     _check_processes(workers, ray)
     sweep = _DatasetPlan(config)
     job = replace(sweep.job, root=Path(out).absolute())
-    described = describe(sweep.scene, config, sweep.train, sweep.test)
+    described = sweep.describe(config)
     with ExitStack() as alone:
         with _frame_maker(sweep.renderer, workers, ray) as make:
             alone.enter_context(lock_folder(job.root))
@@ -85,12 +85,20 @@ def generate(
             overview=lambda d: write_overview(d.root, d),
             more=more,
         )
-        free = isinstance(config.rig, RandomRig | TrajectoryRig) and config.rig.max_phase_deg is None
-        kept = isinstance(config.rig, RandomRig)
-        what = "keeps the Sun on the camera's side, clear of the Earth" if kept else "in [rig] leaves them out"
-        hint = f"max_phase_deg = 90 {what}" if free else ""
-        warn_of_dark_frames(sunlit, {name: keys.get("sun_visibility") == 0 for name, keys in more.items()}, hint)
+        eclipsed = {name: keys.get("sun_visibility") == 0 for name, keys in more.items()}
+        warn_of_dark_frames(sunlit, eclipsed, _against_dark_frames(config))
         return dataset
+
+
+def _against_dark_frames(config: SceneConfig) -> str:
+    """What a scene that is made with dark frames can say to have none."""
+    limit = "" if config.min_sunlit else "min_sunlit = 0.05"
+    if isinstance(config.rig, RandomRig) and config.rig.max_phase_deg is None:
+        phase = "max_phase_deg = 90 keeps the Sun on the camera's side, clear of the Earth"
+        return f"{phase}; {limit} leaves them out" if limit else phase
+    if isinstance(config.rig, TrajectoryRig) and config.rig.max_phase_deg is None:
+        limit = f"max_phase_deg = 90 in [rig]{f' or {limit}' if limit else ''}"
+    return f"{limit} leaves them out" if limit else ""
 
 
 def generate_part(
@@ -100,10 +108,10 @@ def generate_part(
     progress: GenerationProgress | None = None,
     workers: int = 1,
     ray: str | None = None,
-) -> tuple[int, int]:
+) -> tuple[int, int, bool]:
     """Render some frames of a dataset into the folder `out`, where others may make theirs at the same time; returns
-    (number of frames of this part, of all). `generate` with resume completes the dataset once all parts are there, and
-    its bytes are the same as without parts.
+    (number of frames of this part, of all, whether the dataset has been completed and lacks none). `generate` with
+    resume completes the dataset once all parts are there, and its bytes are the same as without parts.
 
     frames: (first, end) among all frames, training ones first, as slices have them; None: up to the last. Parts made in
     folders of their own can be copied into one. Raises as `generate`.
@@ -117,12 +125,13 @@ def generate_part(
     expect(possible, "frames", expected, f"{first}:{'' if end is None else end}")
     specs = sweep.specs[first:end]
     job = replace(sweep.job, root=Path(out).absolute(), shared=True)
-    described = describe(sweep.scene, config, sweep.train, sweep.test)
+    described = sweep.describe(config)
     with ExitStack() as alone, _frame_maker(sweep.renderer, workers, ray) as make:
         alone.enter_context(lock_folder(job.root, shared=True))
         writer = DatasetWriter(Path(out), described, True, raw_suffixes(sweep.job.camera), shared=True)
         _make_missing(writer, specs, lambda left: make(job, left), progress)
-    return len(specs), count
+    completed = (job.root / "transforms.json").exists()
+    return len(specs), count, completed and all(writer.has_frame(spec.name) for spec in sweep.specs)
 
 
 def _check_processes(workers: int, ray: str | None) -> None:
@@ -225,14 +234,48 @@ class _DatasetPlan:
         self.train, self.test = plan_views(self.scene, config)
         quality = config.quality
         self.renderer = Renderer(self.scene, quality.spp, quality.max_depth, config.camera.distortion)
-        views = [(quality.spp, *planned) for planned in self.train] + [
-            (quality.resolved_test_spp, *planned) for planned in self.test
-        ]
-        self.specs = [self._frame(i, *planned) for i, planned in enumerate(views)]
-        self.keys = {name: self._keys_of(view) for _, name, view in views}
+        self._set_frames(quality)
+        self._refuse_cameras_inside(config)
+        self.left_out: dict[str, list[int]] = {}  # numbers that views would have had, by train and test
+        if config.min_sunlit:
+            self._leave_out_dark_views(config.min_sunlit)
+            self._set_frames(quality)
         threads = writing_threads(1)
         self.job = Job(self.scene, config.camera, quality, config.seed, Path(), threads, config.background)
         self.job = replace(self.job, depth_unit=depth_unit(self.scene, [*self.train, *self.test]))
+
+    def describe(self, config: SceneConfig) -> dict[str, JsonValue]:
+        """scene.json of all frames."""
+        described = describe(self.scene, config, self.train, self.test)
+        return {**described, "left_out": self.left_out} if self.left_out else described
+
+    def _set_frames(self, quality: QualityConfig) -> None:
+        """To those of the views, training ones first."""
+        views = [(quality.spp, *planned) for planned in self.train]
+        views += [(quality.resolved_test_spp, *planned) for planned in self.test]
+        self.specs = [self._frame(i, *planned) for i, planned in enumerate(views)]
+        self.keys = {name: self._keys_of(view) for _, name, view in views}
+
+    def _leave_out_dark_views(self, least: float) -> None:
+        """Number the others anew. Raises InputError where no training view stays."""
+        lit = {spec.name for spec in self.specs if is_sunlit(self.renderer, spec, least)}
+        kept = {}
+        for some, named in {"train": self.train, "test": self.test}.items():
+            self.left_out[some] = [i for i, (name, _) in enumerate(named) if name not in lit]
+            kept[some] = _numbered(some, [view for name, view in named if name in lit])
+        if not kept["train"]:
+            expected = f"a training frame of whose object at least {least:g} is sunlit"
+            raise InputError(f"min_sunlit: expected {expected}, found none of {len(self.train)}")
+        count = len(self.specs)
+        _log.info(
+            "generate: %d of %d frames are left out, as less than %g of their object is sunlit or none is seen",
+            count - len(lit),
+            count,
+            least,
+        )
+        self.train, self.test = kept["train"], kept["test"]
+
+    def _refuse_cameras_inside(self, config: SceneConfig) -> None:
         positions = np.stack([spec.camera.position for spec in self.specs])
         inside = cameras_inside(self.scene, self.renderer, positions, [spec.objects for spec in self.specs])
         if inside.any():
@@ -282,10 +325,11 @@ def plan_views(scene: Scene, config: SceneConfig) -> tuple[NamedViews, NamedView
     """The named training and test views."""
     target = TargetSphere(*scene.bounding_sphere, scene.earth)
     train, test = plan(config.rig.located(config.folder or Path()), target, config.camera, config.seed)
-    return (
-        [(f"train_{i:05d}", view) for i, view in enumerate(train)],
-        [(f"test_{i:05d}", view) for i, view in enumerate(test)],
-    )
+    return _numbered("train", train), _numbered("test", test)
+
+
+def _numbered(some: str, views: Sequence[PlannedView]) -> NamedViews:
+    return [(f"{some}_{i:05d}", view) for i, view in enumerate(views)]
 
 
 def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedViews) -> dict[str, JsonValue]:

@@ -1,5 +1,6 @@
 """Objects that move within a dataset: the scene as one of its frames has it."""
 
+import gc
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -44,6 +45,14 @@ def moved(scene: Scene, moves: Poses) -> Scene:
         return scene
     placed = zip(scene.objects, poses_in(scene, moves), strict=True)
     return replace(scene, objects=tuple(replace(item, world_from_object=pose) for item, pose in placed))
+
+
+def as_moved(renderer: Renderer, moves: Poses) -> Renderer:
+    """`renderer`, or one of its scene as a frame has it. Raises InputError as `poses_in`."""
+    if not moves:
+        return renderer
+    gc.collect()  # those of frames before are held by cycles: 8 MB each
+    return renderer.of(moved(renderer.scene, moves))
 
 
 def cameras_inside(scene: Scene, renderer: Renderer, positions: Array, moves: Sequence[Poses]) -> np.ndarray:

@@ -4,6 +4,7 @@ import shutil
 import signal
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,9 @@ from spacesim.data.lock import lock_folder
 from spacesim.data.store import FrameWriter, find_unreadable_files, load_depth, load_truth, read_points
 from spacesim.scenes import build, generate, read_scene
 from spacesim.scenes.cameras.sensor import SensorConfig
-from spacesim.scenes.generation.generate import estimate, generate_part
+from spacesim.scenes.cameras.sphere_rigs import RandomRig
+from spacesim.scenes.generation.generate import _DatasetPlan, estimate, generate_part
+from spacesim.scenes.generation.lighting import is_sunlit
 from spacesim.scenes.trajectory.rig import PoseRig
 
 SMALL = {"views": 4, "test_views": 2, "resolution": (24, 24), "spp": 4, "points": 300}
@@ -230,7 +233,7 @@ def test_bad_scene_folder_and_camera_are_refused(made, tmp_path):
 def test_parts_make_the_same_dataset_as_one_run(made, tmp_path, spacesim):
     """Two at once in one folder, one in a folder of its own that is copied, then one command that completes it."""
     root, apart = tmp_path / "data", tmp_path / "apart"
-    assert generate_part(boxsat(), root, (0, 2)) == (2, 6)
+    assert generate_part(boxsat(), root, (0, 2)) == (2, 6, False)
     with lock_folder(root, shared=True):  # as another part holds it
         generate_part(boxsat(), root, (2, 3))
         (root / "id/.other.part").write_bytes(b"of another part, in the making")
@@ -243,6 +246,9 @@ def test_parts_make_the_same_dataset_as_one_run(made, tmp_path, spacesim):
     assert not (root / "transforms.json").exists()
     generate(boxsat(), root, resume=True)
     assert contents(root) == contents(made)
+    assert generate_part(boxsat(), root, (0, 2)) == (2, 6, True)
+    (root / "id/test_00001.png").unlink()
+    assert generate_part(boxsat(), root, (0, 2)) == (2, 6, False)
     with pytest.raises(InputError, match="'spp' differs"):
         generate_part(boxsat(spp=5), root, (0, 1))
     with pytest.raises(InputError, match=r"frames: expected A:B, A from 0 to 5, .* found '6:'"):
@@ -254,6 +260,8 @@ def test_parts_make_the_same_dataset_as_one_run(made, tmp_path, spacesim):
         done = spacesim(*small, tmp_path / "b", "--frames", part)
         assert (done.code, done.output) == (0, f"{tmp_path / 'b'}: 3 of 6 frames; --resume completes it\n")
     assert spacesim(*small, tmp_path / "b", "--resume").code == 0
+    done = spacesim(*small, tmp_path / "b", "--frames", "0:3")
+    assert (done.code, done.output) == (0, f"{tmp_path / 'b'}: 3 of 6 frames; the dataset is complete\n")
     assert spacesim(*small, tmp_path / "c").code == 0
     assert contents(tmp_path / "b") == contents(tmp_path / "c")
     assert spacesim(*small, tmp_path / "d", "--frames", "1-2").is_refusal("--frames", "A:B")
@@ -270,10 +278,109 @@ def test_dark_and_empty_frames_are_counted_in_one_warning(tmp_path, caplog):
     told = [record.message for record in caplog.records if record.levelname == "WARNING"]
     assert told == [
         "generate: 1 of 3 frames show the object in the dark (train_00001 first); 1 of 3 frames show no object "
-        "(train_00002 first)"
+        "(train_00002 first); min_sunlit = 0.05 leaves them out"
     ]
     frames = json.loads((tmp_path / "data/transforms.json").read_text())["frames"]
     assert [frame["sunlit_fraction"] for frame in frames] == [pytest.approx(0.8, abs=0.2), 0.0, None]
+
+
+LENS = (-0.25, 0.08, 0.002, -0.001, 0.0)
+RANDOM = {"resolution": (160, 120), "spp": 1, "points": 50, "distortion": LENS}
+
+
+@pytest.fixture(scope="module")
+def lit_and_dark(tmp_path_factory):
+    """(its configuration, its folder) of a dataset of random poses and Suns under a lens that distorts."""
+    rig = RandomRig(views=16, test_views=6, random_suns=True, cropped=True)
+    config = read_scene("boxsat", rig=rig, **RANDOM)
+    root = tmp_path_factory.mktemp("lit") / "data"
+    generate(config, root)
+    return config, root
+
+
+def frames_of(root):
+    return json.loads((root / "transforms.json").read_text())["frames"]
+
+
+def test_the_share_in_sunlight_is_known_before_a_frame_is_made(lit_and_dark, monkeypatch):
+    """To the pixel; where it is far from the limit by small pictures alone."""
+    config, root = lit_and_dark
+    sweep, sizes = _DatasetPlan(config), []
+    labels = sweep.renderer.labels
+
+    def counted(camera, *others):
+        sizes.append((camera.width, camera.height))
+        return labels(camera, *others)
+
+    monkeypatch.setattr(sweep.renderer, "labels", counted)
+    shares = [frame["sunlit_fraction"] for frame in frames_of(root)]
+    assert len({share for share in shares if share}) > 10
+    for spec, share in zip(sweep.specs, shares, strict=True):
+        assert is_sunlit(sweep.renderer, spec, share or 1e-9) == bool(share)
+        assert not is_sunlit(sweep.renderer, spec, (share or 0) + 1e-6)
+        assert sizes[-1] == (160, 120)
+        for least in (0.05, 0.3, 0.6, 0.9):
+            assert is_sunlit(sweep.renderer, spec, least) == ((share or 0) >= least)
+            if share is not None and abs(share - least) > 0.4:
+                assert sizes[-1] in ((64, 48), (128, 96))
+    assert (64, 48) in sizes
+
+
+def test_frames_with_less_in_sunlight_are_left_out(lit_and_dark, tmp_path, caplog):
+    config, root = lit_and_dark
+    limited = replace(config, min_sunlit=0.4)
+    assert "min_sunlit" not in config.to_json()
+    assert limited.to_json()["min_sunlit"] == 0.4
+    caplog.set_level("INFO")
+    generate(limited, tmp_path / "data")
+    whole = frames_of(root)
+    is_kept = [(frame["sunlit_fraction"] or 0) >= 0.4 for frame in whole]
+    assert 4 <= sum(is_kept[:16]) <= 12
+    kept = [frame for frame, stays in zip(whole, is_kept, strict=True) if stays]
+    found = frames_of(tmp_path / "data")
+    for key in ("transform_matrix", "sun_direction", "sunlit_fraction"):
+        assert [frame[key] for frame in found] == [frame[key] for frame in kept]
+    names = [
+        f"{some}_{k:05d}"
+        for some, count in (("train", sum(is_kept[:16])), ("test", sum(is_kept[16:])))
+        for k in range(count)
+    ]
+    assert [Path(frame["file_path"]).stem for frame in found] == names
+    for old, new in zip(kept, found, strict=True):
+        assert (root / old["shadow_path"]).read_bytes() == (tmp_path / "data" / new["shadow_path"]).read_bytes()
+    said = [record.getMessage() for record in caplog.records if "left out" in record.getMessage()]
+    assert len(said) == 1
+    assert said[0].startswith(f"generate: {22 - len(kept)} of 22 frames are left out, as less than 0.4 of their object")
+    assert not any("in the dark" in record.getMessage() for record in caplog.records)
+    scene = json.loads((tmp_path / "data/scene.json").read_text())
+    dark = np.flatnonzero(~np.array(is_kept))
+    assert scene["left_out"] == {"train": [k for k in dark if k < 16], "test": [k - 16 for k in dark if k >= 16]}
+    assert "left_out" not in json.loads((root / "scene.json").read_text())
+
+
+def test_parts_resume_and_workers_leave_out_the_same_frames(lit_and_dark, tmp_path):
+    config = replace(lit_and_dark[0], min_sunlit=0.4)
+    generate(config, tmp_path / "a")
+    count = len(frames_of(tmp_path / "a"))
+    assert generate_part(config, tmp_path / "b", (3, 6)) == (3, count, False)
+    assert generate_part(config, tmp_path / "b", (count - 2, None)) == (2, count, False)
+    assert estimate(config, tmp_path / "b").frames == count - 5
+    generate(config, tmp_path / "b", resume=True, workers=2)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    with pytest.raises(InputError, match=f"frames: expected A:B, A from 0 to {count - 1}"):
+        generate_part(config, tmp_path / "b", (count, None))
+    with pytest.raises(InputError, match="expected the scene asked for"):
+        generate(lit_and_dark[0], tmp_path / "b", resume=True)
+
+
+def test_a_limit_of_sunlight_that_no_frame_keeps_is_refused(spacesim, tmp_path):
+    small = ("--views", 4, "--test-views", 1, "--resolution", 16, "--spp", 1)
+    refused = spacesim("generate", "boxsat", *small, "--min-sunlit", 0.99, "--out", tmp_path / "data")
+    assert refused.is_refusal("--min-sunlit: expected a training frame of whose object at least 0.99 is sunlit")
+    assert refused.errors[-1].endswith("found none of 4")
+    assert not (tmp_path / "data").exists()
+    for wrong in (1, -0.1, "nan"):
+        assert spacesim("generate", "boxsat", *small, "--min-sunlit", wrong, "--print").is_refusal("--min-sunlit")
 
 
 def test_estimate_and_workers_on_the_command_line(spacesim, tmp_path):

@@ -1,6 +1,8 @@
 """How much of the Sun the Earth hides: closed form, samples of the disc, and what the path tracer finds."""
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -80,21 +82,42 @@ def test_the_path_tracers_earth_hides_as_much(offset):
     assert dark.render(camera, sun, (1,)).radiance.sum() == pytest.approx(lit, rel=1e-6)  # back where the scene says
 
 
+def scene_in_eclipse(tmp_path, offsets, lit_by_earth, **options):
+    """(scene, direction of the Sun, places of the Earth), a frame every 10 s with the Earth's limb by so many of the
+    Sun's radii beside its centre."""
+    angles = LIMB + SUN_RADIUS * np.array(offsets)
+    sun = np.array([0, 0, 1.0])
+    earths = [DISTANCE * np.array([np.sin(angle), 0, np.cos(angle)]) for angle in angles]
+    lines = ["time_s,camera_x_m,camera_y_m,camera_z_m,sun_x,sun_y,sun_z,earth_x_m,earth_y_m,earth_z_m"]
+    lines += [",".join(map(str, [10 * k, 3, 2, 9, *sun, *earth])) for k, earth in enumerate(earths)]
+    table = tmp_path / "p.csv"
+    table.write_text("\n".join(lines))
+    path = tmp_path / "s.toml"
+    earth = "[earth]\nazimuth_deg = 90.0\nelevation_deg = 80.0\nalbedo = 0.0\n" if lit_by_earth else ""
+    path.write_text(f'[[objects]]\nspacecraft = "boxsat"\n{earth}')
+    return read_scene(path, resolution=(16, 16), points=50, trajectory=table, **options), sun, earths
+
+
+@pytest.mark.parametrize("lit_by_earth", [False, True])
+def test_frames_in_eclipse_are_left_out(tmp_path, lit_by_earth):
+    """Those of whose Sun less than half is seen are lit nowhere, whoever hides it."""
+    scene, sun, earths = scene_in_eclipse(tmp_path, [-1.5, 1.5, -0.3, 0.3, -1.5], lit_by_earth, spp=1)
+    generate(replace(scene, min_sunlit=0.05), tmp_path / "data")
+    frames = json.loads((tmp_path / "data/transforms.json").read_text())["frames"]
+    assert [frame["time"] for frame in frames] == [10.0, 30.0]
+    expected = [visible_fraction(sun, earths[k], SUN_RADIUS) for k in (1, 3)]
+    assert [frame["sun_visibility"] for frame in frames] == pytest.approx(expected, abs=1e-6)
+    assert [Path(frame["file_path"]).name for frame in frames] == ["train_00000.png", "train_00001.png"]
+    assert all(frame["sunlit_fraction"] > 0.05 for frame in frames)
+    left = json.loads((tmp_path / "data/scene.json").read_text())["left_out"]
+    assert left == {"train": [0, 2, 4], "test": []}
+
+
 @pytest.mark.parametrize("lit_by_earth", [False, True])
 def test_frames_through_the_penumbra(tmp_path, caplog, lit_by_earth):
     """A scene without an Earth is dimmed by the closed form, one with an Earth by its limb."""
-    angles = LIMB + SUN_RADIUS * np.array([1.5, 0.3, -0.3, -1.5])
-    sun = np.array([0, 0, 1.0])
-    earths = [DISTANCE * np.array([np.sin(angle), 0, np.cos(angle)]) for angle in angles]
-    lines = ["camera_x_m,camera_y_m,camera_z_m,sun_x,sun_y,sun_z,earth_x_m,earth_y_m,earth_z_m"]
-    lines += [",".join(map(str, [3, 2, 9, *sun, *earth])) for earth in earths]
-    table = tmp_path / "p.csv"
-    table.write_text("\n".join(lines))
-    small = {"resolution": (16, 16), "spp": 256, "points": 50, "trajectory": table}
-    scene = tmp_path / "s.toml"
-    earth = "[earth]\nazimuth_deg = 90.0\nelevation_deg = 80.0\nalbedo = 0.0\n" if lit_by_earth else ""
-    scene.write_text(f'[[objects]]\nspacecraft = "boxsat"\n{earth}')
-    generate(read_scene(scene, **small), tmp_path / "data")
+    scene, sun, earths = scene_in_eclipse(tmp_path, [1.5, 0.3, -0.3, -1.5], lit_by_earth, spp=256)
+    generate(scene, tmp_path / "data")
     frames = json.loads((tmp_path / "data/transforms.json").read_text())["frames"]
     seen = [frame["sun_visibility"] for frame in frames]
     expected = [visible_fraction(sun, earth, SUN_RADIUS) for earth in earths]
@@ -112,5 +135,5 @@ def test_frames_through_the_penumbra(tmp_path, caplog, lit_by_earth):
     told = [record.message for record in caplog.records if "in the dark" in record.message]
     assert told == [
         "generate: 2 of 4 frames show the object in the dark (train_00002 first, in 1 of them the Earth hides the Sun)"
-        "; max_phase_deg = 90 in [rig] leaves them out"
+        "; max_phase_deg = 90 in [rig] or min_sunlit = 0.05 leaves them out"
     ]

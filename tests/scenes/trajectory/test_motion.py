@@ -326,7 +326,7 @@ def test_dark_frames_of_a_trajectory_are_counted_with_what_leaves_them_out(tmp_p
     generate(read_scene("boxsat", **SMALL, trajectory=circle(tmp_path / "p.csv")), tmp_path / "data")
     told = [record.getMessage() for record in caplog.records if "in the dark" in record.getMessage()]
     assert len(told) == 1
-    assert told[0].endswith("max_phase_deg = 90 in [rig] leaves them out")
+    assert told[0].endswith("max_phase_deg = 90 in [rig] or min_sunlit = 0.05 leaves them out")
 
 
 def test_an_exposure_for_each_frame(tmp_path):

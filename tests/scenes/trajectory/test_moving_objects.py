@@ -53,10 +53,15 @@ def table(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def moving(table, tmp_path_factory):
+def pair(table):
     scene = read_scene("boxsat-pair", trajectory=table, sun=[SUN], **SMALL)
     larger = replace(scene.objects[1], scale=1.25)
-    return generate(replace(scene, objects=(scene.objects[0], larger)), tmp_path_factory.mktemp("moving") / "data")
+    return replace(scene, objects=(scene.objects[0], larger))
+
+
+@pytest.fixture(scope="module")
+def moving(pair, tmp_path_factory):
+    return generate(pair, tmp_path_factory.mktemp("moving") / "data")
 
 
 def test_frames_show_what_scenes_with_objects_there_show(moving, tmp_path):
@@ -77,6 +82,17 @@ def test_frames_show_what_scenes_with_objects_there_show(moving, tmp_path):
         np.testing.assert_allclose(found.depth[same], expected.depth[same], rtol=1e-4)
     first, last = (load_truth(moving, frame).object_id == 2 for frame in (moving.train[0], moving.train[-1]))
     assert (first & last).sum() < 0.8 * first.sum()  # it has moved
+
+
+def test_the_share_in_sunlight_is_that_of_the_objects_where_they_are(pair, moving, tmp_path):
+    frames = json.loads((moving.root / "transforms.json").read_text())["frames"]
+    shares = [frame["sunlit_fraction"] for frame in frames]
+    assert len(set(shares)) == 3
+    for least in shares:
+        some = generate(replace(pair, min_sunlit=least), tmp_path / f"from{least:g}")
+        assert [frame.time for frame in some.train] == [
+            t for t, share in zip(TIMES, shares, strict=True) if share >= least
+        ]
 
 
 def test_labels_follow_the_objects(moving, tmp_path):
