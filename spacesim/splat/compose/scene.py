@@ -444,11 +444,8 @@ def _log_choices(models: Sequence[PlacedRun], ensemble: Ensemble) -> None:
     """One sentence about each choice that the models leave open."""
     fixed = [model.name or str(model.run.path) for model in models if not model.run.relightable]
     if fixed:
-        log.info(
-            "%s: knows the light that it was trained under only and cannot be relit; it casts shadows, and those of "
-            "others dim its colours",
-            ", ".join(dict.fromkeys(fixed)),
-        )
+        names = ", ".join(dict.fromkeys(fixed))
+        log.info("%s: knows the light that it was trained under only and cannot be relit", names)
     if len({member.curve for member in ensemble.members}) > 1:
         log.info("colours in linear light stand beside others or sRGB values: all are blended as sRGB values")
 
