@@ -24,7 +24,7 @@ from spacesim.data.geometry import Array
 from spacesim.scenes.trajectory.ephemeris import J2000_FRAMES, sun_direction
 from spacesim.scenes.trajectory.epochs import read_epochs
 from spacesim.scenes.trajectory.motion import DAY, Motion, merge
-from spacesim.scenes.trajectory.tracks import Attitude, Track
+from spacesim.scenes.trajectory.tracks import Attitude, Direction, Track
 
 QUATERNIONS = ("QUATERNION", "QUATERNION/DERIVATIVE", "QUATERNION/RATE", "QUATERNION/ANGVEL")
 """Attitude types whose lines begin with a quaternion."""
@@ -90,9 +90,8 @@ def motion_of(messages: Mapping[str, Sequence[Path]], with_sun: bool = True) -> 
             expected = f"a sun of the rig, or a table with a Sun, as it is computed for {known} only"
             raise InputError(f"{first.path}: expected {expected}, found {found}")
         day, times = first.day, first.times
-        parts.append(
-            Motion(day, first.time_system, sun=Track("direction of the Sun", times, sun_direction(day, times)))
-        )
+        sun = Direction("direction of the Sun", times, sun_direction(day, times))
+        parts.append(Motion(day, first.time_system, sun=sun))
     return merge(parts)
 
 

@@ -6,6 +6,7 @@ the world. Where nothing is said of the target, the scene's frame is the world. 
 where their own poses are told.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from datetime import date, timedelta
@@ -15,6 +16,8 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, look_at, normalize
 from spacesim.scenes.trajectory.tracks import Attitude, Track
+
+_log = logging.getLogger(__name__)
 
 DAY = 86_400.0
 """Seconds."""
@@ -58,8 +61,8 @@ class Motion:
         return {name: track for name, track in tracks.items() if track is not None} | dict(self.bodies)
 
     def times(self) -> Array:
-        """[N] the times of the camera's track, else the target's, that all tracks cover. Raises InputError where there
-        is none, or no pose."""
+        """[N] the times of the camera's track, else the target's, that all tracks cover; logs how many that leaves out.
+        Raises InputError where there is none, or no pose."""
         main = (
             self.camera or self.camera_turn or self.target or self.target_turn or next(iter(self.bodies.values()), None)
         )
@@ -71,6 +74,17 @@ class Motion:
         if not len(common):
             raise InputError(
                 f"rig: expected a time that all of it covers, found that {last.name} ends before {first.name} begins"
+            )
+        if len(common) < len(main.times):
+            shorter = last.name if last.times[-1] < main.times[-1] else first.name
+            lost, span = len(main.times) - len(common), f"{common[0]:.10g} to {common[-1]:.10g} s"
+            _log.warning(
+                "%s: %d of %d rows are left out, as %s does not cover them; what is left is from %s",
+                main.name,
+                lost,
+                len(main.times),
+                shorter,
+                span,
             )
         return common
 

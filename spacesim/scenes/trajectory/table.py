@@ -32,7 +32,7 @@ from spacesim.data.records import SUN_LENGTHS, SUN_WORDS
 from spacesim.data.structure import did_you_mean
 from spacesim.scenes.trajectory.epochs import read_epochs
 from spacesim.scenes.trajectory.motion import Motion
-from spacesim.scenes.trajectory.tracks import Attitude, Track
+from spacesim.scenes.trajectory.tracks import Attitude, Direction, Track
 
 METRES = {"m": 1.0, "km": 1e3}
 SUFFIXES = (".csv", ".json", ".parquet")
@@ -101,7 +101,7 @@ def _motion(path: Path, columns: Columns) -> Motion:
         if wrong.any():
             row = int(wrong.argmax())
             raise InputError(f"sun_x: expected {SUN_WORDS}, found {sun[row].tolist()} in row {row + 1}")
-        tracks["sun"] = Track("sun direction", times, normalize(sun))
+        tracks["sun"] = Direction("sun direction", times, normalize(sun))
     if "exposure" in present:
         exposure = _numbers(columns, "exposure")
         if not (exposure > 0).all():

@@ -50,6 +50,29 @@ class Track:
 
 
 @dataclass(frozen=True, eq=False)
+class Direction(Track):
+    """Unit vectors at times that grow, at an even rate along a great circle, the shorter way, between them."""
+
+    def at(self, times: Array) -> Array:
+        """[M, 3] unit vectors at `times` [M]. Raises InputError for a time before the first or after the last."""
+        check_covered(self, times)
+        if len(self.times) == 1:
+            return np.repeat(self.values, len(times), axis=0)
+        start, end = self.values[:-1], self.values[1:]
+        across = np.cross(start, end)
+        sines, cosines = np.linalg.norm(across, axis=1), (start * end).sum(axis=1)
+        angles = np.arctan2(sines, cosines)
+        _warn_of_guesses(self, times, float(np.degrees(angles.max())))
+        nearest = np.eye(3)[np.abs(start).argmin(axis=1)]  # an axis that is not along it: opposites have no plane
+        axes = np.where((sines > 1e-9)[:, None], across, np.cross(start, nearest))
+        ahead = np.cross(axes / np.linalg.norm(axes, axis=1, keepdims=True), start)
+        k = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(angles) - 1)
+        turn = angles[k] * (times - self.times[k]) / (self.times[k + 1] - self.times[k])
+        values: Array = np.cos(turn)[:, None] * start[k] + np.sin(turn)[:, None] * ahead[k]
+        return values
+
+
+@dataclass(frozen=True, eq=False)
 class Attitude:
     """Rotations at times that grow, at an even rate about one axis, the shorter way, between them (slerp: K. Shoemake,
     "Animating rotation with quaternion curves", SIGGRAPH 1985).
@@ -80,11 +103,15 @@ class Attitude:
         rotations = Rotation.from_quat(self.quaternions[:, [1, 2, 3, 0]])
         if len(self.times) == 1:
             return np.repeat(rotations.as_matrix(), len(times), axis=0)
-        largest = float(np.degrees((rotations[:-1].inv() * rotations[1:]).magnitude().max()))
-        if largest > AMBIGUOUS_DEG and not np.isin(times, self.times).all():
-            _log.warning("%s: turns by %.0f degrees between two rows; which way is a guess", self.name, largest)
+        _warn_of_guesses(self, times, float(np.degrees((rotations[:-1].inv() * rotations[1:]).magnitude().max())))
         turned: Array = Slerp(self.times, rotations)(times).as_matrix()
         return turned
+
+
+def _warn_of_guesses(track: Track | Attitude, times: Array, largest: float) -> None:
+    """Log where one of `times` [M] may lie on a turn whose shorter way may be the wrong one. largest: degrees"""
+    if largest > AMBIGUOUS_DEG and not np.isin(times, track.times).all():
+        _log.warning("%s: turns by %.0f degrees between two rows; which way is a guess", track.name, largest)
 
 
 def check_times(times: Array, name: str) -> None:

@@ -24,7 +24,7 @@ from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.trajectory.motion import Motion, merge
 from spacesim.scenes.trajectory.rig import FileRig
-from spacesim.scenes.trajectory.tracks import Attitude, Track
+from spacesim.scenes.trajectory.tracks import Attitude, Direction, Track
 
 CAMERA = CameraConfig((64, 48), fov_deg=30.0)
 TARGET = TargetSphere(np.zeros(3), 2.0)
@@ -167,6 +167,34 @@ def test_a_turn_that_may_be_either_way_is_told(caplog):
     assert caplog.records == []
     turns.at(np.array([0.0, 1.0]))
     assert [one.message for one in caplog.records] == ["a: turns by 150 degrees between two rows; which way is a guess"]
+
+
+def test_directions_between_rows_turn_evenly_along_a_great_circle(caplog):
+    suns = np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0.6, 0.8]])
+    found = Direction("sun", np.array([0.0, 9.0, 10.0, 12.0]), suns).at(np.array([0.0, 3.0, 9.0, 9.5, 11.0, 12.0]))
+    half = np.array([0, 1.6, 0.8]) / np.hypot(1.6, 0.8)
+    expected = [suns[0], [np.cos(np.pi / 6), np.sin(np.pi / 6), 0], suns[1], suns[1], half, suns[3]]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize("sun", np.concatenate([np.eye(3), [[0.6, 0, -0.8]]]))
+def test_a_sun_that_changes_sides_turns_some_way_and_is_told(caplog, sun):
+    found = Direction("sun", np.array([0.0, 10.0]), np.array([sun, -sun])).at(np.linspace(0, 10, 5))
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1)
+    np.testing.assert_allclose(found @ sun, np.cos(np.linspace(0, np.pi, 5)), atol=1e-12)
+    assert "turns by 180 degrees between two rows" in caplog.text
+
+
+def test_rows_that_another_track_does_not_cover_are_told(caplog):
+    camera = Track("camera", np.arange(5.0), np.ones((5, 3)))
+    sun = Direction("sun", np.array([0.0, 2.5]), np.eye(3)[:2])
+    assert Motion(camera=camera, sun=sun).times().tolist() == [0, 1, 2]
+    told = "camera: 2 of 5 rows are left out, as sun does not cover them; what is left is from 0 to 2 s"
+    assert [one.message for one in caplog.records] == [told]
+    caplog.clear()
+    assert len(Motion(camera=camera).times()) == 5
+    assert caplog.records == []
 
 
 def test_a_camera_that_looks_at_a_target_that_tumbles_does_not_roll_with_it(table):
