@@ -315,7 +315,7 @@ def test_the_share_in_sunlight_is_known_before_a_frame_is_made(lit_and_dark, mon
     monkeypatch.setattr(sweep.renderer, "labels", counted)
     shares = [frame["sunlit_fraction"] for frame in frames_of(root)]
     assert len({share for share in shares if share}) > 10
-    for spec, share in zip(sweep.specs, shares, strict=True):
+    for spec, share in zip(sweep.specs[::2], shares[::2], strict=True):
         assert is_sunlit(sweep.renderer, spec, share or 1e-9) == bool(share)
         assert not is_sunlit(sweep.renderer, spec, (share or 0) + 1e-6)
         assert sizes[-1] == (160, 120)
@@ -359,7 +359,8 @@ def test_frames_with_less_in_sunlight_are_left_out(lit_and_dark, tmp_path, caplo
 
 
 def test_parts_resume_and_workers_leave_out_the_same_frames(lit_and_dark, tmp_path):
-    config = replace(lit_and_dark[0], min_sunlit=0.4)
+    camera = replace(lit_and_dark[0].camera, resolution=(40, 30))
+    config = replace(lit_and_dark[0], min_sunlit=0.4, camera=camera)
     generate(config, tmp_path / "a")
     count = len(frames_of(tmp_path / "a"))
     assert generate_part(config, tmp_path / "b", (3, 6)) == (3, count, False)
@@ -370,7 +371,7 @@ def test_parts_resume_and_workers_leave_out_the_same_frames(lit_and_dark, tmp_pa
     with pytest.raises(InputError, match=f"frames: expected A:B, A from 0 to {count - 1}"):
         generate_part(config, tmp_path / "b", (count, None))
     with pytest.raises(InputError, match="expected the scene asked for"):
-        generate(lit_and_dark[0], tmp_path / "b", resume=True)
+        generate(replace(config, min_sunlit=0.0), tmp_path / "b", resume=True)
 
 
 def test_a_limit_of_sunlight_that_no_frame_keeps_is_refused(spacesim, tmp_path):

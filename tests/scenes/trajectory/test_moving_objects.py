@@ -88,11 +88,9 @@ def test_the_share_in_sunlight_is_that_of_the_objects_where_they_are(pair, movin
     frames = json.loads((moving.root / "transforms.json").read_text())["frames"]
     shares = [frame["sunlit_fraction"] for frame in frames]
     assert len(set(shares)) == 3
-    for least in shares:
-        some = generate(replace(pair, min_sunlit=least), tmp_path / f"from{least:g}")
-        assert [frame.time for frame in some.train] == [
-            t for t, share in zip(TIMES, shares, strict=True) if share >= least
-        ]
+    least = sorted(shares)[1]
+    some = generate(replace(pair, min_sunlit=least), tmp_path / "data")
+    assert [frame.time for frame in some.train] == [t for t, share in zip(TIMES, shares, strict=True) if share >= least]
 
 
 def test_labels_follow_the_objects(moving, tmp_path):
