@@ -108,7 +108,7 @@ class FieldComposition(FieldScene):
     @property
     def has_shadows(self) -> bool:
         """Whether there is anything that casts them: one model on another, or on itself."""
-        return self._shades or any(run.networks.config.casts_shadows for run in self._runs)
+        return self._shades or any(run.has_shadows for run in self._runs)
 
     @cached_property
     def contents(self) -> list[str]:

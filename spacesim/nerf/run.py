@@ -73,6 +73,11 @@ class NerfRun:
         return self.networks.config.knows_sun
 
     @property
+    def has_shadows(self) -> bool:
+        """Whether it casts shadows on itself, so that visibility is predicted."""
+        return self.networks.config.casts_shadows
+
+    @property
     def parts(self) -> tuple[()]:
         """None: it was trained as one."""
         return ()

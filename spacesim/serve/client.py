@@ -13,8 +13,9 @@ from spacesim.serve.protocol import VERSION, arrays_of, import_zmq
 
 
 class CameraClient:
-    """Asks a camera that answers (docs/how-to/closed-loop.md); `with` closes it. timeout: seconds to wait. Raises
-    InputError where pyzmq is not installed, and for an address that is none."""
+    """Asks a camera that answers (docs/how-to/closed-loop.md), for one thread: each has a client of its own. `with`
+    closes it. timeout: seconds to wait. Raises InputError where pyzmq is not installed, and for an address that is
+    none."""
 
     def __init__(self, address: str = "tcp://127.0.0.1:5556", timeout: float = 60.0) -> None:
         zmq = import_zmq()

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MAX_EXPOSURE = 40.0  #: EV, of path-traced pictures
+PREDICTED: tuple[Output, ...] = ("rgb", "alpha", "depth", "normal", "visibility", "object_id")  #: at most
 _LABELS = {
     "visibility": "sun_visibility",
     **{name: name for name in ("depth", "normal", "object_id", "part_id", "shadow")},
@@ -127,10 +128,10 @@ class TracedScene:
 class PredictedRun:
     """A run of any method, or a composed scene: a `Predictor`."""
 
-    outputs: tuple[Output, ...] = ("rgb", "alpha", "depth", "normal", "visibility", "object_id")
-
     def __init__(self, run: "Predictor") -> None:
         self.run = run
+        some = {"visibility": run.has_shadows, "object_id": bool(run.parts)}
+        self.outputs = [name for name in PREDICTED if some.get(name, True)]
         path = Path(run.path).resolve()
         name = path.stem if path.suffix == ".toml" else path.parent.name if path.name == "run" else path.name
         self.names = (name, *(part.name for part in run.parts))
@@ -139,20 +140,20 @@ class PredictedRun:
     def facts(self) -> JsonDict:
         """See `Served`."""
         known = {"kind": "run", "method": self.run.config.get("method"), "relightable": self.run.relightable}
-        return {"served": self.names[0], **known, "outputs": list(self.outputs)}
+        return {"served": self.names[0], **known, "outputs": self.outputs}
 
     def draw(
         self, camera: Camera, sun: Sun | None, exposure: float | None, outputs: Sequence[Output], seed: int
     ) -> dict[str, np.ndarray]:
         """See `Served`; nothing here is random."""
-        seen = self.run.predict(camera, sun, normals="normal" in outputs, exposure=exposure)
-        arrays = {"rgb": as_bytes(seen.rgb), "alpha": seen.alpha, "depth": seen.depth, "normal": seen.normal}
-        arrays |= {"visibility": seen.visibility, "object_id": getattr(seen, "id", None)}
-        there = {name: array for name, array in arrays.items() if array is not None}
         for name in outputs:
-            if name not in there:
-                raise InputError(f"outputs: expected some of {', '.join(there)} of {self.names[0]}, found {name}")
-        return {name: there[name] for name in outputs}
+            if name not in self.outputs:
+                expected = f"some of {', '.join(self.outputs)} of {self.names[0]}"
+                raise InputError(f"outputs: expected {expected}, found {name}")
+        seen = self.run.predict(camera, sun, normals="normal" in outputs, exposure=exposure)
+        arrays: dict[str, Any] = {"alpha": seen.alpha, "depth": seen.depth, "normal": seen.normal}
+        arrays |= {"rgb": as_bytes(seen.rgb), "visibility": seen.visibility, "object_id": getattr(seen, "id", None)}
+        return {name: arrays[name] for name in outputs}
 
 
 def load_served(what: str | Path, spp: int | None = None) -> Served:

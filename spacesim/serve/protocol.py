@@ -15,8 +15,8 @@ A request is one frame, a JSON object:
 An answer is a JSON object with version, id, seconds that drawing took, and arrays [{name, dtype, shape}], then a frame
 for each array: its numbers, little-endian, the last index fastest. What is served is one frame, with version, id,
 served (its name), kind ("scene" or "run"), spp (samples a pixel, of a scene) or method (of a run), relightable (whether
-it takes a Sun) and outputs (names of arrays that it may have; a request for one that it lacks is told which it has). A
-request that cannot be met is answered by one frame, with version, id, and error, a sentence.
+it takes a Sun) and outputs (names of arrays that it has; a request for another is told them). A request that cannot be
+met is answered by one frame, with version, id, and error, a sentence.
 """
 
 import json

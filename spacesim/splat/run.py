@@ -98,6 +98,10 @@ class Predictor(Protocol):
         """Whether the Sun's direction changes what is predicted."""
 
     @property
+    def has_shadows(self) -> bool:
+        """Whether what it predicts has a visibility of the Sun."""
+
+    @property
     def parts(self) -> Sequence[ComposedModel]:
         """The models of a scene, which stand for the dataset's objects in their order; none of a single run."""
 
@@ -173,6 +177,11 @@ class Run:
     def relightable(self) -> bool:
         """Whether the Sun's direction changes what is predicted."""
         return self.light is not None and self.light.config.field.knows_sun
+
+    @property
+    def has_shadows(self) -> bool:
+        """Whether its method knows visibility."""
+        return self.light is not None and self.light.config.shadow is not None
 
     @property
     def parts(self) -> tuple[ComposedModel, ...]:

@@ -274,6 +274,7 @@ def test_a_field_that_is_told_the_sun(dataset, tmp_path):
     assert np.abs(one.rgb - other.rgb).max() > 1e-3
     np.testing.assert_array_equal(one.alpha, other.alpha)
     assert one.visibility.shape == one.alpha.shape
+    assert run.has_shadows
     assert 0 <= one.visibility.min() < 0.9 < one.visibility.max() <= 1 + 1e-5
     assert np.abs(one.visibility - other.visibility).max() > 0.1
     composed = methods.compose([PlacedRun(run)], ComposeConfig(), None).predict(camera, ss.Sun.from_angles(40, 25))

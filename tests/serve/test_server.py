@@ -5,6 +5,7 @@ import os
 import socket
 import struct
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images.tone import as_bytes
 from spacesim.data.records import Sun
 from spacesim.serve.client import CameraClient
-from spacesim.serve.draw import load_served
+from spacesim.serve.draw import PredictedRun, load_served
 from spacesim.serve.protocol import OUTPUTS, arrays_of
 from spacesim.serve.server import MAX_FRAME_BYTES, CameraServer, serving
+from spacesim.splat.compose import ComposeConfig, GaussianComposition, PlacedRun, Pose
+from spacesim.splat.compose.run import ComposedRun
 
 DROPPED = "serve: a client takes no answers; what it asks for is dropped"
 PATIENCE = 60_000  #: milliseconds
@@ -95,9 +98,27 @@ def test_it_says_what_it_is(ball, traced):
         assert "rgb" in facts["outputs"]
 
 
+@pytest.mark.parametrize("shadows", ["trained", "none"])
+def test_it_has_the_arrays_that_it_says(ball, shadows):
+    """And no others; of a run and of a composed scene, whose models shade each other or do not."""
+    models = [PlacedRun(ball.run), PlacedRun(ball.run, Pose(translation=[0, 0, 1.6]))]
+    pair = PredictedRun(ComposedRun(GaussianComposition(models, ComposeConfig(shadows)), Path("pair.toml")))
+    seen = {"trained": {"visibility"}, "none": set()}[shadows]
+    always = {"rgb", "alpha", "depth", "normal"}
+    for served, expected in ((ball, always), (pair, always | {"object_id"} | seen)):
+        with serving(served) as address, CameraClient(address) as client:
+            said = json.loads(asked(address, b'{"version": 1}')[0])["outputs"]
+            assert (len(said), set(said)) == (len(expected), expected)
+            assert set(client.picture(CAMERA, SUN, outputs=said)) == expected
+            sentence = f"outputs: expected some of {', '.join(said)} of {served.names[0]}, found "
+            for name in set(OUTPUTS) - expected:
+                with pytest.raises(InputError, match=f"^{sentence}{name}$"):
+                    client.picture(CAMERA, SUN, outputs=("rgb", name))
+
+
 def test_errors_are_sentences(ball, traced):
     with serving(ball) as address, CameraClient(address) as client:
-        with pytest.raises(InputError, match="outputs: expected some of rgb, alpha, depth of ball, found visibility"):
+        with pytest.raises(InputError, match="outputs: expected some of rgb, alpha, depth, normal of ball, found"):
             client.picture(CAMERA, outputs=("visibility",))
         with pytest.raises(InputError, match="exposure: expected a run trained in linear light"):
             client.picture(CAMERA, exposure=1.0)

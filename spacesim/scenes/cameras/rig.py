@@ -169,6 +169,10 @@ def plan(rig: Rig, target: TargetSphere, camera: CameraConfig, seed: int) -> Vie
     wrong = next((view for some in views for view in some if not isinstance(view, PlannedView)), None)
     if wrong is not None:
         raise InputError(f"rig: expected a PlannedView for each frame, found {type(wrong).__name__}")
+    for view in (*views[0], *views[1]):
+        for kind, value in ((Camera, view.camera), (Sun, view.sun)):
+            if not isinstance(value, kind):
+                raise InputError(f"rig: expected a {kind.__name__} in each PlannedView, found {type(value).__name__}")
     if not views[0]:
         raise InputError("rig: expected at least one training view, found none")
     return list(views[0]), list(views[1])

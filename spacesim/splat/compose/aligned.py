@@ -68,6 +68,11 @@ class AlignedRun:
         return self.run.relightable
 
     @property
+    def has_shadows(self) -> bool:
+        """Whether its method knows visibility."""
+        return self.run.has_shadows
+
+    @property
     def parts(self) -> tuple[()]:
         """None: it was trained as one."""
         return ()

@@ -81,11 +81,6 @@ class Member:
         """Of its linear colours, see `LightConfig.curve`; None where colours are sRGB values."""
         return self.run.light.config.curve if self.run.light else None
 
-    @property
-    def has_shadows(self) -> bool:
-        """Whether its method knows visibility."""
-        return self.run.light is not None and self.run.light.config.shadow is not None
-
     def sunlight(self, sun: Array | None) -> Sunlight | None:
         """In its own shadows; None for a run without light. sun: [3] in the model's frame"""
         light = self.run.light

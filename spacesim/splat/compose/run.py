@@ -95,6 +95,11 @@ class ComposedRun:
         return bool(self.composition.relightable)
 
     @property
+    def has_shadows(self) -> bool:
+        """Whether there is anything that casts them: one model on another, or on itself."""
+        return bool(self.composition.has_shadows)
+
+    @property
     def gaussians(self) -> Gaussians | None:
         """All models' Gaussians where they stand, colours left out; None where some are none."""
         return self.composition.in_world() if isinstance(self.composition, GaussianComposition) else None

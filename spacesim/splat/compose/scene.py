@@ -203,8 +203,8 @@ class GaussianComposition:
 
     @property
     def has_shadows(self) -> bool:
-        """Whether a model's method knows visibility."""
-        return any(member.has_shadows for member in self._members)
+        """Whether there is anything that casts them: one model on another, or on itself."""
+        return self._shades or any(member.run.has_shadows for member in self._members)
 
     @property
     def contents(self) -> list[str]:
@@ -335,7 +335,7 @@ class GaussianComposition:
             source = self.path or self.models[0].run.path
             raise InputError(f"{source}: expected the Sun's direction for a scene that it changes, found none")
         if not poses:
-            return [ad.Float([]) for _ in range(3)], None
+            return [ad.Float([]) for _ in range(3)], ad.Float([]) if self.has_shadows else None
         direction = None if sun is None else sun.direction
         between = self._cross_visibilities(poses, direction)
         members = self._ensemble.members
@@ -345,7 +345,7 @@ class GaussianComposition:
         pairs = zip(parts, members, strict=True)
         colors = [display_colors(part[0], member.curve, scene_curve) for part, member in pairs]
         joined = self._ensemble.joined(colors)
-        if not self._shades and not any(member.has_shadows for member in members):
+        if not self.has_shadows:
             return joined, None
         seen = [
             dr.opaque(ad.Float, 1, member.count) if part[1] is None else part[1]

@@ -1,7 +1,7 @@
 """Rigs from Python: arrays of poses and Suns, and classes of one's own."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -115,6 +115,9 @@ def test_what_is_no_rig(tmp_path):
         ss.generate("boxsat", tmp_path / "data", rig=ss.PoseRig(skewed), **SMALL)
 
 
+VIEW = PlannedView(ss.Camera(POSES[0], 8, 8, 10, 10, 4, 4), ss.Sun.from_angles(40, 25))
+
+
 @pytest.mark.parametrize(
     ("views", "message"),
     [
@@ -123,6 +126,8 @@ def test_what_is_no_rig(tmp_path):
         ((list(POSES), []), "rig: expected a PlannedView for each frame, found ndarray"),
         ([], "rig: expected two lists, of training and test views, found list"),
         (None, "rig: expected two lists, of training and test views, found NoneType"),
+        (([VIEW], [replace(VIEW, sun=(40, 25))]), "rig: expected a Sun in each PlannedView, found tuple"),
+        (([replace(VIEW, camera=POSES[0])], []), "rig: expected a Camera in each PlannedView, found ndarray"),
     ],
 )
 def test_what_a_rig_of_ones_own_must_give(tmp_path, views, message):

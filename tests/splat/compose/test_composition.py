@@ -53,8 +53,10 @@ def test_alone_and_not_posed_a_model_is_what_its_run_gives_to_the_bit(method):
     for antialiased in (False, True):
         run = made_run(method, antialiased=antialiased)
         alone = run.predict(EYE, SUN, normals=True)
-        composed = GaussianComposition([PlacedRun(run)]).predict(EYE, SUN, normals=True)
+        scene = GaussianComposition([PlacedRun(run)])
+        composed = scene.predict(EYE, SUN, normals=True)
         same(alone, composed)
+        assert run.has_shadows == scene.has_shadows == (alone.visibility is not None)
         assert np.array_equal(composed.id, (alone.alpha >= 0.5).astype(np.int32))
 
 
@@ -228,7 +230,9 @@ def test_shadows_off_are_off():
     scene = discs(1.0).shaded(ComposeConfig("none"))
     assert scene.predict(EYE).visibility is None
     assert not scene.relightable
+    assert not scene.has_shadows
     assert discs(1.0).relightable
+    assert discs(1.0).has_shadows
 
 
 # ---- runs that differ ----
@@ -425,6 +429,8 @@ def test_models_of_one_gaussian_and_of_none():
             np.testing.assert_allclose(shifted.rgb, back.rgb, atol=1e-5)
     empty = replace(one, gaussians=made_run("vanilla", 1, count=0).gaussians)
     assert GaussianComposition([PlacedRun(empty)]).predict(EYE, SUN).alpha.max() == 0
+    bare = replace(other, gaussians=empty.gaussians)
+    assert GaussianComposition([PlacedRun(bare)]).predict(EYE, SUN).visibility.max() == 0
     beside = GaussianComposition(
         [PlacedRun(empty), PlacedRun(other), PlacedRun(empty, Pose(translation=[0, 0, 1]))]
     ).predict(EYE, SUN)
