@@ -12,7 +12,7 @@ demo: .venv/base.done
 
 test: export PYTHONDONTWRITEBYTECODE = # byte code is kept: tests start the program a hundred times
 test: .venv/test.done
-	$(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 lint: .venv/test.done
 	$(BIN)/ruff check

@@ -1,8 +1,7 @@
 """Test processes side by side, and all that they start, each keep to a share of the cores.
 
 Threads of Dr.Jit, OpenBLAS and others that wait for work keep a core busy, of which the other process has need: there
-are no more of them than cores to a process. Where there are more processes than cores, as some tests wait for others'
-work, several share a core. To be imported before libraries look how many cores there are.
+are no more of them than cores to a process. To be imported before libraries look how many cores there are.
 """
 
 import os
@@ -12,9 +11,8 @@ from contextlib import contextmanager
 ALL = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set[int]()
 _WORKER, _PROCESSES = os.environ.get("PYTEST_XDIST_WORKER", ""), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 
-if _WORKER and ALL:
-    _apart = min(_PROCESSES, len(ALL))
-    os.sched_setaffinity(0, sorted(ALL)[int(_WORKER.removeprefix("gw")) % _apart :: _apart])
+if _WORKER and len(ALL) >= _PROCESSES:
+    os.sched_setaffinity(0, sorted(ALL)[int(_WORKER.removeprefix("gw")) % _PROCESSES :: _PROCESSES])
 
 
 @contextmanager
