@@ -91,3 +91,9 @@ def test_an_address_that_is_none():
     pytest.importorskip("zmq", reason="pyzmq is not installed")
     with pytest.raises(ss.InputError, match=r"^address: expected one such as tcp://127.0.0.1:5556, found 'foo'"):
         ss.CameraClient("foo")
+
+
+@pytest.mark.parametrize("camera", ["x", np.eye(4), None])
+def test_a_view_is_that_of_a_camera(tiny_run, camera):
+    with pytest.raises(ss.InputError, match=r"^camera: expected a Camera, such as Camera.look_at gives, found "):
+        ss.load_run(tiny_run).render(camera)

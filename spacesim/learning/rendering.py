@@ -36,6 +36,8 @@ class Rendering:
     """A view of a run, drawn when an array of it is asked for first. See `Run.render`."""
 
     def __init__(self, run: CanPredict, camera: Camera, sun: Sun | None, exposure: float | None = None) -> None:
+        if not isinstance(camera, Camera):
+            raise InputError(f"camera: expected a Camera, such as Camera.look_at gives, found {type(camera).__name__}")
         self.run, self.camera, self.sun, self.exposure = run, camera, sun, exposure
 
     @cached_property

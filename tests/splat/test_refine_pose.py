@@ -279,6 +279,7 @@ GREY = np.full((SIZE, SIZE, 3), 0.5)
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
+        ({"image": "a.png"}, "image: expected an array or what load_image returns, found the path a.png"),
         ({"image": GREY[:-1]}, r"image: expected \[64, 64, 3 or 4\] as the camera has it, found \[63, 64, 3\]"),
         ({"image": GREY[..., 0]}, r"image: expected \[64, 64, 3 or 4\] .* found \[64, 64\]"),
         ({"image": 200 * GREY}, r"image: expected float values in \[0, 1\] or uint8, found others"),

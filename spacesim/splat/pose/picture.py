@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -67,6 +68,8 @@ def checked_picture(image: ArrayLike | Image, mask: ArrayLike | None, camera: Ca
     counts = np.ones(size, np.float32)
     if isinstance(image, Image):
         counts, image = image.valid.astype(np.float32), np.dstack([image.rgb, image.alpha])
+    if isinstance(image, str | Path):
+        raise InputError(f"image: expected an array or what load_image returns, found the path {image}")
     pixels = np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[:2] != size or pixels.shape[2] not in (3, 4):
         expected = f"[{camera.height}, {camera.width}, 3 or 4] as the camera has it"
