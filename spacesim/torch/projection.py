@@ -15,7 +15,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Footprints, Splats, project_ellipsoids
 from spacesim.splat.raster.render import harmonics, is_unclamped
 from spacesim.torch.arguments import RasterSettings
-from spacesim.torch.convert import column, rows
+from spacesim.torch.convert import column, row_parts, rows
 
 BORDER = 0.15  #: of the image beyond its border: splats are linearized no farther, as gsplat has it
 TABLE = 8  #: numbers of a row of `ProjectedSplats.table`
@@ -125,10 +125,10 @@ class _Inputs:
         sh: list[Float] = []
         if leaves.harmonics is not None and degree is not None:
             stored = dr.width(leaves.harmonics) // count
-            sh = [column(leaves.harmonics, i, stored, count) for i in range(3 * (degree + 1) ** 2)]
+            sh = row_parts(leaves.harmonics, 3 * (degree + 1) ** 2, stored, count)
         return _Inputs(
             means=[column(leaves.means, i, 3, count) for i in range(3)],
-            quats=[column(leaves.quats, i, 4, count) for i in range(4)],
+            quats=row_parts(leaves.quats, 4, 4, count),
             scales=[column(leaves.scales, i, 3, count) for i in range(3)],
             opacities=[ad.Float(leaves.opacities)],
             harmonics=sh,
@@ -175,9 +175,9 @@ def project_back(
     total, count = ad.Float(0), dr.width(leaves.opacities)
     for given, values in ((grad_means2d, [s.x, s.y]), (grad_table, [s.a, s.b, s.c, s.opacity, s.depth, *colors])):
         if given is not None:
-            size = dr.width(given) // count
-            for i, value in enumerate(values):
-                total += value * column(given, i, size, count)
+            slopes = row_parts(given, len(values), dr.width(given) // count, count)
+            for value, slope in zip(values, slopes, strict=True):
+                total += value * slope
     if dr.grad_enabled(total):
         dr.backward(total)
     gradients: dict[str, Any] = {name: [dr.grad(value) for value in group] for name, group in known.items()}
