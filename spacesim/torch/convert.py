@@ -9,7 +9,7 @@ from spacesim.backend.arrays import Float, Int32, NumberT
 
 ALIGNED = 64  #: bytes to a multiple of which torch allocates on a CPU
 PACKET = 16  #: bytes to a multiple of which CUDA reads packets
-WIDEST = 16  #: numbers of a row that a kernel stores at once
+WIDEST = 16  #: numbers of a row that a kernel reads or stores at once, at most
 
 
 def to_floats(tensor: Tensor) -> Float:
@@ -29,7 +29,7 @@ def column(flat: Float, index: int, size: int, count: int) -> Float:
 def row_parts(flat: Float, used: int, size: int, count: int) -> list[Float]:
     """The first `used` columns of a flat array [count * size], as `column` gives them. Rows are read in packets of
     WIDEST numbers or fewer that divide them: on a CPU a packet is several times as fast as its columns one by one."""
-    packet = next(width for width in (WIDEST, 8, 4, 2, 1) if size % width == 0)
+    packet = _packet(size)
     if packet == 1:
         return [column(flat, i, size, count) for i in range(used)]
     rows = dr.arange(ad.UInt32, count) * (size // packet)
@@ -38,6 +38,11 @@ def row_parts(flat: Float, used: int, size: int, count: int) -> list[Float]:
         place = rows + first // packet
         parts += list(dr.gather(ad.ArrayXf, flat, place, mode=dr.ReduceMode.Permute, shape=(packet, count)))
     return parts[:used]
+
+
+def _packet(size: int) -> int:
+    """Numbers that a kernel reads or stores at once of a row of `size`."""
+    return next(width for width in (WIDEST, 8, 4, 2, 1) if size % width == 0)
 
 
 def columns(tensor: Tensor) -> list[Float]:
@@ -54,7 +59,7 @@ def rows(values: list[NumberT], size: int, count: int, capacity: int | None = No
     capacity: `count` by default; in a recording a number that is an argument of it, by `round_capacity`: what a
     recording allocates stays as large as it was when it was recorded"""
     kind = type(values[0])
-    packet = next(width for width in (WIDEST, 8, 4, 2, 1) if size % width == 0)
+    packet = _packet(size)
     packets = size // packet
     whole = len(values) + packet > size  # packets that hold a value are all that there are
     length = size * (count if capacity is None else capacity)

@@ -15,7 +15,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Footprints, Splats, project_ellipsoids
 from spacesim.splat.raster.render import harmonics, is_unclamped
 from spacesim.torch.arguments import RasterSettings
-from spacesim.torch.convert import column, row_parts, rows
+from spacesim.torch.convert import row_parts, rows
 
 BORDER = 0.15  #: of the image beyond its border: splats are linearized no farther, as gsplat has it
 TABLE = 8  #: numbers of a row of `ProjectedSplats.table`
@@ -127,9 +127,9 @@ class _Inputs:
             stored = dr.width(leaves.harmonics) // count
             sh = row_parts(leaves.harmonics, 3 * (degree + 1) ** 2, stored, count)
         return _Inputs(
-            means=[column(leaves.means, i, 3, count) for i in range(3)],
+            means=row_parts(leaves.means, 3, 3, count),
             quats=row_parts(leaves.quats, 4, 4, count),
-            scales=[column(leaves.scales, i, 3, count) for i in range(3)],
+            scales=row_parts(leaves.scales, 3, 3, count),
             opacities=[ad.Float(leaves.opacities)],
             harmonics=sh,
             viewmat=[dr.gather(ad.Float, leaves.viewmat, ad.UInt32(i)) for i in range(16)],
