@@ -19,6 +19,12 @@ def check_ranges(record: object, **ranges: tuple[float, float]) -> None:
             raise InputError(f"{name}: expected {least_word} to {most_word}, found {value!r}")
 
 
+def check_type(value: object, kind: type, name: str, example: str) -> None:
+    """Raise InputError "name: expected a Kind, such as ..., found ..." unless `value` is of that kind."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name}: expected a {kind.__name__}, such as {example}, found {type(value).__name__}")
+
+
 def expect(condition: bool, name: str, expected: str, found: object) -> None:
     """Raise InputError "name: expected ..., found ..." unless `condition` holds."""
     if not condition:

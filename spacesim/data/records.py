@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, check_type
 from spacesim.data.files import JsonMapping
 from spacesim.data.geometry import (
     OPENCV_FROM_OPENGL,
@@ -40,6 +40,14 @@ def planes_repr(record: object, width: int, height: int) -> str:
     return f"{cls.__name__}({width} x {height} pixels: {', '.join(names)})"
 
 
+def _numbers(value: object) -> Array:
+    """As float64 of any shape, [0] of what is no array of numbers."""
+    try:
+        return np.asarray(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.zeros(0)
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole camera. The centre of pixel (column i, row j) is at (i + 0.5, j + 0.5)."""
@@ -53,7 +61,7 @@ class Camera:
     cy: float  #: principal point, pixels
 
     def __post_init__(self) -> None:
-        pose = np.asarray(self.world_from_camera, dtype=np.float64)
+        pose = _numbers(self.world_from_camera)
         if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
             raise InputError(f"world_from_camera: expected a finite [4, 4] matrix, found shape {pose.shape}")
         rotation = pose[:3, :3]
@@ -116,6 +124,11 @@ class Camera:
         return Camera.from_fov(look_at(position, target, up), width, height, fov_x_deg)
 
 
+def check_camera(camera: object) -> None:
+    """Raise InputError for what is no `Camera`."""
+    check_type(camera, Camera, "camera", "Camera.look_at gives")
+
+
 @dataclass(frozen=True, eq=False)
 class Sun:
     """The Sun as a direction."""
@@ -123,7 +136,7 @@ class Sun:
     direction: Array  #: [3] unit vector, world frame, from the scene towards the Sun
 
     def __post_init__(self) -> None:
-        direction = np.asarray(self.direction, dtype=np.float64)
+        direction = _numbers(self.direction)
         if direction.shape != (3,) or not SUN_LENGTHS[0] <= np.abs(direction).max() <= SUN_LENGTHS[1]:
             raise InputError(f"sun direction: expected {SUN_WORDS}, found {self.direction}")
         object.__setattr__(self, "direction", normalize(direction))
@@ -131,8 +144,12 @@ class Sun:
     @staticmethod
     def from_angles(azimuth_deg: float, elevation_deg: float) -> "Sun":
         """Azimuth from +x towards +y, elevation from the xy plane, degrees (thesis 4.1). Raises InputError for numbers
-        that are not finite."""
-        return Sun(direction_from_angles(azimuth_deg, elevation_deg))
+        that are not finite, and for an elevation beyond 90."""
+        angles = _numbers((azimuth_deg, elevation_deg))
+        if angles.shape != (2,) or not (np.isfinite(angles[0]) and abs(angles[1]) <= 90):
+            expected = "a finite azimuth and an elevation from -90 to 90 degrees"
+            raise InputError(f"sun: expected {expected}, found {azimuth_deg!r} and {elevation_deg!r}")
+        return Sun(direction_from_angles(*angles))
 
     @staticmethod
     def of(value: "Sun | Sequence[float] | None") -> "Sun | None":
@@ -140,10 +157,7 @@ class Sun:
         InputError for other numbers."""
         if value is None or isinstance(value, Sun):
             return value
-        try:
-            numbers = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            numbers = np.zeros(0)
+        numbers = _numbers(value)
         if numbers.shape == (2,) and np.isfinite(numbers).all() and abs(numbers[1]) <= 90:
             return Sun.from_angles(float(numbers[0]), float(numbers[1]))
         if numbers.shape != (3,):
@@ -223,6 +237,12 @@ class Dataset:
     def frames(self) -> tuple[Frame, ...]:
         """All frames, training ones first."""
         return self.train + self.test
+
+
+def check_frame(dataset: object, frame: object) -> None:
+    """Raise InputError for what is no `Dataset` or no `Frame`."""
+    check_type(dataset, Dataset, "dataset", "read_dataset gives")
+    check_type(frame, Frame, "frame", "dataset.test[0]")
 
 
 @dataclass(frozen=True, eq=False)

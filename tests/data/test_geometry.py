@@ -29,6 +29,17 @@ def test_angles_by_hand():
         np.testing.assert_allclose(Sun.from_angles(*angles).direction, direction, atol=1e-15)
 
 
+@pytest.mark.parametrize("angles", [(40, 125), (40, -90.1), (40, np.nan), (np.inf, 3), (None, 3), ([1, 2], 3)])
+def test_impossible_angles_of_the_sun_are_refused(angles):
+    with pytest.raises(InputError, match=r"^sun: expected a finite azimuth and an elevation from -90 to 90 degrees"):
+        Sun.from_angles(*angles)
+
+
+def test_any_finite_azimuth_is_one_of_the_sun():
+    np.testing.assert_allclose(Sun.from_angles(-680, 90).direction, [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(Sun.from_angles(-680, 25).direction, Sun.from_angles(40, 25).direction, atol=1e-12)
+
+
 def test_angles_round_trip():
     for direction in fibonacci_sphere(50, seed=3):
         azimuth, elevation = angles_from_direction(direction)
@@ -144,7 +155,7 @@ def test_impossible_cameras_are_refused(change):
         Camera(**{**camera, **change})
 
 
-@pytest.mark.parametrize("direction", [(0, 0, 0), (1, 2), (np.nan, 0, 1)])
+@pytest.mark.parametrize("direction", [(0, 0, 0), (1, 2), (np.nan, 0, 1), "40,25", None, [1, [2]]])
 def test_impossible_suns_are_refused(direction):
     with pytest.raises(InputError, match="sun direction"):
-        Sun(np.array(direction, float))
+        Sun(direction)
