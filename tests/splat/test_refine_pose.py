@@ -9,6 +9,7 @@ from scipy.linalg import expm
 
 from spacesim import RefinedPose, refine_pose
 from spacesim.data.errors import InputError
+from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Image
 from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.pose import moved, twist_between
@@ -86,7 +87,7 @@ def test_a_relit_picture_is_found_under_its_sun(lit_run):
     assert max(errors(pose.camera)) < 0.05
 
 
-def test_alpha_bytes_and_records_say_the_same(run):
+def test_alpha_bytes_files_and_records_say_the_same(run, tmp_path):
     drawn = run.predict(CAMERA)
     alpha = np.clip(drawn.alpha, 0, 1)[..., None]
     straight = np.clip(drawn.rgb / np.maximum(alpha, 1e-6), 0, 1)
@@ -95,6 +96,9 @@ def test_alpha_bytes_and_records_say_the_same(run):
     assert max(errors(known.camera)) < 0.02
     of_bytes = refine_pose(run, np.rint(255 * rgba).astype(np.uint8), off(0), **ALONE)
     assert max(errors(of_bytes.camera)) < 0.1
+    write_png(tmp_path / "a.png", np.rint(255 * rgba).astype(np.uint8))
+    of_file = refine_pose(run, tmp_path / "a.png", off(0), **ALONE)
+    np.testing.assert_array_equal(of_file.camera.world_from_camera, of_bytes.camera.world_from_camera)
     of_record = refine_pose(run, Image(straight, alpha[..., 0], np.ones((SIZE, SIZE), bool)), off(0), **ALONE)
     np.testing.assert_array_equal(of_record.camera.world_from_camera, known.camera.world_from_camera)
     opaque = np.dstack([picture(run), np.ones((SIZE, SIZE))])  # an alpha that says nothing
@@ -279,7 +283,9 @@ GREY = np.full((SIZE, SIZE, 3), 0.5)
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"image": "a.png"}, "image: expected an array or what load_image returns, found the path a.png"),
+        ({"image": "none.png"}, "^none.png: expected a file, found none"),
+        ({"image": Path(__file__)}, "test_refine_pose.py: expected PNG, JPEG or another image"),
+        ({"camera": np.eye(4)}, "camera: expected a Camera, such as Camera.look_at gives, found ndarray"),
         ({"image": GREY[:-1]}, r"image: expected \[64, 64, 3 or 4\] as the camera has it, found \[63, 64, 3\]"),
         ({"image": GREY[..., 0]}, r"image: expected \[64, 64, 3 or 4\] .* found \[64, 64\]"),
         ({"image": 200 * GREY}, r"image: expected float values in \[0, 1\] or uint8, found others"),

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 from spacesim.backend.arrays import Float
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
-from spacesim.data.records import Camera, Image, Sun
+from spacesim.data.images import load_image
+from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, check_camera
 from spacesim.splat.light.model import LightModel, Sunlight
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
@@ -62,14 +63,17 @@ class SunlitRun:
         return render_supersampled(plain, camera, run.supersample, colors=color_count, linear=run.curve is not None)
 
 
-def checked_picture(image: ArrayLike | Image, mask: ArrayLike | None, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def checked_picture(
+    image: str | Path | ArrayLike | Image, mask: ArrayLike | None, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
     """([H, W, 3] or premultiplied [H, W, 4], [H, W, 1] 1 where it counts, 0 elsewhere), float32."""
+    check_camera(camera)
     size = (camera.height, camera.width)
+    if isinstance(image, str | Path):
+        image = load_image(Dataset(Path(), (), ()), Frame(str(image), camera))
     counts = np.ones(size, np.float32)
     if isinstance(image, Image):
         counts, image = image.valid.astype(np.float32), np.dstack([image.rgb, image.alpha])
-    if isinstance(image, str | Path):
-        raise InputError(f"image: expected an array or what load_image returns, found the path {image}")
     pixels = np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[:2] != size or pixels.shape[2] not in (3, 4):
         expected = f"[{camera.height}, {camera.width}, 3 or 4] as the camera has it"

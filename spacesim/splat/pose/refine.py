@@ -9,6 +9,7 @@ Adam, which does with the adjoint's gradient, takes twice as long and diverges f
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,7 +59,7 @@ class RefinedPose:
 
 def refine_pose(
     run: Predictor,
-    image: ArrayLike | Image,
+    image: str | Path | ArrayLike | Image,
     camera: Camera,
     sun: Sun | Sequence[float] | None = None,
     mask: ArrayLike | None = None,
@@ -68,7 +69,8 @@ def refine_pose(
 ) -> RefinedPose:
     """The pose at which the model of `run` looks most like `image`, near that of `camera`.
 
-    image: [H, W, 3] sRGB values, float in [0, 1] or uint8, or [H, W, 4] with straight alpha; or what `load_image` gives
+    image: [H, W, 3] sRGB values, float in [0, 1] or uint8, or [H, W, 4] with straight alpha; or the path of a picture,
+        or what `load_image` gives
     camera: a guess of the pose, with the picture's size and intrinsics (no distortion)
     sun: as for `Run.render`, in the frame of the model
     mask: [H, W], where not 0 the pixel counts; by default all do

@@ -7,6 +7,7 @@ rest of the pose. The best few are told apart by pictures drawn at these poses, 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -132,7 +133,7 @@ class ModelViews:
 
 def find_pose(
     run: Predictor,
-    image: ArrayLike | Image,
+    image: str | Path | ArrayLike | Image,
     camera: Camera,
     sun: Sun | Sequence[float] | None = None,
     mask: ArrayLike | None = None,
@@ -149,8 +150,8 @@ def find_pose(
     """
     run = check_gaussians(run)
     direction = checked_sun(sun, run.relightable, f"a run of {run.config['method']}")
-    check_picture(camera)
     target, counts = checked_picture(image, mask, camera)
+    check_picture(camera)
     factor = max(1, max(camera.width, camera.height) // COARSE)
     coarse = _shrunk(camera, factor)
     small, known = reduced(target * counts, factor), reduced(counts, factor)
