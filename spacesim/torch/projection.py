@@ -215,8 +215,7 @@ def _splats_of(inputs: _Inputs, settings: RasterSettings) -> tuple[Splats, Footp
         footprints.visible &= ~small
     if settings.degree is None or not inputs.harmonics:
         return splats, footprints, []
-    unread: Any = None
-    model = Gaussians(ad.Array3f(centre), unread, unread, opacity, ad.ArrayXf(inputs.harmonics))
+    model = Gaussians(ad.Array3f(centre), ad.Array3f(), ad.Array4f(), opacity, ad.ArrayXf(inputs.harmonics))
     sums = harmonics(model, camera, settings.degree)
     return splats, footprints, [dr.select(is_unclamped(total), total, 0) for total in sums]
 

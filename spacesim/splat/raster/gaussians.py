@@ -20,7 +20,7 @@ ROWS = dict(zip(NAMES, (slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 11), s
 
 
 class Gaussians:
-    """The one mutable owner of the parameters. Assign to a field to change it.
+    """The one mutable owner of the parameters. Assign to a field to change it. Of numpy arrays: `from_numpy`.
 
     means: Array3f [3, N] metres, world or model frame
     log_scales: Array3f [3, N] natural logarithm of the standard deviations in metres
@@ -40,6 +40,10 @@ class Gaussians:
         sh: ArrayXf,
         features: Float | None = None,
     ) -> None:
+        for name, rows in zip(NAMES, (means, log_scales, quaternions, logit_opacities, sh), strict=True):
+            if not isinstance(rows, dr.ArrayBase):
+                hint = "for numpy arrays there is Gaussians.from_numpy"
+                raise TypeError(f"{name}: expected a Dr.Jit array, found {type(rows).__name__}; {hint}")
         self.means = means
         self.log_scales = log_scales
         self.quaternions = quaternions
@@ -123,7 +127,9 @@ class Gaussians:
     @staticmethod
     def from_numpy(arrays: Mapping[str, np.ndarray]) -> "Gaussians":
         """The inverse of `to_numpy`. Raises ValueError naming the array whose shape does not fit."""
-        for name in ("means", "log_scales", "quaternions", "logit_opacities", "sh"):
+        if not isinstance(arrays, Mapping):
+            raise TypeError(f"arrays: expected a dict, as to_numpy gives, found {type(arrays).__name__}")
+        for name in NAMES:
             if name not in arrays:
                 raise ValueError(f"{name}: expected an array, found none")
         count = len(arrays["means"])
@@ -140,8 +146,9 @@ class Gaussians:
         if sh.ndim != 3 or sh.shape[0] != count or sh.shape[1] not in (0, 1, 4, 9, 16) or sh.shape[2] != 3:
             raise ValueError(f"sh: expected shape ({count}, 0 | 1 | 4 | 9 | 16, 3), found {sh.shape}")
         features = arrays.get("features")
-        if features is not None and (np.ndim(features) != 2 or len(features) != count or features.shape[1] == 0):
-            raise ValueError(f"features: expected shape ({count}, F), found {np.shape(features)}")
+        shape = (count, 1) if features is None else np.shape(features)
+        if len(shape) != 2 or shape[0] != count or shape[1] == 0:
+            raise ValueError(f"features: expected shape ({count}, F), found {shape}")
         rows = {name: np.asarray(arrays[name], dtype=np.float32).T for name in expected}
         harmonics = sh.reshape(count, sh.shape[1] * 3)
         return Gaussians(
