@@ -227,7 +227,7 @@ def test_a_printed_scene_makes_the_same_dataset(spacesim, tmp_path):
 def test_a_broken_scene_file_ends_in_a_sentence_with_its_line(spacesim, tmp_path):
     (tmp_path / "my.toml").write_text('[[objects]]\nspacecraft = "boxsat"\n\n[rig]\nveiws = 3\n', encoding="utf-8")
     refused = spacesim("generate", tmp_path / "my.toml", "--out", tmp_path / "out")
-    assert refused.is_refusal(f"{tmp_path / 'my.toml'}, line 5: rig.veiws:", "did you mean views?")
+    assert refused.is_refusal(f"{tmp_path / 'my.toml'}, line 5: rig.veiws:", "did you mean rig.views?")
     assert not (tmp_path / "out").exists()
 
 
@@ -440,12 +440,16 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ),
         ("--set seed", ["--set: expected KEY=VALUE, found 'seed'"]),
         ("--set =3", ["--set: expected KEY=VALUE, found '=3'"]),
-        ("--set seed=three", ["--seed: expected a whole number, found 'three'"]),
+        ("--set seed=three", ["--set seed: expected a whole number, found 'three'"]),
         ("--set seed.x=3", ["--set seed.x: expected seed alone, which has no fields"]),
         ("--set method=relight", ["--set: expected --method, which sets all that goes with it"]),
         ("--set lihgt.bounce=9", ["--set lihgt", "rates, refinement, strategy", "mean light?"]),
-        ("--method relight --set light.bounse=9", ["--set light.bounse", "mean bounce?"]),
+        ("--method relight --set light.bounse=9", ["--set light.bounse", "did you mean light.bounce?"]),
         ("--set cull_every=9", ["--set cull_every", "did you mean strategy.cull_every?"]),
+        ("--set prune_opcity=1", ["--set prune_opcity", "did you mean refinement.prune_opacity?"]),
+        ("--set refinement.opacity=1", ["--set refinement.opacity", "did you mean refinement.prune_opacity?"]),
+        ("--method nerf --set strategy=default", ["--set strategy: expected one of method,"]),
+        ("--strategy mcmc --set strategy.kind=mcmd", ["--set strategy.kind: expected one of", "mean mcmc?"]),
         ("--set antialiased=1", ["--set antialiased: expected true or false, found 1"]),
         ("--set strategy=mcmd", ["--set strategy", "default, mesh-aware", "did you mean mcmc?"]),
         ("--set warm_start.steps=9", ["--set warm_start.steps", "expected warm_start to be there"]),

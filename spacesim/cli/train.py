@@ -67,15 +67,16 @@ def option_of(field: str, options: argparse.Namespace) -> str | None:
     from spacesim.nerf.config import NerfConfig
     from spacesim.splat.train.config import TrainConfig
 
-    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | {"sun": "--sun"}
+    others = {"sun": "--sun", "warm_start": "--warm-start", "refine_poses": "--refine-poses"}
+    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | others
     keys = {text.partition("=")[0].strip() for text in options.set}  # of which some are no fields
-    switches = {"warm_start": "--warm-start", "refine_poses": "--refine-poses"}  # take no value
-    options_by_key |= {key: option for key, option in switches.items() if key not in keys}
+    if field in options_by_key and field not in keys:
+        return options_by_key[field]
     known = {key.partition(".")[0] for key in keys} | {
         *TrainConfig.__dataclass_fields__,
         *NerfConfig.__dataclass_fields__,
     }
-    return options_by_key.get(field) or (f"--set {field}" if field.partition(".")[0] in known else None)
+    return f"--set {field}" if field.partition(".")[0] in known else None
 
 
 def run(options: argparse.Namespace) -> None:

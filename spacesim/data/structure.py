@@ -262,9 +262,12 @@ class _Reader:
             raise InputError(f"{label}: {rest}" if label else str(error)) from None
 
     def _refuse_key(self, key: str, at: Keys, expected: Sequence[str], kinds: Mapping[str, type]) -> NoReturn:
-        places = [place for place in places_of(self._root, self._rules) if place[-1] == key]
+        places = {str(place[-1]): place for place in reversed([*places_of(self._root, self._rules)])}  # the first
+        places |= {name: (*at, name) for name in expected}
         others = [kind for kind, cls in kinds.items() if key in keys_of(cls, self._rules)]
-        hint = f"; did you mean {dotted(places[0])}?" if places else did_you_mean(key, expected)
+        close = [key] if key in places else get_close_matches(key, expected, 1)
+        close = close or get_close_matches(key, places, 1, 0.8)  # elsewhere: only what is nearly it
+        hint = f"; did you mean {dotted(places[close[0]])}?" if close else ""
         if others:
             hint = f"; kind {' and '.join(others)} know{'s' * (len(others) == 1)} it"
         self._refuse((*at, key), f"one of {', '.join(expected)}", key, hint)

@@ -67,6 +67,8 @@ def test_an_alternative_is_chosen_by_its_name():
         ({"shape": {"kind": 3}}, r"shape\.kind: expected one of disc, box, found 3"),
         ({"shape": 3}, "shape: expected a table, found 3"),
         ({"shape": {"sides": [1, 2]}}, r"shape\.sides: expected one of kind, radius, found 'sides'; kind box knows it"),
+        ({"shape": {"radus": 3}}, r"shape\.radus: expected .*; did you mean shape\.radius\?"),
+        ({"radus": 3}, r"radus: expected .*; did you mean shape\.radius\?"),
         ({"shape": None}, "shape: expected a table, found none"),
         ({"lid": "none"}, "lid: expected one of disc, box, found 'none'"),
         ({"colour": "rad"}, "colour: expected one of red, blue, found 'rad'; did you mean red?"),

@@ -314,7 +314,7 @@ BOXSAT = '[[objects]]\nspacecraft = "boxsat"\n'
         ("[[objects]]", ", line 1: objects[0]: expected either spacecraft or mesh, found neither"),
         (BOXSAT + "mesh='a.glb'", ", line 1: objects[0]: expected either spacecraft or mesh, found both"),
         (BOXSAT + "\n[rig]\nveiws = 3", ", line 5: rig.veiws: expected one of kind, suns, views"),
-        (BOXSAT + "\n[rig]\nveiws = 3", "found 'veiws'; did you mean views?"),
+        (BOXSAT + "\n[rig]\nveiws = 3", "found 'veiws'; did you mean rig.views?"),
         ("veiws = 3\n" + BOXSAT, ", line 1: veiws: expected one of name, objects"),
         ("views = 3\n" + BOXSAT, "found 'views'; did you mean rig.views?"),
         (BOXSAT + "[rig]\nkind = 'fibonaci'", ", line 4: rig.kind: expected one of fibonacci, polar-arc"),

@@ -330,7 +330,8 @@ def with_settings(config: TrainConfig, settings: JsonMapping) -> TrainConfig:
     """
     iterations = settings.get("iterations")
     values = (shortened(config, iterations) if type(iterations) is int else config).to_json()
-    for name in sorted(settings, key=lambda name: name.count(".")):  # what is chosen first, then what it has
+    depths = {name: name.count(".") - name.endswith(".kind") for name in settings}
+    for name in sorted(settings, key=depths.__getitem__):  # what is chosen first, then what it has
         keys = name.split(".")
         table = values
         for depth, key in enumerate(keys[:-1], start=1):
@@ -342,6 +343,8 @@ def with_settings(config: TrainConfig, settings: JsonMapping) -> TrainConfig:
                     raise InputError(f"{name}: expected {first} to be there, found none{why}")
                 raise InputError(f"{name}: expected {first} alone, which has no fields, found {name}")
             table = inner
+        if keys[-1] == "kind" and table.get("kind", settings[name]) != settings[name]:
+            table.clear()  # of another alternative
         table[keys[-1]] = _put(table.get(keys[-1]), settings[name])
     result = _read(Document("", values, {}), Rules(none="none"))
     reads: tuple[str, ...] | None = getattr(result.strategy, "reads", None)

@@ -268,7 +268,7 @@ def test_a_saved_orbit_and_a_scene_without_camera_and_sun(tmp_path):
         (f"{HEAD}axis = [0, 0, 1]", "models[0].axis: expected with angle_deg"),
         (f"{HEAD}angle_deg = 5", "models[0].angle_deg: expected with axis"),
         (f"{HEAD}axis = [0, 0, 0]\nangle_deg = 1", "line 3: models[0].axis"),
-        (f"{HEAD}positon = [0, 0, 1]", "did you mean position?"),
+        (f"{HEAD}positon = [0, 0, 1]", "did you mean models[0].position?"),
         (f"{HEAD}position = [0, 1]", "line 3: models[0].position"),
         (f"{HEAD}position = [0, 1, 1e12]", "line 3: models[0].position"),
         (f"{HEAD}[sun]\nazimuth_deg = 3", "sun.elevation_deg"),

@@ -24,6 +24,7 @@ from spacesim.splat.train.config import (
 )
 from spacesim.splat.train.strategies.factory import make_strategy
 from spacesim.splat.train.strategies.mcmc import McmcConfig
+from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig
 from spacesim.splat.train.train import train
 
 OLD = json.loads((Path(__file__).parent / "configs_before_unions.json").read_text(encoding="utf-8"))
@@ -149,6 +150,19 @@ def test_an_alternative_that_is_there_keeps_what_it_has():
     assert moving.light.shadow.method == SplattingConfig(gradients=True)
 
 
+def test_a_kind_says_the_same_as_the_name_of_its_alternative():
+    config = preset("fast", "shadow-map", "mcmc")
+    other = with_settings(config, {"strategy.cull_every": 7, "strategy.kind": "mesh-aware"})
+    assert other.strategy == MeshAwareConfig(cull_every=7)
+    assert with_settings(config, {"strategy.kind": "default"}) == with_settings(config, {"strategy": "default"})
+    grown = with_settings(config, {"strategy.growth": 0.5})
+    assert with_settings(grown, {"strategy.kind": "mcmc"}) == grown
+    with pytest.raises(InputError, match=r"^strategy\.growth: expected one of kind, .* kind mcmc knows it"):
+        with_settings(config, {"strategy.kind": "default", "strategy.growth": 0.5})
+    with pytest.raises(InputError, match=r"^kind: expected one of method"):
+        with_settings(config, {"kind": "default"})
+
+
 def test_the_light_tells_the_method():
     for method in METHODS:
         config = preset("fast", method)
@@ -176,7 +190,9 @@ def test_the_old_word_for_the_baseline_is_known_everywhere(tiny_data, tmp_path):
     run = ss.train(tiny_data, tmp_path / "run", preset="demo", method="park", **small)
     assert run.config["method"] == "baseline-park"
     assert run.config["light"]["shadow"]["size"] == 16
-    with pytest.raises(InputError, match=r"light\.shadow\.sise: expected one of method, size, .* mean size"):
+    with pytest.raises(
+        InputError, match=r"light\.shadow\.sise: expected one of method, size, .* mean light.shadow.size"
+    ):
         ss.train(tiny_data, tmp_path / "other", method="park", settings={"light.shadow.sise": 16})
 
 
