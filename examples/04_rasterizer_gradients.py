@@ -1,12 +1,11 @@
 """4. Differentiate: fit Gaussians to a picture by gradient descent, without the training loop.
 
-    python examples/04_rasterizer_gradients.py      5 to 15 seconds on two cores; writes fit.png
+    python examples/04_rasterizer_gradients.py      5 to 15 seconds on two cores; writes fit.pgm
 
 `ss.render` is an ordinary Dr.Jit function: enable gradients on any of its parameters and go backward.
 """
 
 import numpy as np
-from PIL import Image
 
 import spacesim as ss
 
@@ -14,7 +13,7 @@ import spacesim as ss
 from drjit import backward, mean, opt, square
 
 
-def main(out="fit.png", count=300, size=128, steps=200):
+def main(out="fit.pgm", count=300, size=128, steps=200):
     camera = ss.Camera.look_at([0, -4, 0], [0, 0, 0], size, size, fov_x_deg=40)
     y, x = np.mgrid[-1.25 : 1.25 : size * 1j, -1.25 : 1.25 : size * 1j]
     truth = np.clip(np.sqrt(np.maximum(1 - x * x - y * y, 0)) * (0.8 * x - 0.6 * y + 0.4), 0, 1)  # a ball
@@ -26,7 +25,8 @@ def main(out="fit.png", count=300, size=128, steps=200):
         losses.append(mean(square(picture.color - target), axis=None))
         backward(losses[-1])
         optimizer.step()
-    Image.fromarray(np.uint8(255 * np.hstack([truth, picture.image("color")[..., 0].clip(0, 1)]))).save(out)
+    pixels = np.uint8(255 * np.hstack([truth, picture.image("color")[..., 0].clip(0, 1)]))
+    np.savetxt(out, pixels, "%d", header=f"P2 {2 * size} {size} 255", comments="")  # a plain PGM picture
     return float(losses[0][0]), float(losses[-1][0])
 
 
