@@ -5,7 +5,7 @@ eval, compose, report and import do; `render` rasterizes Gaussians, `Run.render`
 them stands in the layers of docs/explanation/architecture.md.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,9 @@ from spacesim.backend import BackendError
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.files import JsonDict, JsonMapping
+from spacesim.data.files import JsonDict, JsonMapping, as_path
 from spacesim.data.images import load_image
-from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth
+from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth, check_camera
 from spacesim.data.store import load_depth, load_truth
 from spacesim.data.structure import Rules, did_you_mean, field_value, places_of
 from spacesim.data.toml import dotted
@@ -127,7 +127,7 @@ def generate(
         scene = read_scene(scene, **options)
     elif options:
         raise InputError(f"{next(iter(options))}: expected no options beside a scene that has been read, found one")
-    return _generate(scene, Path(out), resume, progress, workers)
+    return _generate(scene, as_path(out, "out"), resume, progress, workers)
 
 
 def import_dataset(
@@ -145,7 +145,7 @@ def import_dataset(
     """
     from spacesim.data.importers.kinds import import_dataset as run_import
 
-    return run_import(kind, src, out, progress, **options)
+    return run_import(kind, as_path(src, "src"), as_path(out, "out"), progress, **options)
 
 
 def train(
@@ -201,13 +201,13 @@ def train(
     config = methods.with_settings(replace(config, **options), settings or {})
     if "method" in choices and config.method != before:
         raise InputError(f"light: expected that of the method {before}, found that of {config.method}")
-    dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
+    dataset, folder = _dataset(data, "data"), as_path(out, "out")
 
     def tell(state: TrainingProgress) -> None:
         if progress is not None:
             progress(state.iteration, state.iterations, state.words)
 
-    return methods.train(dataset, Path(out), config, resume, tell)
+    return methods.train(dataset, folder, config, resume, tell)
 
 
 def evaluate(
@@ -238,14 +238,15 @@ def evaluate(
     from spacesim.eval.evaluate import EvaluateConfig
     from spacesim.eval.evaluate import evaluate as evaluate_run
 
-    weights = None if lpips_weights is None else Path(lpips_weights)
-    own = align if align is None or isinstance(align, Dataset) else read_dataset(Path(align))
+    weights = None if lpips_weights is None else as_path(lpips_weights, "lpips_weights")
+    own = None if align is None else _dataset(align, "align")
     config = EvaluateConfig(split, weights, fit_gain=fit_gain, align=own)
-    loaded = load_predictor(Path(run)) if isinstance(run, str | Path) else run
-    dataset = data if isinstance(data, Dataset) else read_dataset(Path(data))
     config = config if geometry else replace(config, geometry=None)
-    metrics = evaluate_run(loaded, dataset, Path(out), config, progress)
-    write_report(out, Path(out) / "report.html")
+    expected = "a path or what load_run returns"
+    loaded = run if isinstance(run, Run | NerfRun) else load_predictor(as_path(run, "run", expected))
+    dataset, folder = _dataset(data, "data"), as_path(out, "out")
+    metrics = evaluate_run(loaded, dataset, folder, config, progress)
+    write_report(folder, folder / "report.html")
     return metrics
 
 
@@ -256,9 +257,10 @@ def write_report(evals: str | Path | Sequence[str | Path], out: str | Path) -> P
     """
     from spacesim.eval.report.write import write_report as write
 
-    folders = [evals] if isinstance(evals, str | Path) else evals
-    write([Path(folder) for folder in folders], Path(out))
-    return Path(out)
+    folders = [evals] if isinstance(evals, str) or not isinstance(evals, Iterable) else evals
+    path = as_path(out, "out")
+    write([as_path(folder, "evals") for folder in folders], path)
+    return path
 
 
 def compose(scene: str | Path | PosedScene, out: str | Path, *, size: int | tuple[int, int] | None = None) -> Composed:
@@ -270,8 +272,9 @@ def compose(scene: str | Path | PosedScene, out: str | Path, *, size: int | tupl
 
     Raises InputError for a scene or a folder that cannot be, BackendError where no backend can run.
     """
-    posed = scene if isinstance(scene, PosedScene) else load_scene(Path(scene))
-    return _compose(posed, Path(out), size)
+    if not isinstance(scene, PosedScene):
+        scene = load_scene(as_path(scene, "scene", "a path or what load_scene returns"))
+    return _compose(scene, as_path(out, "out"), size)
 
 
 def render(
@@ -294,9 +297,23 @@ def render(
     `RenderOutput.to_numpy()` gives (colour [H, W, 3], alpha [H, W], depth [H, W] in metres). Raises ValueError for
     another output or degree, features or a twist of another length, BackendError where no backend can run.
     """
-    view = camera if isinstance(camera, Projection) else Pinhole.of(camera)
+    if not isinstance(gaussians, Gaussians):
+        found = f"{type(gaussians).__name__}; a run has a render of its own: run.render(camera, sun)"
+        raise InputError(f"gaussians: expected Gaussians, found {found}")
+    if isinstance(camera, Projection):
+        view = camera
+    else:
+        check_camera(camera)
+        view = Pinhole.of(camera)
     if twist is not None:
         if len(twist) != 6:
             raise ValueError(f"twist: expected 6 numbers, found {len(twist)}")
         view = view.moved(upload(np.asarray(twist)) if isinstance(twist, np.ndarray | Sequence) else twist)
     return _render(gaussians, view, **options)
+
+
+def _dataset(data: str | Path | Dataset, name: str) -> Dataset:
+    """What was read, or is at a path."""
+    if isinstance(data, Dataset):
+        return data
+    return read_dataset(as_path(data, name, "a path or what read_dataset returns"))

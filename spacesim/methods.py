@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonMapping, read_json
+from spacesim.data.files import JsonMapping, as_path, read_json
 from spacesim.data.records import Dataset
 from spacesim.data.structure import did_you_mean
 from spacesim.nerf import config as nerf
@@ -92,7 +92,8 @@ def train(
 
 def load_run(path: str | Path) -> "Run | NerfRun":
     """Load a finished run of any method. Raises InputError where the folder is no run or its training has not ended."""
-    config = Path(path) / "config.json"
+    path = as_path(path, "path")
+    config = path / "config.json"
     values = read_json(config) if config.exists() else {}
     method = values.get("method", "vanilla") if isinstance(values, dict) else "vanilla"
     if method not in (*METHODS, *splat.ALIASES):

@@ -54,7 +54,7 @@ def test_pictures_and_poses(tiny_run, tiny_data, tmp_path):
         run.render(frame.camera, sun="40,25")
     with pytest.raises(ss.InputError, match=r"^kind: expected one of rgb, alpha"):
         view.save(tmp_path / "a.png", "foo")
-    with pytest.raises(ss.InputError, match=r"^run: expected what load_run returns, found the path run"):
+    with pytest.raises(ss.InputError, match=r"^run: expected what load_run returns, found 'run'"):
         ss.refine_pose("run", view.rgb, frame.camera)
     still, moved = (ss.render(run.gaussians, frame.camera, twist=twist) for twist in (np.zeros(6), [0, 0, 0, 0, 0, 1]))
     assert np.array_equal(still.to_numpy()[1], ss.render(run.gaussians, frame.camera).to_numpy()[1])
@@ -87,10 +87,71 @@ def test_pictures_that_cannot_be(tiny_run, tiny_data, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == []
 
 
-def test_an_address_that_is_none():
+@pytest.mark.parametrize("wrong", [None, 5, object()], ids=["None", "5", "object"])
+def test_what_is_neither_a_path_nor_a_record_is_named(wrong, tiny_run, tiny_data, tmp_path):
+    """In place of each path and record that a public function takes."""
+    run, data, out = ss.load_run(tiny_run), ss.read_dataset(tiny_data), tmp_path / "out"
+    frame, picture = data.test[0], ss.load_image(data, data.test[0])
+    scene = tmp_path / "scene.toml"
+    scene.write_text(f"[[models]]\nrun = '{tiny_run}'\n", encoding="utf-8")
+    frames = [(wrong, frame), (data, wrong)]
+    poses = [(wrong, picture, frame.camera), (run, wrong, frame.camera), (run, picture, wrong)]
+    calls = {
+        "compose": [(wrong, out), (scene, wrong)],
+        "estimate_sun": [(wrong, picture, frame.camera)],
+        "evaluate": [(wrong, data, out), (run, wrong, out), (run, data, wrong)],
+        "find_pose": poses,
+        "generate": [(wrong, out), ("boxsat", wrong)],
+        "import_dataset": [(wrong, tiny_data, out), ("nerfstudio", wrong, out), ("nerfstudio", tiny_data, wrong)],
+        "load_depth": frames,
+        "load_image": frames,
+        "load_run": [(wrong,)],
+        "load_scene": [(wrong,)],
+        "load_truth": frames,
+        "preset": [(wrong,), ("fast", wrong)],
+        "read_dataset": [(wrong,)],
+        "read_scene": [(wrong,)],
+        "refine_pose": poses,
+        "render": [(wrong, frame.camera), (run.gaussians, wrong)],
+        "train": [(wrong, out), (data, wrong), (data, out, wrong or "fast")],
+        "write_report": [(wrong, out), (tiny_data, wrong)],
+    }
+    assert set(calls) == {name for name in ss.__all__ if not isinstance(getattr(ss, name), type)}
+    for name, several in calls.items():
+        for arguments in several:
+            with pytest.raises(ss.InputError, match=r"^[a-z]+: expected .+, found "):
+                getattr(ss, name)(*arguments)
+    for name in "lpips_weights", "align":
+        with pytest.raises(ss.InputError, match=f"^{name}: expected a path"):
+            ss.evaluate(run, data, out, **{name: wrong or 0})
+    with pytest.raises(ss.InputError, match=r"^path: expected a path, found "):
+        run.render(frame.camera).save(wrong)
+    assert sorted(tmp_path.iterdir()) == [scene]
+
+
+def test_a_run_is_no_gaussians_and_nor_are_arrays(tiny_run, tiny_data):
+    run, camera = ss.load_run(tiny_run), ss.read_dataset(tiny_data).test[0].camera
+    with pytest.raises(
+        ss.InputError, match=r"^gaussians: expected Gaussians, found Run; .*: run\.render\(camera, sun\)"
+    ):
+        ss.render(run, camera)
+    arrays = run.gaussians.to_numpy()
+    with pytest.raises(TypeError, match=r"^means: expected a Dr.Jit array, found ndarray; .* Gaussians.from_numpy$"):
+        ss.Gaussians(**arrays)
+    with pytest.raises(TypeError, match=r"^sh: expected a Dr.Jit array, found list"):
+        ss.Gaussians(**{**run.gaussians.parameters(), "sh": arrays["sh"].tolist()})
+    with pytest.raises(TypeError, match=r"^arrays: expected a dict, as to_numpy gives, found ndarray"):
+        ss.Gaussians.from_numpy(arrays["means"])
+    lists = {name: array.tolist() for name, array in arrays.items()} | {"features": [[1, 2]] * run.gaussian_count}
+    assert ss.Gaussians.from_numpy(lists).feature_count == 2
+    np.testing.assert_array_equal(ss.Gaussians.from_numpy(lists).to_numpy()["means"], arrays["means"])
+
+
+@pytest.mark.parametrize("address", ["foo", None])
+def test_an_address_that_is_none(address):
     pytest.importorskip("zmq", reason="pyzmq is not installed")
-    with pytest.raises(ss.InputError, match=r"^address: expected one such as tcp://127.0.0.1:5556, found 'foo'"):
-        ss.CameraClient("foo")
+    with pytest.raises(ss.InputError, match=rf"^address: expected one such as tcp://127.0.0.1:5556, found {address!r}"):
+        ss.CameraClient(address)
 
 
 @pytest.mark.parametrize("camera", ["x", np.eye(4), None])

@@ -33,6 +33,13 @@ _KINDS = (
 )
 
 
+def as_path(value: object, name: str, expected: str = "a path") -> Path:
+    """The path that an argument is, by its name. Raises InputError for what is none."""
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(f"{name}: expected {expected}, found {value!r:.60}")
+    return Path(value)
+
+
 def open_regular(path: Path, expected: str = "a file") -> BinaryIO:
     """Open a plain file for reading; links are followed.
 

@@ -32,7 +32,7 @@ from spacesim.data.images import Undistortion, load_image, read_exr, read_png, w
 from spacesim.data.integrity.manifest import check_manifest, read_manifest, write_manifest
 from spacesim.data.integrity.whole import is_whole
 from spacesim.data.mesh import check_points, load_mesh
-from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
+from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth, check_frame
 from spacesim.data.transforms import DEPTH_UNITS, MILLIMETRE, dataset_of, read_dataset
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ def load_truth(dataset: Dataset, frame: Frame) -> Truth:
     Where the frame's lens distorts, radiance and alpha are resampled bilinearly; labels take the nearest pixel's value,
     so that none is averaged, and are 0 beyond what the lens sees.
     """
+    check_frame(dataset, frame)
     if frame.gt_path is None:
         raise InputError(f"{dataset.root}: expected ground truth of {frame.file_path}, found no gt_path")
     path = dataset.root / frame.gt_path
@@ -108,6 +109,7 @@ def load_truth(dataset: Dataset, frame: Frame) -> Truth:
 def load_depth(dataset: Dataset, frame: Frame) -> np.ndarray:
     """[H, W] float32: depth along the optical axis, metres, 0 none, of the picture as it is stored. Raises InputError
     where that is missing or broken."""
+    check_frame(dataset, frame)
     if frame.depth_file_path is None:
         raise InputError(f"{dataset.root}: expected depth of {frame.file_path}, found no depth_file_path")
     path = dataset.root / frame.depth_file_path

@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import MAX_LIST_BYTES, JsonValue, read_json
+from spacesim.data.files import MAX_LIST_BYTES, JsonValue, as_path, read_json
 from spacesim.data.geometry import OPENCV_FROM_OPENGL
 from spacesim.data.images import image_size
 from spacesim.data.integrity.manifest import NAME as DIGESTS
@@ -45,7 +45,7 @@ def read_dataset(path: str | Path) -> Dataset:
     malformed JSON, no frames, none with an image, a pose or a camera that cannot be, or a camera model with no
     pinhole equivalent. Files of truth are only looked for when they are loaded.
     """
-    path = Path(path)
+    path = as_path(path, "path")
     root = path if path.is_dir() else path.parent
     source = root / "transforms.json" if path.is_dir() else path
     if source.is_file() and source.name != "transforms_train.json":

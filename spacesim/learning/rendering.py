@@ -9,7 +9,8 @@ from typing import Protocol
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.records import Camera, Sun
+from spacesim.data.files import as_path
+from spacesim.data.records import Camera, Sun, check_camera
 from spacesim.learning.pictures import write_picture
 from spacesim.learning.prediction import KINDS, Prediction
 
@@ -36,8 +37,7 @@ class Rendering:
     """A view of a run, drawn when an array of it is asked for first. See `Run.render`."""
 
     def __init__(self, run: CanPredict, camera: Camera, sun: Sun | None, exposure: float | None = None) -> None:
-        if not isinstance(camera, Camera):
-            raise InputError(f"camera: expected a Camera, such as Camera.look_at gives, found {type(camera).__name__}")
+        check_camera(camera)
         self.run, self.camera, self.sun, self.exposure = run, camera, sun, exposure
 
     @cached_property
@@ -77,8 +77,9 @@ class Rendering:
         kind: "rgb", "alpha", "depth", "normal" or "shadow". Raises InputError for another, for another suffix, and for
         shadows of a method without.
         """
+        path = as_path(path, "path")
         if kind not in KINDS:
             raise InputError(f"kind: expected one of {', '.join(KINDS)}, found {kind!r}")
         drawn = replace(self._drawn, normal=self.normal) if kind == "normal" else self._drawn
-        write_picture(drawn, kind, Path(path))
-        return Path(path)
+        write_picture(drawn, kind, path)
+        return path

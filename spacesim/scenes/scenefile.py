@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 from spacesim.data import toml
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonDict, JsonMapping
+from spacesim.data.files import JsonDict, JsonMapping, as_path
 from spacesim.data.structure import Rules, did_you_mean, keys_of, structure
 from spacesim.scenes.cameras.rig import Rig
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
@@ -37,7 +37,7 @@ def read_scene(source: str | Path, **options: object) -> SceneConfig:
     also units, up and two_sided (see `ObjectConfig`). Raises InputError where there is no such scene, or for what it
     cannot be.
     """
-    path = Path(source)
+    path = as_path(source, "scene", "a name or a path")
     chosen = {name: value for name, value in options.items() if value is not None}
     if str(source) in BUILT_IN_SCENES:
         path = SCENES / f"{source}.toml"

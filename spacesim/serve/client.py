@@ -26,7 +26,7 @@ class CameraClient:
         self._socket.setsockopt(zmq.LINGER, 0)
         try:
             self._socket.connect(address)
-        except zmq.ZMQError as error:
+        except (zmq.ZMQError, TypeError) as error:
             raise InputError(
                 f"address: expected one such as tcp://127.0.0.1:5556, found {address!r} ({error})"
             ) from None

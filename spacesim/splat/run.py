@@ -259,8 +259,8 @@ class Run:
 
 def check_gaussians(run: Predictor) -> Run:
     """The trained run of Gaussians that `run` is. Raises InputError where it is none."""
-    if isinstance(run, str | Path):
-        raise InputError(f"run: expected what load_run returns, found the path {run}")
+    if not hasattr(run, "gaussian_run"):
+        raise InputError(f"run: expected what load_run returns, found {run!r:.60}")
     if run.gaussian_run is None:
         raise InputError(f"run: expected one of Gaussians, found one of the method {run.config['method']}")
     return run.gaussian_run

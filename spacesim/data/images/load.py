@@ -7,7 +7,7 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.data.images.lens import Resampling, Undistortion
 from spacesim.data.images.png import read_png
-from spacesim.data.records import Camera, Dataset, Frame, Image
+from spacesim.data.records import Camera, Dataset, Frame, Image, check_frame
 
 
 def load_image(dataset: Dataset, frame: Frame) -> Image:
@@ -18,6 +18,7 @@ def load_image(dataset: Dataset, frame: Frame) -> Image:
     black whatever the file holds, so that it cannot reach their neighbours through a window. Raises InputError
     where a file is missing, broken or of another size than the camera.
     """
+    check_frame(dataset, frame)
     pixels = _read_sized(dataset.root / frame.file_path, frame.camera)
     values = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
     alpha = np.ones(values.shape[:2], np.float32)

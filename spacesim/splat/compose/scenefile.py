@@ -11,7 +11,7 @@ import numpy as np
 
 from spacesim.data import toml
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonDict, write_bytes
+from spacesim.data.files import JsonDict, as_path, write_bytes
 from spacesim.data.geometry import OPENCV_FROM_OPENGL, Array, look_at
 from spacesim.data.records import Camera, Sun, check_size
 from spacesim.data.structure import Rules, did_you_mean, structure
@@ -223,7 +223,7 @@ def load_scene(
     load: a folder to a run, None: one of Gaussians;  compose: makes a `GaussianComposition`, or what has its
     words for runs of other methods
     """
-    path = Path(path)
+    path = as_path(path, "path")
     document = toml.read_document(path)
     entry = structure(SceneEntry, document, RULES)
     names = _names(entry.models, document)

@@ -15,6 +15,7 @@ from spacesim.data.exporters import labelled_objects, write_bop
 from spacesim.data.exporters.labels import VISIBLE, DatasetLabeller
 from spacesim.data.images import read_png
 from spacesim.data.store import load_truth
+from spacesim.eval.evaluate import evaluate
 from spacesim.scenes import generate, read_scene
 from spacesim.scenes.silhouette import silhouette_finder
 
@@ -122,7 +123,7 @@ def test_a_model_of_one_shape_is_refused(moving, command, tmp_path, capsys):
     arguments = [command, str(moving.root), "--out", str(tmp_path / "out")]
     if command == "eval":
         with pytest.raises(InputError, match="stand still to each other, found 3 frames that move some"):
-            ss.evaluate(object(), moving, tmp_path / "out")
+            evaluate(object(), moving, tmp_path / "out")
         return
     assert main(arguments) == 2
     assert "stand still to each other, found 3 frames that move some" in capsys.readouterr().err
