@@ -10,7 +10,7 @@ from spacesim.data.files import write_json
 from spacesim.data.geometry import fibonacci_sphere
 from spacesim.data.images import write_png
 from spacesim.data.records import Dataset
-from spacesim.data.store import read_dataset, write_points
+from spacesim.data.store import intrinsics_of, read_dataset, write_points
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
@@ -40,8 +40,8 @@ def write_dataset(root: Path, count: int, pixels: int, views: int = VIEWS) -> Da
         write_png(root / name, np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8), durable=False)
         frames.append({"file_path": name, "transform_matrix": camera.opengl.tolist()})
     write_points(root / "points.ply", arrays["means"], np.full((count, 3), 128, np.uint8))
-    meta: dict[str, Any] = {"camera_model": "OPENCV", "w": pixels, "h": pixels, "cx": camera.cx, "cy": camera.cy}
-    meta |= {"fl_x": camera.fx, "fl_y": camera.fy, "ply_file_path": "points.ply", "frames": frames}
+    meta: dict[str, Any] = {"camera_model": "OPENCV", **intrinsics_of(camera)}
+    meta |= {"ply_file_path": "points.ply", "frames": frames}
     meta |= {"train_filenames": [frame["file_path"] for frame in frames], "test_filenames": []}
     write_json(root / "transforms.json", meta)
     return read_dataset(root)

@@ -19,7 +19,7 @@ from spacesim.splat.train.config import TrainConfig
 if TYPE_CHECKING:
     from spacesim.learning.folder import TrainingProgress
     from spacesim.nerf.run import NerfRun
-    from spacesim.splat.compose.path import PosedScene
+    from spacesim.splat.compose.posed_scene import PosedScene
     from spacesim.splat.run import Predictor, Run
 
 METHODS = (*splat.METHODS, *nerf.METHODS)

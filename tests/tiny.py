@@ -28,6 +28,31 @@ def contents(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
+def pair_scene(one: Path, other: Path, place=(3, 0, 0), sun=(0, 10), eye=(0, -16, 3), size=(48, 32)) -> str:
+    """A scene file of two runs: one at the origin, the other half as large at `place`, under a Sun at (azimuth,
+    elevation), seen from `eye` between both."""
+    return f"""
+[[models]]
+name = "one"
+run = "{one}"
+
+[[models]]
+name = "other"
+run = "{other}"
+position = {list(place)}
+scale = 0.5
+
+[sun]
+azimuth_deg = {sun[0]}
+elevation_deg = {sun[1]}
+
+[camera]
+position = {list(eye)}
+look_at = {[0.5 * x for x in place]}
+resolution = {list(size)}
+"""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What a command left behind. errors: lines of standard error that are no progress."""

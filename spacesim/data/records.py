@@ -98,6 +98,13 @@ class Camera:
         """[4, 4] camera-to-world with OpenGL axes, as Nerfstudio stores it."""
         return self.world_from_camera @ OPENCV_FROM_OPENGL
 
+    def downscaled(self, times: int) -> "Camera":
+        """The camera with one pixel for each whole `times` x `times` of its own; it sees what these see."""
+        if times == 1:
+            return self
+        numbers = [number / times for number in (self.fx, self.fy, self.cx, self.cy)]
+        return Camera(self.world_from_camera, self.width // times, self.height // times, *numbers)
+
     @staticmethod
     def from_fov(world_from_camera: Array, width: int, height: int, fov_x_deg: float) -> "Camera":
         """A camera with square pixels, a centred principal point and a horizontal field of view in degrees. Raises

@@ -21,7 +21,7 @@ TEST = MappingConfig("percentage-closer", radius=0.5)  #: as `Member.cross_shado
 
 @dataclass(frozen=True, eq=False)
 class FieldOccluder:
-    """Fields in the Sun's way of Gaussians, see `splat.compose.scene.SunOccluder`."""
+    """Fields in the Sun's way of Gaussians, see `splat.compose.light.SunOccluder`."""
 
     fields: FieldComposition  #: radiance fields where they stand
 

@@ -225,11 +225,9 @@ class _Reduced:
     """A picture with `times` x `times` pixels in one, and what a run draws of it."""
 
     def __init__(self, run: Predictor, picture: Picture, times: int, space: EmbeddingFit) -> None:
-        camera = picture.camera
         self.run, self.times, self.space = run, times, space
-        self.height, self.width = camera.height // times, camera.width // times
-        numbers = [number / times for number in (camera.fx, camera.fy, camera.cx, camera.cy)]
-        self.camera = Camera(camera.world_from_camera, self.width, self.height, *numbers)
+        self.camera = picture.camera.downscaled(times)
+        self.height, self.width = self.camera.height, self.camera.width
         self.truth = self._means(picture.rgb).reshape(-1, 3)
 
     def share(self, mask: np.ndarray) -> Array:

@@ -7,7 +7,7 @@ from spacesim.data.records import Dataset, Sun
 from spacesim.data.store import read_dataset
 from spacesim.methods import compose, load_run, load_scene
 from spacesim.splat.compose import PlacedRun
-from spacesim.splat.compose.path import PosedScene
+from spacesim.splat.compose.posed_scene import PosedScene
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.path import path_from_scene
 from spacesim.viewer.server import ViewerSetup, import_viser

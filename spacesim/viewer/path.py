@@ -10,7 +10,8 @@ import numpy as np
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
 from spacesim.splat.compose import GaussianComposition
-from spacesim.splat.compose.path import FPS, MAX_FRAMES, CameraView, Keyframe, Orbit, PosedScene, SceneFrame
+from spacesim.splat.compose.path import FPS, MAX_FRAMES, CameraView, Keyframe, Orbit
+from spacesim.splat.compose.posed_scene import PosedScene, SceneFrame
 from spacesim.viewer.state import SceneState, ViewerCamera
 
 RATE = 24.0  #: times a second that a path that is played moves the camera

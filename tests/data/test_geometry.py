@@ -110,6 +110,15 @@ def test_opengl_pose_of_a_camera_is_that_of_blender():
     np.testing.assert_allclose(camera.camera_from_world, np.linalg.inv(camera.world_from_camera), atol=1e-12)
 
 
+def test_a_downscaled_camera_sees_what_its_pixels_saw():
+    camera = Camera(look_at((0, -4, 0), (0, 0, 0)), 11, 9, 14.0, 15.0, 4.5, 5.0)
+    seen = camera.downscaled(4)
+    assert (seen.width, seen.height) == (2, 2)  # 3 columns and a row fill no square
+    assert (seen.fx, seen.fy, seen.cx, seen.cy) == (14 / 4, 15 / 4, 4.5 / 4, 5 / 4)
+    np.testing.assert_array_equal(seen.world_from_camera, camera.world_from_camera)
+    assert camera.downscaled(1) is camera
+
+
 @pytest.mark.parametrize("count", [50, 400])
 def test_fibonacci_directions_are_even(count):
     for seed in (None, 7):

@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 from made_field import box_field, made_field
 from posed import disc_run, made_run, seen_from
-from test_nerf_training import CONFIG
+from tiny import pair_scene
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
 from spacesim.data.records import Sun
-from spacesim.data.store import read_dataset
 from spacesim.methods import compose, load_scene
 from spacesim.mixed.scene import MixedComposition
-from spacesim.nerf.train.train import train
 from spacesim.splat.compose import ComposeConfig, PlacedRun, Pose, save_scene
 from spacesim.splat.compose.pose import rotation_about
 
@@ -210,36 +208,12 @@ def test_what_cannot_be_is_said(box):
     assert scene((made_run("vanilla"), Pose()), (box, Pose())).predict(EYE).visibility is None
 
 
-@pytest.fixture(scope="module")
-def trained_field(tiny_data, tmp_path_factory):
-    return train(read_dataset(tiny_data), tmp_path_factory.mktemp("mixed") / "field", CONFIG).path
-
-
-def test_scene_files_are_composed_and_evaluated(spacesim, tiny_data, tiny_run, trained_field, tmp_path):
+def test_scene_files_are_composed_and_evaluated(spacesim, tiny_data, tiny_run, tiny_field, tmp_path):
     """Of both families, and of fields: pictures of all kinds, numbers, shapes."""
-    kinds = {"mixed": (tiny_run, trained_field), "fields": (trained_field, trained_field)}
+    kinds = {"mixed": (tiny_run, tiny_field), "fields": (tiny_field, tiny_field)}
     for kind, (one, other) in kinds.items():
         path = tmp_path / f"{kind}.toml"
-        path.write_text(f"""
-[[models]]
-run = "{one}"
-name = "one"
-
-[[models]]
-run = "{other}"
-name = "other"
-position = [3, 0, 0]
-scale = 0.5
-
-[sun]
-azimuth_deg = 0
-elevation_deg = 10
-
-[camera]
-position = [0, -16, 3]
-look_at = [0, 0, 0]
-resolution = [48, 32]
-""")
+        path.write_text(pair_scene(one, other))
         done = spacesim("compose", path, "--out", tmp_path / kind)
         assert done.code == 0, done.errors
         assert set(np.unique(read_png(tmp_path / kind / "id/0000.png"))) == {0, 1, 2}

@@ -7,21 +7,20 @@ import drjit as dr
 import nerf_twin as twin
 import numpy as np
 import pytest
-from test_nerf_training import CONFIG
+from small_field import CONFIG
+from tiny import pair_scene
 
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.images import read_png
-from spacesim.data.records import Camera, Dataset
-from spacesim.data.store import read_dataset
+from spacesim.data.records import Camera
 from spacesim.methods import load_scene
 from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.draw import RaySamples
 from spacesim.nerf.partition import merge
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.sampling.render import sum_rays, volume_weights
-from spacesim.nerf.train.train import train
 from spacesim.splat.compose.pose import Pose, rotation_about
 from spacesim.splat.compose.scene import ComposeConfig, PlacedRun
 
@@ -114,16 +113,6 @@ def test_an_empty_ray_is_black():
     assert not opacity.any()
 
 
-@pytest.fixture(scope="module")
-def dataset(tiny_data) -> Dataset:
-    return read_dataset(tiny_data)
-
-
-@pytest.fixture(scope="module")
-def run(dataset, tmp_path_factory) -> NerfRun:
-    return train(dataset, tmp_path_factory.mktemp("nerf") / "run", CONFIG)
-
-
 def scene(*models: tuple[NerfRun, Pose], shadows: str = "none") -> FieldComposition:
     placed = [PlacedRun(run, pose, f"model-{i}") for i, (run, pose) in enumerate(models)]  # type: ignore[arg-type]
     return FieldComposition(placed, ComposeConfig(shadows))
@@ -133,9 +122,9 @@ def camera_at(place, towards=(0, 0, 0), size=36) -> Camera:
     return Camera.from_fov(look_at(place, towards), size, size, 45)
 
 
-def test_one_model_is_its_run(dataset, run):
+def test_one_model_is_its_run(dataset, finished):
     camera = dataset.test[0].camera
-    one, alone = scene((run, Pose())).predict(camera, normals=True), run.predict(camera, normals=True)
+    one, alone = scene((finished, Pose())).predict(camera, normals=True), finished.predict(camera, normals=True)
     for plane in ("rgb", "alpha", "depth"):
         np.testing.assert_allclose(getattr(one, plane), getattr(alone, plane), atol=3e-4 * (1 + 9 * (plane == "depth")))
     solid = alone.alpha > 0.5
@@ -143,15 +132,15 @@ def test_one_model_is_its_run(dataset, run):
     np.testing.assert_array_equal(one.id, solid)
 
 
-def test_a_larger_model_is_not_more_opaque(run):
+def test_a_larger_model_is_not_more_opaque(finished):
     """Twice as large, turned and moved, seen from twice as far: the same picture, depths twice as large."""
-    camera, alone = camera_at((9, 2, 4)), run.predict(camera_at((9, 2, 4)))
+    camera, alone = camera_at((9, 2, 4)), finished.predict(camera_at((9, 2, 4)))
     turn = rotation_about((1, 2, 3), 70)
     pose = Pose(turn, np.array([3.0, -20.0, 8.0]), 2.0)
     place = np.eye(4)
     place[:3, :3] = turn @ camera.world_from_camera[:3, :3]
     place[:3, 3] = pose.points(camera.position)
-    seen = scene((run, pose)).predict(replace(camera, world_from_camera=place))
+    seen = scene((finished, pose)).predict(replace(camera, world_from_camera=place))
     assert 0.02 < alone.alpha.mean() < 0.9
     np.testing.assert_allclose(seen.alpha, alone.alpha, atol=5e-3)
     np.testing.assert_allclose(seen.rgb, alone.rgb, atol=5e-3)
@@ -159,11 +148,13 @@ def test_a_larger_model_is_not_more_opaque(run):
     np.testing.assert_allclose(seen.depth[solid], 2 * alone.depth[solid], rtol=5e-3)
 
 
-def test_the_nearer_model_hides_the_other(run):
+def test_the_nearer_model_hides_the_other(finished):
     camera = camera_at((14, 0, 0.5))
     front, back = Pose(translation=np.array([4.0, 0, 0])), Pose(translation=np.array([-4.0, 0, 0]))
-    both, other = (scene(*models).predict(camera) for models in (((run, front), (run, back)), ((run, front),)))
-    behind = scene((run, back)).predict(camera)
+    both, other = (
+        scene(*models).predict(camera) for models in (((finished, front), (finished, back)), ((finished, front),))
+    )
+    behind = scene((finished, back)).predict(camera)
     opaque = (other.alpha > 0.97) & (behind.alpha > 0.5)
     assert opaque.any()
     np.testing.assert_allclose(both.rgb[opaque], other.rgb[opaque], atol=0.04)
@@ -171,39 +162,20 @@ def test_the_nearer_model_hides_the_other(run):
     clear = other.alpha < 1e-3
     np.testing.assert_allclose(both.rgb[clear], behind.rgb[clear], atol=5e-3)
     np.testing.assert_allclose(both.alpha, 1 - (1 - other.alpha) * (1 - behind.alpha), atol=5e-3)  # they lie apart
-    swapped = scene((run, back), (run, front)).predict(camera)
+    swapped = scene((finished, back), (finished, front)).predict(camera)
     np.testing.assert_allclose(swapped.rgb, both.rgb, atol=1e-5)
     assert (swapped.id[opaque] == 2).all()
 
 
-def test_scene_files(spacesim, run, tmp_path):
-    text = f"""
-[[models]]
-run = "{run.path}"
-name = "left"
-position = [-3, 0, 0]
-
-[[models]]
-run = "{run.path}"
-scale = 0.5
-position = [3, 0, 0]
-
-[sun]
-azimuth_deg = 0
-elevation_deg = 10
-
-[camera]
-position = [0, -16, 3]
-look_at = [0, 0, 0]
-resolution = [48, 32]
-"""
+def test_scene_files(spacesim, finished, tmp_path):
+    text = pair_scene(finished.path, finished.path)
     (tmp_path / "scene.toml").write_text(text)
     assert isinstance(load_scene(tmp_path / "scene.toml").composition, FieldComposition)
     done = spacesim("compose", tmp_path / "scene.toml", "--out", tmp_path / "out")
     assert done.code == 0, done.errors
     assert set(np.unique(read_png(tmp_path / "out/id/0000.png"))) == {0, 1, 2}
     shot = json.loads((tmp_path / "out/shots/0000.json").read_text())
-    assert [model["name"] for model in shot["models"]] == ["left", "nerf0"] or len(shot["models"]) == 2
+    assert [model["name"] for model in shot["models"]] == ["one", "other"]
     assert (tmp_path / "out/visibility/0000.png").exists()
     refused = {
         'shadows = "some"\n' + text: "shadows: expected one of",
@@ -219,4 +191,4 @@ resolution = [48, 32]
     assert (done.code, "expected a scene of Gaussians" in done.errors[0]) == (2, True)
     with pytest.raises(InputError, match="exposure"):
         load_scene(tmp_path / "scene.toml").composition.predict(camera_at((9, 0, 0)), exposure=1.0)
-    assert dr.width(run.filled) == CONFIG.occupancy**3
+    assert dr.width(finished.filled) == CONFIG.occupancy**3

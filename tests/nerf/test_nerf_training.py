@@ -8,16 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_field import CONFIG, GRID
 
 import spacesim as ss
 from spacesim import methods
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image, read_png
-from spacesim.data.records import Dataset
-from spacesim.data.store import read_dataset
 from spacesim.learning.tensors import read_tensors, write_tensors
 from spacesim.methods import load_predictor
-from spacesim.nerf.config import GridConfig, NerfConfig, ProposalConfig, preset, with_settings
+from spacesim.nerf.config import NerfConfig, preset, with_settings
 from spacesim.nerf.run import NerfRun, load_run
 from spacesim.nerf.sampling.box import scene_box
 from spacesim.nerf.train.pixels import training_pixels
@@ -25,35 +24,6 @@ from spacesim.nerf.train.train import fit_grid, train
 from spacesim.nerf.train.trainer import FORMAT, NerfTrainer
 from spacesim.splat.compose import ComposeConfig, PlacedRun
 from spacesim.splat.raster.supersample import upsampled_camera
-
-GRID = GridConfig(4, 8, 48, 12)
-CONFIG = NerfConfig(
-    iterations=250,
-    rate=3e-2,
-    rays=512,
-    samples=10,
-    width=16,
-    features=7,
-    harmonics=2,
-    grid=GRID,
-    coarse=ProposalConfig(16, 8, GridConfig(2, 8, 16, 10)),
-    fine=ProposalConfig(8, 8, GridConfig(2, 8, 16, 10)),
-    warm_up=60,
-    occupancy=16,
-    occupancy_every=10,
-    checkpoint_every=60,
-    chunk=512,
-)
-
-
-@pytest.fixture(scope="module")
-def dataset(tiny_data) -> Dataset:
-    return read_dataset(tiny_data)
-
-
-@pytest.fixture(scope="module")
-def finished(dataset, tmp_path_factory) -> NerfRun:
-    return train(dataset, tmp_path_factory.mktemp("nerf") / "run", CONFIG)
 
 
 def model_bytes(run: NerfRun) -> bytes:

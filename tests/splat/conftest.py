@@ -11,7 +11,7 @@ from PIL import Image
 
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera, Dataset
-from spacesim.data.store import read_dataset, write_points
+from spacesim.data.store import intrinsics_of, read_dataset, write_points
 from spacesim.splat.raster.gaussians import SH_C0
 from spacesim.splat.reference.rasterizer import render_reference
 
@@ -79,8 +79,7 @@ def _write_dataset(root: Path, gaussians: dict[str, np.ndarray]) -> Dataset:
         f"{split}_filenames": [f["file_path"] for f in frames if split in f["file_path"]] for split in ("train", "test")
     }
     write_points(root / "points.ply", gaussians["means"], np.full((60, 3), 128, np.uint8))
-    meta = {"w": SIZE, "h": SIZE, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    meta |= {"ply_file_path": "points.ply", "frames": frames, **listed}
+    meta = {**intrinsics_of(camera), "ply_file_path": "points.ply", "frames": frames, **listed}
     (root / "transforms.json").write_text(json.dumps(meta))
     return read_dataset(root)
 

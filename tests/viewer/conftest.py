@@ -1,9 +1,12 @@
 """Small models to look at, without training."""
 
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny import pair_scene
 
 import spacesim  # noqa: F401  names libLLVM before drjit is imported
 from spacesim.data.geometry import look_at
@@ -15,25 +18,6 @@ from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.load import load_setup
 from spacesim.viewer.server import Viewer
 from spacesim.viewer.state import SceneState, ViewerCamera
-
-SCENE = """
-[[models]]
-name = "below"
-run = "{run}"
-[[models]]
-name = "above"
-run = "{run}"
-position = [0.0, 0.0, 1.6]
-scale = 0.5
-[sun]
-azimuth_deg = 20.0
-elevation_deg = 60.0
-[camera]
-position = [12.0, -4.0, 4.5]
-look_at = [0.0, 0.0, 0.8]
-resolution = [400, 400]
-fov_deg = 35.0
-"""
 
 
 def ball_run(name: str, color: tuple[float, float, float], count: int = 400, radius: float = 0.5) -> Run:
@@ -75,15 +59,27 @@ def view() -> ViewerCamera:
 
 
 @pytest.fixture(scope="module")
-def viewer(tiny_run, tiny_data, tmp_path_factory):
-    """Two models of one run, one above the other, served on loopback."""
+def serve_pair(tmp_path_factory) -> Iterator[Callable[..., Viewer]]:
+    """The function (one run, the run above it, dataset or None) -> a viewer of both, on loopback."""
     pytest.importorskip("viser", reason="viser is not installed")
-    folder = tmp_path_factory.mktemp("viewer")
-    (folder / "pair.toml").write_text(SCENE.format(run=tiny_run))
-    one = Viewer(load_setup(folder / "pair.toml", tiny_data, folder), port=0)
-    one.start()
-    yield one
-    one.stop()
+    with ExitStack() as stack:
+
+        def serve(below: Path, above: Path, data: Path | None = None) -> Viewer:
+            folder = tmp_path_factory.mktemp("viewer")
+            scene = pair_scene(below, above, (0, 0, 1.6), (20, 60), (12, -4, 4.5), (400, 400))
+            (folder / "pair.toml").write_text(scene)
+            one = Viewer(load_setup(folder / "pair.toml", data, folder), port=0)
+            one.start()
+            stack.callback(one.stop)
+            return one
+
+        yield serve
+
+
+@pytest.fixture(scope="module")
+def viewer(serve_pair, tiny_run, tiny_data) -> Viewer:
+    """Two models of one run, one above the other."""
+    return serve_pair(tiny_run, tiny_run, tiny_data)
 
 
 @pytest.fixture

@@ -13,26 +13,8 @@ from spacesim.data.records import Sun
 from spacesim.splat.compose import Pose
 from spacesim.viewer.drawing.frames import draw_mode, picture_size
 from spacesim.viewer.drawing.paint import PALETTE
-from spacesim.viewer.load import load_setup
 from spacesim.viewer.panels.handles import GIZMO, SUN_AWAY
-from spacesim.viewer.server import Viewer
 from spacesim.viewer.state import MODES
-
-MIXED = """
-[[models]]
-run = "{run}"
-[[models]]
-name = "field"
-run = "{field}"
-position = [0.0, 0.0, 1.6]
-scale = 0.5
-[sun]
-azimuth_deg = 20.0
-elevation_deg = 60.0
-[camera]
-position = [12.0, -4.0, 4.5]
-look_at = [0.0, 0.0, 0.8]
-"""
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +24,9 @@ def tab(viewer, browser):
 
 
 @pytest.fixture(scope="module")
-def mixed(tiny_run, tiny_field, tmp_path_factory):
-    """Gaussians below, a radiance field above them, served on loopback."""
-    folder = tmp_path_factory.mktemp("mixed")
-    (folder / "mixed.toml").write_text(MIXED.format(run=tiny_run, field=tiny_field))
-    one = Viewer(load_setup(folder / "mixed.toml", out=folder), port=0)
-    one.start()
-    yield one
-    one.stop()
+def mixed(serve_pair, tiny_run, tiny_field):
+    """Gaussians below, a radiance field above them."""
+    return serve_pair(tiny_run, tiny_field)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +92,7 @@ def test_it_opens_with_the_scene(viewer, tab):
     assert np.allclose(view.world_from_camera, camera.world_from_camera, atol=1e-4)
     assert (picture.max(axis=-1) > 60).mean() > 0.01
     text = tab.page.text()
-    for words in ("Mode", "Azimuth", "Scale of above", "Compare", "600 Gaussians", "CPU (LLVM)"):
+    for words in ("Mode", "Azimuth", "Scale of other", "Compare", "600 Gaussians", "CPU (LLVM)"):
         assert words.lower() in text.lower() or words == "CPU (LLVM)"
 
 

@@ -11,7 +11,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose import Keyframe, Orbit, Pose, scenefile
-from spacesim.splat.compose.path import PosedScene
+from spacesim.splat.compose.posed_scene import PosedScene
 from spacesim.viewer.load import load_setup
 from spacesim.viewer.panels.paths import file_for
 from spacesim.viewer.path import (

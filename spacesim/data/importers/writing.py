@@ -27,7 +27,7 @@ from spacesim.data.images import read_png, write_png
 from spacesim.data.integrity.manifest import write_manifest
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
-from spacesim.data.store import write_points
+from spacesim.data.store import intrinsics_of, write_points
 from spacesim.data.transforms import DEPTH_UNITS, MILLIMETRE, dataset_of, read_dataset
 
 SOURCE = "import.json"  #: of a dataset: where it comes from and what was asked for; written first
@@ -168,12 +168,7 @@ def _entry(frame: ImportedFrame) -> JsonDict:
     entry: JsonDict = {
         "file_path": f"images/{frame.name}{suffix}",
         "transform_matrix": camera.opengl.tolist(),
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
+        **intrinsics_of(camera),
     }
     entry |= dict(zip(("k1", "k2", "p1", "p2", "k3"), frame.distortion, strict=False))
     if frame.sun is not None:

@@ -235,6 +235,7 @@ class _DatasetPlan:
         quality = config.quality
         self.renderer = Renderer(self.scene, quality.spp, quality.max_depth, config.camera.distortion)
         self._set_frames(quality)
+        self.keys = {name: self._keys_of(view) for name, view in (*self.train, *self.test)}
         self._refuse_cameras_inside(config)
         self.left_out: dict[str, list[int]] = {}  # numbers that views would have had, by train and test
         if config.min_sunlit:
@@ -254,15 +255,16 @@ class _DatasetPlan:
         views = [(quality.spp, *planned) for planned in self.train]
         views += [(quality.resolved_test_spp, *planned) for planned in self.test]
         self.specs = [self._frame(i, *planned) for i, planned in enumerate(views)]
-        self.keys = {name: self._keys_of(view) for _, name, view in views}
 
     def _leave_out_dark_views(self, least: float) -> None:
         """Number the others anew. Raises InputError where no training view stays."""
         lit = {spec.name for spec in self.specs if is_sunlit(self.renderer, spec, least)}
-        kept = {}
+        kept, keys = {}, dict[str, dict[str, JsonValue]]()
         for some, named in {"train": self.train, "test": self.test}.items():
             self.left_out[some] = [i for i, (name, _) in enumerate(named) if name not in lit]
-            kept[some] = _numbered(some, [view for name, view in named if name in lit])
+            stay = [(name, view) for name, view in named if name in lit]
+            kept[some] = _numbered(some, [view for _, view in stay])
+            keys |= {new: self.keys[old] for (new, _), (old, _) in zip(kept[some], stay, strict=True)}
         if not kept["train"]:
             expected = f"a training frame of whose object at least {least:g} is sunlit"
             raise InputError(f"min_sunlit: expected {expected}, found none of {len(self.train)}")
@@ -273,7 +275,7 @@ class _DatasetPlan:
             count,
             least,
         )
-        self.train, self.test = kept["train"], kept["test"]
+        self.train, self.test, self.keys = kept["train"], kept["test"], keys
 
     def _refuse_cameras_inside(self, config: SceneConfig) -> None:
         positions = np.stack([spec.camera.position for spec in self.specs])

@@ -28,7 +28,7 @@ from spacesim.data.integrity.whole import is_whole
 from spacesim.data.lock import lock_folder
 from spacesim.data.store import intrinsics_of
 from spacesim.learning.pictures import write_picture
-from spacesim.splat.compose.path import PosedScene, SceneFrame
+from spacesim.splat.compose.posed_scene import PosedScene, SceneFrame
 from spacesim.splat.compose.scene import ComposedPrediction
 from spacesim.splat.export.sweep import COLUMNS, MAX_TILES, SIDE, resize_camera, sky_mark
 from spacesim.splat.export.video import INSTALL, Video, encoder

@@ -1,17 +1,13 @@
 """Trained runs in one scene: each posed, all drawn as one set of Gaussians under one Sun (thesis 3.2, algorithm 2).
 
-Each run's colours, and the shadows that it casts on itself, are computed in its own frame, with camera and Sun brought
-into it: harmonics turn with the model, fields and refinement see the directions, places and lengths that they were
-trained with. Shadows that other models cast on it (4.15) are computed there, too, and multiply its colours (4.16).
-Then its Gaussians go to the world (3.11 to 3.13).
+`light` says how each is lit; then its Gaussians go to the world (3.11 to 3.13).
 """
 
 import logging
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeVar, cast
 
 import drjit as dr
 import numpy as np
@@ -19,15 +15,13 @@ import numpy as np
 from spacesim import backend
 from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float
-from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import Array, may_shade
+from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
 from spacesim.learning.prediction import ComposedPrediction, check_picture
+from spacesim.splat.compose.light import EnsembleLight, LightCache, SunOccluder
 from spacesim.splat.compose.members import Ensemble, Member, display_colors
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.light.shadow.cast import CrossShadow, cast_cross_shadows
-from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.output import RenderOutput, over_alpha, planes_image
 from spacesim.splat.raster.render import render
@@ -37,12 +31,7 @@ from spacesim.splat.run import Run, stops
 
 OUTPUTS = ("rgb", "alpha", "depth", "median_depth", "normal", "visibility", "id")
 SHADOWS = ("trained", "others", "ratio", "none")
-MIN_SCALE_SHARE = 0.25  #: least light pixels over a model's extent as a share of the picture's size: half of training's
-RATIO_EPSILON = 1e-3  #: epsilon of 4.15, for which the thesis names no number
 COVERED = 0.5  #: alpha from which on a pixel shows an object
-
-Light = tuple[list[Float], Float | None]  #: (three colours, visibility or None of a run without shadows), [N] each
-T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
@@ -103,17 +92,6 @@ class DrawnView:
         return np.where(self.output.image("alpha") >= COVERED, numbers[np.argmax(shares, axis=-1)], 0)
 
 
-class SunOccluder(Protocol):
-    """What is no Gaussian and stands in the Sun's way."""
-
-    @property
-    def key(self) -> bytes:
-        """Another one wherever it lets other light through."""
-
-    def sun_visibility(self, points: Array, sun: Sun) -> Array:
-        """[N] share of the Sun's light that comes through to points [N, 3] of the world, metres."""
-
-
 @dataclass(frozen=True, eq=False)
 class LitGaussians:
     """All Gaussians of a scene in the world, in the order of `GaussianComposition.placed`, as a camera sees them
@@ -142,7 +120,7 @@ class GaussianComposition:
         members: dict[int, Member] = {id(model.run): Member.of(model.run) for model in self.models}
         self._members = [members[id(model.run)] for model in self.models]
         self._ensemble = Ensemble(sorted((m for m in self._members if m.count), key=lambda member: member.key))
-        self._cache = _Cache()
+        self._cache = LightCache()
         self._beside: SunOccluder | None = None
         _log_choices(self.models, self._ensemble)
 
@@ -231,7 +209,7 @@ class GaussianComposition:
     def shaded(self, config: ComposeConfig) -> "GaussianComposition":
         """The scene with other shadows between its models."""
         other = self.posed([model.pose for model in self.models])
-        other.config, other._cache = config, _Cache()
+        other.config, other._cache = config, LightCache()
         return other
 
     def shaded_by(self, beside: SunOccluder) -> "GaussianComposition":
@@ -267,7 +245,7 @@ class GaussianComposition:
     def cross_visibility(self, sun: Sun | None) -> list[Float | None]:
         """Of each model, in the order of `placed`, the share of sunlight that the others let through, v_inter of 4.15:
         Float [N of it], or None where no other can be before the Sun."""
-        return self._cross_visibilities([model.pose for model in self.placed], None if sun is None else sun.direction)
+        return self._light([model.pose for model in self.placed], sun).cross_visibilities()
 
     def draw(
         self, camera: Camera, sun: Sun | None, outputs: Sequence[str] = ("rgb",), supersample: int | None = None
@@ -329,19 +307,17 @@ class GaussianComposition:
         drawn = [i for i, member in enumerate(self._members) if member.count]
         return sorted(drawn, key=lambda i: (self._members[i].key, self.models[i].pose.key))
 
-    def _shade_members(self, poses: Sequence[Pose], camera: Camera, sun: Sun | None) -> Light:
+    def _shade_members(
+        self, poses: Sequence[Pose], camera: Camera, sun: Sun | None
+    ) -> tuple[list[Float], Float | None]:
         """(colours as blended, three Floats [N], visibility Float [N] or None)."""
         if sun is None and self.relightable:
             source = self.path or self.models[0].run.path
             raise InputError(f"{source}: expected the Sun's direction for a scene that it changes, found none")
         if not poses:
             return [ad.Float([]) for _ in range(3)], ad.Float([]) if self.has_shadows else None
-        direction = None if sun is None else sun.direction
-        between = self._cross_visibilities(poses, direction)
-        members = self._ensemble.members
-        parts = [self._member_colors(k, poses[k], camera, direction) for k in range(len(poses))]
-        parts = [_dim(part, share) for part, share in zip(parts, between, strict=True)]
-        scene_curve = self._ensemble.curve
+        members, scene_curve = self._ensemble.members, self._ensemble.curve
+        parts = self._light(poses, sun).shade(camera)
         pairs = zip(parts, members, strict=True)
         colors = [display_colors(part[0], member.curve, scene_curve) for part, member in pairs]
         joined = self._ensemble.joined(colors)
@@ -353,91 +329,9 @@ class GaussianComposition:
         ]
         return joined, self._ensemble.joined([[plane] for plane in seen])[0]
 
-    def _member_colors(self, k: int, pose: Pose, camera: Camera, sun: Array | None) -> Light:
-        """(colours, visibility or None) of member k as it is alone."""
-        member = self._ensemble.members[k]
-        near, towards = pose.camera_in_model(camera), None if sun is None else pose.direction_in_model(sun)
-        light = _bytes(towards)
-        sunlight = self._cache.get(("sunlight", k), light, lambda: member.sunlight(towards))
-        key = near.world_from_camera.tobytes(), light
-        return self._cache.get(("light", k), key, lambda: member.shade(Pinhole.of(near), towards, sunlight))
-
-    def _cross_visibilities(self, poses: Sequence[Pose], sun: Array | None) -> list[Float | None]:
-        """Of each member v_inter, Float [N of it], or None where no other can be before the Sun."""
-        if not self._shades:
-            return [None] * len(poses)
-        assert sun is not None, "a scene with such shadows asks for a Sun first"
-        others = b"" if self._beside is None else self._beside.key
-        key = (b"".join(pose.key for pose in poses), sun.tobytes(), self.config.shadows, others)
-
-        def compute() -> list[Float | None]:
-            between = [self._compute_cross_visibility(poses, sun, k) for k in range(len(poses))]
-            return between if self._beside is None else self._behind(self._beside, poses, sun, between)
-
-        return self._cache.get("between", key, compute)
-
-    def _behind(
-        self, beside: SunOccluder, poses: Sequence[Pose], sun: Array, between: list[Float | None]
-    ) -> list[Float | None]:
-        """v_inter `between` with what `beside` lets through to the Gaussians' centres: light that comes through both is
-        the product, so that the ratio of 4.15 is what the others let through."""
-        means = np.array(self._ensemble.placed(poses).means, np.float64).T
-        seen = beside.sun_visibility(means, Sun(sun))
-        result = []
-        for member, start, share in zip(self._ensemble.members, self._ensemble.starts, between, strict=True):
-            own = upload(seen[start : start + member.count])
-            result.append(own if share is None else own * share)
-        dr.eval(result)
-        return result
-
-    def _compute_cross_visibility(self, poses: Sequence[Pose], sun: Array, k: int) -> Float | None:
-        """v_inter of 4.15 for member k, in its own frame: what is seen of the Sun depends neither on where all stands
-        nor on how it is turned, and softness, bias and pixels are those of its training."""
-        ensemble, members = self._ensemble, self._ensemble.members
-        spheres = [(pose.points(one.centre), one.radius * pose.scale) for one, pose in zip(members, poses, strict=True)]
-        if not any(may_shade(spheres[j], spheres[k], sun) for j in range(len(poses)) if j != k):
-            return None
-        member, back = members[k], poses[k].inverse()
-        scene = ensemble.placed([Pose() if j == k else back.after(pose) for j, pose in enumerate(poses)])
-        direction, least = poses[k].direction_in_model(sun), MIN_SCALE_SHARE * member.shadow.size / member.extent
-
-        named = self.config.shadows
-        alone = (member.shadow.between if named == "trained" else named) == "others"
-        shadow = member.cross_shadow_config if alone else member.shadow
-
-        def seen(casts: Bool) -> Float:
-            between = CrossShadow(scene, casts, member.run.gaussians, ensemble.own[k], ensemble.indices[k])
-            return 1 - cast_cross_shadows(between, direction, shadow, member.distance, least)
-
-        if alone:
-            visible = seen(ensemble.others[k])
-        else:
-            everything = dr.opaque(ad.Bool, True, ensemble.count)
-            visible = dr.clip(seen(everything) / (seen(ensemble.own[k]) + RATIO_EPSILON), 0, 1)  # 4.15
-        dr.eval(visible)
-        return visible
-
-
-@dataclass
-class _Cache:
-    """What the last picture has computed and the next may use again, each with what it depends on: where only a model
-    moves, the light of the others; where only the camera moves, the shadows."""
-
-    values: dict[Hashable, tuple[Hashable, object]] = field(default_factory=dict)
-
-    def get(self, name: Hashable, key: Hashable, make: Callable[[], T]) -> T:
-        if name not in self.values or self.values[name][0] != key:
-            self.values.pop(name, None)  # room for the next
-            self.values[name] = key, make()
-        return cast("T", self.values[name][1])
-
-
-def _dim(part: Light, share: Float | None) -> Light:
-    """Colours and visibility in the shadows of others (4.16, 4.17). share: v_inter, or None where there are none"""
-    colors, visibility = part
-    if share is None:
-        return part
-    return [color * share for color in colors], share if visibility is None else visibility * share
+    def _light(self, poses: Sequence[Pose], sun: Sun | None) -> EnsembleLight:
+        direction, shadows = None if sun is None else sun.direction, self.config.shadows if self._shades else "none"
+        return EnsembleLight(self._ensemble, poses, direction, shadows, self._beside, self._cache)
 
 
 def _log_choices(models: Sequence[PlacedRun], ensemble: Ensemble) -> None:
@@ -448,7 +342,3 @@ def _log_choices(models: Sequence[PlacedRun], ensemble: Ensemble) -> None:
         log.info("%s: knows the light that it was trained under only and cannot be relit", names)
     if len({member.curve for member in ensemble.members}) > 1:
         log.info("colours in linear light stand beside others or sRGB values: all are blended as sRGB values")
-
-
-def _bytes(direction: Array | None) -> bytes:
-    return b"" if direction is None else direction.tobytes()

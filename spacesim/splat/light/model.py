@@ -5,7 +5,7 @@
 as given, and so do shadows, as in the literature, unless `ShadowConfig.gradients` takes them back to the Gaussians.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -188,12 +188,12 @@ class LightModel:
         if self.config.shadow is None and not self.config.bounce:
             return Sunlight(None, [])
         read, direction = [*gaussians.rows(), *self.weights], None if sun is None else np.asarray(sun).tobytes()
-        last, numbers = self._last_sunlight, [array.index for array in read]
+        last = self._last_sunlight
         if dr.grad_enabled(read):
             return self._sunlight(gaussians, sun)
-        if direction != last.sun or numbers != [array.index for array in last.read]:
+        if direction != last.sun or not _are_same(read, last.read):
             sunlight = self._sunlight(gaussians, sun)
-            last = self._last_sunlight = _LastSunlight([ad.Float(array) for array in read], direction, sunlight)
+            last = self._last_sunlight = _LastSunlight(_kept(read), direction, sunlight)
         return last.sunlight
 
     def _sunlight(self, gaussians: Gaussians, sun: np.ndarray | None) -> Sunlight:
@@ -323,19 +323,16 @@ class LightModel:
         )
 
     def _picture_cache(self, features: Float, batch: PaddedBatch) -> _PictureCache:
-        """Made anew where features or weights have changed. Copies hold what was read: a number of Dr.Jit's that is in
-        use is never another array's."""
+        """Made anew where features or weights have changed."""
         of_field, _ = split_weights(self.config, self.weights)
         is_cooperative = select() in COOPERATIVE and cooperative.is_usable()
         read = [*(of_field if is_cooperative else [features, of_field[1]]), *self.embeddings]
-        if [array.index for array in read] != [array.index for array in self._cache.read]:
+        if not _are_same(read, self._cache.read):
             self._cache = _PictureCache([], None, [], [])  # room for the next
             field = self.config.field
             packed = cooperative.pack(field.shape, of_field) if is_cooperative else []
             first_layer = None if is_cooperative else kernels.first_layer_of_features(field, of_field, features, batch)
-            self._cache = _PictureCache(
-                [ad.Float(array) for array in read], first_layer, packed, self._mean_embedding()
-            )
+            self._cache = _PictureCache(_kept(read), first_layer, packed, self._mean_embedding())
         return self._cache
 
     def _encode_sun(self, *sun: float) -> SunEncoding:
@@ -343,6 +340,16 @@ class LightModel:
         terms = SunEncoding(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun))
         dr.eval(terms)
         return terms
+
+
+def _kept(arrays: Sequence[Float]) -> list[Float]:
+    """To compare others with, see `_are_same`: a number of Dr.Jit's that is in use is never another array's."""
+    return [ad.Float(array) for array in arrays]
+
+
+def _are_same(arrays: Sequence[Float], kept: Sequence[Float]) -> bool:
+    """Whether these are the arrays that `_kept` was given: the same ones, not equal ones."""
+    return [array.index for array in arrays] == [array.index for array in kept]
 
 
 def _features(gaussians: Gaussians) -> Float:

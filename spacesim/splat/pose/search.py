@@ -153,7 +153,7 @@ def find_pose(
     target, counts = checked_picture(image, mask, camera)
     check_picture(camera)
     factor = max(1, max(camera.width, camera.height) // COARSE)
-    coarse = _shrunk(camera, factor)
+    coarse = camera.downscaled(factor)
     small, known = reduced(target * counts, factor), reduced(counts, factor)
     sky, dim = _sky(small, known)
     has_alpha = small.shape[2] == 4
@@ -290,11 +290,6 @@ def _patch(cut: _Cut, turn: float) -> np.ndarray:
         for k in (0, 1)
     ]
     return np.stack([plane / max(float(np.linalg.norm(plane)), 1e-9) * np.sqrt(0.5) for plane in planes])
-
-
-def _shrunk(camera: Camera, factor: int) -> Camera:
-    numbers = [number / factor for number in (camera.fx, camera.fy, camera.cx, camera.cy)]
-    return Camera(camera.world_from_camera, camera.width // factor, camera.height // factor, *numbers)
 
 
 def _degrees(camera: Camera, other: Camera) -> float:

@@ -104,7 +104,7 @@ class PyramidLevel:
         ).sum(axis=-1)
         costs = np.fft.irfft2(product, (2 * height, 2 * width))
         rows, columns = (np.fft.fftfreq(2 * side, 1 / (2 * side)) for side in (height, width))
-        middle, scaled = self.pivot.seen_by(camera), self._scaled(camera)
+        middle, scaled = self.pivot.seen_by(camera), camera.downscaled(self.factor)
         limit = (self.pivot.angle + self.pivot.length / np.linalg.norm(middle)) * max(scaled.fx, scaled.fy)
         costs[np.hypot(rows[:, None], columns) > max(limit, 1)] = np.inf
         row, column = np.unravel_index(int(costs.argmin()), costs.shape)
@@ -124,17 +124,11 @@ class PyramidLevel:
         height, width = planes.shape[:2]
         return np.fft.rfft2(planes, (2 * height, 2 * width), axes=(0, 1))
 
-    def _scaled(self, camera: Camera) -> Camera:
-        """The camera with the pixels of this level."""
-        factor = self.factor
-        numbers = [number / factor for number in (camera.fx, camera.fy, camera.cx, camera.cy)]
-        return Camera(camera.world_from_camera, camera.width // factor, camera.height // factor, *numbers)
-
     def shade(self, camera: Camera) -> list[Float] | None:
-        return self.drawing.shade(self._scaled(camera))
+        return self.drawing.shade(camera.downscaled(self.factor))
 
     def picture(self, camera: Camera, colors: list[Float] | None) -> np.ndarray:
-        return self.drawing.draw(self._scaled(camera), colors)
+        return self.drawing.draw(camera.downscaled(self.factor), colors)
 
     def errors(self, picture: np.ndarray, gain: float) -> np.ndarray:
         """[h, w, C] model less picture."""
@@ -166,7 +160,7 @@ class PyramidLevel:
 
     def units(self, camera: Camera) -> Array:
         """[6] radians and metres that move the picture by `STEP` pixels, those of depth at the model's rim."""
-        middle, scaled = self.pivot.seen_by(camera), self._scaled(camera)
+        middle, scaled = self.pivot.seen_by(camera), camera.downscaled(self.factor)
         distance = max(float(middle[2]), self.pivot.radius)
         metres = STEP * distance / np.sqrt(scaled.fx * scaled.fy)
         turn = metres / self.pivot.radius

@@ -8,18 +8,9 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, ArrayT, Bool, Float, UInt32
-from spacesim.data.records import Camera
 from spacesim.splat.raster.supersample import mean_light
 from spacesim.splat.raster.tone import inverse_tone_map
 from spacesim.splat.train.loss.terms import TruthPlanes
-
-
-def downscaled_camera(camera: Camera, times: int) -> Camera:
-    """The camera with one pixel for each whole `times` x `times` of its own; it sees what these see."""
-    if times == 1:
-        return camera
-    numbers = [number / times for number in (camera.fx, camera.fy, camera.cx, camera.cy)]
-    return Camera(camera.world_from_camera, camera.width // times, camera.height // times, *numbers)
 
 
 def straight_color(rgba: UInt32, tone: str | None) -> tuple[Array3f, Float]:

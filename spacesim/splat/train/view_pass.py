@@ -20,7 +20,6 @@ from spacesim.splat.raster.supersample import upsampled_camera
 from spacesim.splat.raster.tiles import TileLists
 from spacesim.splat.train.async_lists import AsyncTileLists
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.downscale import downscaled_camera
 from spacesim.splat.train.optimizer.update import ViewGradients
 from spacesim.splat.train.stages import LossSettings, TargetImage, on_screen, picture_loss, project_views
 from spacesim.splat.train.views import TrainingView
@@ -119,7 +118,7 @@ class ViewPass:
         """Draw a view. rows: `gaussians.rows()`;  light: of a method of light;  degree: of the harmonics;  downscale:
         see `RenderedView`;  watched: whether densification wants to know of it"""
         config = self.config
-        camera = Pinhole.of(upsampled_camera(downscaled_camera(view.camera, downscale), config.supersample))
+        camera = Pinhole.of(upsampled_camera(view.camera.downscaled(downscale), config.supersample))
         splats, footprints, values, radii = self._project(
             rows, camera, degree, config.antialiased, config.shape_terms, self.scale, watched
         )

@@ -16,7 +16,7 @@ from spacesim.data.exporters.keypoints import BodyLabels
 from spacesim.data.exporters.symmetries import find_symmetries
 from spacesim.data.images import read_png
 from spacesim.scenes import generate
-from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
+from spacesim.scenes.config import with_options
 from spacesim.scenes.silhouette import silhouette_finder
 
 WHY = "bop_toolkit_lib is not installed"
@@ -32,16 +32,11 @@ COUNTS = "px_count_all", "px_count_valid", "px_count_visib"
 
 
 @pytest.fixture(scope="module")
-def bop(tmp_path_factory) -> Path:
-    """Two boxsats and a cubesat that hide each other and are cut off."""
-    objects = (
-        ObjectConfig(spacecraft="boxsat"),
-        ObjectConfig(spacecraft="cubesat", position=(2.0, 1.0, 2.0), rotation_wxyz=(0.8, 0.1, -0.5, 0.3), scale=2.0),
-        ObjectConfig(spacecraft="boxsat", name="twin", position=(-3.0, -3.0, -3.0)),
-    )
-    options = {"views": 2, "test_views": 2, "resolution": (WIDTH, HEIGHT), "spp": 1, "points": 50, "fov_deg": 40.0}
+def bop(three_objects, tmp_path_factory) -> Path:
+    """`three_objects`, cut off by the picture."""
+    options = {"views": 2, "test_views": 2, "resolution": (WIDTH, HEIGHT)}
     root = tmp_path_factory.mktemp("bop")
-    data = generate(with_options(SceneConfig("three", objects), **options, distance=9.0), root / "data")
+    data = generate(with_options(three_objects, **options), root / "data")
     write_bop(data, root / "bop", silhouette_finder)
     return root / "bop"
 

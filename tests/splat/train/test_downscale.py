@@ -8,13 +8,11 @@ import pytest
 from spacesim.backend import ad, recordings
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import look_at
 from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
-from spacesim.data.records import Camera
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import TrainConfig, preset
-from spacesim.splat.train.downscale import covered_color, downscaled_camera, truth_of_squares, valid_squares
+from spacesim.splat.train.downscale import covered_color, truth_of_squares, valid_squares
 from spacesim.splat.train.stages import LossSettings, TargetImage, picture_loss
 from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.trainer import Trainer
@@ -68,15 +66,6 @@ def test_beside_supersampled_pictures_light_is_averaged(bytes_):
     light = (linear_from_srgb(straight) * alpha).mean(axis=2) / np.maximum(share, 1e-9)
     color, _ = covered_color(packed(bytes_), SIZE, 2, light=True)
     np.testing.assert_allclose(numbers(color).T, (srgb_from_linear(light) * share).reshape(-1, 3), atol=2e-6)
-
-
-def test_a_downscaled_camera_sees_what_its_pixels_saw():
-    camera = replace(Camera.from_fov(look_at((0, -4, 0), (0, 0, 0)), WIDTH, HEIGHT, 40), cx=4.5, cy=5.0)
-    seen = downscaled_camera(camera, 4)
-    assert (seen.width, seen.height) == (2, 2)
-    np.testing.assert_allclose([seen.fx, seen.fy, seen.cx, seen.cy], [camera.fx / 4, camera.fy / 4, 4.5 / 4, 5 / 4])
-    np.testing.assert_array_equal(seen.world_from_camera, camera.world_from_camera)
-    assert downscaled_camera(camera, 1) is camera
 
 
 def test_truth_of_squares_by_hand():
@@ -209,7 +198,7 @@ def test_pictures_of_full_size_teach_what_they_teach_without_it(small_lit_datase
 
 
 def test_what_cannot_be_is_told(small_dataset):
-    tiny = tuple(replace(frame, camera=downscaled_camera(frame.camera, 16)) for frame in small_dataset.train)
+    tiny = tuple(replace(frame, camera=frame.camera.downscaled(16)) for frame in small_dataset.train)
     with pytest.raises(InputError, match="num_downscales: expected pictures of at least 4 pixels a side, found 2x2"):
         Trainer(replace(small_dataset, train=tiny), CONFIG)
     with pytest.raises(InputError, match="num_downscales: expected 0 to 4"):
