@@ -15,7 +15,7 @@ RECORDINGS = 256  #: of a function that are kept: one for each size of picture, 
 _PLAIN = frozenset((int, float, bool, str, type(None)))
 _EQUAL_TO_INTEGERS = frozenset((float, bool))  # 1, 1.0 and True are one key of a dictionary, 0.0 and -0.0 too
 MAX_KEYS = 2**14  # that are remembered of what is not an array
-_constants: dict[int, tuple[Any, Any]] = {}  # frozen dataclasses without arrays, by `id`: what `_split` told of them
+_constants: dict[int, tuple[Any, Any]] = {}  # frozen dataclasses without arrays, by `id`: what `_split` gave for them
 _leaves: set[type] = set()  # types of arguments that Dr.Jit is left to look into
 
 

@@ -89,7 +89,7 @@ _PLAIN_PLY = re.compile(
 
 def _load_trimesh(path: Path, kind: str, content: bytes) -> RawMesh:
     """What trimesh makes of it."""
-    import trimesh  # here and below: half a second, that whoever reads no mesh need not wait
+    import trimesh  # here and below: importing takes half a second, wasted where no mesh is read
 
     try:
         check_header_counts(kind[1:], content)

@@ -1,4 +1,4 @@
-"""What is told of the objects in each picture as it is stored: masks, boxes, keypoints."""
+"""The labels of the objects in each picture as it is stored: masks, boxes, keypoints."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -40,10 +40,10 @@ class FilmFrame:
 
 
 def read_frames(path: Path, again: bool = False) -> Iterator[FilmFrame]:
-    """The frames of a video in order. again: what they lack has been told
+    """The frames of a video in order. again: read before, so that missing frames have been reported
 
     Raises InputError where PyAV is missing, where the file is no video or has none that can be decoded. Where it breaks
-    off, the frames until there are given, and a warning tells.
+    off, the frames until there are given, and a warning is logged.
     """
     library = _decoder()
     with open_regular(path, "a video file"):
