@@ -37,7 +37,7 @@ from spacesim.scenes.scene import Scene
 from spacesim.scenes.trajectory.rig import TrajectoryRig
 
 SCHEMA = 2  #: of scene.json
-COARSE_DEPTH = 0.01  #: of the scene's size: longer steps of depth pictures are told
+COARSE_DEPTH = 0.01  #: of the scene's size: longer steps of depth pictures are reported
 
 GenerationProgress = Callable[[int, int, str], None]
 MakeFrames = Callable[[Job, Sequence[FrameSpec]], Iterator[str]]  #: makes frames and yields their names

@@ -105,7 +105,7 @@ class SpiceRig(TrajectoryRig):
 
 @contextmanager
 def _loaded(kernels: tuple[str, ...]) -> Iterator[ModuleType]:
-    """spiceypy with these kernels, beside those that somebody else has loaded. Raises InputError where the package or a
+    """spiceypy with these kernels, beside those that are loaded already. Raises InputError where the package or a
     file is missing or broken."""
     try:
         import spiceypy
