@@ -194,8 +194,8 @@ class SceneEntry:
     """The whole file."""
 
     models: tuple[ModelEntry, ...]  #: in the order that object numbers count
-    sun: SunEntry | None = None  #: None: keyframes or whoever draws it say
-    camera: CameraEntry | None = None  #: None: whoever draws it says
+    sun: SunEntry | None = None  #: None: from keyframes or the caller
+    camera: CameraEntry | None = None  #: None: from the caller
     shadows: str = ComposeConfig.shadows  #: of models on each other, see `ComposeConfig`
     frames: int | None = None  #: pictures; None: up to the last keyframe, 120 of an orbit, else 1
     fps: float = FPS  #: pictures a second
@@ -387,7 +387,7 @@ def _pose_values(pose: Pose) -> JsonDict:
 
 
 def _sun_values(sun: Sun) -> JsonDict:
-    azimuth, elevation = (round(angle, 9) for angle in sun.angles)  # as they were typed, where that means the same
+    azimuth, elevation = (round(angle, 9) for angle in sun.angles)  # as they were written, where that means the same
     if np.array_equal(Sun.from_angles(azimuth, elevation).direction, sun.direction):
         return {"azimuth_deg": azimuth, "elevation_deg": elevation}
     return {"direction": sun.direction.tolist()}

@@ -26,7 +26,7 @@ def bake(
     gaussians: Gaussians, light: LightModel, sun: np.ndarray | None, degree: int = 3, others: Float | None = None
 ) -> Gaussians:
     """The Gaussians with the colours, shadows included, that they have under a Sun in the direction `sun` [3], or None
-    for a model that is not told.
+    for a model that does not take one.
 
     others: Float [N], the share of sunlight that other models let through (v_inter of 4.16), or None for all of it
     Harmonics of `degree` are fitted by least squares to the colours from `VIEWS` directions around, weighted by how

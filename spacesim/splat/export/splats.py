@@ -42,7 +42,7 @@ def write_splats(
 
 
 def check_ending(path: Path, form: Form) -> None:
-    """Raise InputError for a name by which nobody would know the format."""
+    """Raise InputError for a file name whose ending does not show the format."""
     endings = ENDINGS.get(form, ())
     if endings and path.suffix.lower() not in endings:
         found = path.suffix or "no ending"

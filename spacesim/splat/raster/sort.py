@@ -23,7 +23,7 @@ LONG_LANES = 2**16  #: that share the entries of lists beyond RUN: as many as fi
 
 def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32, count: int) -> UInt32:
     """Which of `count` segments each slot [P] belongs to, where segment i has those from segment_ends[i - 1] to
-    segment_ends[i]; `count` for slots that nobody has."""
+    segment_ends[i]; `count` for slots of no segment."""
     number, wide = type(segment_ends), type(segment_ends)(slot)
     segment, step = ad.UInt32(0), 1 << (count.bit_length() - 1)
     while step:

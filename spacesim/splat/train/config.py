@@ -151,7 +151,7 @@ class TrainConfig:
 
     @property
     def shape_terms(self) -> tuple[str, ...]:
-        """Which of depth and normals are told to training."""
+        """Which of depth and normals supervise training."""
         weights = {"depth": self.depth_weight, "normal": self.normal_weight}
         return tuple(name for name, weight in weights.items() if weight > 0)
 

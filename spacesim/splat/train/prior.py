@@ -1,4 +1,4 @@
-"""Depth and normals of a mesh as a camera sees it: what training may be told of a shape that is known."""
+"""Depth and normals of a mesh as a camera sees it, to supervise training where the shape is known."""
 
 from pathlib import Path
 

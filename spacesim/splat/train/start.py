@@ -16,7 +16,7 @@ from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 OPACITY = 0.1  #: of every Gaussian at the start (Kerbl et al. 2023)
 NEIGHBOURS = 12  #: points that a normal is estimated from
 COARSE = 0.05  #: pixels: steps of 0.1 cost 0.4 dB of 26.6, those of 1 pixel 1.9 dB (boxsat, 96 pixels)
-MANY_PICTURES = 50  #: of which unknown Suns are told
+MANY_PICTURES = 50  #: that unknown Suns are estimated from
 FEATURES = 0.3  #: standard deviation of the features at the start
 SPLATFACTO_CUBE = 10  #: scene scales, side of the cube that its random start fills (`random_scale`)
 
@@ -142,7 +142,7 @@ def sun_warning(dataset: Dataset) -> str:
     if not any(cut_out):
         lacking.append("no silhouette, mask or alpha to tell the object from what is behind it")
     found = " and ".join(lacking)
-    return found and f"{dataset.root}: expected what unknown Suns can be told from, found {found}: they may be far off"
+    return found and f"{dataset.root}: expected enough to estimate unknown Suns, found {found}: they may be far off"
 
 
 def _from_points(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

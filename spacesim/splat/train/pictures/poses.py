@@ -15,9 +15,9 @@ in other ways than moved so, and a step of each moves pixels about as far:
 
     p' = exp([w]) (p - m) + m + d u        p: in the given camera's axes;  m: the centre there;  d = |m|
 
-The world's axes, origin and unit of length cannot be told from pictures. Where training starts at points or a mesh,
-these tell: at first their centres stay, and each camera finds its place before them. From then on, and from the first
-step where training starts at random, the world is held where the cameras have it: what the numbers of all pictures
+The world's axes, origin and unit of length do not follow from pictures. Where training starts at points or a mesh,
+these do: at first their centres stay, and each camera finds its place before them. From then on, and from the
+first step where training starts at random, the world stays where the cameras have it: what the numbers of all pictures
 share with a turn, a shift and a growth of all cameras (7 ways, linearised at the given ones, least squares of angles
 and of shifts per distance) stays as it was, by a correction every `GAUGE_EVERY` steps.
 """

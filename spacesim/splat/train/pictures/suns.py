@@ -179,7 +179,7 @@ def time_order(frames: Sequence[Frame]) -> np.ndarray | None:
 
 
 def check_pictures(dataset: Dataset) -> None:
-    """Raise InputError where too few pictures are there for Suns to be told from albedo."""
+    """Raise InputError where too few pictures are there to separate Suns from albedo."""
     if len(dataset.train) < 8:
         raise InputError(f"sun: expected at least 8 training pictures to estimate it, found {len(dataset.train)}")
 
