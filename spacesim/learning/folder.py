@@ -43,7 +43,7 @@ class TrainingData:
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """What a training loop tells of itself now and then."""
+    """What a training loop reports now and then."""
 
     iteration: int  #: how many are finished
     iterations: int  #: how many there will be
@@ -174,7 +174,7 @@ def _check_resumable(out: Path, described: JsonDict, resume: bool, read_config: 
         raise
     data["path"] = described["data"]["path"]  # it may have moved
     if same_digest(str(data.get("digest")), described["data"]["digest"]):
-        data["digest"] = described["data"]["digest"]  # older versions told less
+        data["digest"] = described["data"]["digest"]  # older versions wrote less
     current = {**config.to_json(), "data": data}  # what an older version did not write is as by default
     difference = _first_difference(current, described)
     if difference is not None:

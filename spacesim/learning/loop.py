@@ -108,8 +108,8 @@ class TrainingLoop(ABC):
         self.iteration, self.history = header.iteration, [asdict(entry) for entry in header.history]
 
     def complete(self, out: Path, on_progress: Callable[[TrainingProgress], None], command: Sequence[str] = ()) -> None:
-        """Train from the newest checkpoint in `out` to the end, and write the run, its model last. command: what the
-        user typed."""
+        """Train from the newest checkpoint in `out` to the end, and write the run, its model last. command: the
+        command line, for the report."""
         newest = max(checkpoints(out), default=None)
         if newest is not None:
             self.restore(newest)

@@ -55,7 +55,7 @@ class ProposalConfig:
 class NerfShadowConfig:
     """How a field shadows itself: by what it lets through towards the Sun, along a second ray from each surface."""
 
-    samples: int = 16  #: of that ray, of the field itself; 0: no shadows, what is told of the Sun has to do
+    samples: int = 16  #: of that ray, of the field itself; 0: no shadows, only the colour depends on the Sun
     bias: float = 0.03  #: of the box's longest side: where that ray begins, so that a surface does not shadow itself
 
     def __post_init__(self) -> None:
