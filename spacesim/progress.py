@@ -18,7 +18,7 @@ LINE_EVERY = 5.0  #: seconds between two plain lines
 
 
 class Reporter:
-    """Told how far a piece of work is; knows its speed and what is left."""
+    """Called with how far a piece of work is; estimates its speed and the time left."""
 
     def __init__(self, title: str, unit: str, bar: progress.Progress | None) -> None:
         self.title, self.unit, self.bar = title, unit, bar

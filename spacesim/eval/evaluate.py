@@ -177,7 +177,7 @@ def evaluate(
                 [result.has_known_sun for result in results],
                 any(result.grazing is not None for result in results),
                 no_sweep,
-                known.untold,
+                known.why_unknown,
             ),
             *explain_objects(objects, records, models, swapped_order(run, dataset)),
         ],

@@ -106,7 +106,7 @@ class SceneState:
     """How the scene stands."""
 
     poses: tuple[Pose, ...]  #: world_from_model of each model
-    sun: Sun | None  #: None where nobody has said
+    sun: Sun | None  #: None where none is given
 
     def with_pose(self, index: int, pose: Pose) -> "SceneState":
         """With another pose of model `index`."""

@@ -19,7 +19,7 @@ _TABLES: tuple[tuple[str, tuple[Metric, ...], tuple[str, ...], tuple[Metric, ...
     ("Shadow by predicted visibility", SHADOW_MASK, ("shadow_mask",), SHADOW_MASK),
     ("Each kind of shadow by predicted visibility", SHADOW_KIND, tuple(KINDS), (RECALL,)),
 )
-"""Caption, columns, groups, and the columns whose meaning is told."""
+"""Caption, columns, groups, and the columns that are explained."""
 
 _OBJECT_TABLES: tuple[tuple[str, str, tuple[Metric, ...]], ...] = (
     ("image", "image", IMAGE),

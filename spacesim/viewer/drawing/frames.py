@@ -117,7 +117,7 @@ class ResolutionControl:
         return ResolutionControl(FIELD_SHARES, FIELD_BUDGET, 0, len(FIELD_SHARES) - 1)
 
     def record_time(self, share: float, size: tuple[int, int], seconds: float) -> None:
-        """Told that a frame of `size` at `share` took so long."""
+        """Record how long a frame of `size` at `share` took."""
         if len(self._seen) > 256:
             self._seen.clear()
         self._seen[size] = self._seen.get(size, 0) + 1
