@@ -24,7 +24,7 @@ ROWS = 3 + 3 + 4 + 1 + 48  #: parameters of a Gaussian at SH 3
 SPLAT = 7 + 3  #: ellipse, depth, colour
 BOX = 2  #: of Footprints, beside a byte
 STAGES = ("project", "bin", "forward", "loss", "backward", "update")
-CHAINS, TURNS = 8, 512  #: chosen: enough to hide latency, few enough for registers
+CHAINS, TURNS = 8, 512  #: enough to hide latency, few enough for registers
 REPEATS = 15
 
 
