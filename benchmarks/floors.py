@@ -47,27 +47,27 @@ class Yardsticks:
 
     def __init__(self) -> None:
         cuda = select() == "cuda"
-        self.count, self.lanes = (2**28, 2**21) if cuda else (2**26, 2**16)
+        self.count, self.threads = (2**28, 2**21) if cuda else (2**26, 2**16)
         self.source = dr.opaque(ad.Float, 1, self.count)
 
     def works(self) -> dict[str, common.Work]:
         """What to measure."""
         return {
             "copy": lambda: dr.eval(self.source + 1),
-            "operations": lambda: _turns(self.lanes, lambda x: dr.fma(x, 0.999, 0.001)),
-            "specials": lambda: _turns(self.lanes, lambda x: dr.exp2(x - 1)),
+            "operations": lambda: _turns(self.threads, lambda x: dr.fma(x, 0.999, 0.001)),
+            "specials": lambda: _turns(self.threads, lambda x: dr.exp2(x - 1)),
         }
 
     def device(self, measured: dict[str, common.Kernels]) -> Device:
         """Rates from the times of `works`."""
-        done = 1e3 * self.lanes * CHAINS * TURNS
+        done = 1e3 * self.threads * CHAINS * TURNS
         bandwidth = 2e3 * FLOAT * self.count / measured["copy"].least
         return Device(bandwidth, done / measured["operations"].least, done / measured["specials"].least)
 
 
-def _turns(lanes: int, function: Callable[[Any], Any]) -> None:
-    """CHAINS independent chains of TURNS calls in each lane."""
-    start = dr.opaque(ad.Float, 0.5, lanes)
+def _turns(threads: int, function: Callable[[Any], Any]) -> None:
+    """CHAINS independent chains of TURNS calls in each thread."""
+    start = dr.opaque(ad.Float, 0.5, threads)
 
     def goes_on(i: Any, _values: list[Any]) -> Any:
         return i < TURNS

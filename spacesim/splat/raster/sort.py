@@ -105,7 +105,7 @@ def _merge_runs(
 
 
 def _packed(values: list[UInt32], index: UInt32, active: Bool | bool, size: int) -> UInt32:
-    """A flat array [4 size] in which the four `values` of a lane stand at its index."""
+    """A flat array [4 size] in which the four `values` of an element stand at its index."""
     target = dr.empty(ad.UInt32, 4 * size)
     dr.scatter(target, ad.Array4u(values), index, active=active)
     dr.eval(target)
