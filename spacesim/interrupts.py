@@ -2,7 +2,7 @@
 
 `spacesim.cli` imports this first. Where the process is the command itself, Ctrl-C then ends in one sentence:
 while modules are being imported the process ends at once (Python's exception would come out of compiled modules as some
-other error, or leave them half made), else KeyboardInterrupt is raised as ever.
+other error, or leave them half made), else KeyboardInterrupt is raised as usual.
 """
 
 import io
@@ -34,7 +34,7 @@ def interruptible() -> Iterator[None]:
     ignored afterwards, as what is left is to say how it went.
 
     Standard output is flushed. Raises BrokenPipeError without a reader, WorkError where it is full; what has not
-    been printed is lost then, so that the interpreter's own end does not stumble over it.
+    been printed is lost then, so that the interpreter does not fail on it when it exits.
     """
     global _is_running
     _is_running = True
@@ -49,7 +49,7 @@ def interruptible() -> Iterator[None]:
 @contextmanager
 def defer_interrupts() -> Iterator[Callable[[], bool]]:
     """Around work that has something to save when Ctrl-C comes, or SIGTERM, by which batch systems and containers end
-    a process: the first makes the yielded function return True, a second one ends the work as ever. Where the
+    a process: the first makes the yielded function return True, a second one ends the work as usual. Where the
     process is not the command, both do what they always do; one that is ignored stays so, as shells start commands with
     `&`: Ctrl-C is not theirs."""
     interrupted = False

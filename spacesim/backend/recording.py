@@ -235,7 +235,7 @@ def _names(kind: object) -> tuple[str, ...] | None:
 
 @cache
 def _values_of(kind: object) -> Callable[[object], tuple[Any, ...]] | None:
-    """What tells the fields of a dataclass, in the order of `_names`; None for any other type."""
+    """A getter of the fields of a dataclass, in the order of `_names`; None for any other type."""
     names = _names(kind)
     if names is None:
         return None

@@ -47,7 +47,7 @@ def _lock(folder: Path, descriptor: int, kind: int) -> None:
 
 
 def _holder(inode: int) -> int | None:
-    """The process that has locked the file of this number, as Linux tells in /proc/locks; None where it does not.
+    """The process that has locked the file of this number, as Linux lists in /proc/locks; None where it does not.
 
     A line is: number, kind, ADVISORY, WRITE, process, device:inode, start, end (proc_locks(5)). Waiting ones have "->".
     """

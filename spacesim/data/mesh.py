@@ -61,7 +61,7 @@ def load_mesh(path: Path, kind: str | None = None) -> RawMesh:
 
 def _plain_ply(content: bytes) -> RawMesh | None:
     """A PLY file of corners, faces and colours alone, as datasets have. None where anything else is in it or it is not
-    whole, which trimesh then tells of: importing that takes half a second."""
+    whole, which trimesh then reports: importing that takes half a second."""
     header = _PLAIN_PLY.match(content)
     if header is None:
         return None

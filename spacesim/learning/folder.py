@@ -36,7 +36,7 @@ class TrainingData:
     """What a run says of its data."""
 
     path: str  #: of the folder
-    digest: str | None = None  #: see `training_digest`, of runs that tell it
+    digest: str | None = None  #: see `training_digest`, of runs that have it
     train_frames: int | None = None  #: how many there are to train on
     test_frames: int | None = None  #: how many there are to evaluate on
 
@@ -49,7 +49,7 @@ class TrainingProgress:
     iterations: int  #: how many there will be
     loss: float  #: of the last one
     gaussian_count: int | None = None  #: None of a radiance field
-    seconds_left: float | None = None  #: as `TimeLeft` reckons it; None where nothing is known yet
+    seconds_left: float | None = None  #: as `TimeLeft` estimates it; None where nothing is known yet
     lower_bound: bool = False  #: whether it will take longer than that, as Gaussians are yet to join
 
     @property
@@ -201,7 +201,7 @@ def _first_difference(old: JsonDict, new: JsonDict, within: str = "") -> tuple[s
 
 def _read_seconds(path: Path) -> dict[str, float]:
     """{iteration of a checkpoint, or "refinement": seconds}; {}, with a warning, where the file is damaged: only the
-    report tells of them."""
+    report shows them."""
     if not path.exists():
         return {}
     try:

@@ -45,7 +45,7 @@ class TrainingLoop(ABC):
     config: Any  #: with `iterations`, `checkpoint_every`, `to_json`
     iteration: int  #: steps taken
     history: list[dict[str, float]]  #: iteration and loss now and then, of Gaussians their number
-    seconds: dict[str, float]  #: parts of training's time that the run tells apart, by their names
+    seconds: dict[str, float]  #: parts of training's time that the run distinguishes, by their names
 
     @abstractmethod
     def step(self) -> Float:

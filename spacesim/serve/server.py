@@ -1,6 +1,6 @@
 """The socket: requests in, answers out, one after another on the thread that draws.
 
-One ROUTER socket speaks to clients of our own protocol (protocol.py) and to Basilisk (vizard.py): the first frame tells
+One ROUTER socket speaks to clients of our own protocol (protocol.py) and to Basilisk (vizard.py): the first frame shows
 which. ZeroMQ takes in the next requests and sends answers meanwhile, on a thread of its own; there it drops what is not
 its protocol, and of a message whose sender hangs up nothing arrives.
 """
@@ -62,7 +62,7 @@ class CameraServer:
                 self._answer_next()
 
     def close(self) -> None:
-        """Let go of the address; answers that were given are still sent for a second."""
+        """Release the address; answers that were given are still sent for a second."""
         self._socket.close()
         self._context.term()
 

@@ -6,7 +6,7 @@ what is turned away from the Sun says little, and one flat surface alone only ho
 
 Shape alone, by alternation (`ShapeSearch`): surfaces are Lambertian, their albedo at first the mean colour of all
 pictures times the number that suits them best, then what the Suns found so far leave. All pictures share one exposure,
-as brightness tells the angle: too large an albedo would put all Suns too low.
+as brightness determines the angle: too large an albedo would put all Suns too low.
 """
 
 from collections.abc import Callable, Sequence

@@ -35,7 +35,7 @@ class DensityTape:
 
 @dataclass(frozen=True)
 class DensityField:
-    """Density, and numbers that tell a colour network of the place."""
+    """Density, and features of the place for a colour network."""
 
     grid: HashGrid  #: what is known of places
     #: the network: what the grid says of a place in, the logarithm of the density and the other numbers out

@@ -48,7 +48,7 @@ class _Worker:
     outbox: list[Any]
 
     def send_next(self) -> None:
-        """Send the next message. Where the process is dead already, reading from it will tell."""
+        """Send the next message. Where the process is dead already, reading from it will fail."""
         with suppress(OSError):
             self.connection.send(self.outbox.pop(0))
 
@@ -150,7 +150,7 @@ def _requeue(worker: _Worker, tasks: deque[_Task]) -> None:
 
 
 def _stop(workers: list[_Worker]) -> None:
-    """End all processes; closing the connection is what tells them."""
+    """End all processes; closing the connection is their signal."""
     for worker in workers:
         worker.connection.close()
     for worker in workers:
@@ -177,8 +177,8 @@ _ROOT = str(Path(__file__).parents[3])
 
 
 def connect_to_parent(connection: Connection) -> tuple[queue.SimpleQueue[Any], Callable[[Any], None]]:
-    """(what the parent has sent, a way to tell it something). Ends this process as soon as the parent has
-    gone, whatever it is doing."""
+    """(what the parent has sent, a function that sends it a message). Ends this process as soon as the parent
+    has gone, whatever it is doing."""
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
     def listen() -> None:

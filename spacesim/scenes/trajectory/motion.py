@@ -121,7 +121,7 @@ class MotionSamples:
 
 
 def merge(motions: Sequence[Motion]) -> Motion:
-    """What several files tell together. Raises InputError where two tell the same, or their clocks differ."""
+    """The motion in several files together. Raises InputError where two have the same, or their clocks differ."""
     whole = motions[0]
     for other in motions[1:]:
         if (whole.day is None) != (other.day is None):

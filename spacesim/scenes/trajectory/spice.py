@@ -129,4 +129,4 @@ def _answer(name: str, ask: Callable[..., T], *arguments: object) -> T:
     except SpiceyError as error:
         long = " ".join(str(getattr(error, "long", "") or error).split())
         short = str(getattr(error, "short", "") or "SPICE(ERROR)").strip()
-        raise InputError(f"{name}: expected kernels that tell it, found {short}: {long[:300]}") from None
+        raise InputError(f"{name}: expected kernels that contain it, found {short}: {long[:300]}") from None

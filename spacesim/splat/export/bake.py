@@ -14,7 +14,7 @@ from spacesim.splat.raster.render import render
 from spacesim.splat.raster.tone import tone_map
 
 VIEWS = 64  #: directions that the harmonics are fitted to, four times as many as degree 3 has terms
-PIXELS = 256  #: on a side of the pictures that tell how much of each Gaussian is seen from a direction
+PIXELS = 256  #: on a side of the pictures that show how much of each Gaussian is seen from a direction
 WITHIN = 0.999  #: share of the Gaussians that they hold
 FAINT = 0.1  #: pixels: what a direction counts at least, from which a Gaussian is hidden
 BLACK = 1e-3  #: colours up to which any value below is as good: colours below 0 are drawn as 0

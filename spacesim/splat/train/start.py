@@ -140,7 +140,7 @@ def sun_warning(dataset: Dataset) -> str:
         lacking.append(f"{len(dataset.train)} training pictures where it takes {MANY_PICTURES} or more")
     cut_out = (f.silhouette_path or f.mask_path or has_alpha(dataset.root / f.file_path) for f in dataset.train)
     if not any(cut_out):
-        lacking.append("no silhouette, mask or alpha to tell the object from what is behind it")
+        lacking.append("no silhouette, mask or alpha to separate the object from what is behind it")
     found = " and ".join(lacking)
     return found and f"{dataset.root}: expected enough to estimate unknown Suns, found {found}: they may be far off"
 
@@ -189,5 +189,5 @@ def object_size(dataset: Dataset) -> float:
     elif dataset.ply_file_path is not None:
         points = read_points(dataset.root / dataset.ply_file_path)[0]
     else:
-        raise InputError(f"{dataset.root}: init_box expects a mesh or points that tell the object's size, found none")
+        raise InputError(f"{dataset.root}: init_box expects a mesh or points for the object's size, found none")
     return float(np.ptp(points, axis=0).max())

@@ -1,7 +1,7 @@
 """Poses of training pictures, refined: each camera moves as its own loss asks, in a training of its own.
 
-Its model only has to tell where cameras are and goes (`pose_config`); the run's model is trained from the start with
-the poses found, which stay, as one that learned before its cameras stood stays worse.
+Its model only has to find where cameras are and is discarded (`pose_config`); the run's model is trained from the
+start with the poses found, which stay, as one that learned before its cameras stood stays worse.
 It is drawn with the anti-aliasing filter: splats that are widened to a pixel cover more the farther a camera is, which
 turns and moves even a camera that is right.
 
@@ -228,7 +228,7 @@ class _Gauge:
 
     def rigid(self, numbers: Array) -> Array:
         """[R] of each way in numbers [V, 6], without growth: splats' sizes, which change while their centres stay,
-        would tell of that."""
+        would follow it."""
         shares = self.shares @ numbers.ravel()
         rigid: Array = shares - self.growth * (self.growth @ shares)
         return rigid
