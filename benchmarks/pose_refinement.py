@@ -85,7 +85,7 @@ def rows_of(data: Dataset, options: argparse.Namespace) -> Iterator[common.Row]:
 
 
 def aligned_psnr(data: Dataset, cameras: list[Camera], folder: Path, evaluation: EvaluateConfig) -> float:
-    """Of the run in a folder, whose world is laid upon the true one by its training cameras."""
+    """Of the run in a folder, whose world is aligned with the true one by its training cameras."""
     frames = zip(data.train, cameras, strict=True)
     own = replace(data, train=tuple(replace(frame, camera=camera) for frame, camera in frames), test=())
     evaluation, run = replace(evaluation, align=own), load_run(folder / "run")
