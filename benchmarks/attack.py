@@ -2,7 +2,7 @@
 
 python benchmarks/attack.py --inputs 20000 --kills 100 --bits 5000 [--viewer 4] [--seed N] [--trial N]
 
-What counts as a find is told in tests/attack/attack.py. --trial does one of the inputs again, and shows what it says.
+tests/attack/attack.py says what counts as a find. --trial does one of the inputs again, and shows what it says.
 Two cores take about 40 minutes for the numbers above.
 """
 

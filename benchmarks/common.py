@@ -168,7 +168,7 @@ def sphere_arrays(count: int, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def sphere_run(count: int, seed: int = 0) -> "Run":
-    """Such splats with features, relit and with shadows by networks that nobody has trained."""
+    """Such splats with features, relit and with shadows by untrained networks."""
     from spacesim.splat.light.model import LightModel, TrainingFrame
     from spacesim.splat.raster.gaussians import Gaussians
     from spacesim.splat.run import Run

@@ -24,7 +24,7 @@ ROWS = 3 + 3 + 4 + 1 + 48  #: parameters of a Gaussian at SH 3
 SPLAT = 7 + 3  #: ellipse, depth, colour
 BOX = 2  #: of Footprints, beside a byte
 STAGES = ("project", "bin", "forward", "loss", "backward", "update")
-CHAINS, TURNS = 8, 512  #: chosen: enough to hide latency, few enough for registers
+CHAINS, TURNS = 8, 512  #: enough to hide latency, few enough for registers
 REPEATS = 15
 
 
@@ -47,27 +47,27 @@ class Yardsticks:
 
     def __init__(self) -> None:
         cuda = select() == "cuda"
-        self.count, self.lanes = (2**28, 2**21) if cuda else (2**26, 2**16)
+        self.count, self.threads = (2**28, 2**21) if cuda else (2**26, 2**16)
         self.source = dr.opaque(ad.Float, 1, self.count)
 
     def works(self) -> dict[str, common.Work]:
         """What to measure."""
         return {
             "copy": lambda: dr.eval(self.source + 1),
-            "operations": lambda: _turns(self.lanes, lambda x: dr.fma(x, 0.999, 0.001)),
-            "specials": lambda: _turns(self.lanes, lambda x: dr.exp2(x - 1)),
+            "operations": lambda: _turns(self.threads, lambda x: dr.fma(x, 0.999, 0.001)),
+            "specials": lambda: _turns(self.threads, lambda x: dr.exp2(x - 1)),
         }
 
     def device(self, measured: dict[str, common.Kernels]) -> Device:
         """Rates from the times of `works`."""
-        done = 1e3 * self.lanes * CHAINS * TURNS
+        done = 1e3 * self.threads * CHAINS * TURNS
         bandwidth = 2e3 * FLOAT * self.count / measured["copy"].least
         return Device(bandwidth, done / measured["operations"].least, done / measured["specials"].least)
 
 
-def _turns(lanes: int, function: Callable[[Any], Any]) -> None:
-    """CHAINS independent chains of TURNS calls in each lane."""
-    start = dr.opaque(ad.Float, 0.5, lanes)
+def _turns(threads: int, function: Callable[[Any], Any]) -> None:
+    """CHAINS independent chains of TURNS calls in each thread."""
+    start = dr.opaque(ad.Float, 0.5, threads)
 
     def goes_on(i: Any, _values: list[Any]) -> Any:
         return i < TURNS

@@ -86,7 +86,7 @@ def arguments_of(pipeline: Pipeline) -> dict[str, Any]:
     return {
         "pairs": lists.pairs,
         "blended pairs": pipeline.blended_pairs,
-        "tile": f"{lists.shape.width}x{lists.shape.height}, {lists.shape.lanes} lanes",
+        "tile": f"{lists.shape.width}x{lists.shape.height}, {lists.shape.threads} threads",
     }
 
 

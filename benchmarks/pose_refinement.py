@@ -5,9 +5,9 @@
 boxsat of 128 pixels under one Sun, 60 training views, the preset fast. Each training camera is turned by so many
 degrees about an axis through itself and moved by as many % of its distance, both at random and each for itself; test
 cameras stay. Trained with the true cameras, the disturbed ones, and these refined. PSNR is over the silhouette of the
-test views. Pose errors are medians over the training cameras against the true ones. Both are told as they are and
+test views. Pose errors are medians over the training cameras against the true ones. Both are reported as they are and
 "aligned", after the turn, shift and growth that fit all training cameras best to the true ones; that common motion is
-the gauge, which pictures do not tell: turn in degrees, shift in % of the distance, growth in %.
+the gauge, which pictures do not fix: turn in degrees, shift in % of the distance, growth in %.
 """
 
 import argparse
@@ -85,7 +85,7 @@ def rows_of(data: Dataset, options: argparse.Namespace) -> Iterator[common.Row]:
 
 
 def aligned_psnr(data: Dataset, cameras: list[Camera], folder: Path, evaluation: EvaluateConfig) -> float:
-    """Of the run in a folder, whose world is laid upon the true one by its training cameras."""
+    """Of the run in a folder, whose world is aligned with the true one by its training cameras."""
     frames = zip(data.train, cameras, strict=True)
     own = replace(data, train=tuple(replace(frame, camera=camera) for frame, camera in frames), test=())
     evaluation, run = replace(evaluation, align=own), load_run(folder / "run")

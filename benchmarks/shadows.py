@@ -129,8 +129,8 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, no bounce", with_bounce(mapped, 0)
     yield "splat, surface, no bounce", with_bounce(splatted, 0)
     with_sun = ShadowRefinementConfig(width=refine_of(splatted).width)
-    yield "splat, surface, refinement told the Sun", with_shadow(splatted, refine=with_sun)
-    yield "splat, surface, no bounce, refinement told the Sun", with_bounce(with_shadow(splatted, refine=with_sun), 0)
+    yield "splat, surface, refinement given the Sun", with_shadow(splatted, refine=with_sun)
+    yield "splat, surface, no bounce, refinement given the Sun", with_bounce(with_shadow(splatted, refine=with_sun), 0)
     if splatted.supersample == 1:
         yield "none, surface, 2x2 samples", replace(relit, supersample=2)
         yield "splat, surface, 2x2 samples", replace(splatted, supersample=2)

@@ -49,7 +49,7 @@ def make(folder: Path, frames: int = 600, height: int = 300, seed: int = 0, spp:
     scene = {"views": frames, "test_views": max(frames // 8, 1), "resolution": size, "spp": spp, "test_spp": spp}
     made = read_dataset(common.generated("speedplus", folder / "made", seed=seed, **scene))
     if not (folder / "data/transforms.json").exists():
-        for name in ("speedplus", "data", "told"):
+        for name in ("speedplus", "data", "labelled"):
             shutil.rmtree(folder / name, ignore_errors=True)
         with show_progress("export", "pictures") as report:
             write_speedplus(made, folder / "speedplus", progress=report)
@@ -58,12 +58,12 @@ def make(folder: Path, frames: int = 600, height: int = 300, seed: int = 0, spp:
         shutil.rmtree(folder / "speedplus/synthetic/masks")  # SPEED+ has none
         import_speedplus(folder / "speedplus", folder / "data")
     data = read_dataset(folder / "data")
-    if not (folder / "told/transforms.json").exists():
+    if not (folder / "labelled/transforms.json").exists():
         train, test = (
             [_labelled(made, data, *pair) for pair in zip(*sets, strict=True)] for sets in _splits(made, data)
         )
-        write_dataset(folder / "told", train, test, {"kind": "told", "source": str(folder / "data")})
-    return SpeedplusData(made, data, read_dataset(folder / "told"))
+        write_dataset(folder / "labelled", train, test, {"kind": "labelled", "source": str(folder / "data")})
+    return SpeedplusData(made, data, read_dataset(folder / "labelled"))
 
 
 def degraded(picture: np.ndarray, seed: tuple[int, ...]) -> np.ndarray:

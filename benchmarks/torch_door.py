@@ -5,7 +5,7 @@ python benchmarks/torch_door.py [--sizes 31622x512,...] [--peers gsplat] [--repe
 A picture with its gradients, by all parameters of the Gaussians, for one camera: harmonics of degree 3, colour and
 alpha. "own" is `render` with Dr.Jit's gradients. Both are handed the same gradients of the picture and of alpha: a loss
 is its user's, in torch or elsewhere. With --peers gsplat the largest differences from its pictures and
-gradients are told, too; that needs CUDA. --store writes what gsplat makes of a small scene, which
+gradients are reported, too; that needs CUDA. --store writes what gsplat makes of a small scene, which
 tests/test_torch.py holds ours against.
 """
 

@@ -2,9 +2,9 @@
 
     python benchmarks/unknown_suns.py --out OUT [--frames 600] [--height 300] [--iterations 7000] [--json]
 
-Data as of speedplus_data.py, silhouettes known. Trained: "told", with the true Suns; "unknown", with estimated ones;
+Data as of speedplus_data.py, silhouettes known. Trained: "known", with the true Suns; "unknown", with estimated ones;
 without Suns, the field of view alone with embeddings of pictures, and vanilla. PSNR is over the silhouette of test
-views, which have Suns of their own: "told" is told these, and the others are not. What they do not know of a test
+views, which have Suns of their own: "known" is given these, and the others are not. What they do not know of a test
 picture, Sun or embedding, is fitted on one half of it and judged on the other. Errors of Suns are against the true
 ones: of all training pictures, and of those whose Sun the estimate calls sure (sigma below its median).
 """
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--spp", type=common.positive, default=64)
     parser.add_argument("--iterations", type=common.positive, default=7000)
     parser.add_argument("--preset", default="fast")
-    parser.add_argument("--rows", default="told,unknown,embeddings,vanilla", help="what to train, commas between")
+    parser.add_argument("--rows", default="known,unknown,embeddings,vanilla", help="what to train, commas between")
     options = parser.parse_args()
     backend.select(options.backend)
     data = speedplus_data.make(options.out, options.frames, options.height, spp=options.spp)
@@ -48,13 +48,13 @@ def main() -> None:
 
 
 def rows_of(data: speedplus_data.SpeedplusData, options: argparse.Namespace) -> Iterator[common.Row]:
-    without = without_suns(data.labelled, options.out / "untold")
+    without = without_suns(data.labelled, options.out / "without-suns")
     evaluation = EvaluateConfig(geometry=None)
     for name, config in configurations(options).items():
         if name not in common.row_names(options.rows):
             continue
         folder = options.out / name
-        metrics = common.measured(name, config, evaluation, data.labelled if name == "told" else without, folder)
+        metrics = common.measured(name, config, evaluation, data.labelled if name == "known" else without, folder)
         if "note" in metrics:
             yield {"Suns": name, **metrics}
             continue
@@ -72,7 +72,7 @@ def configurations(options: argparse.Namespace) -> dict[str, TrainConfig]:
 
     view = {"light.field.inputs": "view", "light.field.embeddings": EMBEDDINGS}
     return {
-        "told": of(METHOD),
+        "known": of(METHOD),
         "unknown": with_settings(of(METHOD), {"sun": "unknown"}),
         "embeddings": with_settings(of("relight"), view),
         "vanilla": of("vanilla"),

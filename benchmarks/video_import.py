@@ -4,11 +4,11 @@
 
 It path-traces the film as far as OUT lacks it: three quarters of it a fly-around of 90 degrees from ahead to above, one
 quarter an approach from above, one Sun; the sky, then the Earth's limb, then its clouds and seas behind. It is encoded
-as H.264 at 4 Mbit/s and imported, once with the field of view told and once without. Positions are compared after the
+as H.264 at 4 Mbit/s and imported, once with the field of view given and once without. Positions are compared after the
 alignment of `eval --align`, in per cent of each camera's distance from the stage; masks with the traced silhouettes of
 the same frames.
 
-The method vanilla is then trained on the import with the field of view told, with the poses as found and with these
+The method vanilla is then trained on the import with the field of view given, with the poses as found and with these
 refined, and on the same frames of the film with the true poses and masks, from the same points. All are evaluated on
 the traced pictures of the frames held out, over the true silhouettes: each model seen by the cameras that its own poses
 give these frames, and, "aligned", by the true cameras, after one motion of the whole model.
@@ -94,7 +94,7 @@ def main() -> None:
     film = options.out / "film.mp4"
     write_bytes(film, encoded([opaque(data, frame) for data, frame in truth]))
     rows = []
-    for name, fov in ("told", FOV), ("estimated", None):
+    for name, fov in ("given", FOV), ("estimated", None):
         folder = options.out / f"import-{name}"
         start = time.perf_counter()
         try:
@@ -109,7 +109,7 @@ def main() -> None:
     trainings = list(trainings_of(options, truth)) if "note" not in rows[0] else []
     tables = {
         f"A film of {len(truth)} frames, {options.width} pixels wide": rows,
-        f"Trained on it, the field of view told, preset {options.preset}": trainings,
+        f"Trained on it, the field of view given, preset {options.preset}": trainings,
     }
     common.emit({"rows": rows, "trainings": trainings}, tables, options)
 
@@ -176,7 +176,7 @@ def trainings_of(options: argparse.Namespace, truth: list[TrueFrame]) -> Iterato
     """With the true poses and masks; with those found; with these refined."""
     from spacesim.cli.train import parse_setting
 
-    own = read_dataset(options.out / "import-told")
+    own = read_dataset(options.out / "import-given")
     true = true_dataset(options.out / "truth", own, truth)
     plain = with_options(preset(options.preset, "vanilla"), iterations=options.iterations)
     plain = with_settings(plain, dict(map(parse_setting, options.set)))

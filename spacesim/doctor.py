@@ -63,7 +63,7 @@ def _check_python() -> Finding:
 def _default_backend() -> str | None:
     try:
         reasons = backend.available()
-    except Exception:  # told by the entries of the backends
+    except Exception:  # reported by the entries of the backends
         return None
     return next((name for name in ("cuda", "llvm") if reasons[name] is None), None)
 

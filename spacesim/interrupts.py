@@ -1,8 +1,8 @@
-"""How a command ends early: Ctrl-C at any moment, and a standard output that is full or that nobody reads any more.
+"""How a command ends early: Ctrl-C at any moment, and a standard output that is full or whose reader has gone.
 
-`spacesim.cli` imports this first. Where the process is the command itself, Ctrl-C is told in a sentence from then on:
+`spacesim.cli` imports this first. Where the process is the command itself, Ctrl-C then ends in one sentence:
 while modules are being imported the process ends at once (Python's exception would come out of compiled modules as some
-other error, or leave them half made), else KeyboardInterrupt is raised as ever.
+other error, or leave them half made), else KeyboardInterrupt is raised as usual.
 """
 
 import io
@@ -33,8 +33,8 @@ def interruptible() -> Iterator[None]:
     """Around the work of a command: KeyboardInterrupt is raised within and Ctrl-C, where the process is the command,
     ignored afterwards, as what is left is to say how it went.
 
-    Standard output is flushed. Raises BrokenPipeError where nobody reads it, WorkError where it is full; what has not
-    been printed is lost then, so that the interpreter's own end does not stumble over it.
+    Standard output is flushed. Raises BrokenPipeError without a reader, WorkError where it is full; what has not
+    been printed is lost then, so that the interpreter does not fail on it when it exits.
     """
     global _is_running
     _is_running = True
@@ -49,7 +49,7 @@ def interruptible() -> Iterator[None]:
 @contextmanager
 def defer_interrupts() -> Iterator[Callable[[], bool]]:
     """Around work that has something to save when Ctrl-C comes, or SIGTERM, by which batch systems and containers end
-    a process: the first is not raised but told by what is yielded, a second one ends the work as ever. Where the
+    a process: the first makes the yielded function return True, a second one ends the work as usual. Where the
     process is not the command, both do what they always do; one that is ignored stays so, as shells start commands with
     `&`: Ctrl-C is not theirs."""
     interrupted = False
@@ -93,7 +93,7 @@ def interrupt_message() -> str:
 
 
 def escape_unprintable() -> None:
-    """From now on output takes any name of a file: what its encoding lacks, or what is no text, is told by numbers."""
+    """From now on output takes any name of a file: what its encoding lacks, or what is no text, is escaped."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

@@ -1,6 +1,6 @@
 """All methods of reconstruction behind one door: Gaussians (`splat`) and radiance fields (`nerf`).
 
-Which family a method is of is told by its name, and of a run by the method that its config.json names.
+A method's name says its family; of a run, that is the method that its config.json names.
 """
 
 from collections.abc import Callable, Sequence

@@ -18,7 +18,7 @@ LINE_EVERY = 5.0  #: seconds between two plain lines
 
 
 class Reporter:
-    """Told how far a piece of work is; knows its speed and what is left."""
+    """Called with how far a piece of work is; estimates its speed and the time left."""
 
     def __init__(self, title: str, unit: str, bar: progress.Progress | None) -> None:
         self.title, self.unit, self.bar = title, unit, bar
@@ -49,12 +49,12 @@ class Reporter:
 
 
 def report_training(report: Reporter) -> "Callable[[TrainingProgress], None]":
-    """What tells `report` of a training's progress."""
+    """A callback that passes a training's progress to `report`."""
     return lambda p: report(p.iteration, p.iterations, p.words, p.seconds_left, p.lower_bound)
 
 
 class TimeLeftColumn(progress.TimeRemainingColumn):
-    """What the work itself says, else what rich reckons from the units' speed."""
+    """What the work itself says, else what rich computes from the units' speed."""
 
     def render(self, task: progress.Task) -> Text:
         left = task.fields.get("left")

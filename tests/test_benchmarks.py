@@ -690,14 +690,14 @@ def test_data_like_speedplus_have_no_suns_but_those_that_are_told(command, place
 
 
 @smallest(
-    "unknown_suns.py --out OUT --frames 8 --height 30 --spp 2 --preset demo --iterations 2 --rows told,unknown,vanilla"
+    "unknown_suns.py --out OUT --frames 8 --height 30 --spp 2 --preset demo --iterations 2 --rows known,unknown,vanilla"
     " --backend llvm --json"
 )
 def test_unknown_suns_are_compared_with_true_ones(command, place, monkeypatch):
     for module in (sun_search, suns):  # a lattice of few Suns
         monkeypatch.setattr(module, "SPHERE", 24)
     rows = {row["Suns"]: row for row in json.loads(call(command))["rows"]}
-    assert list(rows) == ["told", "unknown", "vanilla"]
+    assert list(rows) == ["known", "unknown", "vanilla"]
     assert 0 <= rows["unknown"]["Sun off, deg"] <= 180
     assert all(5 < row["PSNR, dB"] < 60 for row in rows.values())
 
@@ -742,7 +742,7 @@ def test_noise_like_speedpluss_is_that_of_the_full_size_averaged():
 def test_video_import_tells_what_cannot_be_found(command, place):
     """At this size there is nothing to be matched; what is found is tested with the importer."""
     rows = json.loads(call(command))["rows"]
-    assert [row["field of view"] for row in rows] == ["told", "estimated"]
+    assert [row["field of view"] for row in rows] == ["given", "estimated"]
     assert all("expected" in row["note"] for row in rows)
     assert (place / "OUT" / "film.mp4").stat().st_size > 1000
 

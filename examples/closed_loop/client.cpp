@@ -2,7 +2,7 @@
 //
 //     g++ -O2 client.cpp -lzmq -o client && ./client tcp://127.0.0.1:5556 view.ppm
 //
-// The protocol is told in spacesim/serve/protocol.py.
+// spacesim/serve/protocol.py describes the protocol.
 #include <cstdint>
 #include <cstdio>
 #include <string>
@@ -53,7 +53,7 @@ int main(int count, char** words) {
     zmq_close(socket);
     zmq_ctx_term(context);
     if (frames.size() != 3) {  // an error is a header alone
-        std::fprintf(stderr, "%s\n", frames.empty() ? "nobody answers" : frames[0].c_str());
+        std::fprintf(stderr, "%s\n", frames.empty() ? "no answer" : frames[0].c_str());
         return 1;
     }
     const float* depth = reinterpret_cast<const float*>(frames[2].data());

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from spacesim.backend.selection import load_drjit, select
 
-LARGE = 1 << 28  #: bytes below which nobody asks: what is free is read from files of the system
+LARGE = 1 << 28  #: bytes below which free memory is not checked: checking it reads files of the system
 
 
 def check_memory(needed: int, what: str) -> None:

@@ -24,7 +24,7 @@ _FUNCTIONS: dict[str, tuple[str, Any, tuple[Any, ...]]] = {
     "address": ("_Z12jit_var_datajPPv", c_uint32, (c_uint32, c_void_p)),
     "release": ("_Z20jit_var_dec_ref_implj", None, (c_uint32,)),
 }
-"""Name in the library, which tells the types of the arguments, what it returns, and these types."""
+"""Name in the library, which encodes the types of the arguments, what it returns, and these types."""
 _FUNCTIONS_OF_CUDA: dict[str, tuple[str, Any, tuple[Any, ...]]] = {
     "context": ("_Z16jit_cuda_contextv", c_void_p, ()),
     "push": ("_Z21jit_cuda_push_contextPv", None, (c_void_p,)),

@@ -15,7 +15,7 @@ RECORDINGS = 256  #: of a function that are kept: one for each size of picture, 
 _PLAIN = frozenset((int, float, bool, str, type(None)))
 _EQUAL_TO_INTEGERS = frozenset((float, bool))  # 1, 1.0 and True are one key of a dictionary, 0.0 and -0.0 too
 MAX_KEYS = 2**14  # that are remembered of what is not an array
-_constants: dict[int, tuple[Any, Any]] = {}  # frozen dataclasses without arrays, by `id`: what `_split` told of them
+_constants: dict[int, tuple[Any, Any]] = {}  # frozen dataclasses without arrays, by `id`: what `_split` gave for them
 _leaves: set[type] = set()  # types of arguments that Dr.Jit is left to look into
 
 
@@ -235,7 +235,7 @@ def _names(kind: object) -> tuple[str, ...] | None:
 
 @cache
 def _values_of(kind: object) -> Callable[[object], tuple[Any, ...]] | None:
-    """What tells the fields of a dataclass, in the order of `_names`; None for any other type."""
+    """A getter of the fields of a dataclass, in the order of `_names`; None for any other type."""
     names = _names(kind)
     if names is None:
         return None

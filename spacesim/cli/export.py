@@ -123,7 +123,7 @@ def _export_splats(options: argparse.Namespace, form: "Form") -> None:
     if run.light is not None:
         model = bake(model, run.light, Sun.from_angles(*options.sun).direction if options.sun else None)
     write_splats(model, out, form, frame, run.antialiased, options.spz_version or 3)
-    if run.antialiased and form != "spz":  # which tells it
+    if run.antialiased and form != "spz":  # which records it
         print(WANTS_FILTER, file=sys.stderr)
     interrupts.print_output(f"{out}: {run.gaussian_count} Gaussians")
 
@@ -223,7 +223,7 @@ def _export_labels(options: argparse.Namespace, kind: str) -> None:
 
 
 def _keypoints(text: str | None) -> int | Path | None:
-    """How many, or the file that tells them."""
+    """How many, or the file that defines them."""
     if text is None:
         return None
     try:

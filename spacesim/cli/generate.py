@@ -72,7 +72,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     many.add_argument(
         "--ray", metavar="ADDRESS", help="render on a Ray cluster: auto, HOST:PORT, or local to start one"
     )
-    parser.add_argument("--estimate", action="store_true", help="render a few frames, tell time and disk, keep nothing")
+    parser.add_argument("--estimate", action="store_true", help="render a few frames, show time and disk, keep nothing")
     parser.add_argument("--print", action="store_true", help="render nothing, print the whole scene as a scene file")
 
 

@@ -18,7 +18,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--camera", type=Path, metavar="FILE", help="intrinsics, as transforms.json has them (run's data)"
     )
-    parser.add_argument("--sun", type=angles, metavar="AZ,EL", help="of all pictures (what their dataset tells)")
+    parser.add_argument("--sun", type=angles, metavar="AZ,EL", help="of all pictures (those of their dataset)")
     parser.add_argument("--within", type=_within, metavar="DEG,SHARE", help="how far off rough poses may be (5,0.05)")
     parser.add_argument("--resume", action="store_true", help="keep what an interrupted call has found")
 

@@ -1,4 +1,4 @@
-"""What commands have in common: how wrong options are told, types of arguments, from where a run is seen."""
+"""What commands have in common: messages for wrong options, types of arguments, from where a run is seen."""
 
 import argparse
 import math

@@ -1,6 +1,6 @@
-"""`spacesim COMMAND ...`: finds the command, runs it, and tells in a sentence how it ended."""
+"""`spacesim COMMAND ...`: finds the command, runs it, and reports errors in one sentence."""
 
-from spacesim import interrupts  # first: from here on Ctrl-C is told in a sentence
+from spacesim import interrupts  # first: from here on Ctrl-C is reported in a sentence
 
 # isort: split
 
@@ -96,10 +96,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: Sequence[str]) -> None:
     interrupts.escape_unprintable()
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
-    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its tracebacks: what matters of them is told
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its tracebacks: what matters of them is reported
     options = parser(arguments).parse_args(arguments)
     if not options.debug:
-        warnings.simplefilter("ignore")  # of libraries, about numbers that are told in sentences where they matter
+        warnings.simplefilter("ignore")  # of libraries, about numbers that our messages report where they matter
     options.arguments = ("spacesim", *arguments)
     interrupts.set_resume_command("--resume" if hasattr(options, "resume") else "")
     if options.debug:
@@ -155,8 +155,8 @@ def in_flags(sentence: str, options: argparse.Namespace) -> str:
     if not colon or field in {str(value) for value in typed if isinstance(value, str | Path)}:
         return sentence
     flag = options.option_of(field, options) or options.flags.get(field)
-    if not flag or " " in flag:  # beside --set names of fields are what is typed
+    if not flag or " " in flag:  # beside --set the user writes names of fields
         return f"{flag}: {rest}" if flag else sentence
-    expected, found, end = rest.partition(", found ")  # what was found stays as it was typed
+    expected, found, end = rest.partition(", found ")  # what was found stays as the user wrote it
     names = re.sub(r"(?<![^ ])[a-z]+_[a-z_]+(?=[ ,;]|$)", lambda word: options.flags.get(word[0], word[0]), expected)
     return f"{flag}: {names}{found}{end}"

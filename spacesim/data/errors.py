@@ -1,4 +1,4 @@
-"""The two ways in which work ends early, each told to the user in one sentence."""
+"""The two ways in which work ends early, each reported to the user in one sentence."""
 
 
 class InputError(ValueError):

@@ -79,7 +79,7 @@ def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
     """Write `content` to `path` so that a reader sees the old file or the new one, never a part.
 
     Several processes and machines may write the same file: the last one counts. A link stays and the file that it leads
-    to is replaced; devices such as /dev/null and pipes that somebody reads are written into. durable: the content is on
+    to is replaced; devices such as /dev/null and pipes that have a reader are written into. durable: the content is on
     the disk before the file has its name; without that a process may die at any moment, but not the machine (a power
     cut can leave a file empty or cut off). Raises InputError where `path` cannot be written or is a folder, a disk or a
     socket, WorkError where the disk is full.
@@ -118,12 +118,12 @@ def _write_into(path: Path, mode: int, content: bytes) -> None:
     """Write into a device of characters or a pipe, which stay what they are."""
     if not (stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)):
         raise InputError(f"{path}: expected a file to write, found {_kind_of(mode)}")
-    try:  # a pipe that nobody reads would keep us waiting
+    try:  # a pipe without a reader would block
         descriptor = os.open(path, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))
     except OSError as error:
         if error.errno != errno.ENXIO:
             raise
-        raise InputError(f"{path}: expected a pipe that somebody reads, found nobody") from None
+        raise InputError(f"{path}: expected a pipe with a reader, found none") from None
     if hasattr(os, "set_blocking"):
         os.set_blocking(descriptor, True)
     with os.fdopen(descriptor, "wb", buffering=0) as file:

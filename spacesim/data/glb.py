@@ -11,7 +11,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import JsonMapping, JsonValue, write_bytes
 
 POINTS, TRIANGLES = 0, 4  #: modes of a primitive
-_MAX_BYTES = 0xFFFFFFFF  # what the header can tell
+_MAX_BYTES = 0xFFFFFFFF  # what the header can hold
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _COMPONENTS = {"float32": 5126, "uint32": 5125}
 _VERTICES, _INDICES = 34962, 34963  # targets of a buffer view
@@ -49,7 +49,7 @@ def write_glb(
     for name, array in attributes.items():
         numbers[name] = len(accessors)
         accessor = add(array, _VERTICES)
-        if name == "POSITION":  # which must tell its box
+        if name == "POSITION":  # which must have its bounds
             accessor["min"], accessor["max"] = (edge.tolist() for edge in (array.min(axis=0), array.max(axis=0)))
     described: dict[str, JsonValue] = {"attributes": numbers, "mode": mode}
     if indices is not None:

@@ -42,7 +42,7 @@ def frames_digest(root: Path, frames: Sequence[Frame]) -> str:
 
 
 def same_digest(one: str, other: str) -> bool:
-    """Whether two of `frames_digest` may be of the same frames, by what both of them tell."""
+    """Whether two of `frames_digest` may be of the same frames, by the parts that both have."""
     return all(a == b for a, b in zip(one.split("-"), other.split("-"), strict=False))
 
 
@@ -51,7 +51,7 @@ def _content_digests(root: Path, paths: Sequence[str]) -> dict[str, str | None]:
     try:
         manifest = read_manifest(root)
         written = (root / MANIFEST).stat().st_mtime_ns if manifest else 0
-    except (InputError, OSError):  # a broken one: files tell themselves
+    except (InputError, OSError):  # a broken one: files are hashed themselves
         manifest, written = {}, 0
     known = {path: manifest[path] for path in paths if path in manifest and _changed(root / path) <= written}
     others = [path for path in dict.fromkeys(paths) if path not in known]
@@ -89,7 +89,7 @@ def frame_names(frames: Sequence[Frame]) -> list[str]:
         stem = str(Path(frame.file_path).with_suffix("")).removeprefix("./").removeprefix("images/")
         stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem)[-MAX_NAME_LENGTH:].lstrip("._") or "frame"
         name, count = stem, 1
-        while name.lower() in taken:  # some file systems do not tell cases apart
+        while name.lower() in taken:  # some file systems ignore case
             count += 1
             name = f"{stem}_{count}"
         taken.add(name.lower())

@@ -19,8 +19,8 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
     shared: others that are shared may be in it.
 
     Raises InputError where another one is in it. The lock is on the folder itself and leaves nothing there. Where the
-    system or the file system cannot do that (Windows; NFS locks files alone) nobody is kept out; where the folder
-    cannot be made, whoever writes to it says why.
+    system or the file system cannot do that (Windows; NFS locks files alone) no process is kept out; where the folder
+    cannot be made, the first write to it says why.
     """
     descriptor = None
     with suppress(OSError):
@@ -47,7 +47,7 @@ def _lock(folder: Path, descriptor: int, kind: int) -> None:
 
 
 def _holder(inode: int) -> int | None:
-    """The process that has locked the file of this number, as Linux tells in /proc/locks; None where it does not.
+    """The process that has locked the file of this number, as Linux lists in /proc/locks; None where it does not.
 
     A line is: number, kind, ADVISORY, WRITE, process, device:inode, start, end (proc_locks(5)). Waiting ones have "->".
     """

@@ -61,7 +61,7 @@ def load_mesh(path: Path, kind: str | None = None) -> RawMesh:
 
 def _plain_ply(content: bytes) -> RawMesh | None:
     """A PLY file of corners, faces and colours alone, as datasets have. None where anything else is in it or it is not
-    whole, which trimesh then tells of: importing that takes half a second."""
+    whole, which trimesh then reports: importing that takes half a second."""
     header = _PLAIN_PLY.match(content)
     if header is None:
         return None
@@ -89,7 +89,7 @@ _PLAIN_PLY = re.compile(
 
 def _load_trimesh(path: Path, kind: str, content: bytes) -> RawMesh:
     """What trimesh makes of it."""
-    import trimesh  # here and below: half a second, that whoever reads no mesh need not wait
+    import trimesh  # here and below: importing takes half a second, wasted where no mesh is read
 
     try:
         check_header_counts(kind[1:], content)

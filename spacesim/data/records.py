@@ -208,7 +208,7 @@ class Frame:
 
     file_path: str  #: the image
     camera: Camera  #: of the image without its distortion
-    sun: Sun | None = None  #: None where nobody told it
+    sun: Sun | None = None  #: None where it is not known
     gt_path: str | None = None  #: EXR of all that `Truth` has
     shadow_path: str | None = None  #: PNG of shadow classes, see `Truth.shadow`
     silhouette_path: str | None = None  #: PNG, 255 where an object is

@@ -23,7 +23,7 @@ else:
 
 Keys = tuple[str | int, ...]  #: where a value is: names of tables and keys, numbers of what is in a list
 
-MAX_FILE_BYTES = 1 << 20  #: bytes: far more than anybody writes by hand
+MAX_FILE_BYTES = 1 << 20  #: bytes: far more than is written by hand
 _MAX_KEY_PARTS = 16  # parts of a key, nested tables that lines are kept of
 
 

@@ -135,7 +135,7 @@ def read_camera(path: Path) -> Camera:
 
 
 def read_views(path: Path) -> dict[str, Frame]:
-    """Cameras, lenses and Suns that a file like transforms.json tells, by its file paths, whether pictures are there or
+    """Cameras, lenses and Suns in a file like transforms.json, by its file paths, whether pictures are there or
     not; of a file of one camera (see `read_camera`), that alone under "". Frames without a pose are left out. Raises
     InputError where a key is missing or broken, and where there is no frame."""
     meta = read_object(path)

@@ -177,7 +177,7 @@ def evaluate(
                 [result.has_known_sun for result in results],
                 any(result.grazing is not None for result in results),
                 no_sweep,
-                known.untold,
+                known.why_unknown,
             ),
             *explain_objects(objects, records, models, swapped_order(run, dataset)),
         ],
@@ -310,7 +310,7 @@ def _prepare(out: Path) -> None:
 def summary(records: Iterable[Mapping[str, float | None] | None]) -> JsonDict | None:
     """{metric: {"mean", "std" of the population, "count" of frames that have it}, None if no frame has}.
 
-    Where records tell their `pixels`, measures over pixels have "pooled", too: over the pixels of all frames at once.
+    Where records have their `pixels`, measures over pixels have "pooled", too: over the pixels of all frames at once.
     None where every record is None: the group was not measured at all.
     """
     present = [record for record in records if record is not None]

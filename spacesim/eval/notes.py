@@ -70,7 +70,7 @@ def explain_ignored(share: float) -> list[str]:
 
 
 def explain_sensor(scene: JsonMapping) -> list[str]:
-    """A sentence where scene.json tells of a sensor with noise."""
+    """A sentence where scene.json has a sensor with noise."""
     try:
         sensor = scene["config"]["camera"]["sensor"]
         shot = [f"shot noise of a full well of {sensor['full_well_e']:g} electrons"] if sensor["shot_noise"] else []
@@ -92,15 +92,15 @@ def explain_other_data(trained: Path | None, aligned: Path | None) -> list[str]:
 
 
 def explain_light(
-    known_suns: Sequence[bool | None], by_grazing_angle: bool, no_sweep: str, untold: str = ""
+    known_suns: Sequence[bool | None], by_grazing_angle: bool, no_sweep: str, why_unknown: str = ""
 ) -> list[str]:
     """Sentences where what is said of the light is null.
 
     known_suns: of each frame, whether training has seen its Sun, or None; by_grazing_angle: whether there are numbers;
-    no_sweep: why one view under many Suns is null, "" where it is not;  untold: why it is not known what training has
-    seen, "" where it is
+    no_sweep: why one view under many Suns is null, "" where it is not;  why_unknown: why it is not known what
+    training has seen, "" where it is
     """
-    notes = _explain_suns(known_suns, untold)
+    notes = _explain_suns(known_suns, why_unknown)
     if not by_grazing_angle:
         notes.append("by_grazing_angle is null: the data has no path-traced truth.")
     return [*notes, no_sweep] if no_sweep else notes
@@ -133,10 +133,10 @@ def explain_objects(
     ]
 
 
-def _explain_suns(known_suns: Sequence[bool | None], untold: str) -> list[str]:
+def _explain_suns(known_suns: Sequence[bool | None], why_unknown: str) -> list[str]:
     definite = [is_known for is_known in known_suns if is_known is not None]
     if not definite:
-        reason = untold or "no evaluated frame or no training frame says where its Sun is"
+        reason = why_unknown or "no evaluated frame or no training frame says where its Sun is"
         return [f"known_suns and unseen_suns are null: {reason}."]
     notes = []
     if len(definite) < len(known_suns):

@@ -26,7 +26,7 @@ GROUPS = ("image", "shadow", "shadow_mask", "shadow_self_cast", "shadow_other_ca
 
 def object_names(dataset: Dataset, models: Sequence[str] = ()) -> dict[int, str]:
     """{number in the id images: name} of a dataset with more than one object; {} of others. models: names of as many
-    models, which are told instead of the dataset's own."""
+    models, used in place of the dataset's own."""
     objects = dataset.scene.get("objects")
     if not isinstance(objects, list) or len(objects) < 2:
         return {}
@@ -59,8 +59,8 @@ def object_groups(
 
 def swapped_order(run: "Predictor", dataset: Dataset) -> list[int]:
     """Numbers of the objects that a scene's models stand nearest to, in the models' order, where that is not the
-    objects' own, so that models are evaluated as other objects. [] of a run, and where all is in order or cannot be
-    told."""
+    objects' own, so that models are evaluated as other objects. [] of a run, and where all is in order or that is
+    unknown."""
     if not run.parts:
         return []
     try:
@@ -80,7 +80,7 @@ def compare_object_shapes(
     run: "Predictor", dataset: Dataset, names: Mapping[int, str], config: GeometryConfig | None
 ) -> dict[int, JsonDict | None]:
     """{number: "geometry" as metrics.json has it} of a composed scene's models, each alone against its object's part of
-    the true mesh; {} of a run, whose Gaussians belong to no object, and where models or mesh cannot be told apart.
+    the true mesh; {} of a run, whose Gaussians belong to no object, and where models or mesh cannot be separated.
 
     Raises InputError where the grid does not fit into memory.
     """

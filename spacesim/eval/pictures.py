@@ -17,7 +17,7 @@ ERROR_SCALE = 0.25
 FARTHEST_SHADE = 0.15  #: of the colour map at the farthest depth: the background alone is black
 
 WRONGLY_SHADOWED, WRONGLY_LIT = (213, 94, 0), (86, 180, 233)
-"""sRGB colours of shadow masks; the mistakes' are Okabe and Ito's, which colour-blind readers tell apart."""
+"""sRGB colours of shadow masks; the mistakes' are Okabe and Ito's, which colour-blind readers can distinguish."""
 
 ATTACHED, SELF_CAST, OTHER_CAST = (124, 130, 142), SHADOWED, (122, 78, 132)
 """sRGB colours of the kinds of true shadow."""

@@ -23,7 +23,7 @@ class TrainedOn:
     """What a run was trained on."""
 
     frames: Sequence[Frame]  #: () where they are gone or have changed
-    untold: str = ""  #: why nothing can be said then
+    why_unknown: str = ""  #: the reason why there are none
     other: Path | None = None  #: their folder, where they are not those of the dataset asked for
 
 
@@ -66,7 +66,7 @@ def rounded_angles(frame: Frame) -> list[float] | None:
 
 
 def _digest(dataset: Dataset) -> str | None:
-    """As training has told it; None where pictures of it are missing or cannot be read."""
+    """As training records it; None where pictures of it are missing or cannot be read."""
     try:
         return training_digest(dataset)
     except (OSError, InputError):

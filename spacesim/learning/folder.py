@@ -36,20 +36,20 @@ class TrainingData:
     """What a run says of its data."""
 
     path: str  #: of the folder
-    digest: str | None = None  #: see `training_digest`, of runs that tell it
+    digest: str | None = None  #: see `training_digest`, of runs that have it
     train_frames: int | None = None  #: how many there are to train on
     test_frames: int | None = None  #: how many there are to evaluate on
 
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """What a training loop tells of itself now and then."""
+    """What a training loop reports now and then."""
 
     iteration: int  #: how many are finished
     iterations: int  #: how many there will be
     loss: float  #: of the last one
     gaussian_count: int | None = None  #: None of a radiance field
-    seconds_left: float | None = None  #: as `TimeLeft` reckons it; None where nothing is known yet
+    seconds_left: float | None = None  #: as `TimeLeft` estimates it; None where nothing is known yet
     lower_bound: bool = False  #: whether it will take longer than that, as Gaussians are yet to join
 
     @property
@@ -174,7 +174,7 @@ def _check_resumable(out: Path, described: JsonDict, resume: bool, read_config: 
         raise
     data["path"] = described["data"]["path"]  # it may have moved
     if same_digest(str(data.get("digest")), described["data"]["digest"]):
-        data["digest"] = described["data"]["digest"]  # older versions told less
+        data["digest"] = described["data"]["digest"]  # older versions wrote less
     current = {**config.to_json(), "data": data}  # what an older version did not write is as by default
     difference = _first_difference(current, described)
     if difference is not None:
@@ -201,7 +201,7 @@ def _first_difference(old: JsonDict, new: JsonDict, within: str = "") -> tuple[s
 
 def _read_seconds(path: Path) -> dict[str, float]:
     """{iteration of a checkpoint, or "refinement": seconds}; {}, with a warning, where the file is damaged: only the
-    report tells of them."""
+    report shows them."""
     if not path.exists():
         return {}
     try:

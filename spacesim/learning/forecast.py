@@ -23,7 +23,7 @@ class Growth:
 
 @dataclass
 class TimeLeft:
-    """Of a training whose times it is told.
+    """Estimates the time left of a training from the times of finished steps.
 
     A step takes a + b N: pixels, as many as the schedule has then, and Gaussians, as many as there are; least squares
     find a and b, and newer times count more. N grows until `growth.ends` by the power of the iterations that leads from
@@ -41,7 +41,7 @@ class TimeLeft:
 
     @property
     def lower_bound(self) -> bool:
-        """Whether Gaussians will grow in number, and nobody knows how much, as none has joined yet."""
+        """Whether Gaussians will grow in number by an unknown amount, as none has joined yet."""
         if self.growth is None or not self.times:
             return False
         done, _, count = self.times[-1]

@@ -45,7 +45,7 @@ class TrainingLoop(ABC):
     config: Any  #: with `iterations`, `checkpoint_every`, `to_json`
     iteration: int  #: steps taken
     history: list[dict[str, float]]  #: iteration and loss now and then, of Gaussians their number
-    seconds: dict[str, float]  #: parts of training's time that the run tells apart, by their names
+    seconds: dict[str, float]  #: parts of training's time that the run distinguishes, by their names
 
     @abstractmethod
     def step(self) -> Float:
@@ -108,8 +108,8 @@ class TrainingLoop(ABC):
         self.iteration, self.history = header.iteration, [asdict(entry) for entry in header.history]
 
     def complete(self, out: Path, on_progress: Callable[[TrainingProgress], None], command: Sequence[str] = ()) -> None:
-        """Train from the newest checkpoint in `out` to the end, and write the run, its model last. command: what the
-        user typed."""
+        """Train from the newest checkpoint in `out` to the end, and write the run, its model last. command: the
+        command line, for the report."""
         newest = max(checkpoints(out), default=None)
         if newest is not None:
             self.restore(newest)

@@ -25,8 +25,8 @@ class CanPredict(Protocol):
 
 
 def checked_sun(sun: Sun | Sequence[float] | None, needed: bool, whose: str) -> Sun | None:
-    """The Sun that somebody has told, as `Sun.of` takes it. needed: by what is drawn, which `whose` names. Raises
-    InputError where it is needed and nobody has told."""
+    """The Sun that is given, as `Sun.of` takes it. needed: by what is drawn, which `whose` names. Raises InputError
+    where it is needed and none is given."""
     direction = Sun.of(sun)
     if direction is None and needed:
         raise InputError(f"sun: expected its direction for {whose}, found none")

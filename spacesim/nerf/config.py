@@ -25,7 +25,7 @@ class GridConfig:
 
     levels: int = 8  #: resolutions
     coarsest: int = 16  #: cells along the box's longest side, of the first level
-    #: of the last level, None: as many as pictures have pixels there, as finer ones learn each picture by heart; those
+    #: of the last level, None: as many as pictures have pixels there, as finer ones overfit to each picture; those
     #: between grow by one factor
     finest: int | None = None
     log2_size: int = 15  #: vertices that a level stores at most, as a power of 2; beyond that they share by a hash
@@ -55,7 +55,7 @@ class ProposalConfig:
 class NerfShadowConfig:
     """How a field shadows itself: by what it lets through towards the Sun, along a second ray from each surface."""
 
-    samples: int = 16  #: of that ray, of the field itself; 0: no shadows, what is told of the Sun has to do
+    samples: int = 16  #: of that ray, of the field itself; 0: no shadows, only the colour depends on the Sun
     bias: float = 0.03  #: of the box's longest side: where that ray begins, so that a surface does not shadow itself
 
     def __post_init__(self) -> None:
@@ -79,7 +79,7 @@ class NerfConfig:
     #: what colours of `nerf-relight` are given of Sun and view: their directions, or cosines about a normal that each
     #: place learns (`learning.reflectance`), which serve Suns never seen
     inputs: Literal["directions", "surface"] = "surface"
-    sun_harmonics: int = 1  #: of "directions", of the Sun's: more of them tell training's few Suns apart by heart
+    sun_harmonics: int = 1  #: of "directions", of the Sun's: more of them memorise training's few Suns
     shadow: NerfShadowConfig = field(default_factory=NerfShadowConfig)  #: of `nerf-relight`
     grid: GridConfig = field(default_factory=GridConfig)  #: what the field knows of places
     coarse: ProposalConfig = field(default_factory=ProposalConfig)  #: first round: reads evenly spaced samples

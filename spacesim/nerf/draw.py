@@ -59,7 +59,7 @@ def sample_field(
     density, color, _ = networks.field.look_up(own, point, direction, towards)
     if not networks.config.casts_shadows:
         return RaySamples(low, high, density, color)
-    assert towards is not None, "a field that is told the Sun"
+    assert towards is not None, "a field that takes the Sun"
     made = volume_weights(density * lengths, samples)
     seen = ray_visibility(networks, parameters, filled, extent, rays, made, low, high, towards)
     visibility = spread(seen, samples)
@@ -139,7 +139,7 @@ def draw(
     normals: bool,
 ) -> dict[str, np.ndarray]:
     """Planes of a picture by name, [H, W] or [H, W, 3] float32, depths in metres. Memory on the device is that of a
-    chunk of rays: raises MemoryError where these do not fit. sun: [3] towards it, of a field that is told"""
+    chunk of rays: raises MemoryError where these do not fit. sun: [3] towards it, of a field that takes it"""
     check_chunk(networks.config)
     left_out = {"normal": not normals, "visibility": not networks.config.casts_shadows}
     names = [name for name in PLANES if not left_out.get(name)]

@@ -94,7 +94,7 @@ class NerfRun:
         """What `camera` sees under a Sun: rgb, alpha, depth and normal as numpy arrays, drawn when they are asked for.
 
         sun: (azimuth, elevation) in degrees, a direction [3] towards it, or a Sun.  Raises InputError where a run needs
-        the Sun and none is told.
+        the Sun and none is given.
         """
         direction = Sun.of(sun)
         self._check(direction, None)
@@ -103,7 +103,7 @@ class NerfRun:
     def predict(
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> Prediction:
-        """Render one view. Raises InputError where the Sun matters and none is told, and for an exposure: colours are
+        """Render one view. Raises InputError where the Sun matters and none is given, and for an exposure: colours are
         sRGB values."""
         self._check(sun, exposure)
         drawn = self._draw(camera, sun, normals)
@@ -111,7 +111,7 @@ class NerfRun:
 
     def surface_depth(self, camera: Camera) -> np.ndarray:
         """[H, W] float32: depth in metres along the optical axis at which half of the light is gone, 0 where it is
-        not. A field that is told the Sun has one shape under all."""
+        not. A field that takes the Sun has one shape under all Suns."""
         drawn = self._draw(camera, Sun(np.array([0.0, 0.0, 1.0])), False)
         return np.where(drawn["alpha"] >= OPAQUE, drawn["median_depth"], np.float32(0))
 

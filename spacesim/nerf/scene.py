@@ -76,7 +76,7 @@ class FieldScene(ABC):
         exposure: float | None = None,
         on_chunk: Callable[[], None] | None = None,
     ) -> ComposedPrediction:
-        """Render one view. on_chunk: see `nerf.draw.chunks`. Raises InputError where the Sun matters and none is told,
+        """Render one view. on_chunk: see `nerf.draw.chunks`. Raises InputError where the Sun matters and none is given,
         and for an exposure."""
         self.stops(exposure)
         if sun is None and self.relightable:

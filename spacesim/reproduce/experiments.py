@@ -150,14 +150,14 @@ def figure_frames(size: Size) -> list[Work]:
 
 
 def figure_relighting(size: Size) -> list[Work]:
-    """Figure 4.2: what is told the Sun, what is not, and what is trained on views with the Sun behind them alone."""
+    """Figure 4.2: models with the Sun as input, without it, and trained on views with the Sun behind them alone."""
     relit: list[Work] = [_trained(size, name, "relight", parts=("suns",)) for name in ("thesis", size.light)]
     vanilla = _trained(size, "thesis", "vanilla", parts=("own", "suns"))
     return [*relit, replace(vanilla, name=VANILLA), replace(vanilla, name=FULLY_LIT, fully_lit=True)]
 
 
 def figure_fixed_sun(size: Size) -> list[Work]:
-    """Figures 4.3 and 4.4: what is trained under one Sun, and what is told the Sun."""
+    """Figures 4.3 and 4.4: a model trained under one Sun, and models with the Sun as input."""
     relit: list[Work] = [_trained(size, name, "relight", parts=("one-sun",)) for name in ("thesis", size.light)]
     return [_fixed_sun(size, "one-sun"), *relit]
 

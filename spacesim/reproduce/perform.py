@@ -175,7 +175,7 @@ def fully_lit_alone(dataset: Dataset, tolerance: tuple[float, float]) -> Dataset
 
 
 def draw_suns(run: "Predictor", dataset: Dataset, folder: Path) -> None:
-    """One view under many Suns, also of a run that is not told the Sun; with the truth where the dataset has it."""
+    """One view under many Suns, also of a run that does not take the Sun; with the truth where the dataset has it."""
     sweep = plan_sweep(dataset.test, dataset.frames)
     if sweep is None:
         raise WorkError(f"{dataset.root}: expected several Suns, found fewer than two")

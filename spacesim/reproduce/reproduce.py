@@ -205,7 +205,7 @@ def _reporting_to(path: Path, title: str, _unit: str) -> Iterator[ReportCallback
 
 
 def _progress_of(out: Path, work: Work) -> str:
-    """What an experiment under way on the cluster tells, "" of another."""
+    """The progress of an experiment under way on the cluster, "" of another."""
     try:
         return str(read_json(folder_of(out, work.name) / "progress.json"))
     except InputError:

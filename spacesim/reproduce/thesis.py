@@ -147,7 +147,7 @@ def holds(column: Column, values: Mapping[str, float | None], better: str, worse
 
 
 def pairs(column: Column, printed: Mapping[str, float], values: Mapping[str, float | None]) -> Sequence[bool]:
-    """Of each two rows that the thesis tells apart and that are there, whether ours stand in the thesis's order."""
+    """Of each two rows that the thesis distinguishes and that are there, whether ours stand in the thesis's order."""
     names = list(printed)
     ordered = [(a, b) for a in names for b in names if column.distance(printed[a]) < column.distance(printed[b])]
     return [verdict for a, b in ordered if (verdict := holds(column, values, a, b)) is not None]

@@ -22,8 +22,8 @@ SIZES = (1e-6, 1e10)
 """Metres that the longest side of an object's box may have."""
 
 FINEST = 1e-5
-"""Least size of an object, over how far the scene reaches from the world's origin. Chosen: the coordinates of meshes
-are written in single precision, whose steps are 6e-8 of them."""
+"""Least size of an object, over how far the scene reaches from the world's origin. Coordinates of meshes are written in
+single precision, whose steps are 6e-8 of them: an object has 160 steps or more."""
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ def _object(item: ObjectConfig, config: SceneConfig) -> SceneObject:
 
 
 def _from_file(item: ObjectConfig, config: SceneConfig) -> Spacecraft:
-    """The object's mesh file, what was dropped or changed in it told in the log."""
+    """The object's mesh file, what was dropped or changed in it is logged."""
     path = (config.folder or Path()) / item.mesh
     craft, report = read_mesh(path, item.units, item.up, two_sided=item.two_sided, replaced=tuple(item.materials))
     for line in report.lines():

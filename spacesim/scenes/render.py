@@ -127,7 +127,7 @@ class Renderer:
         """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]."""
         mi = backend.mitsuba()
         samples = spp * view.width * view.height
-        sampler = self._sampler.fork()  # a state that was there before must not be let go of in a recording
+        sampler = self._sampler.fork()  # a state that was there before must not be freed in a recording
         sampler.seed(noise.sampler, samples)
         index = dr.arange(mi.UInt32, samples)
         pixel = index // spp

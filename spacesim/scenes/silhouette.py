@@ -32,7 +32,7 @@ def _load(target: LabelledObject) -> mt.Scene:
     world = placed.astype(np.float32)
     faces = drawable_faces(world.astype(np.float64), target.faces)
     if len(faces) == 0:
-        raise InputError(f"object {target.id}: expected a mesh with an area, found none that single precision can tell")
+        raise InputError(f"object {target.id}: expected a mesh with an area, found none in single precision")
     mi = backend.mitsuba()
     mesh = mi.Mesh("target", len(world), len(faces))
     parameters = mi.traverse(mesh)

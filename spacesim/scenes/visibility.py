@@ -35,7 +35,7 @@ class Disc:
     ) -> tuple[Bool, Bool, mt.ShapePtr]:
         """From points [3, N] with their `normal` on the lit side; `active` says which of them are asked.
 
-        Returns for each point and direction, [N count], neighbouring lanes taking the same point: whether the Sun is
+        Returns for each point and direction, [N count], neighbouring elements taking the same point: whether the Sun is
         seen there, whether a shape hides it, and the pointer of that shape.
         """
         mi = backend.mitsuba()

@@ -36,7 +36,7 @@ class CameraClient:
     ) -> dict[str, np.ndarray]:
         """The arrays that were asked for, by name. sun: as for `Run.render`; options: exposure (EV), outputs=("rgb",
         "depth", ...), seed, see spacesim/serve/protocol.py. Raises InputError for what cannot be, WorkError where
-        nobody answers."""
+        no server answers."""
         lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
         fields = {"camera": {"world_from_camera": camera.world_from_camera.tolist(), **lens}, **options}
         if (towards := Sun.of(sun)) is not None:

@@ -44,7 +44,7 @@ class Served(Protocol):
         self, camera: Camera, sun: Sun | None, exposure: float | None, outputs: Sequence[Output], seed: int
     ) -> dict[str, np.ndarray]:
         """The arrays that `outputs` name, see `protocol.Output`. Raises InputError for what it does not have, where the
-        Sun matters and none is told, and for an exposure that cannot be."""
+        Sun matters and none is given, and for an exposure that cannot be."""
 
 
 def draw(

@@ -1,4 +1,4 @@
-"""What clients say and what they are told, in frames of ZeroMQ.
+"""Requests of clients and their answers, in frames of ZeroMQ.
 
 A request is one frame, a JSON object:
 
@@ -15,7 +15,7 @@ A request is one frame, a JSON object:
 An answer is a JSON object with version, id, seconds that drawing took, and arrays [{name, dtype, shape}], then a frame
 for each array: its numbers, little-endian, the last index fastest. What is served is one frame, with version, id,
 served (its name), kind ("scene" or "run"), spp (samples a pixel, of a scene) or method (of a run), relightable (whether
-it takes a Sun) and outputs (names of arrays that it has; a request for another is told them). A request that cannot be
+it takes a Sun) and outputs (names of arrays that it has; an error for another lists them). A request that cannot be
 met is answered by one frame, with version, id, and error, a sentence.
 """
 
@@ -57,7 +57,7 @@ Arrays = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class CameraFields:
-    """The camera of a request, see above. Raises InputError where a pose or a lens is missing or told twice."""
+    """The camera of a request, see above. Raises InputError where a pose or a lens is missing or given twice."""
 
     width: int  #: pixels
     height: int  #: pixels
@@ -110,7 +110,7 @@ class PictureRequest:
     """What is to be drawn."""
 
     camera: CameraFields | None = None  #: None: nothing, say what is served
-    #: azimuth and elevation, degrees, or a direction [3] towards it; None: not told
+    #: azimuth and elevation, degrees, or a direction [3] towards it; None: not given
     sun: tuple[float, ...] | None = None
     exposure: float | None = None  #: EV
     outputs: tuple[Output, ...] = ("rgb",)  #: names of the planes that are asked for
@@ -148,7 +148,7 @@ def read_request(frame: bytes) -> tuple[Identity, PictureRequest | InputError]:
         return number, structure(PictureRequest, Document("", values, {}), Rules())
     except InputError as error:
         return number, error
-    except RecursionError:  # brackets that can just be read, but not be told of
+    except RecursionError:  # brackets that can just be read, but not be shown in a message
         return number, InputError("request: expected a few brackets within each other, found hundreds")
 
 

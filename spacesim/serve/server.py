@@ -1,6 +1,6 @@
 """The socket: requests in, answers out, one after another on the thread that draws.
 
-One ROUTER socket speaks to clients of our own protocol (protocol.py) and to Basilisk (vizard.py): the first frame tells
+One ROUTER socket speaks to clients of our own protocol (protocol.py) and to Basilisk (vizard.py): the first frame shows
 which. ZeroMQ takes in the next requests and sends answers meanwhile, on a thread of its own; there it drops what is not
 its protocol, and of a message whose sender hangs up nothing arrives.
 """
@@ -62,7 +62,7 @@ class CameraServer:
                 self._answer_next()
 
     def close(self) -> None:
-        """Let go of the address; answers that were given are still sent for a second."""
+        """Release the address; answers that were given are still sent for a second."""
         self._socket.close()
         self._context.term()
 
@@ -119,7 +119,7 @@ class CameraServer:
             arrays = draw(self._served, camera, sun, request.exposure, request.outputs, request.seed)
         except (InputError, WorkError, MemoryError) as error:
             return protocol.error_answer(number, " ".join(str(error).split()))
-        except (ArithmeticError, ValueError) as error:  # what nobody foresaw ends this request alone
+        except (ArithmeticError, ValueError) as error:  # an unforeseen error ends this request alone
             _log.exception("serve: a request failed")
             return protocol.error_answer(number, f"request: it failed ({' '.join(str(error).split())})")
         return protocol.picture_answer(number, arrays, time.perf_counter() - start)
@@ -127,11 +127,11 @@ class CameraServer:
 
 def serve(served: Served, host: str, port: int, say: Callable[[str], None]) -> None:
     """Answer until Ctrl-C or SIGTERM; the picture that is being drawn is finished first, and a second one ends that,
-    too. say: told the address. Raises InputError as `CameraServer` does."""
+    too. say: called with the address. Raises InputError as `CameraServer` does."""
     server = CameraServer(served, host, port)
     try:
         if not ipaddress.ip_address(host_of(server.address)).is_loopback:
-            say(f"anybody who reaches {host} can ask for pictures; at 127.0.0.1 only this machine can")
+            say(f"any machine that can reach {host} can ask for pictures; at 127.0.0.1 only this machine can")
         say(f"serve: {served.names[0]} at {server.address} (Ctrl-C ends it)")
         with interrupts.defer_interrupts() as stopped:
             server.run(stopped)

@@ -79,7 +79,7 @@ class MountedCamera:
 
 
 class Simulation:
-    """What one Basilisk has told so far; the number of its frame makes the noise of path-traced pictures."""
+    """The state that one Basilisk has sent so far; the number of its frame makes the noise of path-traced pictures."""
 
     def __init__(self, served: Served) -> None:
         self._served = served

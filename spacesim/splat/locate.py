@@ -51,12 +51,12 @@ def locate(
     images: a dataset, whose poses are not looked at; a folder of pictures; or one picture
     start: a file like transforms.json with poses to start from, by file path or name; None or a picture that it lacks:
         searched for;  within: how far off these may be, see `refine_pose`
-    camera: a file with the intrinsics of pictures that neither a dataset nor `start` tells of: the first frame of a
-        transforms.json; None: that of the run's data;  sun: of all pictures, in place of what files tell
+    camera: a file with the intrinsics of pictures without any in a dataset or `start`: the first frame of a
+        transforms.json; None: that of the run's data;  sun: of all pictures, in place of those in files
     resume: keep what an interrupted call has found
 
-    Raises InputError where files cannot be read, where a run needs a Sun and none is told, or `out` is there and not to
-    be resumed, or of other work or cameras. What is wrong with one picture is told of that.
+    Raises InputError where files cannot be read, where a run needs a Sun and none is given, or `out` exists and is not
+    to be resumed, or of other work or cameras. An error of one picture is recorded for that picture.
     """
     check_gaussians(run)
     start_frames = {} if start is None else read_views(start)

@@ -117,7 +117,7 @@ class Predictor(Protocol):
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> Prediction:
         """Render one view. normals: predict these, too;  exposure: EV, of colours that are linear; by default that of
-        the training pictures. Raises InputError where the Sun matters and none is told, and for an exposure of colours
+        the training pictures. Raises InputError where the Sun matters and none is given, and for an exposure of colours
         that are sRGB values."""
 
 
@@ -206,7 +206,7 @@ class Run:
 
         sun: (azimuth, elevation) in degrees, a direction [3] towards it, or a Sun; a run that is not `relightable`
         knows the light of its pictures alone;  exposure: EV, of a run whose colours are linear
-        Raises InputError where a run needs the Sun and none is told.
+        Raises InputError where a run needs the Sun and none is given.
         """
         direction = checked_sun(sun, self.relightable, f"a run of {self.config['method']}")
         return Rendering(self, camera, direction, exposure)
@@ -225,7 +225,7 @@ class Run:
         """Render one view. A run that is not `relightable` knows one light: `sun` changes nothing. Where training
         pictures have embeddings, every view is drawn with their mean, but see `with_embedding`. exposure: EV, of a
         model whose colours are linear; by default that of its training pictures. Raises InputError where a relightable
-        run is not told the Sun, and for an exposure of a model whose colours are sRGB values."""
+        run gets no Sun, and for an exposure of a model whose colours are sRGB values."""
         stops_more = stops(self.curve, exposure, str(self.path))
         check_picture(camera)
         names = ("alpha", "depth", *(("normal",) if normals else ()))
@@ -288,7 +288,7 @@ def draw_lit(
     embedding: np.ndarray | None = None,
 ) -> RenderOutput:
     """A relit and shadowed frame on the device. features: colour (3 planes), then, of a model with shadows, visibility,
-    all premultiplied. sun: [3], unit, towards the Sun, None of a model that is not told;  outputs, antialiased: see
+    all premultiplied. sun: [3], unit, towards the Sun, None: the model takes none;  outputs, antialiased: see
     `render`;  embedding: of the picture, see `LightModel.shade_picture`"""
     colors, visibility = light.shade_picture(gaussians, camera, sun, embedding=embedding)
     visibilities = [] if visibility is None else [visibility]

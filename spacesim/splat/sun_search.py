@@ -6,7 +6,7 @@ what is turned away from the Sun says little, and one flat surface alone only ho
 
 Shape alone, by alternation (`ShapeSearch`): surfaces are Lambertian, their albedo at first the mean colour of all
 pictures times the number that suits them best, then what the Suns found so far leave. All pictures share one exposure,
-as brightness tells the angle: too large an albedo would put all Suns too low.
+as brightness determines the angle: too large an albedo would put all Suns too low.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ BLOCK = 8.0  #: pixels of a small picture whose errors count as one
 COVERED = 0.5  #: least alpha of a pixel that counts
 AMBIENT = 0.02  #: light that comes from everywhere, as a share of the Sun's
 #: of a surface's n . s times visibility over the Suns of pictures, one of these: a quarter under Suns all round without
-#: shadows, more where nobody takes pictures against the Sun
+#: shadows, more where no picture is taken against the Sun
 MEAN_COSINES = 0.14, 0.2, 0.28, 0.4, 0.56
 ALTERNATIONS = 2  #: of Suns and albedo
 RINGS = 8.0, 3.0  #: degrees about the best Sun, at which a paraboloid is fitted
@@ -104,7 +104,7 @@ def block_means(values: np.ndarray, factor: int) -> np.ndarray:
 
 
 class SunFinder:
-    """Finds Suns of pictures by a model that is told the Sun.
+    """Finds Suns of pictures by a model that takes the Sun as input.
 
     gaussians, light: the model;  antialiased: whether it is drawn so;  curve: as `Run.curve`
     """
@@ -233,7 +233,7 @@ class _LitSurface:
 
 
 class ShapeSearch:
-    """Suns of many pictures by the Gaussians of a training that was told none.
+    """Suns of many pictures by the Gaussians of a training without known Suns.
 
     gaussians: their colours are the mean of all pictures;  distance: metres, of the farthest camera
     """

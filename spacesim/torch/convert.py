@@ -75,7 +75,7 @@ def rows(values: list[NumberT], size: int, count: int, capacity: int | None = No
 
 def as_base(tensor: Tensor) -> Tensor:
     """The same memory, shape and strides, but to torch no view of another tensor: what an operation of torch's returns
-    may then be changed in place by whoever called it."""
+    may then be changed in place by the caller."""
     base = torch.empty(0, dtype=tensor.dtype, device=tensor.device)
     return base.set_(tensor.untyped_storage(), tensor.storage_offset(), tensor.shape, tensor.stride())
 

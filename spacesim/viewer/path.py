@@ -167,7 +167,7 @@ class Player:
         self._thread.start()
 
     def stop(self) -> None:
-        """End early; `done` is told all the same."""
+        """End early; `done` is called all the same."""
         self._ended.set()
 
     def _run(self) -> None:

@@ -176,14 +176,14 @@ def _backend_fact(renderer: SceneRenderer) -> str:
 
 
 def serve(setup: ViewerSetup, host: str, port: int, say: Callable[[str], None]) -> None:
-    """Show models until Ctrl-C. say: told where to look. Raises InputError as `Viewer` does."""
+    """Show models until Ctrl-C. say: called with the address. Raises InputError as `Viewer` does."""
     viewer = Viewer(setup, host, port)
     try:
         viewer.start()
         if port not in (0, viewer.port):
             say(f"port {port} is taken, {viewer.port} takes its place")
         if not address.is_loopback(host):
-            say(f"anybody who reaches {host} can look and change the scene; at 127.0.0.1 only this machine can")
+            say(f"any machine that can reach {host} can look and change the scene; at 127.0.0.1 only this machine can")
         say(f"viewer: {viewer.url} (Ctrl-C ends it)")
         while True:
             time.sleep(3600)

@@ -186,7 +186,7 @@ class Session:
         return next((share for share in STEPS if share > last.share), last.share) if full else last.share
 
     def _is_stale(self, view: ViewerCamera, state: SceneState, settings: DisplaySettings, full: bool) -> bool:
-        """Whether nobody waits for a picture any more: its client has gone, or, of one at rest, sees another one."""
+        """Whether no client waits for a picture: it has gone, or, of a picture at rest, it sees another one."""
         with self._lock:
             if self._closed or not full:
                 return self._closed

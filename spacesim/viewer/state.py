@@ -55,7 +55,7 @@ class ViewerCamera:
 
 
 def parse_viewer_camera(wxyz: Any, position: Any, fov: Any, width: Any, height: Any) -> ViewerCamera | None:
-    """The view that a client tells, or None where that is nonsense."""
+    """The view that a client sends, or None where that is invalid."""
     try:
         turn, place = np.array(wxyz, dtype=np.float64), np.array(position, dtype=np.float64)
         if turn.shape != (4,) or place.shape != (3,) or not _is_rotation(turn):
@@ -68,7 +68,7 @@ def parse_viewer_camera(wxyz: Any, position: Any, fov: Any, width: Any, height: 
 
 
 def _is_rotation(quaternion: Array) -> bool:
-    """Whether [4] is about as long as a quaternion that a browser tells."""
+    """Whether [4] is about as long as a quaternion that a browser sends."""
     return bool(np.abs(quaternion).max() < 2 and 0.5 < np.linalg.norm(quaternion) < 2)
 
 
@@ -106,7 +106,7 @@ class SceneState:
     """How the scene stands."""
 
     poses: tuple[Pose, ...]  #: world_from_model of each model
-    sun: Sun | None  #: None where nobody has said
+    sun: Sun | None  #: None where none is given
 
     def with_pose(self, index: int, pose: Pose) -> "SceneState":
         """With another pose of model `index`."""
@@ -130,7 +130,7 @@ class SharedScene:
     _listeners: list[Callable[[SceneState], None]] = field(default_factory=list)
 
     def change(self, change: Callable[[SceneState], SceneState]) -> SceneState:
-        """Put `change` of the scene in its place and tell the listeners, where it is another one."""
+        """Put `change` of the scene in its place and call the listeners, where it is another one."""
         with self._lock:
             before, self.state = self.state, change(self.state)
             now, listeners = self.state, tuple(self._listeners)
@@ -140,7 +140,7 @@ class SharedScene:
         return now
 
     def listen(self, listener: Callable[[SceneState], None]) -> None:
-        """From now on tell `listener` of changes, on the thread that makes them."""
+        """Call `listener` on changes from now on, on the thread that makes them."""
         with self._lock:
             self._listeners.append(listener)
 

@@ -68,7 +68,7 @@ def test_a_link_is_followed(tmp_path, there):
 def test_a_pipe_is_written_into_where_somebody_reads_it(tmp_path):
     pipe, content, found = tmp_path / "pipe", os.urandom(300_000), list[bytes]()
     os.mkfifo(pipe)
-    with pytest.raises(InputError, match="expected a pipe that somebody reads"):
+    with pytest.raises(InputError, match="expected a pipe with a reader"):
         write_bytes(pipe, content)
     descriptor = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
     os.set_blocking(descriptor, True)

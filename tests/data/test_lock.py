@@ -1,4 +1,4 @@
-"""A lock of a folder: who is kept out, and where nobody can be."""
+"""A lock of a folder: which processes are kept out, and where none can be."""
 
 import errno
 import os

@@ -61,8 +61,9 @@ def test_known_suns_are_those_of_the_runs_own_data(tmp_path):
 
     def known(dataset):
         trained = training_frames(config, dataset)
-        assert trained.other == (None if dataset.root.name in ("own", "moved") and not trained.untold else own.root)
-        return known_suns([frame((30, 20)), frame((200, -40))], trained.frames), trained.untold
+        is_own = dataset.root.name in ("own", "moved") and not trained.why_unknown
+        assert trained.other == (None if is_own else own.root)
+        return known_suns([frame((30, 20)), frame((200, -40))], trained.frames), trained.why_unknown
 
     assert known(own) == ([True, False], "")
     assert known(other) == ([True, False], "")  # not what the evaluated data would say

@@ -53,7 +53,7 @@ def test_cpp(traced, tmp_path):
     assert [array["name"] for array in json.loads(header)["arrays"]] == ["rgb", "depth"]
     assert depth == f"depth in the middle: {drawn['depth'][32, 32]:.3f} m"
     refused = subprocess.run([program, "nowhere", picture], capture_output=True, text=True)
-    assert (refused.returncode, refused.stderr) == (1, "nobody answers\n")
+    assert (refused.returncode, refused.stderr) == (1, "no answer\n")
 
 
 def test_plain_tcp(traced):

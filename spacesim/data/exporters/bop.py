@@ -5,7 +5,7 @@
                                       rgb/  depth/  mask/  mask_visib/
 
 models_eval has the same shapes with vertices all over them, at most some 10,000, as errors are measured at vertices.
-models_info.json tells symmetries: see `symmetries`.
+models_info.json has symmetries: see `symmetries`.
 
 A point p of a model is at cam_R_m2c p + cam_t_m2c in the camera, in millimetres, the axes OpenCV's. In BOP's rendered
 datasets the centres of pixels have whole coordinates, so cam_K's principal point is half a pixel less than ours.

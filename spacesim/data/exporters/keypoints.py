@@ -77,8 +77,8 @@ def body_labels(
 ) -> list[BodyLabels]:
     """Of all `targets`, in their order; objects of one shape have the same.
 
-    given: how many keypoints are to be found, or a file that tells them; None is keypoints.json beside the mesh, else
-    `COUNT`. What the file does not tell is found. Raises InputError where the file is broken or names other objects.
+    given: how many keypoints are to be found, or a file that defines them; None is keypoints.json beside the mesh, else
+    `COUNT`. What the file lacks is found. Raises InputError where the file is broken or names other objects.
     """
     entries: dict[int, BodyLabels] = {}
     path = given if isinstance(given, Path) else dataset.root / NAME

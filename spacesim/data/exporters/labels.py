@@ -1,4 +1,4 @@
-"""What is told of the objects in each picture as it is stored: masks, boxes, keypoints."""
+"""The labels of the objects in each picture as it is stored: masks, boxes, keypoints."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -45,10 +45,10 @@ class Category:
 
 
 class DatasetLabeller:
-    """Labels of the frames of a dataset, whose mesh tells what hides what.
+    """Labels of the frames of a dataset, whose mesh decides what hides what.
 
     keypoints: how many are to be found, or a file: see `body_labels`. Raises InputError where scene.json or mesh.ply do
-    not tell the objects, or the file is broken.
+    not name the objects, or the file is broken.
     """
 
     def __init__(self, dataset: Dataset, keypoints: int | Path | None = None) -> None:

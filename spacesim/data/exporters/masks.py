@@ -27,8 +27,8 @@ def bounding_box(pixels: np.ndarray, origin: tuple[int, int] = (0, 0)) -> tuple[
 
 
 def run_lengths(mask: np.ndarray) -> Rle:
-    """A mask [H, W] bool by the lengths of its runs, column after column, the first of what is not set. Each is told
-    less the one before the last, five bits a character, as pycocotools has it."""
+    """A mask [H, W] bool by the lengths of its runs, column after column, the first of what is not set. Each is
+    written less the one before the last, five bits a character, as pycocotools has it."""
     flat = np.asarray(mask, bool).ravel(order="F")
     ends = np.flatnonzero(np.diff(flat)) + 1
     counts = np.diff(np.r_[0, ends, flat.size]).tolist()

@@ -42,7 +42,7 @@ class LabelledObject:
 
 
 def labelled_objects(dataset: Dataset) -> list[LabelledObject]:
-    """The objects of a dataset. Raises InputError where scene.json or mesh.ply do not tell them apart."""
+    """The objects of a dataset. Raises InputError where scene.json or mesh.ply do not distinguish them."""
     path = dataset.root / "scene.json"
     try:
         objects, counts = dataset.scene["objects"], dataset.scene["mesh"]

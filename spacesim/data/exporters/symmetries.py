@@ -28,8 +28,8 @@ def find_symmetries(
     """(discrete ones as 16 numbers each, identity left out; continuous ones) of a mesh's shape: colours do not count.
 
     vertices: [V, 3], faces: [F, 3]. Axes tried go through the surface's centre of area: the body frame's and those
-    between them, 13 in all, and the principal ones. About a continuous axis nothing discrete is told, and of those that
-    turn such an axis round one is enough.
+    between them, 13 in all, and the principal ones. About a continuous axis no discrete one is listed, and of those
+    that turn such an axis round one is enough.
     """
     vertices = np.asarray(vertices, np.float64)
     faces = drawable_faces(vertices, np.asarray(faces, np.int64))

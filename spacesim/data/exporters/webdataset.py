@@ -3,7 +3,7 @@
     DIR/train-000000.tar, val-000000.tar   of each frame: NAME.png  NAME.id.png  NAME.depth.png  NAME.json
     DIR/keypoints.json                     the keypoints in 3D: see `keypoints`
 
-NAME.png is the picture over black, id.png its object numbers, depth.png the dataset's depth. The JSON tells the camera,
+NAME.png is the picture over black, id.png its object numbers, depth.png the dataset's depth. The JSON has the camera,
 the Sun, metres a step of depth, and of each object seen its pose (OpenCV's axes, metres), box, area, RLE mask and
 keypoints (pixels, the first one's centre at 0.5, 0.5; 2 seen, 1 hidden, 0 not in the picture).
 """

@@ -5,8 +5,8 @@
 
 A line an instance, numbers from 0 to 1 of the picture's width and height: class, then the box (middle x, y, width,
 height), or the outline (x, y, ...), or the box and of each keypoint x, y and visibility: 2 seen, 1 hidden, 0 not in the
-picture. val is our test split. Pictures are one file under three names where the disk allows. No flip_idx is told: a
-mirrored spacecraft is another one, so Ultralytics does not mirror pictures for poses.
+picture. val is our test split. Pictures are one file under three names where the disk allows. No flip_idx is written:
+a mirrored spacecraft is another one, so Ultralytics does not mirror pictures for poses.
 """
 
 import os

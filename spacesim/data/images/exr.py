@@ -104,7 +104,7 @@ def _count_exr_parts(content: bytes) -> int | None:
 
 
 def _exr_size(content: bytes) -> tuple[int, int]:
-    """(width, height), pixels, of the largest part of an EXR file; (0, 0) where no header tells."""
+    """(width, height), pixels, of the largest part of an EXR file; (0, 0) where no header says."""
     largest, position = (0, 0), 8
     try:
         while content[position]:
@@ -119,7 +119,7 @@ def _exr_size(content: bytes) -> tuple[int, int]:
 
 
 def walk_exr_header(content: bytes, position: int) -> tuple[int, int]:
-    """(number of chunks that the header at `position` tells, position after it)."""
+    """(number of chunks in the header at `position`, position after it)."""
     attributes, position = _exr_attributes(content, position)
     return struct.unpack("<i", attributes[b"chunkCount"])[0], position
 

@@ -136,7 +136,7 @@ def _find_pictures(
 def _start_points(
     folder: Path, model: ColmapModel, images: Sequence[ColmapImage]
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Points and colours that the images see, or all where no image tells, without those that lie absurdly far out."""
+    """Points and colours that the images see, or all where none are listed, without those that lie absurdly far out."""
     seen = np.concatenate([image.points for image in images])
     chosen = np.isin(model.numbers, seen) if len(seen) else np.ones(len(model.numbers), bool)
     points, colors = model.points[chosen], model.colors[chosen]

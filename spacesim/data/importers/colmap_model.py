@@ -54,7 +54,7 @@ def holds_model(folder: Path) -> bool:
 
 
 def count_images(folder: Path) -> int:
-    """Of the model in a folder, 0 where its file does not tell."""
+    """Of the model in a folder, 0 where its file does not say."""
     try:
         if (folder / "images.bin").is_file():
             with (folder / "images.bin").open("rb") as file:

@@ -4,7 +4,7 @@ and SPEED (M. Kisantal et al., "Satellite pose estimation challenge", 2020) as d
     SRC/camera.json                              Nu Nv cameraMatrix distCoeffs, or fx fy ppx ppy ccx ccy
     SRC/synthetic/{train,validation}.json        [{filename, q_vbs2tango_true, r_Vo2To_vbs_true}, ...]
     SRC/{lightbox,sunlamp}/test.json
-    SRC/DOMAIN/images/FILENAME                   and SRC/DOMAIN/masks/FILENAME where somebody has made them
+    SRC/DOMAIN/images/FILENAME                   and SRC/DOMAIN/masks/FILENAME where these exist
     SRC/train.json, SRC/images/train/FILENAME    SPEED's, whose quaternion is q_vbs2tango
 
 A point p of the body is at R(q) p + r in the camera: q is scalar-first, r in metres, the axes OpenCV's. The dataset's

@@ -189,7 +189,7 @@ def _write(out: Path, picture: Picture, name: str) -> str:
         raise InputError(f"{name}: expected a name below the dataset's folder, found another")
     if isinstance(picture, Path):
         content = read_bytes(picture, "a picture")
-        read_png(picture, content)  # raises where it is cut off, which its header does not tell
+        read_png(picture, content)  # raises where it is cut off, which its header does not show
         write_bytes(out / name, content, durable=False)
     else:
         write_png(out / name, picture(), durable=False)

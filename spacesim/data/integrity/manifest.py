@@ -67,7 +67,7 @@ def check_unlisted(path: Path) -> None:
             continue
         try:
             listed = read_manifest(folder)
-        except InputError:  # of somebody else, or damaged, which `verify` tells
+        except InputError:  # of another program, or damaged, which `verify` reports
             continue
         if target.relative_to(folder).as_posix() in listed:
             raise InputError(f"{path}: expected a file that is no dataset's own, found one of {folder}")

@@ -146,7 +146,7 @@ class ExteriorView:
 
     def _visible_side(self, points: Array, normals: Array) -> np.ndarray:
         """[N] int8: the first direction in which nothing is in the way, as the sign of its cosine with the normal; 0
-        where there is none. A lane a point."""
+        where there is none. A thread a point."""
         if len(points) == 0:
             return np.zeros(0, np.int8)
         mi = backend.mitsuba()

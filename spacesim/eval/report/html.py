@@ -17,7 +17,7 @@ from spacesim.data.images import read_png
 from spacesim.eval.report.style import STYLE
 
 SERIES = 6
-"""Number of colours that tell runs apart; more runs take them in turn."""
+"""Number of colours that distinguish runs; more runs take them in turn."""
 
 
 def escape(value: object) -> str:

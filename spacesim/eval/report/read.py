@@ -72,7 +72,7 @@ def read_evals(folders: Sequence[Path]) -> list[Evaluation]:
 def by_data(runs: Sequence[Evaluation]) -> list[list[Evaluation]]:
     """The runs that were evaluated on the same frames, together, in their order; each numbered within its group.
 
-    Frames are known by their digest; where a file does not tell it, those of one folder and split are the same. What
+    Frames are known by their digest; where a file lacks it, those of one folder and split are the same. What
     "image" is over must be the same, too.
     """
     groups: list[list[Evaluation]] = []

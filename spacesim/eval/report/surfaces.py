@@ -155,5 +155,5 @@ def _distance(geometry: JsonMapping, factor: float, unit: str) -> str:
 
 
 def _unit(size: float) -> tuple[float, str]:
-    """What lengths of an object of `size` metres are told in: a factor and its name."""
+    """The unit for lengths of an object of `size` metres: a factor and its name."""
     return (1e3, "mm") if size < 50 else (1.0, "m")

@@ -19,7 +19,7 @@ _TABLES: tuple[tuple[str, tuple[Metric, ...], tuple[str, ...], tuple[Metric, ...
     ("Shadow by predicted visibility", SHADOW_MASK, ("shadow_mask",), SHADOW_MASK),
     ("Each kind of shadow by predicted visibility", SHADOW_KIND, tuple(KINDS), (RECALL,)),
 )
-"""Caption, columns, groups, and the columns whose meaning is told."""
+"""Caption, columns, groups, and the columns that are explained."""
 
 _OBJECT_TABLES: tuple[tuple[str, str, tuple[Metric, ...]], ...] = (
     ("image", "image", IMAGE),
@@ -53,7 +53,7 @@ def results(runs: Sequence[Evaluation]) -> str:
 
 
 def results_by_suns(runs: Sequence[Evaluation]) -> str:
-    """HTML of two tables: views of known Suns, and views of Suns never seen; "" where no run tells them apart."""
+    """HTML of two tables: views of known Suns, and views of Suns never seen; "" where no run distinguishes them."""
     if not any(run.metrics.get(suns) for run in runs for suns in ("known_suns", "unseen_suns")):
         return ""
     psnr, ssim, lpips, flip = (metric_of(key, IMAGE) for key in ("psnr", "ssim", "lpips", "flip"))
@@ -79,7 +79,7 @@ def results_by_suns(runs: Sequence[Evaluation]) -> str:
 
 
 def by_object(runs: Sequence[Evaluation]) -> str:
-    """HTML: of each object the tables 4.6 and 4.7, a row for each run; "" where no run tells objects apart."""
+    """HTML: of each object the tables 4.6 and 4.7, a row for each run; "" where no run distinguishes objects."""
     every = [entry for run in runs for entry in run.metrics.get("objects") or []]
     numbers = sorted({entry["id"] for entry in every})
     parts = []

@@ -35,7 +35,7 @@ class DensityTape:
 
 @dataclass(frozen=True)
 class DensityField:
-    """Density, and numbers that tell a colour network of the place."""
+    """Density, and features of the place for a colour network."""
 
     grid: HashGrid  #: what is known of places
     #: the network: what the grid says of a place in, the logarithm of the density and the other numbers out
@@ -91,20 +91,20 @@ class FieldTape:
     color: list[Float]  #: [N] each
     normal: Array3f | None  #: [3, N] of any length, where there are some
     view: Array3f  #: [3, N]
-    sun: Array3f | None  #: [3, N], where the field is told
+    sun: Array3f | None  #: [3, N], where the field takes it
 
 
 @dataclass(frozen=True)
 class RadianceField:
-    """Density and colour of a radiance field. The colour is told the direction of the view, and of the Sun where the
-    method is, or in place of both the cosines about a normal, which is three of the density network's numbers."""
+    """Density and colour of a radiance field. The colour takes the view's direction as input, and the Sun's where
+    the method does, or in place of both the cosines about a normal, three of the density network's outputs."""
 
     density: DensityField  #: its density, and the numbers that the colour network reads
     color: MlpShape  #: the network: features, view and Sun in, three colours out, of a field with shadows six
     features: int  #: numbers of a place that the colour network reads
     harmonics: int  #: degree, of the view's direction
-    sun_harmonics: int | None  #: degree, of the Sun's; None of a field that is not told
-    has_normals: bool  #: the colour is told cosines
+    sun_harmonics: int | None  #: degree, of the Sun's; None: the field does not take it
+    has_normals: bool  #: the colour takes cosines as input
 
     @staticmethod
     def of(config: NerfConfig) -> "RadianceField":
@@ -129,10 +129,10 @@ class RadianceField:
         return [*self.density.initial(rng), *mlp.initial_weights(self.color, rng)]
 
     def directions(self, view: Array3f, sun: Array3f | None) -> list[Float]:
-        """What the colour network is told of directions [3, N], unit: real spherical harmonics."""
+        """The colour network's inputs for directions [3, N], unit: real spherical harmonics."""
         terms = list(dr.sh_eval(view, self.harmonics))
         if self.sun_harmonics is not None:
-            assert sun is not None, "a field that is told the Sun"
+            assert sun is not None, "a field that takes the Sun"
             terms += dr.sh_eval(sun, self.sun_harmonics)
         return [ad.Float(term) for term in terms]
 
@@ -142,13 +142,13 @@ class RadianceField:
         """(density [N] per side, colour, 3 Floats [N] in 0 to 1, tape) at points [3, N]; of a field that casts shadows
         colour in the Sun, then in the shade, 6 Floats.
 
-        view, sun: [3, N] unit, from the camera and towards the Sun; None of a field that is not told
+        view, sun: [3, N] unit, from the camera and towards the Sun; None: the field does not take it
         """
         density, output, tape = self.density.look_up(parameters[: self.split], point)
         features = [row(output, 1 + i) for i in range(output.shape[1] - 1)]
         normal = None
         if self.has_normals:
-            assert sun is not None, "a field that is told the Sun"
+            assert sun is not None, "a field that takes the Sun"
             normal = ad.Array3f(*features[self.features :])
             directions = surface_cosines(normal, view, sun)
         else:
@@ -180,7 +180,7 @@ class RadianceField:
 def _cosines_adjoint(tape: FieldTape, gradients: list[Float]) -> Array3f:
     """[3, N] gradient by the normals, from those [N] by the cosines."""
     assert tape.normal is not None, "a field with normals"
-    assert tape.sun is not None, "a field that is told the Sun"
+    assert tape.sun is not None, "a field that takes the Sun"
     normal = ad.Array3f(tape.normal)
     dr.enable_grad(normal)
     cosines = surface_cosines(normal, tape.view, tape.sun)

@@ -16,7 +16,7 @@ PADDING = 0.05  #: of the samples of a round, at most, that are spread over all 
 
 
 def step_key(seed: int, step: int) -> int:
-    """What `random` is told in a step of a training."""
+    """The key of `random` in a step of a training."""
     return int(np.random.SeedSequence([seed, 4, step]).generate_state(1)[0])
 
 

@@ -31,7 +31,7 @@ class Pixels:
     view: UInt32  #: [P] number of the picture
     count: UInt32  #: of width 1, P
     cameras: Float  #: [V * 16] see `rays.camera_rows`
-    suns: Float  #: [V * 3] towards the Sun, unit; 0 where the field is told nothing of it
+    suns: Float  #: [V * 3] towards the Sun, unit; 0 where the field does not take it
     extent: Float  #: [3] of the box
 
 

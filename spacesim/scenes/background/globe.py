@@ -9,9 +9,9 @@ atmospheres", Space Science Reviews 16, 1974):
 
 and beyond the limb along a chord at the tangent height h, of optical depth tau exp(-h / H) sqrt(2 pi R / H).
 
-Albedos are chosen within what T. R. Oke, "Boundary Layer Climates", 2nd edition, 1987, table 1.1, gives for the whole
-solar spectrum (water 0.03 to 0.10, forests 0.05 to 0.20, desert 0.20 to 0.45, snow 0.40 to 0.95); their colours are
-chosen. How much is land and how much is under clouds follows what is known of the Earth: 29 % and 67 % (M. D. King et
+Albedos are within what T. R. Oke, "Boundary Layer Climates", 2nd edition, 1987, table 1.1, gives for the whole
+solar spectrum (water 0.03 to 0.10, forests 0.05 to 0.20, desert 0.20 to 0.45, snow 0.40 to 0.95); their hues are
+assumed. How much is land and how much is under clouds follows what is known of the Earth: 29 % and 67 % (M. D. King et
 al., "Spatial and temporal distribution of clouds observed by MODIS", IEEE TGRS 51, 2013).
 """
 

@@ -102,5 +102,5 @@ R = TypeVar("R")
 
 def record_on_cuda(function: Callable[P, R]) -> Callable[P, R]:
     """`function`, recorded once and replayed on CUDA. On LLVM it is traced anew, which takes 5 % of a frame there:
-    whatever Embree scene or numpy array somebody lets go of in the middle of a recording would end the process."""
+    an Embree scene or a numpy array that is freed in the middle of a recording would end the process."""
     return backend.recorded(function, limit=RECORDINGS, elements=None) if backend.select() == "cuda" else function

@@ -160,7 +160,7 @@ def check_phases(least: float | None, most: float | None) -> None:
 
 def plan(rig: Rig, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
     """The training and the test views of a rig. Random streams are derived from (seed, purpose, index). Raises
-    InputError where a rig of somebody's own gives something else, or no training view."""
+    InputError where a user-defined rig gives something else, or no training view."""
     views = rig.views_of(target, camera, seed)
     if not (
         isinstance(views, tuple | list) and len(views) == 2 and all(isinstance(some, list | tuple) for some in views)

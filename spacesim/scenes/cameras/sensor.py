@@ -18,8 +18,8 @@ _MAX_ELECTRONS = 1e12  # far above any full well; Poisson numbers end at 2^63
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """A sensor that records the linear image. Raises InputError for a value out of range. The defaults are chosen: a
-    quiet CMOS sensor of 12 bits."""
+    """A sensor that records the linear image. Raises InputError for a value out of range. The defaults
+    describe a generic low-noise CMOS sensor of 12 bits."""
 
     psf_sigma_px: float = 0.0  #: standard deviation of a Gaussian point spread function, pixels
     full_well_e: float = 10_000.0  #: electrons at which a pixel is full, which is also what a display value of 1 makes

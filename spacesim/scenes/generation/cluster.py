@@ -27,9 +27,9 @@ from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, cores,
 
 MAX_FRAMES = 16  #: of a task
 RETRIES = 3  #: times that a task is repeated after its process or its machine has died
-CPUS, GPUS = 4, 0.25  #: of a task, at most: chosen, so that encoding keeps a GPU fed and scenes are seldom loaded
+CPUS, GPUS = 4, 0.25  #: of a task, at most: encoding keeps a GPU busy, and scenes are seldom loaded
 WINDOW = 4  #: tasks handed to the cluster ahead for each that can run
-TOLD_EVERY = 5.0  #: seconds of waiting after which whoever waits is told
+REPORT_EVERY = 5.0  #: seconds between two calls of `waiting`, at most
 
 Load = Callable[[Any, int], Callable[[Any], Any]]
 """(what all tasks need, threads) to what does a task: called once in each process of the cluster."""
@@ -52,7 +52,7 @@ class ClusterWork:
 
 @dataclass(frozen=True, eq=False)
 class _WorkerSetup:
-    """What processes of the cluster are told."""
+    """The setup that processes of the cluster receive."""
 
     work: ClusterWork
     backend: str
@@ -123,7 +123,7 @@ def run_on_cluster(
     left = iter(parcels(places))
     running = [task.remote(key, [sent], parcel) for parcel in islice(left, WINDOW * places)]
     while running:
-        ready, running = ray.wait(running, timeout=TOLD_EVERY)
+        ready, running = ray.wait(running, timeout=REPORT_EVERY)
         waiting()
         running += [task.remote(key, [sent], parcel) for parcel in islice(left, len(ready))]
         for done in ready:
@@ -165,7 +165,7 @@ def _task_resources(ray: ModuleType, share: float) -> tuple[float, float, int]:
     if backend.select() == "llvm":
         return cpus, 0, max(1, places)
     if not total.get("GPU"):
-        raise InputError("ray: expected GPUs in the cluster, as the backend cuda has been chosen, found none")
+        raise InputError("ray: expected GPUs in the cluster, as the backend is cuda, found none")
     return cpus, share, max(1, min(places, int(total["GPU"] / share)))
 
 

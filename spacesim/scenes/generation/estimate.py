@@ -48,7 +48,7 @@ def samples(specs: Sequence[FrameSpec]) -> list[FrameSpec]:
 
 
 def measure(maker: FrameMaker, specs: Sequence[FrameSpec], left: Sequence[FrameSpec], root: Path) -> Estimate:
-    """Make `specs` and reckon from them what those that are `left` in `root` take: time by samples, disk by frames."""
+    """Make `specs` and estimate from them what those `left` in `root` take: time by samples, disk by frames."""
     list(maker.make(specs[:1]))
     start = time.monotonic()
     list(maker.make(specs[1:]))

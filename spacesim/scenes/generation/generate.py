@@ -37,7 +37,7 @@ from spacesim.scenes.scene import Scene
 from spacesim.scenes.trajectory.rig import TrajectoryRig
 
 SCHEMA = 2  #: of scene.json
-COARSE_DEPTH = 0.01  #: of the scene's size: longer steps of depth pictures are told
+COARSE_DEPTH = 0.01  #: of the scene's size: longer steps of depth pictures are reported
 
 GenerationProgress = Callable[[int, int, str], None]
 MakeFrames = Callable[[Job, Sequence[FrameSpec]], Iterator[str]]  #: makes frames and yields their names
@@ -145,7 +145,7 @@ def _make_missing(
     make: Callable[[list[FrameSpec]], Iterator[str]],
     progress: GenerationProgress | None,
 ) -> None:
-    """Make those of the frames that are not there, and tell of each."""
+    """Make those of the frames that are not there, and report each."""
     missing = [spec for spec in specs if not writer.has_frame(spec.name)]
     total, complete = len(specs), len(specs) - len(missing)
     if progress is not None and complete:
@@ -166,7 +166,7 @@ def _warn_of_coarse_depth(unit: float, scene: Scene) -> None:
 
 
 def _open(root: Path, described: dict[str, JsonValue], resume: bool, sweep: "_DatasetPlan") -> DatasetWriter:
-    """The writer of the folder. Only scene.json tells which scene frames are of. Where it is broken, nothing is
+    """The writer of the folder. Only scene.json says which scene frames are of. Where it is broken, nothing is
     resumed; where it is gone, resuming says that they are of the scene asked for, and it is written again."""
     path = root / "scene.json"
     if resume and path.exists():
@@ -214,7 +214,7 @@ def _frame_maker(renderer: Renderer, workers: int, ray: str | None) -> Iterator[
 
 
 def _make_frames(make: MakeFrames, job: Job, specs: Sequence[FrameSpec], renderer: Renderer) -> Iterator[str]:
-    """Frames, as they are made. A long run begins with a few that tell how long and how large it will be."""
+    """Frames, as they are made. A long run begins with a few, from which time and size are estimated."""
     names: set[str] = set()
     if len(specs) > LONG:
         first = samples(specs)

@@ -1,4 +1,4 @@
-"""What tells of a whole dataset: how densely cameras look at the target, a contact sheet of frames, keypoints."""
+"""Overviews of a whole dataset: how densely cameras look at the target, a contact sheet of frames, keypoints."""
 
 import logging
 from pathlib import Path

@@ -29,7 +29,7 @@ from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, cores,
 
 ATTEMPTS = 3  #: times that a task is given out before its death counts as its own fault
 MAX_FRAMES = 16  #: of a task: what a process that dies has to do again
-PATIENCE = 5.0  #: seconds in which a process that is told to go has gone
+PATIENCE = 5.0  #: seconds in which a process ends after it is asked to
 
 
 @dataclass(eq=False)
@@ -40,7 +40,7 @@ class _Task:
 
 @dataclass(eq=False)
 class _Worker:
-    """A process, the socket to it, the task that it has and what it is still to be told when it asks."""
+    """A process, the socket to it, the task that it has and the messages that it has yet to receive."""
 
     process: subprocess.Popen[bytes]
     connection: Connection
@@ -48,7 +48,7 @@ class _Worker:
     outbox: list[Any]
 
     def send_next(self) -> None:
-        """Send the next message. Where the process is dead already, reading from it will tell."""
+        """Send the next message. Where the process is dead already, reading from it will fail."""
         with suppress(OSError):
             self.connection.send(self.outbox.pop(0))
 
@@ -150,7 +150,7 @@ def _requeue(worker: _Worker, tasks: deque[_Task]) -> None:
 
 
 def _stop(workers: list[_Worker]) -> None:
-    """End all processes; closing the connection is what tells them."""
+    """End all processes; closing the connection is their signal."""
     for worker in workers:
         worker.connection.close()
     for worker in workers:
@@ -162,7 +162,7 @@ def _stop(workers: list[_Worker]) -> None:
 
 
 def cuda_devices() -> list[str]:
-    """Names of the CUDA devices of this machine for CUDA_VISIBLE_DEVICES, [] where that cannot be told."""
+    """Names of the CUDA devices of this machine for CUDA_VISIBLE_DEVICES, [] where they cannot be determined."""
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     if named is not None:
         return [name for name in named.split(",") if name]
@@ -177,8 +177,8 @@ _ROOT = str(Path(__file__).parents[3])
 
 
 def connect_to_parent(connection: Connection) -> tuple[queue.SimpleQueue[Any], Callable[[Any], None]]:
-    """(what the parent has sent, a way to tell it something). Ends this process as soon as the parent has
-    gone, whatever it is doing."""
+    """(what the parent has sent, a function that sends it a message). Ends this process as soon as the parent
+    has gone, whatever it is doing."""
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
     def listen() -> None:

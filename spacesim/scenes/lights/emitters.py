@@ -19,7 +19,7 @@ from spacesim.data.records import Sun
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.lights.sun import SunConfig
 
-PARALLEL = 1e-6  #: radians: the radius that densities of parallel light, which are infinite, are reckoned with
+PARALLEL = 1e-6  #: radians: the radius that densities of parallel light, which are infinite, are computed with
 
 
 def kernel_input(value: float | Array) -> Any:

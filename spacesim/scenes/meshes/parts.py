@@ -12,7 +12,7 @@ from spacesim.scenes.meshes.textures import Notes, Surface
 
 ABSENT = "faces that name vertices which are not there are dropped"
 FLAT = math.radians(0.5)  #: normals of vertices this near to their faces' are theirs
-MAX_SOLID_ANGLES = 20_000_000  #: solid angles worth computing to tell cavities from inverted surfaces
+MAX_SOLID_ANGLES = 20_000_000  #: solid angles worth computing to distinguish cavities from inverted surfaces
 
 
 @dataclass(frozen=True, eq=False)

@@ -81,8 +81,8 @@ def read_mesh(
     their standard says, else z), (x, y, z) becomes (-z, y, x) or (x, -z, y); scale: a factor on top.
     two_sided: closed parts show their outside alone and open ones both sides; True shows both sides of all, False also
     makes the winding of open parts consistent.
-    replaced: patterns of the parts ("panel_*") whose materials the caller replaces: here they get UNTOLD, and the
-    report does not speak of the materials that they would have had.
+    replaced: patterns of the parts ("panel_*") whose materials the caller replaces: here they get
+    DEFAULT_PRESET, and the report does not name the materials that they would have had.
     Raises InputError, one sentence, for whatever is wrong with the file or an option.
     """
     path = Path(path)
@@ -205,7 +205,7 @@ def _is_replaced(part: RawPart, patterns: Sequence[str]) -> bool:
 def _spacecraft(
     path: Path, raw: list[RawPart], surfaces: list[Surface | None], notes: Notes, both_sides: bool
 ) -> tuple[Spacecraft, MeshReport]:
-    """The parts `raw` with the materials of `surfaces`, one each, None UNTOLD."""
+    """The parts `raw` with the materials of `surfaces`, one each, None: DEFAULT_PRESET."""
     name = plain_name(path.stem) or "mesh"
     materials: dict[tuple[int, bool], Material] = {}
     parts = []

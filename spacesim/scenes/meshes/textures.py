@@ -194,7 +194,7 @@ def clip_to_unit(value: object, default: float = 1.0) -> float:
 
 
 def material_of(surface: Surface | None, prefix: str, file: str, notes: Notes) -> Material:
-    """The Material of a surface (None: the preset UNTOLD). Its name begins with `prefix`, its source names `file`."""
+    """The Material of a surface (None: DEFAULT_PRESET). Its name begins with `prefix`, its source names `file`."""
     if surface is None:
         return material(DEFAULT_PRESET)
     name = f"{prefix}/{plain_name(surface.name) or 'material'}"

@@ -5,7 +5,7 @@ Body axes: +x towards the payload, the nozzle opens towards -x. The origin is ha
 Public figures that it keeps to: about 11 m long and 4 m wide (Astroscale, ADRAS-J mission, "an unprepared upper
 stage of 11 m by 4 m"), liquid-hydrogen tank of 4 m with sprayed foam, a smaller liquid-oxygen tank hung below it on a
 truss, one LE-5B engine 2.8 m long (JAXA, "H-IIA Launch Vehicle" brochure; Mitsubishi Heavy Industries, LE-5B-2),
-and a conical adapter with the common 1,194 mm clamp-band ring. Everything else is chosen after public photographs.
+and a conical adapter with the common 1,194 mm clamp-band ring. Everything else is estimated from public photographs.
 
 All is built upright first, z towards the payload.
 """

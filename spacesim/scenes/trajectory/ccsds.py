@@ -1,7 +1,7 @@
 """Orbit and attitude ephemeris messages, KVN or XML: CCSDS 502.0-B-2 and B-3 (OEM), 504.0-B-1 and B-2 (AEM).
 
 Of an OEM the state vectors are read (not covariances and accelerations), of an AEM quaternions. Between epochs
-positions are cubic by their velocities and attitudes are slerped, whatever INTERPOLATION says (the log then tells);
+positions are cubic by their velocities and attitudes are slerped, whatever INTERPOLATION says (which is logged);
 where segments meet in an epoch, the later one counts there.
 
 A quaternion of an AEM takes coordinates from one frame into the other: of a rotation by phi about e, which turns the
@@ -59,7 +59,7 @@ class _Segment:
 
 
 def motion_of(messages: Mapping[str, Sequence[Path]], with_sun: bool = True) -> Motion:
-    """What the messages of each body, "camera" and "target", tell together. The Earth is in the centre where
+    """The motion in the messages of each body, "camera" and "target". The Earth is in the centre where
     CENTER_NAME says so; with_sun: in axes of J2000 its Sun is where the Earth's orbit says.
 
     Raises InputError, naming the file, for what is no such message, where frames, centres or time systems differ, and

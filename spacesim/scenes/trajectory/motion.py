@@ -1,9 +1,9 @@
-"""How camera, target, Sun and Earth move in a world, and what of it a scene is told: all of it seen from the target.
+"""How camera, target, Sun and Earth move in a world, and the part of it that a scene needs, seen from the target.
 
 The world is whatever frame the file is in. The scene's own frame is that of the target: its body axes, with the origin
 where the target is. So a dataset shows a target that stands still, which is what it is trained on, whatever it does in
 the world. Where nothing is said of the target, the scene's frame is the world. Other objects of the scene move in it
-where their own poses are told.
+where their own poses are given.
 """
 
 import logging
@@ -121,7 +121,7 @@ class MotionSamples:
 
 
 def merge(motions: Sequence[Motion]) -> Motion:
-    """What several files tell together. Raises InputError where two tell the same, or their clocks differ."""
+    """The motion in several files together. Raises InputError where two have the same, or their clocks differ."""
     whole = motions[0]
     for other in motions[1:]:
         if (whole.day is None) != (other.day is None):
@@ -145,8 +145,8 @@ def merge(motions: Sequence[Motion]) -> Motion:
 def seen_from_target(motion: Motion, times: Array, camera_from_optics: Array, centre: Array) -> MotionSamples:
     """`motion` at `times` [N] in the target's frame.
 
-    camera_from_optics: [3, 3] OpenCV camera axes to those whose attitude is told; centre: [3] of the objects, scene
-    frame, which a camera looks at, the world's z upwards, where no attitude of it is told; the target's origin where
+    camera_from_optics: [3, 3] OpenCV camera axes to those whose attitude is given; centre: [3] of the objects, scene
+    frame, which a camera looks at, the world's z upwards, where its attitude is not given; the target's origin where
     others move. Raises InputError for a time that is not covered.
     """
     centre = np.zeros(3) if motion.bodies else centre

@@ -38,8 +38,8 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class TrajectoryRig(Rig):
     """Camera and target move as a trajectory says. The dataset is in the target's frame: cameras, Sun and Earth move
-    about a target that stands still, and so do objects of the scene whose own poses are told. Where no attitude of the
-    camera is told it looks at the target, the world's z upwards; where no Sun is told, `sun` says it. Test frames lie
+    about a target that stands still, and so do objects of the scene whose own poses are given. Where no attitude of the
+    camera is given it looks at the target, the world's z upwards; where no Sun is given, `sun` says it. Test frames lie
     halfway between training frames; of a trajectory without times they are some of its rows, held out. Raises
     InputError for a value out of range."""
 
@@ -49,7 +49,7 @@ class TrajectoryRig(Rig):
     #: the Sun as (azimuth, elevation), degrees, in the trajectory's world frame, where it says nothing of the Sun; ()
     #: SINGLE_SUN, of tables alone
     sun: tuple[tuple[float, float], ...] = ()
-    #: quaternion that turns OpenCV camera axes (x right, y down, z forward) into those whose attitude is told, such as
+    #: quaternion that turns OpenCV camera axes (x right, y down, z forward) into those whose attitude is given, such as
     #: the body's that carries the camera; [0, 1, 0, 0]: those of OpenGL and Blender
     body_from_camera_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     #: least and greatest angle between Sun and camera as the target sees them; none: any. With either, frames beyond,

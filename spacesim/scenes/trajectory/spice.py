@@ -105,7 +105,7 @@ class SpiceRig(TrajectoryRig):
 
 @contextmanager
 def _loaded(kernels: tuple[str, ...]) -> Iterator[ModuleType]:
-    """spiceypy with these kernels, beside those that somebody else has loaded. Raises InputError where the package or a
+    """spiceypy with these kernels, beside those that are loaded already. Raises InputError where the package or a
     file is missing or broken."""
     try:
         import spiceypy
@@ -129,4 +129,4 @@ def _answer(name: str, ask: Callable[..., T], *arguments: object) -> T:
     except SpiceyError as error:
         long = " ".join(str(getattr(error, "long", "") or error).split())
         short = str(getattr(error, "short", "") or "SPICE(ERROR)").strip()
-        raise InputError(f"{name}: expected kernels that tell it, found {short}: {long[:300]}") from None
+        raise InputError(f"{name}: expected kernels that contain it, found {short}: {long[:300]}") from None

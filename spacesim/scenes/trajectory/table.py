@@ -58,7 +58,7 @@ def _groups(others: Sequence[str] = ()) -> dict[tuple[str, ...], str]:
 
 
 def read_table(path: Path) -> Motion:
-    """The motion that a table tells. Raises InputError, naming file, column and row, for what it cannot be."""
+    """The motion in a table. Raises InputError, naming file, column and row, for what it cannot be."""
     columns = _read_columns(path)
     try:
         return _motion(path, columns)

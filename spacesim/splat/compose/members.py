@@ -29,7 +29,7 @@ from spacesim.splat.run import Run
 
 PLAIN_SHADOWS = ShadowConfig(refine=None)
 """Of a run that was trained without any: a depth test."""
-MODEL_DISTANCE = 5.0  #: farthest training camera of such a run, in its radii: chosen, only the softness depends on it
+MODEL_DISTANCE = 5.0  #: farthest training camera of such a run, in its radii: only softness depends on it
 
 
 @dataclass(frozen=True, eq=False)

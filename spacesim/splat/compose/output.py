@@ -60,8 +60,8 @@ def compose(
     """Render every frame of a scene into `out`. Frames that are there already and show the same, from an earlier call
     that was interrupted or before something else was changed, are kept.
 
-    size: pixels of the longer side, or (width, height), in place of the camera's;  report: told (frames done, of all)
-    exposure: EV, see `GaussianComposition.stops`
+    size: pixels of the longer side, or (width, height), in place of the camera's
+    report: called with (frames done, of all);  exposure: EV, see `GaussianComposition.stops`
     Raises InputError where the scene lacks a camera or a Sun that it needs, an exposure does not fit its models, or the
     folder holds other files.
     """

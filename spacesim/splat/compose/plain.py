@@ -14,7 +14,7 @@ def bake_scene(composition: GaussianComposition, sun: Sun | None) -> Gaussians:
     """All models in the world, in the order of `composition.placed`: colours of relightable runs as `bake` has them,
     harmonics turned with their models, shadows of models on each other included. sRGB values.
 
-    Raises InputError where the Sun matters and none is told.
+    Raises InputError where the Sun matters and none is given.
     """
     if sun is None and composition.relightable:
         source = composition.path or composition.models[0].run.path

@@ -9,7 +9,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
 
-MAX_COORDINATE = 1e8  #: metres of a position at most: single precision tells places 10 m apart there
+MAX_COORDINATE = 1e8  #: metres of a position at most: single precision resolves 10 m there
 MIN_SCALE, MAX_SCALE = 1e-6, 1e6  #: of a scale: squares of lengths in any model's frame stay in single precision
 
 

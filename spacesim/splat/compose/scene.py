@@ -157,7 +157,7 @@ class GaussianComposition:
     def predict(
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> ComposedPrediction:
-        """Render one view. exposure: see `stops`. Raises InputError where the Sun matters and none is told."""
+        """Render one view. exposure: see `stops`. Raises InputError where the Sun matters and none is given."""
         stops = self.stops(exposure)
         check_picture(camera)
         names = [name for name in OUTPUTS if name not in ("median_depth", "normal")]
@@ -252,7 +252,7 @@ class GaussianComposition:
     ) -> DrawnView:
         """A view on the device: of `OUTPUTS` those asked for, and alpha. Visibility is left out where no model knows
         any. supersample: places on a side of each pixel, by default as many as the models were trained with. Raises
-        ValueError for another output, InputError where the Sun matters and none is told."""
+        ValueError for another output, InputError where the Sun matters and none is given."""
         unknown = [name for name in outputs if name not in OUTPUTS]
         if unknown:
             raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
@@ -284,7 +284,7 @@ class GaussianComposition:
 
     def lit_gaussians(self, camera: Camera, sun: Sun | None) -> tuple[Gaussians, list[Float]]:
         """(the set in the world, its colours seen from the camera: three Floats [N], sRGB display values), to draw it
-        in another way. Raises InputError where the Sun matters and none is told."""
+        in another way. Raises InputError where the Sun matters and none is given."""
         lit = self.lit(camera, sun)
         return lit.gaussians, lit.colors
 

@@ -201,7 +201,7 @@ def _pose_values(pose: Pose) -> JsonDict:
 
 
 def _sun_values(sun: Sun) -> JsonDict:
-    azimuth, elevation = (round(angle, 9) for angle in sun.angles)  # as they were typed, where that means the same
+    azimuth, elevation = (round(angle, 9) for angle in sun.angles)  # as they were written, where that means the same
     if np.array_equal(Sun.from_angles(azimuth, elevation).direction, sun.direction):
         return {"azimuth_deg": azimuth, "elevation_deg": elevation}
     return {"direction": sun.direction.tolist()}

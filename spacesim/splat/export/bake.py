@@ -14,7 +14,7 @@ from spacesim.splat.raster.render import render
 from spacesim.splat.raster.tone import tone_map
 
 VIEWS = 64  #: directions that the harmonics are fitted to, four times as many as degree 3 has terms
-PIXELS = 256  #: on a side of the pictures that tell how much of each Gaussian is seen from a direction
+PIXELS = 256  #: on a side of the pictures that show how much of each Gaussian is seen from a direction
 WITHIN = 0.999  #: share of the Gaussians that they hold
 FAINT = 0.1  #: pixels: what a direction counts at least, from which a Gaussian is hidden
 BLACK = 1e-3  #: colours up to which any value below is as good: colours below 0 are drawn as 0
@@ -26,7 +26,7 @@ def bake(
     gaussians: Gaussians, light: LightModel, sun: np.ndarray | None, degree: int = 3, others: Float | None = None
 ) -> Gaussians:
     """The Gaussians with the colours, shadows included, that they have under a Sun in the direction `sun` [3], or None
-    for a model that is not told.
+    for a model that does not take one.
 
     others: Float [N], the share of sunlight that other models let through (v_inter of 4.16), or None for all of it
     Harmonics of `degree` are fitted by least squares to the colours from `VIEWS` directions around, weighted by how

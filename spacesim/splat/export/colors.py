@@ -12,7 +12,7 @@ from spacesim.learning.prediction import Prediction
 from spacesim.splat.export.mesh import RunMesh, select_views
 
 NEAR = 2.0  #: voxels: what lies deeper than the surface that a pixel shows is hidden in it
-OPAQUE = 0.5  #: alpha from which on a picture tells a colour
+OPAQUE = 0.5  #: alpha from which on a picture's colour counts
 POWER = 4  #: of the cosine between normal and view, by which views are weighted: pictures taken head-on are sharp
 
 

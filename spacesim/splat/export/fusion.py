@@ -2,7 +2,7 @@
 
 The mean, over the views, of how far a voxel lies before the surface that each sees, in units of the truncation (Curless
 and Levoy 1996), weighted by how squarely the view sees it. A pixel without surface says that its whole ray is empty.
-Each voxel is a lane of its own and takes the views in their order: the same input gives the same bits.
+Each voxel is a thread of its own and takes the views in their order: the same input gives the same bits.
 """
 
 from collections.abc import Callable, Iterable, Sequence

@@ -26,7 +26,7 @@ def write_splats(
 ) -> None:
     """Write Gaussians with harmonics whose colours are sRGB values, see `bake`, in the file's frame.
 
-    antialiased: whether they are drawn with the anti-aliasing filter, which only SPZ can tell
+    antialiased: whether they are drawn with the anti-aliasing filter, which only SPZ can record
     Raises InputError for a name of another ending, and as the formats' own functions do.
     """
     check_ending(path, form)
@@ -42,7 +42,7 @@ def write_splats(
 
 
 def check_ending(path: Path, form: Form) -> None:
-    """Raise InputError for a name by which nobody would know the format."""
+    """Raise InputError for a file name whose ending does not show the format."""
     endings = ENDINGS.get(form, ())
     if endings and path.suffix.lower() not in endings:
         found = path.suffix or "no ending"

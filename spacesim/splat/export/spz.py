@@ -29,7 +29,7 @@ def write_spz(gaussians: Gaussians, path: Path, antialiased: bool = False, versi
     opacities and constant terms of 8 bits, higher ones in steps of 1/128 from -1 to 1, the three smallest components
     of each quaternion with 10 bits. Axes are taken as they are: the format's are x right, y up, z backward.
 
-    antialiased: whether the model is drawn with the anti-aliasing filter, which the file tells
+    antialiased: whether the model is drawn with the anti-aliasing filter, which the file records
     Raises InputError for another version and for coordinates beyond 8,388 km, WorkError where version 4's library is
     missing.
     """

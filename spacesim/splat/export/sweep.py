@@ -107,7 +107,7 @@ def sweep(
     """Render `run` from `camera` under each of `suns` and write the files named above.
 
     kind: "rgb", over black, or "shadow": how much of the Sun is seen, from SHADOWED to LIT;  keep_frames: write every
-    picture, too;  report: told (pictures done, of all);  exposure: EV, see `Run.predict`
+    picture, too;  report: called with (pictures done, of all);  exposure: EV, see `Run.predict`
     Raises InputError for another kind, a run that no Sun relights, a run without shadows where these are asked for, an
     exposure of one whose colours are sRGB values, a folder that cannot be made, and one of frames that holds some.
     """

@@ -19,8 +19,8 @@ ROWS = 4096  #: of an array that are made text at once
 
 def write_usd(gaussians: Gaussians, path: Path, up: Up = "z", scale: float = 1.0) -> None:
     """Write linear scales, opacities from 0 to 1, unit quaternions (w, x, y, z) and the harmonics of each Gaussian one
-    after the other; colours are sRGB values, which the attribute tells; drawn in the order of depth, as ours are. up:
-    which of the file's axes points up, "z" or "y", USD knows no other;  scale: units a metre, which the file tells
+    after the other; colours are sRGB values, as the attribute says; drawn in the order of depth, as ours are. up:
+    which of the file's axes points up, "z" or "y", USD knows no other;  scale: units a metre, which the file records
 
     Raises InputError for another one and where the file cannot be written.
     """

@@ -1,7 +1,7 @@
 """One bounce: sunlight that some Gaussians scatter onto all others, as if nothing stood in between.
 
 What faces away from the Sun, or lies in a shadow, is not black beside a lit surface: one that a path tracer or a camera
-sees. A field that is told the cosines of one Gaussian cannot know which of its neighbours are lit; visibility does.
+sees. A field that takes the cosines of one Gaussian cannot know which of its neighbours are lit; visibility does.
 """
 
 from dataclasses import dataclass

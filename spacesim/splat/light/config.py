@@ -35,7 +35,7 @@ class LightConfig:
             found = "a field that takes directions"
             raise InputError(f"bounce: expected 0 or light.field.inputs=surface, whose normals it needs, found {found}")
         if self.shadow and not self.field.knows_sun:
-            raise InputError("field: expected inputs that tell of the Sun, which casts shadows, found view")
+            raise InputError("field: expected inputs with the Sun, which casts shadows, found view")
         for name in ("tone", "exposure"):
             if getattr(self, name) is not None and not self.linear:
                 raise InputError(f"{name}: expected linear colours (light.linear = true), found sRGB values")

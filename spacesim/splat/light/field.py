@@ -33,7 +33,7 @@ class SurfaceConfig:
     """Each Gaussian learns a normal, too, and the field takes the cosines of a reflectance model about it
     (`surface_cosines`): what one side of a body has taught then serves the others, and Suns never seen. Ours.
 
-    Directions beside the cosines teach it the Suns of training by heart: by default they say nothing (one constant).
+    With directions beside the cosines it memorises the Suns of training: by default they say nothing (one constant).
     """
 
     kind: ClassVar[str] = "surface"

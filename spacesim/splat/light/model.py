@@ -29,7 +29,7 @@ from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians
 
-ANY_SUN = np.array([0.0, 0.0, 1.0])  #: stands for a Sun that is not known, in a model that is not told it
+ANY_SUN = np.array([0.0, 0.0, 1.0])  #: stands for an unknown Sun, in a model that does not take it
 COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed by `cooperative` where that works
 
 
@@ -149,7 +149,7 @@ class LightModel:
         return LightModel(config, [upload(weight) for weight in weights], frame, embeddings)
 
     def encode_sun(self, sun: np.ndarray | None) -> SunEncoding:
-        """What kernels read of a Sun in the direction `sun` [3], unit, world axes; None where the field is not told."""
+        """What kernels read of a Sun in the direction `sun` [3], unit, world axes; None: the field does not take it."""
         terms: SunEncoding = self._encodings(*(float(value) for value in (ANY_SUN if sun is None else sun)))
         return terms
 
@@ -161,7 +161,7 @@ class LightModel:
         config = self.config.shadow
         if config is None:
             return None
-        assert sun is not None, "what casts shadows is told the Sun"
+        assert sun is not None, "shadows need the Sun"
         return cast_shadows(gaussians, self.encode_sun(sun).light_axes, config, self.frame.distance, make_lists)
 
     def shade(
@@ -172,8 +172,8 @@ class LightModel:
         picture: int | None = None,
         make_lists: MakeLists = bin_splats,
     ) -> Shading:
-        """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes; None
-        where the field is not told. picture: number of the training picture whose embedding the field reads; None: it
+        """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes; None:
+        the field does not take it. picture: number of the training picture whose embedding the field reads; None: it
         reads the mean one. make_lists: of the Sun's picture"""
         shadows = self.shadows(gaussians, sun, make_lists)
         embedding = self._mean_embedding() if picture is None else self._embedding(picture)
@@ -292,7 +292,7 @@ class LightModel:
         return [upload(np.array(every, np.float64).reshape(-1, size).mean(axis=0)) for every in self.embeddings]
 
     def _embedding_gradient(self, by_encoding: Float, picture: int | None) -> Float:
-        """Float [V * E], 0 but where the picture's embedding stands. by_encoding: gradient of what the field is told"""
+        """Float [V * E], 0 but where the picture's embedding stands. by_encoding: gradient of the field's encoding"""
         assert picture is not None, "the mean embedding is not trained"
         size, first = self.config.field.embeddings, self.config.field.sun.size
         gradient = dr.zeros(ad.Float, dr.width(self.embeddings[0]))

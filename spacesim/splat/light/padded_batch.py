@@ -40,13 +40,13 @@ class PaddedBatch:
 
     def pad_zeros(self, row: Float) -> Float:
         """[N] to [M], 0 beyond N."""
-        lane = self._column()
-        return dr.gather(ad.Float, row, lane, lane < self.count)
+        column = self._column()
+        return dr.gather(ad.Float, row, column, column < self.count)
 
     def block(self, packed: Float, first: int, rows: int) -> list[Float]:
         """Some rows of a packed array [C * N], [M] each."""
-        lane = dr.minimum(self._column(), self.count - 1)
-        return [dr.gather(ad.Float, packed, (first + i) * self.count + lane) for i in range(rows)]
+        column = dr.minimum(self._column(), self.count - 1)
+        return [dr.gather(ad.Float, packed, (first + i) * self.count + column) for i in range(rows)]
 
     def matrix(self, rows: list[Float], height: int | None = None) -> TensorXf:
         """TensorXf [B, C, m] of rows [M], or one number for all, in one kernel. height: C, the rows that are missing
@@ -64,18 +64,18 @@ class PaddedBatch:
 
     def unpad(self, rows: list[Float], like: Float) -> list[Float]:
         """Rows [M], evaluated, to [N]. like: any array [N]."""
-        lane = dr.arange(ad.UInt32, dr.width(like))
-        is_real = lane < self.count
-        return [dr.select(is_real, dr.gather(ad.Float, row, lane), like) for row in rows]
+        column = dr.arange(ad.UInt32, dr.width(like))
+        is_real = column < self.count
+        return [dr.select(is_real, dr.gather(ad.Float, row, column), like) for row in rows]
 
     def pack(self, parts: list[tuple[TensorXf, int, int]], like: Float) -> Float:
         """Float [C * N], packed, of parts (TensorXf [B, R, m], first row, rows), one under another. like: an array."""
         place = dr.arange(ad.UInt32, dr.width(like))
-        row, lane = place // self.count, place % self.count
+        row, column = place // self.count, place % self.count
         result, before = like, 0
         for columns, first, rows in parts:
             mine = (row >= before) & (row < before + rows)
-            index = self._matrix_index(lane, row - before + first, columns.shape[1])
+            index = self._matrix_index(column, row - before + first, columns.shape[1])
             result = dr.select(mine, dr.gather(ad.Float, columns.array, index, mine), result)
             before += rows
         return result
@@ -84,6 +84,6 @@ class PaddedBatch:
         return dr.arange(ad.UInt32, self.capacity)
 
     @staticmethod
-    def _matrix_index(lane: UInt32, row: UInt32 | int, height: int) -> UInt32:
+    def _matrix_index(column: UInt32, row: UInt32 | int, height: int) -> UInt32:
         """Where a matrix of `height` rows has this row of this column."""
-        return ((lane // CHUNK) * height + row) * CHUNK + lane % CHUNK
+        return ((column // CHUNK) * height + row) * CHUNK + column % CHUNK

@@ -40,8 +40,8 @@ class SunEncoding:
     """A Sun as the kernels read it, Floats."""
 
     light_axes: Float  #: [9], `light_rows`
-    field_encoding: Float  #: what each network is told; the field also of the picture: its embedding stands behind
-    refine_encoding: Float  #: what each network is told
+    field_encoding: Float  #: input of the field's network: the Sun's encoding, then the picture's embedding
+    refine_encoding: Float  #: input of the refinement's network
 
 
 @dataclass
@@ -54,7 +54,7 @@ class ShadingInputs:
     logits: Float  #: of opacities
     camera: Projection | None  #: None where the Sun's light alone is wanted
     raw_shadows: list[Float]  #: occlusion, normal alignment, light extent and bias, [N] each, or nothing
-    sun: SunEncoding  #: what networks and shadows are told of it
+    sun: SunEncoding  #: as networks and shadows read it
     training_frame: Float  #: Float [4], centre and scale of the training frame
 
 
@@ -229,7 +229,7 @@ def adjoint(
             grad_occlusion = (
                 grad_logit * refine_occlusion_slope(batch.pad_zeros(inputs.raw_shadows[0])) + grad_occlusion
             )
-        if config.refine.bias_info:  # it is told 1 - occlusion, too, before the other three
+        if config.refine.bias_info:  # its inputs have 1 - occlusion, too, before the other three
             grad_occlusion -= batch.row(grad_items, config.refine.shape.inputs - 4)
     if grad_albedo:
         parts.append((batch.matrix(grad_albedo), 0, 3))

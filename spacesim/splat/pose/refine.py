@@ -90,7 +90,7 @@ def refine_pose(
     does not. What is dark before a dark sky cannot be seen: then it is often False.
 
     Raises InputError where the picture, the mask or the numbers are not as above, where the run needs a Sun and none is
-    told, and where the camera does not see the model.
+    given, and where the camera does not see the model.
     """
     run = check_gaussians(run)
     direction = checked_sun(sun, run.relightable, f"a run of {run.config['method']}")

@@ -2,7 +2,7 @@
 
 A picture's object has a middle and an area. About that middle and in units of that size it is compared with views of
 the model, which are cut out in the same way, in all turns about the line of sight; middle, size and turn then say the
-rest of the pose. The best few are told apart by pictures drawn at these poses, and refined.
+rest of the pose. The best few are compared by pictures drawn at these poses, and refined.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ CANDIDATES = 24  #: poses that are drawn and compared as pictures
 APART = 12.0  #: degrees between them
 TRIED, WORSE = 3, 2.0  #: poses that are refined, at most, and how many times worse than the best one they may be
 WITHIN = 12.0, 0.25  #: degrees and share of the distance by which these may be off: 8 degrees round the object are 14 %
-COARSE = 96  #: pixels that the longer side of pictures keeps while poses are told apart
+COARSE = 96  #: pixels that the longer side of pictures keeps while poses are compared
 DIM = 0.04  #: sRGB value above the sky's from which on a pixel is the object's
 NOISE = 5.0  #: standard deviations of the sky
 SPECK = 0.02  #: of all that is bright: smaller spots, stars, do not count

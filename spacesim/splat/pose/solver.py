@@ -205,7 +205,7 @@ def weighed_products(rows: np.ndarray, columns: np.ndarray, weights: np.ndarray)
 
 
 def damped(normal: Array, damping: float) -> Array:
-    """With a share of its diagonal more, and a little more still: no picture tells of an unknown that it does not
+    """With a share of its diagonal more, and a little more still: no picture constrains an unknown that it does not
     depend on."""
     diagonal = np.diag(normal)
     return normal + np.diag(damping * diagonal + 1e-9 * diagonal.mean() + 1e-20)

@@ -3,10 +3,11 @@
 Sums over the pixels of a tile, of each (tile, splat) pair, go into a slot of the pair's own; a second pass adds up each
 splat's slots in order. No two tiles write to one address, so the gradients are the same to the bit in every run.
 
-- `by_tiles`: one lane holds a block of a tile's pixels, as in blending, and replays the tile's list from the last
-  splat blended to the first, recovering each transmittance by division. Lanes meet in a sum for each pair.
-- `by_buckets`: one lane holds a bucket of a tile's list, some pairs, and walks over the tile's pixels, from the state
-  that blending kept before the bucket. Lanes share nothing; what they read twice, and the states kept, cost memory.
+- `by_tiles`: one thread holds a block of a tile's pixels, as in blending, and replays the tile's list from the last
+  splat blended to the first, recovering each transmittance by division. Threads meet in a sum for each pair.
+- `by_buckets`: one thread holds a bucket of a tile's list, some pairs, and walks over the tile's pixels, from the
+  state that blending kept before the bucket. Threads share nothing; what they read twice, and the states kept, cost
+  memory.
 """
 
 from dataclasses import dataclass
@@ -31,10 +32,10 @@ from spacesim.splat.raster.records import (
     packets,
     store,
 )
-from spacesim.splat.raster.tiles import TileLists, TileShape, lane_offsets, lane_pixels, pixel_in_tile
+from spacesim.splat.raster.tiles import TileLists, TileShape, pixel_in_tile, thread_offsets, thread_pixels
 
-COPIES_BYTES = 2**30  #: that threads' copies of gradient slots may take on a CPU
-PACKET = 4  #: lanes that run together on any CPU: Dr.Jit's packets have 4, 8 or 16, and start at a multiple
+COPIES_BYTES = 2**30  #: that copies of gradient slots, one a CPU thread, may take
+PACKET = 4  #: SIMD lanes that run together on any CPU: Dr.Jit's packets have 4, 8 or 16, and start at a multiple
 ONE_PIXEL = TileShape(1, 1, 1)
 
 
@@ -67,13 +68,13 @@ def by_tiles(
     grad_planes: PlaneGradients,
     absolute: bool,
 ) -> SplatGradients:
-    """See `blend.backward`. A lane for a block of a tile's pixels."""
+    """See `blend.backward`. A thread for a block of a tile's pixels."""
     channels, shape = len(grad_planes.features), lists.shape
-    lane, offsets = lane_pixels(lists), lane_offsets(shape)
+    thread, offsets = thread_pixels(lists), thread_offsets(shape)
     transmittance, last, behind, gradients = [], [], [], []
     for p, (i, j) in enumerate(offsets):
-        inside = (lane.column + i < grad_planes.width) & (lane.row + j < grad_planes.height)
-        pixel, place = (lane.row + j) * grad_planes.width + lane.column + i, lane.place * shape.pixels + p
+        inside = (thread.column + i < grad_planes.width) & (thread.row + j < grad_planes.height)
+        pixel, place = (thread.row + j) * grad_planes.width + thread.column + i, thread.place * shape.pixels + p
         gradients.append([dr.gather(ad.Float, plane, pixel, inside) for plane in grad_planes.features])
         end = dr.gather(ad.Float, blended.tile_transmittance, place)
         transmittance.append(end)
@@ -83,7 +84,7 @@ def by_tiles(
     sizes = packet_sizes(_numbers(channels, absolute))
     mode = reduce_mode(4 * sum(sizes) * lists.capacity, shape)
     slots = [dr.zeros(ad.Float, size * lists.capacity) for size in sizes]
-    records, start = blended.records, dr.gather(ad.UInt32, lists.start, lane.tile)
+    records, start = blended.records, dr.gather(ad.UInt32, lists.start, thread.tile)
 
     def remaining(k: UInt32, _transmittance: object, _behind: object) -> Bool:
         return k > start
@@ -91,9 +92,9 @@ def by_tiles(
     def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> tuple[UInt32, list[Float], list[Float]]:
         k = k - 1
         record = load(records, k, lists.capacity)
-        dx, dy = lane.x - record[0], lane.y - record[1]
+        dx, dy = thread.x - record[0], thread.y - record[1]
         a, b, c = record[2], record[3], record[4]
-        powers = exponents(record, lane.x, lane.y, shape)
+        powers = exponents(record, thread.x, thread.y, shape)
         transmittance, behind = list(transmittance), list(behind)
         moments = PixelMoments(dx, dy)
         absolute_x, absolute_y = ad.Float(0), ad.Float(0)
@@ -122,15 +123,15 @@ def by_tiles(
         add_to_slots(slots, sums, lists.sum_index(k), mode)
         return k, transmittance, behind
 
-    first = dr.gather(ad.UInt32, blended.tile_last, lane.tile)
+    first = dr.gather(ad.UInt32, blended.tile_last, thread.tile)
     dr.while_loop((first, transmittance, behind), remaining, replay, mode="symbolic", label="replay")
     dr.eval(slots)
     return gather_slots(slots, splats, lists, channels, absolute)
 
 
 class PixelMoments:
-    """Sums over a lane's pixels, column by column, of g, g dx, g dy, g dx^2, g dx dy and g dy^2, with (dx, dy) from the
-    splat's centre to the pixel. dx, dy: of the lane's first pixel"""
+    """Sums over a thread's pixels, column by column, of g, g dx, g dy, g dx^2, g dx dy and g dy^2; (dx, dy): from the
+    splat's centre to the pixel. dx, dy: of the thread's first pixel"""
 
     def __init__(self, dx: Float, dy: Float) -> None:
         self.dx, self.dy = dx, dy
@@ -156,7 +157,7 @@ class PixelMoments:
 
 
 def add_to_slots(slots: list[Float], sums: list[Float], slot: UInt32, mode: dr.ReduceMode) -> None:
-    """Add a lane's sums to its pair's slot in each array. All lanes do: to ask each whether it has anything to add
+    """Add a thread's sums to its pair's slot in each array. All threads do: to ask each whether it has anything to add
     costs more, on a CPU and on CUDA."""
     for target, values in zip(slots, packets(sums), strict=True):
         dr.scatter_reduce(dr.ReduceOp.Add, target, packet(values), slot, mode=mode)
@@ -183,7 +184,7 @@ def _fours(channels: int, absolute: bool) -> int:
 @dataclass
 class _Buckets:
     """Of each bucket [B]: its tile, the tile's left and top edges in pixels, and its pairs from `first` to below `end`
-    of the tile, none where no lane of blending came to it."""
+    of the tile, none where no thread of blending came to it."""
 
     tile: UInt32
     live: Bool
@@ -201,7 +202,7 @@ def by_buckets(
     grad_planes: PlaneGradients,
     absolute: bool,
 ) -> SplatGradients:
-    """See `blend.backward`. A lane for a bucket: what lies behind a pair is all that the pixel shows, less what
+    """See `blend.backward`. A thread for a bucket: what lies behind a pair is all that the pixel shows, less what
     has been blended up to the pair."""
     channels, shape = len(grad_planes.features), lists.shape
     pixels, bucket = shape.width * shape.height, blended.bucket
@@ -325,15 +326,15 @@ def _pixel_packets(
 
 
 def reduce_mode(bytes_: int, shape: TileShape) -> dr.ReduceMode:
-    """How a tile's lanes add to the slots, `bytes_` large. One tile alone adds to a slot: the sums depend on none of
+    """How a tile's threads add to the slots, `bytes_` large. One tile alone adds to a slot: the sums depend on none of
     this.
 
-    On CUDA a warp sums first. On LLVM a tile whose lanes are all in one packet is one thread's, which adds lane by lane
-    in place, as Dr.Jit does to a thread's copy where every thread has one: for larger tiles, unless that is too much.
+    On CUDA a warp sums first. On LLVM a tile in one packet belongs to one CPU thread, which adds lane by lane in place.
+    For larger tiles each CPU thread adds to its own copy, unless copies are too large.
     """
     if select() == "cuda":
         return dr.ReduceMode.Local
-    if PACKET % shape.lanes == 0:
+    if PACKET % shape.threads == 0:
         return dr.ReduceMode.NoConflicts
     return dr.ReduceMode.Expand if dr.thread_count() * bytes_ < COPIES_BYTES else dr.ReduceMode.Local
 

@@ -25,7 +25,7 @@ from spacesim.splat.raster.tiles import STEPS, TileLists, TileShape, round_capac
 
 DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
 MAX_SORTED_LENGTH = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long
-PACKET = 16  #: lanes that run together on a CPU with AVX-512; elsewhere fewer
+PACKET = 16  #: SIMD lanes that run together on a CPU with AVX-512; elsewhere fewer
 MAX_SHARES = 64  #: at most: no fewer than the parts into which Dr.Jit divides a launch, two a thread, as a rule
 FEW = 2  #: sizes of the lists of pictures from one power of two to the next
 LONG = 2**22  #: pairs from which on lists of pictures have no more capacity than others: a gigabyte
@@ -170,8 +170,8 @@ def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, 
     """Boxes of `count` splats; pairs are numbered in depth order."""
     left, top, columns, pairs, live = _boxes_in_tiles(splats, footprints, count, capacity, grid)
     # Splats that cannot be seen have no pairs, so their place does not matter.
-    lane = dr.arange(ad.UInt32, capacity)
-    key = dr.select(live, dr.gather(ad.UInt32, footprints.order, lane, live), ad.UInt32(0xFFFFFFFF))
+    index = dr.arange(ad.UInt32, capacity)
+    key = dr.select(live, dr.gather(ad.UInt32, footprints.order, index, live), ad.UInt32(0xFFFFFFFF))
     dr.eval(left, top, columns, pairs, key)
     order = _stable_order(key, 32)
     return _Boxes(left, top, columns, pairs, order, _running_sum(ad.UInt64(dr.gather(ad.UInt32, pairs, order))))
@@ -181,11 +181,11 @@ def _boxes_in_tiles(
     splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: _Grid
 ) -> tuple[UInt32, UInt32, UInt32, UInt32, Bool]:
     """(left, top, columns, pairs, whether it can be seen) of each splat's box, [M] = [capacity]."""
-    lane = dr.arange(ad.UInt32, capacity)
-    live = lane < count
-    live &= dr.gather(ad.Bool, footprints.visible, lane, live)
+    index = dr.arange(ad.UInt32, capacity)
+    live = index < count
+    live &= dr.gather(ad.Bool, footprints.visible, index, live)
     x, y, half_width, half_height = (
-        dr.gather(ad.Float, v, lane, live) for v in (splats.x, splats.y, footprints.half_width, footprints.half_height)
+        dr.gather(ad.Float, v, index, live) for v in (splats.x, splats.y, footprints.half_width, footprints.half_height)
     )
     x0, x1 = _tile_range(x, half_width, grid.shape.width, grid.columns)
     y0, y1 = _tile_range(y, half_height, grid.shape.height, grid.rows)
@@ -275,11 +275,11 @@ def _longest_first(length: UInt32, shape: TileShape) -> UInt32:
     """Tiles by the lengths [T] of their lists, longest first, then dealt into `MAX_SHARES` shares.
 
     Tiles that share a packet are walked together until the longest list ends: neighbours are of about one length.
-    Threads take runs of packets: each share has long lists and short ones.
+    CPU threads take runs of packets: each share has long lists and short ones.
     """
     count = dr.width(length)
     sorted_ = _stable_order(MAX_SORTED_LENGTH - dr.minimum(length, MAX_SORTED_LENGTH), MAX_SORTED_LENGTH.bit_length())
-    group = max(PACKET // shape.lanes, 1)
+    group = max(PACKET // shape.threads, 1)
     groups = count // group
     shares = min(MAX_SHARES, groups // 4)
     if shares < 2:

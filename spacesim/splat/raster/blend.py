@@ -1,6 +1,6 @@
 """Stage 3: blend each tile's splats front to back (thesis 2.14 to 2.16), and the adjoint of that.
 
-One lane holds a block of a tile's pixels and walks the tile's list. `forward` and `backward` are the two passes;
+One thread holds a block of a tile's pixels and walks the tile's list. `forward` and `backward` are the two passes;
 `rasterize` is the differentiable operation made of them. The adjoint is by hand (`adjoint.py`): by buckets of pairs on
 CUDA, by tiles on LLVM. Buckets read what `forward` has kept of each pixel before each bucket. On an H100 to keep it
 costs a twentieth of what the adjoint gains; on a CPU it costs more than that (docs/research/speed.md).
@@ -27,7 +27,7 @@ from spacesim.splat.raster.records import (
     load,
     store,
 )
-from spacesim.splat.raster.tiles import TileLists, lane_pixels, round_capacity, tiled_index
+from spacesim.splat.raster.tiles import TileLists, round_capacity, thread_pixels, tiled_index
 
 BUCKET = 8  #: pairs of a bucket, a power of two; 4 keep twice as much for 1 % of a step, 16 took longer on an H100
 BUCKET_TURN = 2  #: pairs a turn of the blending loop where buckets are kept: fewer turns have to ask for a new bucket
@@ -62,9 +62,9 @@ def blend_lists(
     channels, pixels = len(features), lists.shape.pixels
     turn = min(BUCKET_TURN, bucket) if bucket else 1
     records = list_records(splats, features, lists, capacity)
-    lane = lane_pixels(lists)
-    start = dr.gather(ad.UInt32, lists.start, lane.tile)
-    snapshots = _Checkpoints(lists, bucket, channels, lane.place, start) if bucket else None
+    thread = thread_pixels(lists)
+    start = dr.gather(ad.UInt32, lists.start, thread.tile)
+    snapshots = _Checkpoints(lists, bucket, channels, thread.place, start) if bucket else None
 
     def alive(k: UInt32, end: UInt32, transmittance: list[Float], _sums: object, _last: object) -> Bool:
         return (k < end) & (reduce(dr.maximum, transmittance) > TRANSMITTANCE_MIN)
@@ -78,7 +78,7 @@ def blend_lists(
         for u in range(turn):
             listed = k + u < end if u else ad.Bool(True)
             record = load(records, k + u, lists.capacity, listed)
-            powers = exponents(record, lane.x, lane.y, shape)
+            powers = exponents(record, thread.x, thread.y, shape)
             for p in range(pixels):
                 alpha = dr.minimum(exp2(powers[p]), ALPHA_MAX)
                 blends = listed & (powers[p] >= POWER_MIN) & (transmittance[p] > TRANSMITTANCE_MIN)
@@ -91,7 +91,7 @@ def blend_lists(
 
     state = (
         start,
-        dr.gather(ad.UInt32, lists.end, lane.tile),
+        dr.gather(ad.UInt32, lists.end, thread.tile),
         [ad.Float(1) for _ in range(pixels)],
         [[ad.Float(0) for _ in range(channels)] for _ in range(pixels)],
         [ad.UInt32(0) for _ in range(pixels)],
@@ -100,9 +100,9 @@ def blend_lists(
         state = dr.while_loop(state, alive, blend, mode="symbolic", label="blend")
     _, _, transmittance, sums, last = state
 
-    lanes = tiles * shape.lanes
-    tiled = [store([sums[p][c] for p in range(pixels)], lane.place, lanes) for c in range(channels)]
-    tiled_transmittance, tiled_last = store(transmittance, lane.place, lanes), store(last, lane.place, lanes)
+    threads = tiles * shape.threads
+    tiled = [store([sums[p][c] for p in range(pixels)], thread.place, threads) for c in range(channels)]
+    tiled_transmittance, tiled_last = store(transmittance, thread.place, threads), store(last, thread.place, threads)
     checkpoints, bucket_tile = (snapshots.states, snapshots.tile) if snapshots else ([], None)
     dr.eval(tiled, tiled_transmittance, tiled_last, checkpoints, bucket_tile)
     pixel = tiled_index(lists, width, height)
@@ -111,7 +111,7 @@ def blend_lists(
         transmittance=dr.gather(ad.Float, tiled_transmittance, pixel),
         tile_transmittance=tiled_transmittance,
         last=tiled_last,
-        tile_last=dr.block_reduce(dr.ReduceOp.Max, tiled_last, shape.lanes * pixels),
+        tile_last=dr.block_reduce(dr.ReduceOp.Max, tiled_last, shape.threads * pixels),
         records=records,
         bucket=bucket,
         checkpoints=checkpoints,
@@ -122,26 +122,26 @@ def blend_lists(
 class _Checkpoints:
     """What the blending loop keeps of pixels before each bucket, see `BlendResult`.
 
-    lane (its place), start: [T * lanes]"""
+    thread (its place), start: [T * threads]"""
 
-    def __init__(self, lists: TileLists, bucket: int, channels: int, lane: UInt32, start: UInt32) -> None:
+    def __init__(self, lists: TileLists, bucket: int, channels: int, thread: UInt32, start: UInt32) -> None:
         numbers, fours = bucket_numbers(lists, bucket), -(-(1 + channels) // 4)
         pixels = lists.shape.width * lists.shape.height
         self.shape, self.bucket, self.start = lists.shape, bucket, start
-        self.tile_number, self.within = lane // lists.shape.lanes, lane % lists.shape.lanes
+        self.tile_number, self.within = thread // lists.shape.threads, thread % lists.shape.threads
         self.first = start // bucket + self.tile_number
         self.states = [dr.empty(ad.Float, 4 * numbers * pixels) for _ in range(fours)]
         self.tile = dr.full(ad.UInt32, lists.tiles_x * lists.tiles_y, numbers)
 
     def keep(self, k: UInt32, transmittance: list[Float], sums: list[list[Float]]) -> None:
-        """Before pair k, where a bucket starts there; of the pixels whose lane still walks."""
+        """Before pair k, where a bucket starts there; of the pixels whose thread still walks."""
         starts = ((k - self.start) & (self.bucket - 1)) == 0
         number, pixels = self.first + (k - self.start) // self.bucket, self.shape.pixels
-        dr.scatter(self.tile, self.tile_number, number, active=starts)  # whichever lane still walks
+        dr.scatter(self.tile, self.tile_number, number, active=starts)  # whichever thread still walks
         for p in range(pixels):
             values = [transmittance[p], *sums[p]]
             values += [ad.Float(0)] * (-len(values) % 4)
-            place = (number * self.shape.lanes + self.within) * pixels + p
+            place = (number * self.shape.threads + self.within) * pixels + p
             for i, target in enumerate(self.states):
                 dr.scatter(target, ad.Array4f(values[4 * i : 4 * i + 4]), place, starts, dr.ReduceMode.NoConflicts)
 

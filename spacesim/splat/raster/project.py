@@ -120,7 +120,7 @@ def project_ellipsoids(
         opacity=opacity,
         depth=center.z,
     )
-    # The camera's own distance is the same for all: without it, single precision still tells near from far.
+    # The camera's own distance is the same for all: without it, single precision still resolves near and far.
     order = _sortable(dr.detach(dr.dot(camera.row(2), means)))
     return splats, _footprints(splats, xx, yy, order, sane, camera)
 

@@ -1,4 +1,4 @@
-"""What blending and its adjoints read: splats as records in list order, and their alphas at a lane's pixels."""
+"""What blending and its adjoints read: splats as records in list order, and their alphas at a thread's pixels."""
 
 import math
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ _ROUNDING = 1.5 * 2.0**23  #: added to a float below 2^22, it leaves its integer
 class BlendResult:
     """What `forward` leaves behind. Planes are [height * width], row by row.
 
-    The rest is state for `backward`. What is [T * pixels of a tile] is tile-major: a tile's pixels stand lane by lane,
-    a lane's as in `lane_offsets`.
+    The rest is state for `backward`. What is [T * pixels of a tile] is tile-major: a tile's pixels stand thread by
+    thread, a thread's as in `thread_offsets`.
     """
 
     features: list[Float]  #: C planes, sum of w_i f_i
@@ -36,9 +36,9 @@ class BlendResult:
     records: list[Float]  #: the splats' records in list order, see `list_records`
     bucket: int  #: pairs of a bucket of the adjoint, 0 for none
     #: transmittance and sums of each pixel of a bucket's tile before the bucket, by fours, [4 B * pixels of a tile]
-    #: each, without meaning where the pixel's lane did not come to it
+    #: each, without meaning where the pixel's thread did not come to it
     checkpoints: list[Float]
-    bucket_tile: UInt32 | None  #: the tile of each bucket, [B], the number of tiles where no lane came to it
+    bucket_tile: UInt32 | None  #: the tile of each bucket, [B], the number of tiles where no thread came to it
 
 
 def bucket_numbers(lists: TileLists, bucket: int) -> int:
@@ -67,7 +67,7 @@ def list_records(splats: Splats, features: list[Float], lists: TileLists, capaci
 
 def packet_sizes(numbers: int) -> list[int]:
     """How so many numbers of an entry are divided among arrays, in each of which those of an entry stand side by side:
-    a lane reads or adds a packet at once. On LLVM one of eight numbers costs little more than one of four."""
+    a thread reads or adds a packet at once. On LLVM one of eight numbers costs little more than one of four."""
     if select() == "cuda":
         return [4] * -(-numbers // 4)
     rest = numbers % 8
@@ -85,7 +85,7 @@ def packets(values: list[Float]) -> list[list[Float]]:
 
 
 def store(values: list[NumberT], index: UInt32, size: int) -> NumberT:
-    """A flat array [size * len(values)] in which `values` of lane i stand at index i, by one packet scatter."""
+    """A flat array [size * len(values)] in which `values` of an element stand at its index, by one packet scatter."""
     array_type = type(values[0])
     target = dr.empty(array_type, len(values) * size)
     dr.scatter(target, (ad.ArrayXu if array_type is ad.UInt32 else ad.ArrayXf)(values), index)
@@ -114,7 +114,7 @@ def load(arrays: list[Float], index: UInt32, capacity: int, active: Bool | bool 
 
 
 def exponents(record: list[Float], px: Float, py: Float, shape: TileShape) -> list[Float]:
-    """log2 of the unclamped alpha (thesis 2.14) at the pixels of a lane whose first is centred at (px, py)."""
+    """log2 of the unclamped alpha (thesis 2.14) at the pixels of a thread whose first is centred at (px, py)."""
     powers: list[Float] = []
     for i in range(shape.columns):
         dx, dy = px + i - record[0], py - record[1]

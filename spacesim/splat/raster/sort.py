@@ -2,7 +2,7 @@
 itself.
 
 An entry's place among those of its list is taken by an atomic increment, so lists come unordered; then each entry
-counts how many of its list come before it. Key and number tell any two entries of a list apart: where one ends up does
+counts how many of its list come before it. Key and number distinguish any two entries of a list: where one ends up does
 not depend on the order in which they came. A list is ordered in chunks of `CHUNK` entries by comparing each with each;
 an entry then looks for its place in the other chunks of its run of `RUN` by bisection, and, in longer lists, in the
 other runs. Of a list of L that takes CHUNK + RUN / CHUNK log2 CHUNK + L / RUN log2 RUN steps an entry.
@@ -23,7 +23,7 @@ LONG_LANES = 2**16  #: that share the entries of lists beyond RUN: as many as fi
 
 def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32, count: int) -> UInt32:
     """Which of `count` segments each slot [P] belongs to, where segment i has those from segment_ends[i - 1] to
-    segment_ends[i]; `count` for slots that nobody has."""
+    segment_ends[i]; `count` for slots of no segment."""
     number, wide = type(segment_ends), type(segment_ends)(slot)
     segment, step = ad.UInt32(0), 1 << (count.bit_length() - 1)
     while step:
@@ -105,7 +105,7 @@ def _merge_runs(
 
 
 def _packed(values: list[UInt32], index: UInt32, active: Bool | bool, size: int) -> UInt32:
-    """A flat array [4 size] in which the four `values` of a lane stand at its index."""
+    """A flat array [4 size] in which the four `values` of an element stand at its index."""
     target = dr.empty(ad.UInt32, 4 * size)
     dr.scatter(target, ad.Array4u(values), index, active=active)
     dr.eval(target)

@@ -11,7 +11,7 @@ from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import ALPHA_MAX, POWER_MIN, exp2, exponents, list_records, load, packets, store
-from spacesim.splat.raster.tiles import TileLists, lane_pixels, round_capacity, tiled_index
+from spacesim.splat.raster.tiles import TileLists, round_capacity, thread_pixels, tiled_index
 
 NONE = 2**32 - 1  #: in place of a splat's number
 REACH = 2.0  #: standard deviations to which a Gaussian's surface reaches (docs/research/geometry.md)
@@ -48,7 +48,7 @@ def unit(vector: Array3f) -> Array3f:
 def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> UInt32:
     """UInt32 [height * width]: the splat behind which less than half of the light passes; `NONE` where there is none.
 
-    Walks each tile's list once more, until that is known of all pixels of a lane. Not differentiable.
+    Walks each tile's list once more, until that is known of all pixels of a thread. Not differentiable.
     """
     if lists.capacity == 0:
         return dr.opaque(ad.UInt32, NONE, width * height)
@@ -58,7 +58,7 @@ def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> U
 @recorded(elements=lambda _, splats, lists, width, height, *_rest, **_named: width * height)
 def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: int) -> UInt32:
     """`median_splat` as a part of recordings. capacity: room for the N splats"""
-    records, lane, pixels = list_records(splats, [], lists, capacity), lane_pixels(lists), lists.shape.pixels
+    records, thread, pixels = list_records(splats, [], lists, capacity), thread_pixels(lists), lists.shape.pixels
 
     def undecided(k: UInt32, end: UInt32, transmittance: list[Float], _place: object) -> Bool:
         return (k < end) & (reduce(dr.maximum, transmittance) >= 0.5)
@@ -67,7 +67,7 @@ def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: in
         k: UInt32, end: UInt32, transmittance: list[Float], place: list[UInt32]
     ) -> tuple[UInt32, UInt32, list[Float], list[UInt32]]:
         transmittance, place = list(transmittance), list(place)
-        powers = exponents(load(records, k, lists.capacity), lane.x, lane.y, lists.shape)
+        powers = exponents(load(records, k, lists.capacity), thread.x, thread.y, lists.shape)
         for p in range(pixels):
             passing = transmittance[p] >= 0.5
             drawn = dr.minimum(exp2(powers[p]), ALPHA_MAX)
@@ -76,10 +76,10 @@ def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: in
             place[p] = dr.select(passing & (transmittance[p] < 0.5), k, place[p])
         return k + 1, end, transmittance, place
 
-    start, end = (dr.gather(ad.UInt32, bound, lane.tile) for bound in (lists.start, lists.end))
+    start, end = (dr.gather(ad.UInt32, bound, thread.tile) for bound in (lists.start, lists.end))
     state = start, end, [ad.Float(1) for _ in range(pixels)], [ad.UInt32(NONE) for _ in range(pixels)]
     *_, place = dr.while_loop(state, undecided, pass_splat, mode="symbolic", label="median")
-    tiled = store(list(place), lane.place, lists.tiles_x * lists.tiles_y * lists.shape.lanes)
+    tiled = store(list(place), thread.place, lists.tiles_x * lists.tiles_y * lists.shape.threads)
     dr.eval(tiled)
     place = dr.gather(ad.UInt32, tiled, tiled_index(lists, width, height))
     return dr.select(place != NONE, dr.gather(ad.UInt32, lists.splat, place, place != NONE), NONE)
@@ -115,8 +115,8 @@ def surface_depth(gaussians: Gaussians, splats: Splats, index: UInt32, camera: P
     screen = camera.screen(camera.transform(means))
     slopes = [across / (square * screen.scale_x), along / (square * screen.scale_y)]
     numbers = [splats.x, splats.y, *slopes, splats.depth, REACH * dr.exp(most)]
-    lane = dr.arange(ad.UInt32, dr.width(splats.depth))
-    packed = [store(values, lane, capacity) for values in packets(numbers)]
+    splat = dr.arange(ad.UInt32, dr.width(splats.depth))
+    packed = [store(values, splat, capacity) for values in packets(numbers)]
     dr.eval(packed)
 
     is_hit = index != NONE

@@ -12,18 +12,18 @@ STEPS = 8  #: sizes of arrays from one power of two to the next, as a rule
 
 @dataclass(frozen=True)
 class TileShape:
-    """A tile of width x height pixels is blended by `lanes` SIMD lanes, on CUDA threads; each holds `columns` columns
-    of `rows` pixels."""
+    """A tile of width x height pixels is blended by `threads` threads (on LLVM, SIMD lanes); each holds `columns`
+    columns of `rows` pixels."""
 
     width: int  #: pixels
     height: int  #: pixels
-    lanes: int
+    threads: int
     columns: int = 1
 
     @property
     def pixels(self) -> int:
         """Pixels a thread."""
-        return self.width * self.height // self.lanes
+        return self.width * self.height // self.threads
 
     @property
     def rows(self) -> int:
@@ -33,7 +33,7 @@ class TileShape:
 
 def tile_shape() -> TileShape:
     """The fastest shape measured for the backend (docs/research/speed.md). One tile is one warp on CUDA, a part of a
-    packet on LLVM, whose packets have 4 lanes or a multiple: a tile's gradients meet in an order that is fixed."""
+    packet on LLVM, whose packets have 4 threads or a multiple: a tile's gradients meet in an order that is fixed."""
     return TileShape(8, 8, 32) if select() == "cuda" else TileShape(8, 8, 4, columns=2)
 
 
@@ -54,8 +54,8 @@ class TileLists:
     capacity: int
     tiles_x: int  #: tiles in a row
     tiles_y: int  #: rows of tiles
-    shape: TileShape  #: size of a tile, and how lanes share its pixels
-    #: the tiles in the order in which they are given to lanes [T], or None for that of their indices
+    shape: TileShape  #: size of a tile, and how threads share its pixels
+    #: the tiles in the order in which they are given to threads [T], or None for that of their indices
     order: UInt32 | None = None
     #: where each slot's pair stands in `splat` [P], or None: sums of pairs are then kept by slots (`sum_index`)
     place: UInt32 | None = None
@@ -88,41 +88,41 @@ def round_capacity(count: int, steps: int = STEPS) -> int:
 
 
 @dataclass
-class LanePixels:
-    """Of each lane: its tile, its place in tile-major order, and its first pixel: centre (x, y), and indices."""
+class ThreadPixels:
+    """Of each thread: its tile, its place in tile-major order, and its first pixel: centre (x, y), and indices."""
 
     tile: UInt32  #: number, row by row
-    place: UInt32  #: of the lane, where lanes are counted tile by tile
+    place: UInt32  #: of the thread, where threads are counted tile by tile
     x: Float  #: of its first pixel's centre, pixels
     y: Float  #: of its first pixel's centre, pixels
     column: UInt32  #: of its first pixel, from 0
     row: UInt32  #: of its first pixel, from 0
 
 
-def lane_pixels(lists: TileLists) -> LanePixels:
-    """Of all lanes [T * lanes], in the order in which tiles are given to lanes."""
+def thread_pixels(lists: TileLists) -> ThreadPixels:
+    """Of all threads [T * threads], in the order in which tiles are given to threads."""
     shape = lists.shape
-    lane = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * shape.lanes)
-    tile, within = lane // shape.lanes, lane % shape.lanes
+    thread = dr.arange(ad.UInt32, lists.tiles_x * lists.tiles_y * shape.threads)
+    tile, within = thread // shape.threads, thread % shape.threads
     if lists.order is not None:
         tile = dr.gather(ad.UInt32, lists.order, tile)
     across = shape.width // shape.columns
     column = (tile % lists.tiles_x) * shape.width + (within % across) * shape.columns
     row = (tile // lists.tiles_x) * shape.height + (within // across) * shape.rows
-    return LanePixels(tile, tile * shape.lanes + within, ad.Float(column) + 0.5, ad.Float(row) + 0.5, column, row)
+    return ThreadPixels(tile, tile * shape.threads + within, ad.Float(column) + 0.5, ad.Float(row) + 0.5, column, row)
 
 
-def lane_offsets(shape: TileShape) -> list[tuple[int, int]]:
-    """(column, row) of a lane's pixels from its first: column by column."""
+def thread_offsets(shape: TileShape) -> list[tuple[int, int]]:
+    """(column, row) of a thread's pixels from its first: column by column."""
     return [(i, j) for i in range(shape.columns) for j in range(shape.rows)]
 
 
 def pixel_in_tile(number: UInt32, shape: TileShape) -> tuple[UInt32, UInt32]:
     """(column, row) in its tile of a tile's pixel by its number in tile-major order."""
-    lane, pixel, across = number // shape.pixels, number % shape.pixels, shape.width // shape.columns
+    thread, pixel, across = number // shape.pixels, number % shape.pixels, shape.width // shape.columns
     if shape.columns == 1:
-        return lane % across, (lane // across) * shape.rows + pixel
-    column, row = (lane % across) * shape.columns, (lane // across) * shape.rows
+        return thread % across, (thread // across) * shape.rows + pixel
+    column, row = (thread % across) * shape.columns, (thread // across) * shape.rows
     return column + pixel // shape.rows, row + pixel % shape.rows
 
 
@@ -134,4 +134,4 @@ def tiled_index(lists: TileLists, width: int, height: int) -> UInt32:
     tile = (y // shape.height) * lists.tiles_x + x // shape.width
     column, row = x % shape.width, y % shape.height
     within = column // shape.columns + (row // shape.rows) * (shape.width // shape.columns)
-    return (tile * shape.lanes + within) * shape.pixels + (column % shape.columns) * shape.rows + row % shape.rows
+    return (tile * shape.threads + within) * shape.pixels + (column % shape.columns) * shape.rows + row % shape.rows

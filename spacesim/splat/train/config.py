@@ -78,7 +78,7 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything that decides a trained model, apart from the data and the backend. `light` tells the method."""
+    """Everything that decides a trained model, apart from the data and the backend. `light` implies the method."""
 
     #: what makes colours: fixed ones, or light: without shadows, by shadow maps, by shadow splatting, or as table 4.3
     method: Method = field(init=False, repr=False, default="vanilla")
@@ -151,7 +151,7 @@ class TrainConfig:
 
     @property
     def shape_terms(self) -> tuple[str, ...]:
-        """Which of depth and normals are told to training."""
+        """Which of depth and normals supervise training."""
         weights = {"depth": self.depth_weight, "normal": self.normal_weight}
         return tuple(name for name, weight in weights.items() if weight > 0)
 
@@ -169,7 +169,7 @@ class TrainConfig:
         """Plain values for config.json."""
         values: JsonDict = plain(self)
         if self.light and self.light.shadow:
-            values["light"]["shadow"]["method"].pop("baseline", None)  # `method` tells it
+            values["light"]["shadow"]["method"].pop("baseline", None)  # `method` implies it
         return values
 
     @staticmethod
@@ -204,7 +204,7 @@ _LIGHTS: dict[Method, str] = {
 
 @dataclass(frozen=True)
 class _Named:
-    """What files say beside the light, which tells it, too."""
+    """What files say beside the light, which implies it, too."""
 
     method: Method = "vanilla"
 

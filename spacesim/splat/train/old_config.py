@@ -10,7 +10,7 @@ _STRATEGIES = ("mesh-aware", "support-aware", "mcmc")
 
 def in_this_layout(values: JsonMapping) -> JsonDict:
     """The fields of a TrainConfig, plain values; those in today's layout stay as they are, and so does what is neither:
-    whoever reads it says what is wrong."""
+    the reader then says what is wrong."""
     values = dict(values)
     if isinstance(method := values.get("method"), str):
         values["method"] = ALIASES.get(method, method)

@@ -1,4 +1,4 @@
-"""Depth and normals of a mesh as a camera sees it: what training may be told of a shape that is known."""
+"""Depth and normals of a mesh as a camera sees it, to supervise training where the shape is known."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ class MeshPrior:
         single = vertices.astype(np.float32)
         faces = drawable_faces(single.astype(np.float64), faces)
         if len(faces) == 0:
-            raise InputError(f"{path}: expected a mesh that single precision can tell from a point, found none")
+            raise InputError(f"{path}: expected a mesh with faces of some area in single precision, found none")
         mi = backend.mitsuba()
         mesh = mi.Mesh("prior", len(vertices), len(faces))
         parameters = mi.traverse(mesh)

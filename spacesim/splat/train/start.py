@@ -16,7 +16,7 @@ from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 OPACITY = 0.1  #: of every Gaussian at the start (Kerbl et al. 2023)
 NEIGHBOURS = 12  #: points that a normal is estimated from
 COARSE = 0.05  #: pixels: steps of 0.1 cost 0.4 dB of 26.6, those of 1 pixel 1.9 dB (boxsat, 96 pixels)
-MANY_PICTURES = 50  #: of which unknown Suns are told
+MANY_PICTURES = 50  #: that unknown Suns are estimated from
 FEATURES = 0.3  #: standard deviation of the features at the start
 SPLATFACTO_CUBE = 10  #: scene scales, side of the cube that its random start fills (`random_scale`)
 
@@ -140,9 +140,9 @@ def sun_warning(dataset: Dataset) -> str:
         lacking.append(f"{len(dataset.train)} training pictures where it takes {MANY_PICTURES} or more")
     cut_out = (f.silhouette_path or f.mask_path or has_alpha(dataset.root / f.file_path) for f in dataset.train)
     if not any(cut_out):
-        lacking.append("no silhouette, mask or alpha to tell the object from what is behind it")
+        lacking.append("no silhouette, mask or alpha to separate the object from what is behind it")
     found = " and ".join(lacking)
-    return found and f"{dataset.root}: expected what unknown Suns can be told from, found {found}: they may be far off"
+    return found and f"{dataset.root}: expected enough to estimate unknown Suns, found {found}: they may be far off"
 
 
 def _from_points(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -189,5 +189,5 @@ def object_size(dataset: Dataset) -> float:
     elif dataset.ply_file_path is not None:
         points = read_points(dataset.root / dataset.ply_file_path)[0]
     else:
-        raise InputError(f"{dataset.root}: init_box expects a mesh or points that tell the object's size, found none")
+        raise InputError(f"{dataset.root}: init_box expects a mesh or points for the object's size, found none")
     return float(np.ptp(points, axis=0).max())

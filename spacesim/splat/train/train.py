@@ -35,7 +35,7 @@ def train(
     command: Sequence[str] = (),
 ) -> Run:
     """Train and write RUN (see `spacesim.splat.run`). With `resume`, go on from the newest checkpoint, with the
-    same result to the bit; a finished run is returned as it is. command: what the user typed, for the report.
+    same result to the bit; a finished run is returned as it is. command: the command line, for the report.
 
     Ctrl-C on the command line leaves a checkpoint of the step that it came in. Raises InputError where `out` holds a
     run and `resume` is not asked for, or one of another configuration, or where another training is at work in it.

@@ -62,7 +62,7 @@ class TrainingViews:
         self.dataset, self.seed, self.truth, self.surface = dataset, seed, tuple(truth), surface
         self.most_pixels = max(f.camera.width * f.camera.height for f in dataset.train)
         largest = 4 * self.most_pixels * (1 + sum(3 if name == "normal" else 1 for name in truth))
-        self._empty: set[int] = set()  # views that have been told to show nothing
+        self._empty: set[int] = set()  # views that have been reported to show nothing
         self._order = lru_cache(maxsize=1)(self._shuffle)
         in_memory, on_device = kept_bytes()
         self._cached = lru_cache(maxsize=max(1, in_memory // largest))(self._load)

@@ -38,7 +38,7 @@ class WarmStartConfig:
     travel: float = 1.0  #: of the radius of the start, how far a Gaussian can move during `steps`; 0: as without
     rescue: float = 0.5  #: table 5.7, alpha_rescue: how far the unseen move towards the visible cloud
     rescue_every: int = 100  #: steps; a Gaussian that no view of them had in its picture is unseen
-    least_seen: int = 16  #: Gaussians that make a visible cloud, chosen as table 5.3's least supported cloud
+    least_seen: int = 16  #: Gaussians that make a visible cloud, as many as table 5.3's least supported one has
     gather: bool = True  #: beyond the nearest camera is unseen, too
     spacing: float = 1.0  #: widest a Gaussian is after a rescue, in mean distances to its three nearest; 0: any
     revive: float = 0.1  #: opacity to which fainter ones are raised at each rescue: that of the start; 0: none

@@ -19,7 +19,7 @@ FIELD_SHARES = (*SHARES, 0.1875, 0.125, 0.09375)  #: of these
 STEPS = (0.25, 0.5, 1.0)  #: shares in which a picture of these comes at rest, beyond that while the view moves
 STEP = 16  #: sides of pictures are multiples of this many pixels
 STAIR = 128  #: and the longer one, in full resolution, of this many: few sizes occur, each of which compiles kernels
-WARM = 3  #: frames of a size that compile kernels and tell nothing of its speed
+WARM = 3  #: frames of a size that compile kernels and are not timed
 MIN_SIDE = 64  #: pixels of a side
 
 
@@ -117,7 +117,7 @@ class ResolutionControl:
         return ResolutionControl(FIELD_SHARES, FIELD_BUDGET, 0, len(FIELD_SHARES) - 1)
 
     def record_time(self, share: float, size: tuple[int, int], seconds: float) -> None:
-        """Told that a frame of `size` at `share` took so long."""
+        """Record how long a frame of `size` at `share` took."""
         if len(self._seen) > 256:
             self._seen.clear()
         self._seen[size] = self._seen.get(size, 0) + 1

@@ -25,13 +25,13 @@ _log = logging.getLogger(__name__)
 class RenderRequest:
     """A picture that a client wants."""
 
-    #: told whether in full resolution, makes and delivers it, on the render thread; says, of one in full resolution,
-    #: whether it is but a step there
+    #: called with whether it is in full resolution: makes and delivers it, on the render thread; returns, of one in
+    #: full resolution, whether it is but a step there
     draw: Callable[[bool], object]
 
 
 class AbandonedError(Exception):
-    """A picture that nobody waits for any more."""
+    """A picture that no client waits for."""
 
 
 class RenderLoop:

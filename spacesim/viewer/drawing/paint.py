@@ -14,7 +14,7 @@ from spacesim.learning.pictures import LIT, SHADOWED
 Bytes = NDArray[np.uint8]
 
 PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
-"""sRGB colours of objects, from the first again for the eighth: Okabe and Ito's, which the colour-blind tell apart."""
+"""sRGB colours of objects, from the first again for the eighth: Okabe and Ito's, for the colour-blind, too."""
 
 ERROR_SCALE = 0.25  #: mean absolute error of the channels at the bright end, as in reports
 SURFACE = 0.5  #: alpha from which a pixel shows a surface, of depth's range and of ids

@@ -68,7 +68,7 @@ class SceneRenderer:
 
     def draw(self, state: SceneState, camera: Camera, mode: str, on_chunk: Callable[[], None] | None = None) -> Planes:
         """The planes that a mode needs, and alpha. on_chunk: called now and then within a picture of a `progressive`
-        scene, which an exception ends. Raises InputError where the Sun matters and none is told."""
+        scene, which an exception ends. Raises InputError where the Sun matters and none is given."""
         scene = self.composition.posed(state.poses)
         if self.progressive:
             seen = scene.predict(camera, state.sun, normals=NEEDED[mode] == "normal", on_chunk=on_chunk)

@@ -38,7 +38,7 @@ class AllowedHosts:
 def allowed_hosts(host: str) -> AllowedHosts:
     """What a server may be called that listens at `host`.
 
-    The name of another site may lead here, too, as whoever owns it decides (DNS rebinding). So only names count that
+    The name of another site may lead here, too, as its owner decides (DNS rebinding). So only names count that
     are known to be this machine's. An address leads nowhere else: all count where all are listened at.
     """
     if host in _WILDCARDS:

@@ -28,7 +28,7 @@ def sun_from_drag(centre: Array, radius: float, eye: Array, pointer: Array, befo
 
     The ray from the eye through `pointer` [3] meets the sphere in two points; the nearer to where the handle was
     (`before` [3], unit) counts, and of a ray that passes by, the point of the sphere's rim, as the eye sees it, that is
-    nearest to it. What tells no direction leaves it as it was.
+    nearest to it. Without a direction it stays as it was.
     """
     ray = pointer - eye
     length = float(np.linalg.norm(ray))

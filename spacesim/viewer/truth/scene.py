@@ -32,7 +32,7 @@ def load_recorded_scene(data: Path) -> SceneConfig:
     recorded = _without_nulls(config)
     if isinstance(recorded.get("sun"), dict):
         recorded["sun"].pop("color", None)  # what the white balance makes of it, again
-    if isinstance(recorded.get("rig"), dict) and recorded["rig"].get("kind") not in RIGS:  # of somebody's own
+    if isinstance(recorded.get("rig"), dict) and recorded["rig"].get("kind") not in RIGS:  # user-defined
         del recorded["rig"]
     scene = structure(SceneConfig, Document(str(path), recorded, {}), RULES)
     return replace(scene, objects=tuple(_with_absolute_mesh(item, path) for item in scene.objects))

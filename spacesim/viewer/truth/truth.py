@@ -28,7 +28,7 @@ from spacesim.viewer.truth.tracer import TraceRequest, TraceResult, model_ids
 
 SIDE = 512  #: pixels of the longer side of what is path-traced, at most
 SAME_DIRECTION = 1e-4  #: radians between two Suns or two axes that count as one
-PATIENCE = 2.0  #: seconds in which the process has gone that is told to go
+PATIENCE = 2.0  #: seconds in which the process ends after it is asked to
 _START = "import sys; from spacesim.viewer.truth import tracer; tracer.main(int(sys.argv[1]))"
 _ROOT = str(Path(__file__).parents[3])
 
@@ -109,7 +109,7 @@ def resample(picture: Bytes, source: Camera, target: Camera, smooth: bool = True
 class TraceQueue:
     """Takes requests of clients to the process that traces, one after another; a client's newest counts.
 
-    deliver: told (client, answer), on a thread of its own
+    deliver: called with (client, answer), on a thread of its own
     """
 
     def __init__(self, deliver: Callable[[Hashable, TraceResult], None]) -> None:

@@ -174,13 +174,13 @@ def test_without_an_attitude_the_camera_looks_at_the_target(kernels):
     [
         (
             {"stop": "2030-03-01T12:11:00"},
-            r"camera: expected kernels that tell it, found SPICE\(SPKINSUFFDATA\)",
+            r"camera: expected kernels that contain it, found SPICE\(SPKINSUFFDATA\)",
         ),
         ({"start": "2030-03-01T11:59:00", "camera": "SUN"}, r"camera: .*SPICE\(SPKINSUFFDATA\)"),
         ({"camera": "NOBODY"}, r"camera: .* found SPICE\(IDCODENOTFOUND\): The target, 'NOBODY'"),
         ({"camera_frame": "NONE_SUCH"}, r"camera_frame: .* found SPICE\(UNKNOWNFRAME\)"),
         ({"frame": "NONE_SUCH"}, r"camera: .* SPICE\(UNKNOWNFRAME\)"),
-        ({"start": "yesterday"}, "start: expected kernels that tell it, found SPICE"),
+        ({"start": "yesterday"}, "start: expected kernels that contain it, found SPICE"),
         ({"start": STOP, "stop": START}, "stop: expected an epoch after start"),
     ],
 )
@@ -204,7 +204,7 @@ def test_an_earth_that_is_not_covered(kernels, tmp_path):
         orbit = states(times, ahead, height=1.5e8)
         spice.spkw13(handle, body, 10, "J2000", begin, end, "test", 7, len(times), orbit, times)
     spice.spkcls(handle)
-    with pytest.raises(InputError, match=r"earth: expected kernels that tell it, found SPICE\(SPKINSUFFDATA\)"):
+    with pytest.raises(InputError, match=r"earth: expected kernels that contain it, found SPICE\(SPKINSUFFDATA\)"):
         plan(rig((*kernels[:2], name)), TARGET, CAMERA, 0)
     covered = plan(rig((*kernels[:2], name), start="2030-03-01T12:02:00"), TARGET, CAMERA, 0)[0]
     assert all(view.earth is not None for view in covered)
@@ -220,7 +220,7 @@ def test_files_that_are_no_kernels(kernels, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"none.bsp: expected a SPICE kernel, found none"):
         plan(rig((*kernels, str(tmp_path / "none.bsp"))), TARGET, CAMERA, 0)
     (tmp_path / "bad.bsp").write_bytes(b"DAF/SPK " + bytes(3000))
-    with pytest.raises(InputError, match=r"kernels: .*bad.bsp: expected kernels that tell it, found SPICE"):
+    with pytest.raises(InputError, match=r"kernels: .*bad.bsp: expected kernels that contain it, found SPICE"):
         plan(rig((*kernels, str(tmp_path / "bad.bsp"))), TARGET, CAMERA, 0)
     with pytest.raises(InputError, match="kernels: expected names of files, found "):
         SpiceRig(start=START, stop=STOP, camera="A", target="B")

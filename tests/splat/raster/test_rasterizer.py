@@ -342,7 +342,7 @@ def adjoints(arrays, view, channels: int, absolute: bool, monkeypatch) -> list[n
 )
 @pytest.mark.parametrize("logit", [-3.0, 3.0])
 def test_both_adjoints_agree(channels, absolute, logit, monkeypatch):
-    """Faint splats, whose lists are walked to their ends, and opaque ones, where lanes of a tile stop apart."""
+    """Faint splats, whose lists are walked to their ends, and opaque ones, where threads of a tile stop apart."""
     arrays, view = random_splats(400, seed=12), camera(61, 45)
     arrays["logit_opacities"] = arrays["logit_opacities"] + logit
     by_buckets, by_tiles = adjoints(arrays, view, channels, absolute, monkeypatch)
@@ -388,7 +388,7 @@ SHAPES = [(8, 8, 4, 2), (8, 8, 4, 4), (8, 8, 2, 4), (8, 8, 1, 8), (16, 8, 16, 1)
 
 @pytest.mark.parametrize("shape", SHAPES[:1] + SHAPES[3:6])
 def test_any_tile_shape_blends_the_same(shape, monkeypatch):
-    """Lanes that hold columns or blocks, tiles that share a packet or fill it: pictures and gradients by the twin."""
+    """Threads that hold columns or blocks, tiles that share a packet or fill it: pictures and gradients by the twin."""
     monkeypatch.setattr(binning, "tile_shape", lambda: tiles.TileShape(*shape))
     arrays, view = random_splats(25, seed=11, degree=1), camera(24, 17)
     ours, twin = picture(arrays, view), render_reference(arrays, view)
@@ -402,17 +402,17 @@ def test_any_tile_shape_blends_the_same(shape, monkeypatch):
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_lanes_hold_each_pixel_of_a_picture_once(shape):
-    """And `tiled_index` finds it where its lane stores it, `pixel_in_tile` where it is."""
+    """And `tiled_index` finds it where its thread stores it, `pixel_in_tile` where it is."""
     shape, (width, height) = tiles.TileShape(*shape), (37, 21)
     across, down = -(-width // shape.width), -(-height // shape.height)
     none, order = ad.UInt32(0), np.random.default_rng(0).permutation(across * down)
     lists = tiles.TileLists(*[none] * 6, 0, across, down, shape, upload(order.astype(np.uint32), ad.UInt32))
-    lane = tiles.lane_pixels(lists)
+    thread = tiles.thread_pixels(lists)
     found = {}
-    for p, (i, j) in enumerate(tiles.lane_offsets(shape)):
-        column, row, place = (np.array(v) for v in (lane.column + i, lane.row + j, lane.place * shape.pixels + p))
+    for p, (i, j) in enumerate(tiles.thread_offsets(shape)):
+        column, row, place = (np.array(v) for v in (thread.column + i, thread.row + j, thread.place * shape.pixels + p))
         found |= {(x, y): n for x, y, n in zip(column.tolist(), row.tolist(), place.tolist(), strict=True)}
-        inside = tiles.pixel_in_tile(lane.place * shape.pixels % (shape.width * shape.height) + p, shape)
+        inside = tiles.pixel_in_tile(thread.place * shape.pixels % (shape.width * shape.height) + p, shape)
         np.testing.assert_array_equal(np.array(inside[0]), column % shape.width)
         np.testing.assert_array_equal(np.array(inside[1]), row % shape.height)
     pixels = across * down * shape.width * shape.height

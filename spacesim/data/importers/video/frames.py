@@ -36,14 +36,14 @@ class FilmFrame:
     """A decoded frame of a video."""
 
     picture: np.ndarray  #: [H, W, 3] uint8
-    time: float | None  #: seconds at which the file shows it, None where it does not tell
+    time: float | None  #: seconds at which the file shows it, None where it does not say
 
 
 def read_frames(path: Path, again: bool = False) -> Iterator[FilmFrame]:
-    """The frames of a video in order. again: what they lack has been told
+    """The frames of a video in order. again: read before, so that missing frames have been reported
 
     Raises InputError where PyAV is missing, where the file is no video or has none that can be decoded. Where it breaks
-    off, the frames until there are given, and a warning tells.
+    off, the frames until there are given, and a warning is logged.
     """
     library = _decoder()
     with open_regular(path, "a video file"):
@@ -82,7 +82,7 @@ def read_frames(path: Path, again: bool = False) -> Iterator[FilmFrame]:
 
 
 def _lost_seconds(container: Any, end: float | None) -> float:
-    """How much earlier the pictures end than the file declares, 0 where it does not tell or that may well be: by two
+    """How much earlier the pictures end than the file declares, 0 where it does not say or that may well be: by two
     frames and a hundredth of it, beside sound by a second and a tenth."""
     if end is None or not container.duration:
         return 0.0

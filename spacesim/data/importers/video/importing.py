@@ -29,7 +29,7 @@ from spacesim.data.records import Camera, Dataset
 
 FRAMES = 120  #: taken of a video, at most
 LEAST = 3  #: pictures that poses can be found of
-REGISTERED = 0.9  #: share of pictures with a pose below which a warning tells
+REGISTERED = 0.9  #: share of pictures with a pose below which a warning is logged
 NO_MASKS = "none"
 _RIM = 2  # pixels along the outline in which no features are taken: they are of what is behind, too
 _STAGES = ("cut out", "features", "matches", "poses", "write")
@@ -65,7 +65,7 @@ def import_video(
 ) -> Dataset:
     """Import a video of one object. frames: taken at most, see `frames.choose`; options: fields of `ImportOptions`.
 
-    The dataset has structure.json, which tells how the poses were found, and cameras.png. Its unit is the median
+    The dataset has structure.json, which says how the poses were found, and cameras.png. Its unit is the median
     distance of the cameras where neither `length` nor `distance` is known. Raises InputError as `read_frames` and
     `reconstruct` do, and where `out` is not free.
     """

@@ -87,7 +87,7 @@ def placed(model: SfmModel, length: float | None = None, distance: float | None 
 
 
 def report_of(model: SfmModel, names: Sequence[str]) -> dict[str, JsonValue]:
-    """What import tells of it. names: of all pictures."""
+    """The import's report on it. names: of all pictures."""
     tracks = [len(frames) for frames in model.seen_by]
     centres = np.linalg.norm(model.positions, axis=1)
     extent = np.percentile(model.points, EXTENT, axis=0)

@@ -60,7 +60,7 @@ def reconstruct(
     ordered: the pictures are in time order
     workspace: an empty folder for what is needed meanwhile
 
-    Raises InputError where pycolmap is missing, and where the pictures do not tell poses: too few features or matches,
+    Raises InputError where pycolmap is missing, and where the pictures do not fix poses: too few features or matches,
     no parallax, less than half of the pictures in one model, an absurd one.
     """
     colmap = _library()

@@ -145,7 +145,7 @@ class _Cosines:
 
 
 class _Directions:
-    """Conditions are a Sun, None of a field that is not told, and a direction from the camera."""
+    """Conditions are a Sun, None for a field that does not take one, and a direction from the camera."""
 
     def __init__(self, gaussians: Gaussians, light: LightModel) -> None:
         self.gaussians, self.light = gaussians, light

@@ -28,7 +28,7 @@ Arrays = dict[str, np.ndarray]
 
 
 def write_page(run: Run, path: Path, report: Callable[[int, int], None] | None = None) -> None:
-    """Write `run` as a page. report: told (steps done, of all)
+    """Write `run` as a page. report: called with (steps done, of all)
 
     The same run on the same backend gives the same bytes. Raises InputError for a run without Gaussians and for a file
     that cannot be written.
@@ -44,7 +44,7 @@ def write_page(run: Run, path: Path, report: Callable[[int, int], None] | None =
 
 
 def _content(run: Run, report: Callable[[int, int], None] | None) -> tuple[JsonDict, Arrays]:
-    """What the page is told, and its arrays."""
+    """The data of the page, and its arrays."""
     gaussians, light = run.gaussians, run.light
     steps = SEEN_SIDE**2 + color_steps(light) + (sunlight_steps(gaussians, light) if light else 0)
     done = 0

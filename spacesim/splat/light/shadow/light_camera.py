@@ -131,6 +131,6 @@ def _camera(light: Float, middle: Array3f, bounds: list[tuple[Float, Float]], si
         numbers += [*axis, -dr.dot(axis, middle)]
     numbers += [*scales, *principal, ad.Float(0), ad.Float(0)]
     place, values = dr.arange(ad.UInt32, len(numbers)), ad.Float(0)
-    for i, number in enumerate(numbers):  # eighteen lanes pick their own: one kernel, where dr.concat is eighteen
+    for i, number in enumerate(numbers):  # eighteen elements pick their own: one kernel, where dr.concat is eighteen
         values = dr.select(place == i, number, values)
     return Orthographic(values, size, size)

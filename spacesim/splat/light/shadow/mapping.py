@@ -1,6 +1,6 @@
 """Shadow mapping: is a Gaussian behind what the Sun sees first (thesis 4.3.1)? And filters that carry a penumbra.
 
-The Sun's picture is the rasterizer's: the expected depth of every light pixel (4.4). Looking it up costs one lane a
+The Sun's picture is the rasterizer's: the expected depth of every light pixel (4.4). Looking it up costs one thread a
 Gaussian. Everything is detached.
 """
 

@@ -21,10 +21,10 @@ class ShadowRefinementConfig:
     features: int = 6  #: learned numbers that each Gaussian has for this network
     width: int = 64  #: units of a hidden layer
     layers: int = 3  #: matrix products: 3 are two hidden layers
-    sun: Encoding = field(default_factory=Encoding)  #: how the Sun's direction is told
+    sun: Encoding = field(default_factory=Encoding)  #: encoding of the Sun's direction
     positions: Literal["light", "world"] = "light"  #: axes of the model-centred means: the light's (4.12) or world
     positional: int = 0  #: octaves of the encoding of positions, 0 for the bare coordinates
-    bias_info: bool = True  #: raw visibility, normal alignment, light extent and applied bias (4.3.4) are told, too
+    bias_info: bool = True  #: raw visibility, normal alignment, light extent and applied bias (4.3.4) are inputs, too
     #: the network corrects the raw occlusion, which is where training starts; false: it gives the refined occlusion,
     #: through a sigmoid (4.13)
     residual: bool = True
@@ -35,7 +35,7 @@ class ShadowRefinementConfig:
 
     @property
     def shape(self) -> MlpShape:
-        """The network: what is told of each Gaussian, the Sun in common, one number out."""
+        """The network: inputs of each Gaussian, the Sun in common, one number out."""
         inputs = 1 + self.features + 3 + 6 * self.positional + 4 * self.bias_info
         return MlpShape(inputs, self.sun.size, 1, self.width, self.layers)
 

@@ -31,7 +31,7 @@ from spacesim.splat.raster.records import (
     packet_sizes,
     store,
 )
-from spacesim.splat.raster.tiles import LanePixels, TileLists, lane_offsets, lane_pixels, round_capacity
+from spacesim.splat.raster.tiles import ThreadPixels, TileLists, round_capacity, thread_offsets, thread_pixels
 
 BETA_MIN = 0.05  #: a receiver's footprint ends there: 95 % of its weight on 54 % of the area of a cut at 1/255
 LEAST_BETA = 0.004  #: least end of a footprint: 99.6 % of its weight; the lists hold nothing below 1/255
@@ -169,7 +169,7 @@ def _events(
 class _WalkResult:
     """What `_walk` leaves behind. occlusion, weight (sum of beta): [capacity]
 
-    Tile-major, for the adjoint: transmittance and one past the last blocker of each pixel [T * lanes * rows]; the
+    Tile-major, for the adjoint: transmittance and one past the last blocker of each pixel [T * threads * rows]; the
     events' records in list order, see `records.BlendResult`.
     """
 
@@ -182,22 +182,22 @@ class _WalkResult:
 
 @recorded
 def _walk(events: Splats, lists: TileLists, image_size: tuple[UInt32, UInt32], capacity: int) -> _WalkResult:
-    """What each receiver has lost; one lane holds a block of a tile's pixels."""
+    """What each receiver has lost; one thread holds a block of a tile's pixels."""
     shape, pixels = lists.shape, lists.shape.pixels
     receives = dr.select(dr.arange(ad.UInt32, 2 * capacity) < capacity, ad.Float(1), ad.Float(0))
     records = list_records(events, [receives], lists, round_capacity(2 * capacity))
-    lanes, lane = lists.tiles_x * lists.tiles_y * shape.lanes, lane_pixels(lists)
-    inside = [_inside(lane, offset, image_size) for offset in lane_offsets(shape)]
+    threads, thread = lists.tiles_x * lists.tiles_y * shape.threads, thread_pixels(lists)
+    inside = [_inside(thread, offset, image_size) for offset in thread_offsets(shape)]
     slots = dr.zeros(ad.Float, 2 * lists.capacity)
     mode = reduce_mode(8 * lists.capacity, shape)
-    end = dr.gather(ad.UInt32, lists.end, lane.tile)
+    end = dr.gather(ad.UInt32, lists.end, thread.tile)
 
     def remaining(k: UInt32, _transmittance: object, _last: object) -> Bool:
         return k < end
 
     def take(k: UInt32, transmittance: list[Float], last: list[UInt32]) -> tuple[UInt32, list[Float], list[UInt32]]:
         record = load(records, k, lists.capacity)
-        powers = exponents(record, lane.x, lane.y, shape)
+        powers = exponents(record, thread.x, thread.y, shape)
         receiver = record[6] > 0
         transmittance, last = list(transmittance), list(last)
         lost, weight = ad.Float(0), ad.Float(0)
@@ -215,12 +215,12 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[UInt32, UInt32], c
         return k + 1, transmittance, last
 
     state = (
-        dr.gather(ad.UInt32, lists.start, lane.tile),
+        dr.gather(ad.UInt32, lists.start, thread.tile),
         [ad.Float(1) for _ in range(pixels)],
         [ad.UInt32(0) for _ in range(pixels)],
     )
     _, transmittance, last = dr.while_loop(state, remaining, take, mode="symbolic", label="shadow")
-    transmittance, last = store(transmittance, lane.place, lanes), store(last, lane.place, lanes)
+    transmittance, last = store(transmittance, thread.place, threads), store(last, thread.place, threads)
     dr.eval(slots, transmittance, last)
     lost, weight = _sum_slots(slots, lists, capacity)
     seen = weight > 0
@@ -228,9 +228,9 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[UInt32, UInt32], c
     return _WalkResult(occlusion, weight, transmittance, last, records)
 
 
-def _inside(lane: LanePixels, offset: tuple[int, int], image_size: tuple[UInt32, UInt32]) -> Bool:
-    """Is the lane's pixel at an offset from its first one of the picture's?"""
-    return (lane.column + offset[0] < image_size[0]) & (lane.row + offset[1] < image_size[1])
+def _inside(thread: ThreadPixels, offset: tuple[int, int], image_size: tuple[UInt32, UInt32]) -> Bool:
+    """Is the thread's pixel at an offset from its first one of the picture's?"""
+    return (thread.column + offset[0] < image_size[0]) & (thread.row + offset[1] < image_size[1])
 
 
 def _sum_slots(slots: Float, lists: TileLists, capacity: int) -> Array2f:
@@ -259,16 +259,16 @@ def _replay(
     With u_i = dL/d occ_i / sum of beta_i: dL/d beta_i = u_i (1 - T_i - occ_i), and
     dL/d alpha_j = (sum over receivers i behind j of u_i beta_i T_i) / (1 - alpha_j).
     """
-    shape, lane, offsets = lists.shape, lane_pixels(lists), lane_offsets(lists.shape)
-    inside = [_inside(lane, offset, image_size) for offset in offsets]
-    places = [lane.place * shape.pixels + p for p in range(shape.pixels)]
+    shape, thread, offsets = lists.shape, thread_pixels(lists), thread_offsets(lists.shape)
+    inside = [_inside(thread, offset, image_size) for offset in offsets]
+    places = [thread.place * shape.pixels + p for p in range(shape.pixels)]
     transmittance = [dr.gather(ad.Float, walked.transmittance, place) for place in places]
     last = [dr.gather(ad.UInt32, walked.last, place) for place in places]
     shares = dr.select(walked.weight > 0, gradient / dr.maximum(walked.weight, 1e-30), 0)
     dr.eval(shares)
     slots = [dr.zeros(ad.Float, size * lists.capacity) for size in packet_sizes(6)]
     mode = reduce_mode(32 * lists.capacity, shape)
-    start = dr.gather(ad.UInt32, lists.start, lane.tile)
+    start = dr.gather(ad.UInt32, lists.start, thread.tile)
 
     def remaining(k: UInt32, _transmittance: object, _behind: object) -> Bool:
         return k > start
@@ -276,13 +276,13 @@ def _replay(
     def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> tuple[UInt32, list[Float], list[Float]]:
         k = k - 1
         record = load(walked.records, k, lists.capacity)
-        powers = exponents(record, lane.x, lane.y, shape)
+        powers = exponents(record, thread.x, thread.y, shape)
         receiver = record[6] > 0
         event = dr.gather(ad.UInt32, lists.splat, k)
         share = dr.gather(ad.Float, shares, event, receiver)
         occlusion = dr.gather(ad.Float, walked.occlusion, event, receiver)
         transmittance, behind = list(transmittance), list(behind)
-        moments = PixelMoments(lane.x - record[0], lane.y - record[1])
+        moments = PixelMoments(thread.x - record[0], thread.y - record[1])
         for p, offset in enumerate(offsets):
             unclamped = exp2(powers[p])
             alpha = dr.minimum(unclamped, ALPHA_MAX)
@@ -299,7 +299,7 @@ def _replay(
         add_to_slots(slots, moments.sums(), lists.sum_index(k), mode)
         return k, transmittance, behind
 
-    state = dr.gather(ad.UInt32, lists.end, lane.tile), transmittance, [ad.Float(0) for _ in offsets]
+    state = dr.gather(ad.UInt32, lists.end, thread.tile), transmittance, [ad.Float(0) for _ in offsets]
     dr.while_loop(state, remaining, replay, mode="symbolic", label="replay shadow")
     dr.eval(slots)
     gradients: Splats = gather_slots(slots, events, lists, 0).splats

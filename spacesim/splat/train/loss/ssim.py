@@ -1,6 +1,6 @@
 """Structural similarity (Wang et al. 2004; thesis 2.19) with its derivative by hand, in four kernels.
 
-The Gaussian window is separable and symmetric: the adjoint of a blur is the same blur. A lane blurs a strip of ROWS
+The Gaussian window is separable and symmetric: the adjoint of a blur is the same blur. A thread blurs a strip of ROWS
 pixels along one axis, reading each neighbour once, and writes it as one packet across that axis, so that the next
 kernel reads neighbours of the other axis just as it read these.
 """
@@ -104,15 +104,15 @@ def _blur(values: Sequence[Float]) -> list[Float]:
 
 
 class _Strips:
-    """Lanes that hold ROWS pixels along an axis of `extent`; `crossing` is the size of the other. Pixels next to each
+    """Threads that hold ROWS pixels along an axis of `extent`; `crossing` is the size of the other. Pixels next to each
     other along the axis stand `step` apart in memory, those across it 1."""
 
     def __init__(self, crossing: int, extent: int, step: int) -> None:
         count = -(-extent // ROWS)
         self.crossing, self.extent, self.step, self.stride = crossing, extent, step, count * ROWS
-        lane = dr.arange(ad.UInt32, crossing * count)
-        self.cross, self.first = lane % crossing, (lane // crossing) * ROWS
-        self._packet = self.cross * count + lane // crossing
+        strip = dr.arange(ad.UInt32, crossing * count)
+        self.cross, self.first = strip % crossing, (strip // crossing) * ROWS
+        self._packet = self.cross * count + strip // crossing
 
     def read(self, plane: Float) -> list[Float]:
         """ROWS + 2 RADIUS values along the axis, 0 beyond its ends."""

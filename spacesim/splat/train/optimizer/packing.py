@@ -1,7 +1,7 @@
 """Pairs of rows in few arrays that fill the memory that Dr.Jit takes for them.
 
 Dr.Jit gives an array the next power of two of bytes: 20,000 numbers take as much as 32,768. Fifteen pairs of such rows
-in one array take as much as 16 would of 20,000 * 16 / 15. So pairs are dealt to arrays that are nearly full, and a lane
+in one array take as much as 16 would of 20,000 * 16 / 15. So pairs are dealt to arrays that are nearly full; a thread
 reads and writes those of its Gaussian by packets, which costs no more than plain rows do (docs/research/memory.md).
 """
 

@@ -96,7 +96,7 @@ def _without_features(view: ViewGradients) -> tuple[Pinhole, Splats, dict[str, l
 def _replace(
     gaussians: Gaussians, optimizer: Adam, rows: list[Float], number: int, moved: list[Float], moments: list[Float]
 ) -> None:
-    """Put a part's new rows and moments in the place of the old ones, which nobody holds any longer."""
+    """Put a part's new rows and moments in the place of the old ones, which are released."""
     rows[optimizer.slices[number]], optimizer.arrays[number] = moved, moments
     if number == 0:
         gaussians.replace(rows)

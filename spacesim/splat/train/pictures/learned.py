@@ -93,7 +93,7 @@ class LearnedPictures:
         return self.poses is not None and step < self.poses.anchored
 
     def hold(self, steps: int) -> None:
-        """After so many steps: what pictures cannot tell stays as it is given."""
+        """After so many steps: what pictures do not determine stays as it is given."""
         if self.poses:
             self.poses.hold(steps)
         if self.exposures:

@@ -1,7 +1,7 @@
 """Learned numbers of each training picture, which have steps of their own.
 
 A picture is shown once in an epoch, so its moments count its own steps, not the training's. Its numbers are few: they
-stay in main memory in double precision, and gradients are read when a later step has begun, so that nobody waits.
+stay in main memory in double precision, and gradients are read when a later step has begun, so that no step waits.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,7 +1,7 @@
 """Poses of training pictures, refined: each camera moves as its own loss asks, in a training of its own.
 
-Its model only has to tell where cameras are and goes (`pose_config`); the run's model is trained from the start with
-the poses found, which stay, as one that learned before its cameras stood stays worse.
+Its model only has to find where cameras are and is discarded (`pose_config`); the run's model is trained from the
+start with the poses found, which stay, as one that learned before its cameras stood stays worse.
 It is drawn with the anti-aliasing filter: splats that are widened to a pixel cover more the farther a camera is, which
 turns and moves even a camera that is right.
 
@@ -15,9 +15,9 @@ in other ways than moved so, and a step of each moves pixels about as far:
 
     p' = exp([w]) (p - m) + m + d u        p: in the given camera's axes;  m: the centre there;  d = |m|
 
-The world's axes, origin and unit of length cannot be told from pictures. Where training starts at points or a mesh,
-these tell: at first their centres stay, and each camera finds its place before them. From then on, and from the first
-step where training starts at random, the world is held where the cameras have it: what the numbers of all pictures
+The world's axes, origin and unit of length do not follow from pictures. Where training starts at points or a mesh,
+these do: at first their centres stay, and each camera finds its place before them. From then on, and from the
+first step where training starts at random, the world stays where the cameras have it: what the numbers of all pictures
 share with a turn, a shift and a growth of all cameras (7 ways, linearised at the given ones, least squares of angles
 and of shifts per distance) stays as it was, by a correction every `GAUGE_EVERY` steps.
 """
@@ -228,7 +228,7 @@ class _Gauge:
 
     def rigid(self, numbers: Array) -> Array:
         """[R] of each way in numbers [V, 6], without growth: splats' sizes, which change while their centres stay,
-        would tell of that."""
+        would follow it."""
         shares = self.shares @ numbers.ravel()
         rigid: Array = shares - self.growth * (self.growth @ shares)
         return rigid

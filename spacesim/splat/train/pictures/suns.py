@@ -7,7 +7,7 @@
 3. Now and then (`SEARCHES`) every picture is compared with the model under other Suns, shadows included: those near its
    own, and those that its shading allowed (`sun_search.SunFinder`).
 
-Pictures that tell their time have Suns that turn little from one to the next.
+Pictures with a time have Suns that turn little from one to the next.
 """
 
 import logging
@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class FirstSuns:
-    """What shape and shading tell of the Suns of V pictures."""
+    """What shape and shading say of the Suns of V pictures."""
 
     directions: Array  #: [V, 3] unit, world axes
     choices: np.ndarray  #: [V, CHOICES] int, numbers of the lattice's Suns that do best
@@ -171,7 +171,7 @@ def first_suns(dataset: Dataset, gaussians: Gaussians, distance: float) -> First
 
 
 def time_order(frames: Sequence[Frame]) -> np.ndarray | None:
-    """[V] numbers of frames in the order of their times; None where some tell none, or all the same."""
+    """[V] numbers of frames in the order of their times; None where some have none, or all the same."""
     times = [frame.time for frame in frames]
     if any(time is None for time in times) or len(set(times)) < 2:
         return None
@@ -179,7 +179,7 @@ def time_order(frames: Sequence[Frame]) -> np.ndarray | None:
 
 
 def check_pictures(dataset: Dataset) -> None:
-    """Raise InputError where too few pictures are there for Suns to be told from albedo."""
+    """Raise InputError where too few pictures are there to separate Suns from albedo."""
     if len(dataset.train) < 8:
         raise InputError(f"sun: expected at least 8 training pictures to estimate it, found {len(dataset.train)}")
 

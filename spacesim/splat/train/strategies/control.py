@@ -183,7 +183,7 @@ class DensityControl(Strategy):
     def _prune_outside(
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator
     ) -> DensificationCounts:
-        """In the pause after a reset, when opacities tell nothing."""
+        """In the pause after a reset, when opacities mean nothing."""
         statistics = self._collect_statistics(step, gaussians)
         remove = self._outside(gaussians, statistics)
         added = self._prune_and_fill(gaussians, optimizer, statistics, remove, rng)

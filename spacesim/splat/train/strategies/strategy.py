@@ -1,6 +1,6 @@
 """What every strategy of densification is: it watches steps, and now and then changes the set of Gaussians.
 
-It knows nothing of pictures, losses or cameras: a trainer tells it gradients and radii on the screen, and hands it
+It knows nothing of pictures, losses or cameras: a trainer gives it gradients and radii on the screen, and hands it
 Gaussians and the optimizer whose moments have to follow them.
 """
 

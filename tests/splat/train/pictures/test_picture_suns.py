@@ -25,7 +25,7 @@ CONFIG = replace(preset("demo", "shadow-map"), sun="unknown", init_count=150, it
 
 @pytest.fixture
 def untold(small_dataset):
-    """The training pictures under Suns that nobody tells, each three times, so that there are enough."""
+    """The training pictures under unknown Suns, each three times, so that there are enough."""
     frames = tuple(replace(frame, sun=None) for frame in small_dataset.train)
     return replace(small_dataset, train=tuple(frames * 3)[: max(8, len(frames))])
 
