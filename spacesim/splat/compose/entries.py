@@ -182,8 +182,8 @@ class SceneEntry:
     """The whole file."""
 
     models: tuple[ModelEntry, ...]  #: in the order that object numbers count
-    sun: SunEntry | None = None  #: None: keyframes or whoever draws it say
-    camera: CameraEntry | None = None  #: None: whoever draws it says
+    sun: SunEntry | None = None  #: None: from keyframes or the caller
+    camera: CameraEntry | None = None  #: None: from the caller
     shadows: str = ComposeConfig.shadows  #: of models on each other, see `ComposeConfig`
     frames: int | None = None  #: pictures; None: up to the last keyframe, 120 of an orbit, else 1
     fps: float = FPS  #: pictures a second

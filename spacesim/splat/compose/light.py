@@ -61,7 +61,7 @@ class EnsembleLight:
 
     ensemble: Ensemble  #: the members
     poses: Sequence[Pose]  #: one of each
-    sun: Array | None  #: [3] towards it, world; None where nobody has said, and no shadows are asked for
+    sun: Array | None  #: [3] towards it, world; None where none is given, and no shadows are asked for
     shadows: str  #: of members on each other, as `ComposeConfig.shadows`
     beside: SunOccluder | None  #: what else stands in the Sun's way
     cache: LightCache  #: of this ensemble

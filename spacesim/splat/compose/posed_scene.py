@@ -29,7 +29,7 @@ class SceneFrame:
     time: float  #: seconds
     composition: GaussianComposition  #: with the poses of that time
     camera: Camera  #: pose and intrinsics at that time
-    sun: Sun | None  #: at that time; None where nobody has said
+    sun: Sun | None  #: at that time; None where none is given
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class PosedScene:
         time: float = 0.0,
     ) -> Rendering:
         """What a camera sees of the scene at a time, seconds: as `Run.render`. camera, sun: by default the scene's own
-        then. Raises InputError where one is needed and nobody has said which."""
+        then. Raises InputError where one is needed and none is given."""
         camera = self.at(time).camera if camera is None else camera
         composition = self.posed_at(time)
         whose = str(composition.path or "the scene")
@@ -81,7 +81,7 @@ class PosedScene:
         return Rendering(composition, camera, direction, exposure)
 
     def sun_at(self, time: float) -> Sun | None:
-        """The Sun at a time, seconds; None where nobody has said."""
+        """The Sun at a time, seconds; None where none is given."""
         return self._track(lambda key: key.sun, interpolate_sun, time) or self.sun
 
     def posed_at(self, time: float) -> GaussianComposition:
