@@ -18,25 +18,29 @@ if TYPE_CHECKING:
         DirectionSample3f,
         Interaction3f,
         Mesh,
+        Sampler,
         Scene,
         ShapePtr,
     )
 
+    Integrator: TypeAlias = Any
     RayDifferential3f: TypeAlias = Any
     SurfaceInteraction3f: TypeAlias = Any
 else:
-    BSDF = Color3f = DirectionSample3f = Interaction3f = Mesh = Point2f = Point3f = RayDifferential3f = Any
-    Scene = ShapePtr = SurfaceInteraction3f = Vector3f = Any
+    BSDF = Color3f = DirectionSample3f = Integrator = Interaction3f = Mesh = Point2f = Point3f = RayDifferential3f = Any
+    Sampler = Scene = ShapePtr = SurfaceInteraction3f = Vector3f = Any
 
 __all__ = [
     "BSDF",
     "Color3f",
     "DirectionSample3f",
+    "Integrator",
     "Interaction3f",
     "Mesh",
     "Point2f",
     "Point3f",
     "RayDifferential3f",
+    "Sampler",
     "Scene",
     "ShapePtr",
     "SurfaceInteraction3f",

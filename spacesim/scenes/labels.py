@@ -6,6 +6,7 @@ on the pixels next to these, many directions are; as long as that finds more of 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, cast
 
 import drjit as dr
@@ -35,13 +36,12 @@ class Labeller:
 
     def __init__(self, scene: Scene, loaded: MitsubaScene, distortion: Sequence[float]) -> None:
         self._scene = loaded.labelled
-        self._distortion = tuple(distortion)
         self._units = loaded.units
         self._parts = PartTable.of(scene, self._scene)
         self._sun = loaded.sun
         self._directions = SolarDirections(scene.sun)
-        self._centres = record_on_cuda(self._trace_centres)
-        self._penumbrae = record_on_cuda(self._trace_penumbrae)
+        self._centres = record_on_cuda(partial(_trace_centres, tuple(distortion)))
+        self._penumbrae = record_on_cuda(_trace_penumbrae)
 
     def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
         """All fields of Truth but radiance and alpha."""
@@ -51,34 +51,6 @@ class Labeller:
         labels = _images(numbers, ids, camera)
         self._refine(points, sun, labels)
         return labels
-
-    def _trace_centres(
-        self, scene: mt.Scene, parts: "PartTable", view: KernelCamera, sun: mt.Vector3f, disc: Disc
-    ) -> tuple[Float, UInt32, "_Points"]:
-        """(labels that are numbers, one after another; labels that are bytes, packed; surface points)."""
-        mi = backend.mitsuba()
-        pixel = dr.arange(mi.UInt32, view.width * view.height)
-        ray, before = view.rays(pixel, mi.Point2f(0.5), self._distortion)
-        surface: mt.SurfaceInteraction3f = scene.ray_intersect(ray)
-        hit = surface.is_valid()
-        normal = dr.select(dr.dot(surface.n, ray.d) > 0, -surface.n, surface.n)
-        cosine = dr.select(hit, dr.dot(normal, sun), 0.0)
-        object_id, part_id = parts.ids(surface.shape, hit)
-        distance = dr.select(hit, (before + surface.t) * view.metre, 0.0)
-        numbers: list[Float | mt.Vector3f] = [
-            distance * dr.dot(ray.d, view.forward),
-            distance,
-            cosine,
-            dr.select(hit, normal, 0.0),
-            parts.albedo(surface, hit),
-        ]
-        points = _Points(surface.p + OFFSET * normal, normal, object_id)
-        dr.eval(numbers, part_id, points)  # in one kernel
-        faces_sun = cosine > 0
-        visibility, classes = _sun_visibility(scene, parts, disc, points, faces_sun)
-        shadow: Any = dr.select(hit, dr.select(faces_sun, classes, SHADOW_ATTACHED), SHADOW_NONE)
-        flat: list[Any] = [dr.ravel(values) for values in (*numbers, visibility)]
-        return dr.concat(flat), object_id | (part_id << 8) | (shadow << 16), points
 
     def _refine(self, points: "_Points", sun: Sun, labels: Mapping[str, np.ndarray]) -> None:
         """Settle penumbrae in the labels sun_visibility and shadow."""
@@ -109,24 +81,53 @@ class Labeller:
         visibility, shadow = np.concatenate(pieces, axis=1)
         return visibility, shadow.astype(np.uint8)
 
-    def _trace_penumbrae(
-        self,
-        scene: mt.Scene,
-        parts: "PartTable",
-        disc: Disc,
-        points: "_Points",
-        indices: UInt32,
-        count: UInt32,
-        capacity: int,
-    ) -> Float:
-        """Visibility, then shadow classes, of the points `indices` [capacity]; those from `count` on are not asked."""
-        mi = backend.mitsuba()
-        origin, normal = (
-            mi.Vector3f(*(dr.gather(mi.Float, x, indices) for x in vector)) for vector in (points.origin, points.normal)
-        )
-        chosen = _Points(origin, normal, dr.gather(mi.UInt32, points.object_id, indices))
-        visibility, shadow = _sun_visibility(scene, parts, disc, chosen, dr.arange(mi.UInt32, capacity) < count)
-        return dr.concat([visibility, mi.Float(shadow)])
+
+def _trace_centres(
+    distortion: Sequence[float], scene: mt.Scene, parts: "PartTable", view: KernelCamera, sun: mt.Vector3f, disc: Disc
+) -> tuple[Float, UInt32, "_Points"]:
+    """(labels that are numbers, one after another; labels that are bytes, packed; surface points)."""
+    mi = backend.mitsuba()
+    pixel = dr.arange(mi.UInt32, view.width * view.height)
+    ray, before = view.rays(pixel, mi.Point2f(0.5), distortion)
+    surface: mt.SurfaceInteraction3f = scene.ray_intersect(ray)
+    hit = surface.is_valid()
+    normal = dr.select(dr.dot(surface.n, ray.d) > 0, -surface.n, surface.n)
+    cosine = dr.select(hit, dr.dot(normal, sun), 0.0)
+    object_id, part_id = parts.ids(surface.shape, hit)
+    distance = dr.select(hit, (before + surface.t) * view.metre, 0.0)
+    numbers: list[Float | mt.Vector3f] = [
+        distance * dr.dot(ray.d, view.forward),
+        distance,
+        cosine,
+        dr.select(hit, normal, 0.0),
+        parts.albedo(surface, hit),
+    ]
+    points = _Points(surface.p + OFFSET * normal, normal, object_id)
+    dr.eval(numbers, part_id, points)  # in one kernel
+    faces_sun = cosine > 0
+    visibility, classes = _sun_visibility(scene, parts, disc, points, faces_sun)
+    shadow: Any = dr.select(hit, dr.select(faces_sun, classes, SHADOW_ATTACHED), SHADOW_NONE)
+    flat: list[Any] = [dr.ravel(values) for values in (*numbers, visibility)]
+    return dr.concat(flat), object_id | (part_id << 8) | (shadow << 16), points
+
+
+def _trace_penumbrae(
+    scene: mt.Scene,
+    parts: "PartTable",
+    disc: Disc,
+    points: "_Points",
+    indices: UInt32,
+    count: UInt32,
+    capacity: int,
+) -> Float:
+    """Visibility, then shadow classes, of the points `indices` [capacity]; those from `count` on are not asked."""
+    mi = backend.mitsuba()
+    origin, normal = (
+        mi.Vector3f(*(dr.gather(mi.Float, x, indices) for x in vector)) for vector in (points.origin, points.normal)
+    )
+    chosen = _Points(origin, normal, dr.gather(mi.UInt32, points.object_id, indices))
+    visibility, shadow = _sun_visibility(scene, parts, disc, chosen, dr.arange(mi.UInt32, capacity) < count)
+    return dr.concat([visibility, mi.Float(shadow)])
 
 
 def _sun_visibility(

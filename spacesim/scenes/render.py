@@ -11,6 +11,7 @@ frame.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import numpy as np
@@ -62,10 +63,10 @@ class Renderer:
         self._distortion = tuple(distortion)
         self._loaded = load(scene)
         self._earth = scene.earth  # where it is now
-        self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
-        self._sampler = mi.load_dict({"type": "independent"})
+        integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
+        sampler = mi.load_dict({"type": "independent"})
         self._labeller = Labeller(scene, self._loaded, distortion)
-        self._sums = record_on_cuda(self._trace_paths)
+        self._sums = record_on_cuda(partial(_trace_paths, integrator, sampler, self._distortion))
 
     def of(self, scene: Scene) -> "Renderer":
         """The same of another scene."""
@@ -123,22 +124,6 @@ class Renderer:
             for i in range(passes)
         ]
 
-    def _trace_paths(self, scene: mt.Scene, view: KernelCamera, noise: "_Noise", spp: int) -> Float:
-        """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]."""
-        mi = backend.mitsuba()
-        samples = spp * view.width * view.height
-        sampler = self._sampler.fork()  # a state that was there before must not be freed in a recording
-        sampler.seed(noise.sampler, samples)
-        index = dr.arange(mi.UInt32, samples)
-        pixel = index // spp
-        offset = _pixel_offsets(pixel, index - pixel * spp + noise.first, noise.shift)
-        ray, _ = view.rays(pixel, offset, self._distortion)
-        radiance, hit, _ = self._integrator.sample(scene, sampler, ray)
-        channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
-        dr.eval(channels)
-        *rgb, alpha = (dr.block_sum(x, spp, mode="evaluated") for x in channels)
-        return dr.concat([dr.ravel(mi.Color3f(rgb)), alpha])
-
     def inside(self, positions: Array) -> np.ndarray:
         """[N] bool: which of the `positions` [N, 3] are within a part.
 
@@ -173,6 +158,31 @@ class _Noise:
     sampler: UInt32  #: seeds
     shift: UInt32  #: seeds
     first: UInt32  #: number of the pass's first sample
+
+
+def _trace_paths(
+    integrator: mt.Integrator,
+    sampler: mt.Sampler,
+    distortion: Sequence[float],
+    scene: mt.Scene,
+    view: KernelCamera,
+    noise: _Noise,
+    spp: int,
+) -> Float:
+    """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]."""
+    mi = backend.mitsuba()
+    samples = spp * view.width * view.height
+    sampler = sampler.fork()  # a state that was there before must not be freed in a recording
+    sampler.seed(noise.sampler, samples)
+    index = dr.arange(mi.UInt32, samples)
+    pixel = index // spp
+    offset = _pixel_offsets(pixel, index - pixel * spp + noise.first, noise.shift)
+    ray, _ = view.rays(pixel, offset, distortion)
+    radiance, hit, _ = integrator.sample(scene, sampler, ray)
+    channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
+    dr.eval(channels)
+    *rgb, alpha = (dr.block_sum(x, spp, mode="evaluated") for x in channels)
+    return dr.concat([dr.ravel(mi.Color3f(rgb)), alpha])
 
 
 def _mean_radiance(sums: Sequence[Float], camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray]:

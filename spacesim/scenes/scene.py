@@ -2,12 +2,13 @@
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 import trimesh
-from scipy.spatial import QhullError
+from scipy.spatial import ConvexHull, QhullError
 
 from spacesim import backend
 from spacesim.backend import mitsuba_types as mt
@@ -98,11 +99,9 @@ class Scene:
 
         Badoiu and Clarkson, "Smaller core-sets for balls", 2003: step ever less towards the farthest point.
         """
-        try:
-            with np.errstate(invalid="ignore"):  # of the volume of a hull that is nearly flat
-                points = self.mesh.convex_hull.vertices
-        except QhullError:  # all in a plane
-            points = self.mesh.vertices
+        points = np.asarray(self.mesh.vertices)  # trimesh's own array looks after a cache at every operation
+        with suppress(QhullError):  # all in a plane
+            points = points[np.sort(ConvexHull(points, qhull_options="QbB Pp Qt").vertices)]
         centre = points.mean(axis=0)
         for i in range(1, 1000):
             centre = centre + (points[np.linalg.norm(points - centre, axis=1).argmax()] - centre) / (i + 1)

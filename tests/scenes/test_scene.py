@@ -1,5 +1,7 @@
-"""The limits of a scene, and its materials by name."""
+"""The limits of a scene, its materials by name, and its renderer's life."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -78,3 +80,17 @@ def test_numbers_do_not_meet_names_that_are_there():
     found = named_materials(Scene("paints", (SceneObject(Spacecraft("craft", parts)),)))
     assert [name for name, _ in found] == ["p", "p_2", "p_3", "p", "p_3"]
     assert [albedo[0] for _, albedo in found] == [0.1, 0.2, 0.3, 0.1, 0.3]
+
+
+def test_a_renderer_is_let_go_of_at_once():
+    """A scene that moves is loaded for each frame: kernels grow with all the scenes that are still there."""
+    renderer = Renderer(build(SceneConfig("box", (ObjectConfig("boxsat"),))), spp=1)
+    camera = Camera.from_fov(look_at(np.array([10.0, 0, 0]), np.zeros(3)), 8, 8, 25.0)
+    renderer.render(camera, Sun(np.array([1.0, 0, 0])), (0,))
+    there = weakref.ref(renderer._loaded)
+    gc.disable()
+    try:
+        del renderer
+        assert there() is None
+    finally:
+        gc.enable()
