@@ -387,6 +387,25 @@ def test_shadows_compares_methods_and_goes_on_where_it_stopped(command, small_li
 
 
 @smallest(
+    "suns.py --out OUT --pictures 8 --suns 2,8 --resolution 32 --samples 16 --preset demo --iterations 6 --seeds 2"
+    " --backend llvm --json"
+)
+def test_suns_compares_the_same_number_of_pictures(command, place):
+    rows = json.loads(call(command))["rows"]
+    assert [(row["Suns"], row["views of each"]) for row in rows] == [(2, 4), (8, 1)]
+    for row, suns_of_row in zip(rows, (2, 8), strict=True):
+        train = read_dataset(place / f"OUT/data-{suns_of_row}").train
+        assert len(train) == 8
+        assert len({tuple(frame.sun.direction) for frame in train}) == suns_of_row
+        assert 0 < row["PSNR"] < 40
+        assert row["PSNR, deviation"] >= 0
+        assert 0 <= row["BER"] <= 1
+    unseen = {tuple(frame.sun.direction) for frame in read_dataset(place / "OUT/unseen").test}
+    assert len(unseen) == 8
+    assert not unseen & {tuple(frame.sun.direction) for frame in read_dataset(place / "OUT/data-8").train}
+
+
+@smallest(
     "light.py --backend llvm --sizes 300x32 --step-sizes 300x32 --preset demo --repeats 2 --methods relight,shadow-map"
     " --markdown --json found.json"
 )
