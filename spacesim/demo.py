@@ -1,4 +1,4 @@
-"""`spacesim demo`: one satellite under several Suns, from a scene to a report and a page: minutes on two CPU cores."""
+"""`spacesim demo`: one satellite under many Suns, from a scene to a report and a page: minutes on two CPU cores."""
 
 import json
 import logging
@@ -25,12 +25,11 @@ log = logging.getLogger(__name__)
 
 SCENE = "boxsat"
 DATA = {
-    "sun": ((40.0, 25.0), (130.0, 10.0), (220.0, 40.0), (310.0, 20.0)),
-    "views": 80,
-    "test_suns": 3,
+    "suns": 40,
+    "views": 8,
+    "test_suns": 4,
     "test_views": 5,
-    "known_test_views": 5,
-    "shared_test_views": True,
+    "known_test_views": 1,
     "resolution": 128,
     "spp": 64,
 }
