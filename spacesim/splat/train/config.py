@@ -49,8 +49,8 @@ WEIGHTS = (
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes; those of the Gaussians are splatfacto's. Those of the means and the networks fall
-    exponentially; that of the means is per metre of scene scale."""
+    """Adam's step sizes; those of the Gaussians are splatfacto's. Those of the means, the features and the networks
+    fall exponentially; that of the means is per metre of scene scale."""
 
     means: float = 1.6e-4  #: of the centres, at the start
     means_final: float = 1.6e-6  #: of the centres, at the end
@@ -59,9 +59,9 @@ class LearningRates:
     logit_opacities: float = 5e-2  #: of the opacities' logits
     sh_constant: float = 2.5e-3  #: of the constant term of spherical harmonics
     sh_rest: float = 1.25e-4  #: of their other terms
-    #: of what each Gaussian has for the networks of light, and at the start of the pictures' embeddings, whose falls as
-    #: the networks' does
+    #: of what each Gaussian has for the networks of light, and of the pictures' embeddings, at the start
     features: float = 2e-2
+    features_final: float = 2e-2  #: of the Gaussians' features, at the end; the embeddings' falls as the networks' does
     networks: float = 3e-3  #: of their weights, at the start
     networks_final: float = 3e-4  #: of their weights, at the end
     #: of the pictures' poses (`refine_poses`), radians and shares of the distance, at first; falls to a hundredth
