@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -396,6 +397,20 @@ def test_same_tensors_same_bits():
         gradients = torch.autograd.grad(picture.sin().sum() + alpha.sum(), list(leaves.values()))
         found.append([picture, alpha, *gradients])
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
+def test_threads_do_not_disturb_each_other():
+    def results(count: int) -> list[torch.Tensor]:
+        leaves = {name: leaf.detach().requires_grad_() for name, leaf in scenes[count].items()}
+        picture, alpha, _ = rasterization(**leaves, width=SIDE, height=SIDE, sh_degree=3)
+        return [picture, *torch.autograd.grad(picture.sin().sum() + alpha.sum(), list(leaves.values()))]
+
+    scenes = {count: as_floats(scene(count, cameras=1)) for count in (59, 60, 200)}
+    alone = {count: results(count) for count in scenes}
+    with ThreadPoolExecutor(len(scenes)) as threads:
+        found = list(threads.map(lambda i: results(list(scenes)[i % len(scenes)]), range(40)))
+    for i, own in enumerate(found):
+        assert all(torch.equal(one, other) for one, other in zip(own, alone[list(scenes)[i % 3]], strict=True))
 
 
 def test_without_torch_a_sentence():
