@@ -1,5 +1,6 @@
 """The wheel holds what a run of the program needs, and runs without the checkout; how the project is cited."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -32,6 +33,17 @@ def test_the_wheel_stands_alone(tmp_path):
     done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=alone, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(str(tmp_path / "site"))
+
+
+def test_every_extra_is_installed_for_the_tests():
+    """And locked; torch's, which `lpips` and `torch` ask for, is another build."""
+    project = parse((ROOT / "pyproject.toml").read_text(encoding="utf-8"), "pyproject.toml").values["project"]
+    extras = set(project["optional-dependencies"]) - {"lpips", "torch"}
+    lock = (ROOT / "requirements" / "lock.txt").read_text(encoding="utf-8")
+    (loop,) = re.findall(r"for extra in (.+); do", (ROOT / "scripts" / "setup.sh").read_text(encoding="utf-8"))
+    assert set(loop.split()) | {"dev"} == extras
+    assert set(re.findall(r"--extra (\w+)", lock)) == extras
+    assert set(re.findall(r'-e "\.\[(.+)\]"', lock)[0].split(",")) == extras
 
 
 def test_the_citation_is_that_of_the_package():
