@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from spacesim.backend.llvm import name_llvm
+from spacesim.version import __version__ as __version__
 
 _NAMES = {
     "api": "compose evaluate generate import_dataset render train write_report",
@@ -58,8 +59,6 @@ else:  # or type checkers would take any name
         globals()[name] = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
         return globals()[name]
 
-
-__version__ = "0.1.0"
 
 name_llvm()
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import spacesim as ss
 from spacesim.data.toml import parse
 
 ROOT = Path(__file__).parents[1]
@@ -27,7 +28,7 @@ def test_the_wheel_stands_alone(tmp_path):
         names = set(wheel.namelist())
     assets = {path.relative_to(ROOT).as_posix() for path in (ROOT / "spacesim/assets").rglob("*") if path.is_file()}
     assert assets - names == set()
-    assert "spacesim/py.typed" in names
+    assert {"spacesim/py.typed", f"spacesim-{ss.__version__}.dist-info/METADATA"} <= names
     program = "import spacesim as ss; print(ss.__file__); ss.preset('demo', 'shadow-map'); ss.read_scene('boxsat')"
     alone = {"PYTHONPATH": str(tmp_path / "site"), "HOME": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=alone, capture_output=True, text=True)
@@ -54,7 +55,7 @@ def test_the_citation_is_that_of_the_package():
     assert {"cff-version", "message", "title", "authors"} <= set(citation)
     assert (citation["title"], citation["abstract"]) == (project["name"], project["description"])
     for record in (citation, citation["preferred-citation"]):
-        assert (record["version"], record["type"]) == (project["version"], "software")
+        assert (record["version"], record["type"]) == (ss.__version__, "software")
     assert (citation["license"], citation["keywords"]) == (project["license"], project["keywords"])
     year, authors = citation["preferred-citation"]["year"], citation["authors"][0]["name"]
     assert f"Copyright (c) {year}, {authors[0].lower()}{authors[1:]}" in (ROOT / "LICENSE").read_text(encoding="utf-8")
