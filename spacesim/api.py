@@ -188,6 +188,9 @@ def train(
         raise InputError(f"{name}: expected none beside a configuration, found {word!r}")
     if settings is not None and not isinstance(settings, Mapping):
         raise InputError(f"settings: expected {{name: value}}, found {settings!r:.60}")
+    for name, value in {**options, "strategy": strategy}.items():
+        if settings and name in settings and value is not None:
+            raise InputError(f"{name}: expected none beside settings[{name!r}], found {value!r:.60}")
     kind = type(config)
     for name, value in options.items():
         if name not in kind.__dataclass_fields__:

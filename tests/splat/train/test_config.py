@@ -218,6 +218,9 @@ def test_settings_are_checked_before_the_dataset_is_read(tmp_path):
         ss.train(tmp_path / "nothing", tmp_path / "run", iterations=0)
     with pytest.raises(InputError, match=r"did you mean settings=\{'refinement.max_gaussians': 5\}\?"):
         ss.train(tmp_path / "nothing", tmp_path / "run", max_gaussians=5)
+    for twice in ("iterations", 5), ("strategy", "default"):
+        with pytest.raises(InputError, match=rf"^{twice[0]}: expected none beside settings\['{twice[0]}'\], found "):
+            ss.train(tmp_path / "nothing", tmp_path / "run", settings=dict([twice]), **dict([twice]))
     with pytest.raises(InputError, match=r"^itertions: .* did you mean iterations\?"):
         ss.train(tmp_path / "nothing", tmp_path / "run", itertions=5)
 
