@@ -108,7 +108,8 @@ def reference(config: object = TrainConfig) -> str:
         for f in options_in(cls):
             value = f.default_factory() if f.default_factory is not MISSING else f.default
             default = (kind_of(type(value)) or "") if is_dataclass(value) else _literal(value)
-            cells = f"`{f.name}`", type_words(hints[f.name]), f"`{default}`" if default else "", meaning[f.name]
+            keys = [f"`{place}.{f.name}`".replace("`.", "`") for place in places]  # as `--set` takes them
+            cells = ", ".join(keys), type_words(hints[f.name]), f"`{default}`" if default else "", meaning[f.name]
             lines.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
         parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"
@@ -122,7 +123,7 @@ def _records(cls: object, at: str = "") -> dict[Any, list[str]]:
         for member in inner:
             if isinstance(member, type) and is_dataclass(member):
                 for record, places in _records(member, f"{at}.{name}".removeprefix(".")).items():
-                    result[record] = [*result.get(record, []), *places]
+                    result[record] = list(dict.fromkeys([*result.get(record, []), *places]))
     return result
 
 
