@@ -31,6 +31,7 @@ from spacesim.nerf.run import NerfRun
 from spacesim.scenes import SceneConfig, read_scene
 from spacesim.scenes import generate as _generate
 from spacesim.scenes.cameras.rig import Rig
+from spacesim.scenes.spacecraft import spacecraft
 from spacesim.scenes.trajectory.rig import PoseRig
 from spacesim.serve.client import CameraClient
 from spacesim.splat.compose import PosedScene
@@ -62,6 +63,7 @@ __all__ = [
     "InputError",
     "NerfConfig",
     "NerfRun",
+    "Pinhole",
     "PoseRig",
     "PosedScene",
     "RefinedPose",
@@ -90,6 +92,7 @@ __all__ = [
     "read_scene",
     "refine_pose",
     "render",
+    "spacecraft",
     "train",
     "write_report",
 ]
@@ -289,7 +292,7 @@ def render(
 ) -> RenderOutput:
     """Gaussians seen by a camera, as Dr.Jit arrays: differentiable by every parameter that has gradients enabled.
 
-    camera: a record, or one of spacesim.splat.raster.cameras, where arrays hold pose and intrinsics
+    camera: a record, or `Pinhole.of` one, where arrays hold pose and intrinsics
     twist: Float [6], or numbers, moves the camera: a rotation vector (radians), then a translation (metres), in camera
         axes, which take points from the old camera axes to the new ones; zeros to differentiate by the pose
     sh_degree: highest degree of spherical harmonics used; by default all that are stored

@@ -113,6 +113,7 @@ def test_what_is_neither_a_path_nor_a_record_is_named(wrong, tiny_run, tiny_data
         "read_scene": [(wrong,)],
         "refine_pose": poses,
         "render": [(wrong, frame.camera), (run.gaussians, wrong)],
+        "spacecraft": [(wrong,), ([wrong],)],
         "train": [(wrong, out), (data, wrong), (data, out, wrong or "fast")],
         "write_report": [(wrong, out), (tiny_data, wrong)],
     }
