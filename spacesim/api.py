@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from spacesim.backend import BackendError
@@ -18,9 +19,9 @@ from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonDict, JsonMapping, as_path
 from spacesim.data.images import load_image
-from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth, check_camera
+from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth, as_numbers, check_camera
 from spacesim.data.store import load_depth, load_truth
-from spacesim.data.structure import Rules, did_you_mean, field_value, places_of
+from spacesim.data.structure import Rules, checked, did_you_mean, field_value, places_of
 from spacesim.data.toml import dotted
 from spacesim.data.transforms import read_dataset
 from spacesim.learning.folder import TrainingProgress
@@ -98,6 +99,7 @@ __all__ = [
 ]
 
 
+@checked
 def generate(
     scene: str | Path | SceneConfig,
     out: str | Path,
@@ -133,6 +135,7 @@ def generate(
     return _generate(scene, as_path(out, "out"), resume, progress, workers)
 
 
+@checked
 def import_dataset(
     kind: str, src: str | Path, out: str | Path, *, progress: ProgressCallback | None = None, **options: object
 ) -> Dataset:
@@ -151,6 +154,7 @@ def import_dataset(
     return run_import(kind, as_path(src, "src"), as_path(out, "out"), progress, **options)
 
 
+@checked
 def train(
     data: str | Path | Dataset,
     out: str | Path,
@@ -189,7 +193,7 @@ def train(
     elif choices:
         name, word = next(iter(choices.items()))
         raise InputError(f"{name}: expected none beside a configuration, found {word!r}")
-    if settings is not None and not isinstance(settings, Mapping):
+    if settings is not None and not (isinstance(settings, Mapping) and all(isinstance(name, str) for name in settings)):
         raise InputError(f"settings: expected {{name: value}}, found {settings!r:.60}")
     for name, value in {**options, "strategy": strategy}.items():
         if settings and name in settings and value is not None:
@@ -207,7 +211,7 @@ def train(
     config = methods.with_settings(replace(config, **options), settings or {})
     if "method" in choices and config.method != before:
         raise InputError(f"light: expected that of the method {before}, found that of {config.method}")
-    dataset, folder = _dataset(data, "data"), as_path(out, "out")
+    folder, dataset = as_path(out, "out"), _dataset(data, "data")
 
     def tell(state: TrainingProgress) -> None:
         if progress is not None:
@@ -216,6 +220,7 @@ def train(
     return methods.train(dataset, folder, config, resume, tell)
 
 
+@checked
 def evaluate(
     run: str | Path | Run | NerfRun,
     data: str | Path | Dataset,
@@ -312,10 +317,18 @@ def render(
         check_camera(camera)
         view = Pinhole.of(camera)
     if twist is not None:
-        if len(twist) != 6:
-            raise ValueError(f"twist: expected 6 numbers, found {len(twist)}")
-        view = view.moved(upload(np.asarray(twist)) if isinstance(twist, np.ndarray | Sequence) else twist)
+        view = view.moved(_twist(twist))
     return _render(gaussians, view, **options)
+
+
+def _twist(twist: Float | np.ndarray | Sequence[float]) -> Float:
+    """As Dr.Jit's array, which stays as it is."""
+    if isinstance(twist, dr.ArrayBase) and dr.width(twist) == 6:
+        return twist
+    numbers = as_numbers(twist)
+    if numbers.shape != (6,) or not np.isfinite(numbers).all():
+        raise InputError(f"twist: expected 6 finite numbers, found {numbers.tolist() or twist!r:.60}")
+    return upload(numbers)
 
 
 def _dataset(data: str | Path | Dataset, name: str) -> Dataset:

@@ -198,6 +198,9 @@ def test_modes_backgrounds_and_what_is_told():
     }  # fmt: skip
     assert meta["radii"].dtype == torch.int32
     assert (meta["tile_width"], meta["tile_height"]) == (3, 3)  # of 16 pixels
+    with pytest.raises(KeyError, match=r"^meta: expected one of batch_ids, .*, found 'isect_ids'; splats are not"):
+        meta["isect_ids"]
+    assert meta.get("isect_ids") is None
     each = [
         rasterization(**{**leaves, "viewmats": leaves["viewmats"][k : k + 1], "Ks": leaves["Ks"][k : k + 1]}, **size)
         for k in (0, 1)
@@ -208,7 +211,7 @@ def test_modes_backgrounds_and_what_is_told():
 def test_numbers_of_numpy_and_backgrounds_of_one_channel_are_taken():
     leaves = as_floats(scene())
     depths, _, _ = rasterization(**leaves, width=SIDE, height=SIDE, sh_degree=3, render_mode="D")
-    size = {"width": np.int64(SIDE), "height": np.int32(SIDE), "near_plane": np.float32(0.01), "sh_degree": 3}
+    size = {"width": np.int64(SIDE), "height": np.int32(SIDE), "near_plane": np.float32(0.01), "sh_degree": np.int8(3)}
     over, _, _ = rasterization(**leaves, **size, render_mode="D", backgrounds=torch.ones(2, 1, device=DEVICE))
     assert torch.equal(depths, over)  # as gsplat has it: depth has no background
 
@@ -361,6 +364,17 @@ def test_numbers_that_cannot_be_drawn_harm_no_others():
         ({"with_ut": True}, "with_ut: not supported"),
         ({"covars": torch.zeros(60, 6)}, "covars: not supported"),
         ({"sh_degree": 4}, "sh_degree: expected 0 to 3, found 4"),
+        ({"sh_degree": 1.5}, "sh_degree: expected a whole number, found 1.5"),
+        ({"sh_degree": "2"}, "sh_degree: expected a whole number, found '2'"),
+        ({"near_plane": "1"}, "near_plane: expected a number, found '1'"),
+        ({"near_plane": float("nan")}, "near_plane: expected a number, found nan"),
+        ({"radius_clip": None}, "radius_clip: expected a number, found None"),
+        ({"near_plane": 5, "far_plane": 2}, "far_plane: expected at least near_plane, 5, found 2"),
+        ({"eps2d": -1}, "eps2d: expected 0 or more, found -1"),
+        (
+            {"colors": torch.zeros(60, 16, 3).cfloat()},
+            "colors: expected real numbers, found torch.complex64",
+        ),
         ({"sh_degree": None}, r"colors: expected \[60, D\]"),
         ({"quats": torch.zeros(60, 3)}, r"quats: expected \[60, 4\], found \[60, 3\]"),
         ({"quats": torch.zeros(60, 3)}, r"found \[60, 3\]$"),

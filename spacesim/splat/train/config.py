@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.files import JsonDict, JsonMapping
-from spacesim.data.structure import Rules, alternatives, check_choices, did_you_mean, plain, structure
+from spacesim.data.structure import Rules, alternatives, check_fields, did_you_mean, plain, structure
 from spacesim.data.toml import Document, read_document
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.shadow.cast import SplattingConfig
@@ -72,6 +72,7 @@ class LearningRates:
     gains: float = 5e-2
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for f in fields(self):
             check_ranges(self, **{f.name: (0, MAX_LEARNING_RATE)})
 
@@ -123,8 +124,8 @@ class TrainConfig:
     strategy: StrategyConfig = field(default_factory=DefaultStrategyConfig)  #: chooses what grows and what is pruned
 
     def __post_init__(self) -> None:
+        check_fields(self)
         object.__setattr__(self, "method", _method_of(self.light))
-        check_choices(self)
         if self.init_box is not None and not 0 < self.init_box <= MAX_BOX:
             raise InputError(f"init_box: expected a number above 0, at most {MAX_BOX:g}, found {self.init_box}")
         if self.init_box is not None and self.init != "random":
