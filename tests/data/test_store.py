@@ -160,7 +160,7 @@ def test_pictures_by_hand(root):
     assert np.abs(depth * 1e-3 - truth.depth).max() <= 0.5e-3 + 1e-6
 
 
-def test_depth_beyond_16_bits_is_left_out_and_told_once(tmp_path, caplog):
+def test_depth_beyond_16_bits_is_left_out_with_one_warning(tmp_path, caplog):
     truth = make_truth()
     truth.depth[5, 5:7] = [65.535, 65.6]
     writer = DatasetWriter(tmp_path / "data", SCENE)

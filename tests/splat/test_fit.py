@@ -72,8 +72,8 @@ def test_the_embedding_of_a_half_shows_the_other(run):
         picture, start = Picture(np.clip(truth, 0, 1), CAMERA), PictureLight()
         masks = [LEFT, ~LEFT]
         lights = fit.fit(run, picture, masks, [start, start])
-        for light, judged in zip(lights, masks[::-1], strict=True):
-            assert error(run, picture, light, judged) < 0.1 * error(run, picture, start, judged)
+        for light, scored in zip(lights, masks[::-1], strict=True):
+            assert error(run, picture, light, scored) < 0.1 * error(run, picture, start, scored)
         again = fit.fit(run, picture, masks, [start, start])
         assert all(np.array_equal(a.embedding, b.embedding) for a, b in zip(lights, again, strict=True))
 

@@ -129,7 +129,7 @@ def test_broken_pictures_are_not_imported(tmp_path):
 
 @pytest.mark.parametrize("count", [0, 3])
 def test_the_split_stays(tmp_path, count):
-    """Also where nothing is to be tested with, which is no wish to have every eighth frame held out."""
+    """Also where nothing is to be tested with, which does not ask for every eighth frame to be held out."""
     frames = named(9)
     names = [frame["file_path"] for frame in frames]
     root = folder(tmp_path / "src", frames, train_filenames=names[count:], test_filenames=names[:count])

@@ -143,10 +143,10 @@ def test_a_glb_agrees_with_its_bytes_read_by_hand(tmp_path):
     craft, report = read_mesh(tmp_path / "ball.glb")
     turned = np.stack([positions[:, 0], -positions[:, 2], positions[:, 1]], axis=-1)
     np.testing.assert_allclose(craft.parts[0].mesh.triangles, turned[faces])
-    told = document["materials"][0]["pbrMetallicRoughness"]
+    written = document["materials"][0]["pbrMetallicRoughness"]
     made = craft.parts[0].material
-    np.testing.assert_allclose(made.albedo, told["baseColorFactor"][:3])
-    assert (made.bsdf["metallic"], made.bsdf["roughness"]) == (told["metallicFactor"], told["roughnessFactor"])
+    np.testing.assert_allclose(made.albedo, written["baseColorFactor"][:3])
+    assert (made.bsdf["metallic"], made.bsdf["roughness"]) == (written["metallicFactor"], written["roughnessFactor"])
     assert report.materials == ("ball/Gold_Foil",)
 
 

@@ -110,9 +110,9 @@ def tile(sheet: np.ndarray, k: int, columns: int) -> np.ndarray:
 
 def test_the_sheet_shows_every_sun_of_few_and_the_frames_are_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "encoder", lambda: None)
-    suns, told = suns_around(8, 10), []
-    done = sweep(Lit(), CAMERA, suns, tmp_path, keep_frames=True, report=lambda *numbers: told.append(numbers))
-    assert told == [(k + 1, 8) for k in range(8)]
+    suns, reported = suns_around(8, 10), []
+    done = sweep(Lit(), CAMERA, suns, tmp_path, keep_frames=True, report=lambda *numbers: reported.append(numbers))
+    assert reported == [(k + 1, 8) for k in range(8)]
     sheet = read_png(done.sheet)
     for k, sun in enumerate(suns):
         color = np.rint(255 * (0.5 + 0.5 * sun.direction))

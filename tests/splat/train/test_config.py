@@ -90,7 +90,7 @@ def test_an_older_run_is_resumed(small_lit_dataset, tmp_path):
     run = train(small_lit_dataset, tmp_path / "run", config)
     path = run.path / "config.json"
     data = json.loads(path.read_text())["data"]
-    data["digest"], content = data["digest"].split("-")  # which told less
+    data["digest"], content = data["digest"].split("-")  # the shorter form is still read
     assert content
     path.write_text(json.dumps({**OLD["demo shadow-map mesh-aware"], "iterations": 2, "init_count": 40, "data": data}))
     assert train(small_lit_dataset, tmp_path / "run", config, resume=True).gaussian_count == run.gaussian_count

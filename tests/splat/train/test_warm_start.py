@@ -416,17 +416,17 @@ def test_presets_and_table_5_7():
         WarmStartConfig(rescue=2.0)
 
 
-def test_a_training_that_ends_before_the_warm_start_does_is_told(spacesim, tiny_data, tmp_path, caplog):
+def test_a_training_that_ends_before_its_warm_start_is_warned_of(spacesim, tiny_data, tmp_path, caplog):
     """`remark` begins at the sum of what gathers and what fades. Fewer iterations shorten both, unless they are set."""
     table = WarmStartConfig(steps=20, decay=10)
     assert [bool(table.remark(iterations)) for iterations in (5, 20, 30, 31)] == [True, True, True, False]
     line = ["train", tiny_data, "--preset", "demo", "--set", "init_count=300", "--init", "random", "--warm-start"]
     lengths = "--set", "warm_start.steps=500", "--set", "warm_start.decay=500"
     assert spacesim(*line, "--out", tmp_path / "short", "--iterations", 3, *lengths).code == 0
-    told = [record.message for record in caplog.records if record.levelname == "WARNING"]
-    assert len(told) == 1
+    warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warnings) == 1
     for word in ("warm_start", "500 iterations", "more than 1000", "found 3"):
-        assert word in told[0]
+        assert word in warnings[0]
 
 
 def test_a_prior_that_nothing_uses_is_a_mistake(spacesim, tiny_data, tmp_path):
@@ -516,9 +516,9 @@ def test_depth_and_normals_are_learnt_from_truth_and_from_a_mesh(small_lit_datas
     plain.run(lambda progress: None, lambda: None)
     depth, cosine = shape_error(plain, small_lit_dataset)
     for prior in ("truth", "mesh"):
-        told = Trainer(small_lit_dataset, replace(base, depth_weight=10.0, normal_weight=0.1, prior=prior))
-        told.run(lambda progress: None, lambda: None)
-        better_depth, better_cosine = shape_error(told, small_lit_dataset)
+        supervised = Trainer(small_lit_dataset, replace(base, depth_weight=10.0, normal_weight=0.1, prior=prior))
+        supervised.run(lambda progress: None, lambda: None)
+        better_depth, better_cosine = shape_error(supervised, small_lit_dataset)
         assert better_depth < 0.9 * depth, prior
         assert better_cosine < 0.9 * cosine, prior
 
@@ -529,16 +529,16 @@ def test_gradients_of_depth_and_normals_reach_every_parameter(small_lit_dataset)
     plain = Trainer(small_lit_dataset, base)
     plain.step()
     for term, rows in (("depth_weight", range(11)), ("normal_weight", range(11))):
-        told = Trainer(small_lit_dataset, replace(base, **{term: 1.0}))
-        told.step()
-        found, expected = told.optimizer.moments()[0], plain.optimizer.moments()[0]
+        supervised = Trainer(small_lit_dataset, replace(base, **{term: 1.0}))
+        supervised.step()
+        found, expected = supervised.optimizer.moments()[0], plain.optimizer.moments()[0]
         changed = [np.abs(found[i] - expected[i]).max() for i in rows]
         scales = [np.abs(expected[i]).max() + 1e-12 for i in rows]
         moved = np.array(changed) / np.array(scales) > 1e-3
         assert moved[[0, 1, 2, 3, 4, 5, 10]].all(), term
 
 
-def test_what_is_missing_for_them_is_told(small_dataset):
+def test_missing_inputs_of_depth_and_normals_are_refused(small_dataset):
     with pytest.raises(InputError, match="depth"):
         Trainer(small_dataset, replace(BASE, depth_weight=1.0))
     with pytest.raises(InputError, match="prior mesh"):
@@ -550,7 +550,7 @@ def test_what_is_missing_for_them_is_told(small_dataset):
 
 
 @pytest.mark.parametrize(("scale", "shift", "said"), [(1, 1e3, "none sees"), (1e3, 0, "inside of it")])
-def test_a_prior_that_is_out_of_place_is_told(small_dataset, tmp_path, scale, shift, said):
+def test_a_misplaced_prior_is_refused(small_dataset, tmp_path, scale, shift, said):
     trimesh.creation.box((scale,) * 3).apply_translation((shift, 0, 0)).export(tmp_path / "mesh.ply")
     elsewhere = replace(small_dataset, mesh_path=str(tmp_path / "mesh.ply"))
     with pytest.raises(InputError, match=f"prior mesh expects a mesh .*{said}"):

@@ -146,7 +146,7 @@ def test_every_mode_has_a_picture_from_anywhere(renderer, state, mode):
         assert frame.picture.dtype == np.uint8
 
 
-def test_what_nobody_predicts_is_told(renderer, state, view):
+def test_what_no_model_predicts_is_reported(renderer, state, view):
     alone = SceneRenderer(GaussianComposition(renderer.composition.models[:1]))
     frame = draw_frame(alone, SceneState(state.poses[:1], state.sun), view, DisplaySettings("visibility", side=256))
     assert "no visibility" in frame.note

@@ -275,25 +275,25 @@ def test_the_event_loop_is_woken_by_its_own_thread_alone():
     buffer = AsyncMessageBuffer(loop, persistent_messages=True)
     handler = type("Handler", (), {"get_message_buffer": lambda _: buffer})()
     make_sends_thread_safe(handler)
-    told = []
+    sent = []
 
     async def listen():
         windows = buffer.window_generator(0)
-        while len(told) < 50:
-            told.extend(await anext(windows))
+        while len(sent) < 50:
+            sent.extend(await anext(windows))
         await windows.aclose()
 
     def send():
         for k in range(50):
             buffer.push(messages.SetGuiPanelLabelMessage(str(k)) if k else GOOD[0])
-            wait_for(lambda k=k: len(told) > k, "each to be heard before the next")
+            wait_for(lambda k=k: len(sent) > k, "each to be heard before the next")
 
     thread = threading.Thread(target=send)
     thread.start()
     loop.run_until_complete(asyncio.wait_for(listen(), PATIENCE))
     thread.join()
     loop.close()
-    assert [message.label for message in told[1:]] == [str(k) for k in range(1, 50)]
+    assert [message.label for message in sent[1:]] == [str(k) for k in range(1, 50)]
     buffer.message_event.clear()
     buffer.message_event.set()
     assert not buffer.message_event.is_set()

@@ -165,7 +165,7 @@ def test_order_does_not_matter():
     assert content(centres, radii) == content(centres[order], radii[order])
 
 
-def test_members_at_the_same_place_along_the_axis_are_told_apart_by_the_other():
+def test_members_at_the_same_place_along_the_axis_are_ordered_by_the_other():
     centres = np.array([[0, 0], [5, 3], [5, 1], [5, 2], [5, 0], [10, 0.0]])
     low, high = [4, 2, 0], [3, 1, 5]
     found = clusters(centres, np.full((6, 2), 2.6), SIZE, least_scale=8, most=2)

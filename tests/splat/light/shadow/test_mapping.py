@@ -309,9 +309,9 @@ def test_bias_clears_a_wall_and_keeps_its_shadow(elevation):
 def test_grazing_suns(elevation, most):
     """Where the thesis's bias leaves a wall dark, offset points clear it, and a real shadow stays."""
     assert share(elevation, "thesis") > 0.4
-    assert share(elevation, "lifted") < most
+    assert share(elevation, "lift") < most
     assert share(elevation, "grazing bias") < 0.85 * share(elevation, "thesis")
-    foot, _ = screen_shadow(elevation, way("lifted"), 3000)
+    foot, _ = screen_shadow(elevation, way("lift"), 3000)
     assert foot < 3 * 0.031
 
 
