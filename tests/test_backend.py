@@ -318,7 +318,7 @@ def test_a_recorded_function_is_traced_where_no_recording_serves():
     assert backend.recordings() == before + 1
 
 
-def test_what_one_element_is_can_be_said():
+def test_the_size_of_recorded_elements_can_be_given():
     import drjit as dr
 
     ad, seen = backend.ad, []
@@ -446,7 +446,7 @@ def test_numbers_are_read_without_synchronising():
 
 
 @pytest.mark.gpu
-def test_a_number_is_there_before_the_work_that_follows_is_done():
+def test_a_number_is_read_before_later_work_ends():
     if backend.select() != "cuda":
         pytest.skip("needs a CUDA device")
     import drjit as dr

@@ -685,7 +685,7 @@ def test_a_header_of_a_model_that_is_no_object(spacesim, run, tmp_path, header):
 
 
 @pytest.mark.parametrize("content", ["[]", '{"4": "x"}', '{"refinement": 1e400}', "{", '{"40": null}'])
-def test_damaged_times_cost_only_themselves(tiny_data, uninterrupted, tmp_path, caplog, content):
+def test_damaged_training_times_are_dropped_with_a_warning(tiny_data, uninterrupted, tmp_path, caplog, content):
     kill(TRAINING, 7, False, tiny_data, tmp_path / "run")
     (tmp_path / "run/checkpoints/seconds.json").write_text(content)
     run = train(read_dataset(tiny_data), tmp_path / "run", CONFIG, resume=True)
@@ -738,7 +738,7 @@ while sys.argv.pop(0) and sys.argv:
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
-def test_names_that_output_cannot_say(tiny_data, tmp_path, encoding):
+def test_names_that_output_cannot_encode(tiny_data, tmp_path, encoding):
     """Runs whose names are no text, printed to a terminal that knows ASCII alone."""
     words: list[object] = []
     for number, name in enumerate(("l\u00fcn\u00e4", os.fsdecode(b"l\xff"))):
@@ -752,7 +752,7 @@ def test_names_that_output_cannot_say(tiny_data, tmp_path, encoding):
         assert (tmp_path / f"e{number}/report.html").stat().st_size > 10_000
 
 
-def test_folders_that_cannot_be(spacesim, tiny_run, tiny_data, tmp_path):
+def test_impossible_output_folders_are_refused(spacesim, tiny_run, tiny_data, tmp_path):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / ("x" * 300), tmp_path / "file", tmp_path / "file" / "x"):
         for arguments in (
@@ -808,7 +808,7 @@ def test_a_damaged_record_of_a_composed_frame_is_made_again(spacesim, tiny_run, 
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut off", "one line less", "a dangling link"])
-def test_a_list_of_digests_that_lacks_some_is_no_proof(spacesim, broken, tmp_path, damage):
+def test_verify_refuses_an_incomplete_list_of_digests(spacesim, broken, tmp_path, damage):
     sums, victim = broken / "SHA256SUMS", broken / "gt/train_00001.exr"
     lines = sums.read_text().splitlines(keepends=True)
     content = {"empty": "", "cut off": "".join(lines)[:-3]}.get(damage)

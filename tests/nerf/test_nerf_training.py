@@ -269,7 +269,7 @@ def test_shadows_and_normals_resume_to_the_same_bits(dataset, tmp_path):
     assert model_bytes(train(dataset, tmp_path / "cut", config, resume=True)) == model_bytes(whole)
 
 
-def test_what_asks_for_gaussians_says_so(dataset, finished, tmp_path):
+def test_functions_for_gaussians_refuse_a_radiance_field(dataset, finished, tmp_path):
     image = load_image(dataset, dataset.test[0])
     with pytest.raises(InputError, match="run: expected one of Gaussians, found one of the method nerf"):
         ss.refine_pose(finished, image, dataset.test[0].camera)

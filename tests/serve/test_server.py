@@ -90,7 +90,7 @@ def test_pictures_are_those_of_generate(tmp_path, spacesim):
             assert np.abs(seen / 255 - image.over(np.zeros(3))).max() < 1.01 / 255
 
 
-def test_it_says_what_it_is(ball, traced):
+def test_a_request_without_a_picture_describes_the_server(ball, traced):
     for served, kind in ((ball, "run"), (traced, "scene")):
         with serving(served) as address:
             facts = json.loads(asked(address, b'{"version": 1, "id": "who"}')[0])
@@ -99,7 +99,7 @@ def test_it_says_what_it_is(ball, traced):
 
 
 @pytest.mark.parametrize("shadows", ["trained", "none"])
-def test_it_has_the_arrays_that_it_says(ball, shadows):
+def test_pictures_have_the_announced_arrays(ball, shadows):
     """And no others; of a run and of a composed scene, whose models shade each other or do not."""
     models = [PlacedRun(ball.run), PlacedRun(ball.run, Pose(translation=[0, 0, 1.6]))]
     pair = PredictedRun(ComposedRun(GaussianComposition(models, ComposeConfig(shadows)), Path("pair.toml")))

@@ -51,7 +51,7 @@ def error(run, picture: Picture, light: PictureLight, mask: np.ndarray) -> float
     return float(np.sqrt(np.square(np.clip(draw(run, CAMERA, light).rgb, 0, 1) - picture.rgb)[mask].mean()))
 
 
-def test_runs_are_asked_for_what_they_have(run):
+def test_unknowns_are_those_of_the_run(run):
     plain = Run(Path("plain"), {}, {}, Gaussians.from_numpy(random_splats(5)), 1)
     assert find_unknowns(plain) == ()
     assert [unknown.name for unknown in find_unknowns(plain, gain=True)] == ["gain"]

@@ -33,7 +33,7 @@ def overlap(mask: np.ndarray, truth: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("edge", [2.0, 0.85])
-def test_before_the_sky_the_object_is_what_is_bright(edge):
+def test_an_object_before_a_dark_sky_is_segmented_by_brightness(edge):
     picture, truth = box_from(poses_around(1)[0])
     seen = before(picture, truth, earth(0, edge))
     assert overlap(segment(seen), truth) > 0.97
@@ -281,7 +281,7 @@ def test_poses_of_pictures_are_found(tmp_path):
 
 @needs_av
 @needs_colmap
-def test_frames_of_a_film_tell_which_they_are(tmp_path):
+def test_frames_of_a_video_have_their_source_index(tmp_path):
     """Also where frames that repeat the one before are left out, so that numbers differ from places in the list."""
     poses = poses_around(10)
     shown = [0, 0, 0, *range(10)]

@@ -241,7 +241,7 @@ def test_runs_with_and_without_visibility_side_by_side(lit, folder):
     assert "By grazing angle" in alone
 
 
-def test_evaluations_from_before_are_still_read(folder):
+def test_evaluations_of_older_versions_are_read(folder):
     def older(metrics):
         for key in ("known_suns", "unseen_suns", "relight", "by_grazing_angle", *KINDS):
             del metrics[key]

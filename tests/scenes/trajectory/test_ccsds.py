@@ -388,7 +388,7 @@ LINE = "2030-03-01T12:00:00 0 0 0 1"
         (kvn("AEM", AEM, LINE.replace(" 1", " nan")), "expected quaternions of length 1, found one of nan"),
     ],
 )
-def test_what_is_no_message(tmp_path, text, message):
+def test_files_that_are_no_message_are_refused(tmp_path, text, message):
     path = tmp_path / "a.msg"
     path.write_text(text)
     with pytest.raises(InputError, match=message) as caught:

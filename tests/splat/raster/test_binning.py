@@ -137,7 +137,7 @@ def test_recordings_serve_other_numbers_of_splats_and_pairs(way):
     assert recordings() == before
 
 
-def test_nobody_seen_is_no_list(way):
+def test_no_visible_splats_give_empty_lists(way):
     splats, footprints = projected(50, 32, 32)
     hidden = dataclasses.replace(footprints, visible=dr.zeros(ad.Bool, 50))
     lists = binning.bin_splats(splats, hidden, 32, 32)

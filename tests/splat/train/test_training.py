@@ -332,7 +332,7 @@ def test_ply_of_no_gaussians(tmp_path):
         *(("views_per_step", 0), ("views_per_step", 65)),
     ],
 )
-def test_configurations_that_cannot_be(option, value):
+def test_impossible_configurations_are_refused(option, value):
     with pytest.raises(InputError, match=f"{option}: expected"):
         with_options(preset("demo"), **{option: value})
 
@@ -431,7 +431,7 @@ def test_where_memory_is_short_pictures_are_read_again(small_dataset, monkeypatc
     assert kept.views._cached.cache_info().currsize == 3
 
 
-def test_where_numpy_has_a_picture_in_memory_records_nothing_anew(small_dataset):
+def test_recordings_serve_pictures_of_any_alignment(small_dataset):
     trainer = Trainer(small_dataset, CONFIG)
     load, offset = trainer.views._load, [0]
 

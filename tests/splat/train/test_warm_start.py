@@ -179,7 +179,7 @@ def test_bilinear_at_pixel_centres_and_between():
     np.testing.assert_allclose(numbers(found), [0, 12, 6, 0.5, 1.25], rtol=1e-6)
 
 
-def test_nobody_in_the_picture_gives_no_number_that_is_none():
+def test_projected_loss_of_an_empty_picture_is_zero():
     behind = ad.Array3f([0.0], [-9.0], [0.0])
     dr.enable_grad(behind)
     loss, framed = projected_loss(behind, Pinhole.of(CAMERA), ad.Float([1.0]), (1, 1), 24)
@@ -256,7 +256,7 @@ def test_the_thesis_moves_centres_at_their_usual_step_size(small_dataset):
     assert ours.rates(100)[0] > 1.3 * plain.rates(100)[0]
 
 
-def test_those_beyond_the_cameras_come_back_and_the_faint_are_revived(small_dataset):
+def test_warm_start_gathers_far_and_revives_faint_gaussians(small_dataset):
     for within, revive in ((True, 0.2), (False, 0.0)):
         config = replace(CONFIG, least_seen=1, gather=within, revive=revive)
         warm = WarmStart(config, TrainingViews(small_dataset, 0), np.zeros(3), 5.0, 3)
@@ -304,7 +304,7 @@ def inside(trainer: Trainer) -> int:
     return int((np.linalg.norm(trainer.gaussians.to_numpy()["means"], axis=1) < 0.75).sum())
 
 
-def test_a_box_is_as_wide_as_it_should_be(meshed):
+def test_the_box_of_random_gaussians_scales_with_the_object(meshed):
     assert object_size(meshed) == pytest.approx(1.5, rel=1e-3)
     means = initial_gaussians(meshed, "random", 2000, 0, 0, box=10.0).to_numpy()["means"]
     np.testing.assert_allclose(np.abs(means).max(axis=0), 7.5, rtol=5e-3)
@@ -337,7 +337,7 @@ def test_without_attraction_those_in_a_picture_are_still_not_rescued(meshed):
     assert (trainer.gaussians.to_numpy()["means"].std(axis=0) > 0.8 * spread).all()
 
 
-def test_what_it_gathers_becomes_a_good_model(meshed):
+def test_gathered_gaussians_train_to_a_lower_loss(meshed):
     """From a box of ten times the object's size; as wide as they start, Gaussians would hide the object for good."""
     config = replace(BASE, init_box=10.0, refinement=replace(REFINEMENT, reset_every=10**6, max_gaussians=3000))
     losses = []

@@ -234,7 +234,7 @@ def test_keys_and_reset(relit):
     assert state(relit) == start
 
 
-def test_what_no_sun_changes_has_no_handle(tabs):
+def test_pages_without_relighting_have_no_sun_handle(tabs):
     for name, hidden in (("plain", True), ("linear", True), ("relit", False)):
         assert tabs[name].evaluate("[element('sun').hidden, element('suns').hidden]") == [hidden, hidden]
     assert f"vanilla, {COUNT} Gaussians, made by spacesim" in tabs["plain"].text()

@@ -151,7 +151,7 @@ def test_blockers_smaller_than_a_pixel_blend(antialiased):
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_order_is_nothing_to_it(name):
+def test_order_does_not_matter(name):
     arrays = random_splats(300, seed=2)
     camera = fit_camera(Gaussians.from_numpy(arrays), light_rows([1, 2, 2]), 48)
     found = occlusion(arrays, camera, config=CONFIGS[name])
