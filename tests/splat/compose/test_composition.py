@@ -1,4 +1,4 @@
-"""Composed pictures: alone as before, in any order, moved, scaled, turned; shadows between models."""
+"""Composed pictures: of one model, in any order, moved, scaled, turned; shadows between models."""
 
 import logging
 from dataclasses import replace

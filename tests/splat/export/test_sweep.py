@@ -87,7 +87,7 @@ def test_another_size_shows_the_same_things(size, shape, scale):
     camera = Camera(CAMERA.world_from_camera, 24, 16, 50, 40, 10, 9)
     other = resize_camera(camera, size)
     assert (other.width, other.height) == shape
-    # A pixel keeps its place by the middle of the picture, but for the scale: what was seen is seen.
+    # A pixel keeps its place by the middle of the picture, but for the scale: the same things are seen.
     for pixel in ((0, 0), (24, 16), (5, 11)):
         ray = (pixel[0] - camera.cx) / camera.fx, (pixel[1] - camera.cy) / camera.fy
         x, y = other.fx * ray[0] + other.cx, other.fy * ray[1] + other.cy

@@ -1,4 +1,4 @@
-"""Presets as they have always been, settings by name, and what older runs wrote."""
+"""Digests of presets, settings by name, and config.json in its older form."""
 
 import hashlib
 import json
@@ -27,8 +27,8 @@ from spacesim.splat.train.strategies.mcmc import McmcConfig
 from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig
 from spacesim.splat.train.train import train
 
-OLD = json.loads((Path(__file__).parent / "configs_before_unions.json").read_text(encoding="utf-8"))
-"""{preset, method and strategy: its config.json} as it was written while all strategies stood side by side."""
+OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
+"""{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
     "demo": "e6a867f8e670562b",
     "fast": "2287ea8a85e26bd2",
