@@ -5,7 +5,7 @@
 Data as of speedplus_data.py, silhouettes known. Trained: "known", with the true Suns; "unknown", with estimated ones;
 without Suns, the field of view alone with embeddings of pictures, and vanilla. PSNR is over the silhouette of test
 views, which have Suns of their own: "known" is given these, and the others are not. What they do not know of a test
-picture, Sun or embedding, is fitted on one half of it and judged on the other. Errors of Suns are against the true
+picture, Sun or embedding, is fitted on one half of it and scored on the other. Errors of Suns are against the true
 ones: of all training pictures, and of those whose Sun the estimate calls sure (sigma below its median).
 """
 

@@ -238,7 +238,7 @@ def evaluate(
     run: a folder, a scene file, or what `train` or `load_run` returns;  split: "test", "train" or "all"
     lpips_weights: a file or folder of AlexNet and linear weights, without which LPIPS is null
     geometry: evaluate the shape, too
-    fit_gain: fit the exposure of each picture on one half of it, judge it on the other
+    fit_gain: fit the exposure of each picture on one half of it, score it on the other
     align: the dataset in whose axes and scale the run is, where those of `data` are others: their cameras are matched
     progress: called with (frames done, frames in all, file of the next) before each frame and at the end
 

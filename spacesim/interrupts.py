@@ -31,7 +31,7 @@ _ended_by: int = signal.SIGINT
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Around the work of a command: KeyboardInterrupt is raised within and Ctrl-C, where the process is the command,
-    ignored afterwards, as what is left is to say how it went.
+    ignored afterwards, as what is left is to report the outcome.
 
     Standard output is flushed. Raises BrokenPipeError without a reader, WorkError where it is full; what has not
     been printed is lost then, so that the interpreter does not fail on it when it exits.

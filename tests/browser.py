@@ -53,8 +53,8 @@ class Browser:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        told = folder / "DevToolsActivePort"
-        lines = wait_for(lambda: told.exists() and told.read_text().splitlines(), "Chromium")
+        port_file = folder / "DevToolsActivePort"
+        lines = wait_for(lambda: port_file.exists() and port_file.read_text().splitlines(), "Chromium")
         self._port = int(lines[0])
 
     def open(self, url: str, width: int = 640, height: int = 480) -> "Page":

@@ -111,7 +111,7 @@ def tiny_eval(tiny_run, tiny_data, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_field(tiny_data, tmp_path_factory) -> Path:
-    """A radiance field that is told the Sun, 60 iterations on `tiny_data`."""
+    """A radiance field that takes the Sun as input, 60 iterations on `tiny_data`."""
     out = tmp_path_factory.mktemp("tiny") / "field"
     done = call("train", tiny_data, "--out", out, "--method", "nerf-relight", *TRAIN_FIELD)
     assert done.code == 0, done.errors

@@ -235,22 +235,22 @@ def test_recordings_tell_constants_apart_that_occur_twice():
 def test_constants_are_all_that_is_no_array():
     x = backend.ad.Float(1.0, 2.0)
 
-    def told(value):
+    def key(value):
         return recording._split(value, [])  # a key of dictionaries, to which 1, 1.0 and True are one
 
     plain = [(1, x), (1.0, x), (True, x), ("1", x), (None, x), (x, None), ({"a": 1}, x), ({"a": x}, x), ((x,), x)]
     plain += [(0.0, x), (-0.0, x), (_Pair(1), x), (_Pair(1.0), x), (_Pair((1, 2)), x), (_Pair(_Pair(1)), x)]
     kinds = [*plain, ([x], x), ([x, x], x), ([1, x], x), ([[x], [x]], x), ([[x, x]], x), (_Pair(x, 1), x), ([], x)]
-    assert len({told(value) for value in kinds}) == len(kinds)
-    assert told((x, 1)) == told((x + 1, 1))
-    assert told(_Pair(1, "a")) == told(_Pair(1, "a")) != told(_Pair(1, "b"))
+    assert len({key(value) for value in kinds}) == len(kinds)
+    assert key((x, 1)) == key((x + 1, 1))
+    assert key(_Pair(1, "a")) == key(_Pair(1, "a")) != key(_Pair(1, "b"))
     changing = _Pair([1])  # frozen itself, what it holds is not
-    before = told(changing)
+    before = key(changing)
     changing.one.append(2)
-    assert told(changing) != before
+    assert key(changing) != before
 
 
-def test_the_first_arrays_of_a_type_are_told_as_the_next_are(monkeypatch):
+def test_the_first_arrays_of_a_type_have_the_same_key_as_the_next(monkeypatch):
     """Else the second call of a program would record anew."""
     monkeypatch.setattr(recording, "_leaves", set())
     x = backend.ad.Float(1.0, 2.0)
@@ -318,7 +318,7 @@ def test_a_recorded_function_is_traced_where_no_recording_serves():
     assert backend.recordings() == before + 1
 
 
-def test_what_one_element_is_can_be_said():
+def test_the_size_of_recorded_elements_can_be_given():
     import drjit as dr
 
     ad, seen = backend.ad, []
@@ -446,7 +446,7 @@ def test_numbers_are_read_without_synchronising():
 
 
 @pytest.mark.gpu
-def test_a_number_is_there_before_the_work_that_follows_is_done():
+def test_a_number_is_read_before_later_work_ends():
     if backend.select() != "cuda":
         pytest.skip("needs a CUDA device")
     import drjit as dr

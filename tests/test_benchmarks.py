@@ -181,7 +181,7 @@ def test_what_cannot_be_measured_is_refused(arguments, sentence, monkeypatch, ca
     assert sentence in capsys.readouterr().err + str(ended.value)
 
 
-def test_what_was_measured_is_told_before_a_file_that_cannot_be_written(tmp_path, monkeypatch, capsys):
+def test_measurements_are_printed_before_an_unwritable_file_fails(tmp_path, monkeypatch, capsys):
     import common
     import rasterizer
 
@@ -191,9 +191,9 @@ def test_what_was_measured_is_told_before_a_file_that_cannot_be_written(tmp_path
         monkeypatch.setattr(sys, "argv", ["rasterizer.py", "--sizes", "100x16", "--repeats", "1", option, where])
         with pytest.raises(SystemExit, match="2"):
             common.run_main(rasterizer.main)
-        told = capsys.readouterr()
-        assert "Kernels, ms" in told.out
-        assert f"{where}: cannot be written" in told.err
+        printed = capsys.readouterr()
+        assert "Kernels, ms" in printed.out
+        assert f"{where}: cannot be written" in printed.err
 
 
 def stand_in(path: Path, start: float, step: float) -> Path:
@@ -309,7 +309,7 @@ def test_training_tells_growth(command, place):
     "training.py --backend llvm --sizes 300x32 --repeats 1 --peers gsplat --opensplat ./opensplat --markdown"
     " --json found.json"
 )
-def test_training_is_told_beside_opensplat(command, place):
+def test_training_beside_opensplat(command, place):
     """A program that needs 0.1 s to start and 2 ms a step."""
     stand_in(place / "opensplat", start=0.1, step=0.002)
     done = ended(command)
@@ -675,12 +675,12 @@ def test_visitors_get_pictures(command, tiny_run):
     "attack.py --inputs 8 --kills 1 --bits 2 --viewer 0.1 --seed 5 --processes 1 --json", "attack.py --seed 5 --trial 7"
 )
 def test_attack_tells_what_was_tried_and_held(place, command):
-    told = call(command)
+    printed = call(command)
     if "--trial" in command:
-        assert told.startswith("7 ")
-        assert told.splitlines()[-1] == "None"
+        assert printed.startswith("7 ")
+        assert printed.splitlines()[-1] == "None"
         return
-    found = json.loads(told)
+    found = json.loads(printed)
     assert (found["seed"], found["finds"]) == (5, [])
     tried = {row[""]: row["tried"] for row in found["rows"]}
     assert tried["the viewer"] > 10
@@ -689,7 +689,7 @@ def test_attack_tells_what_was_tried_and_held(place, command):
 
 
 @smallest("speedplus_data.py --out data --frames 4 --height 30 --spp 2 --backend llvm --json")
-def test_data_like_speedplus_have_no_suns_but_those_that_are_told(command, place):
+def test_data_like_speedplus_have_suns_only_in_the_labels(command, place):
     import speedplus_data
 
     report = json.loads(call(command))
@@ -697,15 +697,15 @@ def test_data_like_speedplus_have_no_suns_but_those_that_are_told(command, place
     made = speedplus_data.make(place / "data", 4, 30, spp=2)  # all there
     assert made.data.scene == {}
     assert len({tuple(frame.sun.direction) for frame in made.made.frames}) == 5
-    for truth, frame, told in zip(made.made.frames, made.data.frames, made.labelled.frames, strict=True):
+    for truth, frame, labelled in zip(made.made.frames, made.data.frames, made.labelled.frames, strict=True):
         assert frame.sun is None
         assert frame.silhouette_path is None
-        assert frame.file_path == told.file_path
-        np.testing.assert_allclose(told.sun.direction, truth.sun.direction, atol=1e-15)
+        assert frame.file_path == labelled.file_path
+        np.testing.assert_allclose(labelled.sun.direction, truth.sun.direction, atol=1e-15)
         np.testing.assert_allclose(frame.camera.world_from_camera, truth.camera.world_from_camera, atol=1e-12)
-        np.testing.assert_array_equal(frame.camera.world_from_camera, told.camera.world_from_camera)
+        np.testing.assert_array_equal(frame.camera.world_from_camera, labelled.camera.world_from_camera)
         assert (load_image(made.data, frame).alpha == 1).all()
-        assert load_image(made.labelled, told).alpha.min() == 0
+        assert load_image(made.labelled, labelled).alpha.min() == 0
 
 
 @smallest(
@@ -729,11 +729,11 @@ def test_errors_of_suns(tmp_path):
     frames = tuple(Frame("a.png", Camera.from_fov(np.eye(4), 4, 4, 40), sun=Sun.from_angles(*pair)) for pair in true)
     found = [Sun.from_angles(*true[0]), Sun.from_angles(*true[1])]
     found += [Sun.from_angles(azimuth, elevation - 90) for azimuth, elevation in true[2:]]
-    told = [
+    estimated = [
         {"sun_direction": sun.direction.tolist(), "sun_sigma_deg": sigma}
         for sun, sigma in zip(found, (1, 2, 9, 30), strict=True)
     ]
-    (tmp_path / "cameras.json").write_text(json.dumps({"frames": told}))
+    (tmp_path / "cameras.json").write_text(json.dumps({"frames": estimated}))
     row = unknown_suns.sun_errors(tmp_path / "cameras.json", Dataset(tmp_path, frames, ()))
     assert (row["mean"], row["Sun off, deg"], row["of the surer half, deg"]) == pytest.approx((45, 45, 0), abs=1e-4)
     assert (row["at most 8 deg, %"], row["over 60 deg, %"], row["sigma, deg"]) == (50, 50, 5.5)

@@ -625,11 +625,11 @@ def test_bad_usage_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tmp_path, a
     assert not (tmp_path / "out").exists()
 
 
-def test_settings_in_a_sentence_are_told_as_options():
+def test_settings_in_a_sentence_are_shown_as_options():
     options = parser(["train"]).parse_args(["train", "a/seed=3", "--out", "OUT"])
     asked = "expected sun_direction in every frame, or sun=unknown, or light.field.inputs=view"
-    told = "expected sun_direction in every frame, or --sun unknown, or --set light.field.inputs=view"
-    assert in_flags(f"a/seed=3: {asked}, found none", options) == f"a/seed=3: {told}, found none"
+    expected = "expected sun_direction in every frame, or --sun unknown, or --set light.field.inputs=view"
+    assert in_flags(f"a/seed=3: {asked}, found none", options) == f"a/seed=3: {expected}, found none"
     assert in_flags("seed: expected refine_poses, found max_gaussians", options).endswith(
         "--refine-poses, found max_gaussians"
     )

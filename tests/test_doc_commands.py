@@ -66,7 +66,7 @@ NOT_RUN = {  # commands with these words: why they do not run here
     "tests/splat/light/shadow/acne.py": "a minute; the tests beside it bound its figures",
     "tests/splat/light/shadow/against_truth.py": "asks for a run that has been trained to the end",
 }
-LIT = {"relight", "shadow-map", "shadow-splat", "baseline-park"}  #: methods that are told the Sun
+LIT = {"relight", "shadow-map", "shadow-splat", "baseline-park"}  #: methods that take the Sun as input
 
 
 def name_of(path: Path) -> str:
@@ -249,14 +249,14 @@ def test_a_command_is_understood(command, monkeypatch, capsys):
 
 def test_commands_are_found():
     """In each of the ways that they are written in."""
-    told = {(command.document, command.text) for command in EVERY}
-    assert ("README.md", "spacesim view run") in told  # a fenced block, with a comment
-    assert ("how-to/trouble.md", "spacesim doctor") in told  # a sentence
-    assert ("research/viewer.md", "python benchmarks/viewer.py") in told  # an indented block
-    assert ("research/memory.md", "python benchmarks/training.py --memory --markdown") in told
-    assert ("tutorials/relight.md", "spacesim render run --sun 40,25 --out relit.png") in told
-    assert ("dataset.py", "python benchmarks/dataset.py --frames 10000") in told  # a docstring
-    assert ("01_simulate.py", "python examples/01_simulate.py") in told
+    found = {(command.document, command.text) for command in EVERY}
+    assert ("README.md", "spacesim view run") in found  # a fenced block, with a comment
+    assert ("how-to/trouble.md", "spacesim doctor") in found  # a sentence
+    assert ("research/viewer.md", "python benchmarks/viewer.py") in found  # an indented block
+    assert ("research/memory.md", "python benchmarks/training.py --memory --markdown") in found
+    assert ("tutorials/relight.md", "spacesim render run --sun 40,25 --out relit.png") in found
+    assert ("dataset.py", "python benchmarks/dataset.py --frames 10000") in found  # a docstring
+    assert ("01_simulate.py", "python examples/01_simulate.py") in found
     assert [command.words for command in EVERY if command.target == "my.toml"] == [("generate", "boxsat", "--print")]
 
 
@@ -300,7 +300,7 @@ def test_fields_that_sentences_name_exist():
 
 
 @pytest.mark.parametrize("path", [*DOCUMENTS, *TUTORIALS], ids=name_of)
-def test_other_programs_find_what_they_are_told(path):
+def test_other_programs_find_their_inputs(path):
     makefile, project = ((ROOT / name).read_text(encoding="utf-8") for name in ("Makefile", "pyproject.toml"))
     for text, _ in shown(path):
         if match := re.fullmatch(r"make (\w+)", text):
@@ -350,10 +350,10 @@ def smaller(words: tuple[str, ...]) -> list[str]:
     return found
 
 
-class Desk:
+class WorkingDirectory:
     """The working directory of a document's commands. What they read, and no command before has made, is `given`.
 
-    made: where results lie; the desk holds links to them, as the same command on the same inputs runs only once.
+    made: where results lie; the directory holds links to them, as the same command on the same inputs runs only once.
     """
 
     def __init__(self, folder: Path, given: dict[str, Path], made: Path, done: dict[Any, tuple[Outcome, Path]]) -> None:
@@ -397,7 +397,7 @@ LASTING = {"view": HAS_VISER, "serve": HAS_ZMQ}  #: commands that end by Ctrl-C,
 
 
 def stopped(words: list[str]) -> Outcome:
-    """Of a command that lasts, with Ctrl-C once it has told its address."""
+    """Of a command that lasts, with Ctrl-C once it has printed its address."""
     if not LASTING[words[0]]:
         return Outcome(0, "", [])
     command = [sys.executable, "-u", "-m", "spacesim", *words]
@@ -474,15 +474,15 @@ RUNNABLE = [command for command in WHOLE if command.program == "spacesim" and no
 @pytest.mark.parametrize("document", dict.fromkeys(command.document for command in RUNNABLE))
 def test_commands_run_from_the_top_down(document, given, made, done, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    desk = Desk(tmp_path, given, made, done)
-    desk.put("runs/boxsat")
+    directory = WorkingDirectory(tmp_path, given, made, done)
+    directory.put("runs/boxsat")
     for command in RUNNABLE:
         if command.document == document:
-            ended = desk.run(command)
+            ended = directory.run(command)
             assert ended.code == 0, (command.text, ended.errors)
 
 
-def test_what_does_not_run_is_told_why():
+def test_every_command_that_is_not_run_has_a_reason():
     assert [str(one) for one in WHOLE if one not in (*RUNNABLE, *MEASURED) and not is_left_out(one)] == []
     texts = [str(command) for command in WHOLE]
     assert [words for words in NOT_RUN if not any(words in text for text in texts)] == []
@@ -527,9 +527,9 @@ def shrunk(path: Path, text: str) -> str:
 def test_python_runs(path, given, tmp_path, monkeypatch, capsys):
     """The blocks of a document one after the other; only data and runs are given."""
     monkeypatch.chdir(tmp_path)
-    desk = Desk(tmp_path, given, tmp_path, {})
+    directory = WorkingDirectory(tmp_path, given, tmp_path, {})
     for name in ("runs/boxsat", *(("data", "run") if path.name not in ("README.md", "index.md") else ())):
-        desk.put(name)
+        directory.put(name)
     text = shrunk(path, "\n".join(blocks(path, "python")))
     with answering(text) as asked:
         exec(compile(asked, path.name, "exec"), {})

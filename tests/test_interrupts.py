@@ -108,7 +108,7 @@ def test_a_second_ctrl_c_ends_a_step_that_takes_long(tiny_data, tmp_path):
     assert not list(tmp_path.rglob("*.safetensors"))
 
 
-def test_ctrl_c_in_what_cannot_be_resumed_promises_nothing(tiny_data, tiny_run, tmp_path):
+def test_ctrl_c_mentions_resume_only_where_possible(tiny_data, tiny_run, tmp_path):
     done = run(
         "-c",
         PRESSED,
@@ -135,7 +135,7 @@ def test_a_full_standard_output_is_one_sentence(tiny_data, arguments):
 
 
 @CASES
-def test_a_closed_standard_output_is_no_news(tiny_data, arguments):
+def test_a_closed_standard_output_ends_quietly(tiny_data, arguments):
     reading, writing = os.pipe()
     os.close(reading)
     try:
@@ -147,7 +147,7 @@ def test_a_closed_standard_output_is_no_news(tiny_data, arguments):
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
-def test_what_was_made_is_there_though_it_cannot_be_said(tiny_data, tmp_path):
+def test_results_are_whole_where_standard_output_is_full(tiny_data, tmp_path):
     with open(FULL, "w") as full:
         done = run("-c", PROGRAM, "generate", "boxsat", "--out", tmp_path / "data", *GENERATE, stdout=full)
     assert done.returncode == 1

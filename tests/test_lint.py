@@ -16,12 +16,12 @@ def run(tool: str, *options: object) -> subprocess.CompletedProcess:
 
 
 @pytest.mark.parametrize("option", [("check",), ("format", "--check")], ids=" ".join)
-def test_nothing_to_mend(option):
+def test_ruff_finds_nothing(option):
     done = run("ruff", *option)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_types(tmp_path):
+def test_mypy_finds_nothing_and_knows_public_names(tmp_path):
     """Of the package there is nothing to say, of a program that uses it wrongly all that is wrong."""
     program = tmp_path / "program.py"
     program.write_text("import spacesim as ss\nreveal_type(ss.read_scene)\nss.trian\nss.replace\n", encoding="utf-8")

@@ -19,7 +19,7 @@ def test_numbers_of_numpy_are_numbers():
 @pytest.mark.parametrize(
     ("name", "value"), [("resolution", "128"), ("views", "60"), ("spp", 2.5), ("exposure", "bright"), ("sun", "40,25")]
 )
-def test_options_of_scenes_that_cannot_be(name, value):
+def test_impossible_options_of_scenes_are_refused(name, value):
     with pytest.raises(ss.InputError, match=f"^{name}: expected"):
         ss.read_scene("boxsat", **{name: value})
 
@@ -45,7 +45,7 @@ def test_options_of_scenes_that_cannot_be(name, value):
         ({"method": "relight", "light": None}, "light: expected that of the method relight, found that of vanilla"),
     ],
 )
-def test_trainings_that_cannot_be(options, said, tiny_data, tmp_path):
+def test_impossible_trainings_are_refused(options, said, tiny_data, tmp_path):
     with pytest.raises(ss.InputError, match=f"^{said}"):
         ss.train(tiny_data, **{"out": tmp_path / "run", **options})
     assert not (tmp_path / "run").exists()
@@ -101,7 +101,7 @@ def test_pictures_and_poses(tiny_run, tiny_data, tmp_path):
         ss.Gaussians.from_numpy({"means": np.zeros((1, 3))})
 
 
-def test_pictures_that_cannot_be(tiny_run, tiny_data, tmp_path):
+def test_impossible_pictures_are_refused(tiny_run, tiny_data, tmp_path):
     run, frame = ss.load_run(tiny_run), ss.read_dataset(tiny_data).test[0]
     wrong = [
         (r"count: expected 0 or more, found -1", lambda: ss.Gaussians.random(-1, 1.0, 0.1)),
@@ -207,7 +207,7 @@ def test_a_run_is_no_gaussians_and_nor_are_arrays(tiny_run, tiny_data):
 
 
 @pytest.mark.parametrize("address", ["foo", None])
-def test_an_address_that_is_none(address):
+def test_wrong_addresses_are_refused(address):
     pytest.importorskip("zmq", reason="pyzmq is not installed")
     with pytest.raises(ss.InputError, match=rf"^address: expected one such as tcp://127.0.0.1:5556, found {address!r}"):
         ss.CameraClient(address)

@@ -9,9 +9,9 @@ from spacesim.learning.folder import TrainingProgress
 from spacesim.progress import Reporter, TimeLeftColumn, report_training
 
 
-def lines(capsys, *told):
+def lines(capsys, *records):
     report = Reporter("train", "iterations", None)
-    for record in told:
+    for record in records:
         report.last_line = -1e9  # every line is due
         report_training(report)(record)
     return capsys.readouterr().err.splitlines()

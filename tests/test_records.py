@@ -26,15 +26,15 @@ def explained(record: ast.ClassDef, lines: list[str]) -> tuple[set[str], set[str
     """Names of its fields that are explained, and of those that are not."""
     named = re.findall(r"`(\w+)(?:\[\w+\])?`|(\w+): ", ast.get_docstring(record) or "")
     words = {word for pair in named for word in pair}
-    told, untold = set(), set()
+    documented, undocumented = set(), set()
     for node in fields_in(record):
         name = ast.unparse(node.target)
         end = node.end_lineno or node.lineno
         beside = any("  #: " in line for line in lines[node.lineno - 1 : end])
         above = lines[node.lineno - 2].lstrip().startswith("#: ")
         below = any(line.lstrip().startswith('"""') for line in lines[end : end + 1])
-        (told if beside or above or below or name in words else untold).add(name)
-    return told, untold
+        (documented if beside or above or below or name in words else undocumented).add(name)
+    return documented, undocumented
 
 
 def unexplained(sources: dict[str, str]) -> list[str]:
@@ -45,17 +45,17 @@ def unexplained(sources: dict[str, str]) -> list[str]:
         for node in ast.walk(ast.parse(text))
         if is_record(node)
     ]
-    told = {node.name: names for _, node, (names, _) in records}
+    documented = {node.name: names for _, node, (names, _) in records}
     bases = {node.name: [ast.unparse(base) for base in node.bases] for _, node, _ in records}
 
     def inherited(name: str) -> set[str]:
-        return set().union(*(told.get(base, set()) | inherited(base) for base in bases.get(name, ())))
+        return set().union(*(documented.get(base, set()) | inherited(base) for base in bases.get(name, ())))
 
     return [
         f"{path}: {node.name}.{name}"
-        for path, node, (_, untold) in records
+        for path, node, (_, undocumented) in records
         if not node.name.startswith("_")
-        for name in sorted(untold - inherited(node.name))
+        for name in sorted(undocumented - inherited(node.name))
     ]
 
 

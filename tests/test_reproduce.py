@@ -82,7 +82,7 @@ def test_best_and_order_of_a_column():
     assert best(near, {"a": 0.2, "b": 1.5}) == {"b"}
     assert holds(near, {"a": 0.2, "b": 1.5}, "b", "a") is True
     assert holds(near, {"a": 0.2, "b": None}, "b", "a") is None
-    printed = {"a": 1.0, "b": 2.0, "c": 2.0}  # b and c are not told apart
+    printed = {"a": 1.0, "b": 2.0, "c": 2.0}  # b and c are equal
     assert pairs(lower, printed, {"a": 5.0, "b": 6.0, "c": 4.0}) == [True, False]
     assert pairs(lower, printed, {"a": None, "b": 6.0, "c": 4.0}) == []
 
@@ -279,7 +279,7 @@ def test_an_interruption_loses_no_more_than_a_checkpoint_does(whole, tmp_path):
     assert numbers(tmp_path)["figures"]["figure-5.5"] == numbers(whole)["figures"]["figure-5.5"]
 
 
-def test_a_failed_training_is_told_and_tried_again(whole, tmp_path, monkeypatch):
+def test_a_failed_training_is_reported_and_tried_again(whole, tmp_path, monkeypatch):
     (tmp_path / "data").symlink_to(whole / "data")
     (tmp_path / "size.json").write_bytes((whole / "size.json").read_bytes())
 

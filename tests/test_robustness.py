@@ -315,7 +315,7 @@ def test_a_truncated_exr_is_found(broken, fraction):
 
 
 @pytest.mark.parametrize("name", ["scene.json", "transforms.json"])
-def test_a_cut_description_is_told_with_the_way_out(spacesim, broken, tiny_data, name):
+def test_a_truncated_json_file_is_refused_with_a_remedy(spacesim, broken, tiny_data, name):
     """`verify` and `--resume` say: delete it, resume. That works, and gives the same bytes."""
     cut(broken / name)
     arguments = ("generate", "boxsat", "--out", broken, *GENERATE, "--resume")
@@ -426,7 +426,7 @@ def foreign(source: Path, root: Path, mode: str = "RGB", suffix: str = "png", vi
     return root
 
 
-def judge(spacesim, root: Path, work: Path, *options: object) -> dict:
+def evaluated(spacesim, root: Path, work: Path, *options: object) -> dict:
     """metrics.json of a short training on a folder."""
     done = spacesim("train", root, "--out", work / "run", *FEW)
     assert done.code == 0, done.errors
@@ -440,7 +440,7 @@ def judge(spacesim, root: Path, work: Path, *options: object) -> dict:
     ("mode", "suffix"), [("RGB", "png"), ("RGB", "jpg"), ("L", "png"), ("LA", "png"), ("RGBA", "png"), ("P", "png")]
 )
 def test_pictures_of_all_kinds_without_truth(spacesim, tiny_data, tmp_path, mode, suffix):
-    metrics = judge(spacesim, foreign(tiny_data, tmp_path / "data", mode, suffix), tmp_path)
+    metrics = evaluated(spacesim, foreign(tiny_data, tmp_path / "data", mode, suffix), tmp_path)
     assert len(metrics["frames"]) == 1  # every 8th is held out
     assert metrics["frames"][0]["sun"] is None
     assert metrics["shadow_mask"] is None
@@ -461,7 +461,7 @@ def test_pictures_of_different_sizes(spacesim, tiny_data, tmp_path):
             frame.update(w=width, h=height, fl_x=1.87 * width, fl_y=1.87 * height, cx=0.5 * width, cy=0.5 * height)
 
     edit(root / "transforms.json", resize)
-    assert judge(spacesim, root, tmp_path, "--split", "all")["image"]["psnr"]["count"] == 8
+    assert evaluated(spacesim, root, tmp_path, "--split", "all")["image"]["psnr"]["count"] == 8
 
 
 def test_masked_pixels_take_no_part(spacesim, tiny_data, tmp_path):
@@ -483,7 +483,7 @@ def test_masked_pixels_take_no_part(spacesim, tiny_data, tmp_path):
 
         edit(root / "transforms.json", add)
         work = tmp_path / f"work_{value}"
-        numbers.append(judge(spacesim, root, work)["image"]["psnr"])
+        numbers.append(evaluated(spacesim, root, work)["image"]["psnr"])
         numbers.append((work / "run/model.safetensors").read_bytes())
     assert numbers[0] == numbers[2]
     assert numbers[1] == numbers[3]
@@ -493,7 +493,7 @@ def test_nothing_but_masked_or_transparent_pixels(spacesim, tiny_data, tmp_path)
     root = foreign(tiny_data, tmp_path / "data")
     for path in (root / "images").iterdir():
         Image.new("RGBA", (40, 40), (0, 0, 0, 0)).save(path)
-    metrics = judge(spacesim, root, tmp_path)
+    metrics = evaluated(spacesim, root, tmp_path)
     assert metrics["image"]["psnr"] is None
     assert metrics["shadow"]["ber"] is None
     assert metrics["image_full"]["psnr"]["mean"] > 0
@@ -501,7 +501,7 @@ def test_nothing_but_masked_or_transparent_pixels(spacesim, tiny_data, tmp_path)
 
 def test_a_single_picture(spacesim, tiny_data, tmp_path):
     root = foreign(tiny_data, tmp_path / "data", "RGBA", views=1)
-    assert judge(spacesim, root, tmp_path, "--split", "train")["image"]["psnr"]["count"] == 1
+    assert evaluated(spacesim, root, tmp_path, "--split", "train")["image"]["psnr"]["count"] == 1
     refused = spacesim("eval", tmp_path / "run", "--data", root, "--out", tmp_path / "other")
     assert refused.is_refusal(root, "test")
 
@@ -517,7 +517,7 @@ def test_blender_style(spacesim, tiny_data, tmp_path):
             shutil.copy(tiny_data / frame["file_path"], root / split / f"r_{index}.png")
             frames.append({"file_path": f"./{split}/r_{index}", "transform_matrix": frame["transform_matrix"]})
         (root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
-    metrics = judge(spacesim, root, tmp_path)
+    metrics = evaluated(spacesim, root, tmp_path)
     assert [frame["file_path"] for frame in metrics["frames"]] == ["test/r_0.png", "test/r_1.png"]
 
 
@@ -528,7 +528,7 @@ def test_data_without_test_frames(spacesim, tiny_data, tiny_run, tmp_path):
         lambda m: m.update(train_filenames=[f["file_path"] for f in m["frames"]], test_filenames=[]),
     )
     assert spacesim("eval", tiny_run, "--data", root, "--out", tmp_path / "e").is_refusal(root, "test")
-    assert judge(spacesim, root, tmp_path, "--split", "train")["image"]["psnr"]["count"] == 8
+    assert evaluated(spacesim, root, tmp_path, "--split", "train")["image"]["psnr"]["count"] == 8
 
 
 def test_extra_and_empty_keys_are_passed_over(spacesim, tiny_data, tmp_path):
@@ -539,7 +539,7 @@ def test_extra_and_empty_keys_are_passed_over(spacesim, tiny_data, tmp_path):
         meta["frames"][0].update(mask_path=None, colmap_im_id=7, sharpness=3.5, sun_direction=None)
 
     edit(root / "transforms.json", add)
-    assert judge(spacesim, root, tmp_path)["image"]["psnr"]["mean"] > 0
+    assert evaluated(spacesim, root, tmp_path)["image"]["psnr"]["mean"] > 0
 
 
 def test_wide_coordinates(spacesim, tiny_data, tmp_path):
@@ -552,7 +552,7 @@ def test_wide_coordinates(spacesim, tiny_data, tmp_path):
                 frame["transform_matrix"][row][3] = 1e3 * frame["transform_matrix"][row][3] + offset
 
     edit(root / "transforms.json", move)
-    model = judge(spacesim, root, tmp_path)
+    model = evaluated(spacesim, root, tmp_path)
     assert model["image_full"]["psnr"]["mean"] > 0
     assert all(np.isfinite(value).all() for value in load_run(tmp_path / "run").gaussians.to_numpy().values())
 
@@ -565,7 +565,7 @@ def points_at(root: Path, *points: tuple[float, float, float]) -> None:
 def test_a_view_in_which_nothing_is_seen(spacesim, tiny_data, tmp_path):
     root = foreign(tiny_data, tmp_path / "data", "RGBA")
     points_at(root, (1000, 0, 0), (1000, 1, 0))
-    assert judge(spacesim, root, tmp_path)["image_full"]["psnr"]["mean"] > 0
+    assert evaluated(spacesim, root, tmp_path)["image_full"]["psnr"]["mean"] > 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (3, 2)])
@@ -574,14 +574,14 @@ def test_pictures_smaller_than_a_window(spacesim, tiny_data, tmp_path, size):
     for path in (root / "images").iterdir():
         Image.new("RGBA", size, (200, 50, 20, 255)).save(path)
     edit(root / "transforms.json", lambda m: m.update(w=size[0], h=size[1], cx=0.5 * size[0], cy=0.5 * size[1]))
-    assert judge(spacesim, root, tmp_path)["image_full"]["psnr"]["mean"] > 0
+    assert evaluated(spacesim, root, tmp_path)["image_full"]["psnr"]["mean"] > 0
 
 
 @pytest.mark.parametrize("points", [[(0, 0, 0)], 5 * [(0, 0, 0)]])
 def test_few_points_to_start_from(spacesim, tiny_data, tmp_path, points):
     root = foreign(tiny_data, tmp_path / "data", "RGBA")
     points_at(root, *points)
-    assert judge(spacesim, root, tmp_path)["model"]["gaussians"] == len(points)
+    assert evaluated(spacesim, root, tmp_path)["model"]["gaussians"] == len(points)
 
 
 @pytest.mark.parametrize("name", ["config.json", "training.json"])
@@ -685,7 +685,7 @@ def test_a_header_of_a_model_that_is_no_object(spacesim, run, tmp_path, header):
 
 
 @pytest.mark.parametrize("content", ["[]", '{"4": "x"}', '{"refinement": 1e400}', "{", '{"40": null}'])
-def test_damaged_times_cost_only_themselves(tiny_data, uninterrupted, tmp_path, caplog, content):
+def test_damaged_training_times_are_dropped_with_a_warning(tiny_data, uninterrupted, tmp_path, caplog, content):
     kill(TRAINING, 7, False, tiny_data, tmp_path / "run")
     (tmp_path / "run/checkpoints/seconds.json").write_text(content)
     run = train(read_dataset(tiny_data), tmp_path / "run", CONFIG, resume=True)
@@ -738,8 +738,8 @@ while sys.argv.pop(0) and sys.argv:
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
-def test_names_that_output_cannot_say(tiny_data, tmp_path, encoding):
-    """Runs whose names are no text, told to a terminal that knows ASCII alone."""
+def test_names_that_output_cannot_encode(tiny_data, tmp_path, encoding):
+    """Runs whose names are no text, printed to a terminal that knows ASCII alone."""
     words: list[object] = []
     for number, name in enumerate(("l\u00fcn\u00e4", os.fsdecode(b"l\xff"))):
         words += ["train", tiny_data, "--out", tmp_path / name, *FEW, ";"]
@@ -752,7 +752,7 @@ def test_names_that_output_cannot_say(tiny_data, tmp_path, encoding):
         assert (tmp_path / f"e{number}/report.html").stat().st_size > 10_000
 
 
-def test_folders_that_cannot_be(spacesim, tiny_run, tiny_data, tmp_path):
+def test_impossible_output_folders_are_refused(spacesim, tiny_run, tiny_data, tmp_path):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / ("x" * 300), tmp_path / "file", tmp_path / "file" / "x"):
         for arguments in (
@@ -785,7 +785,7 @@ def test_pictures_larger_than_any_is_drawn_are_refused(spacesim, tiny_data, tmp_
         assert done.code == 0, done.errors
 
 
-def test_a_null_character_in_a_name_is_told(spacesim, tiny_run, broken, tmp_path):
+def test_a_null_character_in_a_name_is_refused(spacesim, tiny_run, broken, tmp_path):
     scene = tmp_path / "scene.toml"
     scene.write_text('[[models]]\nrun = "a\\u0000b"\n')
     assert spacesim("compose", scene, "--out", tmp_path / "c").is_refusal("scene.toml, line 2", "null character")
@@ -808,7 +808,7 @@ def test_a_damaged_record_of_a_composed_frame_is_made_again(spacesim, tiny_run, 
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut off", "one line less", "a dangling link"])
-def test_a_list_of_digests_that_lacks_some_is_no_proof(spacesim, broken, tmp_path, damage):
+def test_verify_refuses_an_incomplete_list_of_digests(spacesim, broken, tmp_path, damage):
     sums, victim = broken / "SHA256SUMS", broken / "gt/train_00001.exr"
     lines = sums.read_text().splitlines(keepends=True)
     content = {"empty": "", "cut off": "".join(lines)[:-3]}.get(damage)

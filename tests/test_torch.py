@@ -177,7 +177,7 @@ def test_pictures_and_gradients_are_those_that_gsplat_made(number, mode):
             assert float((leaf.grad.cpu() - expected).norm() / expected.norm()) < 1e-3, name
 
 
-def test_modes_backgrounds_and_what_is_told():
+def test_modes_backgrounds_and_meta():
     leaves = as_floats(scene())
     size = {"width": SIDE, "height": SIDE, "sh_degree": 2, "packed": False}
     rgb, alpha, meta = rasterization(**leaves, **size)
@@ -389,14 +389,14 @@ def test_numbers_that_cannot_be_drawn_harm_no_others():
         ({"backgrounds": torch.zeros(2, 4)}, r"backgrounds: expected \[2, 3\], found \[2, 4\]"),
     ],
 )
-def test_what_does_not_fit_is_told(changes, words):
+def test_arguments_that_do_not_fit_are_refused(changes, words):
     leaves = as_floats(scene())
     changes = {key: value.to(DEVICE) if torch.is_tensor(value) else value for key, value in changes.items()}
     with pytest.raises(ValueError, match=words):
         rasterization(**{**leaves, "width": SIDE, "height": SIDE, "sh_degree": 1, **changes})
 
 
-def test_a_tensor_without_memory_is_told():
+def test_a_tensor_without_memory_is_refused():
     leaves = as_floats(scene())
     words = "means: expected a tensor on a CPU or on CUDA, found one on meta"
     with pytest.raises(ValueError, match=words):

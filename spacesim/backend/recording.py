@@ -143,7 +143,7 @@ class _Arguments:
 
 
 class _Names(dict[Any, str]):
-    """A text for each value of `_split`, short and never given twice; the values that came are forgotten when they are
+    """A text for each value of `_split`, short and never given twice; the values seen are forgotten when they are
     very many."""
 
     def __init__(self) -> None:

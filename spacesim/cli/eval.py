@@ -25,7 +25,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
         "--no-geometry", action="store_true", help="do not evaluate the shape (docs/how-to/geometry.md)"
     )
     parser.add_argument(
-        "--fit-gain", action="store_true", help="fit each picture's exposure on one half of it, judge it on the other"
+        "--fit-gain", action="store_true", help="fit each picture's exposure on one half of it, score it on the other"
     )
     parser.add_argument(
         "--align",

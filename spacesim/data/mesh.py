@@ -54,7 +54,7 @@ def load_mesh(path: Path, kind: str | None = None) -> RawMesh:
     path = Path(path)
     content, kind = read_bytes(path, "a mesh"), kind or path.suffix.lower()
     if kind not in READ:
-        raise InputError(f"{path}: expected a mesh in {', '.join(READ)}, found {kind or 'no ending'!r}")
+        raise InputError(f"{path}: expected a mesh in {', '.join(READ)}, found {kind or 'no extension'!r}")
     check_memory(PARSED * len(content), f"{path}: reading it")
     return (_plain_ply(content) if kind == ".ply" else None) or _load_trimesh(path, kind, content)
 
@@ -161,8 +161,8 @@ def _elements(data: bytes) -> list[tuple[bytes, int]]:
 
 
 def check_header_counts(kind: str, data: bytes) -> None:
-    """Raises InputError where the header of a "ply" or "stl" file promises more than the file holds, before anyone
-    makes room for it. Other kinds pass."""
+    """Raises InputError where the header of a "ply" or "stl" file promises more than the file holds, before memory
+    is allocated for it. Other kinds pass."""
     is_text = data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:1024].lower()
     if kind == "stl" and len(data) >= 84 and not is_text:
         count = struct.unpack_from("<I", data, 80)[0]
@@ -188,7 +188,7 @@ def mesh_suffix(path: Path) -> str:
     suffix = Path(path).suffix.lower()
     if suffix not in WRITTEN:
         raise InputError(
-            f"{path}: expected a file name that ends in {', '.join(WRITTEN)}, found {suffix or 'no ending'}"
+            f"{path}: expected a file name that ends in {', '.join(WRITTEN)}, found {suffix or 'no extension'}"
         )
     return suffix
 

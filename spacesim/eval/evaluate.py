@@ -91,7 +91,7 @@ def evaluate(
 ) -> JsonDict:
     """Evaluate every frame of the split and return what EVAL/metrics.json, written last, then holds.
 
-    What a run does not know of a picture (`splat.fit.find_unknowns`) is fitted on one half of it and judged on the
+    What a run does not know of a picture (`splat.fit.find_unknowns`) is fitted on one half of it and scored on the
     other.
     progress: called with (frames done, frames in all, the next one's file) before each frame and at the end.
     Raises InputError where there is no frame to evaluate or the dataset is broken, WorkError where a prediction is not

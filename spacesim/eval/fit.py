@@ -1,5 +1,5 @@
-"""What a run does not know of a picture, fitted on one half of the object in it and judged on the other half, and the
-other way round: every pixel is judged by numbers that were fitted without it."""
+"""What a run does not know of a picture, fitted on one half of the object in it and scored on the other half, and the
+other way round: every pixel is scored with numbers that were fitted without it."""
 
 import math
 import time

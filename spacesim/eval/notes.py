@@ -53,8 +53,8 @@ def explain_fit(unknowns: Sequence[Unknown], records: Sequence[JsonDict], whole:
     what = "; ".join(f"{unknown.name} ({unknown.how})" for unknown in unknowns)
     of_what = "it" if whole else "the object in it"
     notes = [
-        f"Fitted to each evaluated picture: {what}. On the left half of {of_what}, judged on the right half, and "
-        "the other way round: no pixel is judged by numbers that were fitted on it."
+        f"Fitted to each evaluated picture: {what}. On the left half of {of_what}, scored on the right half, and "
+        "the other way round: no pixel is scored with numbers that were fitted on it."
     ]
     if missing := sum(record["fitted"] is None for record in records):
         why = "a half has no pixel that counts" if whole else "a half shows no object"
@@ -78,12 +78,12 @@ def explain_sensor(scene: JsonMapping) -> list[str]:
     except (KeyError, TypeError, ValueError):
         return []
     noise = " and ".join(shot + read)
-    return [f"The true pictures have a sensor's noise, which no model foretells: {noise}."] if noise else []
+    return [f"The true pictures have a sensor's noise, which no model predicts: {noise}."] if noise else []
 
 
 def explain_other_data(trained: Path | None, aligned: Path | None) -> list[str]:
-    """A sentence where a run is judged in axes that may not be its own. trained: the data that it was trained on, where
-    it is evaluated on, or aligned by, others;  aligned: what it is aligned by"""
+    """A sentence where a run is evaluated in axes that may not be its own. trained: the data that it was trained on,
+    where it is evaluated on, or aligned by, others;  aligned: what it is aligned by"""
     if trained is None:
         return []
     if aligned is not None:

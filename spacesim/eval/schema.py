@@ -174,7 +174,7 @@ class RelightSweep:
 
 @dataclass(frozen=True)
 class FittedNumbers:
-    """What was fitted to each picture, on one half of it to judge the other."""
+    """What was fitted to each picture, on one half of it to score the other."""
 
     name: str  #: "sun", "embedding" or "gain"
     how: str  #: in words

@@ -1,4 +1,4 @@
-"""What files of a training say of it, of any method: its history, how a run came to be, a checkpoint's header."""
+"""What files of a training say of it, of any method: its history, how a run was trained, a checkpoint's header."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ class HistoryEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingRecord:
-    """What training.json says: how a run came to be."""
+    """What training.json says: how a run was trained."""
 
     history: tuple[HistoryEntry, ...]  #: of some iterations, in order
     seconds: float  #: of training

@@ -257,8 +257,8 @@ def _most_likely(small: _Reduced, light: PictureLight, weights: Array, first: tu
     """[K] numbers that minimise the weighted squared error over the noise, whose variance is what is left of errors,
     plus |numbers|^2. weights: [P];  first: `linearised` at 0
 
-    Pixels count as independent: with a prior 16 times as strong, pictures under Suns that training had not seen came
-    out 0.7 dB worse on the half not fitted (boxsat, 96 x 96, 9 views)."""
+    Pixels count as independent: with a prior 16 times as strong, pictures under Suns that training had not seen were
+    0.7 dB worse on the half not fitted (boxsat, 96 x 96, 9 views)."""
     numbers = np.zeros(len(first[1]))
     if not weights.sum() > 0:
         return numbers

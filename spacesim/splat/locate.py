@@ -28,7 +28,7 @@ Progress = Callable[[int, int, str], None]  #: pictures done, of how many, name 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """What came of many pictures."""
+    """Results over many pictures."""
 
     pictures: int  #: in all
     converged: int  #: of which the pose may be trusted

@@ -56,14 +56,14 @@ class ProjectedSplats:
     splats: Splats  #: ellipses on the screen, [N]
     footprints: Footprints  #: which can be seen, and where
     colors: list[Float]  #: of harmonics, three Floats [N]; else none
-    means2d: Float  #: rows x, y, pixels; room for N at least
+    means2d: Float  #: rows x, y, pixels; N rows at least
     table: Float  #: rows of `TABLE` numbers: a, b, c of `Splats`, opacity, depth, and colours or 0
     radii: Int32  #: rows of two, pixels, 0 of what is not drawn
 
 
 @dataclass
 class LeafGradients:
-    """Gradients of `Leaves`, flat, of the Gaussians with room for N at least; None of those that were not wanted."""
+    """Gradients of `Leaves`, flat, of N Gaussians at least; None of those that were not wanted."""
 
     means: Float | None = None  #: three numbers a Gaussian
     quats: Float | None = None  #: four
@@ -139,7 +139,7 @@ class _Inputs:
 
 @recorded(elements=lambda arrays, *_rest, **_named: dr.width(arrays[0]) // 3)
 def project(leaves: Leaves, settings: RasterSettings, capacity: int) -> ProjectedSplats:
-    """Splats of one camera. capacity: room for the rows of N Gaussians, by `round_capacity`."""
+    """Splats of one camera. capacity: rows of the arrays, N at least, by `round_capacity`."""
     splats, footprints, colors = _splats_of(_Inputs.of(leaves, settings.degree), settings)
     s, count = splats, dr.width(leaves.opacities)
     halves = footprints.half_width, footprints.half_height

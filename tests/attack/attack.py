@@ -106,13 +106,13 @@ class Worker:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
             self.honest = max(self.honest, answer["peak"])
 
-    def _ask(self, told: Any) -> dict[str, Any]:
+    def _ask(self, request: Any) -> dict[str, Any]:
         process = self._process
         assert process is not None
         assert process.stdin is not None
         assert process.stdout is not None
         start = time.monotonic()
-        process.stdin.write(json.dumps(told).encode() + b"\n")
+        process.stdin.write(json.dumps(request).encode() + b"\n")
         process.stdin.flush()
         answer = b""
         while not answer.endswith(b"\n"):
@@ -260,8 +260,8 @@ def _special(rng: random.Random, path: Path) -> str:
 
 def _named(folder: Path, out: Path, words: list[str], what: str, path: Path | None = None) -> Trial:
     named = tuple(word.replace("{out}", str(out / "x")) for word in words)
-    told = " ".join(word.replace(str(out.parent), ".") for word in named)
-    return Trial(folder, named, f"{what} | {told}", path)
+    shown = " ".join(word.replace(str(out.parent), ".") for word in named)
+    return Trial(folder, named, f"{what} | {shown}", path)
 
 
 def _is_quick(words: Sequence[str]) -> bool:
@@ -329,9 +329,9 @@ def _listing(folder: Path) -> Listing:
     def visit(place: str, above: str) -> None:
         with os.scandir(place) as entries:
             for entry in entries:
-                told = entry.stat(follow_symlinks=False)
-                size = told.st_size if os.path.isfile(entry.path) else 0
-                found[above + entry.name] = (size, told.st_mode, told.st_ino)
+                status = entry.stat(follow_symlinks=False)
+                size = status.st_size if os.path.isfile(entry.path) else 0
+                found[above + entry.name] = (size, status.st_mode, status.st_ino)
                 if entry.is_dir(follow_symlinks=False):
                     visit(entry.path, f"{above}{entry.name}/")
 
@@ -400,8 +400,8 @@ def attack_kills(root: Path, work: Path, seed: int, count: int, processes: int =
         place = work / f"kill{number}"
         folder, out = corpus.linked_copy(root, place / "in"), place / "out"
         found = _end_and_resume(one, folder, out, list(zip(moments, ends, strict=True)), expected)
-        told = ", ".join(f"{end.name} after {moment:.2f} s" for moment, end in zip(moments, ends, strict=True))
-        tally.add(None if found is None else f"{number} {one.name}, {told}: {found}", tell)
+        signals = ", ".join(f"{end.name} after {moment:.2f} s" for moment, end in zip(moments, ends, strict=True))
+        tally.add(None if found is None else f"{number} {one.name}, {signals}: {found}", tell)
         shutil.rmtree(place, ignore_errors=True)
 
     with ThreadPoolExecutor(processes) as pool:

@@ -27,7 +27,7 @@ ANSWER = 10.0  #: seconds for the answer to a request
 MAX_MEMORY_MB = 500.0  #: MB that the viewer may take at any time, all that it needs by itself included
 MEBI = 2**20
 
-# Two balls without training. Told "state", it says how the scene stands and which controls all clients share.
+# Two balls without training. On any line of input it prints how the scene stands and which controls all clients share.
 VIEWER = """
 import json, sys
 from pathlib import Path
@@ -62,14 +62,14 @@ print(viewer.port, flush=True)
 for line in sys.stdin:
     state = viewer.shared.state
     labels = {handle.label: uuid for uuid, handle in viewer._server.gui._gui_input_handle_from_uuid.items()}
-    told = {"poses": [pose.matrix.tolist() for pose in state.poses], "sun": state.sun.direction.tolist()}
-    print(json.dumps({**told, "shared": labels}), flush=True)
+    printed = {"poses": [pose.matrix.tolist() for pose in state.poses], "sun": state.sun.direction.tolist()}
+    print(json.dumps({**printed, "shared": labels}), flush=True)
 """
 
 
 @dataclass(frozen=True)
 class Found:
-    """What came of an attack. tried: attempts of each kind;  finds: a sentence for each that got through;  peak: MB of
+    """Results of an attack. tried: attempts of each kind;  finds: a sentence for each that got through;  peak: MB of
     memory that the viewer took at most, None where the system does not tell"""
 
     tried: dict[str, int]
@@ -105,11 +105,11 @@ class Target:
             lines = Path(f"/proc/{self.process.pid}/status").read_text().splitlines()
         except OSError:
             return None
-        told = dict(line.split(":", 1) for line in lines)
-        return tuple(int(told[name].split()[0]) * 1024 / 1e6 for name in ("VmRSS", "VmHWM"))
+        status = dict(line.split(":", 1) for line in lines)
+        return tuple(int(status[name].split()[0]) * 1024 / 1e6 for name in ("VmRSS", "VmHWM"))
 
     def found(self, sentence: str, example: str = "") -> None:
-        """Something got through. example: of several that are told in one sentence"""
+        """Something got through. example: one of several that share a sentence"""
         self.through.setdefault(sentence, []).append(example)
 
     @property
@@ -325,8 +325,8 @@ def pictures(port: int, count: int = 2) -> None:
                 left = deadline - time.monotonic()
                 if left <= 0:
                     raise TimeoutError(f"{k} of {count} pictures in {PATIENCE:.0f} s")
-                told = messages(one.recv(timeout=left))
-                seen = any(message["type"] == "BackgroundImageMessage" and message["rgb_data"] for message in told)
+                received = messages(one.recv(timeout=left))
+                seen = any(message["type"] == "BackgroundImageMessage" and message["rgb_data"] for message in received)
 
 
 # ---- the parts ----
@@ -505,7 +505,7 @@ def floods(one: Target, rng: random.Random, scale: float, held: contextlib.ExitS
 
     size = 49 * MEBI
     numbers = encoded(use("a", None))[:-1] + b"\xdd" + struct.pack("!I", size) + bytes(size)  # a list, as valid msgpack
-    for way in ("whole", "in pieces", "told to be larger")[: max(1, round(30 * scale))]:
+    for way in ("whole", "in pieces", "announced as larger")[: max(1, round(30 * scale))]:
         one.tried["message of 49 MB"] += 5
         at = start()
         if way == "whole":
@@ -597,8 +597,8 @@ def pictured(one: Target, deaf: socket.socket) -> None:
         uuid = None
         deadline = time.monotonic() + PATIENCE
         while uuid is None and time.monotonic() < deadline:
-            told = messages(at.recv(timeout=PATIENCE))
-            uuid = next((m["uuid"] for m in told if m.get("props", {}).get("label") == "Picture (PNG)"), None)
+            received = messages(at.recv(timeout=PATIENCE))
+            uuid = next((m["uuid"] for m in received if m.get("props", {}).get("label") == "Picture (PNG)"), None)
         press = encoded(use(uuid or ""))
         with contextlib.suppress(Exception):
             for _ in range(300):

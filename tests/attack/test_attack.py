@@ -89,7 +89,7 @@ def weak(tmp_path_factory) -> Iterator[Worker]:
         ("runtime", "unexplained: .*of no known reason"),
     ],
 )
-def test_it_finds(weak, tmp_path, monkeypatch, way, words):
+def test_failures_of_a_program_are_found(weak, tmp_path, monkeypatch, way, words):
     assert verdict(weak.run(["doctor"], tmp_path)) is None
     if way == "sleep":
         monkeypatch.setattr(attack, "PATIENCE", 2.0)

@@ -1,6 +1,6 @@
-"""Runs commands one after another in one process, as told on its standard input, a line of JSON each.
+"""Runs the commands on its standard input, a line of JSON each, one after another in one process.
 
-Each answer is a line: {"code", "errors", "output"}. A traceback that comes out of `main` is told as code None.
+Each answer is a line: {"code", "errors", "output"}. A traceback that comes out of `main` gives code None.
 """
 
 import contextlib
@@ -44,10 +44,10 @@ def serve() -> None:
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # what libraries print is no answer
     for line in sys.stdin:
-        told = json.loads(line)
-        os.chdir(told["folder"])
+        request = json.loads(line)
+        os.chdir(request["folder"])
         Path("/proc/self/clear_refs").write_text("5")  # from now on the peak is this command's (proc(5))
-        found = run(told["arguments"])
+        found = run(request["arguments"])
         answers.write(json.dumps({**found, "peak": peak()}) + "\n")
 
 

@@ -83,7 +83,7 @@ def test_a_pipe_is_written_into_where_somebody_reads_it(tmp_path):
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
-def test_what_cannot_be_written_is_told(tmp_path):
+def test_unwritable_paths_are_refused(tmp_path):
     with socket.socket(socket.AF_UNIX) as one:
         one.bind(str(tmp_path / "socket"))
         for name, found in ((".", "a folder"), ("socket", "a socket")):
@@ -96,7 +96,7 @@ def test_what_cannot_be_written_is_told(tmp_path):
     assert long.read_bytes() == b"as long as a name may be"
 
 
-def test_a_read_only_disk_is_told(tmp_path):
+def test_a_read_only_disk_raises_an_input_error(tmp_path):
     mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(tmp_path)]
     if (
         not sys.platform.startswith("linux")

@@ -32,7 +32,7 @@ def test_content_silhouettes_and_masks_tell_data_apart(tmp_path):
     digests = [training_digest(write(tmp_path / str(k), *one)) for k, one in enumerate(data)]
     assert len(set(digests)) == len(data)
     assert training_digest(write(tmp_path / "again")) == digests[0]
-    assert len({digest.split("-")[0] for digest in digests}) == 1  # what older versions knew
+    assert len({digest.split("-")[0] for digest in digests}) == 1  # the older form of a digest
 
 
 def test_what_older_versions_wrote_still_matches(tmp_path):

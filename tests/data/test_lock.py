@@ -13,7 +13,7 @@ from spacesim.data.lock import lock_folder
 fcntl = pytest.importorskip("fcntl", reason="this system has no flock")
 
 
-def test_one_at_a_time_and_nothing_stays(tmp_path):
+def test_the_lock_is_exclusive_and_leaves_no_file(tmp_path):
     folder = tmp_path / "a/b"
     with lock_folder(folder):
         with pytest.raises(InputError, match=r"b: expected no other run at work in the folder, found one"):
@@ -47,7 +47,7 @@ def test_where_folders_cannot_be_locked_work_goes_on(tmp_path, monkeypatch, code
         pass
 
 
-def test_a_folder_that_cannot_be_made_is_for_others_to_tell(tmp_path):
+def test_locking_ignores_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("a file, no folder")
     for place in (tmp_path / "file", tmp_path / "file/below"):
         with lock_folder(place):

@@ -124,7 +124,7 @@ def test_a_sheet_has_no_inside():
     np.testing.assert_allclose(of(sheet)(points), [0.2, 0.2, 1.0])
 
 
-def test_meshes_that_are_none_are_told(tmp_path):
+def test_files_that_are_no_meshes_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"gone\.ply"):
         read_mesh(tmp_path / "gone.ply")
     (tmp_path / "broken.ply").write_bytes(b"nonsense")

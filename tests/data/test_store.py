@@ -160,7 +160,7 @@ def test_pictures_by_hand(root):
     assert np.abs(depth * 1e-3 - truth.depth).max() <= 0.5e-3 + 1e-6
 
 
-def test_depth_beyond_16_bits_is_left_out_and_told_once(tmp_path, caplog):
+def test_depth_beyond_16_bits_is_left_out_with_one_warning(tmp_path, caplog):
     truth = make_truth()
     truth.depth[5, 5:7] = [65.535, 65.6]
     writer = DatasetWriter(tmp_path / "data", SCENE)
@@ -381,7 +381,7 @@ def test_our_own_images_load(root):
 @pytest.mark.parametrize(
     ("farthest", "unit"), [(0, 1e-3), (65.535, 1e-3), (65.6, 2e-3), (124.8, 2e-3), (125, 5e-3), (4e5, 10), (7e6, 200)]
 )
-def test_the_finest_round_step_that_reaches(farthest, unit):
+def test_depth_unit_is_the_finest_round_step_that_reaches(farthest, unit):
     assert choose_depth_unit(farthest) == pytest.approx(unit, rel=1e-12)
 
 
@@ -403,7 +403,7 @@ def test_far_depth_is_stored_in_the_unit_that_transforms_json_says(tmp_path, cap
 
 
 @pytest.mark.parametrize("unit", [0, -1, "x", True, float("nan")])
-def test_units_of_depth_that_cannot_be(root, unit):
+def test_impossible_units_of_depth_are_refused(root, unit):
     meta = json.loads((root / "transforms.json").read_text())
     (root / "transforms.json").write_text(json.dumps({**meta, "depth_unit_scale_factor": unit}))
     with pytest.raises(InputError, match=r"transforms\.json: expected .* as depth_unit_scale_factor"):

@@ -53,7 +53,7 @@ def read(values, **rules):
 @pytest.mark.parametrize(
     "part", [Part(), Part(Box((3.0, 4.0)), Disc(2.0), "blue", "matt", Tag("other")), Part(lid=Box())]
 )
-def test_there_and_back(part):
+def test_records_round_trip(part):
     assert read(plain(part)) == part
 
 
@@ -88,7 +88,7 @@ def test_what_is_wrong_is_named(values, said):
         read(values)
 
 
-def test_words_are_checked_however_a_record_is_made():
+def test_choices_are_checked_on_construction():
     with pytest.raises(InputError, match="colour: expected one of red, blue, found 'green'"):
         Part(colour="green")
     with pytest.raises(InputError, match="finish: expected one of matt, found 'wet'"):

@@ -71,7 +71,7 @@ def test_the_similarity_is_found(truth, tmp_path):
         np.testing.assert_allclose(frame.sun.direction, true.sun.direction, atol=1e-9)
 
 
-def test_noise_is_told_as_what_is_left(truth, tmp_path):
+def test_noise_is_the_residual_of_the_alignment(truth, tmp_path):
     found = align(reconstruction(truth, tmp_path / "own", noise=0.02), truth)
     assert found.rms == pytest.approx(0.02 * 3**0.5, rel=0.3)
     assert found.to_json()["rms_over_distance"] == pytest.approx(found.rms / found.distance)
@@ -198,9 +198,11 @@ def test_data_that_are_not_the_runs_are_noted(drawn, tmp_path, monkeypatch):
         write_png(own.root / frame.file_path, np.zeros((48, 48, 3), np.uint8))
 
     def notes(data, **config):
-        told = replace(run, config={"method": "vanilla", "data": data})
+        trained = replace(run, config={"method": "vanilla", "data": data})
         config = EvaluateConfig(geometry=None, **config)
-        return [note for note in evaluate(told, truth, tmp_path / "eval", config)["notes"] if "trained on" in note][:1]
+        return [note for note in evaluate(trained, truth, tmp_path / "eval", config)["notes"] if "trained on" in note][
+            :1
+        ]
 
     its_own = {"path": str(own.root), "digest": training_digest(own)}
     others = {"path": "/elsewhere", "digest": "0123"}

@@ -299,7 +299,7 @@ def elsewhere(dataset, **changes):
     return replace(dataset, test=tuple(replace(frame, **changes) for frame in dataset.test))
 
 
-def test_data_without_truth_is_judged_by_alpha(make_run, dataset, tmp_path):
+def test_data_without_truth_is_scored_over_alpha(make_run, dataset, tmp_path):
     poorer = elsewhere(dataset, sun=None, gt_path=None, silhouette_path=None)
     expected = evaluate(make_run(shifted), dataset, tmp_path / "eval")
     metrics = evaluate(make_run(shifted), poorer, tmp_path / "eval")
@@ -308,7 +308,7 @@ def test_data_without_truth_is_judged_by_alpha(make_run, dataset, tmp_path):
     assert "In 4 of 4 frames the silhouette is where the image's alpha is at least one half." in metrics["notes"]
 
 
-def test_data_without_alpha_is_judged_whole(make_run, dataset, tmp_path):
+def test_data_without_alpha_is_scored_over_whole_frames(make_run, dataset, tmp_path):
     for frame in dataset.test:
         path = dataset.root / frame.file_path
         write_png(path, np.ascontiguousarray(read_png(path)[..., :3]))
@@ -319,9 +319,9 @@ def test_data_without_alpha_is_judged_whole(make_run, dataset, tmp_path):
     assert any("image is over whole pictures" in note for note in metrics["notes"])
     photographs, config = elsewhere(dataset, silhouette_path=None), EvaluateConfig(fit_gain=True)
     notes = evaluate(make_run(shifted), photographs, tmp_path / "fitted", config)["notes"]
-    assert any("On the left half of it, judged on the right half" in note for note in notes)
+    assert any("On the left half of it, scored on the right half" in note for note in notes)
     write_report([tmp_path / "fitted"], tmp_path / "report.html")
-    assert "on one half and judged on the other (gain)" in (tmp_path / "report.html").read_text()
+    assert "on one half and scored on the other (gain)" in (tmp_path / "report.html").read_text()
 
 
 def test_ignored_pixels_do_not_count(make_run, dataset, tmp_path):
@@ -445,7 +445,7 @@ def test_the_same_frames_have_the_same_digest(make_run, dataset, tmp_path):
     assert digest(dataset) != digest(replace(dataset, test=dataset.test[:1]))
 
 
-def test_the_gain_of_each_half_is_judged_on_the_other(make_run, dataset, tmp_path):
+def test_the_gain_of_each_half_is_scored_on_the_other(make_run, dataset, tmp_path):
     """The truth's left half is half as bright as shown, its right half as bright: each is drawn with the other's."""
     left = np.arange(SIZE) < SIZE // 2
 
@@ -464,7 +464,7 @@ def test_the_gain_of_each_half_is_judged_on_the_other(make_run, dataset, tmp_pat
     assert "fitted" not in plain["frames"][0]
     metrics = evaluate(run, dataset, out, EvaluateConfig(fit_gain=True))
     assert [part["name"] for part in metrics["fitted"]] == ["gain"]
-    assert any("no pixel is judged by numbers that were fitted on it" in note for note in metrics["notes"])
+    assert any("no pixel is scored with numbers that were fitted on it" in note for note in metrics["notes"])
     for frame in metrics["frames"]:
         assert frame["fitted"]["from_column"] == SIZE // 2
         assert frame["fitted"]["gain"] == pytest.approx([0.5, 1.0], rel=0.02)
@@ -493,7 +493,7 @@ def test_frames_without_an_object_are_not_fitted(make_run, dataset, tmp_path):
     assert any(note.startswith("In 1 of 4 frames nothing was fitted") for note in metrics["notes"])
 
 
-def test_a_sensor_with_noise_is_told(make_run, dataset, tmp_path):
+def test_a_sensor_with_noise_is_noted(make_run, dataset, tmp_path):
     """By scene.json, as `generate` writes it."""
 
     def notes(sensor, name):

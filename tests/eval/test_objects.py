@@ -139,7 +139,7 @@ def test_old_evaluations_have_no_objects(make_run, dataset, tmp_path):
     assert "Object by object" not in (tmp_path / "report.html").read_text()
 
 
-def test_the_command_judges_a_scene(spacesim, tiny_run, tmp_path):
+def test_eval_of_a_composed_scene(spacesim, tiny_run, tmp_path):
     """Two runs against a path-traced pair: from TOML to report."""
     done = spacesim(
         "generate", "boxsat-pair", "--out", tmp_path / "pair", "--sun", "45,35", "--views", 1, "--test-suns", 0,

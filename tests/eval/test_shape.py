@@ -80,11 +80,11 @@ def placed_pair(run, dataset, folder):
     second = 2 * vertices @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).T + [9, 0, 2]
     write_mesh(folder / "pair.ply", np.concatenate([vertices, second]), np.concatenate([faces, faces + len(vertices)]))
     matrices = [np.eye(4), np.array([[0.0, -2, 0, 9], [2, 0, 0, 0], [0, 0, 2, 2], [0, 0, 0, 1]])]
-    told = {
+    described = {
         "objects": [{"id": k + 1, "name": "one", "world_from_object": m.tolist()} for k, m in enumerate(matrices)],
         "mesh": [{"object": k + 1, "vertices": len(vertices), "faces": len(faces)} for k in range(2)],
     }
-    return scene, replace(dataset, root=folder, mesh_path="pair.ply", scene={**dataset.scene, **told})
+    return scene, replace(dataset, root=folder, mesh_path="pair.ply", scene={**dataset.scene, **described})
 
 
 def test_models_of_a_scene_have_the_shapes_of_their_runs(tiny, tmp_path):
@@ -112,7 +112,7 @@ def test_models_of_a_scene_have_the_shapes_of_their_runs(tiny, tmp_path):
 
 
 def test_objects_without_a_shape_of_their_own(tiny, tmp_path):
-    """A run's Gaussians belong to no object; three models are not two objects; a mesh that is not told apart."""
+    """A run's Gaussians belong to no object; three models are not two objects; a mesh without a description."""
     run, dataset = tiny
     scene, pair = placed_pair(run, dataset, tmp_path)
     names = object_names(pair)
@@ -158,7 +158,7 @@ def test_runs_without_a_surface_have_a_sentence(tiny):
     assert found.note.startswith("Geometry is null but for its floaters: no view")
 
 
-def test_what_cannot_be_judged_is_null_and_why(tiny, tmp_path):
+def test_scores_that_cannot_be_computed_are_null_with_a_reason(tiny, tmp_path):
     run, dataset = tiny
     assert compare_geometry(run, dataset, None).note == "Geometry is null: it was not asked for."
     without = compare_geometry(run, replace(dataset, mesh_path=None), SMALL)

@@ -20,7 +20,7 @@ def by_mean_speed(times, iterations):
 
 
 @pytest.mark.parametrize("name", RECORDED)
-def test_recorded_trainings_are_foretold(name):
+def test_recorded_trainings_are_predicted(name):
     training = RECORDED[name]
     times, iterations = training["times"], training["iterations"]
     left = TimeLeft(iterations, Growth(training["ends"], 250_000))
@@ -47,7 +47,7 @@ def test_before_growth_it_is_a_lower_bound(name):
     assert 0 < left.seconds() < training["times"][-1][1] - times[-1][1]
 
 
-def told(iterations, counts, cost, growth=None, until=1.0, pixels=lambda step: 1.0):
+def forecast(iterations, counts, cost, growth=None, until=1.0, pixels=lambda step: 1.0):
     """(`TimeLeft` that has seen the share `until` of a training, the seconds that are left). counts: of Gaussians by
     iteration; cost: seconds a step by (iteration, Gaussians)"""
     left, seconds = TimeLeft(iterations, growth, pixels), [cost(step, counts(step)) for step in range(iterations)]
@@ -57,7 +57,7 @@ def told(iterations, counts, cost, growth=None, until=1.0, pixels=lambda step: 1
 
 
 def test_steps_that_stay_as_they_are():
-    left, rest = told(1000, lambda step: 300, lambda step, count: 0.02, until=0.5)
+    left, rest = forecast(1000, lambda step: 300, lambda step, count: 0.02, until=0.5)
     assert left.seconds() == pytest.approx(rest)
     assert not left.lower_bound
     radiance_field = TimeLeft(1000)
@@ -72,11 +72,11 @@ def test_growth_ends_at_the_most_that_there_can_be():
         return min(1000 + 10 * step, 6000)
 
     cost = lambda step, count: 1e-5 * count  # noqa: E731
-    bounded, rest = told(2000, counts, cost, Growth(1500, 6000), until=0.2)
+    bounded, rest = forecast(2000, counts, cost, Growth(1500, 6000), until=0.2)
     assert bounded.seconds() == pytest.approx(rest, rel=0.15)
-    free, _ = told(2000, counts, cost, Growth(1500, 250_000), until=0.2)
+    free, _ = forecast(2000, counts, cost, Growth(1500, 250_000), until=0.2)
     assert free.seconds() > 1.3 * bounded.seconds()
-    at_the_most, _ = told(2000, lambda step: 6000, cost, Growth(1500, 6000), until=0.2)
+    at_the_most, _ = forecast(2000, lambda step: 6000, cost, Growth(1500, 6000), until=0.2)
     assert not at_the_most.lower_bound
 
 
@@ -85,13 +85,13 @@ def test_pixels_to_come_are_counted():
         return 0.25 if step < 500 else 1.0
 
     cost = lambda step, count: 0.04 * pixels(step)  # noqa: E731
-    knowing, rest = told(1000, lambda step: 300, cost, until=0.4, pixels=pixels)
-    unknowing, _ = told(1000, lambda step: 300, cost, until=0.4)
+    knowing, rest = forecast(1000, lambda step: 300, cost, until=0.4, pixels=pixels)
+    unknowing, _ = forecast(1000, lambda step: 300, cost, until=0.4)
     assert unknowing.seconds() < 0.35 * rest
     assert knowing.seconds() > 0.55 * rest
 
 
 def test_newer_times_count_more():
     """A machine that others let go is as fast as it is now."""
-    left, rest = told(2000, lambda step: 300, lambda step, count: 0.09 if step < 500 else 0.01, until=0.6)
+    left, rest = forecast(2000, lambda step: 300, lambda step, count: 0.09 if step < 500 else 0.01, until=0.6)
     assert abs(left.seconds() - rest) < 0.3 * abs(by_mean_speed(left.times, 2000) - rest)

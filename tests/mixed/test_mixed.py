@@ -197,7 +197,7 @@ def test_surface_depth_is_the_nearer_surface(box):
         assert found[0, 0] == 0
 
 
-def test_what_cannot_be_is_said(box):
+def test_impossible_predictions_are_refused(box):
     mixed = scene((made_run("vanilla"), Pose()), (box, Pose()), shadows="trained")
     with pytest.raises(InputError, match="expected the Sun's direction"):
         mixed.predict(EYE)

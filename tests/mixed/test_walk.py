@@ -73,7 +73,7 @@ def drawn(edges: np.ndarray, density: np.ndarray, own: np.ndarray, count: int = 
     return made, {**arrays, "visible": np.array(footprints.visible)}, features
 
 
-def test_it_is_the_twin():
+def test_walk_matches_the_twin():
     """Segments before, among and behind the Gaussians, some empty, some without length."""
     rng, rays, segments = np.random.default_rng(4), CAMERA.width * CAMERA.height, 9
     distance = float(np.linalg.norm(CAMERA.position))

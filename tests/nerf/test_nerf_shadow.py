@@ -37,8 +37,8 @@ def parameters(networks: Networks, log_density: float, noise: float) -> list[np.
 
 
 def seen(networks, values, filled, points, sun, **changed) -> np.ndarray:
-    uploaded = [upload(one) for one in values]
-    return sun_visibility(networks, uploaded, upload(filled.astype(np.float32)), BOX, points, sun, **changed)
+    on_device = [upload(one) for one in values]
+    return sun_visibility(networks, on_device, upload(filled.astype(np.float32)), BOX, points, sun, **changed)
 
 
 def leaving(points: np.ndarray, sun: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -118,7 +118,7 @@ def test_a_run_of_no_method_is_refused(tmp_path, method):
         methods.load_run(tmp_path)
 
 
-def test_rays_that_do_not_fit_into_memory_are_told(dataset, finished, monkeypatch):
+def test_rays_that_do_not_fit_into_memory_are_refused(dataset, finished, monkeypatch):
     many = replace(CONFIG, rays=2**20, samples=1024, chunk=2**20)
     assert many.ray_bytes * many.rays > 10**12
     monkeypatch.setattr("spacesim.backend.memory.free_memory", lambda needed=0: 10**11)
@@ -146,7 +146,7 @@ def test_pictures_beside_the_box_are_left_out_in_one_sentence(dataset, caplog):
         training_pixels(replace(dataset, train=tuple(turned)), box, False)
 
 
-def test_damaged_checkpoints_are_told_in_one_sentence(dataset, tmp_path):
+def test_damaged_checkpoints_are_refused(dataset, tmp_path):
     trainer = NerfTrainer(dataset, CONFIG)
     path = tmp_path / "good.safetensors"
     trainer.save(path)
@@ -160,8 +160,8 @@ def test_damaged_checkpoints_are_told_in_one_sentence(dataset, tmp_path):
         (tensors, header | {"iteration": 10**6}, "expected an iteration up to 250"),
         (tensors, header | {"history": 3}, "history"),
     ]
-    for content, told, words in broken:
-        write_tensors(tmp_path / "broken.safetensors", content, told, FORMAT)
+    for content, changed, words in broken:
+        write_tensors(tmp_path / "broken.safetensors", content, changed, FORMAT)
         with pytest.raises(InputError, match=words):
             trainer.restore(tmp_path / "broken.safetensors")
     write_tensors(tmp_path / "other.safetensors", tensors, header, "spacesim-gaussians-1")
@@ -236,7 +236,7 @@ def _turned(camera):
     return replace(camera, world_from_camera=pose)
 
 
-def test_a_field_that_is_told_the_sun(dataset, tmp_path):
+def test_a_field_that_takes_the_sun_as_input(dataset, tmp_path):
     run = ss.train(dataset, tmp_path / "run", replace(CONFIG, method="nerf-relight", iterations=60))
     assert isinstance(run, NerfRun)
     camera = dataset.test[0].camera
@@ -269,7 +269,7 @@ def test_shadows_and_normals_resume_to_the_same_bits(dataset, tmp_path):
     assert model_bytes(train(dataset, tmp_path / "cut", config, resume=True)) == model_bytes(whole)
 
 
-def test_what_asks_for_gaussians_says_so(dataset, finished, tmp_path):
+def test_functions_for_gaussians_refuse_a_radiance_field(dataset, finished, tmp_path):
     image = load_image(dataset, dataset.test[0])
     with pytest.raises(InputError, match="run: expected one of Gaussians, found one of the method nerf"):
         ss.refine_pose(finished, image, dataset.test[0].camera)

@@ -212,7 +212,7 @@ class RayCaster:
 class Agreement:
     """Of labels in one or several images: pixels of the images, of a surface, those that differ from the ray caster's.
 
-    edge: of these, pixels with that answer within NEAR_EDGE; lifted: others with it where shadow rays begin as high as
+    edge: of these, pixels with that answer within NEAR_EDGE; offset: others with it where shadow rays begin as high as
     the renderer's; wrong: all others, counted for each label; classes: shadow classes and how many pixels have them;
     off_plane: largest of the pixels that agree, see OFF_PLANE.
     """
@@ -220,13 +220,13 @@ class Agreement:
     pixels: int
     surface: int
     edge: int
-    lifted: int
+    offset: int
     wrong: Counter[str]
     classes: Counter[int]
     off_plane: float
 
     def __add__(self, other: "Agreement") -> "Agreement":
-        numbers = {key: getattr(self, key) + getattr(other, key) for key in ("pixels", "surface", "edge", "lifted")}
+        numbers = {key: getattr(self, key) + getattr(other, key) for key in ("pixels", "surface", "edge", "offset")}
         both = Counter(self.wrong) + Counter(other.wrong), Counter(self.classes) + Counter(other.classes)
         return Agreement(**numbers, wrong=both[0], classes=both[1], off_plane=max(self.off_plane, other.off_plane))
 
@@ -278,7 +278,7 @@ def compare(truth: Truth, caster: RayCaster, camera: Camera, sun: Sun, seed: int
         pixels=len(centres),
         surface=int((expected["depth"] > 0).sum()),
         edge=counts[0.0],
-        lifted=counts[LIFT],
+        offset=counts[LIFT],
         wrong=wrong,
         classes=Counter(truth.shadow.ravel().tolist()),
         off_plane=float(off[same].max(initial=0)),

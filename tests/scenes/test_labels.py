@@ -34,7 +34,7 @@ def test_labels_agree_with_another_ray_caster(name, view, classes):
     """Every pixel has the other's labels, or those that lie within 0.02 pixels of its centre: at most 0.2 % do."""
     found = raycast.labels_agree(name, first=view, views=1)
     assert not found.wrong, found
-    assert found.edge + found.lifted <= 0.002 * found.surface + 2, found
+    assert found.edge + found.offset <= 0.002 * found.surface + 2, found
     assert set(found.classes) == classes
     assert all(found.classes[one] >= 20 for one in classes), "each shadow class is seen"
 
@@ -66,7 +66,7 @@ def test_labels_of_a_mesh_file_agree_with_another_ray_caster(odd_glb, up):
     """What `python tests/scenes/truth.py --labels FILE ...` does."""
     found = raycast.labels_agree(odd_glb, views=3, resolution=96, sun=(45.0, 60.0), up=up)
     assert not found.wrong, found
-    assert found.edge + found.lifted <= 0.002 * found.surface + 2, found
+    assert found.edge + found.offset <= 0.002 * found.surface + 2, found
     assert all(found.classes[one] > 100 for one in (0, 85, 170, 255)), found
 
 

@@ -440,7 +440,7 @@ def test_damaged_files_are_read_or_refused(tmp_path):
     """Bytes changed, dropped and doubled at random: no other exception than InputError, and mostly with a line."""
     path = tmp_path / "damaged.toml"
     sound = (FULL + EVERYTHING).encode()
-    told = 0
+    with_line = 0
     for seed in range(400):
         dice = random.Random(seed)
         data = bytearray(FULL.encode() if seed % 2 else sound)
@@ -452,8 +452,8 @@ def test_damaged_files_are_read_or_refused(tmp_path):
         try:
             read_scene(path)
         except InputError as error:
-            told += ", line " in str(error)
-    assert told > 300
+            with_line += ", line " in str(error)
+    assert with_line > 300
 
 
 def numeric_keys(cls, table=""):

@@ -155,10 +155,10 @@ def labels(sources: list[str], units: str, views: int = 4) -> None:
     for source in sources:
         options = {} if source in BUILT_IN_SCENES or source.endswith(".toml") else {"units": units}
         found = raycast.labels_agree(source, views=views, **options)
-        same = 1 - (found.edge + found.lifted + sum(found.wrong.values())) / found.surface
+        same = 1 - (found.edge + found.offset + sum(found.wrong.values())) / found.surface
         print(
             f"{Path(source).name:20} {found.surface:7,} pixels of surface, {100 * same:.3f} % the same, on edges "
-            f"{found.edge}, by the height of shadow rays {found.lifted}, wrong {dict(found.wrong) or 'none'}; "
+            f"{found.edge}, by the height of shadow rays {found.offset}, wrong {dict(found.wrong) or 'none'}; "
             f"points off their plane by {found.off_plane:.1e} of the distance",
             flush=True,
         )

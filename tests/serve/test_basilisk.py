@@ -36,34 +36,34 @@ def flown(address, minutes, folder):
     return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
 
 
-def view(told):
+def view(state):
     """The second camera and the Sun in the target's axes, by the states of the simulation."""
-    (r, sigma), (at, turn) = (np.array(told[name]) for name in ("chaser", "target"))
+    (r, sigma), (at, turn) = (np.array(state[name]) for name in ("chaser", "target"))
     NB, TN = rotation_from_mrp(sigma).T, rotation_from_mrp(turn)
     pose = np.eye(4)
     pose[:3, :3] = TN @ NB @ rotation_from_mrp(np.array(SIGMA_CB)).T
     pose[:3, 3] = TN @ (r + NB @ LEVER - at)
     focal = 0.5 * SIZE[1] / np.tan(0.5 * FOV)
     camera = Camera(pose, *SIZE, focal, focal, 0.5 * SIZE[0], 0.5 * SIZE[1])
-    return camera, Sun(TN @ (np.array(told["sun"]) - at))
+    return camera, Sun(TN @ (np.array(state["sun"]) - at))
 
 
 def test_optical_navigation_turns_the_camera_to_the_target(traced, tmp_path):
     with serving(traced) as address:
-        told = flown(address, 2.0, tmp_path)
-    assert len(told) == 60
-    assert told[0]["off_axis_deg"] > 5
-    assert max(each["off_axis_deg"] for each in told[-20:]) < 1.5
-    assert max(each["centroid_error_deg"] for each in told) < 1.5  # boxsat is 6 degrees wide, and lit from aside
+        states = flown(address, 2.0, tmp_path)
+    assert len(states) == 60
+    assert states[0]["off_axis_deg"] > 5
+    assert max(each["off_axis_deg"] for each in states[-20:]) < 1.5
+    assert max(each["centroid_error_deg"] for each in states) < 1.5  # boxsat is 6 degrees wide, and lit from aside
 
 
 @pytest.mark.parametrize("name", ["ball", "traced"])
 def test_pictures_are_those_of_the_same_relative_pose(name, request, tmp_path):
     served = request.getfixturevalue(name)
     with serving(served) as address:
-        told = flown(address, 0.15, tmp_path)
-    assert len(told) == 4
-    for each in told:
+        states = flown(address, 0.15, tmp_path)
+    assert len(states) == 4
+    for each in states:
         seen = read_png(tmp_path / f"{each['seconds']:05.1f}.png")
         expected = served.draw(*view(each), None, ("rgb",), round(each["seconds"] / STEP))["rgb"]
         assert expected.max() > 100

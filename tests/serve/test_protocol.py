@@ -56,8 +56,8 @@ def test_every_field_of_a_request_is_documented_and_no_other():
     asked = asked.partition("a JSON object:")[2]
     known = {f.name for record in (PictureRequest, CameraFields) for f in fields(record)} | {"version", "id"}
     assert [name for name in sorted(known) if not re.search(rf"\b{name}\b", asked)] == []
-    told = re.findall(r"^    (\w+)  +\S", protocol.__doc__, re.MULTILINE)
-    assert set(told) == {f.name for f in fields(PictureRequest)} | {"version", "id"}
+    described = re.findall(r"^    (\w+)  +\S", protocol.__doc__, re.MULTILINE)
+    assert set(described) == {f.name for f in fields(PictureRequest)} | {"version", "id"}
     assert answered
 
 
@@ -121,7 +121,7 @@ def test_a_pose_is_a_matrix_or_a_quaternion():
         ({"version": True}, "version: expected 1"),
     ],
 )
-def test_what_cannot_be_is_told_in_a_sentence(fields, words):
+def test_invalid_requests_are_refused(fields, words):
     number, request = read(**fields)
     if not isinstance(request, InputError):
         with pytest.raises(InputError) as caught:
@@ -138,14 +138,14 @@ def test_what_cannot_be_is_told_in_a_sentence(fields, words):
         *(b'{"id": [1]}', b"9" * 5000, b'{"version": 1, "id": 1.5}'),
     ],
 )
-def test_garbage_is_told_in_a_sentence(frame):
+def test_garbage_is_refused(frame):
     number, request = read_request(frame)
     assert number is None
     assert isinstance(request, InputError)
 
 
 @pytest.mark.parametrize("name", ["camera", "seed", "version"])
-def test_brackets_within_brackets_are_told_in_a_sentence(name):
+def test_deeply_nested_brackets_are_refused(name):
     """However many: some depths can be read and not be written."""
     for depth in range(700, 1100):
         _, request = read_request(b'{"version": 1, "%s": %s%s}' % (name.encode(), b"[" * depth, b"]" * depth))

@@ -90,7 +90,7 @@ def test_pictures_are_those_of_generate(tmp_path, spacesim):
             assert np.abs(seen / 255 - image.over(np.zeros(3))).max() < 1.01 / 255
 
 
-def test_it_says_what_it_is(ball, traced):
+def test_a_request_without_a_picture_describes_the_server(ball, traced):
     for served, kind in ((ball, "run"), (traced, "scene")):
         with serving(served) as address:
             facts = json.loads(asked(address, b'{"version": 1, "id": "who"}')[0])
@@ -99,7 +99,7 @@ def test_it_says_what_it_is(ball, traced):
 
 
 @pytest.mark.parametrize("shadows", ["trained", "none"])
-def test_it_has_the_arrays_that_it_says(ball, shadows):
+def test_pictures_have_the_announced_arrays(ball, shadows):
     """And no others; of a run and of a composed scene, whose models shade each other or do not."""
     models = [PlacedRun(ball.run), PlacedRun(ball.run, Pose(translation=[0, 0, 1.6]))]
     pair = PredictedRun(ComposedRun(GaussianComposition(models, ComposeConfig(shadows)), Path("pair.toml")))
@@ -170,7 +170,7 @@ def test_garbage_and_clients_that_hang_up_do_no_harm(ball):
         place = ("127.0.0.1", int(address.rpartition(":")[2]))
         greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(48)
         ready = b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03REQ"
-        part = b"\x01\x00\x00" + bytes([len(request)])  # of a message: its length is told, half of it comes
+        part = b"\x01\x00\x00" + bytes([len(request)])  # of a message: its length, then half of it
         openings = [random.bytes(200), b"GET / HTTP/1.1\r\n\r\n", greeting, greeting[:20], greeting + ready]
         openings += [greeting + ready + part + request[:20], greeting + ready + b"\x02" + struct.pack(">Q", 1 << 60)]
         for opening in openings * 3:
@@ -250,7 +250,7 @@ def test_a_client_that_takes_no_answers_does_not_stop_the_others(ball, monkeypat
     assert caplog.messages.count(DROPPED) == 1
 
 
-def test_a_client_waits_no_longer_than_it_is_told():
+def test_a_client_waits_no_longer_than_its_timeout():
     with CameraClient("tcp://127.0.0.1:9", timeout=0.1) as client:
         for _ in range(2):
             with pytest.raises(WorkError, match=r"127.0.0.1:9: expected an answer within 0.1 s"):

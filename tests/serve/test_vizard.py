@@ -172,7 +172,7 @@ def test_without_a_sun_a_run_of_one_light_is_drawn_all_the_same(ball, traced, ca
     ]
 
 
-def test_what_is_missing_is_told(ball, flight):
+def test_missing_cameras_and_bodies_are_refused(ball, flight):
     said, _, _ = flight
     simulation = Simulation(ball)
     simulation.update(said)
@@ -202,7 +202,7 @@ def test_what_is_missing_is_told(ball, flight):
         (b"\x0b", "expected wire types"),
     ],
 )
-def test_broken_messages_are_told_in_a_sentence(ball, said, words):
+def test_broken_messages_are_answered_with_an_error(ball, said, words):
     (answer,) = Simulation(ball).answer([b"SIM_UPDATE", b"", b"", said])
     assert answer.startswith(b"ERROR ")
     assert words in answer.decode()

@@ -51,7 +51,7 @@ def error(run, picture: Picture, light: PictureLight, mask: np.ndarray) -> float
     return float(np.sqrt(np.square(np.clip(draw(run, CAMERA, light).rgb, 0, 1) - picture.rgb)[mask].mean()))
 
 
-def test_runs_are_asked_for_what_they_have(run):
+def test_unknowns_are_those_of_the_run(run):
     plain = Run(Path("plain"), {}, {}, Gaussians.from_numpy(random_splats(5)), 1)
     assert find_unknowns(plain) == ()
     assert [unknown.name for unknown in find_unknowns(plain, gain=True)] == ["gain"]
@@ -72,8 +72,8 @@ def test_the_embedding_of_a_half_shows_the_other(run):
         picture, start = Picture(np.clip(truth, 0, 1), CAMERA), PictureLight()
         masks = [LEFT, ~LEFT]
         lights = fit.fit(run, picture, masks, [start, start])
-        for light, judged in zip(lights, masks[::-1], strict=True):
-            assert error(run, picture, light, judged) < 0.1 * error(run, picture, start, judged)
+        for light, scored in zip(lights, masks[::-1], strict=True):
+            assert error(run, picture, light, scored) < 0.1 * error(run, picture, start, scored)
         again = fit.fit(run, picture, masks, [start, start])
         assert all(np.array_equal(a.embedding, b.embedding) for a, b in zip(lights, again, strict=True))
 

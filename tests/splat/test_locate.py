@@ -88,7 +88,7 @@ def test_a_model_that_looks_the_same_from_two_sides_is_ambiguous(known_gaussians
     assert found.residual < 0.05
 
 
-def test_what_cannot_be_found_is_told(run, views):
+def test_pictures_without_the_object_give_no_pose(run, views):
     with pytest.raises(InputError, match="image: expected an object that is brighter than the sky, found none"):
         find_pose(run, np.full((SIZE, SIZE, 3), 0.3), CAMERA, views=views[False])
     other = np.zeros((SIZE, SIZE, 3))
@@ -245,6 +245,6 @@ def test_a_datasets_own_poses_are_not_looked_at(tiny_run, tiny_data):
     assert dataset is not None
     assert [frame.file_path for frame in frames] == [frame.file_path for frame in dataset.frames]
     assert _guess({}, frames[0]) is None
-    told = read_views(tiny_data / "transforms.json")
-    guess = _guess(told, frames[0])
+    guesses = read_views(tiny_data / "transforms.json")
+    guess = _guess(guesses, frames[0])
     np.testing.assert_array_equal(guess.world_from_camera, dataset.frames[0].camera.world_from_camera)

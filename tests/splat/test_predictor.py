@@ -82,7 +82,7 @@ def test_runs_and_what_they_draw_are_shown_in_a_line(run, scene):
     assert repr(drawn) == "RenderOutput(24 x 16 pixels: alpha, depth)"
 
 
-def test_one_model_of_gaussians_is_told_from_a_scene(run, scene):
+def test_a_run_of_gaussians_is_distinguished_from_a_scene(run, scene):
     assert run.gaussian_run is AlignedRun(run, Pose(scale=2.0)).gaussian_run is check_gaussians(run) is run
     assert scene.gaussian_run is None
     with pytest.raises(InputError, match="run: expected one of Gaussians, found one of the method vanilla"):

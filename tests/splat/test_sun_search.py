@@ -21,7 +21,9 @@ from spacesim.splat.sun_search import ShapeSearch, SmallPicture, SunFinder
 NOTHING = Encoding("harmonics", 0)
 MEAN_COSINE = 0.35  #: of pictures that were not taken against the Sun
 FIELD = FieldConfig(features=4, width=12, layers=3, inputs=SurfaceConfig(NOTHING, NOTHING))
-TOLD = FieldConfig(features=4, width=12, layers=3, inputs=DirectionsConfig(Encoding("harmonics", 2), NOTHING))
+DIRECTIONS_FIELD = FieldConfig(
+    features=4, width=12, layers=3, inputs=DirectionsConfig(Encoding("harmonics", 2), NOTHING)
+)
 
 
 def angle(one: np.ndarray, other: np.ndarray) -> float:
@@ -159,7 +161,7 @@ def test_a_model_tells_the_sun_that_it_was_drawn_with():
         np.testing.assert_array_equal(again.direction, estimate.direction)
 
 
-@pytest.mark.parametrize("field", [FIELD, TOLD], ids=["surface", "directions"])
+@pytest.mark.parametrize("field", [FIELD, DIRECTIONS_FIELD], ids=["surface", "directions"])
 def test_the_gradient_by_the_sun_is_that_of_the_colors(field):
     """Against central differences of the colours, along the sphere."""
     from spacesim.backend.upload import upload

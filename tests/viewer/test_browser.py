@@ -52,7 +52,7 @@ def shown(page, client):
 
 
 def settled(page, client):
-    """What is shown once all that was wished for is drawn and the page changes no more."""
+    """What is shown once all that was requested is drawn and the page changes no more."""
     deadline, last, same = time.monotonic() + PATIENCE, None, 0
     while same < 2:
         assert time.monotonic() < deadline, "the picture never settles"

@@ -198,7 +198,7 @@ def test_a_message_that_is_too_large_ends_one_client_alone(viewer, at_start):
         pictures(good, 1)
 
 
-def test_clients_too_many_are_told_so(viewer, monkeypatch):
+def test_clients_beyond_the_limit_get_a_message(viewer, monkeypatch):
     wait_for(lambda: not viewer._server._websock_server._live_connections, "those of other tests to be gone")
     monkeypatch.setattr(message_filter, "MAX_CLIENTS", 2)
     with connected(viewer), connected(viewer):
@@ -207,7 +207,7 @@ def test_clients_too_many_are_told_so(viewer, monkeypatch):
         assert b"2 clients already" in refused.value.response.body
 
 
-def test_sockets_that_say_nothing_make_room(viewer, monkeypatch):
+def test_silent_sockets_are_closed_when_there_are_too_many(viewer, monkeypatch):
     monkeypatch.setattr(message_filter, "MAX_SOCKETS", 4)
     with contextlib.ExitStack() as held:
         good = held.enter_context(connected(viewer))
@@ -359,8 +359,8 @@ def memory(viewer):
     def read():
         gc.collect()
         give_back()
-        told = mallinfo()()
-        found.append(told.mapped + told.used)
+        statistics = mallinfo()()
+        found.append(statistics.mapped + statistics.used)
         done.set()
 
     viewer.loop.submit(read)
@@ -393,9 +393,9 @@ def test_looking_around_takes_no_memory(viewer, at_start, monkeypatch):
     monkeypatch.setattr(Client, "show", keep)
     leaking = look_around()
     pictured = 60 * 384 * 288 * 3  # bytes of the pictures
-    told = f"{(clean - warm) / 2**20:.1f} MiB, {(leaking - clean) / 2**20:.1f} MiB with all pictures kept"
-    assert clean - warm < 0.5 * pictured, told
-    assert leaking - clean > 0.5 * pictured, told
+    message = f"{(clean - warm) / 2**20:.1f} MiB, {(leaking - clean) / 2**20:.1f} MiB with all pictures kept"
+    assert clean - warm < 0.5 * pictured, message
+    assert leaking - clean > 0.5 * pictured, message
 
 
 def messages_of(data):

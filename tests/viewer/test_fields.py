@@ -111,7 +111,7 @@ def test_a_movement_gives_a_coarse_picture_and_rest_all_steps(made):
     assert sizes == sorted(sizes)
     assert sizes[-1] == 256
     assert [full for _, full in screen.pictures] == [False, *[True] * (len(sizes) - 1)]
-    assert screen.told[-1].share == 1
+    assert screen.statistics[-1].share == 1
     drawn = len(sizes)
     session.change_settings(compare="wipe")  # nothing is drawn again
     wait_for(lambda: loop.idle, "the comparison")
@@ -199,7 +199,7 @@ def test_steps_take_turns():
     loop, made = RenderLoop(rest=0.0), []
     left = {"a": 2, "b": 2}
 
-    def wish(name):
+    def request(name):
         def draw(full):
             made.append(name)
             left[name] -= 1
@@ -209,7 +209,7 @@ def test_steps_take_turns():
         return RenderRequest(draw)
 
     for name in left:
-        loop.request(name, wish(name), moving=False)
+        loop.request(name, request(name), moving=False)
     loop.start()
     wait_for(lambda: loop.idle, "all")
     loop.stop()

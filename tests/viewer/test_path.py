@@ -187,7 +187,7 @@ def test_an_orbit_starts_where_the_view_is():
     assert orbit_from_view(view_from([0.0, 0, 5]), CENTRE).elevation_deg <= 89
 
 
-def test_a_player_ends_at_the_end_and_when_it_is_told():
+def test_a_player_stops_at_the_end_and_on_request():
     seen, ended = [], []
     player = Player(seen.append, 0.3, lambda: ended.append(True))
     player._thread.join(PATIENCE)

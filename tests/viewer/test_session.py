@@ -1,4 +1,4 @@
-"""A client's wishes: coarse while it moves, in full at rest, truth on request as long as it is that of the view."""
+"""A client's requests: coarse while it moves, in full at rest, truth on request as long as it is that of the view."""
 
 import numpy as np
 import pytest
@@ -17,13 +17,13 @@ from spacesim.viewer.truth.truth import ViewerTruth
 
 class Screen:
     def __init__(self):
-        self.pictures, self.told = [], []
+        self.pictures, self.statistics = [], []
 
     def show(self, picture, sharp):
         self.pictures.append((picture, sharp))
 
     def show_statistics(self, statistics):
-        self.told.append(statistics)
+        self.statistics.append(statistics)
 
 
 class Source:
@@ -71,7 +71,7 @@ def test_a_move_gives_a_coarse_picture_and_then_a_sharp_one(made):
     assert len(screen.pictures) == 2
     session.on_camera_moved(view_from(0, 5))
     assert (at_rest(screen, 2) != picture).any()
-    assert screen.told[-1].width == 256
+    assert screen.statistics[-1].width == 256
     assert session._last_frame[3].picture.shape == (256, 256, 3)
     assert session._last_frame[3].planes is None  # memory that each client would take
 
@@ -94,14 +94,14 @@ def test_truth_is_asked_for_once_and_shown_as_it_comes(made):
     plain = at_rest(screen)
     session.change_settings(compare="wipe", wipe=0.5)
     wait_for(lambda: source.asked, "the request")
-    wait_for(lambda: "starting" in screen.told[-1].status, "a word about it")
+    wait_for(lambda: "starting" in screen.statistics[-1].status, "a word about it")
     white = Planes(np.ones((64, 64), np.float32), rgb=np.ones((64, 64, 3), np.float32))
     session.on_trace_result(TraceResult(6, white, 4, False))  # to an older request
     session.on_trace_result(TraceResult(7, white, 4, False))
     wait_for(lambda: screen.pictures[-1][0][20, 20].min() == 255, "the truth")
     picture = screen.pictures[-1][0]
     assert (picture[:, 140:] == plain[:, 140:]).all()
-    wait_for(lambda: "4 samples a pixel, more to come" in screen.told[-1].status, "a word about it")
+    wait_for(lambda: "4 samples a pixel, more to come" in screen.statistics[-1].status, "a word about it")
     session.change_settings(wipe=0.0)
     wait_for(lambda: (screen.pictures[-1][0] == plain).all(), "no truth")
     assert source.asked == ["colour"]
@@ -159,14 +159,14 @@ def test_why_there_is_no_truth_is_said(made):
     at_rest(screen)
     source.found = "the scene is not known"
     session.change_settings(compare="difference")
-    wait_for(lambda: screen.told[-1].status == "no truth: the scene is not known", "the reason")
+    wait_for(lambda: screen.statistics[-1].status == "no truth: the scene is not known", "the reason")
     session.change_settings(mode="depth")  # asks again
     wait_for(lambda: source.asked == ["colour", "depth"], "the request")
     source.found = 7
     session.change_settings(mode="normals")
     wait_for(lambda: len(source.asked) == 3, "the request")
     session.on_trace_result(TraceResult(7, None, 0, True, "the process that traces ended"))
-    wait_for(lambda: "no truth: the process that traces ended" in screen.told[-1].status, "the reason")
+    wait_for(lambda: "no truth: the process that traces ended" in screen.statistics[-1].status, "the reason")
 
 
 def test_stored_truth_is_shown_at_once(made):
@@ -178,7 +178,7 @@ def test_stored_truth_is_shown_at_once(made):
     source.found = ViewerTruth(white, view.camera(64, 64), "the dataset's frame 3")
     session.change_settings(compare="wipe", wipe=1.0)
     wait_for(lambda: screen.pictures[-1][0].min() == 255, "the truth")
-    wait_for(lambda: screen.told[-1].status == "truth: the dataset's frame 3", "a word about it")
+    wait_for(lambda: screen.statistics[-1].status == "truth: the dataset's frame 3", "a word about it")
 
 
 def test_a_session_that_is_closed_draws_no_more(made):

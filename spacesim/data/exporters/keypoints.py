@@ -118,7 +118,7 @@ def find_keypoints(vertices: Array, faces: np.ndarray, count: int = COUNT) -> Ar
     from the middle. Each is weighed by the share of directions from which it is seen, beyond `FLAT` (a corner or a tip
     sticks out, what lies within is seen from nowhere), and by how far it is from the middle of the surface around it
     (at corners and ends, that is all to one side). No use is made of normals or of what hangs together, so meshes may
-    be open, and vertices stand there more than once. Then the farthest are picked (T. F. Gonzalez, 1985): the next is
+    be open, and vertices stand there more than once. Then the farthest are chosen (T. F. Gonzalez, 1985): the next is
     that of the largest product of weight and distance to those before. The order of vertices and faces does not
     matter. Raises InputError for a count below 1 and a mesh without an area.
     """

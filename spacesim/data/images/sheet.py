@@ -38,7 +38,7 @@ class Tile:
 
 
 LABEL_HEIGHT = 40  #: pixels of a label's height
-MIN_TILE_WIDTH = 110  #: pixels of a place's width: room for the names
+MIN_TILE_WIDTH = 110  #: pixels, so that a name fits
 
 
 @cache

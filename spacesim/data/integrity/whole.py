@@ -1,4 +1,4 @@
-"""Whether a picture on disk is whole, judged by a few of its bytes: for 100,000 frames, decoding would take an hour.
+"""Whether a picture on disk is whole, by a few of its bytes: for 100,000 frames, decoding would take an hour.
 
 Found are files that are missing, empty, cut off or longer than they say, which is what killed processes, full disks and
 power cuts leave behind. A byte that has changed within is found by `spacesim.data.store.find_unreadable_files`, which

@@ -83,14 +83,14 @@ def _about(runs: Sequence[Evaluation]) -> str:
 
 
 def fitted_words(runs: Sequence[Evaluation]) -> str:
-    """What was fitted to the pictures that runs are judged by."""
+    """What was fitted to the pictures that runs are evaluated on."""
     fitting = {run.name: [part["name"] for part in run.metrics.get("fitted") or []] for run in runs}
     parts = [(name, ", ".join(names)) for name, names in fitting.items() if names]
     if not parts:
         return ""
     what = parts[0][1] if len(runs) == 1 else "; ".join(f"{name}: {names}" for name, names in parts)
     half = "one half" if all(run.whole_pictures for run in runs) else "one half of the object"
-    return f" Fitted to each picture on {half} and judged on the other ({escape(what)})."
+    return f" Fitted to each picture on {half} and scored on the other ({escape(what)})."
 
 
 def aligned_words(runs: Sequence[Evaluation]) -> str:

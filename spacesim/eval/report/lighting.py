@@ -13,7 +13,7 @@ from spacesim.eval.report.html import escape, picture, table
 from spacesim.eval.report.read import Evaluation, legend
 
 MAX_SUN_PAIRS = 24
-"""Frames whose masks stand side by side in small; of more, evenly picked ones."""
+"""Frames whose masks stand side by side in small; of more, evenly chosen ones."""
 
 MIN_PIXEL_SHARE = 0.1
 """Lit and cast-shadow pixels of a frame that can be best or worst, as a share of the median frame's."""

@@ -43,7 +43,7 @@ class Evaluation:
 
     @property
     def tag(self) -> str:
-        """HTML: what was fitted to the pictures that it is judged by, "" for nothing."""
+        """HTML: what was fitted to the pictures that it is evaluated on, "" for nothing."""
         fitted = ", ".join(part["name"] for part in self.metrics.get("fitted") or [])
         return f' <small class="fitted">{escape(fitted)} fitted</small>' if fitted else ""
 

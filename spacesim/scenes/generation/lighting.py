@@ -20,7 +20,7 @@ DARK = 0.01
 """Fraction of the object's pixels in sunlight below which a frame counts as dark."""
 
 COARSE = 64
-"""Pixels of the longer side of the smallest picture by which a view is judged."""
+"""Pixels of the longer side of the smallest picture by which the light of a view is checked."""
 
 CLEAR = 1.5
 """Over the square root of the object's pixels: how far from the limit the sunlit share of a coarse picture is where

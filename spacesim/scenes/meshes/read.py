@@ -41,7 +41,7 @@ _TURNS = {
 
 @dataclass(frozen=True, eq=False)
 class MeshReport:
-    """What came out of a mesh file, and what did not."""
+    """What was read from a mesh file, and what was left out."""
 
     file: str  #: its name, without the folder
     parts: int  #: how many there are

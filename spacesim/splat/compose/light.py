@@ -50,7 +50,7 @@ class LightCache:
     def get(self, name: Hashable, key: Hashable, make: Callable[[], T]) -> T:
         """The value of a name, made anew where the key is not that of the last time."""
         if name not in self._values or self._values[name][0] != key:
-            self._values.pop(name, None)  # room for the next
+            self._values.pop(name, None)  # frees memory for the next
             self._values[name] = key, make()
         return cast("T", self._values[name][1])
 

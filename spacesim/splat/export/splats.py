@@ -45,5 +45,5 @@ def check_ending(path: Path, form: Form) -> None:
     """Raise InputError for a file name whose ending does not show the format."""
     endings = ENDINGS.get(form, ())
     if endings and path.suffix.lower() not in endings:
-        found = path.suffix or "no ending"
+        found = path.suffix or "no extension"
         raise InputError(f"{path}: expected a file name that ends in {' or '.join(endings)}, found {found}")

@@ -328,7 +328,7 @@ class LightModel:
         is_cooperative = select() in COOPERATIVE and cooperative.is_usable()
         read = [*(of_field if is_cooperative else [features, of_field[1]]), *self.embeddings]
         if not _are_same(read, self._cache.read):
-            self._cache = _PictureCache([], None, [], [])  # room for the next
+            self._cache = _PictureCache([], None, [], [])  # frees memory for the next
             field = self.config.field
             packed = cooperative.pack(field.shape, of_field) if is_cooperative else []
             first_layer = None if is_cooperative else kernels.first_layer_of_features(field, of_field, features, batch)

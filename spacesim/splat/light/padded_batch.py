@@ -29,7 +29,7 @@ class PaddedBatch:
 
     @staticmethod
     def of(count: int, still: bool = False) -> "PaddedBatch":
-        """For N = `count` Gaussians, at least one. still: of a model that stays as large as it is, with less room."""
+        """For N = `count` Gaussians, at least one. still: of a model of constant size, with less padding."""
         return PaddedBatch(
             dr.opaque(ad.UInt32, count), (count // CHUNK + 1) * CHUNK if still else round_capacity(count)
         )

@@ -184,7 +184,7 @@ def _fours(channels: int, absolute: bool) -> int:
 @dataclass
 class _Buckets:
     """Of each bucket [B]: its tile, the tile's left and top edges in pixels, and its pairs from `first` to below `end`
-    of the tile, none where no thread of blending came to it."""
+    of the tile, none where no thread of blending reached it."""
 
     tile: UInt32
     live: Bool

@@ -56,8 +56,8 @@ def _bucket(lists: TileLists, channels: int) -> int:
 def blend_lists(
     splats: Splats, features: list[Float], lists: TileLists, width: int, height: int, capacity: int, bucket: int
 ) -> BlendResult:
-    """`forward` as a part of recordings. capacity: room for the N splats;  bucket: pairs of a bucket of the adjoint, 0
-    for none"""
+    """`forward` as a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket of the
+    adjoint, 0 for none"""
     shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
     channels, pixels = len(features), lists.shape.pixels
     turn = min(BUCKET_TURN, bucket) if bucket else 1

@@ -36,9 +36,9 @@ class BlendResult:
     records: list[Float]  #: the splats' records in list order, see `list_records`
     bucket: int  #: pairs of a bucket of the adjoint, 0 for none
     #: transmittance and sums of each pixel of a bucket's tile before the bucket, by fours, [4 B * pixels of a tile]
-    #: each, without meaning where the pixel's thread did not come to it
+    #: each, without meaning where the pixel's thread did not reach it
     checkpoints: list[Float]
-    bucket_tile: UInt32 | None  #: the tile of each bucket, [B], the number of tiles where no thread came to it
+    bucket_tile: UInt32 | None  #: the tile of each bucket, [B], the number of tiles where no thread reached it
 
 
 def bucket_numbers(lists: TileLists, bucket: int) -> int:
@@ -50,7 +50,7 @@ def list_records(splats: Splats, features: list[Float], lists: TileLists, capaci
     """The splats' numbers in list order, so that a tile reads memory in one run.
 
     Record: x, y, -a/2 log2 e, -b log2 e, -c/2 log2 e, log2 o, features; in arrays of `packet_sizes`.
-    capacity: room for the N splats.
+    capacity: length of the splats' arrays.
     """
     if lists.capacity == 0:
         return []
@@ -99,7 +99,7 @@ def packet(values: list[Float]) -> ArrayXf:
 
 
 def load(arrays: list[Float], index: UInt32, capacity: int, active: Bool | bool = True) -> list[Float]:
-    """The numbers of entry `index` of arrays with room for `capacity` entries; 0 where not `active`."""
+    """The numbers of entry `index` of arrays of `capacity` entries; 0 where not `active`."""
     values: list[Float] = []
     for array in arrays:
         count = dr.width(array) // capacity

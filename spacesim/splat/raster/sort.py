@@ -1,9 +1,9 @@
 """Lists in order without a sort over all of them: entries are counted into their lists, and each list is ordered by
 itself.
 
-An entry's place among those of its list is taken by an atomic increment, so lists come unordered; then each entry
+An entry's place among those of its list is taken by an atomic increment, so lists are unordered; then each entry
 counts how many of its list come before it. Key and number distinguish any two entries of a list: where one ends up does
-not depend on the order in which they came. A list is ordered in chunks of `CHUNK` entries by comparing each with each;
+not depend on the order of the input. A list is ordered in chunks of `CHUNK` entries by comparing each with each;
 an entry then looks for its place in the other chunks of its run of `RUN` by bisection, and, in longer lists, in the
 other runs. Of a list of L that takes CHUNK + RUN / CHUNK log2 CHUNK + L / RUN log2 RUN steps an entry.
 """

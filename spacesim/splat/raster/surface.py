@@ -57,7 +57,7 @@ def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> U
 
 @recorded(elements=lambda _, splats, lists, width, height, *_rest, **_named: width * height)
 def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: int) -> UInt32:
-    """`median_splat` as a part of recordings. capacity: room for the N splats"""
+    """`median_splat` as a part of recordings. capacity: length of the splats' arrays"""
     records, thread, pixels = list_records(splats, [], lists, capacity), thread_pixels(lists), lists.shape.pixels
 
     def undecided(k: UInt32, end: UInt32, transmittance: list[Float], _place: object) -> Bool:
@@ -97,7 +97,7 @@ def surface_depth(gaussians: Gaussians, splats: Splats, index: UInt32, camera: P
 
     A ray d is deepest in a Gaussian at z = d'P m / d'P d, P its inverse covariance and m its centre in camera axes.
     That is taken as linear in the pixel about the centre, as in RaDe-GS (Zhang et al. 2024), and ends `REACH` standard
-    deviations of the longest axis before and behind it. Not differentiable. capacity: room for the N splats
+    deviations of the longest axis before and behind it. Not differentiable. capacity: length of the splats' arrays
     (`round_capacity`)
     """
     splats = dr.detach(splats)

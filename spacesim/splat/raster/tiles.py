@@ -42,7 +42,7 @@ class TileLists:
     """(tile, splat) pairs. `splat`, `slot` [P] are in blending order; `start`, `end` [T] delimit each tile.
 
     Slots number the pairs splat by splat: those of splat i are `first_slot[i]` .. + `slot_count[i]`, [M]. Arrays
-    have room for more pairs and splats than there are, so that few sizes occur: P is `capacity`, M at least N.
+    are longer than there are pairs and splats, so that few sizes occur: P is `capacity`, M at least N.
     """
 
     splat: UInt32
@@ -82,7 +82,7 @@ def round_capacity(count: int, steps: int = STEPS) -> int:
     is scattered into is part of a kernel's text, few kernels to compile. steps: sizes from one power of two to the
     next, itself one
 
-    Never `count` itself: a recording in which the two are one takes the size of the room from the number of splats."""
+    Never `count` itself: a recording in which the two are one takes the capacity from the number of splats."""
     step = max(1024, (1 << max(0, count.bit_length() - 1)) // steps)
     return (count // step + 1) * step
 

@@ -114,7 +114,7 @@ class AsyncTileLists:
 
     def all_fit(self) -> bool:
         """Whether all lists since the last time are those of `bin_splats`: the capacity was enough for all pairs, and
-        some were there. Waits until they have been counted, not for what came after."""
+        some were there. Waits until they have been counted, not for later work."""
         pending, self._pending = self._pending, []
         fits = True
         for one in pending:

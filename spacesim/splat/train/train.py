@@ -37,7 +37,7 @@ def train(
     """Train and write RUN (see `spacesim.splat.run`). With `resume`, go on from the newest checkpoint, with the
     same result to the bit; a finished run is returned as it is. command: the command line, for the report.
 
-    Ctrl-C on the command line leaves a checkpoint of the step that it came in. Raises InputError where `out` holds a
+    Ctrl-C on the command line leaves a checkpoint of the step that it arrives in. Raises InputError where `out` holds a
     run and `resume` is not asked for, or one of another configuration, or where another training is at work in it.
     """
     out, config = Path(out), _with_tone_and_exposure(config, check_still(dataset))

@@ -39,7 +39,7 @@ class TrainingView:
 
 
 class TrainingViews:
-    """Views of a dataset's training frames by index, decoded at first use and kept while there is room, see
+    """Views of a dataset's training frames by index, decoded at first use and kept while memory suffices, see
     `kept_bytes`.
 
     suns: every frame must name its Sun;  truth: path-traced planes that it must have, by name

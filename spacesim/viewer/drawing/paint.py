@@ -145,7 +145,7 @@ def compare_pictures(picture: Bytes, truth: Bytes, has_truth: NDArray[np.bool_],
 
 
 def add_color_bar(picture: Bytes, depths: tuple[float, float]) -> Bytes:
-    """A picture of depths with the colour map and its ends in metres at the bottom; as it is where there is no room."""
+    """A picture of depths with the colour map and its ends in metres at the bottom; unchanged where too small."""
     height, width = picture.shape[:2]
     if width < 160 or height < 80:
         return picture

@@ -73,27 +73,27 @@ class RayCaster:
 
 
 def images_of(bop: Path):
-    """(split, image number, camera, poses, infos) as the toolkit reads them."""
+    """(split, image number, camera, poses, gt_infos) as the toolkit reads them."""
     for split in ("train", "test"):
         scene = bop / split / "000000"
         cameras = inout.load_scene_camera(scene / "scene_camera.json")
         poses = inout.load_scene_gt(scene / "scene_gt.json")
-        told = inout.load_json(scene / "scene_gt_info.json", keys_to_int=True)
-        assert cameras.keys() == poses.keys() == told.keys() == {0, 1}
+        gt_infos = inout.load_json(scene / "scene_gt_info.json", keys_to_int=True)
+        assert cameras.keys() == poses.keys() == gt_infos.keys() == {0, 1}
         for image in cameras:
-            yield scene, image, cameras[image], poses[image], told[image]
+            yield scene, image, cameras[image], poses[image], gt_infos[image]
 
 
 def test_visibility_counts_and_boxes_are_those_that_the_toolkit_finds(bop, models):
     """As scripts/calc_gt_info.py does it, with its way to tell what is visible."""
     caster = RayCaster(models, 3 * WIDTH, 3 * HEIGHT)
     cut = hidden = 0
-    for scene, image, camera, poses, told in images_of(bop):
+    for scene, image, camera, poses, gt_infos in images_of(bop):
         k = camera["cam_K"]
         depth = camera["depth_scale"] * inout.load_depth(scene / f"depth/{image:06d}.png")
         assert inout.load_im(scene / f"rgb/{image:06d}.png").shape == (HEIGHT, WIDTH, 3)
         distance = misc.depth_im_to_dist_im_fast(depth, k)
-        for index, (pose, info) in enumerate(zip(poses, told, strict=True)):
+        for index, (pose, info) in enumerate(zip(poses, gt_infos, strict=True)):
             centre = k[0, 2] + WIDTH, k[1, 2] + HEIGHT
             place = pose["obj_id"], pose["cam_R_m2c"], pose["cam_t_m2c"]
             large = caster.render_object(*place, k[0, 0], k[1, 1], *centre)["depth"]
@@ -121,10 +121,10 @@ def test_visibility_counts_and_boxes_are_those_that_the_toolkit_finds(bop, model
 def test_errors_are_zero_of_the_truth_alone(bop, models):
     caster = RayCaster(models, WIDTH, HEIGHT)
     turn = Rotation.from_rotvec([0, 0, 0.3]).as_matrix()
-    for scene, image, camera, poses, told in images_of(bop):
+    for scene, image, camera, poses, gt_infos in images_of(bop):
         k = camera["cam_K"]
         depth = camera["depth_scale"] * inout.load_depth(scene / f"depth/{image:06d}.png")
-        for pose, seen in zip(poses, told, strict=True):
+        for pose, seen in zip(poses, gt_infos, strict=True):
             number, info = pose["obj_id"], infos(bop)[pose["obj_id"]]
             points, r, t = models[number]["pts"], pose["cam_R_m2c"], pose["cam_t_m2c"]
             symmetries = misc.get_symmetry_transformations(info, max_sym_disc_step=0.01)
@@ -147,16 +147,16 @@ def test_symmetries_take_models_to_themselves(tmp_path):
         targets.append(LabelledObject(number, f"body {number}", np.eye(4), vertices, faces))
         bodies.append(BodyLabels(number, {"a": (0.0, 0.0, 0.0)}, "", *find_symmetries(vertices, faces)))
     _write_models(tmp_path, targets, [1, 2], bodies)
-    told = inout.load_json(tmp_path / "models/models_info.json", keys_to_int=True)
+    models_info = inout.load_json(tmp_path / "models/models_info.json", keys_to_int=True)
     unturned = np.eye(3), np.zeros((3, 1))
     for number, least, tolerance in ((1, 8, 1e-6), (2, 300, 0.012)):
         points = inout.load_ply(tmp_path / f"models/obj_{number:06d}.ply")["pts"]
-        ways = misc.get_symmetry_transformations(told[number], max_sym_disc_step=0.01)
+        ways = misc.get_symmetry_transformations(models_info[number], max_sym_disc_step=0.01)
         assert len(ways) >= least
         errors = [pose_error.adi(way["R"], way["t"], *unturned, points) for way in ways]
-        assert max(errors) < tolerance * told[number]["diameter"]
+        assert max(errors) < tolerance * models_info[number]["diameter"]
         far = ways[len(ways) // 3]
-        assert pose_error.add(far["R"], far["t"], *unturned, points) > 0.1 * told[number]["diameter"]
+        assert pose_error.add(far["R"], far["t"], *unturned, points) > 0.1 * models_info[number]["diameter"]
         assert pose_error.mssd(far["R"], far["t"], *unturned, points, ways) < 1e-9
 
 
@@ -168,9 +168,9 @@ def test_models_targets_and_results(bop, models, tmp_path):
         low, size = ([info[f"{name}_{axis}"] for axis in "xyz"] for name in ("min", "size"))
         np.testing.assert_allclose(misc.calc_3d_bbox(*points.T), [*low, *size], rtol=1e-4, atol=1e-2)
     targets, results = [], []
-    for scene, image, _, poses, told in images_of(bop):
+    for scene, image, _, poses, gt_infos in images_of(bop):
         if scene.parent.name == "test":
-            found = inout.get_im_targets(poses, told, 0.1)
+            found = inout.get_im_targets(poses, gt_infos, 0.1)
             targets += [{"scene_id": 0, "im_id": image, "obj_id": k, **count} for k, count in found.items()]
             results += [
                 {"scene_id": 0, "im_id": image, "obj_id": pose["obj_id"], "score": 1.0, "time": 1.0}

@@ -80,13 +80,13 @@ def test_cocos_own_evaluation_takes_the_labels_for_perfect(coco, kind):
     with contextlib.redirect_stdout(io.StringIO()):
         api = read(coco / "annotations/train.json")
         results = [{**annotation, "score": 1.0} for annotation in api.dataset["annotations"]]
-        judge = COCOeval(api, api.loadRes(results), kind)
+        evaluation = COCOeval(api, api.loadRes(results), kind)
         if kind == "keypoints":
-            judge.params.kpt_oks_sigmas = np.full(11, 0.05)
-        judge.evaluate()
-        judge.accumulate()
-        judge.summarize()
-    assert judge.stats[0] == pytest.approx(1)
+            evaluation.params.kpt_oks_sigmas = np.full(11, 0.05)
+        evaluation.evaluate()
+        evaluation.accumulate()
+        evaluation.summarize()
+    assert evaluation.stats[0] == pytest.approx(1)
 
 
 def test_yolo_lines_say_masks_boxes_and_keypoints(labelled, truth, tmp_path):
@@ -136,11 +136,11 @@ def test_webdataset_reads_back_by_the_real_library(labelled, truth, tmp_path):
             np.testing.assert_array_equal(sample["png"], opaque_picture(labelled, frame))
             numbers = sample["id.png"][..., 0]
             np.testing.assert_allclose(described["world_from_camera"], frame.camera.world_from_camera)
-            for told, instance in zip(described["objects"], truth[sample["__key__"]], strict=True):
-                assert told["area"] == (numbers == told["id"]).sum() == instance.area
-                np.testing.assert_allclose(told["keypoints"], instance.keypoints)
+            for written, instance in zip(described["objects"], truth[sample["__key__"]], strict=True):
+                assert written["area"] == (numbers == written["id"]).sum() == instance.area
+                np.testing.assert_allclose(written["keypoints"], instance.keypoints)
                 expected = frame.camera.camera_from_world @ instance.target.world_from_object
-                np.testing.assert_allclose(told["camera_from_object"], expected)
+                np.testing.assert_allclose(written["camera_from_object"], expected)
         raw = next(iter(webdataset.WebDataset(str(tmp_path / f"shards/{split}-000000.tar"), shardshuffle=False)))
         stored = np.asarray(PillowImage.open(io.BytesIO(raw["depth.png"])))
         unit = json.loads(raw["json"])["depth_unit"]
@@ -175,9 +175,9 @@ def test_speedplus_masks_come_back_as_silhouettes(labelled, tmp_path):
         u = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
         v = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
         pixels = np.stack([u, v, np.ones_like(u)], axis=1) @ np.transpose(camera["cameraMatrix"])
-        told = np.array(keypoints[label["filename"]])
-        inside = told[:, 2] > 0
-        np.testing.assert_allclose(told[inside, :2], pixels[inside, :2], atol=1e-9)
+        written = np.array(keypoints[label["filename"]])
+        inside = written[:, 2] > 0
+        np.testing.assert_allclose(written[inside, :2], pixels[inside, :2], atol=1e-9)
     dataset = import_speedplus(tmp_path / "plus", tmp_path / "back")
     for frame in dataset.train:
         name = Path(frame.file_path).name

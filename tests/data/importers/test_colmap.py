@@ -122,7 +122,7 @@ KEPT = {
 
 
 @pytest.mark.parametrize("name", KEPT)
-def test_what_our_cameras_can_say_is_kept(tmp_path, name):
+def test_lenses_that_our_cameras_have_are_kept(tmp_path, name):
     lens = lens_of(name)
     root = project(tmp_path / "src", ring(2, cameras={1: (name, 64, 48, lens.parameters)}), size=(64, 48))
     frame = imported(root, tmp_path / "out").frames[0]

@@ -129,7 +129,7 @@ def test_broken_pictures_are_not_imported(tmp_path):
 
 @pytest.mark.parametrize("count", [0, 3])
 def test_the_split_stays(tmp_path, count):
-    """Also where nothing is to be tested with, which is no wish to have every eighth frame held out."""
+    """Also where nothing is to be tested with, which does not ask for every eighth frame to be held out."""
     frames = named(9)
     names = [frame["file_path"] for frame in frames]
     root = folder(tmp_path / "src", frames, train_filenames=names[count:], test_filenames=names[:count])
@@ -145,7 +145,7 @@ def test_blenders_pictures_of_training_alone(tmp_path):
     assert [(len(one.train), len(one.test)) for one in (dataset, ss.read_dataset(root))] == 2 * [(3, 0)]
 
 
-def test_masks_mean_what_is_asked(tmp_path):
+def test_masks_are_read_as_the_option_says(tmp_path):
     root = folder(tmp_path / "src", named(2, mask_path="masks/m.png"))
     mask = np.zeros((12, 16), np.uint8)
     mask[:, :8] = 1  # as some programs write them: 0 and 1
@@ -222,7 +222,7 @@ def test_nerf_synthetic(tmp_path):
     assert ss.load_image(dataset, dataset.train[0]).alpha[0, 0] == pytest.approx(128 / 255)
 
 
-def test_what_a_film_knows_of_its_frames_stays(tmp_path):
+def test_times_and_source_indices_of_frames_are_kept(tmp_path):
     frames = named(3)
     for k, frame in enumerate(frames):
         frame |= {"time": 0.25 * k, "source_index": 7 * k}

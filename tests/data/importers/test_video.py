@@ -33,7 +33,7 @@ def overlap(mask: np.ndarray, truth: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("edge", [2.0, 0.85])
-def test_before_the_sky_the_object_is_what_is_bright(edge):
+def test_an_object_before_a_dark_sky_is_segmented_by_brightness(edge):
     picture, truth = box_from(poses_around(1)[0])
     seen = before(picture, truth, earth(0, edge))
     assert overlap(segment(seen), truth) > 0.97
@@ -47,10 +47,10 @@ def test_the_object_is_followed_before_the_earth():
         picture, truth = box_from(pose)
         pictures.append(before(picture, truth, earth(40 * k, 0.8 - 0.25 * k)))
         truths.append(truth)
-    told = []
-    masks = segment_sequence([lambda picture=picture: picture for picture in pictures], told.append)
+    reported = []
+    masks = segment_sequence([lambda picture=picture: picture for picture in pictures], reported.append)
     assert [overlap(mask, truth) > 0.95 for mask, truth in zip(masks, truths, strict=True)] == [True] * 6
-    assert told[-1] == 6
+    assert reported[-1] == 6
     again = segment_sequence([lambda picture=picture: picture for picture in pictures])
     assert all(np.array_equal(a, b) for a, b in zip(masks, again, strict=True))
 
@@ -111,7 +111,7 @@ def test_broken_videos_end_in_a_sentence(tmp_path, caplog):
 
 @needs_av
 @pytest.mark.parametrize("kind", ["matroska", "mp4"])
-def test_a_film_that_is_cut_off_is_told_of_once(tmp_path, caplog, kind):
+def test_a_video_that_is_cut_off_is_warned_of_once(tmp_path, caplog, kind):
     """Matroska tells how long it is, and not of how many frames; this MP4 has its index in front."""
     import av
 
@@ -256,11 +256,11 @@ def test_poses_of_pictures_are_found(tmp_path):
         picture, truth = box_from(pose)
         write_png(tmp_path / "in" / f"{k:02d}.png", before(picture, truth, earth(10 * k, 2.0)))
         truths.append(truth)
-    told = []
+    reported = []
     data = import_dataset(
-        "images", tmp_path / "in", tmp_path / "out", lambda *step: told.append(step[0]), fov=FOV, distance=5.0
+        "images", tmp_path / "in", tmp_path / "out", lambda *step: reported.append(step[0]), fov=FOV, distance=5.0
     )
-    assert told == sorted(told)
+    assert reported == sorted(reported)
     frames = sorted(data.frames, key=lambda frame: frame.file_path)
     assert [len(data.train), len(data.test)] == [10, 2]
     found, true = np.array([f.camera.position for f in frames]), np.array([pose[:3, 3] for pose in poses])
@@ -281,7 +281,7 @@ def test_poses_of_pictures_are_found(tmp_path):
 
 @needs_av
 @needs_colmap
-def test_frames_of_a_film_tell_which_they_are(tmp_path):
+def test_frames_of_a_video_have_their_source_index(tmp_path):
     """Also where frames that repeat the one before are left out, so that numbers differ from places in the list."""
     poses = poses_around(10)
     shown = [0, 0, 0, *range(10)]

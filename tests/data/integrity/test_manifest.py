@@ -82,7 +82,7 @@ def test_resume_makes_damaged_frames_again(spacesim, data, tiny_data, caplog):
 
 
 @pytest.mark.parametrize("line", ["x", f"{'0' * 64}  /etc/passwd", f"{'0' * 64}  ../a", f"{'g' * 64}  a", "\xff"])
-def test_a_broken_list_is_told(data, line):
+def test_a_broken_manifest_is_refused(data, line):
     with (data / NAME).open("ab") as file:
         file.write(f"{line}\n".encode("latin-1"))
     with pytest.raises(InputError, match=f"{NAME}, line [0-9]+: expected a digest and a path below the folder"):

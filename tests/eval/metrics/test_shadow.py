@@ -104,7 +104,7 @@ def test_visibility_without_shadows():
     assert metrics == {"error_rate": 0, "balanced_error_rate": None, "iou": None, "visibility_mae": 0, "pixels": 60}
 
 
-def test_kinds_of_shadow_are_judged_apart():
+def test_kinds_of_shadow_are_scored_separately():
     classes = np.array([[0, 85, 85, 85, 170, 170, 171, 254, 255, 255, 255, 255, 255, 255]], np.uint8)
     truth = (classes == 255).astype(float)
     dark = np.array([[1, 1, 1, 0, 1, 0, 1, 1, 1, 0, 0, 0, 0, 0]], bool)

@@ -131,7 +131,7 @@ def test_exterior_of_a_closed_box_with_content():
 
 
 @pytest.mark.parametrize("opened", [False, True])
-def test_much_that_is_hidden_is_not_asked_for_again_and_again(monkeypatch, opened):
+def test_hidden_faces_are_seldom_sampled(monkeypatch, opened):
     """A cube with 20 balls in each other has 12 % of its area outside; what half of an open side shows stays."""
     asked, sides = [], ExteriorView.visible_sides
     monkeypatch.setattr(

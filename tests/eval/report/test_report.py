@@ -241,7 +241,7 @@ def test_runs_with_and_without_visibility_side_by_side(lit, folder):
     assert "By grazing angle" in alone
 
 
-def test_evaluations_from_before_are_still_read(folder):
+def test_evaluations_of_older_versions_are_read(folder):
     def older(metrics):
         for key in ("known_suns", "unseen_suns", "relight", "by_grazing_angle", *KINDS):
             del metrics[key]
@@ -434,10 +434,10 @@ def test_what_was_fitted_is_said_beside_the_numbers(folder):
 
     text = "".join(page_of(folder, another(folder, "fitted", fitted)).text)
     assert text.count("embedding, gain fitted") > 3
-    assert "judged on the other (fitted: embedding, gain)" in text
+    assert "scored on the other (fitted: embedding, gain)" in text
 
 
-def test_runs_of_the_same_name_are_told_apart(folder):
+def test_runs_of_the_same_name_get_different_labels(folder):
     def moved(metrics):
         metrics["run"] = "elsewhere/fake"
 

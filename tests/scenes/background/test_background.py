@@ -135,7 +135,7 @@ def test_same_seed_gives_the_same_bytes_in_any_number_of_processes(made, tmp_pat
     assert other.keys() == first.keys()
 
 
-def test_a_sensor_sees_both(tmp_path):
+def test_a_sensor_records_object_and_background(tmp_path):
     scene = boxsat(background=BackgroundConfig(), views=1, test_views=0)
     quiet = SensorConfig(shot_noise=False, read_noise_e=0.0, black_level_dn=0, monochrome=True, bits=16)
     generate(replace(scene, camera=replace(scene.camera, sensor=quiet)), tmp_path / "data")

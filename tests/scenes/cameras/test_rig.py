@@ -180,7 +180,7 @@ def test_seed_turns_the_lattice_and_nothing_else():
     np.testing.assert_allclose(radii, fitting_distance(TARGET.radius, CAMERA), rtol=1e-12)
 
 
-def test_between():
+def test_intermediate_steps():
     np.testing.assert_allclose(intermediate_steps(5, 4, closed=False), [0.5, 1.5, 2.5, 3.5])
     np.testing.assert_allclose(intermediate_steps(4, 4, closed=True), [0.5, 1.5, 2.5, 3.5])
     np.testing.assert_allclose(intermediate_steps(101, 2, closed=False), [25.5, 75.5])

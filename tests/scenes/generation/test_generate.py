@@ -46,7 +46,7 @@ def test_dataset_is_whole(made):
     assert len(files) == len(top) + 6 * 6
 
 
-def test_test_views_have_four_times_the_samples_unless_told_otherwise(made, tmp_path):
+def test_test_views_have_four_times_the_samples_by_default(made, tmp_path):
     cleaner = tmp_path / "cleaner"
     generate(boxsat(spp=16, test_spp=16), cleaner)
     for name in ("gt/test_00000.exr", "gt/test_00001.exr"):
@@ -275,8 +275,8 @@ def test_dark_and_empty_frames_are_counted_in_one_warning(tmp_path, caplog):
     rig = PoseRig(np.array(poses), sun=(0, 0))
     config = read_scene("boxsat", resolution=(24, 24), spp=4, points=50, rig=rig)
     generate(config, tmp_path / "data")
-    told = [record.message for record in caplog.records if record.levelname == "WARNING"]
-    assert told == [
+    warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    assert warnings == [
         "generate: 1 of 3 frames show the object in the dark (train_00001 first); 1 of 3 frames show no object "
         "(train_00002 first); min_sunlit = 0.05 leaves them out"
     ]

@@ -113,7 +113,7 @@ def test_frames_that_kill_every_process_end_in_a_sentence(job, monkeypatch):
         list(make_in_processes(work, specs, 1))
 
 
-def test_an_error_in_a_worker_is_told_as_it_is(job, tmp_path):
+def test_an_error_in_a_worker_is_raised_unchanged(job, tmp_path):
     work, specs = job
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(InputError, match=r"file/data/.*cannot be written"):
@@ -170,7 +170,7 @@ def test_ray_writes_the_same_bytes(whole, tmp_path):
     assert contents(tmp_path / "data") == whole
 
 
-def test_ray_that_cannot_be_had_is_told_before_anything_is_written(tmp_path, monkeypatch):
+def test_a_missing_ray_is_reported_before_anything_is_written(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"pip install 'spacesim\[cluster\]'"):
         generate(CONFIG, tmp_path / "data", ray="auto")

@@ -132,8 +132,8 @@ def test_frames_through_the_penumbra(tmp_path, caplog, lit_by_earth):
     np.testing.assert_allclose(visibility, seen, atol=0.02)
     assert [frame["sunlit_fraction"] > 0 for frame in frames] == [True, True, False, False]
     assert (truths[2].shadow == 255).sum() == 0
-    told = [record.message for record in caplog.records if "in the dark" in record.message]
-    assert told == [
+    warnings = [record.message for record in caplog.records if "in the dark" in record.message]
+    assert warnings == [
         "generate: 2 of 4 frames show the object in the dark (train_00002 first, in 1 of them the Earth hides the Sun)"
         "; max_phase_deg = 90 in [rig] or min_sunlit = 0.05 leaves them out"
     ]

@@ -104,13 +104,13 @@ def looked_up(path: Path, points: np.ndarray) -> np.ndarray:
     return np.array(hit.bsdf().eval_diffuse_reflectance(hit)).T
 
 
-def test_red_stays_where_red_belongs(tmp_path):
+def test_textures_have_the_right_orientation(tmp_path):
     picture = np.repeat(np.repeat(CORNERS, 8, axis=0), 8, axis=1)
     seen = looked_up(textured(tmp_path, picture), [[0.25, 0.75], [0.75, 0.75], [0.25, 0.25], [0.75, 0.25]])
     np.testing.assert_array_equal(seen > 0.4, CORNERS.reshape(4, 3) > 0)  # upper left, upper right, lower left, right
 
 
-def test_red_stays_where_red_belongs_in_a_file_that_trimesh_wrote(tmp_path):
+def test_textures_of_a_trimesh_file_have_the_right_orientation(tmp_path):
     picture = Image.fromarray(np.repeat(np.repeat(CORNERS, 8, axis=0), 8, axis=1))
     plate = trimesh.Trimesh(SQUARE, QUAD.reshape(2, 3), process=False)
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture, metallicFactor=0.0)
@@ -143,10 +143,10 @@ def test_a_glb_agrees_with_its_bytes_read_by_hand(tmp_path):
     craft, report = read_mesh(tmp_path / "ball.glb")
     turned = np.stack([positions[:, 0], -positions[:, 2], positions[:, 1]], axis=-1)
     np.testing.assert_allclose(craft.parts[0].mesh.triangles, turned[faces])
-    told = document["materials"][0]["pbrMetallicRoughness"]
+    written = document["materials"][0]["pbrMetallicRoughness"]
     made = craft.parts[0].material
-    np.testing.assert_allclose(made.albedo, told["baseColorFactor"][:3])
-    assert (made.bsdf["metallic"], made.bsdf["roughness"]) == (told["metallicFactor"], told["roughnessFactor"])
+    np.testing.assert_allclose(made.albedo, written["baseColorFactor"][:3])
+    assert (made.bsdf["metallic"], made.bsdf["roughness"]) == (written["metallicFactor"], written["roughnessFactor"])
     assert report.materials == ("ball/Gold_Foil",)
 
 
@@ -289,7 +289,7 @@ def test_nodes_move_turn_and_mirror(tmp_path):
     assert not report.changed[1:]  # grey paint alone: a mirrored node needs no mending
 
 
-def test_what_has_no_place_here_is_named(tmp_path):
+def test_unsupported_features_are_named(tmp_path):
     document = Document(
         materials=[
             {

@@ -134,7 +134,7 @@ def test_quaternions_in_every_way_that_they_are_written(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("write", "meta", "told"),
+    ("write", "meta", "warning"),
     [
         (oem, {}, None),
         (oem, {"INTERPOLATION": "HERMITE", "INTERPOLATION_DEGREE": "3"}, None),
@@ -144,16 +144,16 @@ def test_quaternions_in_every_way_that_they_are_written(tmp_path):
         (aem, {"INTERPOLATION_METHOD": "HERMITE", "INTERPOLATION_DEGREE": "7"}, "HERMITE of degree 7 .* slerped"),
     ],
 )
-def test_another_interpolation_than_ours_is_told_once(tmp_path, caplog, write, meta, told):
+def test_another_interpolation_than_ours_is_warned_of_once(tmp_path, caplog, write, meta, warning):
     one, other = write(tmp_path / "1", TIMES, **meta), write(tmp_path / "2", range(540, 601, 60), **meta)
     (tmp_path / "two").write_text(one.read_text() + other.read_text().partition("\n\n")[2])
     read_message(tmp_path / "two")
     lines = [record.getMessage() for record in caplog.records]
-    assert len(lines) == (told is not None)
-    assert told is None or re.search(f"^{tmp_path}/two: asks for {told}", lines[0])
+    assert len(lines) == (warning is not None)
+    assert warning is None or re.search(f"^{tmp_path}/two: asks for {warning}", lines[0])
 
 
-def test_a_message_that_was_cut_off_is_told_of(tmp_path, caplog):
+def test_a_message_that_was_cut_off_is_warned_of(tmp_path, caplog):
     whole = oem(tmp_path / "whole.oem", range(0, 601, 60))
     read_message(whole)
     assert not caplog.records
@@ -278,7 +278,7 @@ def test_a_sun_of_ones_own_takes_the_place(tmp_path):
     ],
 )
 def test_a_sun_that_cannot_be_computed_is_asked_for(tmp_path, meta, found):
-    """Of other axes, other bodies and attitudes alone; with one told they are as good as others."""
+    """Of other axes, other bodies and attitudes alone; with a Sun given they work."""
     target, camera = TargetSphere(np.zeros(3), 1.0), CameraConfig((16, 16))
     rig = FileRig(camera=(str(oem(tmp_path / "a.oem", TIMES, **meta)),))
     expected = (
@@ -388,10 +388,10 @@ LINE = "2030-03-01T12:00:00 0 0 0 1"
         (kvn("AEM", AEM, LINE.replace(" 1", " nan")), "expected quaternions of length 1, found one of nan"),
     ],
 )
-def test_what_is_no_message(tmp_path, text, message):
+def test_files_that_are_no_message_are_refused(tmp_path, text, message):
     path = tmp_path / "a.msg"
     path.write_text(text)
-    with pytest.raises(InputError, match=message) as told:
+    with pytest.raises(InputError, match=message) as caught:
         motion_of({"camera": [path]})
-    assert str(path) in str(told.value)
-    assert "\n" not in str(told.value)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)

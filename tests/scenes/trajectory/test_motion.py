@@ -142,7 +142,7 @@ def test_stars_and_ground_stand_still_in_the_world(table):
     np.testing.assert_allclose(globes[1:], [globes[0]] * 2, atol=1e-9)
 
 
-def test_positions_between_rows_are_cubic_where_velocities_are_told():
+def test_positions_between_rows_are_cubic_where_velocities_are_given():
     times = np.array([0.0, 2.0, 5.0])
     cubic = np.stack([times**3, 1 - times**2, 4 * times], axis=1)
     rates = np.stack([3 * times**2, -2 * times, 0 * times + 4], axis=1)
@@ -161,7 +161,7 @@ def test_attitudes_between_rows_turn_evenly_the_shorter_way():
     np.testing.assert_allclose(angles, [[0, 0, 10], [0, 0, 20], [0, 0, 50]], atol=1e-10)
 
 
-def test_a_turn_that_may_be_either_way_is_told(caplog):
+def test_an_ambiguous_half_turn_is_warned_of(caplog):
     turns = Attitude("a", np.array([0.0, 4.0]), wxyz(Rotation.from_rotvec(np.radians([[0, 0, 0], [0, 0, 150]]))))
     turns.at(np.array([0.0, 4.0]))
     assert caplog.records == []
@@ -179,19 +179,19 @@ def test_directions_between_rows_turn_evenly_along_a_great_circle(caplog):
 
 
 @pytest.mark.parametrize("sun", np.concatenate([np.eye(3), [[0.6, 0, -0.8]]]))
-def test_a_sun_that_changes_sides_turns_some_way_and_is_told(caplog, sun):
+def test_a_sun_that_changes_sides_is_interpolated_with_a_warning(caplog, sun):
     found = Direction("sun", np.array([0.0, 10.0]), np.array([sun, -sun])).at(np.linspace(0, 10, 5))
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1)
     np.testing.assert_allclose(found @ sun, np.cos(np.linspace(0, np.pi, 5)), atol=1e-12)
     assert "turns by 180 degrees between two rows" in caplog.text
 
 
-def test_rows_that_another_track_does_not_cover_are_told(caplog):
+def test_rows_that_another_track_does_not_cover_are_warned_of(caplog):
     camera = Track("camera", np.arange(5.0), np.ones((5, 3)))
     sun = Direction("sun", np.array([0.0, 2.5]), np.eye(3)[:2])
     assert Motion(camera=camera, sun=sun).times().tolist() == [0, 1, 2]
-    told = "camera: 2 of 5 rows are left out, as sun does not cover them; what is left is from 0 to 2 s"
-    assert [one.message for one in caplog.records] == [told]
+    expected = "camera: 2 of 5 rows are left out, as sun does not cover them; what is left is from 0 to 2 s"
+    assert [one.message for one in caplog.records] == [expected]
     caplog.clear()
     assert len(Motion(camera=camera).times()) == 5
     assert caplog.records == []
@@ -333,8 +333,8 @@ def test_frames_beyond_a_phase_angle_are_left_out(tmp_path, limits, kept, caplog
     path = circle(tmp_path / "p.csv")
     train, _ = plan(FileRig(path=str(path), **limits), TARGET, CAMERA, 0)
     assert [PLACES.index(tuple(view.camera.position.round(6))) for view in train] == kept
-    told = ["trajectory: 1 of 4 frames are left out, by their phase angle or as the Earth hides the Sun"]
-    assert [record.getMessage() for record in caplog.records] == (told if limits else [])
+    expected = ["trajectory: 1 of 4 frames are left out, by their phase angle or as the Earth hides the Sun"]
+    assert [record.getMessage() for record in caplog.records] == (expected if limits else [])
 
 
 def test_frames_whose_sun_the_earth_hides_are_left_out(tmp_path, caplog):
@@ -352,9 +352,9 @@ def test_frames_whose_sun_the_earth_hides_are_left_out(tmp_path, caplog):
 
 def test_dark_frames_of_a_trajectory_are_counted_with_what_leaves_them_out(tmp_path, caplog):
     generate(read_scene("boxsat", **SMALL, trajectory=circle(tmp_path / "p.csv")), tmp_path / "data")
-    told = [record.getMessage() for record in caplog.records if "in the dark" in record.getMessage()]
-    assert len(told) == 1
-    assert told[0].endswith("max_phase_deg = 90 in [rig] or min_sunlit = 0.05 leaves them out")
+    warnings = [record.getMessage() for record in caplog.records if "in the dark" in record.getMessage()]
+    assert len(warnings) == 1
+    assert warnings[0].endswith("max_phase_deg = 90 in [rig] or min_sunlit = 0.05 leaves them out")
 
 
 def test_an_exposure_for_each_frame(tmp_path):

@@ -139,7 +139,7 @@ def test_a_model_of_one_shape_is_refused(moving, command, tmp_path, capsys):
         ("boxsat-pair", {"target2_x_m": "target2_x_km"}, "target2_x_m: expected a column beside target2_y_m"),
     ],
 )
-def test_objects_that_cannot_be(table, scene, change, message, tmp_path):
+def test_impossible_tracks_of_objects_are_refused(table, scene, change, message, tmp_path):
     text = table.read_text()
     for old, new in change.items():
         text = text.replace(old, new)

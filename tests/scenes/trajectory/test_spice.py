@@ -119,8 +119,8 @@ def kernels(tmp_path_factory):
 
 
 def rig(kernels, **options):
-    told = {"start": START, "stop": STOP, "camera": "CHASER", "target": "TARGET", "views": 7}
-    return SpiceRig(kernels=kernels, **{**told, **options})
+    defaults = {"start": START, "stop": STOP, "camera": "CHASER", "target": "TARGET", "views": 7}
+    return SpiceRig(kernels=kernels, **{**defaults, **options})
 
 
 TARGET, CAMERA = TargetSphere(np.zeros(3), 1.0), CameraConfig((16, 16))
@@ -128,8 +128,8 @@ TARGET, CAMERA = TargetSphere(np.zeros(3), 1.0), CameraConfig((16, 16))
 
 @pytest.mark.parametrize("frame", ["J2000", "ECLIPJ2000", "CHASER_CAM"])
 def test_states_are_spices_own(kernels, frame):
-    told = {"camera_frame": "CHASER_CAM", "target_frame": "TARGET_BODY", "frame": frame}
-    train, test = plan(rig(kernels, **told, test_views=3), TARGET, CAMERA, 0)
+    names = {"camera_frame": "CHASER_CAM", "target_frame": "TARGET_BODY", "frame": frame}
+    train, test = plan(rig(kernels, **names, test_views=3), TARGET, CAMERA, 0)
     assert (len(train), len(test)) == (7, 3)
     for kernel in kernels:
         spice.furnsh(kernel)
@@ -185,9 +185,9 @@ def test_without_an_attitude_the_camera_looks_at_the_target(kernels):
     ],
 )
 def test_what_kernels_do_not_tell(kernels, options, message):
-    with pytest.raises(InputError, match=message) as told:
+    with pytest.raises(InputError, match=message) as caught:
         plan(rig(kernels, **options), TARGET, CAMERA, 0)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
     assert spice.ktotal("ALL") == 0
 
 

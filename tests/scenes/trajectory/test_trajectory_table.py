@@ -125,11 +125,11 @@ def test_what_is_wrong_is_said_in_one_sentence(tmp_path, name, columns, message)
     if message is None:
         read_table(path)
         return
-    with pytest.raises(InputError, match=message) as told:
+    with pytest.raises(InputError, match=message) as caught:
         read_table(path)
-    assert str(told.value).startswith(f"{path}: ")
-    assert str(told.value).count(str(path)) == 1
-    assert "\n" not in str(told.value)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert str(caught.value).count(str(path)) == 1
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

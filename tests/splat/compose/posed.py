@@ -20,8 +20,8 @@ from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 
-TOLD = {"sun": Encoding("harmonics", 2), "view": Encoding("harmonics", 2)}
-FIELD = FieldConfig(features=5, width=12, layers=3, inputs=DirectionsConfig(**TOLD))
+ENCODINGS = {"sun": Encoding("harmonics", 2), "view": Encoding("harmonics", 2)}
+FIELD = FieldConfig(features=5, width=12, layers=3, inputs=DirectionsConfig(**ENCODINGS))
 REFINE = ShadowRefinementConfig(features=3, width=8, sun=Encoding("harmonics", 1))
 MAP = ShadowConfig(MappingConfig(), 64, refine=REFINE)
 CONFIGS = {
@@ -30,10 +30,12 @@ CONFIGS = {
     "splat": LightConfig(FIELD, ShadowConfig(SplattingConfig(), 64, refine=REFINE)),
     "linear": LightConfig(FIELD, MAP, linear=True),
     "surface": LightConfig(  # shadows as in `fast`
-        replace(FIELD, features=7, inputs=SurfaceConfig(**TOLD)),
+        replace(FIELD, features=7, inputs=SurfaceConfig(**ENCODINGS)),
         replace(MAP, bias=5.0, grazing="both", size=96, method=MappingConfig("median")),
     ),
-    "bounce": LightConfig(replace(FIELD, features=7, inputs=SurfaceConfig(**TOLD)), replace(MAP, size=96), bounce=20),
+    "bounce": LightConfig(
+        replace(FIELD, features=7, inputs=SurfaceConfig(**ENCODINGS)), replace(MAP, size=96), bounce=20
+    ),
     "park": LightConfig(
         FIELD,
         ShadowConfig(

@@ -166,7 +166,7 @@ def test_a_camera_between_two_keeps_its_target_where_other_things_are_up():
         )
 
 
-def test_what_is_up_stands_in_the_file(tmp_path):
+def test_the_up_direction_is_read_and_saved(tmp_path):
     keys = (
         "[[keyframes]]\ntime = 0\ncamera = {position = [4, 0, 0], look_at = [0, 0, 0]}\n"
         "[[keyframes]]\ntime = 1\ncamera = {position = [0, 4, 2], look_at = [0, 0, 1], up = [2, 0, 0]}\n"

@@ -42,10 +42,10 @@ def test_pictures_that_are_no_longer_written_go(tmp_path):
 
 
 def test_frames_hold_what_the_scene_predicts(tmp_path):
-    told: list[tuple[int, int]] = []
-    done = compose(scene(), tmp_path / "out", report=lambda *numbers: told.append(numbers))
+    reported: list[tuple[int, int]] = []
+    done = compose(scene(), tmp_path / "out", report=lambda *numbers: reported.append(numbers))
     assert (done.frames, done.rendered) == (3, 3)
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert reported == [(1, 3), (2, 3), (3, 3)]
     for index in range(3):
         shot, name = scene().frame(index), f"{index:04d}"
         seen = shot.composition.predict(shot.camera, shot.sun)

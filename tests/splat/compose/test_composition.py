@@ -1,4 +1,4 @@
-"""Composed pictures: alone as before, in any order, moved, scaled, turned; shadows between models."""
+"""Composed pictures: of one model, in any order, moved, scaled, turned; shadows between models."""
 
 import logging
 from dataclasses import replace
@@ -327,7 +327,7 @@ def test_moving_anything_compiles_nothing_and_repeats_to_the_bit():
     same(fresh.predict(EYE, SUN), scene.predict(EYE, SUN))  # what was kept was right
 
 
-def test_where_numpy_puts_its_numbers_records_nothing_anew():
+def test_recordings_serve_numpy_arrays_of_any_alignment():
     """On LLVM one array in four begins at a multiple of 64 bytes, and kernels of such memory are others."""
     scene, kept = GaussianComposition([PlacedRun(made_run("map", 1)), PlacedRun(made_run("vanilla", 3))]), []
     encoding, arrays = Encoding("harmonics", 2), made_run("map", 1).gaussians.to_numpy()
@@ -377,7 +377,7 @@ def test_only_what_is_asked_for_is_computed(monkeypatch):
         scene.draw(EYE, SUN, ["color"])
 
 
-def test_what_a_change_leaves_as_it_was_is_not_computed_again(monkeypatch):
+def test_unchanged_visibility_is_not_computed_again(monkeypatch):
     """A camera that moves leaves all visibility; a model that moves with the world's Sun, that of the others."""
     asked = []
     sunlight = LightModel.sunlight

@@ -50,17 +50,17 @@ def spheres(*centres) -> RunMesh:
 
 def test_vertices_have_the_colors_of_what_is_there():
     centres = [np.zeros(3)]
-    mesh, told = spheres(*centres), []
+    mesh, reported = spheres(*centres), []
     colors = color_vertices(
         mesh,
         cameras(30, 4.0, 128),
         lambda c: seen(c, centres)[0],
         lambda c: shown(c, centres),
         20,
-        lambda *step: told.append(step),
+        lambda *step: reported.append(step),
     )
     assert np.abs(colors - paint(mesh.vertices)).max() < 0.02
-    assert told == [(k, 20) for k in range(21)]
+    assert reported == [(k, 20) for k in range(21)]
 
 
 def test_what_stands_before_a_vertex_does_not_color_it():

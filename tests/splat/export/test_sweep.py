@@ -87,7 +87,7 @@ def test_another_size_shows_the_same_things(size, shape, scale):
     camera = Camera(CAMERA.world_from_camera, 24, 16, 50, 40, 10, 9)
     other = resize_camera(camera, size)
     assert (other.width, other.height) == shape
-    # A pixel keeps its place by the middle of the picture, but for the scale: what was seen is seen.
+    # A pixel keeps its place by the middle of the picture, but for the scale: the same things are seen.
     for pixel in ((0, 0), (24, 16), (5, 11)):
         ray = (pixel[0] - camera.cx) / camera.fx, (pixel[1] - camera.cy) / camera.fy
         x, y = other.fx * ray[0] + other.cx, other.fy * ray[1] + other.cy
@@ -110,9 +110,9 @@ def tile(sheet: np.ndarray, k: int, columns: int) -> np.ndarray:
 
 def test_the_sheet_shows_every_sun_of_few_and_the_frames_are_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "encoder", lambda: None)
-    suns, told = suns_around(8, 10), []
-    done = sweep(Lit(), CAMERA, suns, tmp_path, keep_frames=True, report=lambda *numbers: told.append(numbers))
-    assert told == [(k + 1, 8) for k in range(8)]
+    suns, reported = suns_around(8, 10), []
+    done = sweep(Lit(), CAMERA, suns, tmp_path, keep_frames=True, report=lambda *numbers: reported.append(numbers))
+    assert reported == [(k + 1, 8) for k in range(8)]
     sheet = read_png(done.sheet)
     for k, sun in enumerate(suns):
         color = np.rint(255 * (0.5 + 0.5 * sun.direction))

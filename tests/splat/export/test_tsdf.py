@@ -154,7 +154,7 @@ def test_surface_of_any_field_is_closed():
     assert 0 < len(holes[1]) < len(faces)
 
 
-def test_memory_is_told_in_a_sentence(monkeypatch):
+def test_too_large_a_volume_is_refused_in_one_sentence(monkeypatch):
     monkeypatch.setattr(backend, "free_memory", lambda _: 10_000_000)
     with pytest.raises(InputError, match=r"voxel: .* 101x101x101 voxels take .* GB; take at least 0\.0\d+ m"):
         fuse([], Grid.around(np.zeros(3), np.ones(3), 0.01, 0))

@@ -45,9 +45,9 @@ from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 
 SUN = np.array([0.48, -0.36, 0.8])
-TOLD = {"sun": Encoding("harmonics", 2), "view": Encoding("positional", 1)}
-FIELD = FieldConfig(features=5, width=12, layers=3, inputs=DirectionsConfig(**TOLD))
-ON_SURFACE = replace(FIELD, inputs=SurfaceConfig(**TOLD))
+ENCODINGS = {"sun": Encoding("harmonics", 2), "view": Encoding("positional", 1)}
+FIELD = FieldConfig(features=5, width=12, layers=3, inputs=DirectionsConfig(**ENCODINGS))
+ON_SURFACE = replace(FIELD, inputs=SurfaceConfig(**ENCODINGS))
 REFINE = ShadowRefinementConfig(features=3, width=8, sun=Encoding("harmonics", 1))
 CONFIGS = {
     "relight": LightConfig(FIELD),
@@ -61,9 +61,9 @@ CONFIGS = {
     ),
     "bounce": LightConfig(ON_SURFACE, ShadowConfig(SplattingConfig(), 32, refine=REFINE), bounce=7),
     "bounce, linear": LightConfig(ON_SURFACE, bounce=5, linear=True),
-    "no sun": LightConfig(replace(FIELD, inputs=ViewAloneConfig(TOLD["view"]))),
+    "no sun": LightConfig(replace(FIELD, inputs=ViewAloneConfig(ENCODINGS["view"]))),
     "embeddings": LightConfig(replace(FIELD, embeddings=4)),
-    "no sun, embeddings": LightConfig(replace(FIELD, inputs=ViewAloneConfig(TOLD["view"]), embeddings=1)),
+    "no sun, embeddings": LightConfig(replace(FIELD, inputs=ViewAloneConfig(ENCODINGS["view"]), embeddings=1)),
     "map, embeddings": LightConfig(replace(ON_SURFACE, embeddings=3), ShadowConfig(MappingConfig(), 32, refine=REFINE)),
     "park": LightConfig(
         FIELD,
@@ -210,8 +210,8 @@ def twin(
         learned, of_shape = (cosines(n, direction)[:, 0] for n in (normal, shortest_axes(arrays)))
         faces = np.interp(np.maximum(learned, of_shape), [-0.2, 0], [0, 1])
     own = embedding_of(light) if embedding is None else embedding
-    told = np.concatenate([encoded(field.sun, SUN[None])[0], own])
-    color = sigmoid(network(field.shape, weights[:split], items, told))
+    shared = np.concatenate([encoded(field.sun, SUN[None])[0], own])
+    color = sigmoid(network(field.shape, weights[:split], items, shared))
     if not raw:
         visible = np.ones(len(color))
         color, given = with_bounce(light, arrays, color, visible, given)
@@ -224,12 +224,12 @@ def twin(
             axes = numbers(light.encode_sun(SUN).light_axes).reshape(3, 3)
             np.testing.assert_allclose(axes[2], -SUN, atol=1e-6)
             position = position @ axes.T
-        told = [occlusion[:, None], features[:, field.stored : config.albedos]]
-        told.append(encoded(Encoding("positional", refine.positional), position))
+        columns = [occlusion[:, None], features[:, field.stored : config.albedos]]
+        columns.append(encoded(Encoding("positional", refine.positional), position))
         if refine.bias_info:
             scale = light.frame.scale
-            told += [column[:, None] for column in (1 - occlusion, alignment, thickness / scale, bias / scale)]
-        items = np.concatenate(told, axis=1)
+            columns += [column[:, None] for column in (1 - occlusion, alignment, thickness / scale, bias / scale)]
+        items = np.concatenate(columns, axis=1)
         output = network(refine.shape, weights[split:], items, encoded(refine.sun, SUN[None])[0])[:, 0]
         sure = np.clip(occlusion, 0.02, 0.98)
         occlusion = sigmoid(output + (np.log(sure / (1 - sure)) if refine.residual else 0))
@@ -384,8 +384,8 @@ def test_a_refinement_as_printed_begins_as_any_network():
 
 
 @pytest.mark.parametrize("method", [MappingConfig(), SplattingConfig()], ids=lambda method: method.kind)
-def test_the_refinement_is_told_the_bias_that_was_applied(method):
-    """What is told gives the raw occlusion again; epsilon_s of 4.5 is a share of the farthest camera's distance."""
+def test_the_refinement_is_given_the_bias_that_was_applied(method):
+    """The bias in `info` gives the raw occlusion again; epsilon_s of 4.5 is in farthest camera distances."""
     shadow = ShadowConfig(method, 32, bias=4.0, grazing="both", softness=0.02)
     light = LightModel.initial(LightConfig(FIELD, shadow), TrainingFrame(np.zeros(3), 2.0, 7.0, 3.0), 0)
     splats = gaussians(200, light.config.features)
@@ -396,9 +396,9 @@ def test_the_refinement_is_told_the_bias_that_was_applied(method):
             return numbers(occlusion_by_mapping(splats, shadows.camera, bias, 0.02 * 7, method, shadows.points))
         return numbers(occlusion_by_splatting(splats, shadows.camera, bias, shadows.points))
 
-    _, _, told = shadows.info
-    np.testing.assert_allclose(occlusion(told), numbers(shadows.occlusion), atol=1e-6)
-    assert np.abs(occlusion(0.5 * told) - numbers(shadows.occlusion)).max() > 0.1
+    _, _, applied = shadows.info
+    np.testing.assert_allclose(occlusion(applied), numbers(shadows.occlusion), atol=1e-6)
+    assert np.abs(occlusion(0.5 * applied) - numbers(shadows.occlusion)).max() > 0.1
 
 
 def scattered(name: str) -> tuple[LightModel, Gaussians]:

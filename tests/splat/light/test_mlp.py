@@ -97,7 +97,7 @@ def test_networks_and_their_adjoint_match_float64(name, count):
 def test_recorded_passes_repeat_to_the_bit_and_serve_other_sizes():
     shape = SHAPES["filled up"]
     record = recorded(passes, limit=16)
-    for count in (700, 900, CHUNK + 1, 5000, 700):  # the first three have room for as many
+    for count in (700, 900, CHUNK + 1, 5000, 700):  # the first three have one capacity
         case = Case(shape, count)
         output, gradients, _ = record(shape, *case.device())
         again, same, _ = record(shape, *case.device())
@@ -193,7 +193,7 @@ def test_cooperative_vectors_that_fail_or_lie_are_not_used(monkeypatch, caplog):
     def fails() -> float:
         raise RuntimeError("no OptiX here")
 
-    for tried, told in (
+    for tried, message in (
         (fails, "no OptiX here"),
         (lambda: 0.1, "wrong by 0.1"),
         (lambda: float("nan"), "wrong by nan"),
@@ -201,5 +201,5 @@ def test_cooperative_vectors_that_fail_or_lie_are_not_used(monkeypatch, caplog):
         monkeypatch.setattr(cooperative, "_largest_difference", tried)
         cooperative.is_usable.cache_clear()
         assert not cooperative.is_usable()
-        assert told in caplog.records[-1].getMessage()
+        assert message in caplog.records[-1].getMessage()
     cooperative.is_usable.cache_clear()

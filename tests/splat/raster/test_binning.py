@@ -120,7 +120,7 @@ def test_equal_depths_are_in_index_order(way):
 
 
 def test_recordings_serve_other_numbers_of_splats_and_pairs(way):
-    """Larger, smaller, and as many as an array has room for, all twice; the second time nothing is recorded."""
+    """Larger, smaller, and as many as an array can hold, all twice; the second time nothing is recorded."""
     counts = [1000, 1023, 1024, 40, 1, 961, 2048, 2047]
     found = {}
     for count in counts:
@@ -137,7 +137,7 @@ def test_recordings_serve_other_numbers_of_splats_and_pairs(way):
     assert recordings() == before
 
 
-def test_nobody_seen_is_no_list(way):
+def test_no_visible_splats_give_empty_lists(way):
     splats, footprints = projected(50, 32, 32)
     hidden = dataclasses.replace(footprints, visible=dr.zeros(ad.Bool, 50))
     lists = binning.bin_splats(splats, hidden, 32, 32)
@@ -185,10 +185,10 @@ def test_lists_of_any_length_are_ordered(lengths, runs):
         np.testing.assert_array_equal(number[s:e], numbers[wanted])
 
 
-def test_owners_of_slots():
+def test_segment_ids_of_slots():
     counts = np.array([0, 3, 0, 0, 5, 1, 0])
-    upto = upload(np.cumsum(counts).astype(np.uint64), ad.UInt64)
-    found = np.array(segment_ids(upto, dr.arange(ad.UInt32, 11), len(counts)))
+    ends = upload(np.cumsum(counts).astype(np.uint64), ad.UInt64)
+    found = np.array(segment_ids(ends, dr.arange(ad.UInt32, 11), len(counts)))
     np.testing.assert_array_equal(found, [*np.repeat(np.arange(7), counts), 7, 7])
 
 

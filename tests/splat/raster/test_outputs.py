@@ -98,8 +98,8 @@ def test_median_depth_gradient_goes_to_the_chosen_gaussian():
     slope = np.array(dr.grad(gaussians.means)).T
     twin = render_reference(arrays, camera).median_depth.ravel()
     depths = arrays["means"] @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
-    owners = np.where(twin > 0, np.abs(twin[:, None] - depths).argmin(axis=1), -1)
-    share = np.array([weights[owners == i].sum(dtype=np.float64) for i in range(50)])
+    nearest = np.where(twin > 0, np.abs(twin[:, None] - depths).argmin(axis=1), -1)
+    share = np.array([weights[nearest == i].sum(dtype=np.float64) for i in range(50)])
     assert (share != 0).sum() > 10
     np.testing.assert_allclose(slope, share[:, None] * camera.camera_from_world[2, :3], atol=1e-5)
 
@@ -126,9 +126,9 @@ def test_picking_is_a_gather_and_adds_up_in_no_order():
 def test_normals_of_a_sphere_point_outwards(view, axes):
     outward = fibonacci_sphere(3000)
     arrays, camera = surfels(0.5 * outward, outward, 0.02), view(64, 64)
-    uploaded = device_camera(camera)
+    on_device = device_camera(camera)
     gaussians = Gaussians.from_numpy(arrays)
-    output = render(gaussians, uploaded, outputs=("normal",), features=normals(gaussians, uploaded, axes))
+    output = render(gaussians, on_device, outputs=("normal",), features=normals(gaussians, on_device, axes))
     found = (
         output.image("normal")
         if axes == "world"
@@ -233,7 +233,7 @@ def test_features_as_an_array_and_features_that_are_not_finite():
         assert np.isfinite(np.array(dr.grad(feature))).all()
 
 
-def test_wrong_requests_are_told():
+def test_wrong_requests_are_refused():
     gaussians, camera = Gaussians.from_numpy(random_splats(30)), device_camera(perspective())
     with pytest.raises(ValueError, match=r"outputs: expected some of color, alpha, .* found 'shade'"):
         render(gaussians, camera, outputs=("shade",))

@@ -263,8 +263,8 @@ def test_pictures_have_lists_of_few_sizes():
 
 
 @pytest.mark.parametrize("first", [1024, 2048])
-def test_a_recording_of_as_many_splats_as_its_room_holds_serves_fewer(first):
-    """Where count and room were one, a replay would take the room's size from the next, smaller number of splats."""
+def test_a_recording_of_as_many_splats_as_its_capacity_serves_fewer(first):
+    """Were the capacity the count, a replay would take it from the next, smaller number of splats."""
     assert all(tiles.round_capacity(count) > count for count in (*range(1, 5000), 2**20, 2**20 - 1))
     for count in (first, first - 300):
         arrays = {**random_splats(count), "logit_opacities": np.full(count, -1.0)}

@@ -263,7 +263,7 @@ def test_pictures_too_large_to_draw_are_named():
         upsampled_camera(vast, 2)
 
 
-def test_it_is_a_number_of_places():
+def test_supersampling_is_1_to_4():
     for times in (0, 5):
         with pytest.raises(InputError, match=f"supersample: expected 1 to 4, found {times}"):
             TrainConfig(supersample=times)

@@ -103,7 +103,7 @@ def scene(tone: str, exposure: float) -> MappingProxyType:
 
 
 @pytest.mark.parametrize(
-    ("told", "found"),
+    ("described", "found"),
     [
         (scene("filmic", 4 * STANDARD_EXPOSURE), ("filmic", 2.0)),
         (scene("srgb", STANDARD_EXPOSURE / 2), ("srgb", -1.0)),
@@ -113,8 +113,8 @@ def scene(tone: str, exposure: float) -> MappingProxyType:
         ({}, None),
     ],
 )
-def test_a_dataset_tells_how_its_pictures_were_made(told, found):
-    assert tone_and_exposure(told) == found
+def test_a_dataset_tells_how_its_pictures_were_made(described, found):
+    assert tone_and_exposure(described) == found
 
 
 def linear(**options) -> TrainConfig:

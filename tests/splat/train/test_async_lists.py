@@ -36,13 +36,13 @@ def known(changes: list[float], pairs: int = 1000) -> PairForecast:
     return forecast
 
 
-def test_a_view_is_thought_to_change_as_the_latest_did_at_most():
+def test_capacity_follows_the_largest_recent_change():
     assert known([1.0, 1.5, 1.2, 0.5], 10_000).capacity_for("a") == round_capacity(int(1.02 * 15_000))
     later = known([1.5] + [1.1] * HISTORY, 10_000)
     assert later.capacity_for("a") == round_capacity(int(1.02 * 1.1 * 10_000))
 
 
-def test_there_is_no_forecast_of_what_nobody_knows():
+def test_capacity_is_unknown_without_history():
     assert known([1.0] * (ENOUGH - 1)).capacity_for("a") is None
     forecast = known([1.0] * ENOUGH)
     assert forecast.capacity_for("a") is not None
@@ -51,7 +51,7 @@ def test_there_is_no_forecast_of_what_nobody_knows():
     assert forecast.capacity_for("a") is None  # it shows nothing: nobody knows how much it will show
 
 
-def test_after_a_refinement_views_are_compared_with_those_that_it_has_changed():
+def test_capacity_after_a_refinement_follows_views_seen_since():
     forecast = known([1.0] * ENOUGH, 10_000)
     for view in range(ENOUGH + 1):
         forecast.observe(view, 10_000)
@@ -117,7 +117,7 @@ def tight(monkeypatch):
 
 
 @pytest.mark.threads
-def test_steps_without_a_wait_teach_the_same_to_the_bit(small_dataset, tmp_path):
+def test_asynchronous_lists_train_to_the_same_bits(small_dataset, tmp_path):
     plain, losses = trained(small_dataset, CONFIG, 300, Counted(()))
     free, other = trained(small_dataset, CONFIG, 300, lists := Counted((select(),)))
     assert lists.made > 200
@@ -158,7 +158,7 @@ def test_shadows_and_networks_learn_the_same_to_the_bit(small_lit_dataset, metho
     check_same(plain, free)
 
 
-def test_several_views_a_step_teach_the_same_to_the_bit(small_dataset):
+def test_asynchronous_lists_of_several_views_train_to_the_same_bits(small_dataset):
     config = replace(CONFIG, views_per_step=2)
     plain, losses = trained(small_dataset, config, 40, Counted(()))
     free, other = trained(small_dataset, config, 40, lists := Counted((select(),)))
@@ -167,7 +167,7 @@ def test_several_views_a_step_teach_the_same_to_the_bit(small_dataset):
     check_same(plain, free)
 
 
-def test_who_leaves_the_picture_is_listed_exactly():
+def test_an_emptied_picture_has_an_empty_list():
     """Lists of nobody have a form of their own, which the forecast cannot give."""
     camera = Camera.from_fov(look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0]), 40, 40, 40)
     splats, boxes = project(Gaussians.from_numpy(random_splats(50, 0, degree=0)), Pinhole.of(camera))
@@ -203,6 +203,6 @@ def test_where_a_forecast_does_not_fit_into_memory_pairs_are_counted(small_datas
     assert lists.made == made + 1
 
 
-def test_only_where_it_pays():
+def test_lists_are_asynchronous_on_cuda_alone():
     assert AsyncTileLists().is_async == (select() == "cuda")
     assert not AsyncTileLists(()).is_async

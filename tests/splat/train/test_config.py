@@ -1,4 +1,4 @@
-"""Presets as they have always been, settings by name, and what older runs wrote."""
+"""Digests of presets, settings by name, and config.json in its older form."""
 
 import hashlib
 import json
@@ -27,8 +27,8 @@ from spacesim.splat.train.strategies.mcmc import McmcConfig
 from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig
 from spacesim.splat.train.train import train
 
-OLD = json.loads((Path(__file__).parent / "configs_before_unions.json").read_text(encoding="utf-8"))
-"""{preset, method and strategy: its config.json} as it was written while all strategies stood side by side."""
+OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
+"""{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
     "demo": "5ecd92307656132c",
     "fast": "00ce9adf561a0177",
@@ -66,7 +66,7 @@ def thesis_as_it_was(config: TrainConfig) -> TrainConfig:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_are_what_they_were(name):
+def test_presets_keep_their_digests(name):
     every = [preset(name, method, strategy).to_json() for method in HASHED[0] for strategy in HASHED[1]]
     text = json.dumps([*every, replace(preset(name), warm_start=warm_start(name)).to_json()], sort_keys=True)
     assert hashlib.sha256(text.encode()).hexdigest()[:16] == DIGESTS[name]
@@ -98,7 +98,7 @@ def test_an_older_run_is_resumed(small_lit_dataset, tmp_path):
     run = train(small_lit_dataset, tmp_path / "run", config)
     path = run.path / "config.json"
     data = json.loads(path.read_text())["data"]
-    data["digest"], content = data["digest"].split("-")  # which told less
+    data["digest"], content = data["digest"].split("-")  # the shorter form is still read
     assert content
     path.write_text(json.dumps({**OLD["demo shadow-map mesh-aware"], "iterations": 2, "init_count": 40, "data": data}))
     assert train(small_lit_dataset, tmp_path / "run", config, resume=True).gaussian_count == run.gaussian_count
@@ -121,7 +121,7 @@ def test_an_older_run_is_resumed(small_lit_dataset, tmp_path):
         ("method", 3, "method: expected one of vanilla"),
     ],
 )
-def test_what_is_broken_in_an_older_one_is_named(key, value, said):
+def test_wrong_values_of_an_older_configuration_are_named(key, value, said):
     with pytest.raises(InputError, match=f"config.json: {said}"):
         TrainConfig.from_json({**OLD["demo shadow-map mesh-aware"], key: value})
 
@@ -148,7 +148,7 @@ def test_settings_do_not_depend_on_their_order():
     assert with_settings(config, {}) == config
 
 
-def test_an_alternative_that_is_there_keeps_what_it_has():
+def test_choosing_the_present_alternative_keeps_its_settings():
     config = preset("fast", "shadow-map")
     assert with_settings(config, {"light.shadow.method": "mapping"}) == config
     bilinear = with_settings(config, {"light.shadow.method": {"filter": "bilinear"}}).light.shadow.method
@@ -158,7 +158,7 @@ def test_an_alternative_that_is_there_keeps_what_it_has():
     assert moving.light.shadow.method == SplattingConfig(gradients=True)
 
 
-def test_a_kind_says_the_same_as_the_name_of_its_alternative():
+def test_an_alternative_is_chosen_by_its_name_or_its_kind():
     config = preset("fast", "shadow-map", "mcmc")
     other = with_settings(config, {"strategy.cull_every": 7, "strategy.kind": "mesh-aware"})
     assert other.strategy == MeshAwareConfig(cull_every=7)
@@ -192,7 +192,7 @@ def test_a_file_has_the_light_of_its_method():
         with_settings(preset("fast", "shadow-splat"), {"light.shadow.method.baseline": True})
 
 
-def test_the_old_word_for_the_baseline_is_known_everywhere(tiny_data, tmp_path):
+def test_the_alias_park_of_the_baseline_is_accepted(tiny_data, tmp_path):
     assert preset("fast", "park") == preset("fast", "baseline-park")
     small = {"iterations": 1, "init_count": 40, "settings": {"light.shadow.size": 16}}
     run = ss.train(tiny_data, tmp_path / "run", preset="demo", method="park", **small)
@@ -205,7 +205,7 @@ def test_the_old_word_for_the_baseline_is_known_everywhere(tiny_data, tmp_path):
 
 
 @pytest.mark.parametrize("names", [{"preset": "junk"}, {"method": "relight"}, {"strategy": "mcmc"}])
-def test_a_configuration_takes_no_names_beside_it(tmp_path, names):
+def test_a_configuration_excludes_preset_and_method(tmp_path, names):
     ((name, word),) = names.items()
     with pytest.raises(InputError, match=f"{name}: expected none beside a configuration, found '{word}'"):
         ss.train(tmp_path / "nothing", tmp_path / "run", preset("fast"), **names)

@@ -197,7 +197,7 @@ def test_pictures_of_full_size_teach_what_they_teach_without_it(small_lit_datase
         np.testing.assert_array_equal(value, plain.gaussians.to_numpy()[name], err_msg=name)
 
 
-def test_what_cannot_be_is_told(small_dataset):
+def test_impossible_downscales_are_refused(small_dataset):
     tiny = tuple(replace(frame, camera=frame.camera.downscaled(16)) for frame in small_dataset.train)
     with pytest.raises(InputError, match="num_downscales: expected pictures of at least 4 pixels a side, found 2x2"):
         Trainer(replace(small_dataset, train=tiny), CONFIG)

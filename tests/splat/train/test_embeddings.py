@@ -129,7 +129,7 @@ def test_a_run_without_the_sun_is_exported_and_evaluated(small_dataset, sunless,
 
 
 @pytest.mark.parametrize("method", ["shadow-map", "shadow-splat", "baseline-park"])
-def test_methods_with_shadows_are_told_the_sun(method):
+def test_methods_with_shadows_refuse_inputs_without_the_sun(method):
     with pytest.raises(InputError, match=r"^light\.field: expected inputs with the Sun, .* found view$"):
         with_settings(preset("fast", method), {"light.field.inputs": "view", "light.bounce": 0})
 

@@ -64,7 +64,7 @@ def test_a_needle_has_a_finite_radius():
     assert 100 < found < np.inf
 
 
-def test_who_has_faded_still_counts_as_seen():
+def test_gaussians_too_faint_to_draw_count_as_seen():
     """What the rasterizer skips has no gradient, and is in the picture all the same: its support must not decay."""
     gaussians = model([[0, 0, 2.0], [0.1, 0, 2.0], [5.0, 0, 2.0]], 0.05, 0.5)
     gaussians.logit_opacities = dr.select(dr.arange(type(gaussians.logit_opacities), 3) == 0, -9.0, 0.0)

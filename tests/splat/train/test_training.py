@@ -84,9 +84,9 @@ def test_a_run_trained_with_the_filter_is_drawn_with_it(small_dataset, tmp_path,
     np.testing.assert_array_equal(load_run(run.path).predict(camera).rgb, drawn.image("color"))
     unfiltered = render(run.gaussians, Pinhole.of(camera), outputs=("color",)).image("color")
     assert not np.array_equal(drawn.image("color"), unfiltered)
-    for exported, told in ((run, True), (plain, False)):  # other viewers draw as they do
+    for exported, warned in ((run, True), (plain, False)):  # other viewers draw as they do
         assert main(["export", str(exported.path), "--ply", str(tmp_path / "model.ply")]) == 0
-        assert ("is antialiased" in capsys.readouterr().err) == told
+        assert ("is antialiased" in capsys.readouterr().err) == warned
 
 
 @pytest.mark.parametrize("stop", [50, 100])
@@ -119,9 +119,9 @@ def test_checkpoints_that_do_not_fit_are_refused(small_dataset, tmp_path):
         (tensors, {**header, "iteration": "many"}),
         (tensors, {**header, "history": None}),
     ]
-    for number, (content, told) in enumerate(broken):
+    for number, (content, changed) in enumerate(broken):
         path = tmp_path / f"broken_{number}.safetensors"
-        write_tensors(path, content, {key: value for key, value in told.items() if key != "format"})
+        write_tensors(path, content, {key: value for key, value in changed.items() if key != "format"})
         with pytest.raises(InputError, match=path.name):
             trainer.restore(path)
     trainer.restore(tmp_path / "good.safetensors")
@@ -277,13 +277,13 @@ def placed(dataset, factor=1.0, shift=0.0):
     return replace(dataset, train=tuple(replace(f, camera=c) for f, c in zip(dataset.train, cameras, strict=True)))
 
 
-def test_poses_in_kilometres_are_told(small_dataset):
+def test_poses_in_kilometres_are_warned_of(small_dataset):
     assert scale_warning(small_dataset) == scale_warning(placed(small_dataset, 1e-2)) == ""
     assert scale_warning(placed(small_dataset, 1e4)) == ""
     assert "expected poses in metres, found training cameras 0.003 m from" in scale_warning(placed(small_dataset, 1e-3))
 
 
-def test_poses_far_from_the_origin_are_told(small_dataset):
+def test_poses_far_from_the_origin_are_warned_of(small_dataset):
     assert distance_warning(small_dataset) == distance_warning(placed(small_dataset, shift=1e3)) == ""
     assert distance_warning(placed(small_dataset, 1e4, 1e6)) == ""
     assert "found it 1.2e+07 m away, where single precision has steps of 0.5 m" in distance_warning(
@@ -332,7 +332,7 @@ def test_ply_of_no_gaussians(tmp_path):
         *(("views_per_step", 0), ("views_per_step", 65)),
     ],
 )
-def test_configurations_that_cannot_be(option, value):
+def test_impossible_configurations_are_refused(option, value):
     with pytest.raises(InputError, match=f"{option}: expected"):
         with_options(preset("demo"), **{option: value})
 
@@ -405,7 +405,7 @@ def test_several_views_a_step_follow_their_mean_gradient(small_dataset):
     np.testing.assert_allclose(both, (first + second) / 2, rtol=1e-4, atol=1e-6 * np.abs(first).max())
 
 
-def test_views_of_which_nothing_counts_are_told_once(small_dataset, caplog):
+def test_fully_masked_views_are_warned_of_once(small_dataset, caplog):
     """Their loss is 0, whatever is drawn: as if all were well."""
     first = replace(small_dataset.train[0], distortion=(1e30, 0.0, 0.0, 0.0, 0.0))
     trainer = Trainer(replace(small_dataset, train=(first,)), CONFIG)
@@ -431,7 +431,7 @@ def test_where_memory_is_short_pictures_are_read_again(small_dataset, monkeypatc
     assert kept.views._cached.cache_info().currsize == 3
 
 
-def test_where_numpy_has_a_picture_in_memory_records_nothing_anew(small_dataset):
+def test_recordings_serve_pictures_of_any_alignment(small_dataset):
     trainer = Trainer(small_dataset, CONFIG)
     load, offset = trainer.views._load, [0]
 
@@ -487,7 +487,9 @@ def test_a_checkpoint_without_gaussians_is_refused(small_dataset, tmp_path, what
 def test_a_checkpoint_with_another_header_is_refused(small_dataset, tmp_path, header):
     trainer = Trainer(small_dataset, CONFIG)
     trainer.save(tmp_path / "c.safetensors")
-    tensors, told = read_tensors(tmp_path / "c.safetensors")
-    write_tensors(tmp_path / "c.safetensors", tensors, {**{k: v for k, v in told.items() if k != "format"}, **header})
+    tensors, written = read_tensors(tmp_path / "c.safetensors")
+    write_tensors(
+        tmp_path / "c.safetensors", tensors, {**{k: v for k, v in written.items() if k != "format"}, **header}
+    )
     with pytest.raises(InputError, match=r"c\.safetensors: (header: )?[a-z\[\]0-9_.: ]*expected"):
         Trainer(small_dataset, CONFIG).restore(tmp_path / "c.safetensors")

@@ -179,7 +179,7 @@ def test_bilinear_at_pixel_centres_and_between():
     np.testing.assert_allclose(numbers(found), [0, 12, 6, 0.5, 1.25], rtol=1e-6)
 
 
-def test_nobody_in_the_picture_gives_no_number_that_is_none():
+def test_projected_loss_of_an_empty_picture_is_zero():
     behind = ad.Array3f([0.0], [-9.0], [0.0])
     dr.enable_grad(behind)
     loss, framed = projected_loss(behind, Pinhole.of(CAMERA), ad.Float([1.0]), (1, 1), 24)
@@ -256,7 +256,7 @@ def test_the_thesis_moves_centres_at_their_usual_step_size(small_dataset):
     assert ours.rates(100)[0] > 1.3 * plain.rates(100)[0]
 
 
-def test_those_beyond_the_cameras_come_back_and_the_faint_are_revived(small_dataset):
+def test_warm_start_gathers_far_and_revives_faint_gaussians(small_dataset):
     for within, revive in ((True, 0.2), (False, 0.0)):
         config = replace(CONFIG, least_seen=1, gather=within, revive=revive)
         warm = WarmStart(config, TrainingViews(small_dataset, 0), np.zeros(3), 5.0, 3)
@@ -304,7 +304,7 @@ def inside(trainer: Trainer) -> int:
     return int((np.linalg.norm(trainer.gaussians.to_numpy()["means"], axis=1) < 0.75).sum())
 
 
-def test_a_box_is_as_wide_as_it_should_be(meshed):
+def test_the_box_of_random_gaussians_scales_with_the_object(meshed):
     assert object_size(meshed) == pytest.approx(1.5, rel=1e-3)
     means = initial_gaussians(meshed, "random", 2000, 0, 0, box=10.0).to_numpy()["means"]
     np.testing.assert_allclose(np.abs(means).max(axis=0), 7.5, rtol=5e-3)
@@ -337,7 +337,7 @@ def test_without_attraction_those_in_a_picture_are_still_not_rescued(meshed):
     assert (trainer.gaussians.to_numpy()["means"].std(axis=0) > 0.8 * spread).all()
 
 
-def test_what_it_gathers_becomes_a_good_model(meshed):
+def test_gathered_gaussians_train_to_a_lower_loss(meshed):
     """From a box of ten times the object's size; as wide as they start, Gaussians would hide the object for good."""
     config = replace(BASE, init_box=10.0, refinement=replace(REFINEMENT, reset_every=10**6, max_gaussians=3000))
     losses = []
@@ -416,17 +416,17 @@ def test_presets_and_table_5_7():
         WarmStartConfig(rescue=2.0)
 
 
-def test_a_training_that_ends_before_the_warm_start_does_is_told(spacesim, tiny_data, tmp_path, caplog):
+def test_a_training_that_ends_before_its_warm_start_is_warned_of(spacesim, tiny_data, tmp_path, caplog):
     """`remark` begins at the sum of what gathers and what fades. Fewer iterations shorten both, unless they are set."""
     table = WarmStartConfig(steps=20, decay=10)
     assert [bool(table.remark(iterations)) for iterations in (5, 20, 30, 31)] == [True, True, True, False]
     line = ["train", tiny_data, "--preset", "demo", "--set", "init_count=300", "--init", "random", "--warm-start"]
     lengths = "--set", "warm_start.steps=500", "--set", "warm_start.decay=500"
     assert spacesim(*line, "--out", tmp_path / "short", "--iterations", 3, *lengths).code == 0
-    told = [record.message for record in caplog.records if record.levelname == "WARNING"]
-    assert len(told) == 1
+    warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warnings) == 1
     for word in ("warm_start", "500 iterations", "more than 1000", "found 3"):
-        assert word in told[0]
+        assert word in warnings[0]
 
 
 def test_a_prior_that_nothing_uses_is_a_mistake(spacesim, tiny_data, tmp_path):
@@ -516,9 +516,9 @@ def test_depth_and_normals_are_learnt_from_truth_and_from_a_mesh(small_lit_datas
     plain.run(lambda progress: None, lambda: None)
     depth, cosine = shape_error(plain, small_lit_dataset)
     for prior in ("truth", "mesh"):
-        told = Trainer(small_lit_dataset, replace(base, depth_weight=10.0, normal_weight=0.1, prior=prior))
-        told.run(lambda progress: None, lambda: None)
-        better_depth, better_cosine = shape_error(told, small_lit_dataset)
+        supervised = Trainer(small_lit_dataset, replace(base, depth_weight=10.0, normal_weight=0.1, prior=prior))
+        supervised.run(lambda progress: None, lambda: None)
+        better_depth, better_cosine = shape_error(supervised, small_lit_dataset)
         assert better_depth < 0.9 * depth, prior
         assert better_cosine < 0.9 * cosine, prior
 
@@ -529,16 +529,16 @@ def test_gradients_of_depth_and_normals_reach_every_parameter(small_lit_dataset)
     plain = Trainer(small_lit_dataset, base)
     plain.step()
     for term, rows in (("depth_weight", range(11)), ("normal_weight", range(11))):
-        told = Trainer(small_lit_dataset, replace(base, **{term: 1.0}))
-        told.step()
-        found, expected = told.optimizer.moments()[0], plain.optimizer.moments()[0]
+        supervised = Trainer(small_lit_dataset, replace(base, **{term: 1.0}))
+        supervised.step()
+        found, expected = supervised.optimizer.moments()[0], plain.optimizer.moments()[0]
         changed = [np.abs(found[i] - expected[i]).max() for i in rows]
         scales = [np.abs(expected[i]).max() + 1e-12 for i in rows]
         moved = np.array(changed) / np.array(scales) > 1e-3
         assert moved[[0, 1, 2, 3, 4, 5, 10]].all(), term
 
 
-def test_what_is_missing_for_them_is_told(small_dataset):
+def test_missing_inputs_of_depth_and_normals_are_refused(small_dataset):
     with pytest.raises(InputError, match="depth"):
         Trainer(small_dataset, replace(BASE, depth_weight=1.0))
     with pytest.raises(InputError, match="prior mesh"):
@@ -550,7 +550,7 @@ def test_what_is_missing_for_them_is_told(small_dataset):
 
 
 @pytest.mark.parametrize(("scale", "shift", "said"), [(1, 1e3, "none sees"), (1e3, 0, "inside of it")])
-def test_a_prior_that_is_out_of_place_is_told(small_dataset, tmp_path, scale, shift, said):
+def test_a_misplaced_prior_is_refused(small_dataset, tmp_path, scale, shift, said):
     trimesh.creation.box((scale,) * 3).apply_translation((shift, 0, 0)).export(tmp_path / "mesh.ply")
     elsewhere = replace(small_dataset, mesh_path=str(tmp_path / "mesh.ply"))
     with pytest.raises(InputError, match=f"prior mesh expects a mesh .*{said}"):

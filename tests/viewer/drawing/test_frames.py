@@ -146,7 +146,7 @@ def test_every_mode_has_a_picture_from_anywhere(renderer, state, mode):
         assert frame.picture.dtype == np.uint8
 
 
-def test_what_nobody_predicts_is_told(renderer, state, view):
+def test_what_no_model_predicts_is_reported(renderer, state, view):
     alone = SceneRenderer(GaussianComposition(renderer.composition.models[:1]))
     frame = draw_frame(alone, SceneState(state.poses[:1], state.sun), view, DisplaySettings("visibility", side=256))
     assert "no visibility" in frame.note
@@ -217,14 +217,14 @@ GOOD = ([1.0, 0, 0, 0], [0.0, 0, -3], 0.7, 640, 480)
         (4, 10**40),
     ],
 )
-def test_views_that_cannot_be_are_none(field, value):
+def test_invalid_views_are_dropped(field, value):
     assert parse_viewer_camera(*GOOD) is not None
     bad = list(GOOD)
     bad[field] = value
     assert parse_viewer_camera(*bad) is None
 
 
-def test_looks_that_cannot_be_become_some_that_can():
+def test_invalid_display_settings_become_valid():
     settings = DisplaySettings("no such mode", "sideways", float("nan"), 10**9, "many")
     assert settings == DisplaySettings("colour", "off", 0.5, 2048, 32)
     assert DisplaySettings(wipe=7).wipe == 1

@@ -15,28 +15,28 @@ class Drawn:
     """What was drawn, in order; the first picture may be held up."""
 
     def __init__(self):
-        self.made, self.threads, self.gate, self.begun = [], set(), threading.Event(), threading.Event()
+        self.made, self.threads, self.released, self.begun = [], set(), threading.Event(), threading.Event()
 
-    def wish(self, name, held=False):
+    def request(self, name, held=False):
         def draw(full):
             self.threads.add(threading.get_ident())
             if held:
                 self.begun.set()
-                assert self.gate.wait(PATIENCE)
+                assert self.released.wait(PATIENCE)
             self.made.append((name, full))
 
         return RenderRequest(draw)
 
 
-def test_only_the_newest_wish_of_a_client_is_drawn():
+def test_only_the_newest_request_of_a_client_is_drawn():
     loop, drawn = RenderLoop(rest=60), Drawn()
     loop.start()
-    loop.request("a", drawn.wish(0, held=True))
+    loop.request("a", drawn.request(0, held=True))
     assert drawn.begun.wait(PATIENCE)
     for k in range(1, 100):
-        loop.request("a", drawn.wish(k))
-    loop.request("b", drawn.wish("b"))
-    drawn.gate.set()
+        loop.request("a", drawn.request(k))
+    loop.request("b", drawn.request("b"))
+    drawn.released.set()
     wait_for(lambda: len(drawn.made) == 3, "three pictures")
     time.sleep(0.1)
     assert drawn.made == [(0, False), (99, False), ("b", False)]
@@ -55,8 +55,8 @@ def clock(monkeypatch):
 
 def test_full_resolution_comes_at_rest_and_once(clock):
     loop, drawn = RenderLoop(rest=1.0), Drawn()
-    loop.request("a", drawn.wish(1))
-    loop.request("b", drawn.wish(2), moving=False)
+    loop.request("a", drawn.request(1))
+    loop.request("b", drawn.request(2), moving=False)
     assert not loop.idle
     for _ in range(2):
         loop._next()()
@@ -71,9 +71,9 @@ def test_full_resolution_comes_at_rest_and_once(clock):
 
 def test_a_view_at_rest_is_not_kept_waiting_by_one_that_moves_for_ever(clock):
     loop, drawn = RenderLoop(rest=0.05), Drawn()
-    loop.request("still", drawn.wish("still"))
+    loop.request("still", drawn.request("still"))
     for _ in range(100):
-        loop.request("moving", drawn.wish("moving"))
+        loop.request("moving", drawn.request("moving"))
         loop._next()()
         clock.seconds += 0.01
     assert drawn.made[0] == ("still", False)
@@ -84,13 +84,13 @@ def test_a_view_at_rest_is_not_kept_waiting_by_one_that_moves_for_ever(clock):
 def test_a_client_that_has_gone_gets_nothing():
     loop, drawn = RenderLoop(rest=0.05), Drawn()
     loop.start()
-    loop.request("a", drawn.wish(0, held=True))
+    loop.request("a", drawn.request(0, held=True))
     assert drawn.begun.wait(PATIENCE)
-    loop.request("b", drawn.wish("b"))
+    loop.request("b", drawn.request("b"))
     loop.forget("a")
     loop.forget("b")
-    drawn.gate.set()
-    loop.request("c", drawn.wish("c"))
+    drawn.released.set()
+    loop.request("c", drawn.request("c"))
     wait_for(lambda: ("c", True) in drawn.made, "the picture of c")
     loop.stop()
     assert drawn.made == [(0, False), ("c", False), ("c", True)]
@@ -107,7 +107,7 @@ def test_a_picture_that_fails_ends_no_others(caplog):
     done = threading.Event()
     loop.submit(done.set)
     assert done.wait(PATIENCE)
-    loop.request("b", drawn.wish("b"), moving=False)
+    loop.request("b", drawn.request("b"), moving=False)
     wait_for(lambda: drawn.made, "the picture of b")
     loop.stop()
     assert "out of memory" in caplog.text
@@ -120,8 +120,8 @@ def test_other_work_piles_up_of_no_kind_and_lets_pictures_through(clock):
         loop.submit(lambda k=k: done.append(k), "save")
     loop.submit(lambda: done.append("file"))
     loop.submit(lambda: done.append("another"))
-    loop.request("a", drawn.wish("a"), moving=False)
-    loop.request("b", drawn.wish("b"), moving=False)
+    loop.request("a", drawn.request("a"), moving=False)
+    loop.request("b", drawn.request("b"), moving=False)
     order = []
     while not loop.idle and (task := loop._next()) is not None:
         task()
@@ -143,12 +143,12 @@ def test_it_tidies_up_in_pauses_once_after_pictures(clock):
 
     pass_by(50)
     assert tidied == []  # nothing was drawn
-    loop.request("a", drawn.wish(1))
+    loop.request("a", drawn.request(1))
     pass_by(19.5)
     assert tidied == []
     pass_by(100)
     assert tidied == [2]
-    loop.request("a", drawn.wish(2), moving=False)
+    loop.request("a", drawn.request(2), moving=False)
     pass_by(100)
     assert tidied == [2, 3]
 

@@ -106,7 +106,7 @@ def test_everything_else_is_dropped(message):
     assert not is_allowed(message)
 
 
-def test_a_handler_that_fails_is_no_end():
+def test_messages_are_handled_after_a_failed_handler():
     seen = []
 
     class Handler:
@@ -165,7 +165,7 @@ def test_pages_of_other_sites_are_refused(origin):
     assert "not the viewer's" in asked(("Host", "localhost:8080"), ("Origin", origin))
 
 
-def test_two_origins_are_none():
+def test_two_origin_headers_are_refused():
     twice = [("Origin", "http://localhost")] * 2
     assert "not the viewer's" in asked(("Host", "localhost"), *twice)
 
@@ -202,12 +202,12 @@ def test_names_of_others_are_refused(host):
         assert "no such name" in asked(("Host", host), *origins)
 
 
-def test_one_name_is_asked_for():
+def test_one_host_header_is_required():
     assert "no such name" in asked()
     assert "no such name" in asked(("Host", "localhost"), ("Host", "localhost"))
 
 
-def test_what_it_is_called_depends_on_where_it_listens(monkeypatch):
+def test_allowed_hosts_depend_on_the_address(monkeypatch):
     monkeypatch.setattr(socket, "gethostname", lambda: "Station")
     monkeypatch.setattr(socket, "getfqdn", lambda: "station.lab.")
     everywhere = allowed_hosts("0.0.0.0")
@@ -227,7 +227,7 @@ def test_what_it_is_called_depends_on_where_it_listens(monkeypatch):
 
 
 @pytest.mark.parametrize("query", ["websocket=ws://example.org", "a&playbackPath", "%77ebsocket=", "a=1&websocket=x"])
-def test_no_page_that_obeys_another_server_is_given(query):
+def test_urls_that_name_another_server_are_refused(query):
     assert "this server alone" in asked(("Host", "localhost"), path=f"/?{query}")
     assert asked(("Host", "localhost"), path="/?darkMode&a=websocket") == ""
 
@@ -239,7 +239,7 @@ def test_messages_may_be_some_times_as_large_as_those_of_controls():
     assert 8 * largest < MAX_MESSAGE_BYTES < 16 * largest
 
 
-def test_a_server_that_is_made_in_another_way_is_none():
+def test_an_unguarded_server_is_refused():
     import websockets.asyncio.server as library
 
     before = library.serve
@@ -275,25 +275,25 @@ def test_the_event_loop_is_woken_by_its_own_thread_alone():
     buffer = AsyncMessageBuffer(loop, persistent_messages=True)
     handler = type("Handler", (), {"get_message_buffer": lambda _: buffer})()
     make_sends_thread_safe(handler)
-    told = []
+    sent = []
 
     async def listen():
         windows = buffer.window_generator(0)
-        while len(told) < 50:
-            told.extend(await anext(windows))
+        while len(sent) < 50:
+            sent.extend(await anext(windows))
         await windows.aclose()
 
     def send():
         for k in range(50):
             buffer.push(messages.SetGuiPanelLabelMessage(str(k)) if k else GOOD[0])
-            wait_for(lambda k=k: len(told) > k, "each to be heard before the next")
+            wait_for(lambda k=k: len(sent) > k, "each to be heard before the next")
 
     thread = threading.Thread(target=send)
     thread.start()
     loop.run_until_complete(asyncio.wait_for(listen(), PATIENCE))
     thread.join()
     loop.close()
-    assert [message.label for message in told[1:]] == [str(k) for k in range(1, 50)]
+    assert [message.label for message in sent[1:]] == [str(k) for k in range(1, 50)]
     buffer.message_event.clear()
     buffer.message_event.set()
     assert not buffer.message_event.is_set()

@@ -39,7 +39,7 @@ def test_beyond_the_rim_the_nearest_point_counts():
 
 
 @pytest.mark.parametrize("pointer", [EYE, np.full(3, np.nan), np.full(3, np.inf)], ids=("eye", "nan", "inf"))
-def test_what_tells_no_direction_changes_nothing(pointer):
+def test_a_pointer_without_direction_leaves_the_sun(pointer):
     before = np.array([0.0, 1, 0])
     assert sun_from_drag(CENTRE, RADIUS, EYE, pointer, before) is before
 

@@ -157,8 +157,8 @@ def test_frames_are_the_truth_of_what_they_show_alone(tiny_data, tmp_path, scene
         1,
         1,
     ]
-    untold = "the data that a model was trained on are not where they were; name them when the viewer starts"
-    assert source((TURN,), (TURN,), [None]) == untold
+    reason = "the data that a model was trained on are not where they were; name them when the viewer starts"
+    assert source((TURN,), (TURN,), [None]) == reason
     assert source((Pose(), TURN), (Pose(), TURN), [None, None]) == "the dataset's frame 2"
 
 

@@ -17,7 +17,7 @@ from spacesim.data.files import open_regular
 from spacesim.data.records import check_size
 
 INSTALL = "pip install 'spacesim[video]'"
-THUMBNAIL = 160  #: pixels of the longer side at which motion is judged
+THUMBNAIL = 160  #: pixels of the longer side at which motion is measured
 STILL = 0.2 / 255  #: mean change of pixels, sRGB values, below which a frame repeats the one before
 
 _log = logging.getLogger(__name__)

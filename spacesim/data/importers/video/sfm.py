@@ -206,7 +206,7 @@ def _map(
     count: int,
     report: Progress,
 ) -> list[Any]:
-    """Models, empty where nothing came out."""
+    """Models, empty where none was found."""
     options = colmap.IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
     options.num_threads = options.mapper.num_threads = 1

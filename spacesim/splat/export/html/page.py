@@ -38,7 +38,9 @@ def write_page(run: Run, path: Path, report: Callable[[int, int], None] | None =
     if Path(path).is_dir():
         raise InputError(f"{path}: expected a file to write, found a folder")
     if Path(path).suffix.lower() not in (".html", ".htm"):  # browsers go by it
-        raise InputError(f"{path}: expected a file name that ends in .html, found {Path(path).suffix or 'no ending'}")
+        raise InputError(
+            f"{path}: expected a file name that ends in .html, found {Path(path).suffix or 'no extension'}"
+        )
     about, arrays = _content(run, report)
     write_bytes(Path(path), _page(run, about, arrays).encode())
 

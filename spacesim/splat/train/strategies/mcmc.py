@@ -23,7 +23,7 @@ from spacesim.splat.train.strategies.strategy import Strategy
 
 MAX_COPIES = 51  #: of one Gaussian whose sum of binomials is computed, as the paper's code has it; more count as 51
 GOLDEN = 0x9E3779B97F4A7C15  #: 2^64 over the golden ratio
-OPACITY_GATE_SLOPE = 100.0  #: steepness of the paper's gate: faint Gaussians jitter, opaque ones stay
+OPACITY_GATE_SLOPE = 100.0  #: steepness of the paper's sigmoid gate: faint Gaussians jitter, opaque ones stay
 
 
 @dataclass(frozen=True)

@@ -118,10 +118,10 @@ def camera_at(eye: list[float], size: tuple[int, int] = (120, 90)) -> Camera:
 def drawn(tab, camera: Camera, sun: Sun) -> np.ndarray:
     """[H, W, 3]: what the page's renderer draws, over black."""
     axes, lens = camera.camera_from_world[:3, :3].ravel().tolist(), [camera.fx, camera.fy, camera.cx, camera.cy]
-    told = json.dumps({"axes": axes, "eye": camera.position.tolist(), "lens": lens})
+    view = json.dumps({"axes": axes, "eye": camera.position.tolist(), "lens": lens})
     address = tab.evaluate(
         f"""(() => {{ Object.assign(controls.canvas, {{ width: {camera.width}, height: {camera.height} }});
-            controls.renderer.draw({told}, {json.dumps(sun.direction.tolist())});
+            controls.renderer.draw({view}, {json.dumps(sun.direction.tolist())});
             return controls.canvas.toDataURL(); }})()"""
     )
     pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGBA")) / 255.0
@@ -234,7 +234,7 @@ def test_keys_and_reset(relit):
     assert state(relit) == start
 
 
-def test_what_no_sun_changes_has_no_handle(tabs):
+def test_pages_without_relighting_have_no_sun_handle(tabs):
     for name, hidden in (("plain", True), ("linear", True), ("relit", False)):
         assert tabs[name].evaluate("[element('sun').hidden, element('suns').hidden]") == [hidden, hidden]
     assert f"vanilla, {COUNT} Gaussians, made by spacesim" in tabs["plain"].text()
@@ -283,13 +283,13 @@ def test_what_is_hidden_is_not_drawn_but_from_within(relit):
 
 
 def test_the_same_run_gives_the_same_bytes(runs, pages, tmp_path):
-    told: list[tuple[int, int]] = []
-    write_page(runs["relit"], tmp_path / "again.html", lambda *done: told.append(done))
+    reported: list[tuple[int, int]] = []
+    write_page(runs["relit"], tmp_path / "again.html", lambda *done: reported.append(done))
     assert (tmp_path / "again.html").read_bytes() == pages["relit"].read_bytes()
-    assert told[-1][0] == told[-1][1] == len(told)
+    assert reported[-1][0] == reported[-1][1] == len(reported)
 
 
-def test_a_browser_without_webgl_is_told(browser, pages):
+def test_a_browser_without_webgl_shows_a_message(browser, pages):
     tab = browser.open("about:blank")
     tab.send("Page.enable")
     tab.send("Page.addScriptToEvaluateOnNewDocument", source="HTMLCanvasElement.prototype.getContext = () => null")

@@ -22,7 +22,7 @@ def main() -> None:
         ways = {name: way(name, method) for name in (*BIASES, "fast")}
         if method == "mapping":
             ways["fine"] = way("fine", method)  # splatting's are alike
-            ways["lifted, variance"] = replace(ways["lifted"], method=MappingConfig("variance"))
+            ways["lift, variance"] = replace(ways["lift"], method=MappingConfig("variance"))
         print(f"\n| {method}: Sun [°] | {' | '.join(ways)} |")
         for elevation in ELEVATIONS:
             print(f"| {elevation} | {' | '.join(cell(elevation, config) for config in ways.values())} |", flush=True)

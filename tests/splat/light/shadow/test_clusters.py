@@ -165,14 +165,14 @@ def test_order_does_not_matter():
     assert content(centres, radii) == content(centres[order], radii[order])
 
 
-def test_members_at_the_same_place_along_the_axis_are_told_apart_by_the_other():
+def test_members_at_the_same_place_along_the_axis_are_ordered_by_the_other():
     centres = np.array([[0, 0], [5, 3], [5, 1], [5, 2], [5, 0], [10, 0.0]])
     low, high = [4, 2, 0], [3, 1, 5]
     found = clusters(centres, np.full((6, 2), 2.6), SIZE, least_scale=8, most=2)
     assert sorted(parts(found)) == sorted([sorted(low), sorted(high)])
 
 
-def test_one_many_alike_and_none():
+def test_clusters_of_one_of_equal_and_of_no_points():
     assert parts(clusters([[3.0, 4]], [[1e6, 1e6]], SIZE, least_scale=10)) == [[0]]
     assert clusters(np.zeros((0, 2)), np.zeros((0, 2)), SIZE, least_scale=10) == []
     alike = clusters(np.ones((5, 2)), np.full((5, 2), 100.0), SIZE, least_scale=10)
@@ -226,7 +226,7 @@ def test_a_camera_of_a_point_is_finite():
     np.testing.assert_allclose(camera.world_from_camera[:3, 3], [1, 2, 3])
 
 
-def test_who_is_covered_by_the_primary_image_needs_no_other():
+def test_gaussians_covered_by_the_primary_image_use_it():
     centres, radii = points(*np.arange(31) * 0.5)  # no gap is meaningful: 15 to the left, 16 to the right of 7.25
     radii[15, 0] = 2  # at 7.5, so that the primary image begins at 5.5
     supports = Supports(np.column_stack([centres, np.zeros(31)]), radii)

@@ -151,7 +151,7 @@ def test_blockers_smaller_than_a_pixel_blend(antialiased):
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_order_is_nothing_to_it(name):
+def test_order_does_not_matter(name):
     arrays = random_splats(300, seed=2)
     camera = fit_camera(Gaussians.from_numpy(arrays), light_rows([1, 2, 2]), 48)
     found = occlusion(arrays, camera, config=CONFIGS[name])
@@ -309,9 +309,9 @@ def test_bias_clears_a_wall_and_keeps_its_shadow(elevation):
 def test_grazing_suns(elevation, most):
     """Where the thesis's bias leaves a wall dark, offset points clear it, and a real shadow stays."""
     assert share(elevation, "thesis") > 0.4
-    assert share(elevation, "lifted") < most
+    assert share(elevation, "lift") < most
     assert share(elevation, "grazing bias") < 0.85 * share(elevation, "thesis")
-    foot, _ = screen_shadow(elevation, way("lifted"), 3000)
+    foot, _ = screen_shadow(elevation, way("lift"), 3000)
     assert foot < 3 * 0.031
 
 

@@ -75,7 +75,7 @@ def test_occlusion_matches_the_twin(count, size, antialiased):
 
 
 @pytest.mark.parametrize("end", [LEAST_BETA, 0.3])
-def test_a_footprint_ends_where_it_is_told_to(end):
+def test_footprints_end_at_beta_min(end):
     arrays, view = random_splats(60, seed=2), light()
     ours, twin = occlusion(arrays, view, beta_min=end), occlusion_reference(arrays, view, np.zeros(60), end)
     np.testing.assert_allclose(ours, twin, atol=2e-6)
@@ -271,7 +271,7 @@ def test_recordings_serve_models_of_any_size():
 
 
 def test_recordings_tell_models_apart_whose_lists_are_equally_long():
-    """Gaussians that cannot be seen add nothing to the lists, but the arrays need more room."""
+    """Gaussians that cannot be seen add nothing to the lists, but the arrays grow."""
     arrays, view = random_splats(1000, seed=1, degree=0), light(32, 24)
     alone = gradients(arrays, view, np.zeros(1000))
     assert alone[0].mean() > 0.2

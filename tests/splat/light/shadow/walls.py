@@ -19,7 +19,7 @@ BIASES = {
     "none": {"bias": 0.0},
     "thesis": {"bias": 10.0},
     "grazing bias": {"bias": 10.0, "grazing": "bias"},
-    "lifted": {"bias": 10.0, "grazing": "lift"},
+    "lift": {"bias": 10.0, "grazing": "lift"},
     "both": {"bias": 10.0, "grazing": "both"},
 }
 

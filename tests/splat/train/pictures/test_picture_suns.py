@@ -24,7 +24,7 @@ CONFIG = replace(preset("demo", "shadow-map"), sun="unknown", init_count=150, it
 
 
 @pytest.fixture
-def untold(small_dataset):
+def sunless(small_dataset):
     """The training pictures under unknown Suns, each three times, so that there are enough."""
     frames = tuple(replace(frame, sun=None) for frame in small_dataset.train)
     return replace(small_dataset, train=tuple(frames * 3)[: max(8, len(frames))])
@@ -44,22 +44,22 @@ class StoppedError(Exception):
     pass
 
 
-def test_training_estimates_and_resumes_to_the_bit(untold, quick, tmp_path):
-    whole = train(untold, tmp_path / "whole", CONFIG)
+def test_training_estimates_and_resumes_to_the_bit(sunless, quick, tmp_path):
+    whole = train(sunless, tmp_path / "whole", CONFIG)
 
     def stop(progress) -> None:
         if progress.iteration == progress.iterations == CONFIG.iterations:
             raise StoppedError
 
     with pytest.raises(StoppedError):  # after the last checkpoint at 18, before the model is written
-        train(untold, tmp_path / "again", CONFIG, on_progress=stop)
+        train(sunless, tmp_path / "again", CONFIG, on_progress=stop)
     assert (tmp_path / "again" / "suns.safetensors").exists()
-    again = train(untold, tmp_path / "again", CONFIG, resume=True)
+    again = train(sunless, tmp_path / "again", CONFIG, resume=True)
     names = "model.safetensors", "cameras.json"
     for name in names:
         assert (whole.path / name).read_bytes() == (again.path / name).read_bytes(), name
     frames = json.loads((whole.path / "cameras.json").read_text())["frames"]
-    assert [frame["file_path"] for frame in frames] == [frame.file_path for frame in untold.train]
+    assert [frame["file_path"] for frame in frames] == [frame.file_path for frame in sunless.train]
     found = np.array([frame["sun_direction"] for frame in frames])
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1)
     assert all(0 <= frame["sun_sigma_deg"] <= 180 for frame in frames)
@@ -69,7 +69,7 @@ def test_training_estimates_and_resumes_to_the_bit(untold, quick, tmp_path):
 
 
 def test_a_run_tells_the_sun_of_a_new_picture(small_dataset, quick, tmp_path):
-    """Of any method that is told the Sun; here only that it is one, the same each time, and what is refused."""
+    """Of any method that takes the Sun; here only that it is one, the same each time, and what is refused."""
     config = replace(CONFIG, sun="given", iterations=10)
     lit = tuple(replace(frame, sun=Sun.from_angles(30, 40)) for frame in small_dataset.train)
     run = train(replace(small_dataset, train=lit), tmp_path / "run", config)
@@ -90,10 +90,10 @@ def test_a_run_tells_the_sun_of_a_new_picture(small_dataset, quick, tmp_path):
         estimate_sun(plain, picture, frame.camera)
 
 
-def test_a_sun_stays_on_the_sphere_and_follows_its_gradient(untold):
-    start = fibonacci_sphere(len(untold.train))
+def test_a_sun_stays_on_the_sphere_and_follows_its_gradient(sunless):
+    start = fibonacci_sphere(len(sunless.train))
     first = FirstSuns(start, np.zeros((len(start), CHOICES), int))
-    estimation = SunEstimation(untold, first, 0.01, 100)
+    estimation = SunEstimation(sunless, first, 0.01, 100)
     way = np.cross(start[2], [0.6, 0.0, 0.8])
     for step in range(5):
         estimation.learn(2, step, -way - 3 * estimation.direction(2))  # what points outwards does not count
@@ -104,11 +104,11 @@ def test_a_sun_stays_on_the_sphere_and_follows_its_gradient(untold):
     np.testing.assert_array_equal(estimation.direction(1), start[1])
 
 
-def test_frames_that_tell_their_time_are_in_order(untold):
-    frames = [replace(frame, time=float(time)) for frame, time in zip(untold.train, range(9, 0, -1), strict=False)]
+def test_frames_that_tell_their_time_are_in_order(sunless):
+    frames = [replace(frame, time=float(time)) for frame, time in zip(sunless.train, range(9, 0, -1), strict=False)]
     np.testing.assert_array_equal(time_order(frames), np.arange(len(frames))[::-1])
-    assert time_order(untold.train) is None
-    assert time_order([replace(frame, time=1.0) for frame in untold.train]) is None
+    assert time_order(sunless.train) is None
+    assert time_order([replace(frame, time=1.0) for frame in sunless.train]) is None
 
 
 @pytest.mark.parametrize(
@@ -120,14 +120,14 @@ def test_frames_that_tell_their_time_are_in_order(untold):
         lambda tensors: {"directions": tensors["directions"]},
     ],
 )
-def test_first_suns_that_cannot_be_are_told(damage, tmp_path):
+def test_invalid_first_suns_are_refused(damage, tmp_path):
     whole = FirstSuns(fibonacci_sphere(9), np.zeros((9, CHOICES), int)).tensors()
     np.testing.assert_array_equal(FirstSuns.of(whole, 9, tmp_path).directions, whole["directions"])
     with pytest.raises(InputError, match="expected the Suns of 9 pictures"):
         FirstSuns.of(damage(whole), 9, tmp_path)
 
 
-def test_what_cannot_be_estimated_is_told(small_dataset, tmp_path):
+def test_configurations_that_cannot_estimate_suns_are_refused(small_dataset, tmp_path):
     with pytest.raises(InputError, match="sun: expected a method that takes the Sun, as shadow-map, found vanilla"):
         with_settings(preset("demo"), {"sun": "unknown"})
     few = replace(small_dataset, train=small_dataset.train[:3])
@@ -136,15 +136,15 @@ def test_what_cannot_be_estimated_is_told(small_dataset, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_poses_are_learned_under_suns_that_are_estimated(untold, tmp_path, quick):
-    run = train(untold, tmp_path / "run", replace(CONFIG, refine_poses=True))
+def test_poses_are_learned_under_suns_that_are_estimated(sunless, tmp_path, quick):
+    run = train(sunless, tmp_path / "run", replace(CONFIG, refine_poses=True))
     values = read_tensors(run.path / "poses.safetensors")[0]["values"]
-    assert values.shape == (len(untold.train), 6)
+    assert values.shape == (len(sunless.train), 6)
     assert np.abs(values).max() > 0
     assert {"poses", "suns"} <= set(json.loads((run.path / "training.json").read_text()))
 
 
-def test_what_suns_cannot_be_told_from_is_warned_of(tmp_path):
+def test_data_that_cannot_determine_suns_are_warned_of(tmp_path):
     write_png(tmp_path / "opaque.png", np.zeros((4, 4, 3), np.uint8))
     write_png(tmp_path / "alpha.png", np.zeros((4, 4, 4), np.uint8))
     camera = Camera.from_fov(np.eye(4), 4, 4, 40)
@@ -165,29 +165,29 @@ def test_what_suns_cannot_be_told_from_is_warned_of(tmp_path):
         assert remark(MANY_PICTURES, **cut_out) == ""
 
 
-def test_training_warns_of_suns_that_may_be_far_off(untold, quick, tmp_path, caplog):
+def test_training_warns_of_suns_that_may_be_far_off(sunless, quick, tmp_path, caplog):
     def stop(progress) -> None:
         raise StoppedError
 
     with pytest.raises(StoppedError):
-        train(untold, tmp_path / "run", CONFIG, on_progress=stop)
+        train(sunless, tmp_path / "run", CONFIG, on_progress=stop)
     assert any("they may be far off" in record.getMessage() for record in caplog.records)
 
 
-def test_first_suns_are_looked_for_with_the_anti_aliasing_filter(untold, monkeypatch):
+def test_first_suns_are_looked_for_with_the_anti_aliasing_filter(sunless, monkeypatch):
     """Small pictures of a model that was trained on large ones: 22.7 degrees off without it, 17.3 with it."""
-    told = []
+    filters = []
 
     class Search:
         sphere = fibonacci_sphere(SPHERE)
 
         def __init__(self, gaussians, antialiased, distance):
-            told.append(antialiased)
+            filters.append(antialiased)
 
         def losses(self, pictures):
             return np.tile(np.arange(SPHERE, dtype=float), (len(pictures), 1))
 
     monkeypatch.setattr(suns, "ShapeSearch", Search)
-    found = suns.first_suns(untold, None, 5.0)
-    assert told == [True]
-    np.testing.assert_array_equal(found.directions, np.tile(Search.sphere[0], (len(untold.train), 1)))
+    found = suns.first_suns(sunless, None, 5.0)
+    assert filters == [True]
+    np.testing.assert_array_equal(found.directions, np.tile(Search.sphere[0], (len(sunless.train), 1)))

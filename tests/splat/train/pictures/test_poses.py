@@ -247,10 +247,10 @@ def test_a_run_tells_of_its_poses(small_dataset, tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         run = train(small_dataset, tmp_path / "run", replace(CONFIG, exposure_per_picture=True))
     assert "% of the distance (median)" in caplog.text
-    told = json.loads((run.path / "training.json").read_text())
-    assert 0 < told["poses"]["degrees"] < 10
-    assert 0 < told["poses"]["share_of_distance"] < 0.2
-    assert told["gains"]["least"] < told["gains"]["most"]
+    record = json.loads((run.path / "training.json").read_text())
+    assert 0 < record["poses"]["degrees"] < 10
+    assert 0 < record["poses"]["share_of_distance"] < 0.2
+    assert record["gains"]["least"] < record["gains"]["most"]
     cameras = json.loads((run.path / "cameras.json").read_text())
     assert [frame["file_path"] for frame in cameras["frames"]] == [frame.file_path for frame in small_dataset.train]
     camera, first = read_camera(run.path / "cameras.json"), small_dataset.train[0].camera

@@ -166,7 +166,7 @@ def test_what_is_small_and_wide_on_the_screen_is_duplicated_and_split():
     scales = np.exp(np.array(model.log_scales)[0])
     at_first = np.linalg.norm(np.array(model.means).T - means[0], axis=1) < 0.01
     np.testing.assert_allclose(np.sort(scales[at_first]), [0.001 / 1.6, 0.001 / 1.6, 0.001], rtol=1e-5)
-    full = DensificationConfig(max_gaussians=7)  # room for one more, and this would be two
+    full = DensificationConfig(max_gaussians=7)  # one more may be added, and this would be two
     assert refine_once(1100, full, gradient=gradient, radius=radius)[3] == (0, 0, 1)
 
 

@@ -595,7 +595,7 @@ def test_resumed_training_goes_on_as_if_never_stopped(meshed, tmp_path, strategy
     assert straight.gaussians.count != 60
 
 
-def test_a_mesh_that_is_missing_or_elsewhere_is_told(small_dataset, tmp_path):
+def test_a_missing_or_misplaced_mesh_is_an_error(small_dataset, tmp_path):
     with pytest.raises(InputError, match="strategy mesh-aware"):
         Trainer(small_dataset, config_of("mesh-aware"))
     trimesh.creation.box((1, 1, 1)).apply_translation((50, 0, 0)).export(tmp_path / "far.ply")
@@ -610,9 +610,9 @@ def test_a_mesh_that_is_missing_or_elsewhere_is_told(small_dataset, tmp_path):
 
 def test_a_configuration_tells_of_its_own_strategy_alone():
     config = config_of("mesh-aware")
-    told = config.to_json()
-    assert told["strategy"] == {"kind": "mesh-aware", **asdict(config.strategy)}
-    assert TrainConfig.from_json(told).strategy == config.strategy
+    written = config.to_json()
+    assert written["strategy"] == {"kind": "mesh-aware", **asdict(config.strategy)}
+    assert TrainConfig.from_json(written).strategy == config.strategy
     assert config_of("default").to_json()["strategy"] == {"kind": "default"}
 
 
