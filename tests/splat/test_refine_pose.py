@@ -21,7 +21,7 @@ from spacesim.splat.pose.solver import REACH, PyramidLevel
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.reference.rasterizer import render_reference
 from spacesim.splat.run import Run
-from spacesim.splat.train.config import preset
+from spacesim.splat.train.config import preset, with_settings
 
 SIZE = 64
 CAMERA = Camera.look_at([1.5, -2.5, 0.7], [0, 0, 0], SIZE, SIZE, 35)
@@ -41,7 +41,8 @@ def run(known_gaussians) -> Run:
 @pytest.fixture(scope="module")
 def lit_run(known_gaussians) -> Run:
     """In the light of networks that nobody has trained."""
-    config, rng = preset("demo", "shadow-map").light, np.random.default_rng(3)
+    many = {"light.field.features": 16}  # so that colours differ
+    config, rng = with_settings(preset("demo", "shadow-map"), many).light, np.random.default_rng(3)
     dark = {**known_gaussians, "sh": np.zeros((60, 0, 3)), "features": 2 * rng.normal(size=(60, config.features))}
     return run_of(Gaussians.from_numpy(dark), LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, 3.0, 0.8), 0))
 
