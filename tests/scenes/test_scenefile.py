@@ -290,7 +290,7 @@ def test_options():
         ("long" * 999, r"^scene: expected"),
         ("long" * 999 + ".toml", r"expected a scene file, found one that cannot be read"),
         ("a\0b", r"^scene: expected"),
-        ("a\0b.toml", r"expected a scene file, found one that cannot be read"),
+        ("a\0b.toml", r"^scene: expected a path without a null character, found"),
     ],
 )
 def test_no_such_scene(source, said, tmp_path, monkeypatch):
