@@ -50,11 +50,12 @@ def on_files(files: Any, config: Any) -> Any:
 def api_page() -> str:
     """Every public name with its signature and docstring."""
     import spacesim as ss
-    from spacesim.scenes.spacecraft import Part, Spacecraft, spacecraft
-    from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Pinhole, Projection
+    from spacesim.scenes.spacecraft import Part
+    from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Projection
     from spacesim.torch import rasterization
 
-    cameras, models = (Projection, Pinhole, Orthographic, OrthographicCamera), (Spacecraft, Part)
+    cameras = Projection, Orthographic, OrthographicCamera
+    others = sorted({*named_by(ss), Part} - {*cameras}, key=lambda cls: cls.__name__)
     parts = [
         "# API",
         f"Generated from the docstrings of spacesim {ss.__version__}. `import spacesim as ss` gives the names below; "
@@ -67,14 +68,11 @@ def api_page() -> str:
         "## Errors",
         *(f"### ss.{name}\n\n{block(inspect.getdoc(getattr(ss, name)) or '')}" for name in errors(ss)),
         "## What these take and give",
-        *(class_entry(f"{cls.__module__}.{cls.__name__}", cls, False) for cls in named_by(ss) if cls not in cameras),
+        *(class_entry(f"{cls.__module__}.{cls.__name__}", cls, False) for cls in others),
         "## Torch",
         function_entry("spacesim.torch.rasterization", rasterization),
         "## Cameras of arrays",
         *(class_entry(f"spacesim.splat.raster.cameras.{cls.__name__}", cls) for cls in cameras),
-        "## Spacecraft",
-        function_entry("spacesim.scenes.spacecraft.spacecraft", spacecraft),
-        *(class_entry(f"spacesim.scenes.spacecraft.{cls.__name__}", cls) for cls in models),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -142,7 +140,7 @@ def function_entry(title: str, function: Any) -> str:
 def class_entry(title: str, cls: Any, with_methods: bool = True) -> str:
     """A class: its fields as they stand in the code, and what can be asked of it. with_methods: of a record, too"""
     parts = [f"### {title}", block(inspect.getdoc(cls) or "")]
-    if fields := list(field_lines(cls)):
+    if fields := list(all_field_lines(cls)):
         parts.append(block("\n".join(fields), "python"))
     for name, member in members(cls) if with_methods or not fields else ():
         own, said = f"{title.removeprefix('ss.')}.{name}", inspect.getdoc(member) or ""
@@ -151,6 +149,13 @@ def class_entry(title: str, cls: Any, with_methods: bool = True) -> str:
         else:
             parts.append(f"`{own}`\n\n{block(said)}")
     return "\n\n".join(parts)
+
+
+def all_field_lines(cls: type) -> Iterator[str]:
+    """`field_lines` of a class, after those of the records that it extends."""
+    bases = [base for base in reversed(cls.__mro__) if is_dataclass(base)]
+    for record in dict.fromkeys([*bases, cls]):
+        yield from field_lines(record)
 
 
 def field_lines(cls: type) -> Iterator[str]:

@@ -116,7 +116,7 @@ make_runtime
 make_backend
 if [ "$WANTED" = test ]; then
     install --no-build-isolation -e '.[dev]'
-    for extra in cluster docs parquet readers serve sfm spice spz video viewer webdataset; do
+    for extra in cluster docs parquet readers serve sfm spice spz video viewer; do
         install --no-build-isolation -e ".[$extra]" 2>/dev/null ||
             say "what the extra '$extra' needs cannot be had here; its tests are skipped"
     done

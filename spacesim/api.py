@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from spacesim.backend import BackendError
@@ -18,9 +19,9 @@ from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonDict, JsonMapping, as_path
 from spacesim.data.images import load_image
-from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth, check_camera
+from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth, as_numbers, check_camera
 from spacesim.data.store import load_depth, load_truth
-from spacesim.data.structure import Rules, did_you_mean, field_value, places_of
+from spacesim.data.structure import Rules, checked, did_you_mean, field_value, places_of
 from spacesim.data.toml import dotted
 from spacesim.data.transforms import read_dataset
 from spacesim.learning.folder import TrainingProgress
@@ -31,6 +32,7 @@ from spacesim.nerf.run import NerfRun
 from spacesim.scenes import SceneConfig, read_scene
 from spacesim.scenes import generate as _generate
 from spacesim.scenes.cameras.rig import Rig
+from spacesim.scenes.spacecraft import spacecraft
 from spacesim.scenes.trajectory.rig import PoseRig
 from spacesim.serve.client import CameraClient
 from spacesim.splat.compose import PosedScene
@@ -62,6 +64,7 @@ __all__ = [
     "InputError",
     "NerfConfig",
     "NerfRun",
+    "Pinhole",
     "PoseRig",
     "PosedScene",
     "RefinedPose",
@@ -90,11 +93,13 @@ __all__ = [
     "read_scene",
     "refine_pose",
     "render",
+    "spacecraft",
     "train",
     "write_report",
 ]
 
 
+@checked
 def generate(
     scene: str | Path | SceneConfig,
     out: str | Path,
@@ -130,6 +135,7 @@ def generate(
     return _generate(scene, as_path(out, "out"), resume, progress, workers)
 
 
+@checked
 def import_dataset(
     kind: str, src: str | Path, out: str | Path, *, progress: ProgressCallback | None = None, **options: object
 ) -> Dataset:
@@ -148,6 +154,7 @@ def import_dataset(
     return run_import(kind, as_path(src, "src"), as_path(out, "out"), progress, **options)
 
 
+@checked
 def train(
     data: str | Path | Dataset,
     out: str | Path,
@@ -186,8 +193,11 @@ def train(
     elif choices:
         name, word = next(iter(choices.items()))
         raise InputError(f"{name}: expected none beside a configuration, found {word!r}")
-    if settings is not None and not isinstance(settings, Mapping):
+    if settings is not None and not (isinstance(settings, Mapping) and all(isinstance(name, str) for name in settings)):
         raise InputError(f"settings: expected {{name: value}}, found {settings!r:.60}")
+    for name, value in {**options, "strategy": strategy}.items():
+        if settings and name in settings and value is not None:
+            raise InputError(f"{name}: expected none beside settings[{name!r}], found {value!r:.60}")
     kind = type(config)
     for name, value in options.items():
         if name not in kind.__dataclass_fields__:
@@ -201,7 +211,7 @@ def train(
     config = methods.with_settings(replace(config, **options), settings or {})
     if "method" in choices and config.method != before:
         raise InputError(f"light: expected that of the method {before}, found that of {config.method}")
-    dataset, folder = _dataset(data, "data"), as_path(out, "out")
+    folder, dataset = as_path(out, "out"), _dataset(data, "data")
 
     def tell(state: TrainingProgress) -> None:
         if progress is not None:
@@ -210,6 +220,7 @@ def train(
     return methods.train(dataset, folder, config, resume, tell)
 
 
+@checked
 def evaluate(
     run: str | Path | Run | NerfRun,
     data: str | Path | Dataset,
@@ -286,7 +297,7 @@ def render(
 ) -> RenderOutput:
     """Gaussians seen by a camera, as Dr.Jit arrays: differentiable by every parameter that has gradients enabled.
 
-    camera: a record, or one of spacesim.splat.raster.cameras, where arrays hold pose and intrinsics
+    camera: a record, or `Pinhole.of` one, where arrays hold pose and intrinsics
     twist: Float [6], or numbers, moves the camera: a rotation vector (radians), then a translation (metres), in camera
         axes, which take points from the old camera axes to the new ones; zeros to differentiate by the pose
     sh_degree: highest degree of spherical harmonics used; by default all that are stored
@@ -306,10 +317,18 @@ def render(
         check_camera(camera)
         view = Pinhole.of(camera)
     if twist is not None:
-        if len(twist) != 6:
-            raise ValueError(f"twist: expected 6 numbers, found {len(twist)}")
-        view = view.moved(upload(np.asarray(twist)) if isinstance(twist, np.ndarray | Sequence) else twist)
+        view = view.moved(_twist(twist))
     return _render(gaussians, view, **options)
+
+
+def _twist(twist: Float | np.ndarray | Sequence[float]) -> Float:
+    """As Dr.Jit's array, which stays as it is."""
+    if isinstance(twist, dr.ArrayBase) and dr.width(twist) == 6:
+        return twist
+    numbers = as_numbers(twist)
+    if numbers.shape != (6,) or not np.isfinite(numbers).all():
+        raise InputError(f"twist: expected 6 finite numbers, found {numbers.tolist() or twist!r:.60}")
+    return upload(numbers)
 
 
 def _dataset(data: str | Path | Dataset, name: str) -> Dataset:

@@ -6,8 +6,9 @@ import platform
 import sys
 from collections.abc import Callable
 
-from spacesim import __version__, backend
+from spacesim import backend
 from spacesim.data.files import JsonDict
+from spacesim.version import __version__
 
 _PACKAGES = ("mitsuba", "drjit", "numpy", "torch")
 _TITLES = {"python": "Python", "cuda": "CUDA", "llvm": "LLVM", "lpips": "LPIPS"}

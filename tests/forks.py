@@ -1,5 +1,6 @@
 """Processes that have imported what takes a second before they begin, for tests of what a command leaves behind when it
-is killed: forked from one process that has done that and no more, they are as good as new."""
+is killed: forked from one process that has done that and no more, they are as good as new. CUDA survives no fork: where
+there is one, they are new."""
 
 import os
 import runpy
@@ -11,12 +12,14 @@ from collections.abc import Mapping, Sequence
 from multiprocessing import get_context
 from pathlib import Path
 
+from spacesim.backend import available
+
 IMPORTED = (
     *("spacesim.scenes.generation.generate", "spacesim.eval.evaluate", "spacesim.splat.train.train", "sooner"),
     *("spacesim.splat.compose.output", "spacesim.cli.program", "mitsuba", "trimesh", "scipy.spatial", "igl"),
 )
-_SERVER = get_context("forkserver")
-_SERVER.set_forkserver_preload(["__main__", *IMPORTED])
+_CONTEXT = get_context("spawn" if available()["cuda"] is None else "forkserver")
+_CONTEXT.set_forkserver_preload(["__main__", *IMPORTED])
 
 
 class Forked:
@@ -29,7 +32,7 @@ class Forked:
         self._file: Path | None = Path(name)  #: of the errors
         self._errors = b""
         arguments = [str(word) for word in words], folder or Path.cwd(), name, {**os.environ, **environment}
-        self._process = _SERVER.Process(target=_run, args=arguments)
+        self._process = _CONTEXT.Process(target=_run, args=arguments)
         self._process.start()
         assert self._process.pid is not None
         self.pid = self._process.pid

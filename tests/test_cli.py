@@ -72,7 +72,7 @@ def test_the_module_is_a_program_too():
         ("--method relight --set light.bounce=7", "light bounce", 7),
         ("--method vanilla --set supersample=3", "supersample", 3),
         ("--set antialiased=true --set antialiased=false", "antialiased", False),
-        ("--seed 40 --set seed=30", "seed", 30),
+        ("--set seed=30", "seed", 30),
         ("--strategy mesh-aware --set strategy.cull_every=77", "strategy cull_every", 77),
         ("--set strategy.growth=0.5 --set strategy=mcmc", "strategy growth", 0.5),
         ("--max-gaussians 99", "refinement max_gaussians", 99),
@@ -128,6 +128,25 @@ def test_fields_are_listed_with_the_defaults_of_a_preset(spacesim):
     assert "strategy.cull_every" not in fast
     meaning = "Gaussians at the start, at most, and no more than refinement.max_gaussians"
     assert " ".join(fast["init_count"]) == f"20000 {meaning} [whole number]"
+
+
+@pytest.mark.parametrize(
+    ("option", "setting"),
+    [
+        (("--iterations", 0), "iterations=4"),
+        (("--seed", 4), "seed=4"),
+        (("--init", "random"), "init='mesh'"),
+        (("--max-gaussians", 5), "refinement.max_gaussians=4"),
+        (("--strategy", "default"), "strategy='mcmc'"),
+        (("--sun", "given"), "sun='unknown'"),
+        (("--refine-poses",), "refine_poses=False"),
+        (("--warm-start",), "warm_start='none'"),
+    ],
+)
+def test_an_option_and_a_setting_of_the_same_field_are_refused(spacesim, option, setting):
+    key, _, value = setting.partition("=")
+    done = spacesim("train", "--fields", *option, "--set", setting.replace("False", "false"))
+    assert done.is_refusal(f"--set {key}: expected none beside {option[0]}, found {value}")
 
 
 @pytest.mark.parametrize("strategy", ["mesh-aware", "support-aware"])

@@ -8,6 +8,9 @@ import pytest
 
 from spacesim.cli.fields import fields_of, meanings, reference
 from spacesim.cli.train import OPTIONS
+from spacesim.data.structure import Rules, places_of
+from spacesim.data.toml import dotted
+from spacesim.nerf.config import NerfConfig
 from spacesim.splat.train.config import METHODS, PRESETS, STRATEGIES, TrainConfig, preset, warm_start
 from spacesim.splat.train.strategies.support_aware import SupportAwareConfig
 
@@ -72,10 +75,17 @@ def test_the_reference_has_a_table_for_each_record():
     assert len(used) >= 15
     assert used - set(tables) == set()
     says = "strength lambda_b of the receiver-depth bias (4.26), 0: none but that of `grazing`"
-    row = f"| `bias` | number | `10` | {says} |"
+    row = f"| `light.shadow.bias` | number | `10` | {says} |"
     assert row in shown
     assert r"| `init` | mesh \| points \| random \| none | `none` |" in shown
     assert "`light.shadow.method` (`splatting`)" in shown
+    assert "| `light.field.inputs.sun.kind`, `light.field.inputs.view.kind`, `light.shadow.refine.sun.kind` |" in shown
+    assert "| `grid.levels`, `coarse.grid.levels`, `fine.grid.levels` |" in reference(NerfConfig)
+    for config in TrainConfig, NerfConfig:
+        keys = re.findall(r"^\| (`.+?`) \|", reference(config), re.MULTILINE)
+        names = {name for some in keys for name in re.findall(r"`([^`]+)`", some)}
+        places = {dotted(place) for place in places_of(config, Rules())}
+        assert names == places - {"light.shadow.method.baseline"}  # which is no option
     own = shown.split("## SupportAwareConfig\n")[1].split("\n## ")[0]
-    assert re.findall(r"^\| `(\w+)`", own, re.MULTILINE) == [f.name for f in fields(SupportAwareConfig)]
-    assert f"| `steps` | whole number | `{warm_start('thesis').steps}` |" in shown
+    assert re.findall(r"^\| `strategy\.(\w+)`", own, re.MULTILINE) == [f.name for f in fields(SupportAwareConfig)]
+    assert f"| `warm_start.steps` | whole number | `{warm_start('thesis').steps}` |" in shown

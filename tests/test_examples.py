@@ -13,7 +13,16 @@ from spacesim.data.images import read_exr, read_png
 from spacesim.data.store import find_unreadable_files
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-MAX_LINES = 20
+MAX_LINES, MAX_CLIENT_LINES = 20, 110
+CLIENTS = EXAMPLES / "closed_loop"
+"""Programs that ask `spacesim serve` from elsewhere (Basilisk, a plain socket): each is one file that stands alone,
+with the other program's scene or the bytes of the protocol in it, so they may be longer than examples."""
+
+
+def imports(path: Path) -> list[str]:
+    tree = ast.parse(path.read_text())
+    names = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+    return names + [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
 
 
 def example(name: str) -> Any:
@@ -38,13 +47,18 @@ def lines_of_code(path: Path) -> int:
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
 def test_examples_are_short_and_import_from_spacesim_alone(path):
-    tree = ast.parse(path.read_text())
-    names = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
-    names += [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    names = imports(path)
     others = {name.partition(".")[0] for name in names} - sys.stdlib_module_names - {"numpy"}
     assert others == ({"spacesim", "drjit"} if path.stem == "04_rasterizer_gradients" else {"spacesim"})
     assert [name for name in names if name.startswith("spacesim")] == ["spacesim"]
     assert lines_of_code(path) <= MAX_LINES
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*/**/*.py")), ids=lambda path: path.stem)
+def test_only_clients_of_other_programs_are_longer(path):
+    assert path.parent == CLIENTS
+    assert [name for name in imports(path) if name.partition(".")[0] == "spacesim"] == []
+    assert lines_of_code(path) <= MAX_CLIENT_LINES
 
 
 @pytest.fixture(scope="module")

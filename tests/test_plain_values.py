@@ -34,6 +34,10 @@ def test_impossible_options_of_scenes_are_refused(name, value):
         ({"config": "demo"}, "config: expected what `preset` returns, found 'demo'"),
         ({"config": {"iterations": 3}}, "config: expected what `preset` returns, found {'iterations': 3}"),
         ({"settings": "seed=5"}, "settings: expected {name: value}, found 'seed=5'"),
+        ({"settings": {5: 1}}, "settings: expected {name: value}, found {5: 1}"),
+        ({"progress": 4}, "progress: expected a function, found 4"),
+        ({"resume": "no"}, "resume: expected true or false, found 'no'"),
+        ({"out": "a\0b"}, r"out: expected a path without a null character, found 'a\\x00b'"),
         ({"settings": {"preset": "demo"}}, "preset: expected beside the settings"),
         ({"settings": {"method": "relight"}}, "method: expected beside the settings"),
         ({"method": "nerf", "settings": {"method": "nerf-relight"}}, "method: expected beside the settings"),
@@ -43,8 +47,38 @@ def test_impossible_options_of_scenes_are_refused(name, value):
 )
 def test_impossible_trainings_are_refused(options, said, tiny_data, tmp_path):
     with pytest.raises(ss.InputError, match=f"^{said}"):
-        ss.train(tiny_data, tmp_path / "run", **options)
+        ss.train(tiny_data, **{"out": tmp_path / "run", **options})
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("config", "fields", "said"),
+    [
+        (ss.TrainConfig, {"iterations": "a"}, "iterations: expected a whole number, found 'a'"),
+        (ss.TrainConfig, {"ssim_weight": "x"}, "ssim_weight: expected a finite number, found 'x'"),
+        (ss.TrainConfig, {"light": "shadow-map"}, "light: expected a LightConfig, found 'shadow-map'"),
+        (ss.TrainConfig, {"antialiased": "no"}, "antialiased: expected true or false, found 'no'"),
+        (ss.NerfConfig, {"rays": "4"}, "rays: expected a whole number, found '4'"),
+    ],
+)
+def test_configurations_that_cannot_be(config, fields, said):
+    with pytest.raises(ss.InputError, match=f"^{said}"):
+        config(**fields)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"workers": "2"}, "workers: expected a whole number, found '2'"),
+        ({"workers": 2.5}, "workers: expected a whole number, found 2.5"),
+        ({"progress": 4}, "progress: expected a function, found 4"),
+        ({"out": "a\0b"}, "out: expected a path without a null character"),
+    ],
+)
+def test_datasets_that_cannot_be(options, said, tmp_path):
+    with pytest.raises(ss.InputError, match=f"^{said}"):
+        ss.generate(**{"scene": "boxsat", "out": tmp_path / "data", **options})
+    assert not any(tmp_path.iterdir())
 
 
 def test_pictures_and_poses(tiny_run, tiny_data, tmp_path):
@@ -56,6 +90,10 @@ def test_pictures_and_poses(tiny_run, tiny_data, tmp_path):
         view.save(tmp_path / "a.png", "foo")
     with pytest.raises(ss.InputError, match=r"^run: expected what load_run returns, found 'run'"):
         ss.refine_pose("run", view.rgb, frame.camera)
+    numbers = [("starts", "4", "a whole number"), ("seed", -1, "0 or more"), ("within", "ab", "a list of 2 numbers")]
+    for name, value, expected in numbers:
+        with pytest.raises(ss.InputError, match=f"^{name}: expected {expected}, found {value!r}$"):
+            ss.refine_pose(run, view.rgb, frame.camera, (40, 25), **{name: value})
     still, moved = (ss.render(run.gaussians, frame.camera, twist=twist) for twist in (np.zeros(6), [0, 0, 0, 0, 0, 1]))
     assert np.array_equal(still.to_numpy()[1], ss.render(run.gaussians, frame.camera).to_numpy()[1])
     assert not np.array_equal(moved.to_numpy()[1], still.to_numpy()[1])
@@ -66,17 +104,19 @@ def test_pictures_and_poses(tiny_run, tiny_data, tmp_path):
 def test_impossible_pictures_are_refused(tiny_run, tiny_data, tmp_path):
     run, frame = ss.load_run(tiny_run), ss.read_dataset(tiny_data).test[0]
     wrong = [
-        (r"twist: expected 6 numbers, found 5", lambda: ss.render(run.gaussians, frame.camera, twist=[0] * 5)),
-        (
-            r"outputs: expected some of .*, found 'color'",
-            lambda: ss.render(run.gaussians, frame.camera, outputs="color"),
-        ),
-        (r"sh_degree: expected 0 to", lambda: ss.render(run.gaussians, frame.camera, sh_degree=-1)),
-        (r"sh_degree: expected 0 to", lambda: ss.render(run.gaussians, frame.camera, sh_degree=5)),
-        (r"count, radius, scale: expected", lambda: ss.Gaussians.random(-1, 1.0, 0.1)),
-        (r"count, radius, scale: expected", lambda: ss.Gaussians.random(3, float("nan"), 0.1)),
+        (r"count: expected 0 or more, found -1", lambda: ss.Gaussians.random(-1, 1.0, 0.1)),
+        (r"count: expected a whole number, found 'a'", lambda: ss.Gaussians.random("a", 1.0, 0.1)),
+        (r"count: expected a whole number, found 2.5", lambda: ss.Gaussians.random(2.5, 1.0, 0.1)),
+        (r"radius: expected a finite number, found nan", lambda: ss.Gaussians.random(3, float("nan"), 0.1)),
+        (r"scale: expected metres above 0, found 0", lambda: ss.Gaussians.random(3, 1.0, 0)),
+        (r"seed: expected 0 or more, found -1", lambda: ss.Gaussians.random(3, 1.0, 0.1, -1)),
         (r"camera: expected a whole number of pixels", lambda: ss.Camera(np.eye(4), 4.5, 4, 1, 1, 1, 1)),
+        (r"camera: expected focal lengths .*, found a and 1", lambda: ss.Camera(np.eye(4), 4, 4, "a", 1, 1, 1)),
+        (r"camera: expected focal lengths", lambda: ss.Camera(np.eye(4), 4, 4, 1, None, 1, 1)),
+        (r"camera: expected a principal point", lambda: ss.Camera(np.eye(4), 4, 4, 1, 1, "1", 1)),
+        (r"camera: expected a size .*, found 4 x 4 and 'a'", lambda: ss.Camera.from_fov(np.eye(4), 4, 4, "a")),
         (r"position: expected three finite numbers", lambda: ss.Camera.look_at([0, 0, np.nan], [0, 0, 0], 4, 4, 40)),
+        (r"position: expected three finite numbers", lambda: ss.Camera.look_at(["a"] * 3, [0, 0, 0], 4, 4, 40)),
         (r"target: expected three finite numbers", lambda: ss.Camera.look_at([0, 0, 1], "abc", 4, 4, 40)),
         (r"world_from_camera: expected a finite", lambda: ss.PoseRig(np.full((2, 4, 4), np.nan))),
         (r".*: expected a folder for an evaluation, found a dataset", lambda: ss.evaluate(run, tiny_data, tiny_data)),
@@ -84,6 +124,24 @@ def test_impossible_pictures_are_refused(tiny_run, tiny_data, tmp_path):
     for said, call in wrong:
         with pytest.raises((ss.InputError, ValueError), match=f"^{said}"):
             call()
+    options = [
+        ("twist", [0] * 5, "6 finite numbers, found "),
+        ("twist", 5, "6 finite numbers, found 5.0"),
+        ("twist", [np.nan] * 6, "6 finite numbers, found "),
+        ("twist", np.zeros((6, 2)), "6 finite numbers, found "),
+        ("outputs", "color", "some of color, .*, found 'color'"),
+        ("outputs", None, "some of color, .*, found None"),
+        ("features", "ab", "arrays of .*, found 'ab'"),
+        ("sh_degree", -1, "0 to"),
+        ("sh_degree", 5, "0 to"),
+        ("sh_degree", "a", "a whole number, found 'a'"),
+        ("antialiased", "no", "true or false, found 'no'"),
+    ]
+    for name, value, said in options:
+        with pytest.raises(ValueError, match=f"^{name}: expected {said}"):
+            ss.render(run.gaussians, frame.camera, **{name: value})
+    with pytest.raises(ss.InputError, match=r"^exposure: expected a finite number, found 'a'"):
+        run.render(frame.camera, exposure="a")
     assert sorted(path.name for path in tmp_path.iterdir()) == []
 
 
@@ -113,6 +171,7 @@ def test_what_is_neither_a_path_nor_a_record_is_named(wrong, tiny_run, tiny_data
         "read_scene": [(wrong,)],
         "refine_pose": poses,
         "render": [(wrong, frame.camera), (run.gaussians, wrong)],
+        "spacecraft": [(wrong,), ([wrong],)],
         "train": [(wrong, out), (data, wrong), (data, out, wrong or "fast")],
         "write_report": [(wrong, out), (tiny_data, wrong)],
     }

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -197,6 +198,9 @@ def test_modes_backgrounds_and_meta():
     }  # fmt: skip
     assert meta["radii"].dtype == torch.int32
     assert (meta["tile_width"], meta["tile_height"]) == (3, 3)  # of 16 pixels
+    with pytest.raises(KeyError, match=r"^meta: expected one of batch_ids, .*, found 'isect_ids'; splats are not"):
+        meta["isect_ids"]
+    assert meta.get("isect_ids") is None
     each = [
         rasterization(**{**leaves, "viewmats": leaves["viewmats"][k : k + 1], "Ks": leaves["Ks"][k : k + 1]}, **size)
         for k in (0, 1)
@@ -207,7 +211,7 @@ def test_modes_backgrounds_and_meta():
 def test_numbers_of_numpy_and_backgrounds_of_one_channel_are_taken():
     leaves = as_floats(scene())
     depths, _, _ = rasterization(**leaves, width=SIDE, height=SIDE, sh_degree=3, render_mode="D")
-    size = {"width": np.int64(SIDE), "height": np.int32(SIDE), "near_plane": np.float32(0.01), "sh_degree": 3}
+    size = {"width": np.int64(SIDE), "height": np.int32(SIDE), "near_plane": np.float32(0.01), "sh_degree": np.int8(3)}
     over, _, _ = rasterization(**leaves, **size, render_mode="D", backgrounds=torch.ones(2, 1, device=DEVICE))
     assert torch.equal(depths, over)  # as gsplat has it: depth has no background
 
@@ -360,6 +364,17 @@ def test_numbers_that_cannot_be_drawn_harm_no_others():
         ({"with_ut": True}, "with_ut: not supported"),
         ({"covars": torch.zeros(60, 6)}, "covars: not supported"),
         ({"sh_degree": 4}, "sh_degree: expected 0 to 3, found 4"),
+        ({"sh_degree": 1.5}, "sh_degree: expected a whole number, found 1.5"),
+        ({"sh_degree": "2"}, "sh_degree: expected a whole number, found '2'"),
+        ({"near_plane": "1"}, "near_plane: expected a number, found '1'"),
+        ({"near_plane": float("nan")}, "near_plane: expected a number, found nan"),
+        ({"radius_clip": None}, "radius_clip: expected a number, found None"),
+        ({"near_plane": 5, "far_plane": 2}, "far_plane: expected at least near_plane, 5, found 2"),
+        ({"eps2d": -1}, "eps2d: expected 0 or more, found -1"),
+        (
+            {"colors": torch.zeros(60, 16, 3).cfloat()},
+            "colors: expected real numbers, found torch.complex64",
+        ),
         ({"sh_degree": None}, r"colors: expected \[60, D\]"),
         ({"quats": torch.zeros(60, 3)}, r"quats: expected \[60, 4\], found \[60, 3\]"),
         ({"quats": torch.zeros(60, 3)}, r"found \[60, 3\]$"),
@@ -396,6 +411,20 @@ def test_same_tensors_same_bits():
         gradients = torch.autograd.grad(picture.sin().sum() + alpha.sum(), list(leaves.values()))
         found.append([picture, alpha, *gradients])
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
+def test_threads_do_not_disturb_each_other():
+    def results(count: int) -> list[torch.Tensor]:
+        leaves = {name: leaf.detach().requires_grad_() for name, leaf in scenes[count].items()}
+        picture, alpha, _ = rasterization(**leaves, width=SIDE, height=SIDE, sh_degree=3)
+        return [picture, *torch.autograd.grad(picture.sin().sum() + alpha.sum(), list(leaves.values()))]
+
+    scenes = {count: as_floats(scene(count, cameras=1)) for count in (59, 60, 200)}
+    alone = {count: results(count) for count in scenes}
+    with ThreadPoolExecutor(len(scenes)) as threads:
+        found = list(threads.map(lambda i: results(list(scenes)[i % len(scenes)]), range(40)))
+    for i, own in enumerate(found):
+        assert all(torch.equal(one, other) for one, other in zip(own, alone[list(scenes)[i % 3]], strict=True))
 
 
 def test_without_torch_a_sentence():

@@ -2,6 +2,7 @@
 
 import gc
 import itertools
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache, update_wrapper
@@ -72,6 +73,7 @@ class Recorded(Generic[P, R]):
     Dr.Jit's LLVM backend makes of a numpy array is numpy's own memory, whose kernels and recordings differ by whether
     it happens to begin at a multiple of 64 bytes: make arguments of lists, or copy them (`backend.upload`).
     Python's garbage collector waits during a call: arrays that it frees in the middle of a recording end the process.
+    Other threads' calls, of any such function, wait as well: a recording takes in what they do.
 
     traced: the function itself, without a recording
     """
@@ -94,6 +96,10 @@ class Recorded(Generic[P, R]):
         self._has_gradients, self._flag, self._scope = dr.grad_enabled, dr.flag, dr.JitFlag.FreezingScope
 
     def __call__(self, *arguments: P.args, **named: P.kwargs) -> R:
+        with _one_at_a_time:
+            return self._call(arguments, named)
+
+    def _call(self, arguments: tuple[Any, ...], named: dict[str, Any]) -> R:
         if self._flag(self._scope):
             return self.traced(*arguments, **named)
         arrays: list[Any] = []
@@ -116,6 +122,7 @@ class Recorded(Generic[P, R]):
                 gc.enable()
 
 
+_one_at_a_time = threading.RLock()
 _recordings = 0  # that were made
 
 

@@ -11,10 +11,10 @@ import tokenize
 from collections.abc import Iterator
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from functools import cache
-from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import Any, get_type_hints
 
-from spacesim.data.structure import alternatives, choices, kind_of
+from spacesim.data.structure import alternatives, choices, kind_of, members_of
 from spacesim.splat.train.config import TrainConfig
 
 _WORDS: dict[object, str] = {int: "whole number", float: "number", bool: "true or false", str: "text"}
@@ -75,7 +75,7 @@ def fields_of(record: object, at: str = "") -> Iterator[ConfigField]:
 
 def type_words(hint: object) -> str:
     """An annotation in words."""
-    inner = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    inner = members_of(hint)
     words = [*alternatives(hint)] or [*choices(hint)]
     if not words:
         words = [_WORDS.get(member, "table") for member in inner if member is not NoneType]
@@ -108,7 +108,8 @@ def reference(config: object = TrainConfig) -> str:
         for f in options_in(cls):
             value = f.default_factory() if f.default_factory is not MISSING else f.default
             default = (kind_of(type(value)) or "") if is_dataclass(value) else _literal(value)
-            cells = f"`{f.name}`", type_words(hints[f.name]), f"`{default}`" if default else "", meaning[f.name]
+            keys = [f"`{place}.{f.name}`".replace("`.", "`") for place in places]  # as `--set` takes them
+            cells = ", ".join(keys), type_words(hints[f.name]), f"`{default}`" if default else "", meaning[f.name]
             lines.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
         parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"
@@ -118,11 +119,10 @@ def _records(cls: object, at: str = "") -> dict[Any, list[str]]:
     """{record: keys under which it stands}, outer ones first."""
     result: dict[Any, list[str]] = {cls: [at]}
     for name, hint in get_type_hints(cls).items():
-        inner = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-        for member in inner:
+        for member in members_of(hint):
             if isinstance(member, type) and is_dataclass(member):
                 for record, places in _records(member, f"{at}.{name}".removeprefix(".")).items():
-                    result[record] = [*result.get(record, []), *places]
+                    result[record] = list(dict.fromkeys([*result.get(record, []), *places]))
     return result
 
 

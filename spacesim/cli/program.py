@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
-from spacesim import __version__, backend
+from spacesim import backend
 from spacesim.cli import (
     compose,
     demo,
@@ -35,6 +35,7 @@ from spacesim.cli import eval as evaluate
 from spacesim.cli import import_ as import_command
 from spacesim.cli.parser import Parser
 from spacesim.data.errors import InputError, WorkError
+from spacesim.version import __version__
 
 COMMANDS: dict[str, ModuleType] = {
     "doctor": doctor,

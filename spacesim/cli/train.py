@@ -22,6 +22,13 @@ OPTIONS = {
 }
 """Options with a value: the field that each sets, and what stands for its value. Every other field is for --set."""
 
+_KEYS = {option: key for option, (key, _) in OPTIONS.items()} | {
+    "--sun": "sun",
+    "--warm-start": "warm_start",
+    "--refine-poses": "refine_poses",
+}
+"""{option: the field that it sets} of all."""
+
 _NAMES = ("method", "strategy", "preset")  #: of a configuration: `preset` makes it, with all its defaults
 _OF_BOTH = ("iterations", "seed")  #: fields of options that a radiance field has, too
 
@@ -47,10 +54,12 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
         shown = field.default if key in (*_NAMES, "seed") else "what the data has" if key == "init" else "of the preset"
         text = f"{words} (default: {shown})"
         parser.add_argument(option, type=kind, default=default, metavar=value, help=text)
-    parser.add_argument("--warm-start", action="store_true", help=meanings["warm_start"].meaning.partition(";")[0])
+    parser.add_argument(
+        "--warm-start", action="store_true", default=None, help=meanings["warm_start"].meaning.partition(";")[0]
+    )
     sun = meanings["sun"].meaning
-    parser.add_argument("--sun", choices=("given", "unknown"), default="given", help=f"{sun} (default: given)")
-    parser.add_argument("--refine-poses", action="store_true", help=meanings["refine_poses"].meaning)
+    parser.add_argument("--sun", choices=("given", "unknown"), help=f"{sun} (default: given)")
+    parser.add_argument("--refine-poses", action="store_true", default=None, help=meanings["refine_poses"].meaning)
     parser.add_argument("--resume", action="store_true", help="go on from the newest checkpoint")
     parser.add_argument(
         "--set",
@@ -67,8 +76,7 @@ def option_of(field: str, options: argparse.Namespace) -> str | None:
     from spacesim.nerf.config import NerfConfig
     from spacesim.splat.train.config import TrainConfig
 
-    others = {"sun": "--sun", "warm_start": "--warm-start", "refine_poses": "--refine-poses"}
-    options_by_key = {key: option for option, (key, _) in OPTIONS.items()} | others
+    options_by_key = {key: option for option, key in _KEYS.items()}
     keys = {text.partition("=")[0].strip() for text in options.set}  # of which some are no fields
     if field in options_by_key and field not in keys:
         return options_by_key[field]
@@ -86,17 +94,20 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.progress import report_training, show_progress
     from spacesim.splat.train.config import TrainConfig, warm_start
 
+    own = dict(map(parse_setting, options.set))
+    values = {key: getattr(options, option[2:].replace("-", "_")) for option, key in _KEYS.items()}
+    chosen = {key: value for key, value in values.items() if value is not None and key not in _NAMES}
     config = preset(options.preset, options.method, options.strategy)
-    settings = {key: getattr(options, option[2:].replace("-", "_")) for option, (key, _) in OPTIONS.items()}
-    settings |= {"refine_poses": options.refine_poses or None, "sun": options.sun if options.sun != "given" else None}
-    chosen = {key: value for key, value in settings.items() if value is not None and key not in _NAMES}
+    for option, key in _KEYS.items():
+        if key in own and values[key] is not None:
+            raise InputError(f"{key}: expected none beside {option}, found {own[key]!r}")
     if isinstance(config, TrainConfig):
-        if options.warm_start:
+        if chosen.pop("warm_start", False):
             config = replace(config, warm_start=warm_start(options.preset))
-    elif others := [*(["warm_start"] if options.warm_start else []), *(key for key in chosen if key not in _OF_BOTH)]:
+    elif others := [key for key in chosen if key not in _OF_BOTH]:
         raise InputError(f"{others[0]}: expected with a method of Gaussians, found with {options.method}")
     try:
-        config = with_settings(config, chosen | dict(map(parse_setting, options.set)))
+        config = with_settings(config, chosen | own)
     except InputError as error:
         raise InputError(f"{error}{_advice(str(error))}") from None
     if options.fields:

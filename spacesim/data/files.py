@@ -37,6 +37,8 @@ def as_path(value: object, name: str, expected: str = "a path") -> Path:
     """The path that an argument is, by its name. Raises InputError for what is none."""
     if not isinstance(value, str | os.PathLike):
         raise InputError(f"{name}: expected {expected}, found {value!r:.60}")
+    if "\0" in os.fspath(value):
+        raise InputError(f"{name}: expected a path without a null character, found {value!r:.60}")
     return Path(value)
 
 

@@ -40,10 +40,10 @@ def planes_repr(record: object, width: int, height: int) -> str:
     return f"{cls.__name__}({width} x {height} pixels: {', '.join(names)})"
 
 
-def _numbers(value: object) -> Array:
-    """As float64 of any shape, [0] of what is no array of numbers."""
+def as_numbers(value: object) -> Array:
+    """As float64 of any shape, [0] of what is no array of real numbers, as text is not."""
     try:
-        return np.asarray(value, np.float64)
+        return np.asarray(value, np.float64) if np.asarray(value).dtype.kind not in "USc" else np.zeros(0)
     except (TypeError, ValueError, OverflowError):
         return np.zeros(0)
 
@@ -61,7 +61,7 @@ class Camera:
     cy: float  #: principal point, pixels
 
     def __post_init__(self) -> None:
-        pose = _numbers(self.world_from_camera)
+        pose = as_numbers(self.world_from_camera)
         if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
             raise InputError(f"world_from_camera: expected a finite [4, 4] matrix, found shape {pose.shape}")
         rotation = pose[:3, :3]
@@ -72,11 +72,11 @@ class Camera:
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: expected a size of at least 1x1 pixels, found {self.width}x{self.height}")
         check_size(self.width, self.height, "camera")
-        lengths, centre = np.array([self.fx, self.fy]), np.array([self.cx, self.cy])
-        if not ((lengths >= 1 / MAX_FOCAL_LENGTH) & (lengths <= MAX_FOCAL_LENGTH)).all():
+        lengths, centre = as_numbers((self.fx, self.fy)), as_numbers((self.cx, self.cy))
+        if lengths.shape != (2,) or not ((lengths >= 1 / MAX_FOCAL_LENGTH) & (lengths <= MAX_FOCAL_LENGTH)).all():
             limit = f"above 0, at most {MAX_FOCAL_LENGTH:g} pixels"
             raise InputError(f"camera: expected focal lengths {limit}, found {self.fx} and {self.fy}")
-        if not (np.abs(centre) <= MAX_FOCAL_LENGTH).all():
+        if centre.shape != (2,) or not (np.abs(centre) <= MAX_FOCAL_LENGTH).all():
             raise InputError(f"camera: expected a principal point in pixels, found {self.cx}, {self.cy}")
         object.__setattr__(self, "world_from_camera", pose)
 
@@ -109,6 +109,10 @@ class Camera:
     def from_fov(world_from_camera: Array, width: int, height: int, fov_x_deg: float) -> "Camera":
         """A camera with square pixels, a centred principal point and a horizontal field of view in degrees. Raises
         InputError for a size or a field of view that no camera has."""
+        numbers = as_numbers((width, height, fov_x_deg))
+        if numbers.shape != (3,) or not np.isfinite(numbers).all():
+            found = f"{width!r} x {height!r} and {fov_x_deg!r}"
+            raise InputError(f"camera: expected a size in pixels and a field of view in degrees, found {found}")
         focal = 0.5 * width / np.tan(0.5 * np.radians(fov_x_deg))
         return Camera(world_from_camera, width, height, focal, focal, 0.5 * width, 0.5 * height)
 
@@ -124,7 +128,7 @@ class Camera:
         """A camera at `position` [3] that looks at `target` [3], metres, its picture upright towards `up`; see
         `from_fov`. Raises InputError where both are one place, too."""
         for name, place in (("position", position), ("target", target), ("up", up)):
-            if np.shape(place) != (3,) or not np.isfinite(np.asarray(place, np.float64)).all():
+            if as_numbers(place).shape != (3,) or not np.isfinite(as_numbers(place)).all():
                 raise InputError(f"{name}: expected three finite numbers, found {place!r}")
         if not np.linalg.norm(np.subtract(target, position)) > 0:
             raise InputError(f"position: expected another place than the target, found {np.asarray(position).tolist()}")
@@ -143,7 +147,7 @@ class Sun:
     direction: Array  #: [3] unit vector, world frame, from the scene towards the Sun
 
     def __post_init__(self) -> None:
-        direction = _numbers(self.direction)
+        direction = as_numbers(self.direction)
         if direction.shape != (3,) or not SUN_LENGTHS[0] <= np.abs(direction).max() <= SUN_LENGTHS[1]:
             raise InputError(f"sun direction: expected {SUN_WORDS}, found {self.direction}")
         object.__setattr__(self, "direction", normalize(direction))
@@ -152,7 +156,7 @@ class Sun:
     def from_angles(azimuth_deg: float, elevation_deg: float) -> "Sun":
         """Azimuth from +x towards +y, elevation from the xy plane, degrees (thesis 4.1). Raises InputError for numbers
         that are not finite, and for an elevation beyond 90."""
-        angles = _numbers((azimuth_deg, elevation_deg))
+        angles = as_numbers((azimuth_deg, elevation_deg))
         if angles.shape != (2,) or not (np.isfinite(angles[0]) and abs(angles[1]) <= 90):
             expected = "a finite azimuth and an elevation from -90 to 90 degrees"
             raise InputError(f"sun: expected {expected}, found {azimuth_deg!r} and {elevation_deg!r}")
@@ -164,7 +168,7 @@ class Sun:
         InputError for other numbers."""
         if value is None or isinstance(value, Sun):
             return value
-        numbers = _numbers(value)
+        numbers = as_numbers(value)
         if numbers.shape == (2,) and np.isfinite(numbers).all() and abs(numbers[1]) <= 90:
             return Sun.from_angles(float(numbers[0]), float(numbers[1]))
         if numbers.shape != (3,):

@@ -1,18 +1,20 @@
 """Plain values of a file to frozen dataclasses: the fields and their annotations are all that says what is allowed."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, wraps
+from inspect import signature
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NoReturn, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from spacesim.data.errors import InputError
 from spacesim.data.files import MAX_JSON_BYTES, JsonDict, JsonMapping, read_json
 from spacesim.data.toml import Document, Keys, dotted
 
+P = ParamSpec("P")
 T = TypeVar("T")
 _NOUNS = {int: "a whole number", float: "a finite number", bool: "true or false", str: "text in quotes"}
 
@@ -83,29 +85,26 @@ def alternatives(hint: object) -> dict[str, type]:
 
 def choices(hint: object) -> tuple[str, ...]:
     """What an annotation `Literal[...]`, or one with None beside it, allows; () of another."""
-    if get_origin(hint) is Literal:
-        return get_args(hint)
-    inner = get_args(hint) if get_origin(hint) in (Union, UnionType) else ()
-    return next((get_args(member) for member in inner if get_origin(member) is Literal), ())
+    return next((get_args(member) for member in members_of(hint) if get_origin(member) is Literal), ())
 
 
-def check_choices(record: object) -> None:
-    """Raise InputError "field: expected one of ..., found ..." unless every field of `record` that is annotated with
-    `Literal[...]` holds one of these words."""
+def check_fields(record: object) -> None:
+    """Raise InputError "field: expected ..., found ..." unless every field of `record` holds what its annotation says,
+    where that is a record or what a file can say."""
     cls: Any = type(record)
-    for name, allowed, may_lack in _choices_of(cls):
+    for name, types, words in _taken_by(cls):
         value = getattr(record, name)
-        if value not in allowed and not (value is None and may_lack):
-            raise InputError(
-                f"{name}: expected one of {', '.join(allowed)}, found {value!r}{did_you_mean(value, allowed)}"
-            )
+        if type(value) not in types and not (isinstance(value, str) and value in words):
+            field_value(cls, name, value)
 
 
 @cache
-def _choices_of(cls: type) -> list[tuple[str, tuple[str, ...], bool]]:
-    """(field, its words, whether None is allowed, too) of a dataclass's fields that have `choices`."""
-    hints = _hints(cls).items()
-    return [(name, words, NoneType in get_args(hint)) for name, hint in hints if (words := choices(hint))]
+def _taken_by(cls: type) -> list[tuple[str, set[Any], tuple[str, ...]]]:
+    """(field, types and words that need no closer look) of each field of a dataclass."""
+    return [
+        (name, {*members_of(hint), *([int] if float in members_of(hint) else [])}, choices(hint))
+        for name, hint in _hints(cls).items()
+    ]
 
 
 @cache
@@ -124,23 +123,65 @@ def keys_of(cls: type, rules: Rules) -> dict[str, Any]:
 def field_value(cls: type, name: str, value: object) -> Any:
     """`value`, given in Python, as the field `name` of a dataclass wants it: numpy's numbers and arrays as Python's,
     lists as tuples, records and what no file can say as they are. Raises InputError "name: expected ..., found ..."."""
-    hint = _hints(cls)[name]
-    members = {hint, *get_args(hint)}
+    return _python_value(_hints(cls)[name], name, value)
+
+
+def checked(function: Callable[P, T]) -> Callable[P, T]:
+    """`function`, which raises InputError "name: expected ..., found ..." for an argument that its annotation says to
+    be a number, several, true or false, or a function, and that is none."""
+    names = list(signature(function).parameters)
+
+    @cache
+    def hints() -> dict[str, Any]:
+        return {name: hint for name, hint in get_type_hints(function).items() if _is_checked(hint)}
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        for name, value in [*zip(names, args, strict=False), *kwargs.items()]:
+            if name in hints():
+                _python_value(hints()[name], name, value)
+        return function(*args, **kwargs)
+
+    return call
+
+
+def _is_checked(hint: object) -> bool:
+    """Whether `checked` looks at arguments of an annotation. Words are left to functions, which know them."""
+    members = [member for member in members_of(hint) if member is not NoneType]
+    if len(members) != 1 or members[0] is str or get_origin(members[0]) is Literal:
+        return False
+    return _is_plain(members[0]) or get_origin(members[0]) is Callable
+
+
+def _python_value(hint: Any, name: str, value: object) -> Any:
+    """As `field_value`, of any annotation."""
+    members = [member for member in members_of(hint) if member is not NoneType]
+    if value is None and NoneType in members_of(hint):
+        return None
     records = tuple(member for member in members if isinstance(member, type) and is_dataclass(member))
     if records:
-        if value is not None and not isinstance(value, records):
-            expected = " or ".join(sorted(record.__name__ for record in records))
-            raise InputError(f"{name}: expected a {expected}, found {_short(value)}")
+        expected, fits = f"a {' or '.join(sorted(record.__name__ for record in records))}", isinstance(value, records)
+    elif get_origin(members[0]) is Callable:
+        expected, fits = "a function", callable(value)
+    elif len(members) == 1 and _is_plain(members[0]):
+        return _Reader(Document("", {}, {}), Rules(), object).value(hint, _as_in_files(value), (name,))
+    else:
         return value
-    if not _is_plain(hint):
-        return value
-    return _Reader(Document("", {}, {}), Rules(), cls).value(hint, _as_in_files(value), (name,))
+    if not fits:
+        raise InputError(f"{name}: expected {expected}, found {_short(value)}")
+    return value
+
+
+def members_of(hint: object) -> tuple[Any, ...]:
+    """The members of an annotation that is a union, another annotation alone."""
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
 
 
 def _is_plain(hint: object) -> bool:
     """Whether a file can say all values of an annotation."""
-    inner = [member for member in get_args(hint) if member not in (NoneType, Ellipsis)]
-    return hint in _NOUNS or get_origin(hint) is Literal or (bool(inner) and all(map(_is_plain, inner)))
+    origin, inner = get_origin(hint), [member for member in get_args(hint) if member not in (NoneType, Ellipsis)]
+    holds = origin in (tuple, Mapping, Union, UnionType) and all(map(_is_plain, inner))
+    return hint in list(_NOUNS) or origin is Literal or holds
 
 
 def _as_in_files(value: object) -> object:
@@ -153,8 +194,7 @@ def places_of(cls: type, rules: Rules, at: Keys = ()) -> Iterator[Keys]:
     for kind in dict.fromkeys([cls, *rules.kinds.get(cls, {}).values()]):
         for key, hint in keys_of(kind, rules).items():
             yield (*at, key)
-            inner = [member for member in get_args(hint) if get_origin(hint) in (Union, UnionType)]
-            for table in (member for member in (hint, *inner) if isinstance(member, type) and is_dataclass(member)):
+            for table in (member for member in members_of(hint) if isinstance(member, type) and is_dataclass(member)):
                 yield from places_of(table, rules, (*at, key))
 
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-import spacesim
 from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, holds_files, read_json, remove_leftovers, write_json
@@ -22,6 +21,7 @@ from spacesim.data.lock import lock_folder
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
 from spacesim.data.toml import Document
+from spacesim.version import __version__
 
 KEEP_CHECKPOINTS = 2
 
@@ -138,7 +138,7 @@ def write_checkpoint(save: Callable[[Path], None], out: Path, iteration: int) ->
 
 def versions() -> dict[str, str]:
     """Versions of what the numbers depend on."""
-    packages = {"spacesim": spacesim.__version__, "drjit": version("drjit"), "numpy": np.__version__}
+    packages = {"spacesim": __version__, "drjit": version("drjit"), "numpy": np.__version__}
     return {**packages, "python": platform.python_version()}
 
 

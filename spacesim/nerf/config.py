@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.files import JsonDict, JsonMapping
-from spacesim.data.structure import Rules, check_choices, did_you_mean, plain, structure
+from spacesim.data.structure import Rules, check_fields, did_you_mean, plain, structure
 from spacesim.data.toml import Document, read_document
 
 Method = Literal["nerf", "nerf-relight"]
@@ -31,6 +31,7 @@ class GridConfig:
     log2_size: int = 15  #: vertices that a level stores at most, as a power of 2; beyond that they share by a hash
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_ranges(self, levels=(1, 32), coarsest=(1, 4096), log2_size=(4, 24))
         if self.finest is None:
             return
@@ -48,6 +49,7 @@ class ProposalConfig:
     grid: GridConfig = field(default_factory=lambda: GridConfig(4, 8, 64, 13))  #: where it stores what it knows
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_ranges(self, samples=(2, MAX_SAMPLES), width=(1, 256))
 
 
@@ -59,6 +61,7 @@ class NerfShadowConfig:
     bias: float = 0.03  #: of the box's longest side: where that ray begins, so that a surface does not shadow itself
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_ranges(self, samples=(0, MAX_SAMPLES), bias=(0, 1))
 
 
@@ -100,7 +103,7 @@ class NerfConfig:
     chunk: int = 8_192  #: rays that are drawn at once: bounds memory, changes no picture
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_fields(self)
         check_ranges(self, iterations=(1, MAX_STEPS), seed=(0, 2**63), checkpoint_every=(1, MAX_STEPS))
         check_ranges(self, rays=(CHUNK, MAX_RAYS), chunk=(CHUNK, MAX_RAYS), samples=(2, MAX_SAMPLES), width=(1, 1024))
         check_ranges(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from spacesim.data.errors import InputError
-from spacesim.data.structure import Rules, check_choices, structure
+from spacesim.data.structure import Rules, check_fields, structure
 from spacesim.data.toml import read_document
 from spacesim.eval.labels import HIGHER, LOWER, Metric
 
@@ -29,7 +29,7 @@ class Column:
     arrow: bool = True  #: whether the thesis says which way is better
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_fields(self)
 
     @property
     def comparison(self) -> str:
@@ -96,7 +96,7 @@ class Table:
     by_suns: bool = True  #: whether its numbers depend on the Suns of the test views
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_fields(self)
         metrics, names = {column.metric for column in self.columns}, {row.name for row in self.rows}
         for row in self.rows:
             if len(row.cells) != len(self.columns):

@@ -9,6 +9,7 @@ import numpy as np
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonValue
 from spacesim.data.records import Camera, Sun
+from spacesim.data.structure import checked
 from spacesim.serve.protocol import VERSION, arrays_of, import_zmq
 
 
@@ -17,6 +18,7 @@ class CameraClient:
     closes it. timeout: seconds to wait. Raises InputError where pyzmq is not installed, and for an address that is
     none."""
 
+    @checked
     def __init__(self, address: str = "tcp://127.0.0.1:5556", timeout: float = 60.0) -> None:
         zmq = import_zmq()
         self.address, self.timeout = address, timeout

@@ -20,7 +20,7 @@ from spacesim.backend.arrays import Bool
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
-from spacesim.data.structure import read_record
+from spacesim.data.structure import checked, read_record
 from spacesim.learning.folder import finished_model, read_described
 from spacesim.learning.prediction import Prediction, check_picture
 from spacesim.learning.record import TrainingRecord
@@ -198,6 +198,7 @@ class Run:
         """Tone curve and exposure (EV) of colours that are blended in linear light; None where they are sRGB values."""
         return self.light.config.curve if self.light else None
 
+    @checked
     def render(
         self, camera: Camera, sun: Sun | Sequence[float] | None = None, exposure: float | None = None
     ) -> "Rendering":

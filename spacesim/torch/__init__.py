@@ -8,7 +8,7 @@ Tensors on a CUDA device run on CUDA, others on the CPU, one of the two in a pro
 spinning and take cores from the kernels: `torch.set_num_threads(1)`.
 """
 
-from typing import TypedDict
+from typing import NoReturn, TypedDict, cast
 
 try:
     import torch
@@ -41,8 +41,24 @@ class Meta(TypedDict):
     n_cameras: int
 
 
+class _MissingEntryError(KeyError):
+    """An entry that `Meta` has not. Its message is a sentence as it is, not quoted."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+class _Entries(dict[str, object]):
+    """A `Meta` that says which entries it has where it is asked for another."""
+
+    def __missing__(self, name: str) -> NoReturn:
+        why = "; splats are not listed by tile" if name in OF_TILES else ""
+        raise _MissingEntryError(f"meta: expected one of {', '.join(self)}, found {name!r}{why}")
+
+
 Results = tuple[Tensor, Tensor, Meta]
 
+OF_TILES = ("isect_ids", "flatten_ids", "isect_offsets", "tiles_per_gauss")  #: entries of gsplat's alone
 MIN_ALPHA = 1e-10  #: by which "ED" divides at least, as gsplat
 
 
@@ -103,9 +119,9 @@ def rasterization(
     are int64 [M]; with packed=False [C, N, ...], radii 0 of what is not drawn, and None for the ids. Further width,
     height, n_cameras, n_batches, tile_size, tile_width and tile_height.
 
-    Raises ValueError for what is no tensor, for shapes that do not fit, for tensors on several devices, for a second
-    device in one process and for what is not supported, BackendError where the device's backend cannot run. Without
-    torch, importing this module raises ImportError.
+    Raises ValueError for what is no tensor, for numbers that cannot be, for shapes that do not fit, for tensors on
+    several devices, for a second device in one process and for what is not supported, BackendError where the device's
+    backend cannot run. Without torch, importing this module raises ImportError.
     """
     arguments.check_unsupported(
         {
@@ -127,16 +143,20 @@ def rasterization(
     arguments.check_choice("camera_model", camera_model, arguments.CAMERA_MODELS)
     sizes = {"width": width, "height": height, "tile_size": tile_size}
     width, height, tile_size = (arguments.checked_size(name, size) for name, size in sizes.items())
+    numbers = arguments.checked_numbers(
+        {"near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "eps2d": eps2d}
+    )
+    sh_degree = None if sh_degree is None else arguments.checked_whole("sh_degree", sh_degree)
     count, cameras = arguments.check_shapes(means, quats, scales, opacities, viewmats, Ks)
     arguments.check_colors(colors, backgrounds, sh_degree, render_mode, means, cameras)
     backend.select("cuda" if means.is_cuda else "llvm")
     settings = arguments.raster_settings(
         width=width,
         height=height,
-        near=float(near_plane),
-        far=float(far_plane),
-        radius_clip=float(radius_clip),
-        eps2d=float(eps2d),
+        near=numbers["near_plane"],
+        far=numbers["far_plane"],
+        radius_clip=numbers["radius_clip"],
+        eps2d=numbers["eps2d"],
         antialiased=rasterize_mode == "antialiased",
         ortho=camera_model == "ortho",
         degree=sh_degree,
@@ -188,7 +208,7 @@ def rasterization(
         "n_batches": 1,
         "n_cameras": cameras,
     }
-    return pictures, alphas, meta
+    return pictures, alphas, cast(Meta, _Entries(meta))
 
 
 def _finish_picture(picture: Tensor, alpha: Tensor, backgrounds: Tensor | None, render_mode: str) -> Tensor:

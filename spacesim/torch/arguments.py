@@ -1,10 +1,11 @@
 """What `rasterization` takes: checks with one sentence each, and what of a call is no tensor."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from operator import index
-from typing import SupportsIndex
+from typing import SupportsFloat, SupportsIndex
 
 from torch import Tensor
 
@@ -62,14 +63,38 @@ def check_choice(name: str, value: str, known: Sequence[str]) -> None:
 
 
 def checked_size(name: str, value: SupportsIndex) -> int:
-    """A size in pixels, also numpy's, as Python's number. Raises ValueError for what is no whole number above 0."""
-    try:
-        size = index(value)
-    except TypeError:
-        raise ValueError(f"{name}: expected a whole number, found {value!r:.60}") from None
+    """A size in pixels as Python's number. Raises ValueError for what is no whole number above 0."""
+    size = checked_whole(name, value)
     if size < 1:
         raise ValueError(f"{name}: expected at least 1, found {size}")
     return size
+
+
+def checked_whole(name: str, value: SupportsIndex) -> int:
+    """A whole number, also numpy's, as Python's. Raises ValueError for what is none."""
+    try:
+        return index(value)
+    except TypeError:
+        raise ValueError(f"{name}: expected a whole number, found {value!r:.60}") from None
+
+
+def checked_numbers(numbers: Mapping[str, SupportsFloat]) -> dict[str, float]:
+    """`near_plane`, `far_plane`, `radius_clip` and `eps2d`, also numpy's, as Python's numbers. Raises ValueError for
+    what is no number, for planes in no order and for a negative `eps2d`."""
+    checked = {}
+    for name, value in numbers.items():
+        try:
+            checked[name] = float("nan" if isinstance(value, str) else value)
+        except (TypeError, ValueError, OverflowError):
+            checked[name] = math.nan
+        if math.isnan(checked[name]):
+            raise ValueError(f"{name}: expected a number, found {value!r:.60}")
+    near, far, eps2d = checked["near_plane"], checked["far_plane"], checked["eps2d"]
+    if far < near:
+        raise ValueError(f"far_plane: expected at least near_plane, {near:g}, found {far:g}")
+    if not 0 <= eps2d < math.inf:
+        raise ValueError(f"eps2d: expected 0 or more, found {eps2d:g}")
+    return checked
 
 
 def check_shapes(
@@ -110,9 +135,11 @@ def check_shapes(
 
 
 def check_tensor(name: str, value: object) -> None:
-    """Raises ValueError for what is no tensor."""
+    """Raises ValueError for what is no tensor of real numbers."""
     if not isinstance(value, Tensor):
         raise ValueError(f"{name}: expected a tensor, found one of type {type(value).__name__}")
+    if value.is_complex():
+        raise ValueError(f"{name}: expected real numbers, found {value.dtype}")
     if value.device.type not in ("cpu", "cuda"):
         raise ValueError(f"{name}: expected a tensor on a CPU or on CUDA, found one on {value.device}")
 

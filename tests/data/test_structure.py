@@ -1,12 +1,14 @@
 """Plain values to records and back: words, alternatives, and how what is wrong is named."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
+import numpy as np
 import pytest
 
 from spacesim.data.errors import InputError
-from spacesim.data.structure import Rules, check_choices, plain, structure
+from spacesim.data.structure import Rules, check_fields, checked, plain, structure
 from spacesim.data.toml import Document
 
 
@@ -20,6 +22,11 @@ class Disc:
 class Box:
     kind: ClassVar[str] = "box"
     sides: tuple[float, float] = (1.0, 2.0)
+    count: int = 1
+    is_open: bool = False
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,7 @@ class Part:
     tag: Tag = field(default_factory=Tag)
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_fields(self)
 
 
 def read(values, **rules):
@@ -86,3 +93,51 @@ def test_choices_are_checked_on_construction():
         Part(colour="green")
     with pytest.raises(InputError, match="finish: expected one of matt, found 'wet'"):
         Part(finish="wet")
+
+
+@pytest.mark.parametrize(
+    ("cls", "fields", "said"),
+    [
+        (Box, {"sides": (1.0, "2")}, r"sides\[1\]: expected a finite number, found '2'"),
+        (Box, {"sides": 3}, "sides: expected a list of 2 numbers, found 3"),
+        (Box, {"count": 2.5}, "count: expected a whole number, found 2.5"),
+        (Box, {"count": True}, "count: expected a whole number, found True"),
+        (Box, {"is_open": "no"}, "is_open: expected true or false, found 'no'"),
+        (Part, {"shape": "disc"}, "shape: expected a Box or Disc, found 'disc'"),
+        (Part, {"shape": None}, "shape: expected a Box or Disc, found None"),
+        (Part, {"tag": {}}, "tag: expected a Tag, found a table"),
+    ],
+)
+def test_fields_are_checked_however_a_record_is_made(cls, fields, said):
+    with pytest.raises(InputError, match=f"^{said}$"):
+        cls(**fields)
+
+
+def test_numbers_of_numpy_are_fields():
+    Box(sides=np.ones(2), count=np.int64(3), is_open=np.bool_(True))
+    Box(sides=[1, np.float32(2)])
+
+
+@checked
+def cut(
+    part: Part, depth: float, /, name: str = "", *, times: int | None = None, on_end: Callable[[int], None] = print
+) -> int:
+    return times or 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "said"),
+    [
+        ((Part(), "1"), {}, "depth: expected a finite number, found '1'"),
+        ((Part(), float("nan")), {}, "depth: expected a finite number, found nan"),
+        ((Part(), 1), {"times": 2.5}, "times: expected a whole number, found 2.5"),
+        ((Part(), 1), {"on_end": 4}, "on_end: expected a function, found 4"),
+        ((Part(), 1), {"on_end": None}, "on_end: expected a function, found None"),
+    ],
+)
+def test_arguments_are_checked_by_their_annotations(arguments, options, said):
+    with pytest.raises(InputError, match=f"^{said}$"):
+        cut(*arguments, **options)
+    assert cut(Part(), np.float32(1), times=np.int64(3)) == 3
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'depth'"):
+        cut(Part())

@@ -294,7 +294,7 @@ GREY = np.full((SIZE, SIZE, 3), 0.5)
         ({"mask": np.ones((3, 3))}, r"mask: expected \[64, 64\] as the camera has it, found \[3, 3\]"),
         ({"mask": np.zeros((SIZE, SIZE))}, "mask: expected pixels that count, found none"),
         ({"within": (0, 0.05)}, r"within: expected degrees up to 60 .* found \(0, 0.05\)"),
-        ({"within": (np.nan, 0.05)}, "within: expected"),
+        ({"within": (np.nan, 0.05)}, r"within\[0\]: expected a finite number, found nan"),
         ({"within": 5}, "within: expected"),
         ({"starts": 0}, "starts: expected at least 1, found 0"),
         ({"camera": AWAY}, "camera: expected one that sees the model, found one before which it is not"),

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-import spacesim
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, SHADOW_LIT, SHADOW_SELF_CAST, FrameWriter
@@ -26,6 +25,7 @@ from spacesim.scenes.generation.moves import as_moved
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
+from spacesim.version import __version__
 
 MAX_THREADS = 16
 IN_FLIGHT = 1 << 30
@@ -80,7 +80,7 @@ def raw_suffixes(camera: CameraConfig) -> tuple[str, ...]:
 def versions() -> dict[str, str]:
     """Versions of what the pictures depend on."""
     packages = {name: version(name) for name in ("mitsuba", "drjit", "numpy", "trimesh")}
-    return {"spacesim": spacesim.__version__, "python": platform.python_version(), **packages}
+    return {"spacesim": __version__, "python": platform.python_version(), **packages}
 
 
 def cores() -> int:

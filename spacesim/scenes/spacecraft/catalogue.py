@@ -21,10 +21,14 @@ _BUILT_IN: dict[str, Callable[[], Spacecraft]] = {
 SPACECRAFT = tuple(_BUILT_IN)  #: names of the built-in spacecraft
 
 
-@cache
 def spacecraft(name: str) -> Spacecraft:
     """The built-in spacecraft called `name`, made once (a quarter of a second): its meshes are not to be changed.
     InputError lists the names where there is none."""
-    if name not in _BUILT_IN:
+    if not isinstance(name, str) or name not in _BUILT_IN:
         raise InputError(f"spacecraft: expected one of {', '.join(SPACECRAFT)}, found {name!r}")
+    return _make(name)
+
+
+@cache
+def _make(name: str) -> Spacecraft:
     return _BUILT_IN[name]()

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spacesim import __version__, backend
+from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonValue, holds_files, read_json, remove_leftovers, write_bytes, write_json
 from spacesim.data.images import read_png, write_exr, write_png
@@ -32,6 +32,7 @@ from spacesim.splat.compose.posed_scene import PosedScene, SceneFrame
 from spacesim.splat.compose.scene import ComposedPrediction
 from spacesim.splat.export.sweep import COLUMNS, MAX_TILES, SIDE, resize_camera, sky_mark
 from spacesim.splat.export.video import INSTALL, Video, encoder
+from spacesim.version import __version__
 
 SHOTS = "shots"
 PICTURES = {"rgb": ".png", "depth": ".exr", "id": ".png", "visibility": ".png"}

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 from spacesim.data.errors import InputError
 from spacesim.data.records import Camera, Sun
+from spacesim.data.structure import checked
 from spacesim.learning.rendering import Rendering, checked_sun
 from spacesim.splat.compose.path import (
     FPS,
@@ -65,6 +66,7 @@ class PosedScene:
         view = self.orbit.view(share) if self.orbit else self._view(self.camera, time)
         return SceneFrame(time, self.posed_at(time), view.of(self.camera) if view else self.camera, self.sun_at(time))
 
+    @checked
     def render(
         self,
         camera: Camera | None = None,

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from spacesim.data.errors import InputError
 from spacesim.data.images.tone import Tone
-from spacesim.data.structure import check_choices
+from spacesim.data.structure import check_fields
 from spacesim.splat.light.field import FieldConfig
 from spacesim.splat.light.shadow.cast import ShadowConfig
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
@@ -29,6 +29,7 @@ class LightConfig:
     exposure: float | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if not 0 <= self.bounce <= MAX_EMITTERS:
             raise InputError(f"bounce: expected 0 to {MAX_EMITTERS}, found {self.bounce}")
         if self.bounce and not self.field.surface:
@@ -39,7 +40,6 @@ class LightConfig:
         for name in ("tone", "exposure"):
             if getattr(self, name) is not None and not self.linear:
                 raise InputError(f"{name}: expected linear colours (light.linear = true), found sRGB values")
-        check_choices(self)
         if self.exposure is not None and not abs(self.exposure) <= MAX_EXPOSURE:
             raise InputError(f"exposure: expected -{MAX_EXPOSURE} to {MAX_EXPOSURE} EV, found {self.exposure}")
 

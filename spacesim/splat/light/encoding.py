@@ -10,7 +10,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float
 from spacesim.data.errors import check_ranges
 from spacesim.data.geometry import Array
-from spacesim.data.structure import check_choices
+from spacesim.data.structure import check_fields
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Encoding:
     degree: int = 4  #: of the harmonics, or how many octaves; 0 to 9
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_fields(self)
         check_ranges(self, degree=(0, 9))
 
     @property

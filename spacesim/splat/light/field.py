@@ -8,6 +8,7 @@ import drjit as dr
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, TensorXf
 from spacesim.data.errors import check_ranges
+from spacesim.data.structure import check_fields
 from spacesim.learning.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape
 from spacesim.learning.reflectance import COSINES, points_away, seen_side_normals, surface_cosines
 from spacesim.splat.light.encoding import Encoding
@@ -69,6 +70,7 @@ class FieldConfig:
     embeddings: int = 0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_ranges(self, features=(0, MAX_FEATURES), width=(1, MAX_WIDTH), layers=(1, MAX_LAYERS))
         check_ranges(self, embeddings=(0, MAX_FEATURES))
 

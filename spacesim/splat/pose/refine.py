@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, expect
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Image, Sun
+from spacesim.data.structure import checked
 from spacesim.learning.rendering import checked_sun
 from spacesim.splat.pose.covariance import uncertainty
 from spacesim.splat.pose.motion import Pivot
@@ -57,6 +58,7 @@ class RefinedPose:
     iterations: int  #: steps of all starts and sizes
 
 
+@checked
 def refine_pose(
     run: Predictor,
     image: str | Path | ArrayLike | Image,
@@ -95,7 +97,7 @@ def refine_pose(
     run = check_gaussians(run)
     direction = checked_sun(sun, run.relightable, f"a run of {run.config['method']}")
     target, counts = checked_picture(image, mask, camera)
-    _check_numbers(within, starts)
+    _check_numbers(within, starts, seed)
     check_picture(camera)
     drawing = SunlitRun.of(run, direction)
     pivot = Pivot.of(drawing, camera, within)
@@ -134,9 +136,9 @@ def _find_starts(level: PyramidLevel, gain: float, starts: int, seed: int) -> li
     return [candidates[k][0] for k in order[:starts]]
 
 
-def _check_numbers(within: tuple[float, float], starts: int) -> None:
+def _check_numbers(within: tuple[float, float], starts: int, seed: int) -> None:
     numbers = np.asarray(within, np.float64)
     if numbers.shape != (2,) or not (0 < numbers[0] <= 60 and 0 < numbers[1] <= 0.5):
         raise InputError(f"within: expected degrees up to 60 and a share of the distance up to 0.5, found {within}")
-    if starts < 1:
-        raise InputError(f"starts: expected at least 1, found {starts}")
+    expect(starts >= 1, "starts", "at least 1", starts)
+    expect(seed >= 0, "seed", "0 or more", seed)

@@ -16,6 +16,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, fibonacci_sphere, look_at
 from spacesim.data.images import luminance
 from spacesim.data.records import Camera, Image, Sun
+from spacesim.data.structure import checked
 from spacesim.learning.rendering import checked_sun
 from spacesim.splat.pose.motion import twist_between
 from spacesim.splat.pose.picture import GAINS, SunlitRun, checked_picture, reduced
@@ -131,6 +132,7 @@ class ModelViews:
         return replace(camera, world_from_camera=pose)
 
 
+@checked
 def find_pose(
     run: Predictor,
     image: str | Path | ArrayLike | Image,

@@ -13,6 +13,8 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Array4f, ArrayXf, Float, NumberT, UInt32
 from spacesim.backend.upload import upload, upload_rows
+from spacesim.data.errors import expect
+from spacesim.data.structure import checked
 
 SH_C0 = 0.28209479177387814  #: Y_00, the constant spherical harmonic
 NAMES = ("means", "log_scales", "quaternions", "logit_opacities", "sh")
@@ -106,11 +108,14 @@ class Gaussians:
         return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
 
     @staticmethod
+    @checked
     def random(count: int, radius: float, scale: float, seed: int = 0) -> "Gaussians":
         """`count` grey, half-transparent balls, evenly within a sphere of `radius` metres about the origin; scale:
-        their standard deviation, metres. Raises ValueError for numbers that no Gaussians have."""
-        if count < 0 or not (0 < radius < np.inf and 0 < scale < np.inf):
-            raise ValueError(f"count, radius, scale: expected finite numbers above 0, found {count}, {radius}, {scale}")
+        their standard deviation, metres. Raises InputError for numbers that no Gaussians have."""
+        for name, number in (("count", count), ("seed", seed)):
+            expect(number >= 0, name, "0 or more", number)
+        for name, metres in (("radius", radius), ("scale", scale)):
+            expect(metres > 0, name, "metres above 0", metres)
         rng = np.random.default_rng(seed)
         directions = rng.normal(size=(count, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)

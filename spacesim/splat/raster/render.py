@@ -3,13 +3,14 @@
 What a picture shows beside colour is blended as features of the Gaussians: `blend` takes any number of them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float
+from spacesim.data.structure import checked
 from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.blend import rasterize
 from spacesim.splat.raster.cameras import Projection
@@ -22,6 +23,7 @@ from spacesim.splat.raster.tiles import TileLists
 FEATURES_PER_PASS = 16  #: features in one pass: fewer repeat the blending, more gain little
 
 
+@checked
 def render(
     gaussians: Gaussians,
     camera: Projection,
@@ -39,10 +41,16 @@ def render(
     antialiased: see `project`
     Raises ValueError for another output or degree, or features of another length.
     """
-    unknown = [outputs] if isinstance(outputs, str) else [name for name in outputs if name not in OUTPUTS]
+    alone = isinstance(outputs, str) or not isinstance(outputs, Iterable)
+    unknown = [outputs] if alone else [name for name in outputs if name not in OUTPUTS]
     if unknown:
         raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
-    feature_list = [] if features is None else [ad.Float(feature) for feature in features]
+    if not isinstance(antialiased, bool | dr.ArrayBase):
+        raise ValueError(f"antialiased: expected true or false, found {antialiased!r}")
+    try:
+        feature_list = [] if features is None else [ad.Float(feature) for feature in features]
+    except TypeError:
+        raise ValueError(f"features: expected arrays of {gaussians.count}, found {features!r:.60}") from None
     wrong_widths = [dr.width(feature) for feature in feature_list if dr.width(feature) not in (1, gaussians.count)]
     if wrong_widths:
         raise ValueError(f"features: expected arrays of {gaussians.count}, found one of {wrong_widths[0]}")

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.files import JsonDict, JsonMapping
-from spacesim.data.structure import Rules, alternatives, check_choices, did_you_mean, plain, structure
+from spacesim.data.structure import Rules, alternatives, check_fields, did_you_mean, plain, structure
 from spacesim.data.toml import Document, read_document
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.shadow.cast import SplattingConfig
@@ -49,8 +49,8 @@ WEIGHTS = (
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes; those of the Gaussians are splatfacto's. Those of the means and the networks fall
-    exponentially; that of the means is per metre of scene scale."""
+    """Adam's step sizes; those of the Gaussians are splatfacto's. Those of the means, the features and the networks
+    fall exponentially; that of the means is per metre of scene scale."""
 
     means: float = 1.6e-4  #: of the centres, at the start
     means_final: float = 1.6e-6  #: of the centres, at the end
@@ -59,9 +59,9 @@ class LearningRates:
     logit_opacities: float = 5e-2  #: of the opacities' logits
     sh_constant: float = 2.5e-3  #: of the constant term of spherical harmonics
     sh_rest: float = 1.25e-4  #: of their other terms
-    #: of what each Gaussian has for the networks of light, and at the start of the pictures' embeddings, whose falls as
-    #: the networks' does
+    #: of what each Gaussian has for the networks of light, and of the pictures' embeddings, at the start
     features: float = 2e-2
+    features_final: float = 2e-2  #: of the Gaussians' features, at the end; the embeddings' falls as the networks' does
     networks: float = 3e-3  #: of their weights, at the start
     networks_final: float = 3e-4  #: of their weights, at the end
     #: of the pictures' poses (`refine_poses`), radians and shares of the distance, at first; falls to a hundredth
@@ -72,6 +72,7 @@ class LearningRates:
     gains: float = 5e-2
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for f in fields(self):
             check_ranges(self, **{f.name: (0, MAX_LEARNING_RATE)})
 
@@ -123,8 +124,8 @@ class TrainConfig:
     strategy: StrategyConfig = field(default_factory=DefaultStrategyConfig)  #: chooses what grows and what is pruned
 
     def __post_init__(self) -> None:
+        check_fields(self)
         object.__setattr__(self, "method", _method_of(self.light))
-        check_choices(self)
         if self.init_box is not None and not 0 < self.init_box <= MAX_BOX:
             raise InputError(f"init_box: expected a number above 0, at most {MAX_BOX:g}, found {self.init_box}")
         if self.init_box is not None and self.init != "random":

@@ -297,7 +297,8 @@ class Trainer(TrainingLoop):
             means = self.config.warm_start.means_rate(index, means, self._start_radius)
         shape = [means] * 3 + [rates.log_scales] * 3 + [rates.quaternions] * 4 + [rates.logit_opacities]
         if self.gaussians.features is not None:
-            return [*shape, rates.features]
+            done = index / self.config.iterations
+            return [*shape, rates.features ** (1 - done) * rates.features_final**done]
         return shape + [rates.sh_constant] * 3 + [rates.sh_rest] * (len(self.gaussians.sh) - 3)
 
     def means_rate(self, index: int) -> float:

@@ -13,6 +13,7 @@ from spacesim.backend.arrays import Array3f, Bool, Float
 from spacesim.backend.upload import upload, upload_rows
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.images import luminance
+from spacesim.data.structure import check_fields
 from spacesim.splat.raster.cameras import NEAR, Pinhole
 from spacesim.splat.raster.gaussians import Gaussians, stack_rows
 from spacesim.splat.train.optimizer.adam import Adam
@@ -46,6 +47,7 @@ class WarmStartConfig:
     opacity_scale: float = 0.5  #: table 5.7, of that threshold
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if not self.reach > 0:
             raise InputError(f"reach: expected a number above 0, found {self.reach}")
         check_ranges(self, rescue=(0, 1), least_seen=(0, MAX_STEPS))

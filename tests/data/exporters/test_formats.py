@@ -122,7 +122,7 @@ def test_yolo_lines_say_masks_boxes_and_keypoints(labelled, truth, tmp_path):
 
 
 def test_webdataset_reads_back_by_the_real_library(labelled, truth, tmp_path):
-    webdataset = pytest.importorskip("webdataset")
+    webdataset = pytest.importorskip("webdataset", reason="webdataset (extra: readers) is not installed")
     assert write_webdataset(labelled, tmp_path / "shards") == 2
     write_webdataset(labelled, tmp_path / "again")
     assert contents(tmp_path / "again") == contents(tmp_path / "shards")

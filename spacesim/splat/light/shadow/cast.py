@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.data.errors import InputError, check_ranges
-from spacesim.data.structure import check_choices
+from spacesim.data.structure import check_fields
 from spacesim.splat.light.shadow.bias import Bias, grazing_bias, offset_receivers, receiver_bias
 from spacesim.splat.light.shadow.clusters import occlusion_in_clusters
 from spacesim.splat.light.shadow.light_camera import fit_camera
@@ -42,6 +42,7 @@ class SplattingConfig:
     baseline: bool = field(default=False, metadata={"option": False})
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_ranges(self, beta_min=(LEAST_BETA, 0.5))
 
 
@@ -67,7 +68,7 @@ class ShadowConfig:
     between: Literal["others", "ratio"] = "others"
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_fields(self)
         if not 4 <= self.size <= MAX_LIGHT_SIZE:
             raise InputError(f"size: expected 4 to {MAX_LIGHT_SIZE} pixels, found {self.size}")
         if not 0 <= self.reach < math.inf:

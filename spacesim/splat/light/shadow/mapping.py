@@ -14,7 +14,7 @@ import drjit as dr
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.data.errors import InputError
-from spacesim.data.structure import check_choices
+from spacesim.data.structure import check_fields
 from spacesim.splat.light.shadow.light_camera import drawable_mask
 from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.blend import blend_lists
@@ -56,7 +56,7 @@ class MappingConfig:
     antialiased: bool = True
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_fields(self)
         for name in ("radius", "widest"):
             if not 0.5 <= getattr(self, name) <= MAX_WINDOW:
                 raise InputError(f"{name}: expected 0.5 to {MAX_WINDOW} pixels, found {getattr(self, name)}")

@@ -7,7 +7,7 @@ import drjit as dr
 
 from spacesim.backend.arrays import Array3f, Float
 from spacesim.data.errors import check_ranges
-from spacesim.data.structure import check_choices
+from spacesim.data.structure import check_fields
 from spacesim.learning.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape, sigmoid
 from spacesim.splat.light.encoding import Encoding
 
@@ -30,8 +30,8 @@ class ShadowRefinementConfig:
     residual: bool = True
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_ranges(self, features=(0, MAX_FEATURES), width=(1, MAX_WIDTH), layers=(1, MAX_LAYERS), positional=(0, 9))
-        check_choices(self)
 
     @property
     def shape(self) -> MlpShape:

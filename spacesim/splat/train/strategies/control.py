@@ -15,7 +15,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Bool, Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError, check_ranges
-from spacesim.data.structure import check_choices
+from spacesim.data.structure import check_fields
 from spacesim.splat.raster.gaussians import Gaussians, stack_rows
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.strategies.densify import DensificationCounts, append_copies, grow, limit_opacities, prune
@@ -45,7 +45,7 @@ class DensificationConfig:
     screen_size_stop: int = 15_000  #: iterations; until then screen sizes split and, after the first reset, prune
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_fields(self)
         if self.max_gaussians < 1:
             raise InputError(f"max_gaussians: expected at least 1, found {self.max_gaussians}")
         if not 0 < self.prune_opacity < 0.5:  # a reset lowers to twice as much

@@ -14,6 +14,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Bool, Float, UInt64
 from spacesim.backend.upload import upload, upload_rows
 from spacesim.data.errors import InputError, check_ranges
+from spacesim.data.structure import check_fields
 from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes, stack_rows
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.strategies.control import DensificationConfig
@@ -39,6 +40,7 @@ class McmcConfig:
     noise: float = 5e5  #: lambda_noise of the paper's code, for scenes as large as 1
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if not 0 < self.min_opacity < 1:
             raise InputError(f"min_opacity: expected a number above 0 and below 1, found {self.min_opacity}")
         check_ranges(self, growth=(0, 100), noise=(0, 1e12))

@@ -15,6 +15,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float
 from spacesim.data.errors import InputError, WorkError, check_ranges
 from spacesim.data.mesh import SignedDistance
+from spacesim.data.structure import check_fields
 from spacesim.splat.raster.gaussians import Gaussians, stack_rows
 from spacesim.splat.train.strategies.control import (
     DensificationConfig,
@@ -41,6 +42,7 @@ class MeshAwareConfig:
     protect_interior: bool = True  #: from weak pruning, as what is near the surface
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if not 0 < self.boundary_ease <= 1:
             raise InputError(f"boundary_ease: expected a number in (0, 1], found {self.boundary_ease}")
         check_ranges(

@@ -9,6 +9,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float
 from spacesim.data.errors import InputError, check_ranges
+from spacesim.data.structure import check_fields
 from spacesim.splat.raster.gaussians import Gaussians, stack_rows
 from spacesim.splat.train.strategies.control import (
     DensificationConfig,
@@ -45,6 +46,7 @@ class SupportAwareConfig:
     min_cloud: int = 16  #: table 5.3, Gaussians in a supported cloud
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if not 0 <= self.decay < 1:
             raise InputError(f"decay: expected a number from 0 to below 1, found {self.decay}")
         if not 0 < self.ease <= 1:
