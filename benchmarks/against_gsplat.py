@@ -17,9 +17,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import common
 import drjit as dr
 import numpy as np
+from support import common
 
 from spacesim import backend
 from spacesim.backend import ad
@@ -40,7 +40,7 @@ from spacesim.splat.train.trainer import Trainer
 try:
     import gsplat
     import torch
-    from peer_gsplat import Tensors, rasterize, similarity_of
+    from support.peer_gsplat import Tensors, rasterize, similarity_of
 except ImportError as error:
     MISSING: ImportError | None = error
 else:

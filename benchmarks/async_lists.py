@@ -13,9 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import common
 from light import SUNS
-from synthetic import still_trainer, write_dataset
+from support import common
+from support.synthetic import still_trainer, write_dataset
 
 from spacesim import backend
 from spacesim.data.errors import InputError

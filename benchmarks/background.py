@@ -11,8 +11,8 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import common
 import numpy as np
+from support import common
 
 from spacesim import backend
 from spacesim.data.images import load_image

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import common
 import shadows
+from support import common
 
 from spacesim import backend
 from spacesim.data.records import Dataset

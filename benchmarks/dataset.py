@@ -19,9 +19,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import common
 import drjit as dr
 import numpy as np
+from support import common
 
 from spacesim import backend
 from spacesim.data.errors import InputError

@@ -16,9 +16,9 @@ import tempfile
 import time
 from pathlib import Path
 
-import common
 import numpy as np
 from PIL import Image
+from support import common
 
 from spacesim import backend
 from spacesim.cli.parser import resolution

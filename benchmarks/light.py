@@ -14,10 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import common
 import drjit as dr
 import numpy as np
-import synthetic
+from support import common, synthetic
 
 from spacesim import backend
 from spacesim.data.geometry import fibonacci_sphere

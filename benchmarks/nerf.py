@@ -19,10 +19,10 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import common
 import drjit as dr
 import numpy as np
 from rasterizer import load_peer
+from support import common
 
 from spacesim import backend, methods
 from spacesim.data.records import Dataset, Frame
@@ -61,7 +61,7 @@ def main() -> None:
     rows = [
         {"": f"spacesim, {options.preset}", **trained_row(step_time(data, run, options.repeats), duration, run, data)}
     ]
-    if options.peers and load_peer(options.peers, name, "peer_nerfacc"):
+    if options.peers and load_peer(options.peers, name, "support.peer_nerfacc"):
         rows += measured_apart(data, options.rays, config.iterations, options.repeats)
     frames = list(frame_rows(run, data, options.pixels))
     tables = {"Training": rows, f"A frame of {options.pixels} pixels": frames}
@@ -89,7 +89,7 @@ def measured_apart(data: Dataset, *sizes: int) -> list[common.Row]:
 
 
 def peer_row(data: Dataset, rays: int, iterations: int, repeats: int) -> common.Row:
-    from peer_nerfacc import Training
+    from support.peer_nerfacc import Training
 
     theirs = Training(data, rays, iterations)
     start = time.perf_counter()

@@ -19,9 +19,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import common
 import numpy as np
 from scipy.spatial.transform import Rotation
+from support import common
 
 from spacesim import backend
 from spacesim.data.errors import InputError

@@ -17,10 +17,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 
-import common
 import numpy as np
 from pose import WRONG, arguments, data_and_run, errors
 from scipy.spatial.transform import Rotation
+from support import common
 
 from spacesim import backend
 from spacesim.data.errors import InputError

@@ -15,9 +15,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import common
 import numpy as np
 from scipy.spatial.transform import Rotation
+from support import common
 
 from spacesim import backend
 from spacesim.data.files import read_json

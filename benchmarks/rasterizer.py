@@ -16,9 +16,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import common
-import growth
-from pipeline import Pipeline, arguments_of
+from support import common, growth
+from support.pipeline import Pipeline, arguments_of
 
 from spacesim import backend
 from spacesim.data.files import write_bytes
@@ -57,7 +56,7 @@ def main() -> None:
         write_bytes(options.plot, growth.plot("project + bin + forward + backward, kernels", points).encode())
 
 
-def load_peer(wanted: str | None, name: str, module: str = "peer_gsplat") -> Any:
+def load_peer(wanted: str | None, name: str, module: str = "support.peer_gsplat") -> Any:
     """The module, or None with a line that says why it is not measured."""
     if wanted is None:
         return None

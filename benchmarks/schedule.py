@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import common
 import numpy as np
+from support import common
 
 from spacesim import backend
 from spacesim.data.files import read_json, write_bytes, write_json

@@ -16,8 +16,8 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-import common
 import numpy as np
+from support import common
 
 from spacesim import backend
 from spacesim.data.errors import WorkError

@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import common
+from support import common
 
 from spacesim import backend
 from spacesim.data.store import read_dataset

@@ -12,9 +12,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import common
 import numpy as np
 from scipy.ndimage import gaussian_filter
+from support import common
 
 from spacesim import backend
 from spacesim.data.exporters import write_speedplus

@@ -14,8 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import common
 import numpy as np
+from support import common
 
 from spacesim import backend
 from spacesim.data.store import read_dataset

@@ -14,10 +14,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import common
 import drjit as dr
 import numpy as np
 from rasterizer import load_peer
+from support import common
 
 from spacesim import backend
 from spacesim.backend.arrays import Float

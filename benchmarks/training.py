@@ -21,14 +21,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import common
-import counters
-import floors
-import growth
-import peer_opensplat
-from pipeline import SSIM_WEIGHT, Pipeline
 from rasterizer import load_peer
-from synthetic import NEVER, STILL, still_trainer, write_dataset
+from support import common, counters, floors, growth, peer_opensplat
+from support.pipeline import SSIM_WEIGHT, Pipeline
+from support.synthetic import NEVER, STILL, still_trainer, write_dataset
 
 from spacesim import backend
 from spacesim.data.files import write_bytes

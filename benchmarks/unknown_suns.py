@@ -14,9 +14,9 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-import common
 import numpy as np
 import speedplus_data
+from support import common
 
 from spacesim import backend
 from spacesim.data.files import read_json

@@ -22,8 +22,8 @@ from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
-import common
 import numpy as np
+from support import common
 
 from spacesim import backend
 from spacesim.data.errors import InputError, WorkError

@@ -27,10 +27,10 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import common
 import numpy as np
 import visitor
 from PIL import Image
+from support import common
 
 from spacesim import backend
 from spacesim.data.errors import InputError, WorkError

@@ -101,13 +101,13 @@ def small_lit(tmp_path_factory) -> Path:
 
 
 def test_rows_are_named_with_commas_in_them():
-    import common
+    from support import common
 
     assert common.row_names("none,map, no bias,ours") == ["none", "map, no bias", "ours"]
 
 
 def points_of(time):
-    import growth
+    from support import growth
 
     sizes = [(1_000, 64, 3_000), (10_000, 64, 20_000), (100_000, 64, 150_000), (10_000, 256, 60_000)]
     return [growth.Point(n, side, pairs, time(n, side, pairs)) for n, side, pairs in sizes]
@@ -115,13 +115,13 @@ def points_of(time):
 
 @pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
 def test_slope_is_the_exponent(power):
-    import growth
+    from support import growth
 
     assert growth.slope(points_of(lambda n, side, pairs: 3 * pairs**power)) == pytest.approx(power)
 
 
 def test_linear_model_finds_the_parts_it_is_made_of_and_its_own_failure():
-    import growth
+    from support import growth
 
     linear = points_of(lambda n, side, pairs: 0.5 + 40e-6 * pairs + 7e-6 * n + 2e-6 * side**2)
     parts, worst = growth.model(linear)
@@ -131,7 +131,7 @@ def test_linear_model_finds_the_parts_it_is_made_of_and_its_own_failure():
 
 
 def test_plot_has_a_mark_for_each_measurement():
-    import growth
+    from support import growth
 
     points = points_of(lambda n, side, pairs: 1e-4 * pairs)
     root = ElementTree.fromstring(growth.plot("time <&>", points))
@@ -145,7 +145,7 @@ def test_plot_has_a_mark_for_each_measurement():
 
 
 def test_quartiles_and_tables():
-    import common
+    from support import common
 
     timing = common.Timing.of(np.arange(1, 10) * 1e-3)
     assert (timing.low, timing.median, timing.high, timing.least) == pytest.approx((3, 5, 7, 1))
@@ -157,7 +157,7 @@ def test_quartiles_and_tables():
 
 @pytest.mark.parametrize("text", ["12", "axb", "100x0", "1x2x3", ""])
 def test_sizes_that_are_none_are_refused(text):
-    import common
+    from support import common
 
     with pytest.raises(SystemExit, match="--sizes: expected"):
         common.parse_sizes(text)
@@ -172,8 +172,8 @@ def test_sizes_that_are_none_are_refused(text):
     ],
 )
 def test_what_cannot_be_measured_is_refused(arguments, sentence, monkeypatch, capsys):
-    import common
     import training
+    from support import common
 
     monkeypatch.setattr(sys, "argv", ["training.py", *arguments])
     with pytest.raises(SystemExit) as ended:
@@ -182,8 +182,8 @@ def test_what_cannot_be_measured_is_refused(arguments, sentence, monkeypatch, ca
 
 
 def test_measurements_are_printed_before_an_unwritable_file_fails(tmp_path, monkeypatch, capsys):
-    import common
     import rasterizer
+    from support import common
 
     (tmp_path / "file").write_text("")
     for option in ("--json", "--plot"):
@@ -206,8 +206,7 @@ def stand_in(path: Path, start: float, step: float) -> Path:
 
 def test_opensplat_is_timed_without_its_start(tmp_path):
     """A program that needs half a second to start and 5 ms a step."""
-    import peer_opensplat
-    import synthetic
+    from support import peer_opensplat, synthetic
 
     binary = stand_in(tmp_path / "opensplat", start=0.5, step=0.005)
     dataset = synthetic.write_dataset(tmp_path / "data", 50, 16, views=2)
@@ -582,7 +581,7 @@ def test_background_tells_both(command, small_lit, place):
 
 def test_background_of_a_model_that_shows_nothing(small_lit):
     import background
-    import common
+    from support import common
 
     from spacesim.splat.raster.gaussians import Gaussians
 

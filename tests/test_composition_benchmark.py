@@ -39,7 +39,7 @@ def test_rows_by_kind_and_by_name():
     ],
 )
 def test_what_cannot_be_is_refused(benchmark, arguments, sentence, monkeypatch, capsys):
-    import common
+    from support import common
 
     monkeypatch.setattr(sys, "argv", [f"{benchmark}.py", *arguments, *(["--out", "x"] * (benchmark == "composition"))])
     if benchmark == "viewer":

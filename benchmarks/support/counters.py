@@ -9,12 +9,12 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from common import Row, resident, sphere_arrays
-from synthetic import still_trainer, write_dataset
 
 from spacesim import backend
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.trainer import Trainer
+from support.common import Row, resident, sphere_arrays
+from support.synthetic import still_trainer, write_dataset
 
 SCENE = 2_000, 64  #: Gaussians and pixels of the run over many steps
 MAX_GAUSSIANS = 6_000  #: Gaussians that refinement may reach in it

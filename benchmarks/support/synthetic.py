@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import camera_from, sphere_arrays
 
 from spacesim.data.files import write_json
 from spacesim.data.geometry import fibonacci_sphere
@@ -17,6 +16,7 @@ from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import LearningRates, TrainConfig
 from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.trainer import Trainer
+from support.common import camera_from, sphere_arrays
 
 VIEWS = 8
 NEVER = 10**9  #: iterations

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import common
 import drjit as dr
-from pipeline import Pipeline
-from synthetic import still_trainer, write_dataset
 
 from spacesim.backend import ad, select
+from support import common
+from support.pipeline import Pipeline
+from support.synthetic import still_trainer, write_dataset
 
 FLOAT = 4
 ROWS = 3 + 3 + 4 + 1 + 48  #: parameters of a Gaussian at SH 3
