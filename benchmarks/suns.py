@@ -3,10 +3,9 @@
     python benchmarks/suns.py --out OUT [--pictures 640] [--suns 4,16,64,640] [--resolution 256] [--samples 1024]
                               [--method shadow-splat] [--preset fast] [--iterations N] [--seeds 1] [--json]
 
-boxsat. Every row has as many training pictures, of few Suns with many views each or of many
-with few, and is evaluated on the same views under 8 Suns that no row has seen: PSNR over the silhouette, BER by
-brightness, errors of the predicted shadow masks. With several seeds, of training: mean and standard deviation. What is
-done already is not done again.
+boxsat. Every row has as many training pictures, of few Suns with many views each or of many with few, and is evaluated
+on the same views under 8 Suns that no row has seen: PSNR over the silhouette, BER by brightness, errors of the predicted
+shadow masks. With several seeds, of training: mean and standard deviation. What is done already is not done again.
 """
 
 from collections.abc import Iterator
@@ -43,8 +42,9 @@ def main() -> None:
     parser.add_argument("--iterations", type=common.positive, help="default: the preset's")
     parser.add_argument("--seeds", type=common.positive, default=1, help="trainings a row (1)")
     options = parser.parse_args()
-    counts = [int(word) for word in options.suns.split(",") if word.isdigit()]
-    if not counts or any(count < 1 or options.pictures % count for count in counts):
+    words = options.suns.split(",")
+    counts = [int(word) if word.isdigit() else 0 for word in words]
+    if any(count < 1 or options.pictures % count for count in counts):
         parser.error(f"--suns: expected numbers that divide {options.pictures} pictures, found {options.suns!r}")
     backend.select(options.backend)
     rows = list(rows_of(counts, options))
