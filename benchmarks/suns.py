@@ -4,8 +4,9 @@
                               [--method shadow-splat] [--preset fast] [--iterations N] [--seeds 1] [--json]
 
 boxsat. Every row has as many training pictures, of few Suns with many views each or of many with few, and is evaluated
-on the same views under 8 Suns that no row has seen: PSNR over the silhouette, BER by brightness, errors of the predicted
-shadow masks. With several seeds, of training: mean and standard deviation. What is done already is not done again.
+on the same views under 8 Suns that no row has seen: PSNR over the silhouette, BER by brightness, errors of the
+predicted shadow masks. With several seeds, of training: mean and standard deviation. What is done already is not done
+again.
 """
 
 from collections.abc import Iterator

@@ -350,7 +350,7 @@ BOXSAT = '[[objects]]\nspacecraft = "boxsat"\n'
         ),
         (
             BOXSAT + "[materials.x]\npreset = 'white-paint'\nalbedo = 0.95",
-            ", line 5: materials.x.albedo: expected at most 0.9 for white-paint, whose coat adds its gloss, found 0.95",
+            ", line 5: materials.x.albedo: expected at most 0.9 under a coat, which adds its gloss, found 0.95",
         ),
         (BOXSAT + "[quality]\nspp = 9999999", ", line 4: quality.spp: expected at most 1,000,000, found 9999999"),
         (BOXSAT + "[quality]\nmax_depth = 2000", ", line 4: quality.max_depth: expected at most 1,000, found 2000"),

@@ -5,20 +5,20 @@ A material's albedo is its spectrum weighted with sunlight and the camera's resp
 perfectly smooth, because a mirror never meets a directional Sun.
 """
 
-import importlib
 import math
-import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
+from spacesim.data.structure import Rules, check_fields, structure
+from spacesim.data.toml import Document, read_document
 from spacesim.scenes.materials import textures
 
 Color = tuple[float, float, float]
@@ -163,6 +163,23 @@ class MaterialPreset:
     tile: float | None = None  #: metres that one repeat of the pictures covers
     spectrum: tuple[tuple[float, float], ...] = ()  #: (wavelength in nm, reflectance), which the albedo follows from
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+        _check_unit("albedo", self.albedo)
+        if self.kind == "coated" and max(self.albedo) > WHITEST:
+            raise InputError(
+                f"albedo: expected at most {WHITEST:g} under a coat, which adds its gloss, found {max(self.albedo):g}"
+            )
+        for key, (low, high) in LIMITS.items():
+            value = getattr(self, key)
+            if value is not None and not low <= value <= high:
+                raise InputError(f"{key}: expected a number from {low:g} to {high:g}, found {value}")
+        if self.kind != "diffuse" and self.roughness is None:
+            raise InputError(f"roughness: expected a number, as {self.kind} surfaces have one, found none")
+        for key, names in (("normals", NORMALS), ("pattern", PATTERNS)):
+            if getattr(self, key) not in (None, *names):
+                raise InputError(f"{key}: expected one of {', '.join(names)}, found {getattr(self, key)!r}")
+
     def material(self, name: str) -> Material:
         """The row as a Material of that name."""
         if self.kind == "coated":
@@ -181,6 +198,7 @@ class MaterialPreset:
 
 NORMALS = {"crinkle": textures.crinkle, "grain": textures.grain}
 PATTERNS = {"cells": textures.cells}
+LIMITS = {"roughness": (0.01, 1.0), "ior": (1.001, 4.0), "tile": (1e-6, 1e6)}  #: of what a row has of these
 
 
 def _with_pattern(plain: Material, pattern: str) -> Material:
@@ -194,19 +212,14 @@ def _with_pattern(plain: Material, pattern: str) -> Material:
 
 @cache
 def _table() -> dict[str, MaterialPreset]:
-    toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
-    return {
-        name: _material_preset(name, values) for name, values in toml.loads(TABLE.read_text(encoding="utf-8")).items()
-    }
+    document = read_document(TABLE)
+    return {name: _row(document, name) for name in document.values}
 
 
-def _material_preset(name: str, values: JsonMapping) -> MaterialPreset:
-    """The row called `name`; InputError where its kind is none of `Kind`."""
-    if values.get("kind") not in get_args(Kind):
-        kinds = ", ".join(get_args(Kind))
-        raise InputError(f"{TABLE.name}: {name}: kind: expected one of {kinds}, found {values.get('kind')!r}")
-    spectrum = tuple((float(nm), float(value)) for nm, value in values.get("spectrum", ()))
-    return MaterialPreset(**{**values, "albedo": _color(values["albedo"]), "spectrum": spectrum})
+def _row(document: Document, name: str) -> MaterialPreset:
+    """The row called `name`. Raises InputError with line and key for what it lacks or cannot have."""
+    lines = {keys[1:]: line for keys, line in document.lines.items() if keys[0] == name}
+    return structure(MaterialPreset, Document(f"{TABLE.name}: {name}", document.values[name], lines), Rules())
 
 
 def material_names() -> tuple[str, ...]:
@@ -258,24 +271,20 @@ def customise_preset(
     row = material_preset(base)
     changes: JsonDict = {}
     if albedo is not None:
-        _check_unit(f"material {name}: albedo", albedo)
-        if row.kind == "coated" and max(albedo) > WHITEST:
-            why = f"for {base}, whose coat adds its gloss"
-            raise InputError(f"material {name}: albedo: expected at most {WHITEST:g} {why}, found {max(albedo):g}")
         changes.update(albedo=_color(albedo), spectrum=())
-    limits = {"roughness": (roughness, 0.01, 1.0), "ior": (ior, 1.001, 4.0), "tile": (tile, 1e-6, 1e6)}
-    for key, (value, low, high) in limits.items():
+    for key, value in (("roughness", roughness), ("ior", ior), ("tile", tile)):
         if value is None:
             continue
         if getattr(row, key) is None:
             raise InputError(f"material {name}: {key}: expected none, as {base} has none, found {value}")
-        if not low <= value <= high:
-            raise InputError(f"material {name}: {key}: expected a number from {low:g} to {high:g}, found {value}")
         changes[key] = float(value)
     if not changes:
         return row
     source = f"{base} with {', '.join(key for key in changes if key != 'spectrum')} of the scene file; {row.source}"
-    return replace(row, source=source, **changes)
+    try:
+        return replace(row, source=source, **changes)
+    except InputError as error:
+        raise InputError(f"material {name}: {error}") from None
 
 
 def _check_unit(what: str, values: Iterable[float]) -> None:

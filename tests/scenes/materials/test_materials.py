@@ -12,6 +12,7 @@ import spacesim  # noqa: F401
 from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb
+from spacesim.data.toml import read_document
 from spacesim.scenes.lights.sun import SOLAR_IRRADIANCE
 from spacesim.scenes.materials import spectra, textures
 from spacesim.scenes.materials import table as m
@@ -212,6 +213,27 @@ def test_presets_are_plain_data_with_a_source():
         m.material("chrome")
 
 
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("kind = 'metal'", "new: roughness: expected a number, as metal surfaces have one, found none"),
+        (
+            "kind = 'coated'\nalbedo = [0.95, 0.5, 0.5]\nroughness = 0.2",
+            "line 3: albedo: expected at most 0.9 under a coat",
+        ),
+        ("kind = 'diffuse'\nalbedo = [5, 0.4, 0.3]", "line 3: albedo: expected numbers from 0 to 1, found 5, 0.4, 0.3"),
+        ("kind = 'diffuse'\nrougness = 0.2", "line 3: rougness: expected one of kind, .*did you mean roughness"),
+        ("kind = 'metal'\nroughness = 1\nnormals = 'x'", "line 4: normals: expected one of crinkle, grain, found 'x'"),
+    ],
+)
+def test_a_row_that_cannot_be_ends_in_a_sentence(tmp_path, row, message):
+    path = tmp_path / "materials.toml"
+    albedo = "" if "albedo" in row else "albedo = [0.5, 0.4, 0.3]\n"
+    path.write_text(f"[new]\n{row}\nsource = 'a reader'\n{albedo}", encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        m._row(read_document(path), "new")
+
+
 def test_textured_albedo_is_the_mean_that_mitsuba_sees():
     cells = m.material("solar-cell")
     mi = backend.mitsuba()
@@ -275,7 +297,7 @@ def test_customised_presets():
         ({"roughness": 0.0}, "material x: roughness: expected a number from 0.01 to 1, found 0.0"),
         ({"tile": 1.0}, "material x: tile: expected none, as white-paint has none, found 1.0"),
         ({"ior": float("nan")}, "ior: expected a number from 1.001 to 4, found nan"),
-        ({"albedo": (0.5, 0.91, 0.5)}, "material x: albedo: expected at most 0.9 for white-paint, .*, found 0.91"),
+        ({"albedo": (0.5, 0.91, 0.5)}, "material x: albedo: expected at most 0.9 under a coat, .*, found 0.91"),
     ):
         with pytest.raises(InputError, match=message):
             m.customise("x", "white-paint", **bad)
@@ -288,7 +310,7 @@ def test_a_row_of_another_kind_is_refused(monkeypatch, tmp_path):
     table = tmp_path / "materials.toml"
     table.write_text('[foil]\nkind = "metall"\nsource = "chosen"\nalbedo = [0.5, 0.5, 0.5]\nroughness = 0.2\n')
     monkeypatch.setattr(m, "TABLE", table)
-    message = "materials.toml: foil: kind: expected one of diffuse, coated, metal, found 'metall'"
+    message = "materials.toml: foil, line 2: kind: expected one of diffuse, coated, metal, found 'metall'"
     with pytest.raises(InputError, match=message):
         m._table.__wrapped__()
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from spacesim.data.mesh import SignedDistance
 from spacesim.data.records import Dataset
 from spacesim.splat.train.prior import check_outside, known_mesh
-from spacesim.splat.train.strategies.default import DefaultStrategy
+from spacesim.splat.train.strategies.default import DefaultStrategy, DefaultStrategyConfig
 from spacesim.splat.train.strategies.mcmc import McmcConfig, McmcStrategy
 from spacesim.splat.train.strategies.mesh_aware import MeshAwareConfig, MeshAwareStrategy
 from spacesim.splat.train.strategies.strategy import Strategy
@@ -31,4 +31,6 @@ def make_strategy(config: "TrainConfig", dataset: Dataset, scene_scale: float, c
         return SupportAwareStrategy(schedule, strategy, scene_scale, count, warm_start)
     if isinstance(strategy, McmcConfig):
         return McmcStrategy(schedule, strategy, scene_scale)
-    return DefaultStrategy(schedule, scene_scale, count)
+    if isinstance(strategy, DefaultStrategyConfig):
+        return DefaultStrategy(schedule, scene_scale, count)
+    raise TypeError(f"strategy: expected one that is made here, found {type(strategy).__name__}")

@@ -629,9 +629,7 @@ def test_presets_know_their_strategies():
     assert backfill == (1000, 0.85, 0.3)
     assert (support.radius_quantile, support.radius_scale, support.min_cloud) == (0.80, 1.25, 16)
     assert preset("fast", "vanilla", "mcmc").opacity_weight == preset("fast", "vanilla", "mcmc").scale_weight == 0.01
-    with pytest.raises(
-        InputError, match="strategy: expected one of default, mesh-aware, support-aware, mcmc, found 'hope'"
-    ):
+    with pytest.raises(InputError, match=f"strategy: expected one of {', '.join(STRATEGIES)}, found 'hope'"):
         preset("fast", "vanilla", "hope")
 
 
