@@ -48,7 +48,6 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--views", type=common.positive, default=50, help="test views, evenly taken (default 50)")
     parser.add_argument("--starts", type=common.positive, default=4)
-    parser.add_argument("--seed", type=common.natural, default=0)
     options = parser.parse_args()
     backend.select(options.backend)
     data, run = data_and_run(options)
@@ -68,6 +67,7 @@ def arguments(description: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, required=True, help="where data and run are, or are made")
     parser.add_argument("--data", type=Path, help="a dataset with Suns and test views")
     parser.add_argument("--run", type=Path, help="a run trained on it")
+    parser.add_argument("--seed", type=common.natural, default=0, help="of the data, of training and of what is tried")
     return parser
 
 
@@ -75,20 +75,21 @@ def data_and_run(options: argparse.Namespace) -> tuple[Dataset, Run]:
     """Those that are named, or made. Raises InputError where only one is named."""
     if (options.data is None) != (options.run is None):
         raise InputError("--data, --run: expected both or none, found one")
-    data = read_dataset(options.data) if options.data else make_data(options.out / "data")
-    return data, load_run(options.run) if options.run else make_run(data, options.out / "run")
+    data = read_dataset(options.data) if options.data else make_data(options.out / "data", options.seed)
+    return data, load_run(options.run) if options.run else make_run(data, options.out / "run", options.seed)
 
 
-def make_data(out: Path) -> Dataset:
+def make_data(out: Path, seed: int = 0) -> Dataset:
     from spacesim.scenes import generate, read_scene
 
     with show_progress("generate", "frames") as report:
-        return generate(read_scene("boxsat", **SCENE, **TEST), out, resume=True, progress=report)
+        return generate(read_scene("boxsat", **SCENE, **TEST, seed=seed), out, resume=True, progress=report)
 
 
-def make_run(data: Dataset, out: Path) -> Run:
+def make_run(data: Dataset, out: Path, seed: int = 0) -> Run:
+    config = replace(preset("demo", "shadow-map"), seed=seed)
     with show_progress("train", "iterations") as report:
-        return train(data, out, preset("demo", "shadow-map"), resume=True, on_progress=report_training(report))
+        return train(data, out, config, resume=True, on_progress=report_training(report))
 
 
 def displaced(camera: Camera, rng: np.random.Generator) -> Camera:

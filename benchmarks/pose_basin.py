@@ -40,7 +40,6 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--views", type=common.positive, default=5, help="test views a case, evenly taken (default 5)")
     parser.add_argument("--searched", type=common.natural, default=5, help="of these, views that are searched for")
-    parser.add_argument("--seed", type=common.natural, default=0)
     options = parser.parse_args()
     backend.select(options.backend)
     data, run = data_and_run(options)
