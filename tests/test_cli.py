@@ -15,15 +15,18 @@ import pytest
 from tiny import GENERATE, PROGRAM, TRAIN, contents
 
 from spacesim.cli.parser import view_of
+from spacesim.cli.program import COMMANDS as ALL_COMMANDS
 from spacesim.cli.program import in_flags, parser
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_exr, read_png
+from spacesim.data.importers.kinds import KINDS
 from spacesim.data.mesh import read_mesh
 from spacesim.data.store import find_unreadable_files, read_dataset
 from spacesim.splat.export.ply import read_ply
 from spacesim.splat.run import load_run
 
 THESIS = {"kind": "directions"} | {name: {"kind": "harmonics", "degree": 4} for name in ("sun", "view")}
+WITHOUT_NUMBERS = ("doctor", "demo", "eval", "report", "locate", "verify", "import")
 COMMANDS = ("doctor", "demo", "generate", "train", "eval", "report", "render", "sweep", "export", "reproduce")
 
 
@@ -623,6 +626,45 @@ def test_bad_usage_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tmp_path, a
     refused = spacesim(*words)
     assert refused.is_refusal(*names), refused
     assert not (tmp_path / "out").exists()
+
+
+EVERY = [(name,) for name in ALL_COMMANDS if name != "import"] + [("import", kind) for kind in KINDS]
+
+
+@pytest.mark.parametrize("command", EVERY, ids=" ".join)
+def test_a_wrong_number_is_named_in_every_command(spacesim, command):
+    own = parser(command)
+    for name in command:
+        (chosen,) = (action.choices for action in own._actions if isinstance(action.choices, dict))
+        own = chosen[name]
+    numbers = {action.option_strings[-1]: action.type for action in own._actions if action.type in (int, float)}
+    for option, kind in numbers.items():
+        expected = f"spacesim {' '.join(command)}: {option}: expected a {'whole ' if kind is int else ''}number, found"
+        for text in ("x", "1e3" if kind is int else "1,5"):
+            assert spacesim(*command, option, text).is_refusal(f"{expected} {text!r}; see spacesim")
+    assert numbers or command[0] in WITHOUT_NUMBERS
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("train DATA --out OUT --sed 5", "train: unknown option --sed; did you mean --seed? see spacesim train --help"),
+        ("train DATA --out OUT --sed=5", "train: unknown option --sed; did you mean --seed? see spacesim train --help"),
+        ("train DATA --ouut OUT", "train: unknown option --ouut; did you mean --out? see spacesim train --help"),
+        ("export RUN --plyy OUT", "export: unknown option --plyy; did you mean --ply? see spacesim export --help"),
+        ("train DATA --out OUT -q", "train: unknown option -q; see spacesim train --help"),
+        (
+            "import video A --out B --hight 9",
+            "video: unknown option --hight; did you mean --height? see spacesim import",
+        ),
+        (
+            "eval RUN other --data A --out B",
+            "eval: expected no more arguments, found 'other'; see spacesim eval --help",
+        ),
+    ],
+)
+def test_an_unknown_option_is_answered_with_the_closest(spacesim, words, said):
+    assert spacesim(*words.split()).is_refusal(said)
 
 
 def test_settings_in_a_sentence_are_shown_as_options():
