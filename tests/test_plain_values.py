@@ -1,5 +1,7 @@
 """The public functions take plain values, and say in a sentence which of them cannot be."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -114,7 +116,8 @@ def test_impossible_pictures_are_refused(tiny_run, tiny_data, tmp_path):
         (r"camera: expected focal lengths .*, found a and 1", lambda: ss.Camera(np.eye(4), 4, 4, "a", 1, 1, 1)),
         (r"camera: expected focal lengths", lambda: ss.Camera(np.eye(4), 4, 4, 1, None, 1, 1)),
         (r"camera: expected a principal point", lambda: ss.Camera(np.eye(4), 4, 4, 1, 1, "1", 1)),
-        (r"camera: expected a size .*, found 4 x 4 and 'a'", lambda: ss.Camera.from_fov(np.eye(4), 4, 4, "a")),
+        (r"camera: expected a size in pixels, found '4' x 4", lambda: ss.Camera.from_fov(np.eye(4), "4", 4, 40)),
+        (r"fov_x_deg: expected a number .*, found 'a'", lambda: ss.Camera.from_fov(np.eye(4), 4, 4, "a")),
         (r"position: expected three finite numbers", lambda: ss.Camera.look_at([0, 0, np.nan], [0, 0, 0], 4, 4, 40)),
         (r"position: expected three finite numbers", lambda: ss.Camera.look_at(["a"] * 3, [0, 0, 0], 4, 4, 40)),
         (r"target: expected three finite numbers", lambda: ss.Camera.look_at([0, 0, 1], "abc", 4, 4, 40)),
@@ -143,6 +146,14 @@ def test_impossible_pictures_are_refused(tiny_run, tiny_data, tmp_path):
     with pytest.raises(ss.InputError, match=r"^exposure: expected a finite number, found 'a'"):
         run.render(frame.camera, exposure="a")
     assert sorted(path.name for path in tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("angle", [400, 180, 180.0, 0, -5, float("nan"), float("inf"), None, "40", [40]])
+def test_a_field_of_view_that_no_camera_has_is_named(angle):
+    expected = re.escape(f"fov_x_deg: expected a number between 0 and 180 degrees, found {angle!r}")
+    with pytest.raises(ss.InputError, match=f"^{expected}$"):
+        ss.Camera.look_at([0, -5, 1], [0, 0, 0], 4, 4, angle)
+    assert np.isclose(ss.Camera.look_at([0, -5, 1], [0, 0, 0], 4, 4, 90).fx, 2)
 
 
 @pytest.mark.parametrize("wrong", [None, 5, object()], ids=["None", "5", "object"])
