@@ -26,6 +26,7 @@ from spacesim.splat.export.ply import read_ply
 from spacesim.splat.run import load_run
 
 THESIS = {"kind": "directions"} | {name: {"kind": "harmonics", "degree": 4} for name in ("sun", "view")}
+A_FIELD = "expected a field that spacesim train --fields lists"
 WITHOUT_NUMBERS = ("doctor", "demo", "eval", "report", "locate", "verify", "import")
 COMMANDS = ("doctor", "demo", "generate", "train", "eval", "report", "render", "sweep", "export", "reproduce")
 
@@ -455,7 +456,12 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
             ["--set light.bounce: expected light", "vanilla; try --method shadow-map"],
         ),
         ("--method relight --set light.shadow.bias=5", ["expected light.shadow to be", "; try --method shadow-map"]),
-        ("--set nonsense=1", ["--set nonsense: expected one of method,", "'nonsense'; see spacesim train --fields"]),
+        ("--set nonsense=1", [f"--set nonsense: {A_FIELD}, found 'nonsense'"]),
+        ("--set bias=5", [f"--set bias: {A_FIELD}, found 'bias'; did you mean light.shadow.bias?"]),
+        ("--set max_gaussians=5", [f"{A_FIELD}, found 'max_gaussians'; did you mean refinement.max_gaussians?"]),
+        ("--set maxgaussians=5", [f"{A_FIELD}, found 'maxgaussians'; did you mean refinement.max_gaussians?"]),
+        ("--set shadow.bias=5", [f"--set shadow.bias: {A_FIELD}, found 'shadow'; did you mean light.shadow.bias?"]),
+        ("--method nerf --set bias=5", [f"--set bias: {A_FIELD}, found 'bias'; did you mean shadow.bias?"]),
         (
             "--method shadow-map --set light.field.inputs=directions",
             ["--set light.bounce: expected 0 or --set light.field.inputs=surface,"],
@@ -465,12 +471,12 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("--set seed=three", ["--set seed: expected a whole number, found 'three'"]),
         ("--set seed.x=3", ["--set seed.x: expected seed alone, which has no fields"]),
         ("--set method=relight", ["--set: expected --method, which sets all that goes with it"]),
-        ("--set lihgt.bounce=9", ["--set lihgt", "rates, refinement, strategy", "mean light?"]),
+        ("--set lihgt.bounce=9", ["--set lihgt", A_FIELD, "mean light?"]),
         ("--method relight --set light.bounse=9", ["--set light.bounse", "did you mean light.bounce?"]),
         ("--set cull_every=9", ["--set cull_every", "did you mean strategy.cull_every?"]),
         ("--set prune_opcity=1", ["--set prune_opcity", "did you mean refinement.prune_opacity?"]),
         ("--set refinement.opacity=1", ["--set refinement.opacity", "did you mean refinement.prune_opacity?"]),
-        ("--method nerf --set strategy=default", ["--set strategy: expected one of method,"]),
+        ("--method nerf --set strategy=default", [f"--set strategy: {A_FIELD}, found 'strategy'"]),
         ("--strategy mcmc --set strategy.kind=mcmd", ["--set strategy.kind: expected one of", "mean mcmc?"]),
         ("--set antialiased=1", ["--set antialiased: expected true or false, found 1"]),
         ("--set strategy=mcmd", ["--set strategy", "default, mesh-aware", "did you mean mcmc?"]),
@@ -483,7 +489,10 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("--method shadow-splat --set light.shadow.bias=-1", ["--set light.shadow.bias: expected 0 or more, found -1"]),
         (
             "--method shadow-splat --set light.shadow.method.filter=median",
-            ["light.shadow.method.filter", "one of kind, gradients"],
+            [
+                "light.shadow.method.filter: expected one of kind, gradients, beta_min, found 'filter'",
+                "; kind mapping knows it",
+            ],
         ),
         (
             "--method shadow-map --set light.shadow.method.gradients=true",

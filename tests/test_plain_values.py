@@ -40,6 +40,10 @@ def test_impossible_options_of_scenes_are_refused(name, value):
         ({"progress": 4}, "progress: expected a function, found 4"),
         ({"resume": "no"}, "resume: expected true or false, found 'no'"),
         ({"out": "a\0b"}, r"out: expected a path without a null character, found 'a\\x00b'"),
+        (
+            {"settings": {"bias": 5}},
+            "bias: expected a field of TrainConfig, found 'bias'; did you mean light.shadow.bias",
+        ),
         ({"settings": {"preset": "demo"}}, "preset: expected beside the settings"),
         ({"settings": {"method": "relight"}}, "method: expected beside the settings"),
         ({"method": "nerf", "settings": {"method": "nerf-relight"}}, "method: expected beside the settings"),

@@ -1,6 +1,7 @@
 """`spacesim train`. Its options stand for fields of TrainConfig and NerfConfig, whose comments say what they mean."""
 
 import argparse
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -109,7 +110,8 @@ def run(options: argparse.Namespace) -> None:
     try:
         config = with_settings(config, chosen | own)
     except InputError as error:
-        raise InputError(f"{error}{_advice(str(error))}") from None
+        sentence = re.sub(r"expected a field of \w+", "expected a field that spacesim train --fields lists", str(error))
+        raise InputError(f"{sentence}{_advice(sentence)}") from None
     if options.fields:
         interrupts.print_output(listing(config))
         return
@@ -148,7 +150,8 @@ def _advice(sentence: str) -> str:
     if field == "warm_start" or rest.startswith("expected warm_start to be there"):
         return "; add --warm-start"
     is_unknown = f"found {field.rpartition('.')[2]!r}" in rest
-    return "; see spacesim train --fields" if is_unknown and "did you mean" not in rest else ""
+    has_advice = "did you mean" in rest or "train --fields" in rest
+    return "; see spacesim train --fields" if is_unknown and not has_advice else ""
 
 
 def _help(prog: str) -> argparse.HelpFormatter:
