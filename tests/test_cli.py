@@ -275,6 +275,64 @@ def test_resuming_with_another_configuration_is_refused(spacesim, tiny_run, tiny
     assert other.is_refusal(tiny_run, "seed 0", "3")
 
 
+LIT = ("--method", "shadow-map", "--strategy", "mesh-aware", "--warm-start")
+FIELD = ("--method", "nerf-relight", "--set=rays=512", "--set=samples=12", "--set=chunk=2048", "--set=width=16")
+SHORT = ("--preset", "demo", "--iterations", "6", "--seed", "3", "--set=checkpoint_every=4")
+SMALL = ("--set=light.shadow.size=16", "--set=init_count=60")
+
+
+@pytest.mark.parametrize("words", [LIT + SMALL, FIELD], ids=["Gaussians", "field"])
+def test_what_is_not_given_is_resumed_as_it_was_started(spacesim, tiny_data, tmp_path, words):
+    """The model is that of an uninterrupted training, to the bit; what is given must be what the run has."""
+    run = tmp_path / "run"
+    assert spacesim("train", tiny_data, "--out", run, *SHORT, *words).code == 0
+    resume, files = ("train", tiny_data, "--out", run, "--resume"), ("model.safetensors", "config.json")
+    whole = {name: (run / name).read_bytes() for name in files}
+    for given in (), ("--seed", 3), words[:2], (*SHORT, *words):
+        (run / "model.safetensors").unlink()
+        done = spacesim(*resume, *given)
+        assert done.code == 0, done.errors
+        assert {name: (run / name).read_bytes() for name in files} == whole
+        assert "after 6 iterations" in done.output
+        assert (run / "checkpoints/step_00000004.safetensors").exists()
+    others = [
+        ("--seed 4", "seed 3, expected the same to resume it, found 4"),
+        ("--iterations 5", "iterations 6, expected the same to resume it, found 5"),
+        ("--method relight", f"method {words[1]!r}, expected the same to resume it, found 'relight'"),
+        ("--preset fast", "preset 'demo', expected the same to resume it, found 'fast'"),
+        ("--set checkpoint_every=5", "checkpoint_every 4, expected the same to resume it, found 5"),
+    ]
+    if "shadow-map" in words:
+        others.append(("--strategy mcmc", "strategy 'mesh-aware', expected the same to resume it, found 'mcmc'"))
+        others.append(
+            ("--set light.shadow.bias=3", "light.shadow.bias 5.0, expected the same to resume it, found 3.0")
+        )
+    else:
+        others.append(("--strategy mcmc", "strategy None, expected the same to resume it, found 'mcmc'"))
+        assert spacesim(*resume, "--warm-start").is_refusal("--warm-start: expected with a method of Gaussians, found")
+    for given, said in others:
+        assert spacesim(*resume, *given.split()).is_refusal(f"spacesim: {run}: was started with {said}")
+    assert spacesim(*resume, "--method", "magic").is_refusal("--method: expected one of vanilla")
+
+
+def test_a_run_without_a_checkpoint_is_begun_as_it_was(spacesim, tiny_data, tmp_path):
+    run, words = tmp_path / "run", ("--iterations", 2, "--set", "init_count=50")
+    first = ("train", tiny_data, "--out", run, "--preset", "demo", "--method", "relight", *words)
+    for given, found in ([], ("relight", "demo")), (["--preset", "fast"], ("relight", "fast")):
+        assert spacesim(*first).code == 0
+        (run / "model.safetensors").unlink()
+        assert spacesim("train", tiny_data, "--out", run, "--resume", *words, *given).code == 0
+        config = json.loads((run / "config.json").read_text())
+        assert (config["method"], config["preset"], config["iterations"]) == (*found, 2)
+        shutil.rmtree(run)
+    assert spacesim(*first).code == 0
+    (run / "model.safetensors").unlink()
+    (run / "config.json").write_text("{")
+    assert spacesim("train", tiny_data, "--out", run, "--resume", "--preset", "demo", *words).code == 0
+    (run / "config.json").write_text("{")
+    assert spacesim("train", tiny_data, "--out", run, "--resume").is_refusal(run / "config.json")
+
+
 def test_generating_again_needs_resume(spacesim, tiny_data):
     assert spacesim("generate", "boxsat", "--out", tiny_data, *GENERATE).is_refusal(tiny_data, "--resume")
     assert spacesim("generate", "boxsat", "--out", tiny_data, *GENERATE, "--seed", 1, "--resume").is_refusal("seed")
