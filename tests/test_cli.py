@@ -304,9 +304,7 @@ def test_what_is_not_given_is_resumed_as_it_was_started(spacesim, tiny_data, tmp
     ]
     if "shadow-map" in words:
         others.append(("--strategy mcmc", "strategy 'mesh-aware', expected the same to resume it, found 'mcmc'"))
-        others.append(
-            ("--set light.shadow.bias=3", "light.shadow.bias 5.0, expected the same to resume it, found 3.0")
-        )
+        others.append(("--set light.shadow.bias=3", "light.shadow.bias 5.0, expected the same to resume it, found 3.0"))
     else:
         others.append(("--strategy mcmc", "strategy None, expected the same to resume it, found 'mcmc'"))
         assert spacesim(*resume, "--warm-start").is_refusal("--warm-start: expected with a method of Gaussians, found")

@@ -94,7 +94,7 @@ def test_pictures_and_poses(tiny_run, tiny_data, tmp_path):
         run.render(frame.camera, sun="40,25")
     with pytest.raises(ss.InputError, match=r"^kind: expected one of rgb, alpha"):
         view.save(tmp_path / "a.png", "foo")
-    with pytest.raises(ss.InputError, match=r"^run: expected what load_run returns, found 'run'"):
+    with pytest.raises(ss.InputError, match=r"^run: expected a run of .spacesim train., found no config.json in it"):
         ss.refine_pose("run", view.rgb, frame.camera)
     numbers = [("starts", "4", "a whole number"), ("seed", -1, "0 or more"), ("within", "ab", "a list of 2 numbers")]
     for name, value, expected in numbers:
@@ -201,6 +201,28 @@ def test_what_is_neither_a_path_nor_a_record_is_named(wrong, tiny_run, tiny_data
     with pytest.raises(ss.InputError, match=r"^path: expected a path, found "):
         run.render(frame.camera).save(wrong)
     assert sorted(tmp_path.iterdir()) == [scene]
+
+
+def test_poses_and_suns_take_the_folder_of_a_run(tiny_data, tmp_path):
+    data = ss.read_dataset(tiny_data)
+    run = ss.train(data, tmp_path / "run", preset="demo", method="relight", iterations=30, init_count=200)
+    camera, sun = data.test[0].camera, data.test[0].sun
+    picture = run.render(camera, sun)
+    rgba = np.dstack([picture.rgb / np.maximum(picture.alpha, 1e-3)[..., None], picture.alpha]).clip(0, 1)
+    calls = [
+        lambda one, image: ss.refine_pose(one, image, camera, sun, starts=1).camera.world_from_camera,
+        lambda one, image: ss.find_pose(one, image, camera, sun).pose.camera.world_from_camera,
+        lambda one, image: ss.estimate_sun(one, image, camera).direction,
+    ]
+    for find in calls:
+        np.testing.assert_array_equal(find(str(run.path), rgba), find(run, rgba))
+        for one, image, said in [
+            (run.path, None, r"image: expected \[40, 40, 3 or 4\] as the camera has it, found None"),
+            (None, rgba, "run: expected a path or what load_run returns, found None"),
+            (tiny_data, rgba, ".*data: expected a run of .spacesim train., found no config.json in it"),
+        ]:
+            with pytest.raises(ss.InputError, match=f"^{said}$"):
+                find(one, image)
 
 
 def test_a_run_is_no_gaussians_and_nor_are_arrays(tiny_run, tiny_data):
