@@ -176,7 +176,8 @@ def train(
     options: fields of TrainConfig, or NerfConfig of a radiance field, in place of the configuration's: seed=0,
         iterations=7000, which shortens its whole schedule where it is fewer, ...
     settings: fields by their dotted names, as `spacesim train --set` has them: {"light.shadow.bias": 5}
-    resume: go on from the newest checkpoint, with the same result to the bit; a finished run is returned as it is
+    resume: go on from the newest checkpoint, with the same result to the bit; a finished run is returned as it is. What
+        is not named here is as in the run's config.json
     progress: called with (iterations done, iterations in all, "loss 0.0123, 4000 Gaussians") now and then
 
     Raises InputError for data, a configuration or a folder that cannot be, WorkError where the loss is not finite or
@@ -186,8 +187,9 @@ def train(
 
     names = {"preset": preset, "method": method, "strategy": strategy}
     choices = {name: word for name, word in names.items() if word is not None}
+    folder = as_path(out, "out")
     if config is None:
-        config = methods.preset(choices.pop("preset", "fast"), **choices)
+        config = methods.configuration(preset, method, strategy, folder if resume else None)
     elif not isinstance(config, TrainConfig | NerfConfig):
         raise InputError(f"config: expected what `preset` returns, found {config!r:.60}")
     elif choices:
@@ -211,7 +213,7 @@ def train(
     config = methods.with_settings(replace(config, **options), settings or {})
     if "method" in choices and config.method != before:
         raise InputError(f"light: expected that of the method {before}, found that of {config.method}")
-    folder, dataset = as_path(out, "out"), _dataset(data, "data")
+    dataset = _dataset(data, "data")
 
     def tell(state: TrainingProgress) -> None:
         if progress is not None:

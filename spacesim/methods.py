@@ -55,6 +55,54 @@ def preset(name: str = "fast", method: str = "vanilla", strategy: str | None = N
     return nerf.preset(name, method)
 
 
+def configuration(
+    name: str | None = None, method: str | None = None, strategy: str | None = None, begun: Path | None = None
+) -> Config:
+    """What `preset` returns for these names, "fast" and "vanilla" where none is given; of the run that is begun in the
+    folder `begun`, if there is one, its own configuration. Raises InputError as `preset`, and for a name that is not
+    that of the run."""
+    chosen = preset("fast" if name is None else name, "vanilla" if method is None else method, strategy)
+    own = None if begun is None else _begun_configuration(begun)
+    if begun is None or own is None:
+        return chosen
+    from spacesim.learning.folder import holds_training, started_with
+
+    given = {"method": method, "preset": name, "strategy": strategy}
+    found, names = _names_of(chosen), _names_of(own)
+    differing = [key for key, word in given.items() if word is not None and found[key] != names[key]]
+    if not differing:
+        return own
+    if holds_training(begun):
+        raise started_with(begun, differing[0], names[differing[0]], found[differing[0]])
+    method = method or own.method
+    strategy = strategy or (None if method in nerf.METHODS else names["strategy"])
+    return preset(name or own.preset or "fast", method, strategy)
+
+
+def _names_of(config: Config) -> dict[str, str | None]:
+    """The names by which `preset` gives a configuration of its kind."""
+    strategy = None if isinstance(config, NerfConfig) else config.strategy.kind
+    return {"method": config.method, "preset": config.preset, "strategy": strategy}
+
+
+def _begun_configuration(out: Path) -> Config | None:
+    """Of the run in a folder, whether its training has ended or not; None where there is none, or one that is broken
+    and has not come to a checkpoint."""
+    from spacesim.learning.folder import holds_training, read_described
+
+    path = out / "config.json"
+    if not path.exists():
+        return None
+    try:
+        values, _ = read_described(path)
+        family = NerfConfig if _method_of(path, values) in nerf.METHODS else TrainConfig
+        return family.from_json(values, str(path))
+    except InputError:
+        if holds_training(out):
+            raise
+        return None
+
+
 def shortened(config: Config, iterations: int | None) -> Config:
     """`config` with so many iterations, its schedule with them where they are fewer; as it is for None."""
     if iterations is None:
@@ -94,17 +142,22 @@ def load_run(path: str | Path) -> "Run | NerfRun":
     """Load a finished run of any method. Raises InputError where the folder is no run or its training has not ended."""
     path = as_path(path, "path")
     config = path / "config.json"
-    values = read_json(config) if config.exists() else {}
-    method = values.get("method", "vanilla") if isinstance(values, dict) else "vanilla"
-    if method not in (*METHODS, *splat.ALIASES):
-        raise InputError(f"{config}: method: expected one of {', '.join(METHODS)}, found {method!r:.60}")
-    if method in nerf.METHODS:
+    if _method_of(config, read_json(config) if config.exists() else {}) in nerf.METHODS:
         from spacesim.nerf.run import load_run as load_field
 
         return load_field(path)
     from spacesim.splat.run import load_run as load_splats
 
     return load_splats(path)
+
+
+def _method_of(path: Path, values: object) -> str:
+    """Of what a run's config.json at `path` holds; a file without it is of Gaussians, whose reader says what it lacks.
+    Raises InputError where it names none that is known."""
+    method = values.get("method", "vanilla") if isinstance(values, dict) else "vanilla"
+    if method not in (*METHODS, *splat.ALIASES):
+        raise InputError(f"{path}: method: expected one of {', '.join(METHODS)}, found {method!r:.60}")
+    return str(method)
 
 
 def load_scene(path: str | Path) -> "PosedScene":

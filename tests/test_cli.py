@@ -15,15 +15,19 @@ import pytest
 from tiny import GENERATE, PROGRAM, TRAIN, contents
 
 from spacesim.cli.parser import view_of
+from spacesim.cli.program import COMMANDS as ALL_COMMANDS
 from spacesim.cli.program import in_flags, parser
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_exr, read_png
+from spacesim.data.importers.kinds import KINDS
 from spacesim.data.mesh import read_mesh
 from spacesim.data.store import find_unreadable_files, read_dataset
 from spacesim.splat.export.ply import read_ply
 from spacesim.splat.run import load_run
 
 THESIS = {"kind": "directions"} | {name: {"kind": "harmonics", "degree": 4} for name in ("sun", "view")}
+A_FIELD = "expected a field that spacesim train --fields lists"
+WITHOUT_NUMBERS = ("doctor", "demo", "eval", "report", "locate", "verify", "import")
 COMMANDS = ("doctor", "demo", "generate", "train", "eval", "report", "render", "sweep", "export", "reproduce")
 
 
@@ -271,6 +275,62 @@ def test_resuming_with_another_configuration_is_refused(spacesim, tiny_run, tiny
     assert other.is_refusal(tiny_run, "seed 0", "3")
 
 
+LIT = ("--method", "shadow-map", "--strategy", "mesh-aware", "--warm-start")
+FIELD = ("--method", "nerf-relight", "--set=rays=512", "--set=samples=12", "--set=chunk=2048", "--set=width=16")
+SHORT = ("--preset", "demo", "--iterations", "6", "--seed", "3", "--set=checkpoint_every=4")
+SMALL = ("--set=light.shadow.size=16", "--set=init_count=60")
+
+
+@pytest.mark.parametrize("words", [LIT + SMALL, FIELD], ids=["Gaussians", "field"])
+def test_what_is_not_given_is_resumed_as_it_was_started(spacesim, tiny_data, tmp_path, words):
+    """The model is that of an uninterrupted training, to the bit; what is given must be what the run has."""
+    run = tmp_path / "run"
+    assert spacesim("train", tiny_data, "--out", run, *SHORT, *words).code == 0
+    resume, files = ("train", tiny_data, "--out", run, "--resume"), ("model.safetensors", "config.json")
+    whole = {name: (run / name).read_bytes() for name in files}
+    for given in (), ("--seed", 3), words[:2], (*SHORT, *words):
+        (run / "model.safetensors").unlink()
+        done = spacesim(*resume, *given)
+        assert done.code == 0, done.errors
+        assert {name: (run / name).read_bytes() for name in files} == whole
+        assert "after 6 iterations" in done.output
+        assert (run / "checkpoints/step_00000004.safetensors").exists()
+    others = [
+        ("--seed 4", "seed 3, expected the same to resume it, found 4"),
+        ("--iterations 5", "iterations 6, expected the same to resume it, found 5"),
+        ("--method relight", f"method {words[1]!r}, expected the same to resume it, found 'relight'"),
+        ("--preset fast", "preset 'demo', expected the same to resume it, found 'fast'"),
+        ("--set checkpoint_every=5", "checkpoint_every 4, expected the same to resume it, found 5"),
+    ]
+    if "shadow-map" in words:
+        others.append(("--strategy mcmc", "strategy 'mesh-aware', expected the same to resume it, found 'mcmc'"))
+        others.append(("--set light.shadow.bias=3", "light.shadow.bias 5.0, expected the same to resume it, found 3.0"))
+    else:
+        others.append(("--strategy mcmc", "strategy None, expected the same to resume it, found 'mcmc'"))
+        assert spacesim(*resume, "--warm-start").is_refusal("--warm-start: expected with a method of Gaussians, found")
+    for given, said in others:
+        assert spacesim(*resume, *given.split()).is_refusal(f"spacesim: {run}: was started with {said}")
+    assert spacesim(*resume, "--method", "magic").is_refusal("--method: expected one of vanilla")
+
+
+def test_a_run_without_a_checkpoint_is_begun_as_it_was(spacesim, tiny_data, tmp_path):
+    run, words = tmp_path / "run", ("--iterations", 2, "--set", "init_count=50")
+    first = ("train", tiny_data, "--out", run, "--preset", "demo", "--method", "relight", *words)
+    for given, found in ([], ("relight", "demo")), (["--preset", "fast"], ("relight", "fast")):
+        assert spacesim(*first).code == 0
+        (run / "model.safetensors").unlink()
+        assert spacesim("train", tiny_data, "--out", run, "--resume", *words, *given).code == 0
+        config = json.loads((run / "config.json").read_text())
+        assert (config["method"], config["preset"], config["iterations"]) == (*found, 2)
+        shutil.rmtree(run)
+    assert spacesim(*first).code == 0
+    (run / "model.safetensors").unlink()
+    (run / "config.json").write_text("{")
+    assert spacesim("train", tiny_data, "--out", run, "--resume", "--preset", "demo", *words).code == 0
+    (run / "config.json").write_text("{")
+    assert spacesim("train", tiny_data, "--out", run, "--resume").is_refusal(run / "config.json")
+
+
 def test_generating_again_needs_resume(spacesim, tiny_data):
     assert spacesim("generate", "boxsat", "--out", tiny_data, *GENERATE).is_refusal(tiny_data, "--resume")
     assert spacesim("generate", "boxsat", "--out", tiny_data, *GENERATE, "--seed", 1, "--resume").is_refusal("seed")
@@ -452,7 +512,12 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
             ["--set light.bounce: expected light", "vanilla; try --method shadow-map"],
         ),
         ("--method relight --set light.shadow.bias=5", ["expected light.shadow to be", "; try --method shadow-map"]),
-        ("--set nonsense=1", ["--set nonsense: expected one of method,", "'nonsense'; see spacesim train --fields"]),
+        ("--set nonsense=1", [f"--set nonsense: {A_FIELD}, found 'nonsense'"]),
+        ("--set bias=5", [f"--set bias: {A_FIELD}, found 'bias'; did you mean light.shadow.bias?"]),
+        ("--set max_gaussians=5", [f"{A_FIELD}, found 'max_gaussians'; did you mean refinement.max_gaussians?"]),
+        ("--set maxgaussians=5", [f"{A_FIELD}, found 'maxgaussians'; did you mean refinement.max_gaussians?"]),
+        ("--set shadow.bias=5", [f"--set shadow.bias: {A_FIELD}, found 'shadow'; did you mean light.shadow.bias?"]),
+        ("--method nerf --set bias=5", [f"--set bias: {A_FIELD}, found 'bias'; did you mean shadow.bias?"]),
         (
             "--method shadow-map --set light.field.inputs=directions",
             ["--set light.bounce: expected 0 or --set light.field.inputs=surface,"],
@@ -462,12 +527,12 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("--set seed=three", ["--set seed: expected a whole number, found 'three'"]),
         ("--set seed.x=3", ["--set seed.x: expected seed alone, which has no fields"]),
         ("--set method=relight", ["--set: expected --method, which sets all that goes with it"]),
-        ("--set lihgt.bounce=9", ["--set lihgt", "rates, refinement, strategy", "mean light?"]),
+        ("--set lihgt.bounce=9", ["--set lihgt", A_FIELD, "mean light?"]),
         ("--method relight --set light.bounse=9", ["--set light.bounse", "did you mean light.bounce?"]),
         ("--set cull_every=9", ["--set cull_every", "did you mean strategy.cull_every?"]),
         ("--set prune_opcity=1", ["--set prune_opcity", "did you mean refinement.prune_opacity?"]),
         ("--set refinement.opacity=1", ["--set refinement.opacity", "did you mean refinement.prune_opacity?"]),
-        ("--method nerf --set strategy=default", ["--set strategy: expected one of method,"]),
+        ("--method nerf --set strategy=default", [f"--set strategy: {A_FIELD}, found 'strategy'"]),
         ("--strategy mcmc --set strategy.kind=mcmd", ["--set strategy.kind: expected one of", "mean mcmc?"]),
         ("--set antialiased=1", ["--set antialiased: expected true or false, found 1"]),
         ("--set strategy=mcmd", ["--set strategy", "default, mesh-aware", "did you mean mcmc?"]),
@@ -480,7 +545,10 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ("--method shadow-splat --set light.shadow.bias=-1", ["--set light.shadow.bias: expected 0 or more, found -1"]),
         (
             "--method shadow-splat --set light.shadow.method.filter=median",
-            ["light.shadow.method.filter", "one of kind, gradients"],
+            [
+                "light.shadow.method.filter: expected one of kind, gradients, beta_min, found 'filter'",
+                "; kind mapping knows it",
+            ],
         ),
         (
             "--method shadow-map --set light.shadow.method.gradients=true",
@@ -623,6 +691,45 @@ def test_bad_usage_ends_in_a_sentence(spacesim, tiny_data, tiny_run, tmp_path, a
     refused = spacesim(*words)
     assert refused.is_refusal(*names), refused
     assert not (tmp_path / "out").exists()
+
+
+EVERY = [(name,) for name in ALL_COMMANDS if name != "import"] + [("import", kind) for kind in KINDS]
+
+
+@pytest.mark.parametrize("command", EVERY, ids=" ".join)
+def test_a_wrong_number_is_named_in_every_command(spacesim, command):
+    own = parser(command)
+    for name in command:
+        (chosen,) = (action.choices for action in own._actions if isinstance(action.choices, dict))
+        own = chosen[name]
+    numbers = {action.option_strings[-1]: action.type for action in own._actions if action.type in (int, float)}
+    for option, kind in numbers.items():
+        expected = f"spacesim {' '.join(command)}: {option}: expected a {'whole ' if kind is int else ''}number, found"
+        for text in ("x", "1e3" if kind is int else "1,5"):
+            assert spacesim(*command, option, text).is_refusal(f"{expected} {text!r}; see spacesim")
+    assert numbers or command[0] in WITHOUT_NUMBERS
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("train DATA --out OUT --sed 5", "train: unknown option --sed; did you mean --seed? see spacesim train --help"),
+        ("train DATA --out OUT --sed=5", "train: unknown option --sed; did you mean --seed? see spacesim train --help"),
+        ("train DATA --ouut OUT", "train: unknown option --ouut; did you mean --out? see spacesim train --help"),
+        ("export RUN --plyy OUT", "export: unknown option --plyy; did you mean --ply? see spacesim export --help"),
+        ("train DATA --out OUT -q", "train: unknown option -q; see spacesim train --help"),
+        (
+            "import video A --out B --hight 9",
+            "video: unknown option --hight; did you mean --height? see spacesim import",
+        ),
+        (
+            "eval RUN other --data A --out B",
+            "eval: expected no more arguments, found 'other'; see spacesim eval --help",
+        ),
+    ],
+)
+def test_an_unknown_option_is_answered_with_the_closest(spacesim, words, said):
+    assert spacesim(*words.split()).is_refusal(said)
 
 
 def test_settings_in_a_sentence_are_shown_as_options():

@@ -1,5 +1,7 @@
 """The public functions take plain values, and say in a sentence which of them cannot be."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,10 @@ def test_impossible_options_of_scenes_are_refused(name, value):
         ({"progress": 4}, "progress: expected a function, found 4"),
         ({"resume": "no"}, "resume: expected true or false, found 'no'"),
         ({"out": "a\0b"}, r"out: expected a path without a null character, found 'a\\x00b'"),
+        (
+            {"settings": {"bias": 5}},
+            "bias: expected a field of TrainConfig, found 'bias'; did you mean light.shadow.bias",
+        ),
         ({"settings": {"preset": "demo"}}, "preset: expected beside the settings"),
         ({"settings": {"method": "relight"}}, "method: expected beside the settings"),
         ({"method": "nerf", "settings": {"method": "nerf-relight"}}, "method: expected beside the settings"),
@@ -88,7 +94,7 @@ def test_pictures_and_poses(tiny_run, tiny_data, tmp_path):
         run.render(frame.camera, sun="40,25")
     with pytest.raises(ss.InputError, match=r"^kind: expected one of rgb, alpha"):
         view.save(tmp_path / "a.png", "foo")
-    with pytest.raises(ss.InputError, match=r"^run: expected what load_run returns, found 'run'"):
+    with pytest.raises(ss.InputError, match=r"^run: expected a run of .spacesim train., found no config.json in it"):
         ss.refine_pose("run", view.rgb, frame.camera)
     numbers = [("starts", "4", "a whole number"), ("seed", -1, "0 or more"), ("within", "ab", "a list of 2 numbers")]
     for name, value, expected in numbers:
@@ -114,7 +120,8 @@ def test_impossible_pictures_are_refused(tiny_run, tiny_data, tmp_path):
         (r"camera: expected focal lengths .*, found a and 1", lambda: ss.Camera(np.eye(4), 4, 4, "a", 1, 1, 1)),
         (r"camera: expected focal lengths", lambda: ss.Camera(np.eye(4), 4, 4, 1, None, 1, 1)),
         (r"camera: expected a principal point", lambda: ss.Camera(np.eye(4), 4, 4, 1, 1, "1", 1)),
-        (r"camera: expected a size .*, found 4 x 4 and 'a'", lambda: ss.Camera.from_fov(np.eye(4), 4, 4, "a")),
+        (r"camera: expected a size in pixels, found '4' x 4", lambda: ss.Camera.from_fov(np.eye(4), "4", 4, 40)),
+        (r"fov_x_deg: expected a number .*, found 'a'", lambda: ss.Camera.from_fov(np.eye(4), 4, 4, "a")),
         (r"position: expected three finite numbers", lambda: ss.Camera.look_at([0, 0, np.nan], [0, 0, 0], 4, 4, 40)),
         (r"position: expected three finite numbers", lambda: ss.Camera.look_at(["a"] * 3, [0, 0, 0], 4, 4, 40)),
         (r"target: expected three finite numbers", lambda: ss.Camera.look_at([0, 0, 1], "abc", 4, 4, 40)),
@@ -143,6 +150,14 @@ def test_impossible_pictures_are_refused(tiny_run, tiny_data, tmp_path):
     with pytest.raises(ss.InputError, match=r"^exposure: expected a finite number, found 'a'"):
         run.render(frame.camera, exposure="a")
     assert sorted(path.name for path in tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("angle", [400, 180, 180.0, 0, -5, float("nan"), float("inf"), None, "40", [40]])
+def test_a_field_of_view_that_no_camera_has_is_named(angle):
+    expected = re.escape(f"fov_x_deg: expected a number between 0 and 180 degrees, found {angle!r}")
+    with pytest.raises(ss.InputError, match=f"^{expected}$"):
+        ss.Camera.look_at([0, -5, 1], [0, 0, 0], 4, 4, angle)
+    assert np.isclose(ss.Camera.look_at([0, -5, 1], [0, 0, 0], 4, 4, 90).fx, 2)
 
 
 @pytest.mark.parametrize("wrong", [None, 5, object()], ids=["None", "5", "object"])
@@ -186,6 +201,28 @@ def test_what_is_neither_a_path_nor_a_record_is_named(wrong, tiny_run, tiny_data
     with pytest.raises(ss.InputError, match=r"^path: expected a path, found "):
         run.render(frame.camera).save(wrong)
     assert sorted(tmp_path.iterdir()) == [scene]
+
+
+def test_poses_and_suns_take_the_folder_of_a_run(tiny_data, tmp_path):
+    data = ss.read_dataset(tiny_data)
+    run = ss.train(data, tmp_path / "run", preset="demo", method="relight", iterations=30, init_count=200)
+    camera, sun = data.test[0].camera, data.test[0].sun
+    picture = run.render(camera, sun)
+    rgba = np.dstack([picture.rgb / np.maximum(picture.alpha, 1e-3)[..., None], picture.alpha]).clip(0, 1)
+    calls = [
+        lambda one, image: ss.refine_pose(one, image, camera, sun, starts=1).camera.world_from_camera,
+        lambda one, image: ss.find_pose(one, image, camera, sun).pose.camera.world_from_camera,
+        lambda one, image: ss.estimate_sun(one, image, camera).direction,
+    ]
+    for find in calls:
+        np.testing.assert_array_equal(find(str(run.path), rgba), find(run, rgba))
+        for one, image, said in [
+            (run.path, None, r"image: expected \[40, 40, 3 or 4\] as the camera has it, found None"),
+            (None, rgba, "run: expected a path or what load_run returns, found None"),
+            (tiny_data, rgba, ".*data: expected a run of .spacesim train., found no config.json in it"),
+        ]:
+            with pytest.raises(ss.InputError, match=f"^{said}$"):
+                find(one, image)
 
 
 def test_a_run_is_no_gaussians_and_nor_are_arrays(tiny_run, tiny_data):

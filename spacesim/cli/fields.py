@@ -9,12 +9,12 @@ import io
 import textwrap
 import tokenize
 from collections.abc import Iterator
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from types import NoneType
 from typing import Any, get_type_hints
 
-from spacesim.data.structure import alternatives, choices, kind_of, members_of
+from spacesim.data.structure import alternatives, choices, kind_of, members_of, options_in
 from spacesim.splat.train.config import TrainConfig
 
 _WORDS: dict[object, str] = {int: "whole number", float: "number", bool: "true or false", str: "text"}
@@ -53,11 +53,6 @@ def meanings(cls: Any) -> dict[str, str]:
                 above -= 1
             result[node.target.id] = " ".join(comments[line] for line in lines)
     return {f.name: result.get(f.name, "") for f in fields(cls)}
-
-
-def options_in(cls: Any) -> list[Field[Any]]:
-    """The fields of a dataclass that can be set: not those whose metadata say `"option": False`."""
-    return [f for f in fields(cls) if f.metadata.get("option", True)]
 
 
 def fields_of(record: object, at: str = "") -> Iterator[ConfigField]:

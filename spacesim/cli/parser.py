@@ -4,6 +4,8 @@ import argparse
 import math
 import re
 import sys
+from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -18,12 +20,24 @@ if TYPE_CHECKING:
     from spacesim.splat.run import Run
 
 
+_NUMBERS: dict[object, str] = {int: "a whole number", float: "a number"}
+
+
 class Parser(argparse.ArgumentParser):
     """Says what is wrong with the usage in one sentence, and takes "-40,10" and "-y" for arguments, not for options."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._negative_number_matcher = re.compile(r"^-(\.?\d|y$)")
+        self._typed: Sequence[str] = ()
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """As argparse's, but a command refuses by itself what it does not know."""
+        self._typed = sys.argv[1:] if args is None else args
+        options, rest = super().parse_known_args(args, namespace)
+        if rest:
+            self.error(self._unknown_option(rest) or f"expected no more arguments, found {' '.join(rest)!r:.60}")
+        return options, rest
 
     def flags(self) -> dict[str, str]:
         """{name of an option's value: the option}."""
@@ -36,6 +50,15 @@ class Parser(argparse.ArgumentParser):
         else:
             super()._print_message(message, file)
 
+    def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
+        try:
+            return super()._get_value(action, arg_string)
+        except argparse.ArgumentError:
+            if action.type not in _NUMBERS:
+                raise
+            expected = f"expected {_NUMBERS[action.type]}, found {arg_string!r:.60}"
+            raise argparse.ArgumentError(action, expected) from None
+
     def _check_value(self, action: argparse.Action, value: object) -> None:
         if action.choices is not None and value not in action.choices:
             words = ", ".join(map(str, action.choices))
@@ -44,7 +67,23 @@ class Parser(argparse.ArgumentParser):
             )
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+        if "required" in message and self._subparsers is None:  # what is missing may have been misspelt
+            message = self._unknown_option(self._typed) or message
+        message = message.removeprefix("argument ")
+        end = "" if message.endswith("?") else ";"
+        self.exit(2, f"{self.prog}: {message}{end} see {self.prog} --help\n")
+
+    def _unknown_option(self, words: Sequence[str]) -> str | None:
+        """What is said of the first of the words that looks like an option and is none; None where all are known."""
+        known = {option.lstrip("-"): option for action in self._actions for option in action.option_strings}
+        for word in words:
+            if word == "--":
+                break
+            name = word.partition("=")[0]
+            if re.match(r"--?[a-zA-Z]", name) and not any(option.startswith(name) for option in known.values()):
+                close = get_close_matches(name.lstrip("-"), known, n=1)
+                return f"unknown option {name}" + (f"; did you mean {known[close[0]]}?" if close else "")
+        return None
 
 
 def angles(text: str) -> tuple[float, float]:

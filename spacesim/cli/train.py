@@ -1,6 +1,7 @@
 """`spacesim train`. Its options stand for fields of TrainConfig and NerfConfig, whose comments say what they mean."""
 
 import argparse
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -49,11 +50,10 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
         field = meanings[key]
         words = field.type.removesuffix(" | none").replace(" | ", ", ") if value == "NAME" else field.meaning
         words = ", ".join(METHODS) if key == "method" else words
-        default = field.default if key in ("method", "preset") else None
         kind = int if value == "N" else str
         shown = field.default if key in (*_NAMES, "seed") else "what the data has" if key == "init" else "of the preset"
         text = f"{words} (default: {shown})"
-        parser.add_argument(option, type=kind, default=default, metavar=value, help=text)
+        parser.add_argument(option, type=kind, metavar=value, help=text)
     parser.add_argument(
         "--warm-start", action="store_true", default=None, help=meanings["warm_start"].meaning.partition(";")[0]
     )
@@ -90,26 +90,28 @@ def option_of(field: str, options: argparse.Namespace) -> str | None:
 def run(options: argparse.Namespace) -> None:
     from spacesim.cli.fields import listing
     from spacesim.data.store import read_dataset
-    from spacesim.methods import preset, train, with_settings
+    from spacesim.methods import configuration, train, with_settings
     from spacesim.progress import report_training, show_progress
     from spacesim.splat.train.config import TrainConfig, warm_start
 
     own = dict(map(parse_setting, options.set))
     values = {key: getattr(options, option[2:].replace("-", "_")) for option, key in _KEYS.items()}
     chosen = {key: value for key, value in values.items() if value is not None and key not in _NAMES}
-    config = preset(options.preset, options.method, options.strategy)
+    begun = options.out if options.resume else None
+    config = configuration(options.preset, options.method, options.strategy, begun)
     for option, key in _KEYS.items():
         if key in own and values[key] is not None:
             raise InputError(f"{key}: expected none beside {option}, found {own[key]!r}")
     if isinstance(config, TrainConfig):
-        if chosen.pop("warm_start", False):
-            config = replace(config, warm_start=warm_start(options.preset))
+        if chosen.pop("warm_start", False) and config.warm_start is None:
+            config = replace(config, warm_start=warm_start(config.preset or "fast"))
     elif others := [key for key in chosen if key not in _OF_BOTH]:
-        raise InputError(f"{others[0]}: expected with a method of Gaussians, found with {options.method}")
+        raise InputError(f"{others[0]}: expected with a method of Gaussians, found with {config.method}")
     try:
         config = with_settings(config, chosen | own)
     except InputError as error:
-        raise InputError(f"{error}{_advice(str(error))}") from None
+        sentence = re.sub(r"expected a field of \w+", "expected a field that spacesim train --fields lists", str(error))
+        raise InputError(f"{sentence}{_advice(sentence)}") from None
     if options.fields:
         interrupts.print_output(listing(config))
         return
@@ -148,7 +150,8 @@ def _advice(sentence: str) -> str:
     if field == "warm_start" or rest.startswith("expected warm_start to be there"):
         return "; add --warm-start"
     is_unknown = f"found {field.rpartition('.')[2]!r}" in rest
-    return "; see spacesim train --fields" if is_unknown and "did you mean" not in rest else ""
+    has_advice = "did you mean" in rest or "train --fields" in rest
+    return "; see spacesim train --fields" if is_unknown and not has_advice else ""
 
 
 def _help(prog: str) -> argparse.HelpFormatter:

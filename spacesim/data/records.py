@@ -109,10 +109,11 @@ class Camera:
     def from_fov(world_from_camera: Array, width: int, height: int, fov_x_deg: float) -> "Camera":
         """A camera with square pixels, a centred principal point and a horizontal field of view in degrees. Raises
         InputError for a size or a field of view that no camera has."""
-        numbers = as_numbers((width, height, fov_x_deg))
-        if numbers.shape != (3,) or not np.isfinite(numbers).all():
-            found = f"{width!r} x {height!r} and {fov_x_deg!r}"
-            raise InputError(f"camera: expected a size in pixels and a field of view in degrees, found {found}")
+        size, angle = as_numbers((width, height)), as_numbers(fov_x_deg)
+        if size.shape != (2,) or not np.isfinite(size).all():
+            raise InputError(f"camera: expected a size in pixels, found {width!r} x {height!r}")
+        if angle.shape != () or not 0 < angle < 180:
+            raise InputError(f"fov_x_deg: expected a number between 0 and 180 degrees, found {fov_x_deg!r:.60}")
         focal = 0.5 * width / np.tan(0.5 * np.radians(fov_x_deg))
         return Camera(world_from_camera, width, height, focal, focal, 0.5 * width, 0.5 * height)
 

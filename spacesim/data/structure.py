@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache, wraps
 from inspect import signature
@@ -120,6 +120,22 @@ def keys_of(cls: type, rules: Rules) -> dict[str, Any]:
     return {name: hint for name, hint in _hints(cls).items() if name not in hidden}
 
 
+def options_in(cls: Any) -> list[Field[Any]]:
+    """The fields of a dataclass that can be set: not those whose metadata say `"option": False`."""
+    return [f for f in fields(cls) if f.metadata.get("option", True)]
+
+
+def check_first_key(cls: type, name: str) -> None:
+    """Raise InputError "name: expected a field of ..., found ..." unless a dotted name begins with a field of the
+    dataclass `cls`. It says where a field within is called so, or nearly so."""
+    keys, known = tuple(name.split(".")), keys_of(cls, Rules())
+    if keys[0] not in known:
+        ends = (place for place in places_of(cls, Rules()) if place[-len(keys) :] == keys)
+        close = next(ends, None) or _close_place(cls, Rules(), (), keys[0], [*known])
+        hint = f"; did you mean {dotted(close)}?" if close else ""
+        raise InputError(f"{name}: expected a field of {cls.__name__}, found {keys[0]!r:.60}{hint}")
+
+
 def field_value(cls: type, name: str, value: object) -> Any:
     """`value`, given in Python, as the field `name` of a dataclass wants it: numpy's numbers and arrays as Python's,
     lists as tuples, records and what no file can say as they are. Raises InputError "name: expected ..., found ..."."""
@@ -192,10 +208,23 @@ def _as_in_files(value: object) -> object:
 def places_of(cls: type, rules: Rules, at: Keys = ()) -> Iterator[Keys]:
     """Where keys are in a document that gives a `cls`, but for those in lists and in tables with free names."""
     for kind in dict.fromkeys([cls, *rules.kinds.get(cls, {}).values()]):
+        options = {f.name for f in options_in(kind)}
         for key, hint in keys_of(kind, rules).items():
+            if key not in options:
+                continue
             yield (*at, key)
             for table in (member for member in members_of(hint) if isinstance(member, type) and is_dataclass(member)):
                 yield from places_of(table, rules, (*at, key))
+
+
+def _close_place(root: type, rules: Rules, at: Keys, key: str, expected: Sequence[str]) -> Keys | None:
+    """Where a key is that is called `key`, or nearly so: one of the `expected` in the table `at`, else any of the
+    document that gives a `root`; None where there is none."""
+    places = {str(place[-1]): place for place in reversed([*places_of(root, rules)])}  # the first
+    places |= {name: (*at, name) for name in expected}
+    close = [key] if key in places else get_close_matches(key, expected, 1)
+    close = close or get_close_matches(key, places, 1, 0.8)  # elsewhere: only what is nearly it
+    return places[close[0]] if close else None
 
 
 def did_you_mean(word: object, words: Iterable[str]) -> str:
@@ -230,7 +259,8 @@ class _Reader:
         values = {key: value for key, value in values.items() if key in hints or not is_open}
         for key in values:
             if key not in hints:
-                self._refuse_key(key, at, [*(["kind"] if kinds else []), *hints], kinds)
+                options = [f.name for f in options_in(cls) if f.name in hints]
+                self._refuse_key(key, at, [*(["kind"] if kinds else []), *options], kinds)
         settings = {key: self.value(hints[key], value, (*at, key)) for key, value in values.items()}
         settings = {**(defaults or {}), **settings}
         for f in fields(cls):
@@ -302,12 +332,9 @@ class _Reader:
             raise InputError(f"{label}: {rest}" if label else str(error)) from None
 
     def _refuse_key(self, key: str, at: Keys, expected: Sequence[str], kinds: Mapping[str, type]) -> NoReturn:
-        places = {str(place[-1]): place for place in reversed([*places_of(self._root, self._rules)])}  # the first
-        places |= {name: (*at, name) for name in expected}
         others = [kind for kind, cls in kinds.items() if key in keys_of(cls, self._rules)]
-        close = [key] if key in places else get_close_matches(key, expected, 1)
-        close = close or get_close_matches(key, places, 1, 0.8)  # elsewhere: only what is nearly it
-        hint = f"; did you mean {dotted(places[close[0]])}?" if close else ""
+        close = _close_place(self._root, self._rules, at, key, expected)
+        hint = f"; did you mean {dotted(close)}?" if close else ""
         if others:
             hint = f"; kind {' and '.join(others)} know{'s' * (len(others) == 1)} it"
         self._refuse((*at, key), f"one of {', '.join(expected)}", key, hint)

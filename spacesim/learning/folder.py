@@ -79,12 +79,17 @@ def check_folder(out: Path, described: JsonDict, resume: bool, read_config: Read
     """Raises InputError where a run that is so described cannot be written to `out`, or completed in it. read_config:
     of the method"""
     if (out / "config.json").exists():
-        if checkpoints(out) or (out / "model.safetensors").exists():  # else nothing is there that could be lost
+        if holds_training(out):  # else nothing is there that could be lost
             _check_resumable(out, described, resume, read_config)
     elif out.exists() and not out.is_dir():
         raise InputError(f"{out}: expected an empty or new folder for the run, found no folder")
     elif holds_files(out):
         raise InputError(f"{out}: expected an empty or new folder for the run, found other files in it")
+
+
+def holds_training(out: Path) -> bool:
+    """Whether a folder holds a checkpoint or a model."""
+    return bool(checkpoints(out)) or (out / "model.safetensors").exists()
 
 
 def checkpoints(out: Path) -> list[Path]:
@@ -170,7 +175,7 @@ def _check_resumable(out: Path, described: JsonDict, resume: bool, read_config: 
         values = read_json(out / "config.json")
         method, expected = values.get("method") if isinstance(values, dict) else None, described["method"]
         if isinstance(method, str) and method != expected:  # of another family, whose configurations have other fields
-            raise _started_with(out, "method", method, expected) from None
+            raise started_with(out, "method", method, expected) from None
         raise
     data["path"] = described["data"]["path"]  # it may have moved
     if same_digest(str(data.get("digest")), described["data"]["digest"]):
@@ -178,10 +183,11 @@ def _check_resumable(out: Path, described: JsonDict, resume: bool, read_config: 
     current = {**config.to_json(), "data": data}  # what an older version did not write is as by default
     difference = _first_difference(current, described)
     if difference is not None:
-        raise _started_with(out, *difference)
+        raise started_with(out, *difference)
 
 
-def _started_with(out: Path, key: str, old: object, new: object) -> InputError:
+def started_with(out: Path, key: str, old: object, new: object) -> InputError:
+    """What refuses to resume the run in `out` with another value of a key than its own."""
     return InputError(f"{out}: was started with {key} {old!r}, expected the same to resume it, found {new!r}")
 
 

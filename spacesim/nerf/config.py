@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.files import JsonDict, JsonMapping
-from spacesim.data.structure import Rules, check_fields, did_you_mean, plain, structure
+from spacesim.data.structure import Rules, check_fields, check_first_key, did_you_mean, plain, structure
 from spacesim.data.toml import Document, read_document
 
 Method = Literal["nerf", "nerf-relight"]
@@ -185,6 +185,8 @@ def shortened(config: NerfConfig, iterations: int) -> NerfConfig:
 def with_settings(config: NerfConfig, settings: JsonMapping) -> NerfConfig:
     """`config` with fields set by their dotted names: {"grid.levels": 12}. Fewer `iterations` shorten the warm-up.
     Raises InputError "grid.levels: expected ..., found ..." for a name or a value that cannot be."""
+    for name in settings:
+        check_first_key(NerfConfig, name)
     iterations = settings.get("iterations")
     values = (shortened(config, iterations) if type(iterations) is int else config).to_json()
     for name, value in settings.items():

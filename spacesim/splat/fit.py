@@ -83,11 +83,11 @@ def find_unknowns(run: Predictor, gain: bool = False) -> tuple[Unknown, ...]:
 
 
 def estimate_sun(
-    run: Predictor, image: str | Path | ArrayLike | Image, camera: Camera, mask: ArrayLike | None = None
+    run: Predictor | str | Path, image: str | Path | ArrayLike | Image, camera: Camera, mask: ArrayLike | None = None
 ) -> SunEstimate:
     """The Sun under which the model of `run` looks most like a picture: its direction, and how sure that is.
 
-    image: as for `refine_pose`
+    run, image: as for `refine_pose`
     camera: of the picture, with its size and intrinsics (no distortion);  mask: [H, W], where not 0 the pixel counts
     Pixels count where the picture's alpha is at least one half, or the model's where the picture has none. All
     directions are compared, shadows included, on a picture of 64 pixels; the picture's exposure is taken for that of

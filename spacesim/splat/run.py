@@ -18,7 +18,7 @@ import numpy as np
 from spacesim import backend
 from spacesim.backend.arrays import Bool
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonDict
+from spacesim.data.files import JsonDict, as_path
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import checked, read_record
 from spacesim.learning.folder import finished_model, read_described
@@ -34,7 +34,8 @@ from spacesim.splat.raster.render import render
 from spacesim.splat.raster.supersample import render_supersampled
 from spacesim.splat.raster.tone import adjust_exposure
 from spacesim.splat.train.checkpoint import GaussianHistoryEntry, read_tensors
-from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.config import METHODS, TrainConfig
+from spacesim.splat.train.old_config import ALIASES
 
 
 class ComposedModel(Protocol):
@@ -258,10 +259,16 @@ class Run:
         return _prediction(output, rgb, visibility, normals)
 
 
-def check_gaussians(run: Predictor) -> Run:
-    """The trained run of Gaussians that `run` is. Raises InputError where it is none."""
-    if not hasattr(run, "gaussian_run"):
-        raise InputError(f"run: expected what load_run returns, found {run!r:.60}")
+def check_gaussians(run: Predictor | str | Path) -> Run:
+    """The trained run of Gaussians that `run` is, or that lies in the folder `run`. Raises InputError where it is
+    none."""
+    if isinstance(run, str | Path) or not hasattr(run, "gaussian_run"):
+        path = as_path(run, "run", "a path or what load_run returns")
+        finished_model(path)
+        method = read_described(path / "config.json")[0].get("method", "vanilla")
+        if isinstance(method, str) and method not in (*METHODS, *ALIASES):
+            raise InputError(f"run: expected one of Gaussians, found one of the method {method:.60}")
+        return load_run(path)
     if run.gaussian_run is None:
         raise InputError(f"run: expected one of Gaussians, found one of the method {run.config['method']}")
     return run.gaussian_run

@@ -273,6 +273,8 @@ def test_functions_for_gaussians_refuse_a_radiance_field(dataset, finished, tmp_
     image = load_image(dataset, dataset.test[0])
     with pytest.raises(InputError, match="run: expected one of Gaussians, found one of the method nerf"):
         ss.refine_pose(finished, image, dataset.test[0].camera)
+    with pytest.raises(InputError, match="run: expected one of Gaussians, found one of the method nerf"):
+        ss.refine_pose(finished.path, image, dataset.test[0].camera)
     with pytest.raises(InputError, match="run: expected one of Gaussians"):
         ss.estimate_sun(finished, image, dataset.test[0].camera)
     with pytest.raises(InputError, match="align: expected a run of Gaussians"):

@@ -77,7 +77,8 @@ def checked_picture(
     pixels = np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[:2] != size or pixels.shape[2] not in (3, 4):
         expected = f"[{camera.height}, {camera.width}, 3 or 4] as the camera has it"
-        raise InputError(f"image: expected {expected}, found {list(pixels.shape)}")
+        found = f"{image!r:.60}" if pixels.ndim == 0 else list(pixels.shape)
+        raise InputError(f"image: expected {expected}, found {found}")
     if not (np.issubdtype(pixels.dtype, np.floating) or pixels.dtype == np.uint8):
         raise InputError(f"image: expected float values in [0, 1] or uint8, found {pixels.dtype}")
     pixels = pixels.astype(np.float32) / (255 if pixels.dtype == np.uint8 else 1)

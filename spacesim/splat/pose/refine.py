@@ -60,7 +60,7 @@ class RefinedPose:
 
 @checked
 def refine_pose(
-    run: Predictor,
+    run: Predictor | str | Path,
     image: str | Path | ArrayLike | Image,
     camera: Camera,
     sun: Sun | Sequence[float] | None = None,
@@ -71,6 +71,7 @@ def refine_pose(
 ) -> RefinedPose:
     """The pose at which the model of `run` looks most like `image`, near that of `camera`.
 
+    run: what `load_run` returns, or its folder
     image: [H, W, 3] sRGB values, float in [0, 1] or uint8, or [H, W, 4] with straight alpha; or the path of a picture,
         or what `load_image` gives
     camera: a guess of the pose, with the picture's size and intrinsics (no distortion)

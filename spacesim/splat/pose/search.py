@@ -134,7 +134,7 @@ class ModelViews:
 
 @checked
 def find_pose(
-    run: Predictor,
+    run: Predictor | str | Path,
     image: str | Path | ArrayLike | Image,
     camera: Camera,
     sun: Sun | Sequence[float] | None = None,
@@ -144,7 +144,7 @@ def find_pose(
 ) -> FoundPose:
     """The pose from which the model of `run` looks most like `image`, wherever that is.
 
-    image: as for `refine_pose`, with one object before a sky of one colour, or with alpha
+    run, image: as for `refine_pose`, with one object before a sky of one colour, or with alpha
     camera: size and intrinsics of the picture; its pose does not matter
     sun, mask, seed: as for `refine_pose`; views: of the same run and Sun, to save time with many pictures
 

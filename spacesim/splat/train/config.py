@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.files import JsonDict, JsonMapping
-from spacesim.data.structure import Rules, alternatives, check_fields, did_you_mean, plain, structure
+from spacesim.data.structure import Rules, alternatives, check_fields, check_first_key, did_you_mean, plain, structure
 from spacesim.data.toml import Document, read_document
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.shadow.cast import SplattingConfig
@@ -329,6 +329,8 @@ def with_settings(config: TrainConfig, settings: JsonMapping) -> TrainConfig:
     the schedule, see `shortened`; other fields of it are put in after that. Raises InputError
     "light.shadow.bias: expected ..., found ..." for a name or a value that cannot be.
     """
+    for name in settings:
+        check_first_key(TrainConfig, name)
     iterations = settings.get("iterations")
     values = (shortened(config, iterations) if type(iterations) is int else config).to_json()
     depths = {name: name.count(".") - name.endswith(".kind") for name in settings}

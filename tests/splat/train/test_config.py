@@ -102,6 +102,16 @@ def test_an_older_run_is_resumed(small_lit_dataset, tmp_path):
     assert content
     path.write_text(json.dumps({**OLD["demo shadow-map mesh-aware"], "iterations": 2, "init_count": 40, "data": data}))
     assert train(small_lit_dataset, tmp_path / "run", config, resume=True).gaussian_count == run.gaussian_count
+    model = run.path / "model.safetensors"
+    before = model.read_bytes()
+    model.unlink()
+    resumed = ss.train(small_lit_dataset, run.path, resume=True)  # whose configuration is that of the older config.json
+    assert resumed.config == run.config
+    assert model.read_bytes() == before
+    with pytest.raises(InputError, match=r"was started with method 'shadow-map', .* found 'vanilla'"):
+        ss.train(small_lit_dataset, run.path, method="vanilla", resume=True)
+    with pytest.raises(InputError, match=r"was started with seed 0, .* found 7"):
+        ss.train(small_lit_dataset, run.path, seed=7, resume=True)
     other = with_settings(config, {"strategy.cull_every": 77})
     with pytest.raises(InputError, match=r"strategy\.cull_every 500, .* found 77"):
         train(small_lit_dataset, tmp_path / "run", other, resume=True)
@@ -167,7 +177,7 @@ def test_an_alternative_is_chosen_by_its_name_or_its_kind():
     assert with_settings(grown, {"strategy.kind": "mcmc"}) == grown
     with pytest.raises(InputError, match=r"^strategy\.growth: expected one of kind, .* kind mcmc knows it"):
         with_settings(config, {"strategy.kind": "default", "strategy.growth": 0.5})
-    with pytest.raises(InputError, match=r"^kind: expected one of method"):
+    with pytest.raises(InputError, match=r"^kind: expected a field of TrainConfig, found 'kind'"):
         with_settings(config, {"kind": "default"})
 
 
