@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import BackendError
-from spacesim.backend.arrays import Float
+from spacesim.backend.arrays import ArrayXf, Bool, Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonDict, JsonMapping, as_path
@@ -295,7 +295,10 @@ def render(
     camera: Camera | Projection,
     *,
     twist: Float | np.ndarray | Sequence[float] | None = None,
-    **options: Any,
+    sh_degree: int | None = None,
+    outputs: Sequence[str] = ("color", "alpha", "depth"),
+    features: Sequence[Float] | ArrayXf | None = None,
+    antialiased: Bool | bool = False,
 ) -> RenderOutput:
     """Gaussians seen by a camera, as Dr.Jit arrays: differentiable by every parameter that has gradients enabled.
 
@@ -320,7 +323,7 @@ def render(
         view = Pinhole.of(camera)
     if twist is not None:
         view = view.moved(_twist(twist))
-    return _render(gaussians, view, **options)
+    return _render(gaussians, view, sh_degree, outputs, features, antialiased)
 
 
 def _twist(twist: Float | np.ndarray | Sequence[float]) -> Float:
