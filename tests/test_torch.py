@@ -111,12 +111,14 @@ def dense(leaves: dict, camera: int, degree: int | None, eps2d: float, antialias
     pixel = torch.arange(SIDE) + 0.5
     grid = torch.stack(torch.meshgrid(pixel, pixel, indexing="xy"), -1).double()
     passes, picture = torch.ones(SIDE, SIDE, dtype=torch.float64), torch.zeros(SIDE, SIDE, features.shape[1]).double()
-    inverse = torch.linalg.inv(spread)
+    inverse, goes_on = torch.linalg.inv(spread), torch.ones(SIDE, SIDE, dtype=torch.bool)
     for k in order.tolist():
         offset = grid - centre[k]
         alpha = opacity[k] * torch.exp(-0.5 * torch.einsum("hwi,ij,hwj->hw", offset, inverse[k], offset))
         alpha = alpha.clamp(max=ALPHA_MAX)
-        alpha = torch.where((alpha >= ALPHA_MIN) & (z[k] > 0.01) & (passes.detach() > PASSES), alpha, 0 * alpha)
+        alpha = torch.where((alpha >= ALPHA_MIN) & (z[k] > 0.01), alpha, 0 * alpha)
+        goes_on = goes_on & (passes.detach() * (1 - alpha.detach()) > PASSES)
+        alpha = torch.where(goes_on, alpha, 0 * alpha)
         picture = picture + (passes * alpha)[..., None] * features[k]
         passes = passes * (1 - alpha)
     return picture, 1 - passes

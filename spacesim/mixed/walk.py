@@ -125,7 +125,8 @@ def blend_segments(
 
         # the splat
         alpha: Any = dr.select(blends, dr.minimum(exp2(power), ALPHA_MAX), 0)
-        taken = alpha * behind
+        finishes = blends & (behind * (1 - alpha) <= TRANSMITTANCE_MIN)
+        taken = dr.select(finishes, 0, alpha * behind)
         left = behind - taken
         median = dr.select((behind >= 0.5) & (left < 0.5), z, median)
         depth = dr.fma(taken, dr.select(is_splat, z, 0), depth)
@@ -136,7 +137,7 @@ def blend_segments(
         splat = [dr.fma(taken, own[common + c], splat[c]) for c in range(sizes[1])]
         segment = [dr.fma(weight, there[common + c], segment[c]) for c in range(sizes[2])]
         reached = dr.select(passes, dr.maximum(reached, stop), reached)
-        k, j = dr.select(splat_first, k + 1, k), dr.select(splat_first, j, j + 1)
+        k, j = dr.select(finishes, end, dr.select(splat_first, k + 1, k)), dr.select(splat_first, j, j + 1)
         return k, end, j, reached, left, depth, median, [both, splat, segment]
 
     state = (

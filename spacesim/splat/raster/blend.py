@@ -67,7 +67,7 @@ def blend_lists(
     snapshots = _Checkpoints(lists, bucket, channels, thread.place, start) if bucket else None
 
     def alive(k: UInt32, end: UInt32, transmittance: list[Float], _sums: object, _last: object) -> Bool:
-        return (k < end) & (reduce(dr.maximum, transmittance) > TRANSMITTANCE_MIN)
+        return (k < end) & (reduce(dr.maximum, transmittance) > 0)
 
     def blend(
         k: UInt32, end: UInt32, transmittance: list[Float], sums: list[list[Float]], last: list[UInt32]
@@ -81,11 +81,15 @@ def blend_lists(
             powers = exponents(record, thread.x, thread.y, shape)
             for p in range(pixels):
                 alpha = dr.minimum(exp2(powers[p]), ALPHA_MAX)
-                blends = listed & (powers[p] >= POWER_MIN) & (transmittance[p] > TRANSMITTANCE_MIN)
-                weight = dr.select(blends, alpha * transmittance[p], 0)
+                reached = listed & (powers[p] >= POWER_MIN) & (transmittance[p] > 0)
+                weight = alpha * transmittance[p]
+                behind = transmittance[p] - weight
+                blends = reached & (behind > TRANSMITTANCE_MIN)
+                weight = dr.select(blends, weight, 0)
                 for c in range(channels):
                     sums[p][c] = dr.fma(weight, record[6 + c], sums[p][c])
-                transmittance[p] -= weight
+                left = dr.select(blends, behind, -transmittance[p])  # finished: negative from then on
+                transmittance[p] = dr.select(reached, left, transmittance[p])
                 last[p] = dr.select(blends, k + (u + 1), last[p])
         return k + turn, end, transmittance, sums, last
 
@@ -99,6 +103,7 @@ def blend_lists(
     if lists.capacity > 0:
         state = dr.while_loop(state, alive, blend, mode="symbolic", label="blend")
     _, _, transmittance, sums, last = state
+    transmittance = [dr.abs(value) for value in transmittance]
 
     threads = tiles * shape.threads
     tiled = [store([sums[p][c] for p in range(pixels)], thread.place, threads) for c in range(channels)]

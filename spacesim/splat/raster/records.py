@@ -13,7 +13,7 @@ from spacesim.splat.raster.tiles import TileLists, TileShape
 
 ALPHA_MAX = 0.999  #: a splat never hides everything behind it
 POWER_MIN = math.log2(ALPHA_MIN)  #: of what is blended
-TRANSMITTANCE_MIN = 1e-4  #: a pixel is finished once less than this passes
+TRANSMITTANCE_MIN = 1e-4  #: a pixel is finished before the first splat behind which no more than this would pass
 LOG2_E = 1.4426950408889634
 
 _EXP2 = (1.0, 0.693147004, 0.240222469, 0.0555071086, 0.00967129413, 0.00132695748)

@@ -54,6 +54,7 @@ def render_reference(
     sums = np.zeros((camera.height, camera.width, blended.shape[1]))
     median_depth = np.zeros((camera.height, camera.width))
     transmittance = np.ones((camera.height, camera.width))
+    finished = np.zeros((camera.height, camera.width), bool)
     for i in np.argsort(centers[:, 2], kind="stable"):
         if perspective and centers[i, 2] <= 0.01:
             continue
@@ -66,7 +67,9 @@ def render_reference(
         dx, dy = columns - x, rows - y
         squared = inverse[0, 0] * dx**2 + 2 * inverse[0, 1] * dx * dy + inverse[1, 1] * dy**2
         alpha = np.minimum(opacity[i] * share * np.exp(-0.5 * squared), 0.999)
-        alpha[(alpha < 1 / 255) | (transmittance <= 1e-4)] = 0
+        alpha[alpha < 1 / 255] = 0
+        finished |= transmittance * (1 - alpha) <= 1e-4  # which the splat that does it has no part in
+        alpha[finished] = 0
         sums += (alpha * transmittance)[..., None] * blended[i]
         behind = transmittance * (1 - alpha)
         median_depth[(transmittance >= 0.5) & (behind < 0.5)] = centers[i, 2]

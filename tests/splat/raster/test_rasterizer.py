@@ -66,6 +66,21 @@ def picture(arrays: dict[str, np.ndarray], view: Camera) -> dict[str, np.ndarray
     }
 
 
+def test_a_pixel_ends_before_the_splat_that_would_finish_it():
+    """As in gsplat: behind an opacity of 0.95 one of 0.999 would leave 5e-5, so neither it nor what follows counts."""
+    arrays = placed_splats() | {"logit_opacities": np.log([19.0, 1999.0, 1.0, 1.0])}
+    arrays["log_scales"][:] = np.log(50.0)
+    view = camera(16, 12)
+    model = Gaussians.from_numpy(arrays)
+    dr.enable_grad(model.logit_opacities)
+    output = render(model, Pinhole.of(view))
+    dr.backward(dr.sum(output.alpha))
+    alpha = np.array(output.alpha)
+    assert 0.94 < alpha.min() <= alpha.max() < 0.96
+    assert np.array(dr.grad(model.logit_opacities))[1:].tolist() == [0, 0, 0]
+    np.testing.assert_allclose(alpha, render_reference(arrays, view).alpha.ravel(), atol=1e-6)
+
+
 def loss_weights(view: Camera) -> list[np.ndarray]:
     rng = np.random.default_rng(3)
     return [rng.normal(size=view.width * view.height) for _ in range(5)]
