@@ -97,8 +97,8 @@ def load_truth(dataset: Dataset, frame: Frame) -> Truth:
     sizes = {layers[name].shape[:2] for name in present}
     if sizes != {(frame.camera.height, frame.camera.width)}:
         expected = f"{frame.camera.width}x{frame.camera.height}"
-        found = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
-        raise InputError(f"{path}: expected {expected} pixels as the camera says, found {found}")
+        listed = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
+        raise InputError(f"{path}: expected {expected} pixels as the camera says, found {listed}")
     values = {name: layers[name].astype(np.uint8 if name in _LABELS else np.float32) for name in present}
     if any(frame.distortion):
         source = Undistortion(frame.camera, frame.distortion)

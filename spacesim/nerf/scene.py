@@ -64,8 +64,8 @@ class FieldScene(ABC):
     def stops(self, exposure: float | None) -> float:
         """0: colours are sRGB values. Raises InputError for an exposure."""
         if exposure is not None:
-            found = f"a radiance field in {self.path or 'the scene'}"
-            raise InputError(f"exposure: expected runs trained in linear light (light.linear) alone, found {found}")
+            model = f"a radiance field in {self.path or 'the scene'}"
+            raise InputError(f"exposure: expected runs trained in linear light (light.linear) alone, found {model}")
         return 0.0
 
     def predict(

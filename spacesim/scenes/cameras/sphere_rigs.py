@@ -122,8 +122,8 @@ class RandomRig(RigConfig):
         check_phases(self.min_phase_deg, self.max_phase_deg)
         expect(not (self.random_suns and self.sun), "random_suns", "false where sun names the Suns", True)
         if self.random_suns and (self.suns, self.test_suns) != (1, 0):
-            found = f"{self.suns} suns and {self.test_suns} test_suns"
-            raise InputError(f"random_suns: expected 1 suns and 0 test_suns, as every frame has its own, found {found}")
+            suns = f"{self.suns} suns and {self.test_suns} test_suns"
+            raise InputError(f"random_suns: expected 1 suns and 0 test_suns, as every frame has its own, found {suns}")
 
     def views_of(self, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
         near = self.near or min(fitting_distance(target.radius, camera), self.far or math.inf)

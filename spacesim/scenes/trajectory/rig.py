@@ -166,8 +166,8 @@ def check_exposures(exposures: Array | None) -> None:
     """Raise InputError where one of them [N] is out of range."""
     least, most = EXPOSURES
     if exposures is not None and not ((exposures >= least) & (exposures <= most)).all():
-        found = exposures[int((~((exposures >= least) & (exposures <= most))).argmax())]
-        raise InputError(f"exposure: expected numbers from {least:g} to {most:g}, found {found:g}")
+        wrong = exposures[int((~((exposures >= least) & (exposures <= most))).argmax())]
+        raise InputError(f"exposure: expected numbers from {least:g} to {most:g}, found {wrong:g}")
 
 
 @dataclass(frozen=True)

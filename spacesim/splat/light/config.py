@@ -33,8 +33,8 @@ class LightConfig:
         if not 0 <= self.bounce <= MAX_EMITTERS:
             raise InputError(f"bounce: expected 0 to {MAX_EMITTERS}, found {self.bounce}")
         if self.bounce and not self.field.surface:
-            found = "a field that takes directions"
-            raise InputError(f"bounce: expected 0 or light.field.inputs=surface, whose normals it needs, found {found}")
+            kind = "a field that takes directions"
+            raise InputError(f"bounce: expected 0 or light.field.inputs=surface, whose normals it needs, found {kind}")
         if self.shadow and not self.field.knows_sun:
             raise InputError("field: expected inputs with the Sun, which casts shadows, found view")
         for name in ("tone", "exposure"):
