@@ -34,7 +34,8 @@ class FieldScene(ABC):
     """Posed runs under one Sun, radiance fields among them; in scene files what
     `splat.compose.GaussianComposition` is to Gaussians.
 
-    models: at least one;  config: how they shade each other, see `splat.compose.scene.ComposeConfig`
+    models: at least one
+    config: how they shade each other, see `splat.compose.scene.ComposeConfig`
     """
 
     def __init__(self, models: Sequence[Any], config: Any, path: Path | None = None) -> None:

@@ -69,12 +69,11 @@ for line in sys.stdin:
 
 @dataclass(frozen=True)
 class AttackResult:
-    """Results of an attack. tried: attempts of each kind;  finds: a sentence for each that got through;  peak: MB of
-    memory that the viewer took at most, None where the system does not tell"""
+    """Results of an attack."""
 
-    tried: dict[str, int]
-    finds: list[str]
-    peak: float | None
+    tried: dict[str, int]  #: attempts of each kind
+    finds: list[str]  #: a sentence for each that got through
+    peak: float | None  #: MB of memory that the viewer took at most, None where the system does not tell
 
 
 @dataclass

@@ -19,7 +19,8 @@ class LightConfig:
 
     field: FieldConfig = field(default_factory=FieldConfig)  #: the network that gives colours
     shadow: ShadowConfig | None = None  #: how shadows are cast; none leaves them to the field (the method `relight`)
-    bounce: int = 0  #: so many of the Gaussians scatter sunlight onto all (`bounce.irradiance`), 0 for none
+    #: so many of the Gaussians scatter sunlight onto all others, once and as if nothing stood in between; 0 for none
+    bounce: int = 0
     #: colours are linear, shares of what is white, and blended as such, and pictures go through the tone curve
     #: afterwards; else they are sRGB values, as in the thesis (section 7.2 asks for the former)
     linear: bool = False
