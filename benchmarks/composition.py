@@ -39,12 +39,12 @@ COLUMNS = shadows.COLUMNS[:9]  #: those of both tables
 
 @dataclass(frozen=True)
 class Row:
-    """name: of the row;  run: of the run, a folder of RUNS;  config: of its training;  shadows: between the models"""
+    """A row of the tables."""
 
-    name: str
-    run: str
-    config: TrainConfig
-    shadows: str
+    name: str  #: of the row
+    run: str  #: of the run, a folder of RUNS
+    config: TrainConfig  #: of its training
+    shadows: str  #: between the models
 
 
 def main() -> None:

@@ -105,8 +105,8 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "splat, surface", splatted
     yield "map, surface, thesis's shadows", with_shadow(mapped, bias=10.0, grazing="none", method=MappingConfig())
     yield "map, surface, bilinear", with_shadow(mapped, method=MappingConfig())
-    yield "map, surface, lifted alone", with_shadow(mapped, grazing="lift")
-    yield "splat, surface, lifted alone", with_shadow(splatted, grazing="lift")
+    yield "map, surface, offset receivers alone", with_shadow(mapped, grazing="lift")
+    yield "splat, surface, offset receivers alone", with_shadow(splatted, grazing="lift")
     yield "map, surface, no refinement", with_shadow(mapped, refine=None)
     closer = MappingConfig("percentage-closer", sun_radius_deg=SUN_RADIUS_DEG)
     yield "map, surface, percentage-closer", with_shadow(mapped, method=closer)
@@ -124,7 +124,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "splat, surface, gradients", with_shadow(splatted, method=moving)
     both = with_shadow(replace(splatted, visibility_weight=0.1), method=moving)
     yield "splat, surface, supervised, gradients", both
-    yield "splat, surface, lifted alone, supervised, gradients", with_shadow(both, grazing="lift")
+    yield "splat, surface, offset receivers alone, supervised, gradients", with_shadow(both, grazing="lift")
     yield "none, surface, bounce", with_bounce(relit, light_of(splatted).bounce)
     yield "map, surface, no bounce", with_bounce(mapped, 0)
     yield "splat, surface, no bounce", with_bounce(splatted, 0)

@@ -53,8 +53,9 @@ def places(centre: np.ndarray, distance: float, start: int = 0) -> Iterator[np.n
 class Visitor:
     """One client. window: (width, height), pixels
 
-    controls: what the panel holds, by label: messages of viser;  handles: names of gizmos;  first: (position, what it
-    looks at) that the viewer proposes
+    controls: what the panel holds, by label: messages of viser
+    handles: names of gizmos
+    first: (position, what it looks at) that the viewer proposes
     """
 
     def __init__(self, url: str, window: tuple[int, int]) -> None:

@@ -24,7 +24,11 @@ _CONTEXT.set_forkserver_preload(["__main__", *IMPORTED])
 
 class Forked:
     """A process in a session of its own, as `python WORDS` would be: "-m", a module, or "-c", a program, and arguments.
-    What it prints is lost, but for its errors. folder: where it works;  environment: added to this process's"""
+    What it prints is lost, but for its errors.
+
+    folder: where it works
+    environment: added to this process's
+    """
 
     def __init__(self, words: Sequence[object], folder: Path | None = None, **environment: str) -> None:
         errors, name = tempfile.mkstemp()

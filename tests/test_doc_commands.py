@@ -76,8 +76,15 @@ def name_of(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Command:
-    """document: where it stands; text: as it stands there; program: "spacesim" or a script; words: its arguments;
-    target: the file that its output goes to; whole: not just named in a sentence, without what it needs."""
+    """A command of a document.
+
+    document: where it stands
+    text: as it stands there
+    program: "spacesim" or a script
+    words: its arguments
+    target: the file that its output goes to
+    whole: not just named in a sentence, without what it needs
+    """
 
     document: str
     text: str

@@ -39,14 +39,15 @@ def explained(record: ast.ClassDef, lines: list[str]) -> tuple[set[str], set[str
 
 def unexplained(sources: dict[str, str]) -> list[str]:
     """ "module.py: Record.field" of public records' fields that neither they nor what they extend explains."""
-    records = [
-        (path, node, explained(node, text.splitlines()))
+    classes = [
+        (path, node, text.splitlines())
         for path, text in sources.items()
         for node in ast.walk(ast.parse(text))
-        if is_record(node)
+        if isinstance(node, ast.ClassDef)
     ]
+    records = [(path, node, explained(node, lines)) for path, node, lines in classes if is_record(node)]
     documented = {node.name: names for _, node, (names, _) in records}
-    bases = {node.name: [ast.unparse(base) for base in node.bases] for _, node, _ in records}
+    bases = {node.name: [ast.unparse(base) for base in node.bases] for _, node, _ in classes}
 
     def inherited(name: str) -> set[str]:
         return set().union(*(documented.get(base, set()) | inherited(base) for base in bases.get(name, ())))
@@ -92,6 +93,14 @@ class Heir(Base):
     beside: int = 3
     bare: int = 3
 
+class Between(Base):
+    pass
+
+@dataclass
+class Later(Between):
+    beside: int = 4
+    new: int = 4
+
 @dataclass
 class _Private:
     bare: int
@@ -99,4 +108,9 @@ class _Private:
 class Other:
     bare: int
 '''
-    assert unexplained({"a.py": source}) == ["a.py: Base.bare", "a.py: Base.last", "a.py: Heir.bare"]
+    assert unexplained({"a.py": source}) == [
+        "a.py: Base.bare",
+        "a.py: Base.last",
+        "a.py: Heir.bare",
+        "a.py: Later.new",
+    ]

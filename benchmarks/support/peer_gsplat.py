@@ -97,7 +97,9 @@ class Frame:
 class Step:
     """One training step: rasterization, L1 + D-SSIM, gradients, Adam over all parameters; no refinement.
 
-    ssim: "torch" (five separable blurs by conv2d) or "fused_ssim";  fused: torch's one-kernel Adam.
+    ssim: "torch" (five separable blurs by conv2d) or "fused_ssim"
+    fused: torch's one-kernel Adam
+
     The pictures wait on the device as floats; ours unpacks 8-bit values and composites them over a background.
     """
 

@@ -49,7 +49,7 @@ class RawMesh:
 
 def load_mesh(path: Path, kind: str | None = None) -> RawMesh:
     """One of the READ formats by itself: files beside it, such as textures, are not opened. kind: one of READ, by
-    default the ending of the name. Raises InputError where it cannot be read, MemoryError where it does not fit into
+    default the suffix of the name. Raises InputError where it cannot be read, MemoryError where it does not fit into
     memory."""
     path = Path(path)
     content, kind = read_bytes(path, "a mesh"), kind or path.suffix.lower()
@@ -150,8 +150,8 @@ def check_points(points: np.ndarray, path: Path, farthest: float = 1e15) -> None
     `farthest` metres, by default as far as squares in single precision reach."""
     with np.errstate(invalid="ignore"):
         if not len(points) or not (np.abs(points) <= farthest).all():
-            found = "another one" if len(points) else "none"
-            raise InputError(f"{path}: expected points within {farthest:g} m, found {found}")
+            which = "another one" if len(points) else "none"
+            raise InputError(f"{path}: expected points within {farthest:g} m, found {which}")
 
 
 def _elements(data: bytes) -> list[tuple[bytes, int]]:

@@ -97,8 +97,8 @@ def load_truth(dataset: Dataset, frame: Frame) -> Truth:
     sizes = {layers[name].shape[:2] for name in present}
     if sizes != {(frame.camera.height, frame.camera.width)}:
         expected = f"{frame.camera.width}x{frame.camera.height}"
-        found = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
-        raise InputError(f"{path}: expected {expected} pixels as the camera says, found {found}")
+        listed = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
+        raise InputError(f"{path}: expected {expected} pixels as the camera says, found {listed}")
     values = {name: layers[name].astype(np.uint8 if name in _LABELS else np.float32) for name in present}
     if any(frame.distortion):
         source = Undistortion(frame.camera, frame.distortion)
@@ -133,8 +133,9 @@ def choose_depth_unit(farthest: float) -> float:
 class FrameWriter:
     """Writes the frames of a dataset folder that exists; any number of processes and machines may do so at once.
 
-    root: the folder; raw: suffixes of the names of a sensor's pictures in raw/: () none, RAW_MONOCHROME or RAW_COLOR;
-    depth_unit: metres a step of depth/*.png.
+    root: the folder
+    raw: suffixes of the names of a sensor's pictures in raw/: () none, RAW_MONOCHROME or RAW_COLOR
+    depth_unit: metres a step of depth/*.png
     """
 
     def __init__(self, root: Path, raw: Sequence[str] = (), depth_unit: float = MILLIMETRE) -> None:
@@ -188,10 +189,14 @@ class FrameWriter:
 class DatasetWriter(FrameWriter):
     """Writes a dataset folder; an interrupted run leaves whole files only, which a later run completes.
 
-    root: the folder, made here; scene: what to render, as JSON values, written to scene.json first, its DEPTH_UNIT is
-    that of depth/*.png; resume: go on with a folder that holds the same scene; raw: as in FrameWriter; shared: others
-    write frames of it at the same time, so that files in the making and damaged ones are left alone. Otherwise only one
-    at a time may work on a folder. Raises InputError where it holds anything else.
+    root: the folder, made here
+    scene: what to render, as JSON values, written to scene.json first, its DEPTH_UNIT is that of depth/*.png
+    resume: go on with a folder that holds the same scene
+    raw: as in FrameWriter
+    shared: others write frames of it at the same time, so that files in the making and damaged ones are left alone;
+        otherwise only one at a time may work on a folder
+
+    Raises InputError where the folder holds anything else.
     """
 
     def __init__(

@@ -79,9 +79,9 @@ def dataset_of_pair(root: Path, meta: Json, held_out: tuple[str, Json] | None) -
     return _dataset(source, meta, train, test, missing + missing_test)
 
 
-def _warn_of_missing(source: Path, missing: tuple[str, ...], found: int) -> None:
+def _warn_of_missing(source: Path, missing: tuple[str, ...], read: int) -> None:
     if missing:
-        count = len(missing) + found
+        count = len(missing) + read
         _log.warning(
             "%s: %d of %d frames have no image and are left out, %s first",
             source,
@@ -238,7 +238,7 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
 def _read_objects(entry: Json) -> dict[int, np.ndarray]:
     """{number: world_from_object [4, 4]} of a frame whose objects move; others mean all kinds of things by the key."""
     listed = entry.get("objects")
-    found = {}
+    poses = {}
     for item in listed if isinstance(listed, list) else ():
         if isinstance(item, dict) and "world_from_object" in item:
             try:
@@ -250,8 +250,8 @@ def _read_objects(entry: Json) -> dict[int, np.ndarray]:
                 raise InputError(
                     "expected an id and a world_from_object of 4x4 finite numbers in objects, found others"
                 )
-            found[number] = pose
-    return found
+            poses[number] = pose
+    return poses
 
 
 def check_still(dataset: Dataset) -> Dataset:

@@ -70,8 +70,13 @@ def frame_images(dataset: Dataset, frame: Frame, prediction: "Prediction") -> tu
         raise WorkError(f"{frame.file_path}: the prediction has values that are not finite; train the run again")
     target = frame_target(dataset, frame)
     valid = target.image.valid
-    shown = np.where(valid[..., None], np.clip(prediction.rgb, 0, 1), np.float32(0)), target.image.over(np.zeros(3))
-    return FrameImages(*shown, target.silhouette, valid), target.source
+    images = FrameImages(
+        prediction=np.where(valid[..., None], np.clip(prediction.rgb, 0, 1), np.float32(0)),
+        truth=target.image.over(np.zeros(3)),
+        silhouette=target.silhouette,
+        valid=valid,
+    )
+    return images, target.source
 
 
 def frame_light(dataset: Dataset, frame: Frame, prediction: "Prediction") -> FrameLight:
@@ -93,7 +98,7 @@ def image_groups(
     """The frame's values of the groups that compare pictures. Where the silhouette's `source` is "frame", "image" is
     "image_full". photograph: see `is_photograph`"""
     inside = image.interior(view.valid.shape)
-    levels = luminance(view.prediction), luminance(view.truth)
+    predicted, true = luminance(view.prediction), luminance(view.truth)
     full = _image_metrics(view, view.valid, view.valid & inside, network)
     over = full if source == "frame" else _image_metrics(view, view.silhouette, view.silhouette, network)
     if photograph:
@@ -101,8 +106,8 @@ def image_groups(
     return {
         "image": over,
         "image_full": full,
-        "shadow": shadow.luminance_metrics(*levels, view.silhouette),
-        "shadow_full": shadow.luminance_metrics(*levels, view.valid),
+        "shadow": shadow.luminance_metrics(prediction=predicted, truth=true, mask=view.silhouette),
+        "shadow_full": shadow.luminance_metrics(prediction=predicted, truth=true, mask=view.valid),
     }
 
 
@@ -111,11 +116,15 @@ def visibility_groups(light: FrameLight, view: FrameImages) -> dict[str, shadow.
     shadow that the frame does not show."""
     if light.visibility is None or light.truth is None:
         return {"shadow_mask": None, **dict.fromkeys(shadow.KINDS)}
-    pair = light.visibility, light.truth.sun_visibility
-    sees_the_sun_or_a_caster = light.truth.shadow >= SHADOW_SELF_CAST
+    predicted, true, classes = light.visibility, light.truth.sun_visibility, light.truth.shadow
+    sees_the_sun_or_a_caster = classes >= SHADOW_SELF_CAST
+    mask = view.valid & sees_the_sun_or_a_caster
     return {
-        "shadow_mask": shadow.visibility_metrics(*pair, view.valid & sees_the_sun_or_a_caster),
-        **{kind: shadow.kind_metrics(*pair, light.truth.shadow, kind, view.valid) for kind in shadow.KINDS},
+        "shadow_mask": shadow.visibility_metrics(prediction=predicted, truth=true, mask=mask),
+        **{
+            kind: shadow.kind_metrics(prediction=predicted, truth=true, classes=classes, kind=kind, valid=view.valid)
+            for kind in shadow.KINDS
+        },
     }
 
 
@@ -123,8 +132,13 @@ def tally_grazing(light: FrameLight, view: FrameImages) -> Array | None:
     """Sums of the frame by grazing angle; None without truth."""
     if light.truth is None:
         return None
-    levels = luminance(view.prediction), luminance(view.truth)
-    return grazing.tally(light.truth, *levels, light.visibility, view.valid)
+    return grazing.tally(
+        truth=light.truth,
+        predicted_luminance=luminance(view.prediction),
+        true_luminance=luminance(view.truth),
+        visibility=light.visibility,
+        mask=view.valid,
+    )
 
 
 def depth_range(light: FrameLight) -> tuple[float, float] | None:
@@ -163,13 +177,15 @@ def write_pictures(folder: Path, view: FrameImages, light: FrameLight, photograp
 
 def _image_metrics(view: FrameImages, mask: Mask, windows: Mask, network: lpips.Lpips | None) -> shadow.Metrics:
     """Metrics over `mask`; SSIM over `windows`, the centres of its windows."""
-    pair = view.prediction, view.truth
-    crops = [image.crop_to_mask(picture, mask) for picture in pair] if network and mask.any() else []
+    predicted, true = view.prediction, view.truth
+    distance = None
+    if network and mask.any():
+        distance = network(image.crop_to_mask(predicted, mask), image.crop_to_mask(true, mask))
     return {
-        "psnr": image.psnr(*pair, mask),
-        "ssim": image.ssim(*pair, windows),
-        "lpips": network(*crops) if network and crops else None,
-        "mae": image.mae(*pair, mask),
-        "rmse": image.rmse(*pair, mask),
-        "flip": image.flip(*pair, mask),
+        "psnr": image.psnr(prediction=predicted, truth=true, mask=mask),
+        "ssim": image.ssim(prediction=predicted, truth=true, mask=windows),
+        "lpips": distance,
+        "mae": image.mae(prediction=predicted, truth=true, mask=mask),
+        "rmse": image.rmse(prediction=predicted, truth=true, mask=mask),
+        "flip": image.flip(prediction=predicted, truth=true, mask=mask),
     }

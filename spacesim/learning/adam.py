@@ -12,18 +12,23 @@ from spacesim.backend.upload import upload
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 
-class NetworkAdam:
-    """Moments of the weights of networks, arrays of any lengths."""
+class AdamSteps:
+    """How many steps were taken."""
 
-    def __init__(self, weights: list[Float]) -> None:
-        self.first = [dr.zeros(ad.Float, dr.width(weight)) for weight in weights]
-        self.second = [dr.zeros(ad.Float, dr.width(weight)) for weight in weights]
-        self.steps = 0
+    steps = 0
 
     def corrections(self) -> tuple[float, float]:
         """Count a step; the factors that make the moments unbiased estimates."""
         self.steps += 1
         return corrections(self.steps)
+
+
+class NetworkAdam(AdamSteps):
+    """Moments of the weights of networks, arrays of any lengths."""
+
+    def __init__(self, weights: list[Float]) -> None:
+        self.first = [dr.zeros(ad.Float, dr.width(weight)) for weight in weights]
+        self.second = [dr.zeros(ad.Float, dr.width(weight)) for weight in weights]
 
     def moments(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """The first and the second moment of each array."""

@@ -33,8 +33,8 @@ def read_tensors(path: Path, form: str) -> tuple[dict[str, np.ndarray], JsonDict
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{path}: expected a safetensors file, found one that cannot be read ({error})") from None
     if not isinstance(header, dict) or header.get("format") != form:
-        found = repr(header.get("format")) if isinstance(header, dict) else "none"
-        raise InputError(f"{path}: expected a {form} file, found format {found}")
+        named = repr(header.get("format")) if isinstance(header, dict) else "none"
+        raise InputError(f"{path}: expected a {form} file, found format {named}")
     for name, tensor in tensors.items():
         if tensor.dtype not in (np.float32, np.float64):
             raise InputError(f"{path}: expected floating-point numbers as {name}, found {tensor.dtype}")

@@ -48,9 +48,9 @@ class MixedComposition(FieldScene):
     """Posed runs of both families under one Sun; in scene files what `splat.compose.GaussianComposition` is to
     Gaussians.
 
-    models: at least one of each family;  config: how they shade each other. `shadows` is of Gaussians on each other;
-    what has to do with a field is "none", or by light that comes through, which multiplies, so that the ratio of (4.15)
-    is that of the others alone.
+    models: at least one of each family
+    config: how they shade each other. `shadows` is of Gaussians on each other; what has to do with a field is "none",
+        or by light that comes through, which multiplies, so that the ratio of (4.15) is that of the others alone
     """
 
     def __init__(self, models: Sequence[Any], config: ComposeConfig | None = None, path: Path | None = None) -> None:
@@ -211,8 +211,9 @@ def _blend_splats(
     size, gaussians = camera.width * camera.height, lit.gaussians
     if gaussians.count == 0:
         none = ad.Float([])
-        nowhere = Footprints(none, none, ad.Bool([]), ad.UInt32([]))
-        lists = bin_splats(Projected(*[none] * 7), nowhere, camera.width, camera.height)
+        nowhere = Footprints(half_width=none, half_height=none, visible=ad.Bool([]), order=ad.UInt32([]))
+        empty = Projected(x=none, y=none, a=none, b=none, c=none, opacity=none, depth=none)
+        lists = bin_splats(empty, nowhere, camera.width, camera.height)
         planes = np.zeros((3 + COMMON + 3 * normals + len(lit.shares), size), np.float32)
         planes[0] = 1
         return ListedSplats([], lists, COMMON + 3 * normals + len(lit.shares)), planes

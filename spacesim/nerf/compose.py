@@ -78,9 +78,11 @@ class Placed(Protocol):
 class FieldComposition(FieldScene):
     """Posed radiance fields under one Sun; in scene files what `splat.compose.GaussianComposition` is to Gaussians.
 
-    models: at least one;  config: how they shade each other: `shadows` is "none", or else by transmittance towards the
-    Sun, which multiplies: the ratio of (4.15) is that of the others alone. One model with no pose gives what its run
-    gives alone, but for rounding.
+    models: at least one
+    config: how they shade each other: `shadows` is "none", or else by transmittance towards the Sun, which multiplies:
+        the ratio of (4.15) is that of the others alone
+
+    One model with no pose gives what its run gives alone, but for rounding.
     """
 
     def __init__(self, models: Sequence[Any], config: Any, path: Path | None = None) -> None:

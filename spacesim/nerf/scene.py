@@ -34,7 +34,8 @@ class FieldScene(ABC):
     """Posed runs under one Sun, radiance fields among them; in scene files what
     `splat.compose.GaussianComposition` is to Gaussians.
 
-    models: at least one;  config: how they shade each other, see `splat.compose.scene.ComposeConfig`
+    models: at least one
+    config: how they shade each other, see `splat.compose.scene.ComposeConfig`
     """
 
     def __init__(self, models: Sequence[Any], config: Any, path: Path | None = None) -> None:
@@ -64,8 +65,8 @@ class FieldScene(ABC):
     def stops(self, exposure: float | None) -> float:
         """0: colours are sRGB values. Raises InputError for an exposure."""
         if exposure is not None:
-            found = f"a radiance field in {self.path or 'the scene'}"
-            raise InputError(f"exposure: expected runs trained in linear light (light.linear) alone, found {found}")
+            model = f"a radiance field in {self.path or 'the scene'}"
+            raise InputError(f"exposure: expected runs trained in linear light (light.linear) alone, found {model}")
         return 0.0
 
     def predict(

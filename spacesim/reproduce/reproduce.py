@@ -100,10 +100,10 @@ def _open(out: Path, size: Size, resume: bool) -> None:
     there = there if isinstance(there, dict) else {}
     for key, value in this.items():
         if there.get(key) != value:
-            found = f"of the {key} {value!r:.60}, found {there.get(key)!r:.60}"
+            difference = f"of the {key} {value!r:.60}, found {there.get(key)!r:.60}"
             if key == "configurations":
-                found = "with the scenes and trainings of this version, found one with others"
-            raise InputError(f"{out}: expected a folder {found}; choose another")
+                difference = "with the scenes and trainings of this version, found one with others"
+            raise InputError(f"{out}: expected a folder {difference}; choose another")
 
 
 def _described(size: Size) -> Values:

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
 
 from spacesim.data.errors import InputError
+from spacesim.data.files import JsonMapping
 from spacesim.data.structure import Rules, check_fields, structure
 from spacesim.data.toml import read_document
 from spacesim.eval.labels import HIGHER, LOWER, Metric
@@ -123,8 +124,16 @@ class Thesis:
 
 @cache
 def thesis() -> Thesis:
-    """The file's content."""
-    return structure(Thesis, read_document(PATH), Rules())
+    """The file's content, in each table the columns that it names."""
+    document = read_document(PATH)
+    lists = document.values["columns"]
+    tables = [{**table, "columns": _listed(table["columns"], lists)} for table in document.values["tables"]]
+    values = {key: value for key, value in document.values.items() if key != "columns"} | {"tables": tables}
+    return structure(Thesis, replace(document, values=values), Rules())
+
+
+def _listed(columns: str | Sequence[JsonMapping], lists: Mapping[str, Sequence[JsonMapping]]) -> Sequence[JsonMapping]:
+    return lists[columns] if isinstance(columns, str) else columns
 
 
 def parse(cell: str) -> dict[str, float]:

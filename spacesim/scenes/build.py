@@ -73,8 +73,8 @@ def _check_sizes(scene: Scene) -> None:
     reach = float(np.linalg.norm(centre)) + radius
     for name, size in sizes:
         if size < FINEST * reach:
-            found = f"{size:.3g} m in a scene that reaches {reach:.3g} m from the origin"
-            raise InputError(f"object {name}: expected a size of at least {FINEST:g} of the scene's, found {found}")
+            ratio = f"{size:.3g} m in a scene that reaches {reach:.3g} m from the origin"
+            raise InputError(f"object {name}: expected a size of at least {FINEST:g} of the scene's, found {ratio}")
 
 
 def _size(item: SceneObject) -> float:

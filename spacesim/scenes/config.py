@@ -63,8 +63,8 @@ class ObjectConfig:
 
     def __post_init__(self) -> None:
         if bool(self.spacecraft) == bool(self.mesh):
-            found = "both" if self.mesh else "neither"
-            raise InputError(f"objects: expected either spacecraft or mesh, found {found}")
+            given = "both" if self.mesh else "neither"
+            raise InputError(f"objects: expected either spacecraft or mesh, found {given}")
         near = all(abs(x) <= MAX_COORDINATE for x in self.position)  # which nan is not
         expect(near, "position", f"metres from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}", list(self.position))
         turns = all(map(math.isfinite, self.rotation_wxyz)) and any(self.rotation_wxyz)

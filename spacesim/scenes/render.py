@@ -51,8 +51,9 @@ def _check_memory(camera: Camera, spp: int) -> None:
 class Renderer:
     """A scene loaded once, from which frames are rendered under any Sun.
 
-    spp: samples a pixel, where a frame does not say; max_depth: longest path in edges from camera to source (2 is
-    direct light only); distortion: Brown-Conrady k1, k2, p1, p2, k3 of the lens, () none.
+    spp: samples a pixel, where a frame does not say
+    max_depth: longest path in edges from camera to source (2 is direct light only)
+    distortion: Brown-Conrady k1, k2, p1, p2, k3 of the lens, () none
     """
 
     def __init__(self, scene: Scene, spp: int, max_depth: int = 6, distortion: Sequence[float] = ()) -> None:

@@ -109,8 +109,8 @@ def _check_names(scene: SceneConfig, document: toml.Document) -> None:
         parts = [part.name for part in spacecraft(item.spacecraft).parts] if item.materials else []
         for pattern in item.materials:
             if not any(fnmatchcase(part, pattern) for part in parts):
-                found = f"none that fits{did_you_mean(pattern, parts)}"
-                refuse(f"a part of {item.spacecraft}, or a pattern", found, "objects", index, "materials", pattern)
+                none = f"none that fits{did_you_mean(pattern, parts)}"
+                refuse(f"a part of {item.spacecraft}, or a pattern", none, "objects", index, "materials", pattern)
 
 
 def _from_here(mesh: Path) -> str:

@@ -320,8 +320,8 @@ def load_run(path: str | Path) -> Run:
         gaussians = Gaussians.from_numpy(tensors)
         light = LightModel.from_tensors(light_config, tensors) if light_config else None
         if light_config and (gaussians.count == 0 or gaussians.feature_count != light_config.features):
-            found = f"{gaussians.count} with {gaussians.feature_count if gaussians.count else 0}"
-            raise ValueError(f"features: expected Gaussians with {light_config.features} each, found {found}")
+            counts = f"{gaussians.count} with {gaussians.feature_count if gaussians.count else 0}"
+            raise ValueError(f"features: expected Gaussians with {light_config.features} each, found {counts}")
     except (KeyError, ValueError) as error:
         raise InputError(f"{model_path}: expected the tensors of a model, found none or others ({error})") from None
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):

@@ -106,7 +106,9 @@ def block_means(values: np.ndarray, factor: int) -> np.ndarray:
 class SunFinder:
     """Finds Suns of pictures by a model that takes the Sun as input.
 
-    gaussians, light: the model;  antialiased: whether it is drawn so;  curve: as `Run.curve`
+    gaussians, light: the model
+    antialiased: whether it is drawn so
+    curve: as `Run.curve`
     """
 
     def __init__(
@@ -235,7 +237,8 @@ class _LitSurface:
 class ShapeSearch:
     """Suns of many pictures by the Gaussians of a training without known Suns.
 
-    gaussians: their colours are the mean of all pictures;  distance: metres, of the farthest camera
+    gaussians: their colours are the mean of all pictures
+    distance: metres, of the farthest camera
     """
 
     def __init__(self, gaussians: Gaussians, antialiased: bool, distance: float) -> None:

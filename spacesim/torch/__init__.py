@@ -22,23 +22,24 @@ from spacesim.torch.autograd import DEPTH, OPACITY, Blend, BlendInputs, Project,
 
 
 class Meta(TypedDict):
-    """What `rasterization` returns beside pictures and alphas; shapes: see there."""
+    """What `rasterization` returns beside pictures and alphas. `...` is M with packed=True, the splats that are drawn,
+    camera by camera; with packed=False it is C, N, all Gaussians of each camera."""
 
-    batch_ids: Tensor | None
-    camera_ids: Tensor | None
-    gaussian_ids: Tensor | None
-    radii: Tensor
-    means2d: Tensor
-    depths: Tensor
-    conics: Tensor
-    opacities: Tensor
-    tile_width: int
-    tile_height: int
-    width: int
-    height: int
-    tile_size: int
-    n_batches: int
-    n_cameras: int
+    batch_ids: Tensor | None  #: int64 [M], all 0; None where not packed
+    camera_ids: Tensor | None  #: int64 [M], camera of each splat; None where not packed
+    gaussian_ids: Tensor | None  #: int64 [M], Gaussian of each splat; None where not packed
+    radii: Tensor  #: int32 [..., 2], half the sides of the box around a splat, pixels; 0 of what is not drawn
+    means2d: Tensor  #: [..., 2], centres, pixels
+    depths: Tensor  #: [...], of the centres along the camera's axis, metres
+    conics: Tensor  #: [..., 3], inverse of the 2D covariance, pixels^-2: a, b, c of a dx^2 + 2 b dx dy + c dy^2
+    opacities: Tensor  #: [...], in [0, 1]; with "antialiased" those that are drawn
+    tile_width: int  #: tiles of `tile_size` in a row of the picture
+    tile_height: int  #: tiles in a column
+    width: int  #: of the pictures, pixels
+    height: int  #: of the pictures, pixels
+    tile_size: int  #: as given, pixels
+    n_batches: int  #: 1
+    n_cameras: int  #: C
 
 
 class _MissingEntryError(KeyError):

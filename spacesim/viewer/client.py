@@ -29,7 +29,11 @@ MAX_PICTURE_SIDE = 4096  #: pixels a side of a picture that is saved
 
 
 class Client:
-    """One browser. handle: viser's;  facts: lines for the statistics"""
+    """One browser.
+
+    handle: viser's
+    facts: lines for the statistics
+    """
 
     def __init__(
         self,

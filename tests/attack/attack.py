@@ -163,12 +163,12 @@ Listing = dict[str, tuple[int, int, int]]
 
 @dataclass(frozen=True)
 class Trial:
-    """One damaged input. words: the command;  what: in words, how to make it again;  path: what is damaged, or None"""
+    """One damaged input."""
 
     folder: Path
-    words: tuple[str, ...]
-    what: str
-    path: Path | None = None
+    words: tuple[str, ...]  #: the command
+    what: str  #: in words, how to make it again
+    path: Path | None = None  #: what is damaged
 
 
 class Copy:
@@ -363,11 +363,11 @@ train(read_dataset(Path("data")), Path(sys.argv[1]), config, resume=True)
 
 @dataclass(frozen=True)
 class Killed:
-    """A command that is killed and done again. words: after the interpreter's name;  changes: names of files that may
-    differ from an undisturbed run's, as they hold times or the folder's name"""
+    """A command that is killed and done again."""
 
     name: str
-    words: tuple[str, ...]
+    words: tuple[str, ...]  #: after the interpreter's name
+    #: names of files that may differ from an undisturbed run's, as they hold times or the folder's name
     changes: tuple[str, ...] = ()
 
 

@@ -68,17 +68,16 @@ for line in sys.stdin:
 
 
 @dataclass(frozen=True)
-class Found:
-    """Results of an attack. tried: attempts of each kind;  finds: a sentence for each that got through;  peak: MB of
-    memory that the viewer took at most, None where the system does not tell"""
+class AttackResult:
+    """Results of an attack."""
 
-    tried: dict[str, int]
-    finds: list[str]
-    peak: float | None
+    tried: dict[str, int]  #: attempts of each kind
+    finds: list[str]  #: a sentence for each that got through
+    peak: float | None  #: MB of memory that the viewer took at most, None where the system does not tell
 
 
 @dataclass
-class Target:
+class AttackedViewer:
     """A viewer in another process."""
 
     process: subprocess.Popen[str]
@@ -122,7 +121,7 @@ class Target:
 
 
 @contextlib.contextmanager
-def target(folder: Path, weakened: str = "") -> Iterator[Target]:
+def attacked_viewer(folder: Path, weakened: str = "") -> Iterator[AttackedViewer]:
     """A viewer that is up. weakened: Python that its process runs first, to see that an attack can succeed"""
     process = subprocess.Popen(
         [sys.executable, "-c", VIEWER, str(folder), weakened],
@@ -136,7 +135,7 @@ def target(folder: Path, weakened: str = "") -> Iterator[Target]:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert line.strip().isdigit(), f"the viewer did not start: {line!r}"
-        yield Target(process, int(line))
+        yield AttackedViewer(process, int(line))
     finally:
         process.kill()
         process.communicate()
@@ -144,14 +143,14 @@ def target(folder: Path, weakened: str = "") -> Iterator[Target]:
 
 def attack(
     seed: int, scale: float, folder: Path, parts: Sequence[Callable[..., None]] | None = None, weakened: str = ""
-) -> Found:
+) -> AttackResult:
     """Parts of the attack in turn, all by default.
 
     scale: 1 for a run of a quarter of a minute, more for more of everything, at least 0.1;  folder: an empty one, where
-    the viewer may save;  weakened: as `target` has it
+    the viewer may save;  weakened: as `attacked_viewer` has it
     """
     rng = random.Random(seed)
-    with target(folder, weakened) as one:
+    with attacked_viewer(folder, weakened) as one:
         honest(one, "before the attack")
         for part in PARTS if parts is None else parts:
             if one.process.poll() is not None:
@@ -163,10 +162,10 @@ def attack(
                     one.found(f"{part.__name__}: the viewer does not answer ({type(error).__name__}: {error})")
                 honest(one, part.__name__)
         memory = one.memory()
-        return Found(dict(one.tried), one.finds, memory[1] if memory else None)
+        return AttackResult(dict(one.tried), one.finds, memory[1] if memory else None)
 
 
-def honest(one: Target, part: str) -> None:
+def honest(one: AttackedViewer, part: str) -> None:
     """Somebody looks from two places and gets pictures; memory is in bounds, the scene is one."""
     try:
         pictures(one.port)
@@ -332,7 +331,7 @@ def pictures(port: int, count: int = 2) -> None:
 # ---- the parts ----
 
 
-def foreign_pages(one: Target, rng: random.Random, scale: float, held: contextlib.ExitStack) -> None:
+def foreign_pages(one: AttackedViewer, rng: random.Random, scale: float, held: contextlib.ExitStack) -> None:
     """Pages of other sites connect and, at once, move a model: before an answer, and after it."""
     port, before = one.port, one.state()
     own = f"http://127.0.0.1:{port}"
@@ -363,7 +362,7 @@ def foreign_pages(one: Target, rng: random.Random, scale: float, held: contextli
         one.found("the viewer's own page could move nothing, so that it proves nothing that others could not")
 
 
-def rebinding(one: Target, rng: random.Random, scale: float, held: contextlib.ExitStack) -> None:
+def rebinding(one: AttackedViewer, rng: random.Random, scale: float, held: contextlib.ExitStack) -> None:
     """Names of others that lead to this machine, for the page and for the connection; and the viewer's own names."""
     port, before = one.port, one.state()
     names = [
@@ -414,7 +413,7 @@ def rebinding(one: Target, rng: random.Random, scale: float, held: contextlib.Ex
                     one.found("asked under its own name, the viewer gave nothing", host)
 
 
-def garbage(one: Target, rng: random.Random, scale: float, held: contextlib.ExitStack) -> None:
+def garbage(one: AttackedViewer, rng: random.Random, scale: float, held: contextlib.ExitStack) -> None:
     """Bytes and messages that are none, ones with wrong values, frames that break the protocol."""
     from viser import _messages
 
@@ -496,7 +495,7 @@ def garbage(one: Target, rng: random.Random, scale: float, held: contextlib.Exit
         opened(one.port, raw).close()
 
 
-def floods(one: Target, rng: random.Random, scale: float, held: contextlib.ExitStack) -> None:
+def floods(one: AttackedViewer, rng: random.Random, scale: float, held: contextlib.ExitStack) -> None:
     """More than anybody can need: messages, large ones, ones that swell, pieces without end, pings."""
     port, shared = one.port, one.state()["shared"]
 
@@ -547,7 +546,7 @@ def floods(one: Target, rng: random.Random, scale: float, held: contextlib.ExitS
         opened(port, request(port) if rng.random() < 0.5 else b"").close()
 
 
-def slow_sockets(one: Target, rng: random.Random, scale: float, held: contextlib.ExitStack) -> None:
+def slow_sockets(one: AttackedViewer, rng: random.Random, scale: float, held: contextlib.ExitStack) -> None:
     """Those who say little, or read nothing, and stay while somebody else looks."""
     port, shared = one.port, one.state()["shared"]
 
@@ -589,7 +588,7 @@ def slow_sockets(one: Target, rng: random.Random, scale: float, held: contextlib
     time.sleep(0.2)
 
 
-def pictured(one: Target, deaf: socket.socket) -> None:
+def pictured(one: AttackedViewer, deaf: socket.socket) -> None:
     """One more who reads nothing wants the view as a file, again and again."""
     one.tried["file that is not read"] += 1
     with client(one.port) as at:

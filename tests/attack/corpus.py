@@ -83,14 +83,13 @@ scale = 0.5
 
 @dataclass(frozen=True)
 class Kind:
-    """files: of the corpus, one of which is damaged;  ways: of damaging it;  commands: one of which then reads it, with
-    {out} for a new path;  special: whether a device, a pipe, a folder or a link may stand in its place"""
+    """A kind of input."""
 
     name: str
-    files: tuple[str, ...]
-    ways: tuple[m.Mutation, ...]
-    commands: tuple[tuple[str, ...], ...]
-    special: bool = True
+    files: tuple[str, ...]  #: of the corpus, one of which is damaged
+    ways: tuple[m.Mutation, ...]  #: of damaging it
+    commands: tuple[tuple[str, ...], ...]  #: one of which then reads it, with {out} for a new path
+    special: bool = True  #: whether a device, a pipe, a folder or a link may stand in its place
 
 
 def _words(*lines: str) -> tuple[tuple[str, ...], ...]:

@@ -212,9 +212,11 @@ class RayCaster:
 class Agreement:
     """Of labels in one or several images: pixels of the images, of a surface, those that differ from the ray caster's.
 
-    edge: of these, pixels with that answer within NEAR_EDGE; offset: others with it where shadow rays begin as high as
-    the renderer's; wrong: all others, counted for each label; classes: shadow classes and how many pixels have them;
-    off_plane: largest of the pixels that agree, see OFF_PLANE.
+    edge: of these, pixels with that answer within NEAR_EDGE
+    offset: others with it where shadow rays begin as high as the renderer's
+    wrong: all others, counted for each label
+    classes: shadow classes and how many pixels have them
+    off_plane: largest of the pixels that agree, see OFF_PLANE
     """
 
     pixels: int
@@ -306,11 +308,11 @@ def labels_agree(
 
 @dataclass(frozen=True)
 class Penumbra:
-    """visibility, expected: [N] of points beside cast shadows; pixel: [N, 3] view, row and column of each."""
+    """Points beside cast shadows."""
 
-    visibility: np.ndarray
-    expected: np.ndarray
-    pixel: np.ndarray
+    visibility: np.ndarray  #: [N]
+    expected: np.ndarray  #: [N]
+    pixel: np.ndarray  #: [N, 3] view, row and column of each
 
     @property
     def error(self) -> np.ndarray:

@@ -1,6 +1,9 @@
-"""Splats that several test files draw."""
+"""Splats, colours and cameras that several test files share."""
 
 import numpy as np
+
+from spacesim.data.records import Camera
+from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Pinhole
 
 
 def light_of(values: np.ndarray) -> np.ndarray:
@@ -9,7 +12,7 @@ def light_of(values: np.ndarray) -> np.ndarray:
 
 
 def srgb_of(light: np.ndarray) -> np.ndarray:
-    """The inverse of `frame_light`."""
+    """The inverse of `light_of`."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
 
 
@@ -22,3 +25,7 @@ def random_splats(count: int, seed: int = 0, degree: int = 3) -> dict[str, np.nd
         "logit_opacities": rng.uniform(-2.5, 2.0, count),
         "sh": rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.25,
     }
+
+
+def device_camera(view: Camera | OrthographicCamera) -> Pinhole | Orthographic:
+    return Pinhole.of(view) if isinstance(view, Camera) else Orthographic.of(view)

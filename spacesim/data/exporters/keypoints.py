@@ -68,7 +68,7 @@ class BodyLabels:
 
 
 @dataclass(frozen=True)
-class _File:
+class _KeypointsFile:
     objects: tuple[BodyLabels, ...]
 
 
@@ -83,7 +83,7 @@ def body_labels(
     entries: dict[int, BodyLabels] = {}
     path = given if isinstance(given, Path) else dataset.root / NAME
     if isinstance(given, Path) or (given is None and path.is_file()):
-        entries = {entry.id: entry for entry in read_record(path, _File, Rules(), MAX_JSON_BYTES)[0].objects}
+        entries = {entry.id: entry for entry in read_record(path, _KeypointsFile, Rules(), MAX_JSON_BYTES)[0].objects}
         others = sorted(entries.keys() - {target.id for target in targets})
         if others:
             raise InputError(f"{path}: expected objects of {dataset.root}, found {others[0]}")

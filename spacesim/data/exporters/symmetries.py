@@ -35,7 +35,7 @@ def find_symmetries(
     faces = drawable_faces(vertices, np.asarray(faces, np.int64))
     if len(faces) == 0:
         return (), ()
-    shape = _Shape(vertices, faces)
+    shape = _Surface(vertices, faces)
     axes = _axes(shape)
     steps = 2 * np.pi * np.arange(1, TURNS) / TURNS
     round_axes = [axis for axis in axes if all(shape.is_kept(Rotation.from_rotvec(step * axis)) for step in steps)]
@@ -70,7 +70,7 @@ def sample_surface(vertices: Array, faces: np.ndarray, count: int) -> Array:
     return points
 
 
-class _Shape:
+class _Surface:
     """A surface, and points on it."""
 
     def __init__(self, vertices: Array, faces: np.ndarray) -> None:
@@ -106,7 +106,7 @@ class _Shape:
         return tuple(pose.ravel().tolist())
 
 
-def _axes(shape: _Shape) -> list[Array]:
+def _axes(shape: _Surface) -> list[Array]:
     """Unit vectors [3], each of a pair of opposite ones once."""
     lattice = [(x, y, z) for x in (0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)]
     principal = np.linalg.eigh(shape.moments)[1].T

@@ -59,9 +59,9 @@ def _without_ignored(rgb: np.ndarray, alpha: np.ndarray, valid: np.ndarray) -> t
 
 def _read_sized(path: Path, camera: Camera) -> np.ndarray:
     pixels = read_png(path)
-    expected, found = f"{camera.width}x{camera.height}", f"{pixels.shape[1]}x{pixels.shape[0]}"
-    if found != expected:
-        raise InputError(f"{path}: expected {expected} pixels as the camera says, found {found}")
+    camera_size, size = f"{camera.width}x{camera.height}", f"{pixels.shape[1]}x{pixels.shape[0]}"
+    if size != camera_size:
+        raise InputError(f"{path}: expected {camera_size} pixels as the camera says, found {size}")
     return pixels
 
 

@@ -17,7 +17,7 @@ from spacesim.data.importers.colmap_model import (
 )
 from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.masks import MASK_OPTIONS, MaskFolder
-from spacesim.data.importers.pictures import FrameImporter, View, fitted
+from spacesim.data.importers.pictures import FrameImporter, SourceView, fitted
 from spacesim.data.importers.writing import Progress, frame_names, write_dataset
 from spacesim.data.records import Dataset
 from spacesim.data.transforms import is_file
@@ -58,7 +58,7 @@ def import_colmap(
     for name, image in zip(frame_names([image.name for image in used]), used, strict=True):
         path = paths[image.name]
         lens = fitted(model.cameras[image.camera], path)
-        frames.append(maker.frame(View(name, path, image.world_from_camera, lens, mask_paths.get(image.name))))
+        frames.append(maker.frame(SourceView(name, path, image.world_from_camera, lens, mask_paths.get(image.name))))
     source = {
         "kind": "colmap",
         "source": str(src),

@@ -155,8 +155,8 @@ class Lens:
         if len(self.parameters) != count or not np.isfinite(self.parameters).all():
             raise InputError(f"expected {count} finite parameters of {name}, found {self.parameters}")
         if self.width < 1 or self.height < 1 or self.fx <= 0 or self.fy <= 0:
-            found = f"{self.width} x {self.height} and {self.fx:g}, {self.fy:g}"
-            raise InputError(f"expected a size and focal lengths above 0, found {found}")
+            lengths = f"{self.width} x {self.height} and {self.fx:g}, {self.fy:g}"
+            raise InputError(f"expected a size and focal lengths above 0, found {lengths}")
 
     @property
     def fx(self) -> float:

@@ -23,7 +23,7 @@ from spacesim.data.images import read_png
 from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.lenses import LENS_MODELS, Lens, LensModel
 from spacesim.data.importers.masks import MASKED
-from spacesim.data.importers.pictures import FrameImporter, View, fitted
+from spacesim.data.importers.pictures import FrameImporter, SourceView, fitted
 from spacesim.data.importers.writing import ImportedFrame, Progress, frame_names, write_dataset
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import choose_depth_unit, read_points
@@ -160,7 +160,7 @@ def _below_one_folder(root: Path, paths: Sequence[str]) -> list[str]:
     return [Path(path).relative_to(common).as_posix() for path in whole]
 
 
-def _view(dataset: Dataset, frame: Frame, name: str, extras: _Extras, depths: "_DepthReader") -> View:
+def _view(dataset: Dataset, frame: Frame, name: str, extras: _Extras, depths: "_DepthReader") -> SourceView:
     camera, path = frame.camera, dataset.root / frame.file_path
     fisheye = extras.fisheye.get(frame.file_path)
     model = _MODELS["FULL_OPENCV" if fisheye is None else "OPENCV_FISHEYE"]
@@ -179,7 +179,7 @@ def _view(dataset: Dataset, frame: Frame, name: str, extras: _Extras, depths: "_
         depth = partial(depths.read, dataset.root / file, unit, lens.width, lens.height)
     keys = {"time": frame.time, "source_index": extras.index.get(frame.file_path)}
     keys = {key: value for key, value in keys.items() if value is not None}
-    return View(name, path, camera.world_from_camera, lens, mask, frame.sun, silhouette, depth, keys)
+    return SourceView(name, path, camera.world_from_camera, lens, mask, frame.sun, silhouette, depth, keys)
 
 
 def _common_unit(root: Path, extras: _Extras) -> float:

@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class SourceView:
     """A picture, from where and through which lens it was taken."""
 
     name: str  #: of the frame
@@ -54,7 +54,7 @@ class FrameImporter:
         self._resampling = lru_cache(maxsize=2)(_undistortion)
         self._seen_share = lru_cache(maxsize=None)(self._find_seen_share)
 
-    def frame(self, view: View) -> ImportedFrame:
+    def frame(self, view: SourceView) -> ImportedFrame:
         """Pictures are read when the frame is written. Raises InputError for a camera that cannot be."""
         lens, empty = view.lens, self.masked == "empty"
         try:
@@ -100,7 +100,7 @@ class FrameImporter:
                 path, 100 * share,
             )  # fmt: skip
 
-    def _picture(self, view: View) -> np.ndarray:
+    def _picture(self, view: SourceView) -> np.ndarray:
         """uint8, with the file's channels."""
         pixels = read_png(view.path)
         values = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
@@ -116,7 +116,7 @@ class FrameImporter:
             image = resample(image, source)
         return np.rint(255 * np.concatenate([image.rgb, image.alpha[..., None]], axis=-1)).astype(np.uint8)
 
-    def _silhouette(self, view: View) -> np.ndarray:
+    def _silhouette(self, view: SourceView) -> np.ndarray:
         """255 object, 0 none."""
         if view.mask is not None and self.masked == "empty":
             known = read_mask(view.mask, view.lens.width, view.lens.height)
@@ -125,7 +125,7 @@ class FrameImporter:
             known = read_silhouette(view.silhouette, view.lens.width, view.lens.height)
         return self._labels(view, np.where(known, 255, 0).astype(np.uint8))
 
-    def _known(self, view: View) -> np.ndarray:
+    def _known(self, view: SourceView) -> np.ndarray:
         """255 counts, 0 unknown."""
         known = np.ones((view.lens.height, view.lens.width), bool)
         if view.mask is not None and self.masked == "unknown":
@@ -135,10 +135,10 @@ class FrameImporter:
             known = source.inside & (source.linear(known.astype(np.float32)) > 0.999)  # no unknown pixel takes part
         return np.where(known, 255, 0).astype(np.uint8)
 
-    def _depth(self, read: Callable[[], np.ndarray], view: View) -> np.ndarray:
+    def _depth(self, read: Callable[[], np.ndarray], view: SourceView) -> np.ndarray:
         return self._labels(view, read())
 
-    def _labels(self, view: View, labels: np.ndarray) -> np.ndarray:
+    def _labels(self, view: SourceView, labels: np.ndarray) -> np.ndarray:
         return self._resampling(view.lens).nearest(labels) if view.lens.distortion is None else labels
 
 

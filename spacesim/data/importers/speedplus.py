@@ -245,10 +245,10 @@ class _FrameMaker:
     def frame(self, label: _Label) -> ImportedFrame:
         """Pictures are read when it is written. Raises InputError for a picture of another size than the camera's."""
         path, full = self.pictures / label.filename, (self.intrinsics.width, self.intrinsics.height)
-        found = image_size(path)
-        if found != full:
+        size = image_size(path)
+        if size != full:
             expected = f"{full[0]}x{full[1]} pixels as camera.json says"
-            raise InputError(f"{path}: expected {expected}, found {found[0]}x{found[1]}")
+            raise InputError(f"{path}: expected {expected}, found {size[0]}x{size[1]}")
         mask = self.masks.get(label.filename)
         made = None if mask is None else partial(_resized_mask, mask, full, self.size)
         return ImportedFrame(

@@ -160,9 +160,9 @@ def _read_pth(path: Path) -> "dict[str, Tensor]":
     import torch
 
     data = read_bytes(path, "a file of tensors", MAX_WEIGHTS_BYTES)
-    expected, found = SHA256[path.name], hashlib.sha256(data).hexdigest()
-    if not found.startswith(expected):
-        raise InputError(f"{path}: expected the published file, whose SHA-256 begins {expected}, found {found}")
+    expected, digest = SHA256[path.name], hashlib.sha256(data).hexdigest()
+    if not digest.startswith(expected):
+        raise InputError(f"{path}: expected the published file, whose SHA-256 begins {expected}, found {digest}")
     try:
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # torch documents none of what it raises on damaged files

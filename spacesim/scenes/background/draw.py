@@ -21,7 +21,9 @@ _WHEN, _WHERE, _SKY, _GLOBE = range(100, 104)  # streams of random numbers
 
 
 class Background:
-    """Draws the background of a scene's frames. seed: of the scene; the same seed, backend and frame: the same bits.
+    """Draws the background of a scene's frames.
+
+    seed: of the scene; the same seed, backend and frame: the same bits
 
     Where the Earth is behind the objects, it is so in a share of any run of frames (multiples of the golden ratio
     spread evenly), in a direction and turned as drawn at random for the frame, with sunlit ground behind the middle of

@@ -67,8 +67,13 @@ class Placement:
 
 
 class Globe:
-    """Draws the Earth. units: of the scene; distortion: of the lens; irradiance: [3] of sunlight, W m^-2; seed: makes
-    the continents and clouds."""
+    """Draws the Earth.
+
+    units: of the scene
+    distortion: of the lens
+    irradiance: [3] of sunlight, W m^-2
+    seed: makes the continents and clouds
+    """
 
     def __init__(self, units: Units, distortion: tuple[float, ...], irradiance: Array, seed: int) -> None:
         self._units, self._distortion = units, distortion

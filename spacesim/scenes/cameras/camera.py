@@ -49,9 +49,9 @@ class CameraConfig:
         if any(self.distortion):
             folds = self._first_fold()
             limit = 0.5 * math.hypot(width, height)
-            found = f"one that folds {folds:.0f} of {limit:.0f} pixels from its centre"
+            lens = f"one that folds {folds:.0f} of {limit:.0f} pixels from its centre"
             if math.isfinite(folds):
-                raise InputError(f"distortion: expected a lens that is one-to-one over the image, found {found}")
+                raise InputError(f"distortion: expected a lens that is one-to-one over the image, found {lens}")
 
     @property
     def half_tangents(self) -> tuple[float, float]:

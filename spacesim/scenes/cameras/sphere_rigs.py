@@ -33,23 +33,37 @@ TRIES = 1000
 """Poses that are drawn for one whose Sun the Earth does not hide."""
 
 
-@dataclass(frozen=True)
-class FibonacciRig(RigConfig):
-    """Cameras all around, that look at the target. One Sun alone stands at SINGLE_SUN, several on a Fibonacci lattice
-    (thesis 4.3.6)."""
+class _LatticeRig(RigConfig):
+    """Cameras on a Fibonacci lattice, turned at random for each Sun, so that no two sets coincide."""
 
-    distance: float | None = None  #: metres from the target's centre; None: it just fits into the image
+    distance: float | None  #: metres; None: it just fits into the image
 
     def __post_init__(self) -> None:
         super().__post_init__()
         expect_metres(distance=self.distance)
 
     def views_of(self, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
-        return _views_on_sphere(self.sun_directions(seed), self, self.distance, target, camera, seed)
+        metres = self.distance or fitting_distance(target.radius, camera)
+
+        def around(sun: Sun, count: int, stream: Stream) -> list[PlannedView]:
+            return [
+                PlannedView(camera.at(look_at(target.centre + metres * direction, target.centre)), sun)
+                for direction in fibonacci_sphere(count, seed=seed_of(seed, *stream))
+            ]
+
+        return self.all_views(self.sun_directions(seed), around)
 
 
 @dataclass(frozen=True)
-class PolarArcRig(RigConfig):
+class FibonacciRig(_LatticeRig):
+    """Cameras all around, that look at the target. One Sun alone stands at SINGLE_SUN, several on a Fibonacci lattice
+    (thesis 4.3.6)."""
+
+    distance: float | None = None  #: metres from the target's centre; None: it just fits into the image
+
+
+@dataclass(frozen=True)
+class PolarArcRig(_LatticeRig):
     """Cameras all around, Suns on an arc over the pole (+z), as of the thesis's Hubble dataset (6.2.2).
 
     Suns stand in the middles of as many equal pieces of the arc; test Suns stand on it halfway between them.
@@ -65,10 +79,6 @@ class PolarArcRig(RigConfig):
         super().__post_init__()
         expect(math.isfinite(self.arc_azimuth_deg), "arc_azimuth_deg", "a finite angle", self.arc_azimuth_deg)
         expect(0 < self.arc_deg <= 360, "arc_deg", "an angle above 0, up to 360 degrees", self.arc_deg)
-        expect_metres(distance=self.distance)
-
-    def views_of(self, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
-        return _views_on_sphere(self.sun_directions(seed), self, self.distance, target, camera, seed)
 
     def sun_directions(self, seed: int) -> tuple[list[Sun], list[Sun]]:
         if self.sun:
@@ -112,8 +122,8 @@ class RandomRig(RigConfig):
         check_phases(self.min_phase_deg, self.max_phase_deg)
         expect(not (self.random_suns and self.sun), "random_suns", "false where sun names the Suns", True)
         if self.random_suns and (self.suns, self.test_suns) != (1, 0):
-            found = f"{self.suns} suns and {self.test_suns} test_suns"
-            raise InputError(f"random_suns: expected 1 suns and 0 test_suns, as every frame has its own, found {found}")
+            suns = f"{self.suns} suns and {self.test_suns} test_suns"
+            raise InputError(f"random_suns: expected 1 suns and 0 test_suns, as every frame has its own, found {suns}")
 
     def views_of(self, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
         near = self.near or min(fitting_distance(target.radius, camera), self.far or math.inf)
@@ -188,26 +198,6 @@ class RandomRig(RigConfig):
         pose[:3, :3] = rotation_from_quaternion(random.normal(size=4))  # uniform: a normal law has no direction
         pose[:3, 3] = target.centre - pose[:3, :3] @ (z * np.array([u, v, 1.0]))
         return pose
-
-
-def _views_on_sphere(
-    suns: tuple[list[Sun], list[Sun]],
-    rig: RigConfig,
-    distance: float | None,
-    target: TargetSphere,
-    camera: CameraConfig,
-    seed: int,
-) -> Views:
-    """Cameras on a Fibonacci lattice, turned at random for each Sun, so that no two sets coincide."""
-    metres = distance or fitting_distance(target.radius, camera)
-
-    def around(sun: Sun, count: int, stream: Stream) -> list[PlannedView]:
-        return [
-            PlannedView(camera.at(look_at(target.centre + metres * direction, target.centre)), sun)
-            for direction in fibonacci_sphere(count, seed=seed_of(seed, *stream))
-        ]
-
-    return rig.all_views(suns, around)
 
 
 def _frame_about(axis: Array) -> Array:

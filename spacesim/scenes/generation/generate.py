@@ -288,9 +288,9 @@ class _DatasetPlan:
     def _frame(self, index: int, spp: int, name: str, view: PlannedView) -> FrameSpec:
         sunlight, earth = 1.0, self.scene.earth
         if view.earth is not None and not np.linalg.norm(view.earth) > 1e3 * EARTH_RADIUS_KM:
-            found = f"{np.linalg.norm(view.earth) / 1e3:.6g} km in {name}"
+            distance = f"{np.linalg.norm(view.earth) / 1e3:.6g} km in {name}"
             raise InputError(
-                f"earth: expected the Earth's centre beyond its radius of {EARTH_RADIUS_KM} km, found {found}"
+                f"earth: expected the Earth's centre beyond its radius of {EARTH_RADIUS_KM} km, found {distance}"
             )
         if view.earth is not None and earth is None:
             sunlight = visible_fraction(view.sun.direction, view.earth, self.scene.sun.angular_radius)

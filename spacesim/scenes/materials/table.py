@@ -289,8 +289,8 @@ def customise_preset(
 
 def _check_unit(what: str, values: Iterable[float]) -> None:
     if not all(0.0 <= x <= 1.0 for x in values):
-        found = ", ".join(f"{x:g}" for x in values)
-        raise InputError(f"{what}: expected numbers from 0 to 1, found {found}")
+        listed = ", ".join(f"{x:g}" for x in values)
+        raise InputError(f"{what}: expected numbers from 0 to 1, found {listed}")
 
 
 def _color(values: Iterable[float]) -> Color:

@@ -31,7 +31,7 @@ _COMPRESSIONS = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_m
 def read_gltf(path: Path, notes: Notes) -> list[RawPart]:
     """The triangles of the file's scene, a part for each primitive of each node. Raises InputError."""
     document, body = _document(path)
-    file = _File(document, body, Folder(path))
+    file = _GltfFile(document, body, Folder(path))
     file.check(notes)
     surfaces = Surfaces(document, file.view, file.folder, notes)
     parts = []
@@ -95,7 +95,7 @@ def _index(value: object) -> int:
     return value
 
 
-class _File:
+class _GltfFile:
     """Buffers, views and accessors (3.6) of a document."""
 
     def __init__(self, document: JsonDict, body: bytes | None, folder: Folder) -> None:
@@ -223,7 +223,9 @@ def _local(node: JsonDict) -> np.ndarray:
     return local
 
 
-def _part(file: _File, surfaces: Surfaces, primitive: JsonDict, transform: np.ndarray, notes: Notes) -> RawPart | None:
+def _part(
+    file: _GltfFile, surfaces: Surfaces, primitive: JsonDict, transform: np.ndarray, notes: Notes
+) -> RawPart | None:
     """A primitive in the scene's axes; None (and a note) for points and lines."""
     mode = primitive.get("mode", 4)
     if mode not in (4, 5, 6):
@@ -265,7 +267,7 @@ def _part(file: _File, surfaces: Surfaces, primitive: JsonDict, transform: np.nd
     return RawPart("", vertices, faces, uv, surface, normals)
 
 
-def _normals(file: _File, attributes: JsonDict, transform: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+def _normals(file: _GltfFile, attributes: JsonDict, transform: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     """[F, 3, 3] normals at the corners of faces in the scene's axes, None where not every vertex has one."""
     stored = file.accessor(attributes["NORMAL"], (3,)).astype(np.float64)
     if faces.max(initial=-1) >= len(stored):

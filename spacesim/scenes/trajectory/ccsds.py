@@ -86,9 +86,9 @@ def motion_of(messages: Mapping[str, Sequence[Path]], with_sun: bool = True) -> 
     if with_sun:
         if not orbits or first.center != "EARTH" or first.frame not in J2000_FRAMES:
             known = f"an orbit about EARTH in {', '.join(J2000_FRAMES)}"
-            found = f"an orbit about {first.center} in {first.frame}" if orbits else "attitudes alone"
+            content = f"an orbit about {first.center} in {first.frame}" if orbits else "attitudes alone"
             expected = f"a sun of the rig, or a table with a Sun, as it is computed for {known} only"
-            raise InputError(f"{first.path}: expected {expected}, found {found}")
+            raise InputError(f"{first.path}: expected {expected}, found {content}")
         day, times = first.day, first.times
         sun = Direction("direction of the Sun", times, sun_direction(day, times))
         parts.append(Motion(day, first.time_system, sun=sun))
@@ -207,8 +207,8 @@ def _local(item: ElementTree.Element) -> str:
 def _read_kvn(text: str) -> tuple[str, list[_Segment]]:
     version = _VERSION.search(text)
     if version is None or version[1] not in ("OEM", "AEM"):
-        found = version[0] if version else "neither"
-        raise InputError(f"expected CCSDS_OEM_VERS or CCSDS_AEM_VERS, found {found}")
+        header = version[0] if version else "neither"
+        raise InputError(f"expected CCSDS_OEM_VERS or CCSDS_AEM_VERS, found {header}")
     return version[1], list(_segments(text))
 
 

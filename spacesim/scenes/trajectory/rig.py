@@ -166,8 +166,8 @@ def check_exposures(exposures: Array | None) -> None:
     """Raise InputError where one of them [N] is out of range."""
     least, most = EXPOSURES
     if exposures is not None and not ((exposures >= least) & (exposures <= most)).all():
-        found = exposures[int((~((exposures >= least) & (exposures <= most))).argmax())]
-        raise InputError(f"exposure: expected numbers from {least:g} to {most:g}, found {found:g}")
+        wrong = exposures[int((~((exposures >= least) & (exposures <= most))).argmax())]
+        raise InputError(f"exposure: expected numbers from {least:g} to {most:g}, found {wrong:g}")
 
 
 @dataclass(frozen=True)
@@ -212,8 +212,10 @@ class PoseRig(Rig):
 
     world_from_camera: [N, 4, 4], OpenCV axes, metres
     sun: (azimuth, elevation) in degrees [2], or a direction [3]; or one for each pose, [N, 2] or [N, 3]
-    test: world_from_camera [M, 4, 4] of testing;  test_sun: as `sun`, of these; None: as `sun`
-    time: [N] seconds, exposure: [N] display values of a radiance of 1 W m^-2 sr^-1, written with the frames
+    test: world_from_camera [M, 4, 4] of testing
+    test_sun: as `sun`, of these; None: as `sun`
+    time: [N] seconds, written with the frames
+    exposure: [N] display values of a radiance of 1 W m^-2 sr^-1, written with the frames
 
     Raises InputError for arrays of other shapes and for what no pose or Sun can be.
     """

@@ -116,11 +116,11 @@ def _motion(path: Path, columns: Columns) -> Motion:
 def _other_targets(columns: Columns) -> list[str]:
     """Objects beside the target that have columns, "target2" for the scene's second, in the order of their numbers.
     Raises InputError for a number below 2."""
-    found = {int(match[2]): match for name in columns if (match := _TARGETS.match(name))}
-    for number, match in found.items():
+    matches = {int(match[2]): match for name in columns if (match := _TARGETS.match(name))}
+    for number, match in matches.items():
         if number < 2 or match[1] != f"target{number}":
             raise InputError(f"{match[0]}: expected target, or target2 for the scene's second object, found {match[1]}")
-    return [f"target{number}" for number in sorted(found)]
+    return [f"target{number}" for number in sorted(matches)]
 
 
 def _check_names(path: Path, columns: Columns, groups: Mapping[tuple[str, ...], str]) -> None:

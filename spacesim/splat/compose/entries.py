@@ -66,8 +66,8 @@ class SunEntry:
         angles = {"azimuth_deg": self.azimuth_deg, "elevation_deg": self.elevation_deg}
         for key, value in angles.items():
             if (value is None) == (self.direction is None):
-                found = "none" if value is None else "direction beside it"
-                raise InputError(f"{key}: expected azimuth_deg and elevation_deg, or direction alone, found {found}")
+                given = "none" if value is None else "direction beside it"
+                raise InputError(f"{key}: expected azimuth_deg and elevation_deg, or direction alone, found {given}")
         if self.elevation_deg is not None and not abs(self.elevation_deg) <= 90:
             raise InputError(f"elevation_deg: expected -90 to 90 degrees, found {self.elevation_deg}")
         if self.direction is not None and not any(self.direction):

@@ -106,7 +106,9 @@ class LitGaussians:
 class GaussianComposition:
     """Posed models under one Sun. What does not change with poses, Sun and camera is kept, also by what `moved` makes.
 
-    models: at least one;  config: how they shade each other
+    models: at least one
+    config: how they shade each other
+
     The same models in another order give the same picture to the bit, `id` apart. One model with no pose gives what its
     run gives alone, to the bit.
     """

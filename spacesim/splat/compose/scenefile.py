@@ -162,8 +162,8 @@ def _keyframe(
     if keyframe.camera is not None:
         label = document.label((*at, "camera"))
         if entry.camera is None or entry.camera.orbit is not None:
-            found = "none" if entry.camera is None else "an orbit"
-            raise InputError(f"{label}: expected a table [camera] that says the image's size, found {found}")
+            camera = "none" if entry.camera is None else "an orbit"
+            raise InputError(f"{label}: expected a table [camera] that says the image's size, found {camera}")
         view = keyframe.camera.view(width)
         if view is None:
             raise InputError(f"{label}: expected position and look_at, or transform_matrix, found neither")

@@ -12,7 +12,7 @@ from spacesim.splat.export.usd import write_usd
 from spacesim.splat.raster.gaussians import Gaussians
 
 Form = Literal["ply", "glb", "spz", "usd"]
-ENDINGS = {"glb": (".glb",), "spz": (".spz",), "usd": (".usda", ".usd")}  #: of names; a PLY may have any
+SUFFIXES = {"glb": (".glb",), "spz": (".spz",), "usd": (".usda", ".usd")}  #: of names; a PLY may have any
 Y_UP = ("glb", "spz")  #: formats that say that y points up; the others hold the dataset's axes
 
 
@@ -27,9 +27,9 @@ def write_splats(
     """Write Gaussians with harmonics whose colours are sRGB values, see `bake`, in the file's frame.
 
     antialiased: whether they are drawn with the anti-aliasing filter, which only SPZ can record
-    Raises InputError for a name of another ending, and as the formats' own functions do.
+    Raises InputError for a name of another suffix, and as the formats' own functions do.
     """
-    check_ending(path, form)
+    check_suffix(path, form)
     placed = frame.placed(gaussians)
     if form == "ply":
         write_ply(placed, path)
@@ -41,9 +41,12 @@ def write_splats(
         write_usd(placed, path, frame.up, frame.scale)
 
 
-def check_ending(path: Path, form: Form) -> None:
-    """Raise InputError for a file name whose ending does not show the format."""
-    endings = ENDINGS.get(form, ())
-    if endings and path.suffix.lower() not in endings:
-        found = path.suffix or "no extension"
-        raise InputError(f"{path}: expected a file name that ends in {' or '.join(endings)}, found {found}")
+def check_suffix(path: Path, form: Form) -> None:
+    """Raise InputError for a file name whose suffix does not show the format."""
+    suffixes = SUFFIXES.get(form, ())
+    if suffixes and path.suffix.lower() not in suffixes:
+        suffix = path.suffix or "no extension"
+        raise InputError(f"{path}: expected a file name that ends in {' or '.join(suffixes)}, found {suffix}")
+
+
+check_ending = check_suffix  # the name that cli/export.py knows

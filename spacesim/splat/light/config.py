@@ -19,7 +19,8 @@ class LightConfig:
 
     field: FieldConfig = field(default_factory=FieldConfig)  #: the network that gives colours
     shadow: ShadowConfig | None = None  #: how shadows are cast; none leaves them to the field (the method `relight`)
-    bounce: int = 0  #: so many of the Gaussians scatter sunlight onto all (`bounce.irradiance`), 0 for none
+    #: so many of the Gaussians scatter sunlight onto all others, once and as if nothing stood in between; 0 for none
+    bounce: int = 0
     #: colours are linear, shares of what is white, and blended as such, and pictures go through the tone curve
     #: afterwards; else they are sRGB values, as in the thesis (section 7.2 asks for the former)
     linear: bool = False
@@ -33,8 +34,8 @@ class LightConfig:
         if not 0 <= self.bounce <= MAX_EMITTERS:
             raise InputError(f"bounce: expected 0 to {MAX_EMITTERS}, found {self.bounce}")
         if self.bounce and not self.field.surface:
-            found = "a field that takes directions"
-            raise InputError(f"bounce: expected 0 or light.field.inputs=surface, whose normals it needs, found {found}")
+            kind = "a field that takes directions"
+            raise InputError(f"bounce: expected 0 or light.field.inputs=surface, whose normals it needs, found {kind}")
         if self.shadow and not self.field.knows_sun:
             raise InputError("field: expected inputs with the Sun, which casts shadows, found view")
         for name in ("tone", "exposure"):

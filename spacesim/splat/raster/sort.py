@@ -18,7 +18,7 @@ from spacesim.backend.arrays import Array4u, Bool, UInt32, UInt64
 CHUNK = 64  #: entries that are compared each with each, a power of two; 128 and 256 took longer on an H100
 RUN = 4096  #: entries within which chunks are searched, a power of two: lists of pictures are shorter
 COMPARED = 2  #: entries compared in a turn of the loop
-LONG_LANES = 2**16  #: that share the entries of lists beyond RUN: as many as fill a large device
+MERGE_THREADS = 2**16  #: that share the entries of lists beyond RUN: as many as fill a large device
 
 
 def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32, count: int) -> UInt32:
@@ -98,9 +98,9 @@ def _merge_runs(
         others = _search_others(entries, key, run, first, dr.select(is_long, last, first), run_size)
         for value, target in zip((key[1], key[2]), targets, strict=True):
             dr.scatter(target, value, first + (entry - run) + others, is_long)
-        return (entry + LONG_LANES,)
+        return (entry + MERGE_THREADS,)
 
-    dr.while_loop((dr.arange(ad.UInt32, LONG_LANES),), remaining, merge, mode="symbolic", label="merge runs")
+    dr.while_loop((dr.arange(ad.UInt32, MERGE_THREADS),), remaining, merge, mode="symbolic", label="merge runs")
     dr.eval(targets)
 
 

@@ -141,8 +141,8 @@ def sun_warning(dataset: Dataset) -> str:
     cut_out = (f.silhouette_path or f.mask_path or has_alpha(dataset.root / f.file_path) for f in dataset.train)
     if not any(cut_out):
         lacking.append("no silhouette, mask or alpha to separate the object from what is behind it")
-    found = " and ".join(lacking)
-    return found and f"{dataset.root}: expected enough to estimate unknown Suns, found {found}: they may be far off"
+    lack = " and ".join(lacking)
+    return lack and f"{dataset.root}: expected enough to estimate unknown Suns, found {lack}: they may be far off"
 
 
 def _from_points(dataset: Dataset, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

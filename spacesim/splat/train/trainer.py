@@ -332,8 +332,8 @@ def _check_sizes(dataset: Dataset, config: TrainConfig) -> None:
     least = config.downscale(0)
     for frame in dataset.train:
         if min(frame.camera.width, frame.camera.height) < least:
-            found = f"{frame.camera.width}x{frame.camera.height} in {frame.file_path}"
-            raise InputError(f"num_downscales: expected pictures of at least {least} pixels a side, found {found}")
+            picture = f"{frame.camera.width}x{frame.camera.height} in {frame.file_path}"
+            raise InputError(f"num_downscales: expected pictures of at least {least} pixels a side, found {picture}")
 
 
 def _views(dataset: Dataset, config: TrainConfig) -> TrainingViews:

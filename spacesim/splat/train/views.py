@@ -42,7 +42,8 @@ class TrainingViews:
     """Views of a dataset's training frames by index, decoded at first use and kept while memory suffices, see
     `kept_bytes`.
 
-    suns: every frame must name its Sun;  truth: path-traced planes that it must have, by name
+    suns: every frame must name its Sun
+    truth: path-traced planes that it must have, by name
     surface: gives depth and normals of a camera, in place of the path-traced ones; see `prior.MeshPrior`
     Raises InputError where a frame has not what it must have.
     """

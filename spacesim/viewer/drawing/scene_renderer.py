@@ -33,12 +33,16 @@ class ViewerModel:
 
 
 class SceneRenderer:
-    """A composed scene to be drawn. composition: with the poses that the viewer starts with, of Gaussians, or another
-    that predicts as `nerf.compose.FieldComposition` does
+    """A composed scene to be drawn.
 
-    gaussian_count: of all models;  content: what there is, in words;  progressive: whether a picture takes so long that
-    it comes in steps, of radiance fields;  modes: of `MODES`, those that there can be;  relightable: whether the Sun
-    changes the picture;  backend: that draws
+    composition: with the poses that the viewer starts with, of Gaussians, or another that predicts as
+        `nerf.compose.FieldComposition` does
+    gaussian_count: of all models
+    content: what there is, in words
+    progressive: whether a picture takes so long that it comes in steps, of radiance fields
+    modes: of `MODES`, those that there can be
+    relightable: whether the Sun changes the picture
+    backend: that draws
     """
 
     def __init__(self, composition: Any) -> None:

@@ -24,7 +24,9 @@ ORBIT_SECONDS = 10.0  #: once round
 class PathControls:
     """Keyframes that all clients share; each plays them with its own camera.
 
-    client: of viser's number;  put: makes a state the scene's, handles and sliders included;  path: at first
+    client: of viser's number
+    put: makes a state the scene's, handles and sliders included
+    path: at first
     """
 
     def __init__(

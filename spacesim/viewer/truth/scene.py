@@ -104,10 +104,10 @@ def _pose_object(item: ObjectConfig, pose: Pose, renamed: Mapping[str, str]) -> 
     return replace(item, position=(x, y, z), rotation_wxyz=(w, i, j, k), scale=placed.scale, materials=used)
 
 
-def _expect_same(first: SceneConfig, second: SceneConfig, what: str, value: object, found: object) -> None:
-    if value != found:
+def _expect_same(first: SceneConfig, second: SceneConfig, what: str, value: object, other: object) -> None:
+    if value != other:
         raise InputError(
-            f"{second.name}: expected the {what} of {first.name} ({value}), found another ({found}); the truth of both "
+            f"{second.name}: expected the {what} of {first.name} ({value}), found another ({other}); the truth of both "
             "together is not known"
         )
 

@@ -28,8 +28,9 @@ from spacesim.viewer.truth.truth import SIDE, TraceQueue, ViewerTruth, matching_
 class TruthService:
     """Truth for sessions.
 
-    data: of each model, the folder of the dataset that its scene is recorded in, or None;  dataset: whose frames are
-    truth where its scene is the one that is shown, or None;  start: shown for a dataset without a recorded scene
+    data: of each model, the folder of the dataset that its scene is recorded in, or None
+    dataset: whose frames are truth where its scene is the one that is shown, or None
+    start: shown for a dataset without a recorded scene
     """
 
     def __init__(self, data: Sequence[Path | None], dataset: Dataset | None, start: SceneState) -> None:

@@ -22,7 +22,7 @@ NUMBERS = {
 
 
 @dataclass
-class Shot:
+class ColmapImage:
     name: str
     pose: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 3.0)  #: qw qx qy qz tx ty tz, camera from world
     camera: int = 1
@@ -32,7 +32,7 @@ class Shot:
 @dataclass
 class Model:
     cameras: dict = field(default_factory=lambda: {1: ("SIMPLE_PINHOLE", 16, 12, (20.0, 8.0, 6.0))})
-    shots: list = field(default_factory=list)
+    images: list = field(default_factory=list)
     points: dict = field(default_factory=dict)  #: number: ((x, y, z), (r, g, b))
 
 
@@ -42,19 +42,19 @@ def write_binary(folder, model):
     for number, (name, width, height, parameters) in model.cameras.items():
         data += struct.pack(f"<iiQQ{len(parameters)}d", number, NUMBERS[name], width, height, *parameters)
     (folder / "cameras.bin").write_bytes(data)
-    data = struct.pack("<Q", len(model.shots))
-    for number, shot in enumerate(model.shots, start=1):
-        data += struct.pack("<I7dI", number, *shot.pose, shot.camera) + shot.name.encode() + b"\0"
-        data += struct.pack("<Q", len(shot.seen))
-        for point in shot.seen:
+    data = struct.pack("<Q", len(model.images))
+    for number, image in enumerate(model.images, start=1):
+        data += struct.pack("<I7dI", number, *image.pose, image.camera) + image.name.encode() + b"\0"
+        data += struct.pack("<Q", len(image.seen))
+        for point in image.seen:
             data += struct.pack("<ddQ", 1.5, 2.5, point % 2**64)
     (folder / "images.bin").write_bytes(data)
     data = struct.pack("<Q", len(model.points))
     for number, (xyz, rgb) in model.points.items():
-        track = [k for k, shot in enumerate(model.shots, start=1) if number in shot.seen]
+        track = [k for k, image in enumerate(model.images, start=1) if number in image.seen]
         data += struct.pack("<Q3d3BdQ", number, *xyz, *rgb, 0.5, len(track))
-        for image in track:
-            data += struct.pack("<II", image, 0)
+        for k in track:
+            data += struct.pack("<II", k, 0)
     (folder / "points3D.bin").write_bytes(data)
 
 
@@ -65,13 +65,13 @@ def write_text(folder, model):
         lines.append(f"{number} {name} {width} {height} {' '.join(map(repr, parameters))}")
     (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
     lines = ["# Image list with two lines of data per image:"]
-    for number, shot in enumerate(model.shots, start=1):
-        lines.append(f"{number} {' '.join(map(repr, shot.pose))} {shot.camera} {shot.name}")
-        lines.append(" ".join(f"1.5 2.5 {point}" for point in shot.seen))
+    for number, image in enumerate(model.images, start=1):
+        lines.append(f"{number} {' '.join(map(repr, image.pose))} {image.camera} {image.name}")
+        lines.append(" ".join(f"1.5 2.5 {point}" for point in image.seen))
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     lines = ["# 3D point list with one line of data per point:"]
     for number, (xyz, rgb) in model.points.items():
-        track = [k for k, shot in enumerate(model.shots, start=1) if number in shot.seen]
+        track = [k for k, image in enumerate(model.images, start=1) if number in image.seen]
         words = [number, *xyz, *rgb, 0.5, *(word for image in track for word in (image, 0))]
         lines.append(" ".join(map(str, words)))
     (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
@@ -86,12 +86,12 @@ def ring(count=5, **options):
     points = {
         10 * k + 7: (tuple(map(float, rng.normal(size=3))), tuple(map(int, rng.integers(0, 256, 3)))) for k in range(20)
     }
-    shots = []
+    images = []
     for k in range(count):
         half = np.pi * k / count
         pose = (float(np.cos(half)), 0.0, float(np.sin(half)), 0.0, 0.1 * k, -0.2, 5.0)
-        shots.append(Shot(f"view {k}.png", pose, seen=(*points, -1)))
-    return Model(shots=shots, points=points, **options)
+        images.append(ColmapImage(f"view {k}.png", pose, seen=(*points, -1)))
+    return Model(images=images, points=points, **options)
 
 
 EXAMPLES = {  # what lenses distort by, as strongly as there are such lenses
@@ -131,7 +131,7 @@ def project(root, model=None, form="binary", size=(16, 12), sparse="sparse/0"):
     """A folder with a model and its pictures."""
     model = ring() if model is None else model
     WRITERS[form](root / sparse, model)
-    write_pictures(root / "images", [shot.name for shot in model.shots], size)
+    write_pictures(root / "images", [image.name for image in model.images], size)
     return root
 
 

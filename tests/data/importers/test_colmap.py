@@ -7,8 +7,8 @@ import pytest
 from colmap_files import (
     EXAMPLES,
     WRITERS,
+    ColmapImage,
     Model,
-    Shot,
     imported,
     lens_of,
     project,
@@ -35,8 +35,8 @@ def test_a_model_comes_through(tmp_path, form, place):
     assert [frame.file_path for frame in dataset.train] == [f"images/view {k}.png" for k in range(1, 5)]
     assert find_unreadable_files(tmp_path / "out") == []
     frames = sorted(dataset.frames, key=lambda frame: frame.file_path)
-    for shot, frame in zip(model.shots, frames, strict=True):
-        w, x, y, z, *shift = shot.pose
+    for image, frame in zip(model.images, frames, strict=True):
+        w, x, y, z, *shift = image.pose
         axis_angle = 2 * np.arctan2(y, w)  # poses of `ring` turn about y
         rotation = [
             [np.cos(axis_angle), 0, np.sin(axis_angle)],
@@ -51,7 +51,7 @@ def test_a_model_comes_through(tmp_path, form, place):
         camera = frame.camera
         assert (camera.width, camera.height, camera.fx, camera.fy) == (16, 12, 20.0, 20.0)
         assert (camera.cx, camera.cy, frame.distortion, frame.mask_path) == (8.0, 6.0, (), None)
-        source = tmp_path / "src/images" / shot.name
+        source = tmp_path / "src/images" / image.name
         assert (tmp_path / "out" / frame.file_path).read_bytes() == source.read_bytes()
     points, colors = read_points(tmp_path / "out" / dataset.ply_file_path)
     np.testing.assert_allclose(points, [xyz for xyz, _ in model.points.values()], rtol=1e-6)
@@ -165,8 +165,8 @@ def test_the_largest_of_several_models_is_taken(tmp_path, caplog):
 
 def test_of_a_model_in_two_parts_the_larger_is_taken(tmp_path, caplog):
     points = {k: ((float(k), 0.0, 1.0), (k, k, k)) for k in range(8)}
-    shots = [Shot(f"{k}.png", seen=(0, 1, k % 4)) for k in range(4)] + [Shot(f"{k}.png", seen=(6, 7)) for k in (4, 5)]
-    dataset = imported(project(tmp_path / "src", Model(shots=shots, points=points)), tmp_path / "out")
+    images = [ColmapImage(f"{k}.png", seen=(0, 1, k) if k < 4 else (6, 7)) for k in range(6)]
+    dataset = imported(project(tmp_path / "src", Model(images=images, points=points)), tmp_path / "out")
     assert {frame.file_path for frame in dataset.frames} == {f"images/{k}.png" for k in range(4)}
     (record,) = caplog.records
     assert "2 parts that share no point" in record.getMessage()
@@ -175,9 +175,9 @@ def test_of_a_model_in_two_parts_the_larger_is_taken(tmp_path, caplog):
 
 
 def test_a_model_of_given_poses_has_no_parts(tmp_path, caplog):
-    shots = [Shot(f"{k}.png") for k in range(3)]
+    images = [ColmapImage(f"{k}.png") for k in range(3)]
     (tmp_path / "src").mkdir()
-    root = project(tmp_path / "src", Model(shots=shots))
+    root = project(tmp_path / "src", Model(images=images))
     (root / "sparse/0/points3D.bin").unlink()
     dataset = imported(root, tmp_path / "out")
     assert (len(dataset.frames), dataset.ply_file_path, caplog.records) == (3, None, [])
@@ -187,8 +187,8 @@ def test_wild_points_are_left_out_and_counted(tmp_path, caplog):
     caplog.set_level(logging.INFO)
     model = ring()
     model.points[3] = ((1e6, 0.0, 0.0), (1, 2, 3))
-    for shot in model.shots:
-        shot.seen = (*shot.seen, 3)
+    for image in model.images:
+        image.seen = (*image.seen, 3)
     imported(project(tmp_path / "src", model), tmp_path / "out")
     assert len(read_points(tmp_path / "out/points.ply")[0]) == 20
     (record,) = caplog.records
@@ -197,8 +197,8 @@ def test_wild_points_are_left_out_and_counted(tmp_path, caplog):
 
 def test_names_that_differ_in_their_suffix_or_folder(tmp_path):
     names = ["left/a.png", "right/a.png", "a.png", "a.jpg"]
-    shots = [Shot(name) for name in names]
-    dataset = imported(project(tmp_path / "src", Model(shots=shots)), tmp_path / "out")
+    images = [ColmapImage(name) for name in names]
+    dataset = imported(project(tmp_path / "src", Model(images=images)), tmp_path / "out")
     expected = {"images/left/a.png", "images/right/a.png", "images/a_png.png", "images/a_jpg.jpg"}
     assert {frame.file_path for frame in dataset.frames} == expected
 
@@ -206,12 +206,12 @@ def test_names_that_differ_in_their_suffix_or_folder(tmp_path):
 # ---- masks ----
 
 
-@pytest.mark.parametrize("ending", [".png", ".png.png", ".tif"])
+@pytest.mark.parametrize("suffix", [".png", ".png.png", ".tif"])
 @pytest.mark.parametrize("size", [(16, 12), (32, 24)])
 @pytest.mark.parametrize("mode", ["L", "RGBA"])
-def test_masked_pixels_are_empty(tmp_path, ending, size, mode):
+def test_masked_pixels_are_empty(tmp_path, suffix, size, mode):
     root = project(tmp_path / "src")
-    write_masks(tmp_path / "masks", [f"view {k}{ending}" for k in range(5)], size, mode)
+    write_masks(tmp_path / "masks", [f"view {k}{suffix}" for k in range(5)], size, mode)
     dataset = imported(root, tmp_path / "out", masks=tmp_path / "masks")
     for frame in dataset.frames:
         image = ss.load_image(dataset, frame)

@@ -56,10 +56,10 @@ def test_frames_hold_what_the_scene_predicts(tmp_path):
         assert np.array_equal(read_png(tmp_path / f"out/id/{name}.png"), seen.id)
         visible = read_png(tmp_path / f"out/visibility/{name}.png") / 255
         np.testing.assert_allclose(visible, np.clip(seen.visibility, 0, 1), atol=0.5 / 255 + 1e-6)
-        told_of = json.loads((tmp_path / f"out/shots/{name}.json").read_text())
-        assert told_of["time"] == pytest.approx(index / 24)
-        np.testing.assert_allclose(told_of["models"][0]["position"], shot.composition.models[0].pose.translation)
-        np.testing.assert_allclose(told_of["sun_direction"], SUN.direction)
+        record = json.loads((tmp_path / f"out/shots/{name}.json").read_text())
+        assert record["time"] == pytest.approx(index / 24)
+        np.testing.assert_allclose(record["models"][0]["position"], shot.composition.models[0].pose.translation)
+        np.testing.assert_allclose(record["sun_direction"], SUN.direction)
     assert read_png(done.sheet).shape[1] >= 560
 
 

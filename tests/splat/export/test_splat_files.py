@@ -14,7 +14,7 @@ from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera
 from spacesim.splat.export import spz
 from spacesim.splat.export.frame import FileFrame
-from spacesim.splat.export.splats import ENDINGS, write_splats
+from spacesim.splat.export.splats import SUFFIXES, write_splats
 from spacesim.splat.export.spz import write_spz
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
@@ -38,7 +38,7 @@ def model(degree: int = 3, count: int = 200) -> Gaussians:
 
 
 def out_of(folder: Path, form: str) -> Path:
-    return folder / f"model{ENDINGS.get(form, ('.ply',))[0]}"
+    return folder / f"model{SUFFIXES.get(form, ('.ply',))[0]}"
 
 
 def again(decoded: Decoded) -> Gaussians:
@@ -232,7 +232,7 @@ def test_no_gaussians(tmp_path, form):
 
 
 def test_what_cannot_be_written_ends_in_a_sentence(tmp_path, monkeypatch):
-    for form in ENDINGS:
+    for form in SUFFIXES:
         with pytest.raises(InputError, match=r"model\.txt: expected a file name that ends in \."):
             write_splats(model(), tmp_path / "model.txt", form, FileFrame())
     for values, words in (

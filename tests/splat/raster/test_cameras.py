@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from splats import random_splats
+from splats import device_camera, random_splats
 
 import spacesim as ss
 from spacesim.backend import ad
@@ -29,10 +29,6 @@ def record(kind: str, width: int = 40, height: int = 28, pose=POSE) -> Camera | 
     if kind == "perspective":
         return Camera(pose, width, height, 1.3 * width, 1.2 * width, 0.52 * width, 0.47 * height)
     return OrthographicCamera(pose, width, height, 0.55 * width, 0.6 * width, 0.52 * width, 0.47 * height)
-
-
-def device_camera(view: Camera | OrthographicCamera) -> Pinhole | Orthographic:
-    return Pinhole.of(view) if isinstance(view, Camera) else Orthographic.of(view)
 
 
 def wide_splats() -> dict[str, np.ndarray]:

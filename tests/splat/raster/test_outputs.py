@@ -4,12 +4,13 @@ import drjit as dr
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from splats import device_camera
 
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera
-from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Pinhole
+from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.output import OUTPUTS
 from spacesim.splat.raster.project import project
@@ -29,10 +30,6 @@ def orthographic(width: int = 40, height: int = 28) -> OrthographicCamera:
 
 
 VIEWS = [perspective, orthographic]
-
-
-def device_camera(view):
-    return Pinhole.of(view) if isinstance(view, Camera) else Orthographic.of(view)
 
 
 def random_splats(count: int, seed: int = 0, scales: tuple[float, float] = (-3.2, -1.4)) -> dict[str, np.ndarray]:

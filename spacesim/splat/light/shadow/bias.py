@@ -35,7 +35,7 @@ def receiver_bias(gaussians: Gaussians, sun: Array3f, strength: Float | float = 
     in the thesis. Among equal axes the first is the shortest. A Gaussian that is not finite gets 0
     everywhere. May be part of a recording.
     """
-    shape = _Shape.of(gaussians, sun)
+    shape = _SunlitGaussian.of(gaussians, sun)
     bias = strength * shape.thickness * shape.alignment * shape.confidence
     return Bias(shape.thickness, shape.alignment, shape.confidence, dr.minimum(bias, MAX_MAGNITUDE))
 
@@ -54,7 +54,7 @@ def grazing_bias(gaussians: Gaussians, camera: Orthographic, reach: Float | floa
     camera: the light camera;  reach: standard deviations, chosen by measurement (docs/research/shadows.md), as is the
     slope's limit, |n_z| at least `STEEPEST`. May be part of a recording.
     """
-    shape = _Shape.of(gaussians, -camera.row(2))
+    shape = _SunlitGaussian.of(gaussians, -camera.row(2))
     x, y, z = (dr.dot(camera.row(i), shape.normal) for i in range(3))
     slope2 = dr.square(x * dr.rcp(camera[12])) + dr.square(y * dr.rcp(camera[13]))
     slope2 *= dr.rcp(dr.square(dr.maximum(dr.abs(z), STEEPEST)))
@@ -71,14 +71,14 @@ def offset_receivers(gaussians: Gaussians, sun: Array3f, thickness: float = 3.0,
     grazing Suns such a layer is deep along the light, however thin it is. Shadows move by that height at most.
     thickness, width: chosen by measurement (docs/research/shadows.md). A Gaussian that is not finite stays where it is.
     """
-    shape = _Shape.of(gaussians, sun)
+    shape = _SunlitGaussian.of(gaussians, sun)
     height = shape.confidence * dr.fma(thickness, shape.shortest, width * shape.longest)
     towards = dr.select(dr.dot(shape.normal, sun) < 0, -height, height)
     return dr.detach(gaussians.means) + towards * shape.normal
 
 
 @dataclass
-class _Shape:
+class _SunlitGaussian:
     """A Gaussian as the Sun sees it, [N]; zeros where it is not finite."""
 
     thickness: Float  #: standard deviation along the sunlight, metres
@@ -89,7 +89,7 @@ class _Shape:
     normal: Array3f  #: Array3f, world axes: the shortest axis
 
     @staticmethod
-    def of(gaussians: Gaussians, sun: Array3f) -> "_Shape":
+    def of(gaussians: Gaussians, sun: Array3f) -> "_SunlitGaussian":
         log_scales, quaternions = dr.detach(gaussians.log_scales), dr.detach(gaussians.quaternions)
         length2 = dr.squared_norm(quaternions)
         sane = (length2 > 1e-24) & (length2 < 1e24)
@@ -102,7 +102,7 @@ class _Shape:
         normal: Any = dr.select(first, columns[0], dr.select(scales[1] <= scales[2], columns[1], columns[2]))  # 4.23
         longest = dr.max(scales)
         ratio: Any = dr.min(scales) * dr.rcp(dr.maximum(longest, 1e-30))
-        return _Shape(
+        return _SunlitGaussian(
             thickness=dr.norm(scales * local),
             alignment=dr.select(sane, dr.minimum(dr.abs(dr.dot(normal, sun)), 1), 0),
             confidence=dr.select(sane, dr.clip(1 - ratio, 0, 1), 0),

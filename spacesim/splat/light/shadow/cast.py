@@ -53,10 +53,10 @@ class ShadowConfig:
     method: MappingConfig | SplattingConfig = field(default_factory=MappingConfig)  #: shadow mapping or splatting (4.3)
     size: int = 512  #: pixels of each side of the Sun's picture, of which the thesis names none
     bias: float = 10.0  #: strength lambda_b of the receiver-depth bias (4.26), 0: none but that of `grazing`
-    #: what holds at a grazing Sun, too, where the thesis's bias goes to 0: a bias (`grazing_bias`), points offset
-    #: along the normals (`offset_receivers`), or both
+    #: what holds at a grazing Sun, too, where the thesis's bias goes to 0: a bias by the depth that a splat spans in
+    #: the Sun's picture, points that are tested off the surface, along its normals (lift), or both
     grazing: Literal["none", "bias", "lift", "both"] = "none"
-    reach: float = 2.0  #: of `grazing_bias`, standard deviations
+    reach: float = 2.0  #: of that bias, standard deviations of a splat in the Sun's picture
     softness: float = 1e-6  #: epsilon_s of 4.5 as a share of the farthest training camera's distance
     #: the network that corrects raw shadows (4.3.3)
     refine: ShadowRefinementConfig | None = field(default_factory=ShadowRefinementConfig)

@@ -51,8 +51,8 @@ class MappingConfig:
     sun_radius_deg: float = 0.0
     widest: float = 8.0  #: pixels, half the width of the widest such window, and of the search for blockers
     bleeding: float = 0.2  #: with variance: lit shares below it count as none (Lauritzen 2007)
-    #: what is thinner than a light pixel fades in the picture, where it would else grow to a pixel (see `project`):
-    #: shadows end where bodies do, within two pixels; the thesis does not say
+    #: what is thinner than a light pixel fades in the picture, where it would else grow to a pixel: shadows end where
+    #: bodies do, within two pixels; the thesis does not say
     antialiased: bool = True
 
     def __post_init__(self) -> None:

@@ -56,7 +56,7 @@ def occlusion_by_splatting(
     camera: looks from the Sun at the scene
     bias: Float [N] metres, of each receiver, or one for all; below 0, from 1e9 on or not a number counts as 0
     points: Array3f [3, N], world, metres: where each Gaussian is tested, if not at its centre (`bias.offset_receivers`)
-    antialiased: blockers thinner than a pixel of the light image fade, see `project`
+    antialiased: blockers thinner than a pixel of the light image fade
     receives: Bool [N]: who is asked about, all by default; the others block, and have 0
     beta_min: where a receiver's footprint ends, `LEAST_BETA` to below 1
     0 for what cannot be projected and where no pixel of a footprint is inside of the image. Raises ValueError for a
@@ -335,7 +335,8 @@ class _Occlusion(dr.CustomOp):
     def backward(self) -> None:
         index, capacity = dr.arange(ad.UInt32, self.count), self.capacity
         none = dr.opaque(ad.Float, 0, self.count)
-        grad_events = Splats(*[dr.opaque(ad.Float, 0, 2 * capacity)] * 7)
+        zero = dr.opaque(ad.Float, 0, 2 * capacity)
+        grad_events = Splats(x=zero, y=zero, a=zero, b=zero, c=zero, opacity=zero, depth=zero)
         if self.lists.capacity > 0:
             receiver = dr.arange(ad.UInt32, capacity)
             padded = dr.gather(ad.Float, self.grad_out(), receiver, receiver < dr.opaque(ad.UInt32, self.count))

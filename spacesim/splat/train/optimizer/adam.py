@@ -8,7 +8,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float, UInt32
 from spacesim.backend.upload import upload
-from spacesim.learning.adam import corrections
+from spacesim.learning.adam import AdamSteps
 from spacesim.splat.raster.gaussians import ROWS, gather_entries
 from spacesim.splat.train.optimizer.packing import (
     PackedArray,
@@ -26,26 +26,21 @@ CONSTANT = 3  #: rows of the constant harmonic, which are moved with them
 PART = 15  #: rows of harmonics that are moved at once: five coefficients
 
 
-class Adam:
+class Adam(AdamSteps):
     """Moments of the rows of Gaussians (`Gaussians.rows`), part by part, those of a part in few arrays (`packing`).
 
     slices: the rows of each part; features, a packed row, are none
-    layouts, arrays: how the moments of each part lie, and where;  features: their two moments [F * N], or none
+    layouts, arrays: how the moments of each part lie, and where
+    features: their two moments [F * N], or none
     """
 
     def __init__(self, rows: list[Float]) -> None:
-        self.steps = 0
         self.slices, count = parts(len(rows)), dr.width(rows[0])
         self.arrays: list[list[Float]] = []
         self.layouts: list[tuple[PackedArray, ...]] = []
         self._lay_out(count)
         self.arrays = [zeros(layout) for layout in self.layouts]
         self.features = [dr.opaque(ad.Float, 0, dr.width(row)) for row in 2 * rows[self.slices[-1].stop :]]
-
-    def corrections(self) -> tuple[float, float]:
-        """Count a step; the factors that make the moments unbiased estimates."""
-        self.steps += 1
-        return corrections(self.steps)
 
     def select(self, index: UInt32, fresh: Bool) -> None:
         """Entry i of each moment becomes entry index[i], or zero where `fresh[i]`. index, fresh: [M]."""

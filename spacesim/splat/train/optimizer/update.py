@@ -40,7 +40,8 @@ class ViewGradients:
 class Update:
     """Moves all parameters by the mean gradient of some views.
 
-    antialiased: see `project`;  scale: metres, the unit of depth
+    antialiased: whether splats are drawn with the anti-aliasing filter
+    scale: metres, the unit of depth
     """
 
     def __init__(self, antialiased: bool, scale: float) -> None:

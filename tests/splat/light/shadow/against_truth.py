@@ -41,24 +41,24 @@ METHODS = {"mapping": MappingConfig, "splatting": SplattingConfig}
 
 def ways(size: int) -> dict[str, ShadowConfig]:
     """Shadows by name."""
-    found: dict[str, ShadowConfig] = {}
+    configs: dict[str, ShadowConfig] = {}
     for method in ("mapping", "splatting"):
         for bias, grazing in ((0.0, "none"), (3.0, "none"), (10.0, "none"), (30.0, "none"), (10.0, "bias")):
             what = {"none": "", "bias": ", grazing bias"}[grazing]
-            found[f"{method}, λ = {bias:g}{what}"] = ShadowConfig(METHODS[method](), size, bias, grazing)
+            configs[f"{method}, λ = {bias:g}{what}"] = ShadowConfig(METHODS[method](), size, bias, grazing)
         for bias, grazing in ((5.0, "lift"), (10.0, "lift"), (5.0, "both")):
-            what = {"lift": "lifted", "both": "lifted, grazing bias"}[grazing]
-            found[f"{method}, λ = {bias:g}, {what}"] = ShadowConfig(METHODS[method](), size, bias, grazing)
+            what = {"lift": "offset receivers", "both": "offset receivers, grazing bias"}[grazing]
+            configs[f"{method}, λ = {bias:g}, {what}"] = ShadowConfig(METHODS[method](), size, bias, grazing)
         if method == "mapping":
             for name in ("percentage-closer", "variance", "median"):
                 reading = MappingConfig(name)
-                found[f"{method}, λ = 5, lifted, {name}"] = ShadowConfig(reading, size, 5.0, "lift")
+                configs[f"{method}, λ = 5, offset receivers, {name}"] = ShadowConfig(reading, size, 5.0, "lift")
     for method, kind in (("mapping", "shadow-map"), ("splatting", "shadow-splat")):
         light = preset("fast", kind).light
         assert light is not None
         assert light.shadow is not None
-        found[f"{method}, as shipped"] = light.shadow
-    return found
+        configs[f"{method}, as shipped"] = light.shadow
+    return configs
 
 
 def main() -> None:
@@ -106,10 +106,10 @@ def unseen(dataset: Dataset) -> list[Frame]:
     """At most VIEWS frames of each Sun that training has not seen, of each that it has where there is no other."""
     known = known_suns(dataset.test, dataset.train)
     frames = [frame for frame, seen in zip(dataset.test, known, strict=True) if seen is False] or dataset.frames
-    found: dict[tuple[float, ...], list[Frame]] = {}
+    by_sun: dict[tuple[float, ...], list[Frame]] = {}
     for frame in frames:
-        found.setdefault(tuple(frame.sun.direction), []).append(frame)
-    return [frame for of_sun in found.values() for frame in of_sun[:VIEWS]]
+        by_sun.setdefault(tuple(frame.sun.direction), []).append(frame)
+    return [frame for of_sun in by_sun.values() for frame in of_sun[:VIEWS]]
 
 
 def mask_errors(gaussians: Gaussians, dataset: Dataset, frames: Sequence[Frame], visibility: Visibility) -> list[float]:
