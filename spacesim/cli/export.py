@@ -104,10 +104,10 @@ def _export_splats(options: argparse.Namespace, form: "Form") -> None:
     from spacesim.methods import load_run
     from spacesim.splat.export.bake import bake
     from spacesim.splat.export.frame import FileFrame
-    from spacesim.splat.export.splats import Y_UP, check_ending, write_splats
+    from spacesim.splat.export.splats import Y_UP, check_suffix, write_splats
 
     out: Path = getattr(options, form)
-    check_ending(out, form)
+    check_suffix(out, form)
     frame = FileFrame(options.up or ("y" if form in Y_UP else "z"), _scale(options), options.recentre)
     backend.select(options.backend)
     run = load_run(options.path).gaussian_run

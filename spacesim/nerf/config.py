@@ -80,7 +80,7 @@ class NerfConfig:
     color_layers: int = 3  #: matrix products of the colour network
     harmonics: int = 3  #: degree of spherical harmonics of the view's direction
     #: what colours of `nerf-relight` are given of Sun and view: their directions, or cosines about a normal that each
-    #: place learns (`learning.reflectance`), which serve Suns never seen
+    #: place learns, which serve Suns never seen
     inputs: Literal["directions", "surface"] = "surface"
     sun_harmonics: int = 1  #: of "directions", of the Sun's: more of them memorise training's few Suns
     shadow: NerfShadowConfig = field(default_factory=NerfShadowConfig)  #: of `nerf-relight`

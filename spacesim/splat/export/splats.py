@@ -47,6 +47,3 @@ def check_suffix(path: Path, form: Form) -> None:
     if suffixes and path.suffix.lower() not in suffixes:
         suffix = path.suffix or "no extension"
         raise InputError(f"{path}: expected a file name that ends in {' or '.join(suffixes)}, found {suffix}")
-
-
-check_ending = check_suffix  # the name that cli/export.py knows

@@ -32,9 +32,12 @@ class State:
 
 
 class PyramidLevel:
-    """The picture at one size. factor: pixels of the whole picture on a side of one of its pixels;  blur: pixels of
-    its own, standard deviation. Unknowns [7]: a turn and a shift in steps that move pictures by `STEP` pixels, and
-    the logarithm of the gain."""
+    """The picture at one size. Unknowns [7]: a turn and a shift in steps that move pictures by `STEP` pixels, and the
+    logarithm of the gain.
+
+    factor: pixels of the whole picture on a side of one of its pixels
+    blur: pixels of its own, standard deviation
+    """
 
     def __init__(
         self,
