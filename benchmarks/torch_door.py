@@ -146,26 +146,32 @@ def _differences(
     torch: Any, one: Any, other: Any, leaves: dict[str, Any], camera: Camera, mode: dict
 ) -> dict[str, float]:
     """Largest absolute differences of pictures and alphas, shares of pixels that differ by more than some (a splat
-    whose alpha is all but 1/255 may count with one alone), relative norms of differences of gradients."""
-    results = []
-    weights = None
-    for function in (one, other):
+    whose alpha is all but 1/255 may count with one alone, and two of all but one depth may change places), relative
+    norms of differences of gradients: of all pixels, and of those that differ by at most 1e-4."""
+    size = {"width": camera.width, "height": camera.height, "sh_degree": 3, "packed": False}
+
+    def drawn(function: Any) -> tuple[Any, Any, dict[str, Any]]:
         own = {name: leaf.detach().clone().requires_grad_(name != "Ks") for name, leaf in leaves.items()}
         if mode.get("camera_model") == "ortho":
             own["Ks"][:, :2, :2] /= 4
-        size = {"width": camera.width, "height": camera.height, "sh_degree": 3, "packed": False}
         picture, alpha, _ = function(**own, **size, **mode)
-        both = torch.cat([picture, alpha], dim=-1)
-        if weights is None:
-            weights = torch.randn(both.shape, device=both.device, generator=torch.Generator(both.device).manual_seed(1))
-        (weights[..., :3] * both[..., :3] + weights[..., -1:] * both[..., -1:]).sum().backward()
-        results.append((picture.detach(), alpha.detach(), {name: own[name].grad for name in (*NAMES, "viewmats")}))
-    (a, alpha_a, by_a), (b, alpha_b, by_b) = results
-    off = torch.where(alpha_b > 0.01, a - b, 0 * a).abs().amax(dim=-1).flatten()
+        return picture, alpha, own
+
+    def gradients(function: Any, weights: Any) -> dict[str, Any]:
+        picture, alpha, own = drawn(function)
+        (weights[..., :3] * picture[..., :3] + weights[..., -1:] * alpha).sum().backward()
+        return {name: own[name].grad for name in (*NAMES, "viewmats")}
+
+    (a, alpha_a, _), (b, alpha_b, _) = drawn(one), drawn(other)
+    off = torch.where(alpha_b > 0.01, a - b, 0 * a).abs().amax(dim=-1, keepdim=True).detach()
     differences = {"picture": float(off.max()), "alpha": float((alpha_a - alpha_b).abs().max())}
     differences |= {f"pixels off by {bound:g}": float((off > bound).float().mean()) for bound in (1e-4, 1e-3)}
-    for name, gradient in by_b.items():
-        differences[f"gradient {name}"] = float((by_a[name] - gradient).norm() / gradient.norm())
+    generator = torch.Generator(a.device).manual_seed(1)
+    weights = torch.randn((*a.shape[:-1], 4), device=a.device, generator=generator)
+    for where, some in (("", weights), (" of like pixels", weights * (off <= 1e-4))):
+        by_a, by_b = gradients(one, some), gradients(other, some)
+        for name, gradient in by_b.items():
+            differences[f"gradient {name}{where}"] = float((by_a[name] - gradient).norm() / gradient.norm())
     return differences
 
 
