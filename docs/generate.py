@@ -330,8 +330,8 @@ def materials_page() -> str:
     lead = (
         "Generated from `spacesim/assets/materials.toml`. Albedo is linear camera RGB, of coated surfaces that of the "
         "base as seen through the coat; the absorptance is over 300 to 2500 nm. Chosen: assumed, not measured. "
-        "Table 11.3: Fortescue, Swinerd and Stark, *Spacecraft Systems Engineering*, 4th edition, 2011; Rakic: Appl. Opt. "
-        "34, 4755 (1995)."
+        "Table 11.3: Fortescue, Swinerd and Stark, *Spacecraft Systems Engineering*, 4th edition, 2011; Rakic: Appl. "
+        "Opt. 34, 4755 (1995)."
     )
     return f"# Table of materials\n\n{lead}\n\n{chr(10).join(rows)}\n"
 
