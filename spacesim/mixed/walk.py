@@ -63,7 +63,7 @@ class Blended:
     """Of R pixels; sums are of weight x value."""
 
     transmittance: Float  #: [R]
-    depth: Float  #: [R] sum, metres; a segment's is its middle's
+    depth: Float  #: [R] sum, metres; a segment's, or that of a piece of one, is its middle's
     median_depth: Float  #: [R] metres, where half of the light is gone; 0 where it is not
     common: list[Float]  #: [R] each, of the features that both have
     of_splats: list[Float]  #: [R] each, of the Gaussians' other ones
@@ -121,7 +121,7 @@ def blend_segments(
         share = dr.log(dr.maximum(2 * transmittance, 1)) / dr.maximum(thickness, 1e-12)
         half = (transmittance >= 0.5) & (behind < 0.5)
         median = dr.select(half, dr.fma(dr.minimum(share, 1), stop - start, start), median)
-        depth = dr.fma(weight, dr.select(is_segment, 0.5 * (low + high), 0), depth)
+        depth = dr.fma(weight, dr.select(is_segment, 0.5 * (start + stop), 0), depth)
 
         # the splat
         alpha: Any = dr.select(blends, dr.minimum(exp2(power), ALPHA_MAX), 0)

@@ -133,8 +133,8 @@ class FieldComposition(FieldScene):
 
     @property
     def chunk(self) -> int:
-        """Rays that are drawn at once."""
-        return self._runs[0].networks.config.chunk
+        """Rays that are drawn at once: no more than any of the models takes."""
+        return min(run.networks.config.chunk for run in self._runs)
 
     def posed(self, poses: Sequence[Any]) -> "FieldComposition":
         """The scene with these poses, one of each model."""
@@ -167,7 +167,7 @@ class FieldComposition(FieldScene):
     def crossing(self, fields: PlacedFields, camera: Camera) -> np.ndarray:
         """Numbers, row by row, of the pixels whose rays cross what a model fills. Raises MemoryError where a chunk of
         rays does not fit."""
-        check_chunk(self._runs[0].networks.config)
+        check_chunk([self._runs[number].networks.config for number in self._which], self.chunk)
         size, count, width = camera.width * camera.height, self.chunk, dr.opaque(ad.UInt32, camera.width)
         seen = (_find_crossing(fields, dr.opaque(ad.UInt32, first), width, count) for first in range(0, size, count))
         return np.flatnonzero(np.concatenate([np.array(part, bool) for part in seen])[:size]).astype(np.uint32)

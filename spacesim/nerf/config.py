@@ -51,6 +51,8 @@ class ProposalConfig:
     def __post_init__(self) -> None:
         check_fields(self)
         check_ranges(self, samples=(2, MAX_SAMPLES), width=(1, 256))
+        if self.grid.finest is None:
+            raise InputError("grid: expected one whose finest level is given, found finest none, as the field's may be")
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class NerfConfig:
     fine: ProposalConfig = field(default_factory=lambda: ProposalConfig(16))  #: second: where the first saw density
     proposals_every: int = 4  #: steps after which proposals learn, once `warm_up` is over
     warm_up: int = 250  #: steps in which proposals learn each time and the whole box counts as filled
-    occupancy: int = 32  #: cells along the box's longest side that are known as empty or not
+    occupancy: int = 32  #: cells along the box's longest side that are known as empty or not; a multiple of 8
     occupancy_every: int = 25  #: steps between two looks at these
     interlevel_weight: float = 1.0  #: in the loss: proposals that miss what the field has (Barron et al. 2022)
     distortion_weight: float = 0.002  #: in the loss: weights of a ray that lie apart (Barron et al. 2022)

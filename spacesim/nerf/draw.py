@@ -1,6 +1,6 @@
 """Pictures of a radiance field: rays of a chunk at a time, and of these only such as cross what is filled."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -19,6 +19,7 @@ from spacesim.nerf.sampling.rays import Rays, camera_rows, pixel_rays
 from spacesim.nerf.sampling.render import Weights, expected_depth, median_depth, spread, sum_rays, volume_weights
 from spacesim.nerf.shadow import mix, ray_visibility
 
+A_SAMPLE = 300  #: bytes that are kept of each, of models that are merged: by peaks seen on LLVM
 INTERRUPTIBLE = 2_048  #: rays of a chunk, at most, of a picture that may be given up after any
 PLANES = {"rgb": 3, "alpha": 1, "depth": 1, "median_depth": 1, "visibility": 1, "normal": 3}
 """Of a picture, in this order: colours over black, opacity, depths (sides of the box, along the ray), the share of the
@@ -140,7 +141,7 @@ def draw(
 ) -> dict[str, np.ndarray]:
     """Planes of a picture by name, [H, W] or [H, W, 3] float32, depths in metres. Memory on the device is that of a
     chunk of rays: raises MemoryError where these do not fit. sun: [3] towards it, of a field that takes it"""
-    check_chunk(networks.config)
+    check_chunk([networks.config], networks.config.chunk)
     left_out = {"normal": not normals, "visibility": not networks.config.casts_shadows}
     names = [name for name in PLANES if not left_out.get(name)]
     size, chunk = camera.width * camera.height, networks.config.chunk
@@ -174,9 +175,12 @@ def draw(
     return result
 
 
-def check_chunk(config: NerfConfig) -> None:
-    """Raise MemoryError where the rays that are drawn at once do not fit into memory."""
-    check_free_memory(config.ray_bytes * config.chunk // 2, f"chunk: a picture by {config.chunk} rays at once")
+def check_chunk(configs: Sequence[NerfConfig], chunk: int) -> None:
+    """Raise MemoryError where `chunk` rays that are drawn at once through models of these configurations, one after the
+    other, do not fit into memory."""
+    kept = A_SAMPLE * sum(config.samples for config in configs) if len(configs) > 1 else 0
+    most = max(config.ray_bytes for config in configs) // 2
+    check_free_memory((most + kept) * chunk, f"chunk: a picture by {chunk} rays at once")
 
 
 def chunks(

@@ -37,7 +37,7 @@ def twin(
         for k, thickness in enumerate(density):
             low, high = max(edges[k], start), min(edges[k + 1], stop)
             if high > low:
-                middle = 0.5 * (edges[k] + edges[k + 1])
+                middle = 0.5 * (low + high)
                 share = -np.expm1(-thickness * (high - low))
                 take(share, middle, own[k], lambda t, low=low, d=thickness: low + np.log(2 * t) / d)
 
@@ -109,3 +109,14 @@ def test_what_lies_before_or_behind_all(low, color):
     else:
         np.testing.assert_array_equal(splats, np.array(empty.of_splats[0]))
         np.testing.assert_allclose(np.array(made.of_segments[0]), np.array(empty.transmittance), atol=1e-5)
+
+
+def test_a_segment_that_gaussians_cut_lies_where_its_pieces_do():
+    """Thin fog from before the Gaussians to far behind them, as one segment and as 400 of them."""
+    distance, rays = float(np.linalg.norm(CAMERA.position)), CAMERA.width * CAMERA.height
+    depths = []
+    for count in (1, 400):
+        edges = np.tile(np.linspace(distance - 3, distance + 20, count + 1), (rays, 1))
+        made, _, _ = drawn(edges, np.full((rays, count), 0.001), np.ones((rays, count, 3)))
+        depths.append(np.array(made.depth))
+    np.testing.assert_allclose(depths[0], depths[1], atol=2e-3)

@@ -18,6 +18,7 @@ from spacesim.data.records import Camera
 from spacesim.methods import load_scene
 from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.draw import RaySamples
+from spacesim.nerf.fields.model import Networks
 from spacesim.nerf.partition import merge
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.sampling.render import sum_rays, volume_weights
@@ -165,6 +166,20 @@ def test_the_nearer_model_hides_the_other(finished):
     swapped = scene((finished, back), (finished, front)).predict(camera)
     np.testing.assert_allclose(swapped.rgb, both.rgb, atol=1e-5)
     assert (swapped.id[opaque] == 2).all()
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_memory_of_a_picture_is_bounded_by_the_smallest_chunk_and_the_largest_model(finished, monkeypatch, order):
+    config = finished.networks.config
+    large = replace(finished, networks=Networks(replace(config, samples=256, chunk=512)))
+    runs = [finished, large]
+    composed = scene(*((runs[number], Pose(translation=(4.0 * number, 0, 0))) for number in order))
+    assert composed.chunk == 512
+    asked = []
+    monkeypatch.setattr("spacesim.nerf.draw.check_free_memory", lambda needed, what: asked.append((needed, what)))
+    composed.crossing(composed.placed(camera_at((0, -20, 0)), None), camera_at((0, -20, 0)))
+    needed = 512 * (large.networks.config.ray_bytes // 2 + 300 * (config.samples + 256))
+    assert asked == [(needed, "chunk: a picture by 512 rays at once")]
 
 
 def test_scene_files(spacesim, finished, tmp_path):

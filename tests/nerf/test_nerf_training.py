@@ -130,6 +130,21 @@ def test_rays_that_do_not_fit_into_memory_are_refused(dataset, finished, monkeyp
             drawn.predict(dataset.test[0].camera)
 
 
+def test_cells_are_looked_at_a_few_at_a_time(dataset, monkeypatch):
+    """To the same bits; and so many that they do not fit are refused before anything is trained."""
+    config = replace(CONFIG, occupancy=32, occupancy_every=2, iterations=4)
+    whole, parts = NerfTrainer(dataset, config), NerfTrainer(dataset, config)
+    for cells, trained in ((32**3, whole), (3 * 4096, parts)):
+        monkeypatch.setattr("spacesim.nerf.train.trainer.CELLS", cells)
+        for _ in range(4):
+            trained.step()
+    np.testing.assert_array_equal(np.array(parts.occupancy), np.array(whole.occupancy))
+    assert np.array(whole.occupancy).max() > 0
+    monkeypatch.setattr("spacesim.backend.memory.free_memory", lambda needed=0: 10**9)
+    with pytest.raises(MemoryError, match="occupancy: 512 cells a side"):
+        NerfTrainer(dataset, replace(config, occupancy=512))
+
+
 def test_pictures_beside_the_box_are_left_out_in_one_sentence(dataset, caplog):
     turn = np.diag([-1.0, 1, -1, 1])  # looks the other way
     turned = [
@@ -337,6 +352,10 @@ def test_the_commands(spacesim, tiny_data, tmp_path):
         (["--set", "rays=100"], "rays: expected 512 to 1048576, found 100"),
         (["--set", "rays=600"], "rays: expected a multiple of 512, found 600"),
         (["--set", "grid.finest=4"], "finest: expected at least coarsest, 16, found 4"),
+        (
+            ["--set", "coarse.grid.finest=none"],
+            "coarse.grid: expected one whose finest level is given",
+        ),
         (["--set", "sh_degree=2"], "sh_degree"),
     ],
 )

@@ -20,9 +20,8 @@ class Occupancy:
 
     cells: int
 
-    def points(self, key: UInt32) -> Array3f:
-        """[3, cells^3] a place in each cell. key: see `sampler.random`"""
-        index = dr.arange(ad.UInt32, self.cells**3)
+    def points(self, key: UInt32, index: UInt32) -> Array3f:
+        """[3, N] a place in each of the cells number `index` [N]. key: see `sampler.random`"""
         n = self.cells
         corner = ad.Array3f(index % n, index // n % n, index // (n * n))
         return (corner + ad.Array3f([random(key, index, STREAM + i) for i in range(3)])) / n

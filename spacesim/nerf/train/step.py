@@ -137,15 +137,19 @@ def loss_and_gradients(
     return loss, of_proposals + of_field
 
 
-def look_around(networks: Networks, parameters: Parameters, state: Float, key: UInt32) -> tuple[Float, Float]:
-    """(state, filled cells) of the occupancy grid after a look at every cell."""
-    occupancy = networks.occupancy
-    point = occupancy.points(key)
+def look_at_cells(networks: Networks, parameters: Parameters, key: UInt32, first: UInt32, count: int) -> Float:
+    """[count] densities in cells of the occupancy grid, from number `first` (width 1) on."""
+    point = networks.occupancy.points(key, dr.arange(ad.UInt32, count) + first)
     dr.eval(point)
     density, _ = networks.density_tape(parameters, point)
-    state = occupancy.updated(state, density)
+    return density
+
+
+def note_densities(networks: Networks, state: Float, density: Float) -> tuple[Float, Float]:
+    """(state, filled cells) of the occupancy grid after a look at all cells."""
+    state = networks.occupancy.updated(state, density)
     dr.eval(state)
-    return state, occupancy.filled(state)
+    return state, networks.occupancy.filled(state)
 
 
 def _background(is_random: bool, key: UInt32, index: UInt32) -> Float:

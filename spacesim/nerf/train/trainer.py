@@ -21,12 +21,14 @@ from spacesim.nerf.fields.model import Networks
 from spacesim.nerf.sampling.box import SceneBox, scene_box
 from spacesim.nerf.sampling.sampler import step_key
 from spacesim.nerf.train.pixels import training_pixels
-from spacesim.nerf.train.step import StepNumbers, look_around, step
+from spacesim.nerf.train.step import StepNumbers, look_at_cells, note_densities, step
 
 FORMAT = "spacesim-nerf-1"
 #: first steps, at most a tenth of all, in which the step size grows to its full: at full size at once, every unit of a
 #: colour network may come to give 0 for good, and the field stays black
 RATE_WARM_UP = 100
+CELLS = 2**17  #: of the occupancy grid that are looked at together
+A_CELL = 32  #: bytes on the device, of its state before and after, and whether it is filled
 SLOPE = 10.0  #: of the power of proposals' weights as they warm up (Barron et al. 2022, annealing)
 
 
@@ -50,6 +52,7 @@ class NerfTrainer(TrainingLoop):
     def __init__(self, dataset: Dataset, config: NerfConfig) -> None:
         self.config, self.iteration, self.proposal_steps = config, 0, 0
         check_free_memory(config.ray_bytes * config.rays, f"rays: a step of {config.rays} rays")
+        check_free_memory(A_CELL * config.occupancy**3, f"occupancy: {config.occupancy} cells a side")
         self.box = scene_box(dataset, config.margin)
         self.networks = Networks(config)
         self.pixels = training_pixels(dataset, self.box, config.knows_sun)
@@ -59,7 +62,8 @@ class NerfTrainer(TrainingLoop):
         self.occupancy = dr.opaque(ad.Float, 0, config.occupancy**3)  #: see `Occupancy`
         self.filled = dr.opaque(ad.Float, 1, config.occupancy**3)
         self.history, self.seconds = [], {}
-        self._step, self._look_around = recorded(step), recorded(look_around)
+        self._step, self._look = recorded(step), recorded(look_at_cells, elements=None)
+        self._note = recorded(note_densities)
 
     def step(self) -> Float:
         """One update. Returns the mean squared error of colours, Float of width 1."""
@@ -82,10 +86,18 @@ class NerfTrainer(TrainingLoop):
         )
         self.iteration += 1
         if self.iteration % config.occupancy_every == 0:
-            self.occupancy, self.filled = self._look_around(
-                self.networks, self.parameters, self.occupancy, self._key(2**40 + index)
-            )
+            self._look_around(self._key(2**40 + index))
         return loss
+
+    def _look_around(self, key: UInt32) -> None:
+        """Look at all cells, so many at a time as bound the memory."""
+        cells = self.config.occupancy**3
+        parts = [
+            self._look(self.networks, self.parameters, key, dr.opaque(ad.UInt32, first), min(CELLS, cells - first))
+            for first in range(0, cells, CELLS)
+        ]
+        density = parts[0] if len(parts) == 1 else dr.concat(parts)
+        self.occupancy, self.filled = self._note(self.networks, self.occupancy, density)
 
     def model_tensors(self) -> dict[str, np.ndarray]:
         """Grids, networks, which cells are filled, the box."""
