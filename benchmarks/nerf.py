@@ -1,12 +1,14 @@
 """Radiance fields: a training step, a whole training, frames of one and of three models; beside nerfacc's instant-ngp.
 
     python benchmarks/nerf.py --out OUT [--data DATA] [--preset thesis] [--rays 4096] [--iterations N] [--pixels 512]
-                              [--peers nerfacc] [--json]
+                              [--splats] [--peers nerfacc] [--json]
 
 boxsat, one Sun, 100 views of 256 pixels, or a dataset of yours. A step is timed once trained, so that rays skip what is
 empty. PSNR is of test views, over whole pictures and over the silhouette. Frames are what `predict` returns, in the
-computer's memory, of test views drawn at so many pixels. --peers trains the recipe of nerfacc's train_ngp_nerf_occ.py
-for as many iterations of as many rays; that needs CUDA, torch, nerfacc and tinycudann.
+computer's memory, of test views drawn at so many pixels. --splats trains `vanilla` of the preset `fast`, too, and puts
+it through the field, a third of the object's size aside: how far the picture of both, in one walk, is from the two
+pictures put together by each pixel's expected depth, over the pixels that they cover. --peers trains the recipe of
+nerfacc's train_ngp_nerf_occ.py for as many iterations of as many rays; that needs CUDA, torch, nerfacc and tinycudann.
 """
 
 import sys
@@ -51,6 +53,7 @@ def main() -> None:
     parser.add_argument("--rays", type=common.positive, default=4096, help="of a step")
     parser.add_argument("--iterations", type=common.positive, help="default: the preset's")
     parser.add_argument("--pixels", type=common.positive, default=512, help="of a frame's side")
+    parser.add_argument("--splats", action="store_true", help="train splats, too; draw both in one scene")
     parser.add_argument("--peers", choices=["nerfacc"], help="measured beside ours; needs CUDA and the peer")
     options = parser.parse_args()
     name = backend.select(options.backend)
@@ -65,7 +68,13 @@ def main() -> None:
         rows += measured_apart(data, options.rays, config.iterations, options.repeats)
     frames = list(frame_rows(run, data, options.pixels))
     tables = {"Training": rows, f"A frame of {options.pixels} pixels": frames}
-    common.emit({"training": rows, "frames": frames}, tables, options)
+    results = {"training": rows, "frames": frames}
+    if options.splats:
+        splats = methods.shortened(methods.preset("fast", "vanilla"), options.iterations)
+        model = trained_splats(data, options.out / "splats", splats)
+        rows.append({"": "splats, fast", "training, s": model.training["seconds"], **quality(model, data)})
+        results["mixed"] = tables["Field and splats through each other"] = [mixed_row(run, model, data)]
+    common.emit(results, tables, options)
 
 
 def trained(data: Dataset, folder: Path, config: Any) -> tuple[NerfRun, float]:
@@ -119,13 +128,43 @@ def step_timing(step: Callable[[], Any], turn: int, repeats: int) -> common.Timi
 
 
 def trained_row(step: common.Timing, duration: float, model: Any, data: Dataset) -> common.Row:
+    return {"step, ms": step.median, "training, s": duration, **quality(model, data)}
+
+
+def quality(model: Any, data: Dataset) -> common.Row:
+    """Means over the test views, dB."""
     whole, inside = [], []
     for frame in data.test:
         images, _ = frame_images(data, frame, model.predict(frame.camera))
         whole.append(image.psnr(images.prediction, images.truth))
         inside.append(image.psnr(images.prediction, images.truth, images.silhouette))
-    quality = {"PSNR": _mean(whole), "over the silhouette": _mean(inside)}
-    return {"step, ms": step.median, "training, s": duration, **quality}
+    return {"PSNR": _mean(whole), "over the silhouette": _mean(inside)}
+
+
+def trained_splats(data: Dataset, folder: Path, config: Any) -> Any:
+    from spacesim.progress import report_training, show_progress
+
+    with show_progress("train splats", "iterations") as report:
+        return methods.train(data, folder, config, True, report_training(report))
+
+
+def mixed_row(field: NerfRun, splats: Any, data: Dataset) -> common.Row:
+    """PSNR over covered pixels, and the share of them that differ by more than a tenth."""
+    aside = Pose(translation=np.array([field.box.side / 3, 0.0, 0.0]))
+    models = PlacedRun(field, Pose()), PlacedRun(splats, aside)  # type: ignore[arg-type]
+    drawers = [methods.compose(some, ComposeConfig("none")) for some in (models, models[:1], models[1:])]
+    squares, off, count = 0.0, 0, 0
+    for frame in data.test:
+        both, *each = (drawer.predict(frame.camera, frame.sun) for drawer in drawers)
+        depths = [np.where(one.alpha > 0.01, one.depth, np.inf) for one in each]
+        nearer = (depths[0] <= depths[1])[..., None]
+        front, back = (np.where(nearer, a, b) for a, b in ((each[0].rgb, each[1].rgb), (each[1].rgb, each[0].rgb)))
+        through = 1 - np.where(nearer[..., 0], each[0].alpha, each[1].alpha)[..., None]
+        difference = np.abs(both.rgb - front - through * back)[both.alpha > 0.5]
+        squares += float(np.square(difference, dtype=np.float64).sum())
+        off, count = off + int((difference.max(axis=1) > 0.1).sum()), count + len(difference)
+    psnr = -10 * np.log10(max(squares / (3 * max(count, 1)), 1e-12))
+    return {"PSNR": float(psnr), "off by a tenth, %": 100 * off / max(count, 1)}
 
 
 def frame_rows(run: NerfRun, data: Dataset, pixels: int) -> Iterator[common.Row]:

@@ -522,7 +522,7 @@ def test_frames_count_from_when_the_kernels_are_there():
 
 @smallest(
     "nerf.py --backend llvm --out OUT --data DATA --preset demo --iterations 8 --rays 512 --pixels 24 --repeats 2"
-    " --peers nerfacc --json"
+    " --splats --peers nerfacc --json"
 )
 def test_a_radiance_field_is_trained_and_drawn_without_its_peer(command, place, tiny_data):
     (place / "DATA").symlink_to(tiny_data)
@@ -530,9 +530,13 @@ def test_a_radiance_field_is_trained_and_drawn_without_its_peer(command, place, 
     assert done.code == 0, done.errors
     assert "nerfacc: not measured here (nerfacc runs on CUDA alone)" in done.errors
     report = json.loads(done.output)
-    (row,) = report["training"]
+    row, splats = report["training"]
     assert row["step, ms"] > 0
-    assert 5 < row["over the silhouette"] < row["PSNR"] < 60
+    for model in (row, splats):
+        assert 5 < model["over the silhouette"] < model["PSNR"] < 60
+    (mixed,) = report["mixed"]
+    assert mixed["PSNR"] > 5
+    assert 0 <= mixed["off by a tenth, %"] <= 100
     assert [frame["models"] for frame in report["frames"]] == [1, 3]
     assert all(frame["frame, ms"] > 0 for frame in report["frames"])
 
