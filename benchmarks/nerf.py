@@ -6,7 +6,7 @@
 boxsat, one Sun, 100 views of 256 pixels, or a dataset of yours. A step is timed once trained, so that rays skip what is
 empty. PSNR is of test views, over whole pictures and over the silhouette. Frames are what `predict` returns, in the
 computer's memory, of test views drawn at so many pixels. --splats trains `vanilla` of the preset `fast`, too, and puts
-it through the field, a third of the object's size aside: how far the picture of both, in one walk, is from the two
+it through the field, a tenth of the object's size aside: how far the picture of both, in one walk, is from the two
 pictures put together by each pixel's expected depth, over the pixels that they cover. --peers trains the recipe of
 nerfacc's train_ngp_nerf_occ.py for as many iterations of as many rays; that needs CUDA, torch, nerfacc and tinycudann.
 """
@@ -150,7 +150,7 @@ def trained_splats(data: Dataset, folder: Path, config: Any) -> Any:
 
 def mixed_row(field: NerfRun, splats: Any, data: Dataset) -> common.Row:
     """PSNR over covered pixels, and the share of them that differ by more than a tenth."""
-    aside = Pose(translation=np.array([field.box.side / 3, 0.0, 0.0]))
+    aside = Pose(translation=np.array([field.box.side / 10, 0.0, 0.0]))
     models = PlacedRun(field, Pose()), PlacedRun(splats, aside)  # type: ignore[arg-type]
     drawers = [methods.compose(some, ComposeConfig("none")) for some in (models, models[:1], models[1:])]
     squares, off, count = 0.0, 0, 0
