@@ -5,7 +5,6 @@
 as given, and so do shadows, as in the literature, unless `ShadowConfig.gradients` takes them back to the Gaussians.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -31,7 +30,6 @@ from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians
 
 ANY_SUN = np.array([0.0, 0.0, 1.0])  #: stands for an unknown Sun, in a model that does not take it
-RADIANCE_START = np.float32(math.log(0.0134 / (1 - 0.0134)))  #: logit of an sRGB value of 0.5 as a share of PEAK
 COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed by `cooperative` where that works
 
 
@@ -140,13 +138,10 @@ class LightModel:
 
     @staticmethod
     def initial(config: LightConfig, frame: TrainingFrame, seed: int, pictures: int = 0) -> "LightModel":
-        """Fresh networks; those of radiance start as bright as others. The last layer of a refinement that corrects raw
-        shadows starts at 0, so that these are where training starts, and so do the embeddings of `pictures` training
-        pictures."""
+        """Fresh networks; the last layer of a refinement that corrects raw shadows starts at 0, so that these are where
+        training starts, and so do the embeddings of `pictures` training pictures."""
         rng = np.random.default_rng([seed, 4])
         weights = mlp.initial_weights(config.field.shape, rng)
-        if config.radiance:
-            weights[-1] += RADIANCE_START  # of the last layer
         if config.refine:
             weights += mlp.initial_weights(config.refine.shape, rng, last=0.0 if config.refine.residual else 1.0)
         numbers = pictures * config.field.embeddings
