@@ -17,7 +17,8 @@ SUMMARY, NEEDS_BACKEND = "one picture of a run", True
 
 def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument("path", type=Path, metavar="RUN")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.png|.exr")
+    of_exr = "EXR: numbers; rgb sRGB values, of light.radiance linear ones"
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.png|.exr", help=of_exr)
     add_view(parser)
     parser.add_argument("--sun", type=angles, metavar="AZ,EL", help="degrees; a vanilla run knows one light only")
     parser.add_argument("--kind", choices=KINDS, default="rgb")

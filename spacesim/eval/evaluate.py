@@ -31,6 +31,7 @@ from spacesim.eval.frame_metrics import (
     frame_light,
     image_groups,
     is_photograph,
+    own_exposure,
     tally_grazing,
     visibility_groups,
     write_pictures,
@@ -243,10 +244,10 @@ def _evaluate_frame(
         prediction, seconds, fitted = fit.prediction, fit.seconds, fit.record
     else:
         start = time.perf_counter()
-        prediction = run.predict(frame.camera, frame.sun)
+        prediction = run.predict(frame.camera, frame.sun, exposure=own_exposure(run, frame))
         seconds = time.perf_counter() - start
-    view, source = frame_images(dataset, frame, prediction)
     light = frame_light(dataset, frame, prediction)
+    view, source = frame_images(dataset, frame, prediction, light.truth)
     photograph = is_photograph(frame, source)
     ignored = float(1 - view.valid.mean())
     write_pictures(folder, view, light, photograph)

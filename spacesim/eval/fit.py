@@ -57,8 +57,8 @@ def _joined(left: "Prediction", right: "Prediction", is_left: np.ndarray) -> "Pr
     def join(one: Any, other: Any) -> Any:
         return None if one is None else np.where(is_left.reshape(*is_left.shape, *[1] * (one.ndim - 2)), one, other)
 
-    planes = {name: join(getattr(left, name), getattr(right, name)) for name in ("rgb", "alpha", "depth", "visibility")}
-    return replace(left, **planes)
+    names = "rgb", "alpha", "depth", "visibility", "linear"
+    return replace(left, **{name: join(getattr(left, name), getattr(right, name)) for name in names})
 
 
 def _record(unknowns: Sequence[Unknown], middle: int, lights: Sequence[PictureLight]) -> JsonDict:

@@ -9,6 +9,14 @@ import numpy as np
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import Array
 from spacesim.data.images import load_image, luminance, read_labels, write_png
+from spacesim.data.images.tone import (
+    PEAK,
+    STANDARD_EXPOSURE,
+    exposure_value,
+    linear_from_display,
+    mu_law,
+    tone_and_exposure,
+)
 from spacesim.data.records import Dataset, Frame, Image, Truth
 from spacesim.data.store import SHADOW_NONE, SHADOW_SELF_CAST, load_truth
 from spacesim.eval import pictures
@@ -16,7 +24,7 @@ from spacesim.eval.metrics import grazing, image, lpips, shadow
 from spacesim.eval.metrics.image import Mask
 
 if TYPE_CHECKING:
-    from spacesim.splat.run import Prediction
+    from spacesim.splat.run import Prediction, Predictor
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +35,9 @@ class FrameImages:
     truth: np.ndarray  #: as `prediction`
     silhouette: Mask  #: [H, W] bool, the object's among them
     valid: Mask  #: [H, W] bool, pixels that are not to be ignored
+    #: [H, W, 3] each: prediction and truth of linear light over black, by `data.images.tone.mu_law`, in [0, 1]; None
+    #: where the radiance or the exposure of the truth is not known
+    encoded: tuple[np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +71,10 @@ def frame_target(dataset: Dataset, frame: Frame) -> FrameTarget:
     return FrameTarget(loaded, silhouette & loaded.valid, source)
 
 
-def frame_images(dataset: Dataset, frame: Frame, prediction: "Prediction") -> tuple[FrameImages, str]:
-    """The pictures to compare, and where the silhouette is from, see `FrameTarget`.
+def frame_images(
+    dataset: Dataset, frame: Frame, prediction: "Prediction", traced: Truth | None = None
+) -> tuple[FrameImages, str]:
+    """The pictures to compare, and where the silhouette is from, see `FrameTarget`. traced: the truth of linear light
 
     Raises WorkError where the prediction is not finite, InputError where the dataset is broken.
     """
@@ -75,6 +88,7 @@ def frame_images(dataset: Dataset, frame: Frame, prediction: "Prediction") -> tu
         truth=target.image.over(np.zeros(3)),
         silhouette=target.silhouette,
         valid=valid,
+        encoded=None if traced is None else _encoded(dataset, frame, prediction, traced),
     )
     return images, target.source
 
@@ -84,6 +98,28 @@ def frame_light(dataset: Dataset, frame: Frame, prediction: "Prediction") -> Fra
     truth = None if frame.gt_path is None else load_truth(dataset, frame)
     depth = np.where(prediction.alpha >= 0.5, np.nan_to_num(prediction.depth), 0)
     return FrameLight(truth, prediction.visibility, prediction.alpha, depth)
+
+
+def own_exposure(run: "Predictor", frame: Frame) -> float | None:
+    """EV of a frame that has its own, where a run knows light as bright as that shows it; else None."""
+    curve = run.gaussian_run.curve if run.gaussian_run else None
+    if frame.exposure is None or curve is None or not curve.reaches_beyond_white:
+        return None
+    return exposure_value(frame.exposure)
+
+
+def _encoded(
+    dataset: Dataset, frame: Frame, prediction: "Prediction", traced: Truth
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """See `FrameImages.encoded`. What predicts sRGB values alone shows light up to white, by the dataset's curve."""
+    development = tone_and_exposure(dataset.scene)
+    if development is None:
+        return None
+    tone, exposure = development
+    factor = frame.exposure or STANDARD_EXPOSURE * 2.0**exposure
+    light = prediction.linear if prediction.linear is not None else linear_from_display(prediction.rgb, tone)
+    predicted, true = (mu_law(np.clip(v, 0, PEAK)) for v in (light, factor * np.nan_to_num(traced.radiance)))
+    return predicted, true
 
 
 def is_photograph(frame: Frame, source: str) -> bool:
@@ -181,6 +217,7 @@ def _image_metrics(view: FrameImages, mask: Mask, windows: Mask, network: lpips.
     distance = None
     if network and mask.any():
         distance = network(image.crop_to_mask(predicted, mask), image.crop_to_mask(true, mask))
+    encoded = view.encoded
     return {
         "psnr": image.psnr(prediction=predicted, truth=true, mask=mask),
         "ssim": image.ssim(prediction=predicted, truth=true, mask=windows),
@@ -188,4 +225,5 @@ def _image_metrics(view: FrameImages, mask: Mask, windows: Mask, network: lpips.
         "mae": image.mae(prediction=predicted, truth=true, mask=mask),
         "rmse": image.rmse(prediction=predicted, truth=true, mask=mask),
         "flip": image.flip(prediction=predicted, truth=true, mask=mask),
+        "psnr_mu": image.psnr(*encoded, mask=mask) if encoded else None,
     }

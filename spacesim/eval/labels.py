@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from spacesim.data.images.tone import MU, PEAK
 from spacesim.eval.metrics.lpips import MIN_SIDE
 from spacesim.eval.metrics.shadow import BAND, THRESHOLD
 
@@ -50,6 +51,11 @@ IMAGE = (
     Metric("mae", "MAE", "", LOWER, 4, "Mean absolute error of the sRGB values in [0, 1] (2.21)."),
     Metric("rmse", "RMSE", "", LOWER, 4, "Root mean squared error of the sRGB values in [0, 1] (2.22)."),
     Metric("flip", "FLIP", "", LOWER, 4, "Mean perceived difference (LDR FLIP at 67 pixels per degree)."),
+    Metric(
+        "psnr_mu", "PSNR-μ", "dB", HIGHER, 2,
+        f"PSNR of linear light up to {PEAK:g} times white, by the μ-law (μ = {MU:g}); sRGB values are decoded.",
+        "no pixel is there to measure, or no radiance",
+    ),
 )  # fmt: skip
 
 SHADOW = (

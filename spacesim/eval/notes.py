@@ -1,6 +1,6 @@
 """Why a value of metrics.json is null, and what stands in for missing truth: a sentence each."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from spacesim.data.files import JsonDict, JsonMapping
@@ -9,6 +9,7 @@ from spacesim.splat.fit import Unknown
 
 MODELS_OF_A_SCENE = "the models of a scene were trained on other data"
 
+NO_LIGHT = "psnr_mu is null: the data has no radiance (gt_path), or scene.json does not say the exposure."
 WHOLE_PICTURES = "image is over whole pictures, as image_full: no silhouette is known, nor alpha."
 _STAND_INS = {
     "alpha": "the silhouette is where the image's alpha is at least one half",
@@ -25,6 +26,9 @@ def explain(records: Sequence[JsonDict], sources: Sequence[str], no_lpips: str |
     notes = []
     if no_lpips:
         notes.append(f"LPIPS is null; {no_lpips}.")
+    no_light = all(record["image_full"].get("psnr_mu") is None for record in records)
+    if no_light:
+        notes.append(NO_LIGHT)
     photographs = sum(record["shadow"] is None for record in records)
     if photographs:
         notes.append(
@@ -41,8 +45,9 @@ def explain(records: Sequence[JsonDict], sources: Sequence[str], no_lpips: str |
     unseen = sum(not _shows_object(record) for record in records)
     if unseen:
         notes.append(f"{unseen} of {total} frames show no object: what is taken over its silhouette is null there.")
+    explained = [key for key, known in (("lpips", no_lpips), ("psnr_mu", no_light)) if known]
     for group in GROUPS:
-        notes += _explain_group(records, group, bool(no_lpips))
+        notes += _explain_group(records, group, explained)
     return notes + _explain_kinds(records)
 
 
@@ -165,14 +170,14 @@ def _explain_kinds(records: Sequence[JsonDict]) -> list[str]:
     ]
 
 
-def _explain_group(records: Sequence[JsonDict], group: str, no_lpips: bool) -> list[str]:
-    """A sentence for each metric that is null in frames which show the object."""
+def _explain_group(records: Sequence[JsonDict], group: str, explained: Collection[str]) -> list[str]:
+    """A sentence for each metric that is null in frames which show the object, but for those `explained` already."""
     where, metrics = GROUPS[group]
     values = [record[group] for record in records if record[group] is not None and _shows_object(record)]
     notes = []
     for metric in metrics:
-        count = sum(value[metric.key] is None for value in values)
-        if count and not (metric.key == "lpips" and no_lpips):
+        count = sum(value.get(metric.key) is None for value in values)
+        if count and metric.key not in explained:
             reason = f"{metric.null}; its mean leaves them out"
             notes.append(f"{metric.label} {where} is null in {count} of {len(records)} frames: {reason}.")
     return notes

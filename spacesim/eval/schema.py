@@ -140,6 +140,7 @@ class FrameRecord:
     mae: float | None = None  #: of sRGB values in [0, 1]
     rmse: float | None = None  #: of sRGB values in [0, 1]
     flip: float | None = None  #: 0 to 1
+    psnr_mu: float | None = None  #: dB, of linear light; None without radiance
     ber: float | None = None  #: share of pixels on the wrong side of the luminance that counts as shadow (2.23)
     bias: float | None = None  #: mean error of the luminance over true shadow (2.24)
     boundary_mae: float | None = None  #: mean absolute error of the luminance near the shadow's boundary (2.25)

@@ -13,9 +13,9 @@ LIT, SHADOWED = (222, 222, 216), (58, 64, 82)  #: sRGB colours of visibility 1 a
 
 
 def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
-    """kind: "rgb" (PNG: straight alpha; EXR: sRGB over black), "alpha", "depth" (PNG: near is bright; EXR: metres)
-    "normal" (PNG: world x, y, z from -1 to 1 as red, green, blue; EXR: the vectors) or "shadow" (PNG: `shadow_colors`;
-    EXR: visibility, 1 where all of the Sun is seen).
+    """kind: "rgb" (PNG: straight alpha; EXR: sRGB over black, or `Prediction.linear` where there is one), "alpha",
+    "depth" (PNG: near is bright; EXR: metres), "normal" (PNG: world x, y, z from -1 to 1 as red, green, blue; EXR: the
+    vectors) or "shadow" (PNG: `shadow_colors`; EXR: visibility, 1 where all of the Sun is seen).
 
     Raises InputError for another suffix than .png or .exr, and for shadows of a method without.
     """
@@ -23,7 +23,9 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
     if plane is None:
         raise InputError("kind: expected another than shadow, of a run whose method predicts none, found shadow")
     if path.suffix == ".exr":
-        write_exr(path, {kind: plane.astype(np.float32)})
+        shown = prediction.linear if kind == "rgb" else None
+        layers = {kind: plane} if shown is None else {"linear": shown}
+        write_exr(path, {name: layer.astype(np.float32) for name, layer in layers.items()})
     elif path.suffix != ".png":
         raise InputError(f"{path}: expected a file name that ends in .png or .exr")
     elif kind == "rgb":

@@ -1,6 +1,6 @@
 """What a run predicts of a view."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -26,6 +26,8 @@ class Prediction:
     visibility: np.ndarray | None  #: [H, W], or None from a method without
     #: [H, W, 3] unit vectors in world axes, 0 where there is no surface, or None where not asked for
     normal: np.ndarray | None = None
+    #: [H, W, 3] linear display values over black, not clipped; None of a run that does not learn radiance
+    linear: np.ndarray | None = field(default=None, kw_only=True)
 
     def __repr__(self) -> str:
         return planes_repr(self, self.alpha.shape[1], self.alpha.shape[0])

@@ -50,6 +50,12 @@ class Rendering:
         return self._drawn.rgb
 
     @property
+    def linear(self) -> np.ndarray | None:
+        """[H, W, 3] float32, linear display values over black, 1 white, not clipped, of a run that learned radiance
+        (`light.radiance`); None of others."""
+        return self._drawn.linear
+
+    @property
     def alpha(self) -> np.ndarray:
         """[H, W] float32 in [0, 1]."""
         return self._drawn.alpha

@@ -113,7 +113,10 @@ def draw(run: Predictor, camera: Camera, light: PictureLight) -> Prediction:
     if light.embedding is not None:
         run = run.with_embedding(light.embedding)
     drawn = run.predict(camera, light.sun)
-    return drawn if light.gain == 1 else replace(drawn, rgb=srgb_from_linear(light.gain * linear_from_srgb(drawn.rgb)))
+    if light.gain == 1:
+        return drawn
+    linear = None if drawn.linear is None else light.gain * drawn.linear
+    return replace(drawn, rgb=srgb_from_linear(light.gain * linear_from_srgb(drawn.rgb)), linear=linear)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from spacesim import backend
 from spacesim.backend.arrays import Bool
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, as_path
+from spacesim.data.images.tone import Curve
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import checked, read_record
 from spacesim.learning.folder import finished_model, read_described
@@ -195,8 +196,8 @@ class Run:
         return self
 
     @property
-    def curve(self) -> tuple[str, float] | None:
-        """Tone curve and exposure (EV) of colours that are blended in linear light; None where they are sRGB values."""
+    def curve(self) -> Curve | None:
+        """How colours that are blended in linear light are shown; None where they are sRGB values."""
         return self.light.config.curve if self.light else None
 
     @checked
@@ -254,9 +255,11 @@ class Run:
         visible = [over_alpha(plane, output.alpha) for plane in features[3:]]
         visibility = planes_image(visible, output.width, output.height)[..., 0] if visible else None
         rgb = planes_image(features[:3], output.width, output.height)
-        if self.curve:
-            rgb = adjust_exposure(rgb, self.curve[0], stops_more)
-        return _prediction(output, rgb, visibility, normals)
+        light = None
+        if curve := self.curve:
+            light = display_light(rgb, curve, stops_more)
+            rgb = adjust_exposure(rgb, curve.tone, stops_more, curve.white)
+        return replace(_prediction(output, rgb, visibility, normals), linear=light)
 
 
 def check_gaussians(run: Predictor | str | Path) -> Run:
@@ -274,7 +277,7 @@ def check_gaussians(run: Predictor | str | Path) -> Run:
     return run.gaussian_run
 
 
-def stops(curve: tuple[str, float] | None, exposure: float | None, source: str) -> float:
+def stops(curve: Curve | None, exposure: float | None, source: str) -> float:
     """By how many EV a picture is exposed more than those of training: none where no `exposure` is asked for. curve: as
     `Run.curve`;  source: whose it is. Raises InputError for colours that are sRGB values, and for no such exposure."""
     if exposure is None:
@@ -283,7 +286,12 @@ def stops(curve: tuple[str, float] | None, exposure: float | None, source: str) 
         raise InputError(f"exposure: expected a run trained in linear light (light.linear), found {source}")
     if not abs(exposure) <= MAX_EXPOSURE:
         raise InputError(f"exposure: expected -{MAX_EXPOSURE} to {MAX_EXPOSURE} EV, found {exposure}")
-    return exposure - curve[1]
+    return exposure - curve.exposure
+
+
+def display_light(light: np.ndarray, curve: Curve, stops: float = 0.0) -> np.ndarray | None:
+    """`Prediction.linear` of a picture [H, W, 3] of linear colours. stops: as in `adjust_exposure`"""
+    return np.float32(curve.white * 2.0**stops) * light if curve.reaches_beyond_white else None
 
 
 def draw_lit(

@@ -20,6 +20,7 @@ from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array, degrees_between, fibonacci_sphere
 from spacesim.data.images import linear_from_srgb, luminance
+from spacesim.data.images.tone import Curve
 from spacesim.data.records import Camera, Image
 from spacesim.splat.light.model import LightModel, Sunlight
 from spacesim.splat.light.shadow.cast import ShadowConfig, cast_shadows
@@ -111,9 +112,7 @@ class SunFinder:
     curve: as `Run.curve`
     """
 
-    def __init__(
-        self, gaussians: Gaussians, light: LightModel, antialiased: bool, curve: tuple[str, float] | None
-    ) -> None:
+    def __init__(self, gaussians: Gaussians, light: LightModel, antialiased: bool, curve: Curve | None) -> None:
         self.gaussians, self.light, self.antialiased, self.curve = gaussians, light, antialiased, curve
         self.sphere = fibonacci_sphere(SPHERE)
         self._sunlight: dict[int, Sunlight] = {}
@@ -158,7 +157,7 @@ class SunFinder:
         drawn = render(self.gaussians, camera, outputs=(), features=colors, antialiased=self.antialiased)
         rgb = drawn.image("features")
         if self.curve:
-            rgb = adjust_exposure(rgb, self.curve[0])
+            rgb = adjust_exposure(rgb, self.curve.tone, white=self.curve.white)
         return cauchy((rgb - picture.rgb)[picture.counts].ravel()) / 3
 
 

@@ -88,7 +88,7 @@ class FakeRun:
 
     relightable, gaussian_run = False, None
 
-    def predict(self, camera, sun):
+    def predict(self, camera, sun, exposure=None):
         frame = next(frame for frame in self.dataset.test if frame.camera is camera)
         rgb = load_image(self.dataset, frame).over(np.zeros(3))
         alpha = np.ones(rgb.shape[:2], np.float32)
@@ -103,7 +103,7 @@ class RelightableRun(FakeRun):
     edge: int = SIZE // 2
     config: dict = field(default_factory=lambda: {"method": "shadow-map", "preset": "demo", "seed": 7})
 
-    def predict(self, camera, sun):
+    def predict(self, camera, sun, exposure=None):
         rgb, inside = sphere(sun.angles)
         columns = np.arange(SIZE) >= self.edge
         return Prediction(

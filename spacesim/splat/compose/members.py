@@ -16,6 +16,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array
+from spacesim.data.images.tone import Curve
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.light.model import Sunlight, robust_radius
 from spacesim.splat.light.shadow.cast import ShadowConfig
@@ -77,7 +78,7 @@ class Member:
         return replace(self.shadow, bias=0.0, grazing="none", method=method)
 
     @property
-    def curve(self) -> tuple[str, float] | None:
+    def curve(self) -> Curve | None:
         """Of its linear colours, see `LightConfig.curve`; None where colours are sRGB values."""
         return self.run.light.config.curve if self.run.light else None
 
@@ -165,7 +166,7 @@ class Ensemble:
         return upload(np.concatenate(of_each), ad.Bool)
 
     @cached_property
-    def curve(self) -> tuple[str, float] | None:
+    def curve(self) -> Curve | None:
         """Of the whole, which is blended in linear light where all members have one curve and exposure."""
         curves = {member.curve for member in self.members}
         return curves.pop() if len(curves) == 1 else None
@@ -189,12 +190,12 @@ class Ensemble:
         return masks
 
 
-def display_colors(
-    colors: list[Float], model_curve: tuple[str, float] | None, scene_curve: tuple[str, float] | None
-) -> list[Float]:
+def display_colors(colors: list[Float], model_curve: Curve | None, scene_curve: Curve | None) -> list[Float]:
     """Colours as they are blended: linear ones become sRGB values first where not all are alike. model_curve,
     scene_curve: `curve` of the member and of the ensemble"""
-    return [tone_map(color, model_curve[0]) for color in colors] if model_curve and not scene_curve else colors
+    if model_curve is None or scene_curve is not None:
+        return colors
+    return [tone_map(color, model_curve.tone, model_curve.white) for color in colors]
 
 
 @recorded

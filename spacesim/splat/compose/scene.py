@@ -17,6 +17,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
+from spacesim.data.images.tone import Curve
 from spacesim.data.records import Camera, Sun
 from spacesim.learning.prediction import ComposedPrediction, check_picture
 from spacesim.splat.compose.light import EnsembleLight, LightCache, SunOccluder
@@ -27,7 +28,7 @@ from spacesim.splat.raster.output import RenderOutput, over_alpha, planes_image
 from spacesim.splat.raster.render import render
 from spacesim.splat.raster.supersample import render_supersampled
 from spacesim.splat.raster.tone import adjust_exposure
-from spacesim.splat.run import Run, stops
+from spacesim.splat.run import Run, display_light, stops
 
 OUTPUTS = ("rgb", "alpha", "depth", "median_depth", "normal", "visibility", "id")
 SHADOWS = ("trained", "others", "ratio", "none")
@@ -69,7 +70,14 @@ class DrawnView:
     output: RenderOutput
     planes: dict[str, list[Float]]  #: the features by what they are, as above
     order: list[int]  #: which model each plane of "id" is of
-    curve: tuple[str, float] | None  #: tone curve and exposure (EV) of linear colours; None where they are sRGB values
+    curve: Curve | None  #: how linear colours are shown; None where they are sRGB values
+
+    def light(self, stops: float = 0.0) -> np.ndarray | None:
+        """See `Prediction.linear`. stops: as of `image`"""
+        if self.curve is None or "rgb" not in self.planes:
+            return None
+        colors = planes_image(self.planes["rgb"], self.output.width, self.output.height)
+        return display_light(colors, self.curve, stops)
 
     def image(self, name: str, stops: float = 0.0) -> np.ndarray:
         """One of `OUTPUTS` that was asked for: rgb [H, W, 3] sRGB values over black, normal [H, W, 3], others [H, W];
@@ -82,7 +90,7 @@ class DrawnView:
         size, planes = (self.output.width, self.output.height), self.planes[name]
         if name == "rgb":
             rgb = planes_image(planes, *size)
-            return adjust_exposure(rgb, self.curve[0], stops) if self.curve else rgb
+            return adjust_exposure(rgb, self.curve.tone, stops, self.curve.white) if self.curve else rgb
         if name == "visibility":
             return planes_image([over_alpha(planes[0], self.output.alpha)], *size)[..., 0]
         if not planes:
@@ -167,9 +175,8 @@ class GaussianComposition:
         visibility = drawn.image("visibility") if "visibility" in drawn.planes else None
         normal = drawn.image("normal") if normals else None
         rgb = drawn.image("rgb", stops)
-        return ComposedPrediction(
-            rgb, drawn.image("alpha"), drawn.image("depth"), visibility, normal, drawn.image("id")
-        )
+        alpha, depth = drawn.image("alpha"), drawn.image("depth")
+        return ComposedPrediction(rgb, alpha, depth, visibility, normal, drawn.image("id"), linear=drawn.light(stops))
 
     @property
     def antialiased(self) -> Bool | bool:

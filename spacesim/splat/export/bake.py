@@ -50,7 +50,7 @@ def bake(
         if others is not None:
             shown = [color * others for color in shown]
         if light.config.curve:
-            shown = [tone_map(color, light.config.curve[0]) for color in shown]
+            shown = [tone_map(color, light.config.curve.tone, light.config.curve.white) for color in shown]
         colors[view] = [np.array(color) for color in shown]
         weights[view] = blended_weights(gaussians, camera)
     terms = _harmonics(directions, degree)

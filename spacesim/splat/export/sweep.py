@@ -2,7 +2,7 @@
 
 OUT/sweep.png   pictures evenly chosen, each with its Sun in numbers and on a map of the sky
 OUT/sweep.mp4   all pictures, where there is an encoder
-OUT/frames/*    each picture as it was rendered, where asked for
+OUT/frames/*    each picture as it was rendered, where asked for; of runs that learned radiance an EXR of light, too
 """
 
 import math
@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw
 from spacesim.data.errors import InputError
 from spacesim.data.files import holds_files, write_bytes
 from spacesim.data.geometry import direction_from_angles
-from spacesim.data.images import write_png
+from spacesim.data.images import write_exr, write_png
 from spacesim.data.images.sheet import (
     DARK_PAGE,
     DETAIL,
@@ -131,9 +131,11 @@ def sweep(
     shown = {k * len(suns) // count for k in range(count)}
     tiles = []
     for k, sun in enumerate(suns):
-        picture = first if k == 0 else _picture(run, camera, sun, kind, exposure)
+        picture, light = first if k == 0 else _picture(run, camera, sun, kind, exposure)
         if keep_frames:
             write_png(out / FRAMES_NAME / f"{k:04d}.png", picture, durable=False)
+            if light is not None:
+                write_exr(out / FRAMES_NAME / f"{k:04d}.exr", {"linear": light}, durable=False)
         if video is not None:
             video.add(picture, sun)
         if k in shown:
@@ -175,15 +177,17 @@ def _make_folder(out: Path) -> None:
         raise InputError(f"{out}: expected a folder that can be written ({error.strerror})") from None
 
 
-def _picture(run: Predictor, camera: Camera, sun: Sun, kind: str, exposure: float | None) -> np.ndarray:
-    """[H, W, 3] uint8."""
+def _picture(
+    run: Predictor, camera: Camera, sun: Sun, kind: str, exposure: float | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """([H, W, 3] uint8, `Prediction.linear` of the kind rgb)."""
     prediction = run.predict(camera, sun, exposure=exposure)
     if kind == "rgb":
-        return as_bytes(np.clip(np.nan_to_num(prediction.rgb), 0, 1))
+        return as_bytes(np.clip(np.nan_to_num(prediction.rgb), 0, 1)), prediction.linear
     if prediction.visibility is None:
         method = run.config["method"]
         raise InputError(f"{run.path}: expected a run of a method with shadows for the kind shadow, found {method}")
-    return as_bytes(shadow_colors(prediction))
+    return as_bytes(shadow_colors(prediction)), None
 
 
 def _tile(picture: np.ndarray, sun: Sun) -> Tile:

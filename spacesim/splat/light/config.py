@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from spacesim.data.errors import InputError
-from spacesim.data.images.tone import Tone
+from spacesim.data.images.tone import PEAK, STANDARD_EXPOSURE, WHITES, Curve, Tone
 from spacesim.data.structure import check_fields
 from spacesim.splat.light.field import FieldConfig
 from spacesim.splat.light.shadow.cast import ShadowConfig
@@ -28,6 +28,8 @@ class LightConfig:
     tone: Tone | None = None
     #: EV of the pictures trained on, of linear colours; none: the dataset's own, which `train` fills in, else 0
     exposure: float | None = None
+    #: learn from radiance (gt/*.exr), not from 8-bit pictures, compared by the mu-law: colours reach 16 times white
+    radiance: bool = False
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -41,13 +43,21 @@ class LightConfig:
         for name in ("tone", "exposure"):
             if getattr(self, name) is not None and not self.linear:
                 raise InputError(f"{name}: expected linear colours (light.linear = true), found sRGB values")
+        if self.radiance and not self.linear:
+            raise InputError("radiance: expected linear colours (light.linear = true), found sRGB values")
         if self.exposure is not None and not abs(self.exposure) <= MAX_EXPOSURE:
             raise InputError(f"exposure: expected -{MAX_EXPOSURE} to {MAX_EXPOSURE} EV, found {self.exposure}")
 
     @property
-    def curve(self) -> tuple[str, float] | None:
-        """Tone curve and exposure (EV) of linear colours, None of others."""
-        return (self.tone or "srgb", self.exposure or 0.0) if self.linear else None
+    def curve(self) -> Curve | None:
+        """How linear colours are shown, None of others."""
+        tone: Tone = self.tone or "srgb"
+        return Curve(tone, self.exposure or 0.0, PEAK if self.radiance else WHITES[tone]) if self.linear else None
+
+    @property
+    def peaks(self) -> float | None:
+        """Shares of PEAK that a radiance of 1 W m^-2 sr^-1 is; None where radiance is not learned."""
+        return STANDARD_EXPOSURE * 2.0 ** (self.exposure or 0.0) / PEAK if self.radiance else None
 
     @property
     def refine(self) -> ShadowRefinementConfig | None:

@@ -51,7 +51,7 @@ class SunlitRun:
         output = self.output(camera, colors)
         rgb = output.image("color" if colors is None else "features")
         if self.run.curve:
-            rgb = adjust_exposure(rgb, self.run.curve[0])
+            rgb = adjust_exposure(rgb, self.run.curve.tone, white=self.run.curve.white)
         return np.concatenate([rgb, output.image("alpha")[..., None]], axis=-1)
 
     def output(self, camera: Camera, colors: list[Float] | None, *outputs: str) -> RenderOutput:

@@ -1,9 +1,10 @@
 """Linear light to sRGB values and back in Dr.Jit, differentiable: for colours that are blended in linear light.
 
 A model's linear colours are shares of what its tone curve makes white (`spacesim.data.images.tone.WHITES`): at most 1
-but where light bounces. What is brighter than white is clipped.
+but where light bounces. What is brighter than white is clipped. Of models that learn radiance they are shares of PEAK.
 """
 
+import math
 from typing import cast
 
 import drjit as dr
@@ -11,13 +12,16 @@ import numpy as np
 
 from spacesim.backend.arrays import ArrayT
 from spacesim.data.images import srgb_from_linear
-from spacesim.data.images.tone import WHITES, filmic
+from spacesim.data.images.tone import MU, WHITES, filmic
 
 _LINEAR_END, _ENCODED_END = 0.0031308, 0.04045
 
 
-def tone_map(light: ArrayT, tone: str) -> ArrayT:
-    """sRGB values in [0, 1] of linear colours, shares of white, by a tone curve. Arrays of any shape."""
+def tone_map(light: ArrayT, tone: str, white: float | None = None) -> ArrayT:
+    """sRGB values in [0, 1] of linear colours by a tone curve. Arrays of any shape. white: linear display value of a
+    colour of 1, by default what the curve makes white"""
+    if white is not None and white != WHITES[tone]:
+        light = (white / WHITES[tone]) * light
     if tone == "srgb":
         return encode_srgb(light)
     v = WHITES[tone] * dr.clip(light, 0, 1)
@@ -33,12 +37,19 @@ def inverse_tone_map(values: ArrayT, tone: str) -> ArrayT:
     return dr.clip((dr.sqrt(dr.fma(b, b, 0.56 * a * t)) - b) / (2 * a) / WHITES[tone], 0, 1)
 
 
-def adjust_exposure(light: np.ndarray, tone: str, stops: float = 0.0) -> np.ndarray:
+def adjust_exposure(light: np.ndarray, tone: str, stops: float = 0.0, white: float | None = None) -> np.ndarray:
     """sRGB values in [0, 1] of a picture of such colours, exposed by `stops` (EV) more than those trained on."""
-    if tone == "srgb" and stops == 0:
+    white = WHITES[tone] if white is None else white
+    if tone == "srgb" and stops == 0 and white == 1:
         return srgb_from_linear(light)
-    v = (WHITES[tone] * 2.0**stops) * light
+    v = (white * 2.0**stops) * light
     return srgb_from_linear(filmic(v) if tone == "filmic" else v)
+
+
+def mu_law(light: ArrayT) -> ArrayT:
+    """`spacesim.data.images.tone.mu_law` of linear colours that are shares of PEAK, 0 or more. It goes on beyond 1,
+    ever flatter: a glint 100 times as bright has 1.54. Arrays of any shape."""
+    return dr.log(dr.fma(light, MU, 1)) / math.log1p(MU)
 
 
 def encode_srgb(linear: ArrayT) -> ArrayT:

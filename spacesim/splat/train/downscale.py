@@ -56,8 +56,8 @@ def valid_squares(valid: Bool, size: tuple[int, int], times: int) -> Bool:
 
 def truth_of_squares(truth: TruthPlanes, size: tuple[int, int], times: int) -> TruthPlanes:
     """What the planes of `TargetImage.truth` say of squares, in the form that the loss compares with what is blended:
-    visibility that is seen in a square (below 0 where there is no surface), so times alpha; the mean depth and the mean
-    normal, of unit length, of what surface there is; foreground where half of a square is."""
+    visibility that is seen in a square (below 0 where there is no surface), so times alpha; the mean radiance; the mean
+    depth and the mean normal, of unit length, of what surface there is; foreground where half of a square is."""
     if times == 1:
         return truth
     places, result = _places(size, times), TruthPlanes()
@@ -76,6 +76,8 @@ def truth_of_squares(truth: TruthPlanes, size: tuple[int, int], times: int) -> T
         elif name == "depth":
             counts = [dr.select(value[0] > 0, ad.Float(1), 0) for value in values]
             result[name] = [_sum([value[0] for value in values]) / dr.maximum(_sum(counts), 1)]
+        elif name == "radiance":
+            result[name] = list(sum(values[1:], values[0]) / times**2)
         else:
             total = ad.Array3f(sum(values[1:], values[0]))
             result[name] = list(total * dr.rcp(dr.maximum(dr.norm(total), 1e-6)))

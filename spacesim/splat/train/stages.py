@@ -7,6 +7,7 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.data.images.tone import PEAK
 from spacesim.learning.adam import adam_step
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
@@ -14,7 +15,7 @@ from spacesim.splat.raster.project import Footprints, Splats, project
 from spacesim.splat.raster.render import view_colors
 from spacesim.splat.raster.supersample import pixel_means
 from spacesim.splat.raster.surface import normals
-from spacesim.splat.raster.tone import inverse_tone_map, tone_map
+from spacesim.splat.raster.tone import decode_srgb, inverse_tone_map, mu_law, tone_map
 from spacesim.splat.train.downscale import covered_color, truth_of_squares, valid_squares
 from spacesim.splat.train.loss.terms import TruthPlanes, depth_loss, normal_loss, photometric_loss, visibility_loss
 from spacesim.splat.train.warm_start import foreground_loss
@@ -88,6 +89,8 @@ class LossSettings:
     scale: float  #: metres, the unit of depth
     tone: str | None  #: curve of colours that are blended, with the background, in linear light, or None
     supersample: int = 1  #: places on a side of each pixel, see `pixel_means`
+    #: shares of PEAK of a radiance of 1 W m^-2 sr^-1: radiance is compared, by `mu_law`; None: 8-bit pictures are
+    radiance: float | None = None
     downscale: int = 1  #: pixels of the target on a side of each pixel that is compared
 
 
@@ -105,7 +108,9 @@ def picture_loss(
     valid, truths = valid_squares(target.valid, size, times), truth_of_squares(target.truth, size, times)
     size = size[0] // times, size[1] // times
     below = ad.Array3f([dr.gather(ad.Float, target.background, ad.UInt32(c)) for c in range(3)])
-    if config.tone:
+    if config.radiance is not None:
+        covered, below = config.radiance * ad.Array3f(truths["radiance"]), decode_srgb(below) / PEAK
+    elif config.tone:
         below = inverse_tone_map(below, config.tone)
     truth = covered + (1 - alpha) * below
     planes = {name: [ad.Float(plane) for plane in group] for name, group in planes.items()}
@@ -119,7 +124,9 @@ def picture_loss(
     if gains is not None:
         color *= ad.Array3f([dr.gather(ad.Float, gains, ad.UInt32(c)) for c in range(3)])
     picture = dr.select(valid, color + transmittance * below, truth)
-    if config.tone:
+    if config.radiance is not None:
+        picture, truth = mu_law(picture), mu_law(truth)
+    elif config.tone:
         picture, truth = tone_map(picture, config.tone), tone_map(truth, config.tone)
     loss = photometric_loss(picture, truth, *size, ssim_weight=config.ssim)
     if "visibility" in planes:

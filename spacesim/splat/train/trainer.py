@@ -339,6 +339,7 @@ def _check_sizes(dataset: Dataset, config: TrainConfig) -> None:
 def _views(dataset: Dataset, config: TrainConfig) -> TrainingViews:
     """The training pictures with the truth that the loss asks for."""
     truth = config.shape_terms + (("visibility",) if config.visibility_weight > 0 else ())
+    truth += ("radiance",) if config.light and config.light.radiance else ()
     prior = MeshPrior.of(dataset) if config.shape_terms and config.prior == "mesh" else None
     suns = config.light is not None and config.light.field.knows_sun and config.sun == "given"
     return TrainingViews(dataset, config.seed, suns, truth, prior)

@@ -96,8 +96,9 @@ class ViewPass:
             config.depth_weight,
             config.normal_weight,
             scale,
-            config.light.curve[0] if config.light and config.light.curve else None,
+            config.light.curve.tone if config.light and config.light.curve else None,
             config.supersample,
+            config.light.peaks if config.light else None,
         )
         factors = [2**power for power in range(config.num_downscales + 1)]
         self._loss_settings = {downscale: replace(terms, downscale=downscale) for downscale in factors}

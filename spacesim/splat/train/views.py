@@ -12,7 +12,7 @@ from spacesim.backend.arrays import Bool, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
-from spacesim.data.records import Camera, Dataset, Frame
+from spacesim.data.records import Camera, Dataset, Frame, Truth
 from spacesim.data.store import load_truth
 from spacesim.splat.train.loss.terms import TruthPlanes
 
@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 CACHE_BYTES = 6 * 2**30  #: of decoded pictures, at most
 DEVICE_BYTES = 2 * 2**30  #: of pictures that stay on the device, at most: 512 of 1024 x 1024
+OF_PIXELS = "visibility", "radiance"  #: truth that no mesh can stand in for
 SHARES = 4, 8  #: a fourth and an eighth of the memory that is free are not exceeded
 
 
@@ -34,7 +35,8 @@ class TrainingView:
     valid: np.ndarray | None  #: [H * W] bool, or None where all pixels count
     opaque: bool  #: the picture has no transparency, so that what is behind the object is part of it
     #: {name: planes [H * W] float32} of what is asked for: "visibility", path-traced, below 0 where there is no
-    #: surface; "depth", along the optical axis, metres, 0 where there is none; "normal", 3 planes, world axes
+    #: surface; "depth", along the optical axis, metres, 0 where there is none; "normal", 3 planes, world axes;
+    #: "radiance", 3 planes, W m^-2 sr^-1, weighted by alpha
     truth: dict[str, list[np.ndarray]]
 
 
@@ -58,11 +60,11 @@ class TrainingViews:
     ) -> None:
         if not dataset.train:
             raise InputError(f"{dataset.root}: expected at least one training image, found none")
-        traced = [name for name in truth if surface is None or name == "visibility"]
+        traced = [name for name in truth if surface is None or name in OF_PIXELS]
         _check_known(dataset, suns, traced)
         self.dataset, self.seed, self.truth, self.surface = dataset, seed, tuple(truth), surface
         self.most_pixels = max(f.camera.width * f.camera.height for f in dataset.train)
-        largest = 4 * self.most_pixels * (1 + sum(3 if name == "normal" else 1 for name in truth))
+        largest = 4 * self.most_pixels * (1 + sum(3 if name in ("normal", "radiance") else 1 for name in truth))
         self._empty: set[int] = set()  # views that have been reported to show nothing
         self._order = lru_cache(maxsize=1)(self._shuffle)
         in_memory, on_device = kept_bytes()
@@ -97,23 +99,34 @@ class TrainingViews:
     def _load(self, index: int) -> TrainingView:
         frame = self.dataset.train[index]
         image = load_image(self.dataset, frame)
-        rgba = np.concatenate([image.rgb, image.alpha[..., None]], axis=-1)
+        traced, alpha = self._traced(frame), image.alpha
+        if "radiance" in self.truth and traced is not None:  # which is weighted by this one
+            alpha = np.where(image.valid, np.clip(traced.alpha, 0, 1), np.float32(1))
+        rgba = np.concatenate([image.rgb, alpha[..., None]], axis=-1)
         bytes_ = np.ascontiguousarray(np.rint(rgba * 255).astype(np.uint8)).reshape(-1, 4)
         valid = None if image.valid.all() else image.valid.ravel()
         if not image.valid.any() and index not in self._empty:
             self._empty.add(index)
             log.warning("%s: no pixel of it counts, by its mask or by its lens distortion", frame.file_path)
         sun = None if frame.sun is None else frame.sun.direction
-        opaque = bool((image.alpha == 1).all())
-        return TrainingView(index, frame.camera, sun, bytes_.view("<u4").ravel(), valid, opaque, self._planes(frame))
+        opaque, planes = bool((alpha == 1).all()), self._planes(frame, traced)
+        return TrainingView(index, frame.camera, sun, bytes_.view("<u4").ravel(), valid, opaque, planes)
 
-    def _planes(self, frame: Frame) -> dict[str, list[np.ndarray]]:
-        """What is asked for of a frame's truth, or of the surface as its camera sees it."""
-        traced = None
-        if "visibility" in self.truth or (self.truth and self.surface is None):
+    def _traced(self, frame: Frame) -> Truth | None:
+        """A frame's truth, if any of it is asked for. Raises InputError for radiance that is not finite."""
+        if any(name in OF_PIXELS for name in self.truth) or (self.truth and self.surface is None):
             traced = load_truth(self.dataset, frame)
+            if "radiance" in self.truth and not np.isfinite(traced.radiance).all():
+                path = self.dataset.root / str(frame.gt_path)
+                raise InputError(f"{path}: expected finite radiance, found infinite values or none")
+            return traced
+        return None
+
+    def _planes(self, frame: Frame, traced: Truth | None) -> dict[str, list[np.ndarray]]:
+        """What is asked for of a frame's truth, or of the surface as its camera sees it."""
         planes: dict[str, np.ndarray] = {}
         if traced is not None:
+            planes["radiance"] = np.maximum(traced.radiance, 0)
             planes["visibility"] = np.where(traced.shadow > 0, traced.sun_visibility, -1)[..., None]
         if self.surface is not None:
             depth, normal = self.surface(frame.camera)

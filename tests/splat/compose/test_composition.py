@@ -9,15 +9,19 @@ import pytest
 from posed import METHODS, disc_run, made_run, seen_from
 
 from spacesim import backend
+from spacesim.backend import ad
 from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
+from spacesim.data.images.tone import Curve
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose import ComposeConfig, GaussianComposition, PlacedRun, Pose
+from spacesim.splat.compose.members import display_colors
 from spacesim.splat.compose.pose import rotation_about
 from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.run import Run
 
 SUN = Sun.from_angles(40, 35)
 EYE = seen_from([3.0, -2.0, 1.5])
@@ -270,6 +274,31 @@ def test_each_model_keeps_its_own_filter():
         for run, pose in zip(runs, poses, strict=True)
     ]
     assert sums[0] < 0.8 * sums[1]
+
+
+def radiant(seed: int) -> Run:
+    """The linear run, as if it had learned radiance."""
+    run = made_run("linear", seed)
+    light = run.light
+    config = replace(light.config, radiance=True)
+    return replace(run, light=LightModel(config, light.weights, light.frame, light.embeddings))
+
+
+def test_runs_that_learned_radiance_keep_their_light():
+    pose, below = Pose(translation=[0, 2.5, 0]), 1 / 32
+    both = GaussianComposition([PlacedRun(radiant(1)), PlacedRun(radiant(2), pose)])
+    plain = GaussianComposition([PlacedRun(made_run("linear", 1)), PlacedRun(made_run("linear", 2), pose)])
+    seen = both.predict(EYE, SUN, exposure=-5.0)
+    assert (seen.linear.max() > 0.1 * 16 * below, seen.id.max()) == (True, 2)
+    np.testing.assert_allclose(srgb_from_linear(seen.linear), seen.rgb, atol=1e-5)
+    colors = linear_from_srgb(plain.predict(EYE, SUN).rgb)  # the same shares, there of white
+    np.testing.assert_allclose(seen.linear, 16 * below * colors, atol=2e-4)
+    assert plain.predict(EYE, SUN).linear is None
+    mixed = GaussianComposition([PlacedRun(radiant(1)), PlacedRun(made_run("vanilla", 2), pose)]).predict(EYE, SUN)
+    assert mixed.linear is None
+    light = np.array([0.001, 0.02, 0.3, 1])  # beyond white is white before it is blended with sRGB values
+    (shown,) = display_colors([ad.Float(light)], Curve("srgb", 0.0, 16.0), None)
+    np.testing.assert_allclose(np.array(shown), srgb_from_linear(16 * light), atol=1e-5)
 
 
 def test_linear_and_srgb_runs_blend_as_srgb():

@@ -127,7 +127,7 @@ def test_a_run_takes_tone_and_exposure_of_its_data_and_can_be_exposed_anew(small
     run = train(dataset, tmp_path / "own", linear())
     kept = json.loads((run.path / "config.json").read_text())["light"]
     assert (kept["tone"], kept["exposure"]) == ("filmic", 2.0)
-    assert run.curve == ("filmic", 2.0)
+    assert run.curve == ("filmic", 2.0, WHITES["filmic"])
     assert train(dataset, tmp_path / "own", linear(), resume=True).curve == run.curve
     as_taken = run.predict(frame.camera, frame.sun)
     np.testing.assert_array_equal(run.predict(frame.camera, frame.sun, exposure=2.0).rgb, as_taken.rgb)
@@ -137,11 +137,11 @@ def test_a_run_takes_tone_and_exposure_of_its_data_and_can_be_exposed_anew(small
     np.testing.assert_allclose(darker, expected, atol=1e-3)
     assert darker.mean() < 0.9 * as_taken.rgb.mean()
     given = train(dataset, tmp_path / "given", linear(tone="srgb", exposure=0.5))
-    assert given.curve == ("srgb", 0.5)
+    assert given.curve == ("srgb", 0.5, 1)
     with pytest.raises(InputError, match="exposure: expected -40 to 40 EV, found nan"):
         given.predict(frame.camera, frame.sun, exposure=float("nan"))
     plain = train(small_lit_dataset, tmp_path / "plain", linear())
-    assert plain.curve == ("srgb", 0.0)
+    assert plain.curve == ("srgb", 0.0, 1)
     doubled = plain.predict(frame.camera, frame.sun, exposure=1.0).rgb
     once = linear_from_srgb(plain.predict(frame.camera, frame.sun).rgb)
     np.testing.assert_allclose(linear_from_srgb(doubled), np.minimum(2 * once, 1), atol=1e-4)

@@ -12,7 +12,6 @@ import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, write_bytes
-from spacesim.data.images.tone import WHITES
 from spacesim.splat.export.html.colors import NODES, color_steps, tabulate_colors, tells_cosines
 from spacesim.splat.export.html.seen import SIDE as SEEN_SIDE
 from spacesim.splat.export.html.seen import tabulate_seen
@@ -81,7 +80,7 @@ def _content(run: Run, report: Callable[[int, int], None] | None) -> tuple[JsonD
     if light is not None and light.config.field.surface:
         arrays["normals"] = _normals(gaussians, light.config.field.features)
     if run.curve:
-        about["curve"] = {"tone": run.curve[0], "white": WHITES[run.curve[0]]}
+        about["curve"] = {"tone": run.curve.tone, "white": run.curve.white}
     if sunlight is not None:
         _add_sunlight(sunlight, about, arrays)
     return about, arrays
