@@ -10,6 +10,7 @@ import pytest
 from small_field import CONFIG
 from tiny import pair_scene
 
+from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
@@ -19,7 +20,7 @@ from spacesim.methods import load_scene
 from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.draw import RaySamples
 from spacesim.nerf.fields.model import Networks
-from spacesim.nerf.partition import merge
+from spacesim.nerf.partition import merge, partition
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.sampling.render import sum_rays, volume_weights
 from spacesim.splat.compose.pose import Pose, rotation_about
@@ -131,6 +132,19 @@ def test_one_model_is_its_run(dataset, finished):
     solid = alone.alpha > 0.5
     assert np.einsum("nc,nc->n", one.normal[solid], alone.normal[solid]).min() > 0.99
     np.testing.assert_array_equal(one.id, solid)
+
+
+@pytest.mark.parametrize(("aside", "away"), [(0.0, 12), (0.001, 12), (0.3, 12), (0.3, 3000)])
+def test_boundaries_of_models_that_stand_in_each_other_rise(finished, aside, away):
+    """As drawn, where boundaries are middles and half lengths, rounded: two of one rank would leave one unset."""
+    composed = scene((finished, Pose()), (finished, Pose(translation=np.array([aside, 0.0, 0.0]))))
+    camera = camera_at((away, away / 5, away / 3), size=32)
+    fields, pixel = composed.placed(camera, None), dr.arange(ad.UInt32, 1024)
+    merged = partition(fields, pixel, dr.opaque(ad.UInt32, 32), 1024, False).merged
+    low, high = (np.array(values).reshape(1024, -1) for values in (merged.low, merged.high))
+    assert np.isfinite(low).all()
+    assert (high >= low).all()
+    np.testing.assert_array_equal(low[:, 1:], high[:, :-1])
 
 
 def test_a_larger_model_is_not_more_opaque(finished):
