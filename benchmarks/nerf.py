@@ -19,7 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
@@ -31,13 +31,13 @@ from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import read_dataset
 from spacesim.eval.frame_metrics import frame_images
 from spacesim.eval.metrics import image
-from spacesim.learning.folder import TrainingProgress
 from spacesim.learning.prediction import Prediction
 from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.run import NerfRun
-from spacesim.nerf.train.train import train
 from spacesim.nerf.train.trainer import NerfTrainer
+from spacesim.progress import show_progress
 from spacesim.reproduce.frames import places, views
+from spacesim.reproduce.perform import trained
 from spacesim.splat.compose import ComposeConfig, PlacedRun, Pose
 
 SCENE = {"sun": [(45.0, 35.0)], "test_suns": 0, "views": 100, "test_views": 20, "resolution": 256}
@@ -60,7 +60,8 @@ def main() -> None:
     data = read_dataset(options.data or common.generated("boxsat", options.out / "data", **SCENE, **SAMPLES))
     config = methods.shortened(methods.preset(options.preset, "nerf"), options.iterations)
     config = replace(config, rays=options.rays)
-    run, duration = trained(data, options.out / "run", config)
+    run = cast(NerfRun, trained(options.out / "run", data, config, "nerf", show_progress))
+    duration = float(run.training["seconds"])
     rows = [
         {"": f"spacesim, {options.preset}", **trained_row(step_time(data, run, options.repeats), duration, run, data)}
     ]
@@ -71,20 +72,10 @@ def main() -> None:
     results = {"training": rows, "frames": frames}
     if options.splats:
         splats = methods.shortened(methods.preset("fast", "vanilla"), options.iterations)
-        model = trained_splats(data, options.out / "splats", splats)
+        model = trained(options.out / "splats", data, splats, "splats", show_progress)
         rows.append({"": "splats, fast", "training, s": model.training["seconds"], **quality(model, data)})
         results["mixed"] = tables["Field and splats through each other"] = [mixed_row(run, model, data)]
     common.emit(results, tables, options)
-
-
-def trained(data: Dataset, folder: Path, config: Any) -> tuple[NerfRun, float]:
-    """(the run, seconds that its training took)."""
-    from spacesim.progress import report_training, show_progress
-
-    with show_progress("train nerf", "iterations") as report:
-        tell: Callable[[TrainingProgress], None] = report_training(report)
-        run = train(data, folder, config, True, tell)
-    return run, float(run.training["seconds"])
 
 
 def measured_apart(data: Dataset, *sizes: int) -> list[common.Row]:
@@ -139,13 +130,6 @@ def quality(model: Any, data: Dataset) -> common.Row:
         whole.append(image.psnr(images.prediction, images.truth))
         inside.append(image.psnr(images.prediction, images.truth, images.silhouette))
     return {"PSNR": _mean(whole), "over the silhouette": _mean(inside)}
-
-
-def trained_splats(data: Dataset, folder: Path, config: Any) -> Any:
-    from spacesim.progress import report_training, show_progress
-
-    with show_progress("train splats", "iterations") as report:
-        return methods.train(data, folder, config, True, report_training(report))
 
 
 def mixed_row(field: NerfRun, splats: Any, data: Dataset) -> common.Row:
