@@ -90,7 +90,7 @@ def estimate_sun(
     run, image: as for `refine_pose`
     camera: of the picture, with its size and intrinsics (no distortion);  mask: [H, W], where not 0 the pixel counts
     Pixels count where the picture's alpha is at least one half, or the model's where the picture has none. All
-    directions are compared, shadows included, on a picture of 64 pixels; the picture's exposure is taken for that of
+    directions are compared, shadows included, on a picture of 128 pixels; the picture's exposure is taken for that of
     the training pictures. Raises InputError where the run knows no Sun, for no such picture, and where none counts.
     """
     run = check_gaussians(run)
@@ -126,7 +126,7 @@ class SunFit:
     finder: SunFinder  #: of the run's model
 
     name = "sun"
-    how = "its direction, searched over the sphere by shading and shadows of a picture of 64 pixels"
+    how = "its direction, searched over the sphere by shading and shadows of a picture of 128 pixels"
 
     def fit(
         self, run: Predictor, picture: Picture, masks: Sequence[np.ndarray], start: Sequence[PictureLight]

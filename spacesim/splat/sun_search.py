@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from spacesim.backend import ad
+from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array, degrees_between, fibonacci_sphere
@@ -28,12 +28,14 @@ from spacesim.splat.light.shadow.light_camera import light_rows
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 from spacesim.splat.raster.render import render
-from spacesim.splat.raster.tone import adjust_exposure
+from spacesim.splat.raster.tone import tone_map
 
 SPHERE = 300  #: Suns of the lattice: 12 degrees apart
-SIDE = 64  #: pixels of the longer side of a small picture, which shows the object alone
+SIDE = 128  #: pixels of the longer side of a small picture, which shows the object alone
+SHAPE_SIDE = 64  #: the same for `ShapeSearch`, which blends all Suns of the lattice at once
 ERROR = 0.05  #: sRGB values, or roots of linear ones: an error so large counts half (Cauchy's loss)
-BLOCK = 8.0  #: pixels of a small picture whose errors count as one
+DRAWN = 16  #: Suns whose pictures are drawn at once: Gaussians are projected and sorted once for all of them
+BLOCKS = 512  #: parts of a small square picture whose errors count as one each
 COVERED = 0.5  #: least alpha of a pixel that counts
 AMBIENT = 0.02  #: light that comes from everywhere, as a share of the Sun's
 #: of a surface's n . s times visibility over the Suns of pictures, one of these: a quarter under Suns all round without
@@ -64,11 +66,11 @@ class SmallPicture:
     counts: np.ndarray  #: [H, W] bool, on the object, as far as known
 
     @staticmethod
-    def of(camera: Camera, image: Image, least: float = 0.999) -> "SmallPicture":
+    def of(camera: Camera, image: Image, least: float = 0.999, side: int = SIDE) -> "SmallPicture":
         """The object's part of a picture, in means over squares of pixels, of those that are valid. least: share of
-        them in a square that counts"""
+        them in a square that counts;  side: pixels of the longer side, at most"""
         rows, columns = cropped(image)
-        factor = max(1, -(-max(rows.stop - rows.start, columns.stop - columns.start) // SIDE))
+        factor = max(1, -(-max(rows.stop - rows.start, columns.stop - columns.start) // side))
         numbers = camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start
         small = Camera(
             camera.world_from_camera,
@@ -129,15 +131,21 @@ class SunFinder:
         """
         numbers = list(range(SPHERE)) if among is None else sorted({int(number) for number in among})
         directions = list(self.sphere[numbers])
-        losses = [self._loss(picture, self.sphere[k], k) + cost(self.sphere[k]) for k in numbers]
+        seen = _SeenPicture(picture)
+
+        def losses_of(directions: Sequence[Array], numbers: Sequence[int | None]) -> list[float]:
+            losses = self._losses(seen, directions, numbers)
+            return [loss + cost(direction) for loss, direction in zip(losses, directions, strict=True)]
+
+        losses = losses_of(directions, numbers)
         for degrees in RINGS:
             best = directions[int(np.argmin(losses))]
             around = ring(best, degrees)
-            of_ring = [self._loss(picture, direction) + cost(direction) for direction in around]
+            of_ring = losses_of(around, [None] * RING)
             directions, losses = [*directions, *around], [*losses, *of_ring]
             lowest = paraboloid_minimum(best, around, min(losses), of_ring, degrees)
             directions.append(lowest)
-            losses.append(self._loss(picture, lowest) + cost(lowest))
+            losses += losses_of([lowest], [None])
         best = int(np.argmin(losses))
         return SunEstimate(directions[best], spread(np.array(directions), np.array(losses)), float(losses[best]))
 
@@ -145,25 +153,55 @@ class SunFinder:
         """Numbers of the lattice's Suns within so many degrees."""
         return [int(k) for k in np.flatnonzero(self.sphere @ direction >= np.cos(np.radians(degrees)))]
 
-    def _loss(self, picture: SmallPicture, direction: Array, number: int | None = None) -> float:
-        """number: of the lattice, whose light is kept for other pictures"""
-        camera = Pinhole.of(picture.camera)
+    def _losses(self, seen: "_SeenPicture", directions: Sequence[Array], numbers: Sequence[int | None]) -> Array:
+        """[K] of the model under K Suns. numbers: theirs in the lattice, whose light is kept for other pictures"""
+        losses = []
+        for start in range(0, len(directions), DRAWN):
+            suns = zip(directions[start : start + DRAWN], numbers[start : start + DRAWN], strict=True)
+            colors = [color for sun in suns for color in self._colors(seen.camera, *sun)]
+            drawn = render(self.gaussians, seen.camera, outputs=(), features=colors, antialiased=self.antialiased)
+            curve = (self.curve.tone, self.curve.white) if self.curve else None
+            errors = _errors(drawn.features or [], seen.rgb, seen.counts, curve)
+            losses.append(dr.block_sum(dr.ravel(ad.ArrayXf(errors), order="C"), drawn.width * drawn.height))
+        return np.concatenate([np.array(some, np.float64) for some in losses]) * seen.share
+
+    def _colors(self, camera: Pinhole, direction: Array, number: int | None) -> list[Float]:
         light = None if number is None else self._sunlight.get(number)
         if light is None:
             light = self.light.sunlight(self.gaussians, direction)
             if number is not None:
                 self._sunlight[number] = light
-        colors, _ = self.light.shade_picture(self.gaussians, camera, direction, sunlight=light)
-        drawn = render(self.gaussians, camera, outputs=(), features=colors, antialiased=self.antialiased)
-        rgb = drawn.image("features")
-        if self.curve:
-            rgb = adjust_exposure(rgb, self.curve.tone, white=self.curve.white)
-        return cauchy((rgb - picture.rgb)[picture.counts].ravel()) / 3
+        return self.light.shade_picture(self.gaussians, camera, direction, sunlight=light)[0]
 
 
-def cauchy(errors: np.ndarray) -> float:
-    """Sum of log(1 + (e / ERROR)^2) over blocks of pixels."""
-    return float(np.log1p((errors / ERROR) ** 2).sum()) / BLOCK
+class _SeenPicture:
+    """A small picture where it is compared with others."""
+
+    def __init__(self, picture: SmallPicture) -> None:
+        self.camera = Pinhole.of(picture.camera)
+        self.rgb = [upload(np.ascontiguousarray(picture.rgb[..., c].ravel())) for c in range(3)]
+        self.counts = upload(picture.counts.ravel().astype(np.float32))  #: 1 or 0
+        self.share = share_of_blocks(picture.counts.shape)
+
+
+@recorded
+def _errors(planes: list[Float], rgb: list[Float], counts: Float, curve: tuple[str, float] | None) -> list[Float]:
+    """[K] planes: of each of K pictures, three planes each, Cauchy's loss of its pixels, a third for each channel.
+    curve: tone and white of linear pictures, None: values are sRGB"""
+    errors = []
+    for k in range(0, len(planes), 3):
+        drawn = planes[k : k + 3]
+        if curve:
+            drawn = [tone_map(plane, *curve) for plane in drawn]
+        terms = [dr.log(1 + dr.square((d - t) / ERROR)) for d, t in zip(drawn, rgb, strict=True)]
+        errors.append(counts / 3 * (terms[0] + terms[1] + terms[2]))
+    return errors
+
+
+def share_of_blocks(shape: tuple[int, ...]) -> float:
+    """By which losses are multiplied that are sums over pixels of a small picture [H, W], as if those were as many as
+    the blocks that they cover."""
+    return min(BLOCKS / max(shape) ** 2, 1.0)
 
 
 def ring(direction: Array, degrees: float) -> list[Array]:
@@ -229,7 +267,7 @@ class _LitSurface:
     def losses(self, brighter: float = 1.0) -> Array:
         """[SPHERE], of a surface that reflects so many times as much."""
         errors = np.sqrt(brighter * self.reflected[:, None] * self.light) - np.sqrt(self.seen)[:, None]
-        losses: Array = np.log1p((errors / ERROR) ** 2).sum(axis=0) / BLOCK
+        losses: Array = np.log1p((errors / ERROR) ** 2).sum(axis=0) * share_of_blocks(self.counts.shape)
         return losses
 
 

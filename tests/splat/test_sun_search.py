@@ -16,7 +16,7 @@ from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import render
-from spacesim.splat.sun_search import ShapeSearch, SmallPicture, SunFinder
+from spacesim.splat.sun_search import ShapeSearch, SmallPicture, SunFinder, _SeenPicture
 
 NOTHING = Encoding("harmonics", 0)
 MEAN_COSINE = 0.35  #: of pictures that were not taken against the Sun
@@ -94,7 +94,7 @@ def test_small_pictures_show_the_object_alone():
     image.alpha[40:60, 10:110] = 1
     camera = eye(side=120)
     camera = replace(camera, height=90)
-    small = SmallPicture.of(camera, image)
+    small = SmallPicture.of(camera, image, side=64)
     assert (small.camera.width, small.camera.height) == (50, 10)
     assert small.counts.all()
     np.testing.assert_allclose(small.rgb, 0.25)
@@ -103,7 +103,7 @@ def test_small_pictures_show_the_object_alone():
     column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     assert (column - 10) / 2 == pytest.approx(small.camera.fx * x / z + small.camera.cx)
     assert (row - 40) / 2 == pytest.approx(small.camera.fy * y / z + small.camera.cy)
-    empty = SmallPicture.of(camera, replace(image, alpha=np.zeros_like(image.alpha)))
+    empty = SmallPicture.of(camera, replace(image, alpha=np.zeros_like(image.alpha)), side=64)
     assert not empty.counts.any()
 
 
@@ -154,7 +154,7 @@ def test_a_model_tells_the_sun_that_it_was_drawn_with():
         image = Image(rgb, alpha, np.ones(alpha.shape, bool))
         estimate = finder.estimate(SmallPicture.of(camera, image))
         assert angle(estimate.direction, sun) < 3
-        assert estimate.loss < finder._loss(SmallPicture.of(camera, image), -sun)
+        assert estimate.loss < finder._losses(_SeenPicture(SmallPicture.of(camera, image)), [-sun], [None])[0]
         near = finder.estimate(SmallPicture.of(camera, image), finder.neighbours(sun, 26.0))
         assert angle(near.direction, sun) < 3
         again = SunFinder(splats, light, False, None).estimate(SmallPicture.of(camera, image))

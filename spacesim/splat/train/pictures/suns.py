@@ -25,7 +25,16 @@ from spacesim.data.images import load_image
 from spacesim.data.records import Dataset, Frame, Sun
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.sun_search import SPHERE, ShapeSearch, SmallPicture, SunFinder, constant_colors, smoothest
+from spacesim.splat.sun_search import (
+    SHAPE_SIDE,
+    SIDE,
+    SPHERE,
+    ShapeSearch,
+    SmallPicture,
+    SunFinder,
+    constant_colors,
+    smoothest,
+)
 from spacesim.splat.train.config import TrainConfig, preset, shortened, with_options
 from spacesim.splat.train.pictures.numbers import PictureNumbers, falling
 
@@ -163,7 +172,7 @@ def first_suns(dataset: Dataset, gaussians: Gaussians, distance: float) -> First
     However it was trained, it is drawn with the anti-aliasing filter: pictures are far smaller here.
     """
     search = ShapeSearch(gaussians, True, distance)
-    losses = search.losses([_small_picture(dataset, frame) for frame in dataset.train])
+    losses = search.losses([_small_picture(dataset, frame, SHAPE_SIDE) for frame in dataset.train])
     best, order = losses.argmin(axis=1), time_order(dataset.train)
     if order is not None:
         best[order] = smoothest(losses[order], search.sphere, TURN)
@@ -191,5 +200,5 @@ def _turn_cost(direction: Array, before: Array | None) -> float:
     return float(0.5 * (turn / TURN) ** 2)
 
 
-def _small_picture(dataset: Dataset, frame: Frame) -> SmallPicture:
-    return SmallPicture.of(frame.camera, load_image(dataset, frame))
+def _small_picture(dataset: Dataset, frame: Frame, side: int = SIDE) -> SmallPicture:
+    return SmallPicture.of(frame.camera, load_image(dataset, frame), side=side)
