@@ -722,6 +722,7 @@ def test_unknown_suns_are_compared_with_true_ones(command, place, monkeypatch):
     assert list(rows) == ["known", "unknown", "vanilla"]
     assert 0 <= rows["unknown"]["Sun off, deg"] <= 180
     assert all(5 < row["PSNR, dB"] < 60 for row in rows.values())
+    assert 5 < rows["unknown"]["PSNR, told"] < 60
 
 
 def test_errors_of_suns(tmp_path):
