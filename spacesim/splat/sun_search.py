@@ -10,7 +10,7 @@ as brightness determines the angle: too large an albedo would put all Suns too l
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
@@ -35,6 +35,7 @@ SIDE = 128  #: pixels of the longer side of a small picture, which shows the obj
 SHAPE_SIDE = 64  #: the same for `ShapeSearch`, which blends all Suns of the lattice at once
 ERROR = 0.05  #: sRGB values, or roots of linear ones: an error so large counts half (Cauchy's loss)
 DRAWN = 16  #: Suns whose pictures are drawn at once: Gaussians are projected and sorted once for all of them
+GRANULE = 32  #: pixels, of which the sides of compared pictures are multiples
 BLOCKS = 512  #: parts of a small square picture whose errors count as one each
 COVERED = 0.5  #: least alpha of a pixel that counts
 AMBIENT = 0.02  #: light that comes from everywhere, as a share of the Sun's
@@ -149,9 +150,11 @@ class SunFinder:
         best = int(np.argmin(losses))
         return SunEstimate(directions[best], spread(np.array(directions), np.array(losses)), float(losses[best]))
 
-    def neighbours(self, direction: Array, degrees: float) -> list[int]:
-        """Numbers of the lattice's Suns within so many degrees."""
-        return [int(k) for k in np.flatnonzero(self.sphere @ direction >= np.cos(np.radians(degrees)))]
+    def near(self, direction: Array, besides: Sequence[int], count: int) -> list[int]:
+        """Numbers of so many of the lattice's Suns: `besides`, and of the others those nearest to a direction."""
+        others = np.setdiff1d(np.arange(SPHERE), besides)
+        nearest = others[np.argsort(-(self.sphere[others] @ direction), kind="stable")]
+        return [*(int(k) for k in besides), *(int(k) for k in nearest[: count - len(besides)])]
 
     def _losses(self, seen: "_SeenPicture", directions: Sequence[Array], numbers: Sequence[int | None]) -> Array:
         """[K] of the model under K Suns. numbers: theirs in the lattice, whose light is kept for other pictures"""
@@ -175,12 +178,15 @@ class SunFinder:
 
 
 class _SeenPicture:
-    """A small picture where it is compared with others."""
+    """A small picture where it is compared with others, of one of few sizes, as each is recorded anew."""
 
     def __init__(self, picture: SmallPicture) -> None:
-        self.camera = Pinhole.of(picture.camera)
-        self.rgb = [upload(np.ascontiguousarray(picture.rgb[..., c].ravel())) for c in range(3)]
-        self.counts = upload(picture.counts.ravel().astype(np.float32))  #: 1 or 0
+        height, width = picture.counts.shape
+        padding = (0, -height % GRANULE), (0, -width % GRANULE)
+        rgb, counts = np.pad(picture.rgb, (*padding, (0, 0))), np.pad(picture.counts, padding)
+        self.camera = Pinhole.of(replace(picture.camera, width=counts.shape[1], height=counts.shape[0]))
+        self.rgb = [upload(np.ascontiguousarray(rgb[..., c].ravel())) for c in range(3)]
+        self.counts = upload(counts.ravel().astype(np.float32))  #: 1 or 0
         self.share = share_of_blocks(picture.counts.shape)
 
 

@@ -155,8 +155,12 @@ def test_a_model_tells_the_sun_that_it_was_drawn_with():
         estimate = finder.estimate(SmallPicture.of(camera, image))
         assert angle(estimate.direction, sun) < 3
         assert estimate.loss < finder._losses(_SeenPicture(SmallPicture.of(camera, image)), [-sun], [None])[0]
-        near = finder.estimate(SmallPicture.of(camera, image), finder.neighbours(sun, 26.0))
+        near = finder.estimate(SmallPicture.of(camera, image), finder.near(sun, [0, 7], 32))
         assert angle(near.direction, sun) < 3
+        numbers = finder.near(sun, [0, 7], 32)
+        assert numbers[:2] == [0, 7]
+        assert len(set(numbers)) == 32
+        assert max(angle(finder.sphere[k], sun) for k in numbers[2:]) < 33
         again = SunFinder(splats, light, False, None).estimate(SmallPicture.of(camera, image))
         np.testing.assert_array_equal(again.direction, estimate.direction)
 

@@ -40,7 +40,7 @@ from spacesim.splat.train.pictures.numbers import PictureNumbers, falling
 
 SEARCHES = 0.2, 0.4, 0.6, 0.8  #: of the training, after which pictures are compared with other Suns, as at its end
 CHOICES = 12  #: Suns that a picture's shading allowed, of those that are looked at
-NEAR = 26.0  #: degrees: two rings of the lattice about a picture's Sun
+LOOKED_AT = 32  #: Suns of the lattice, these and the nearest to a picture's own: two rings, of about 30 degrees
 SHAPE_SHARE, SHAPE_STEPS = 0.3, 1_500  #: of the training's steps, and at least: of the one without light before it
 TURN = 3.0  #: degrees: a turn of the Sun from one picture to the next, in time order, that costs half
 
@@ -103,10 +103,9 @@ class SunEstimation:
         directions = self.directions()
         for place, picture in enumerate(self.order if self.order is not None else range(len(directions))):
             before = directions[self.order[place - 1]] if self.order is not None and place else None
-            near = finder.neighbours(directions[picture], NEAR)
             estimate = finder.estimate(
                 _small_picture(self.dataset, self.dataset.train[picture]),
-                [*near, *self.choices[picture]],
+                finder.near(directions[picture], self.choices[picture], LOOKED_AT),
                 lambda direction, before=before: _turn_cost(direction, before),  # type: ignore[misc]
             )
             directions[picture], self.sigmas[picture] = estimate.direction, estimate.sigma_deg

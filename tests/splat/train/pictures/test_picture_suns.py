@@ -37,7 +37,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(suns, "SPHERE", 60)
     monkeypatch.setattr(suns, "SEARCHES", (0.5,))
     monkeypatch.setattr(suns, "SHAPE_STEPS", 12)
-    monkeypatch.setattr(suns, "NEAR", 30.0)
+    monkeypatch.setattr(suns, "LOOKED_AT", 16)
 
 
 class StoppedError(Exception):
