@@ -17,7 +17,8 @@ from spacesim.splat.raster.supersample import pixel_means
 from spacesim.splat.raster.surface import normals
 from spacesim.splat.raster.tone import decode_srgb, inverse_tone_map, mu_law, tone_map
 from spacesim.splat.train.downscale import covered_color, truth_of_squares, valid_squares
-from spacesim.splat.train.loss.terms import TruthPlanes, depth_loss, normal_loss, photometric_loss, visibility_loss
+from spacesim.splat.train.loss.photometric import photometric_loss
+from spacesim.splat.train.loss.terms import TruthPlanes, depth_loss, normal_loss, visibility_loss
 from spacesim.splat.train.warm_start import foreground_loss
 
 
