@@ -13,13 +13,12 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
+from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float, UInt32
 
 RADIUS = 5  #: 11 x 11 window
 SIGMA = 1.5  #: pixels
 COLUMNS = 8  #: pixels of a row that a thread computes
 ROWS = 16  #: pixels of a column that a thread computes
-_PACKET = 4  #: pixels of a pair of pictures that are read at once
 _C1, _C2 = 0.01**2, 0.03**2
 _OFFSETS = np.arange(-RADIUS, RADIUS + 1)
 _WEIGHTS = np.exp(-0.5 * (_OFFSETS / SIGMA) ** 2)
@@ -41,7 +40,8 @@ class _Photometric(dr.CustomOp):
     def eval(self, prediction: Array3f, target: Array3f, width: int, height: int, ssim_weight: float) -> Float:
         self.strips = strips = _Strips(width, height)
         self.l1, self.ssim = ((share / (3 * width * height)) for share in (1 - ssim_weight, ssim_weight))
-        self.pairs = [strips.write_pair(x, y) for x, y in zip(prediction, target, strict=True)]
+        dr.eval(prediction, target)
+        self.pairs = [(strips.padded(x), strips.padded(y)) for x, y in zip(prediction, target, strict=True)]
         dr.eval(self.pairs)
         moments, distances = _moments(strips, self.pairs)
         dr.eval(moments, distances)
@@ -53,16 +53,20 @@ class _Photometric(dr.CustomOp):
     def backward(self) -> None:
         strips, scale = self.strips, cast(Float, self.grad_out())
         l1, ssim = scale * self.l1, scale * self.ssim
-        y = dr.arange(ad.UInt32, strips.across * strips.height)
-        y, strip = y % strips.height, y // strips.height
+        thread = dr.arange(ad.UInt32, strips.height * strips.across)
+        row, strip = thread % strips.height, thread // strips.height
         gradients = []
-        for pair, plane in zip(self.pairs, self.partials, strict=True):
-            by_mean, by_square, by_product = (_blur(values) for values in strips.read_partials(plane, strip, y))
+        for channel, pair in enumerate(self.pairs):
+            partials = strips.read_partials(self.partials, channel, row, strip)
+            by_mean, by_square, by_product = (_blur(values) for values in partials)
+            xs, ys = (strips.read_row(plane, row, strip, 0) for plane in pair)
             values = []
-            for j, (x, t) in enumerate(zip(*strips.read_pair(pair, strip, y, 0), strict=True)):
-                by_ssim = by_mean[j] + 2 * x * by_square[j] + t * by_product[j]
-                values.append(l1 * dr.sign(x - t) - ssim * by_ssim)
-            gradients.append(_write([values], y * strips.across + strip))
+            for j, (x, y) in enumerate(zip(xs, ys, strict=True)):
+                by_ssim = by_mean[j] + 2 * x * by_square[j] + y * by_product[j]
+                values.append(l1 * dr.sign(x - y) - ssim * by_ssim)
+            gradient = dr.empty(ad.Float, strips.height * strips.stride)
+            dr.scatter(gradient, ad.ArrayXf(values), row * strips.across + strip)
+            gradients.append(gradient)
         dr.eval(gradients)
         self.set_grad_in("prediction", ad.Array3f([strips.tight(plane) for plane in gradients]))
 
@@ -70,45 +74,43 @@ class _Photometric(dr.CustomOp):
         return "photometric"
 
 
-def _moments(strips: "_Strips", pairs: list[Float]) -> tuple[list[Float], Float]:
-    """Of each pair of pictures x, y, x^2 + y^2 and x y, blurred along rows; and |x - y|, added up by each thread."""
-    thread = dr.arange(ad.UInt32, strips.across * strips.height)
-    y, strip = thread // strips.across, thread % strips.across
-    moments, distances = [], ad.Float(0)
-    for pair in pairs:
-        xs, ys = strips.read_pair(pair, strip, y, RADIUS)
+def _moments(strips: "_Strips", pairs: list[tuple[Float, Float]]) -> tuple[Float, Float]:
+    """Of each pair of planes x, y, x^2 + y^2 and x y, blurred along rows; and |x - y|, added up by each thread."""
+    count = strips.height * strips.across
+    thread = dr.arange(ad.UInt32, count)
+    row, strip = thread // strips.across, thread % strips.across
+    moments, distances = dr.empty(ad.Float, 3 * 4 * strips.height * strips.stride), ad.Float(0)
+    for channel, pair in enumerate(pairs):
+        xs, ys = (strips.read_row(plane, row, strip, RADIUS) for plane in pair)
         for j in range(RADIUS, RADIUS + COLUMNS):
             distances += dr.abs(xs[j] - ys[j])
         squares = [dr.fma(x, x, y * y) for x, y in zip(xs, ys, strict=True)]
         products = [x * y for x, y in zip(xs, ys, strict=True)]
-        blurred = [_blur(values) for values in (xs, ys, squares, products)]
-        moments.append(_write(_transposed(blurred), thread))
+        packets = _transposed([_blur(values) for values in (xs, ys, squares, products)])
+        dr.scatter(moments, _joined(packets), channel * count + thread, mode=dr.ReduceMode.NoConflicts)
     return moments, distances
 
 
-def _partials(strips: "_Strips", moments: list[Float]) -> tuple[list[Float], Float]:
-    """Of each of `_moments`, the derivatives of SSIM, blurred along columns; and 1 - SSIM, added up by each thread."""
-    thread = dr.arange(ad.UInt32, strips.width * strips.down)
-    column, first = thread % strips.width, (thread // strips.width) * ROWS
+def _partials(strips: "_Strips", moments: Float) -> tuple[Float, Float]:
+    """Of `_moments`, the derivatives of SSIM, blurred along columns; and 1 - SSIM, added up by each thread."""
+    thread = dr.arange(ad.UInt32, 3 * strips.down * strips.width)
+    column, strip = thread % strips.width, thread // strips.width
+    channel, first = strip // strips.down, (strip % strips.down) * ROWS
+    blurred = [_blur(values) for values in strips.read_moments(moments, channel, first, column)]
     inside = [inside for _, inside in _neighbours(first, range(-RADIUS, ROWS + RADIUS), strips.height)]
-    partials, similarities = [], ad.Float(0)
-    for plane in moments:
-        blurred = [_blur(values) for values in strips.read_moments(plane, column, first)]
-        pixels = [_similarity(*means, active) for *means, active in zip(*blurred, inside, strict=True)]
-        for value, *_ in pixels[RADIUS:-RADIUS]:
-            similarities += value
-        derivatives = [_blur(values) for values in _transposed(pixels)[1:]]
-        packets = [[*pixel, ad.Float(0)] for pixel in _transposed(derivatives)]
-        partials.append(_write(packets, column * strips.down + first // ROWS))
-    pixels_inside = len(moments) * dr.minimum(strips.height - first, ROWS)
-    return partials, ad.Float(pixels_inside) - similarities
+    pixels = [_similarity(means, active) for means, active in zip(_transposed(blurred), inside, strict=True)]
+    similarity = sum((value for value, *_ in pixels[RADIUS:-RADIUS]), ad.Float(0))
+    packets = [[*values, ad.Float(0)] for values in _transposed([_blur(values) for values in _transposed(pixels)[1:]])]
+    partials = dr.empty(ad.Float, 3 * 4 * strips.width * strips.depth)
+    place = (channel * strips.width + column) * strips.down + first // ROWS
+    dr.scatter(partials, _joined(packets), place)
+    return partials, ad.Float(dr.minimum(strips.height - first, ROWS)) - similarity
 
 
-def _similarity(
-    mx: Float, my: Float, squares: Float, product: Float, inside: Bool
-) -> tuple[Float, Float, Float, Float]:
+def _similarity(means: Sequence[Float], inside: Bool) -> tuple[Float, Float, Float, Float]:
     """SSIM of a pixel from the means of x, y, x^2 + y^2 and x y under its window, and its derivatives by those of x,
     x^2 and x y (the first with the window's other means held); all 0 where not `inside`."""
+    mx, my, squares, product = means
     mxy, mm = mx * my, dr.fma(mx, mx, my * my)
     a1, a2 = 2 * mxy + _C1, 2 * (product - mxy) + _C2
     r1, r2 = dr.rcp(mm + _C1), dr.rcp(squares - mm + _C2)
@@ -132,53 +134,51 @@ def _blur(values: Sequence[Float]) -> list[Float]:
 class _Strips:
     """Where pixels stand in memory. Threads hold COLUMNS pixels of a row or ROWS of a column.
 
-    A pair of pictures: two numbers a pixel, row by row. Moments: four, in the same order. Partials: three and a 0,
-    column by column. Rows and columns are as long as their strips: beyond the picture, pairs and partials are 0.
+    Pictures are planes. Moments: channels of rows of pixels, four numbers each. Partials: channels of columns of pixels,
+    three numbers and a 0. Rows and columns are as long as their strips; beyond the picture, pictures and partials are 0.
 
-    across, down: strips of a row, of a column;  stride: pixels of a row
+    across, down: strips of a row, of a column;  stride, depth: pixels of a row, of a column
     """
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height = width, height
         self.across, self.down = -(-width // COLUMNS), -(-height // ROWS)
-        self.stride = self.across * COLUMNS
+        self.stride, self.depth = self.across * COLUMNS, self.down * ROWS
 
-    def write_pair(self, x: Float, y: Float) -> Float:
-        """Planes [height * width] as a pair."""
-        pixel = dr.arange(ad.UInt32, self.width * self.height)
-        if self.stride == self.width:
-            return _write([[x, y]], pixel)
-        pair = dr.zeros(ad.Float, 2 * self.stride * self.height)
-        dr.scatter(pair, ad.Array2f(x, y), (pixel // self.width) * self.stride + pixel % self.width)
-        return pair
-
-    def read_pair(self, pair: Float, strip: UInt32, row: UInt32, halo: int) -> tuple[list[Float], list[Float]]:
-        """Both pictures' pixels of a strip and `halo` of its row to either side, 0 beyond the row's ends."""
-        beside, inner, packets = -(-halo // _PACKET), COLUMNS // _PACKET, self.stride // _PACKET
-        values: list[Float] = []
-        for place, inside in _neighbours(strip * inner, range(-beside, inner + beside), packets):
-            values += _read(pair, 2 * _PACKET, row * packets + place, inside)
-        spare = 2 * (beside * _PACKET - halo)
-        values = values[spare : len(values) - spare]
-        return values[::2], values[1::2]
-
-    def read_moments(self, plane: Float, column: UInt32, first: UInt32) -> list[list[Float]]:
-        """Of a column's ROWS pixels from `first` and 2 RADIUS to either side, 0 beyond the column's ends."""
-        places = _neighbours(first, range(-2 * RADIUS, ROWS + 2 * RADIUS), self.height)
-        return _transposed([_read(plane, 4, place * self.stride + column, inside) for place, inside in places])
-
-    def read_partials(self, plane: Float, strip: UInt32, row: UInt32) -> list[list[Float]]:
-        """Of a strip's pixels and RADIUS of its row to either side, 0 beyond the row's ends."""
-        places = _neighbours(strip * COLUMNS, range(-RADIUS, COLUMNS + RADIUS), self.width)
-        depth = self.down * ROWS
-        return _transposed([_read(plane, 4, place * depth + row, inside) for place, inside in places])[:3]
-
-    def tight(self, plane: Float) -> Float:
-        """A plane [height * stride] without what is beyond the picture."""
+    def padded(self, plane: Float) -> Float:
+        """A plane [height * width] as one [height * stride], 0 beyond the picture."""
         if self.stride == self.width:
             return plane
-        pixel = dr.arange(ad.UInt32, self.width * self.height)
+        pixel = dr.arange(ad.UInt32, self.height * self.stride)
+        row, column = pixel // self.stride, pixel % self.stride
+        return dr.gather(ad.Float, plane, row * self.width + column, column < self.width)
+
+    def tight(self, plane: Float) -> Float:
+        """A plane [height * stride] as one [height * width]."""
+        if self.stride == self.width:
+            return plane
+        pixel = dr.arange(ad.UInt32, self.height * self.width)
         return dr.gather(ad.Float, plane, (pixel // self.width) * self.stride + pixel % self.width)
+
+    def read_row(self, plane: Float, row: UInt32, strip: UInt32, halo: int) -> list[Float]:
+        """A strip's pixels and `halo` to either side, 0 beyond the row's ends."""
+        beside, values = -(-halo // COLUMNS), list[Float]()
+        for place, inside in _neighbours(strip, range(-beside, beside + 1), self.across):
+            values += _read(plane, COLUMNS, row * self.across + place, inside)
+        spare = beside * COLUMNS - halo
+        return values[spare : len(values) - spare]
+
+    def read_moments(self, moments: Float, channel: UInt32, first: UInt32, column: UInt32) -> list[list[Float]]:
+        """The four of a column's ROWS pixels from `first`, of 2 RADIUS to either side; 0 beyond the column's ends."""
+        places = _neighbours(first, range(-2 * RADIUS, ROWS + 2 * RADIUS), self.height)
+        start = channel * (self.height * self.stride) + column
+        return _transposed([_read(moments, 4, start + place * self.stride, inside) for place, inside in places])
+
+    def read_partials(self, partials: Float, channel: int, row: UInt32, strip: UInt32) -> list[list[Float]]:
+        """The three of a strip's pixels and of RADIUS to either side, 0 beyond the row's ends."""
+        places = _neighbours(strip * COLUMNS, range(-RADIUS, COLUMNS + RADIUS), self.width)
+        start = channel * (self.width * self.depth) + row
+        return _transposed([_read(partials, 4, start + place * self.depth, inside) for place, inside in places])[:3]
 
 
 def _neighbours(first: UInt32, offsets: range, extent: int) -> list[tuple[UInt32, Bool]]:
@@ -187,21 +187,18 @@ def _neighbours(first: UInt32, offsets: range, extent: int) -> list[tuple[UInt32
     return [(place, place < extent) for place in places]
 
 
-def _transposed(pixels: list[list[Float]]) -> list[list[Float]]:
-    return [list(values) for values in zip(*pixels, strict=True)]
-
-
-def _read(plane: Float, size: int, index: UInt32, active: Bool) -> list[Float]:
+def _read(array: Float, size: int, index: UInt32, active: Bool) -> list[Float]:
     """Packet `index` of `size` numbers, zeros where not `active`."""
-    return list(dr.gather(ad.ArrayXf, plane, index, active, shape=(size, dr.width(index))))
+    return list(dr.gather(ad.ArrayXf, array, index, active, shape=(size, dr.width(index))))
 
 
-def _write(packets: list[list[Float]], index: UInt32) -> Float:
-    """A new array of each thread's packets, one after another, at its index."""
-    values = [value for packet in packets for value in packet]
-    plane = dr.empty(ad.Float, len(values) * dr.width(index))
-    dr.scatter(plane, ad.ArrayXf(values), index)
-    return plane
+def _joined(packets: list[list[Float]]) -> ArrayXf:
+    """Packets, one after another, as one."""
+    return ad.ArrayXf([value for packet in packets for value in packet])
+
+
+def _transposed(lists: Sequence[Sequence[Float]]) -> list[list[Float]]:
+    return [list(values) for values in zip(*lists, strict=True)]
 
 
 def _folded(values: Float, count: int) -> Float:
