@@ -134,8 +134,9 @@ def _blur(values: Sequence[Float]) -> list[Float]:
 class _Strips:
     """Where pixels stand in memory. Threads hold COLUMNS pixels of a row or ROWS of a column.
 
-    Pictures are planes. Moments: channels of rows of pixels, four numbers each. Partials: channels of columns of pixels,
-    three numbers and a 0. Rows and columns are as long as their strips; beyond the picture, pictures and partials are 0.
+    Pictures are planes. Moments: channels of rows of pixels, four numbers each. Partials: channels of columns of
+    pixels, three numbers and a 0. Rows and columns are as long as their strips; beyond the picture, pictures and
+    partials are 0.
 
     across, down: strips of a row, of a column;  stride, depth: pixels of a row, of a column
     """
