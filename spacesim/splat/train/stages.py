@@ -113,6 +113,8 @@ def picture_loss(
         covered, below = config.radiance * ad.Array3f(truths["radiance"]), decode_srgb(below) / PEAK
     elif config.tone:
         below = inverse_tone_map(below, config.tone)
+    if config.tone:
+        dr.eval(below)  # three numbers, which each pixel would compute
     truth = covered + (1 - alpha) * below
     planes = {name: [ad.Float(plane) for plane in group] for name, group in planes.items()}
     transmittance = ad.Float(transmittance)
