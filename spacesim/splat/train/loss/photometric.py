@@ -13,12 +13,13 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float, UInt32
+from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 
 RADIUS = 5  #: 11 x 11 window
 SIGMA = 1.5  #: pixels
 COLUMNS = 8  #: pixels of a row that a thread computes
 ROWS = 16  #: pixels of a column that a thread computes
+PACKED = True  #: moments of a pixel stand side by side, else in planes
 _C1, _C2 = 0.01**2, 0.03**2
 _OFFSETS = np.arange(-RADIUS, RADIUS + 1)
 _WEIGHTS = np.exp(-0.5 * (_OFFSETS / SIGMA) ** 2)
@@ -54,10 +55,10 @@ class _Photometric(dr.CustomOp):
         strips, scale = self.strips, cast(Float, self.grad_out())
         l1, ssim = scale * self.l1, scale * self.ssim
         thread = dr.arange(ad.UInt32, strips.height * strips.across)
-        row, strip = thread % strips.height, thread // strips.height
+        row, strip = thread // strips.across, thread % strips.across
         gradients = []
         for channel, pair in enumerate(self.pairs):
-            partials = strips.read_partials(self.partials, channel, row, strip)
+            partials = [strips.read_row(plane, channel * strips.height + row, strip, RADIUS) for plane in self.partials]
             by_mean, by_square, by_product = (_blur(values) for values in partials)
             xs, ys = (strips.read_row(plane, row, strip, 0) for plane in pair)
             values = []
@@ -65,7 +66,7 @@ class _Photometric(dr.CustomOp):
                 by_ssim = by_mean[j] + 2 * x * by_square[j] + y * by_product[j]
                 values.append(l1 * dr.sign(x - y) - ssim * by_ssim)
             gradient = dr.empty(ad.Float, strips.height * strips.stride)
-            dr.scatter(gradient, ad.ArrayXf(values), row * strips.across + strip)
+            dr.scatter(gradient, ad.ArrayXf(values), thread)
             gradients.append(gradient)
         dr.eval(gradients)
         self.set_grad_in("prediction", ad.Array3f([strips.tight(plane) for plane in gradients]))
@@ -74,37 +75,47 @@ class _Photometric(dr.CustomOp):
         return "photometric"
 
 
-def _moments(strips: "_Strips", pairs: list[tuple[Float, Float]]) -> tuple[Float, Float]:
+def _moments(strips: "_Strips", pairs: list[tuple[Float, Float]]) -> tuple[list[Float], Float]:
     """Of each pair of planes x, y, x^2 + y^2 and x y, blurred along rows; and |x - y|, added up by each thread."""
     count = strips.height * strips.across
     thread = dr.arange(ad.UInt32, count)
     row, strip = thread // strips.across, thread % strips.across
-    moments, distances = dr.empty(ad.Float, 3 * 4 * strips.height * strips.stride), ad.Float(0)
+    size, numbers = 3 * strips.height * strips.stride, 4 if PACKED else 1
+    moments, distances = [dr.empty(ad.Float, numbers * size) for _ in range(4 // numbers)], ad.Float(0)
     for channel, pair in enumerate(pairs):
         xs, ys = (strips.read_row(plane, row, strip, RADIUS) for plane in pair)
         for j in range(RADIUS, RADIUS + COLUMNS):
             distances += dr.abs(xs[j] - ys[j])
         squares = [dr.fma(x, x, y * y) for x, y in zip(xs, ys, strict=True)]
         products = [x * y for x, y in zip(xs, ys, strict=True)]
-        packets = _transposed([_blur(values) for values in (xs, ys, squares, products)])
-        dr.scatter(moments, _joined(packets), channel * count + thread, mode=dr.ReduceMode.NoConflicts)
+        packets = [_blur(values) for values in (xs, ys, squares, products)]
+        if PACKED:
+            packets = [[value for values in _transposed(packets) for value in values]]
+        for array, packet in zip(moments, packets, strict=True):
+            dr.scatter(array, ad.ArrayXf(packet), channel * count + thread, mode=dr.ReduceMode.NoConflicts)
     return moments, distances
 
 
-def _partials(strips: "_Strips", moments: Float) -> tuple[Float, Float]:
-    """Of `_moments`, the derivatives of SSIM, blurred along columns; and 1 - SSIM, added up by each thread."""
-    thread = dr.arange(ad.UInt32, 3 * strips.down * strips.width)
-    column, strip = thread % strips.width, thread // strips.width
+def _partials(strips: "_Strips", moments: list[Float]) -> tuple[list[Float], Float]:
+    """Of `_moments`, the three derivatives of SSIM, blurred along columns; and 1 - SSIM, added up by each thread."""
+    thread = dr.arange(ad.UInt32, 3 * strips.down * strips.stride)
+    column, strip = thread % strips.stride, thread // strips.stride
     channel, first = strip // strips.down, (strip % strips.down) * ROWS
     blurred = [_blur(values) for values in strips.read_moments(moments, channel, first, column)]
-    inside = [inside for _, inside in _neighbours(first, range(-RADIUS, ROWS + RADIUS), strips.height)]
+    rows = _neighbours(first, range(-RADIUS, ROWS + RADIUS), strips.height)
+    inside = [active & (column < strips.width) for _, active in rows]
     pixels = [_similarity(means, active) for means, active in zip(_transposed(blurred), inside, strict=True)]
-    similarity = sum((value for value, *_ in pixels[RADIUS:-RADIUS]), ad.Float(0))
-    packets = [[*values, ad.Float(0)] for values in _transposed([_blur(values) for values in _transposed(pixels)[1:]])]
-    partials = dr.empty(ad.Float, 3 * 4 * strips.width * strips.depth)
-    place = (channel * strips.width + column) * strips.down + first // ROWS
-    dr.scatter(partials, _joined(packets), place)
-    return partials, ad.Float(dr.minimum(strips.height - first, ROWS)) - similarity
+    dissimilarity = ad.Float(0)
+    for (value, *_), active in list(zip(pixels, inside, strict=True))[RADIUS:-RADIUS]:
+        dissimilarity += dr.select(active, 1 - value, 0)
+    partials = []
+    for values in _transposed(pixels)[1:]:
+        plane = dr.empty(ad.Float, 3 * strips.height * strips.stride)
+        for value, (row, active) in zip(_blur(values), rows[RADIUS:-RADIUS], strict=True):
+            place = (channel * strips.height + row) * strips.stride + column
+            dr.scatter(plane, value, place, active, dr.ReduceMode.NoConflicts)
+        partials.append(plane)
+    return partials, dissimilarity
 
 
 def _similarity(means: Sequence[Float], inside: Bool) -> tuple[Float, Float, Float, Float]:
@@ -134,17 +145,16 @@ def _blur(values: Sequence[Float]) -> list[Float]:
 class _Strips:
     """Where pixels stand in memory. Threads hold COLUMNS pixels of a row or ROWS of a column.
 
-    Pictures are planes. Moments: channels of rows of pixels, four numbers each. Partials: channels of columns of
-    pixels, three numbers and a 0. Rows and columns are as long as their strips; beyond the picture, pictures and
-    partials are 0.
+    Pictures and partials are planes, of one channel and of three; moments stand by pixels, four each. Rows are as long
+    as their strips; beyond the picture, pictures and partials are 0.
 
-    across, down: strips of a row, of a column;  stride, depth: pixels of a row, of a column
+    across, down: strips of a row, of a column;  stride: pixels of a row
     """
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height = width, height
         self.across, self.down = -(-width // COLUMNS), -(-height // ROWS)
-        self.stride, self.depth = self.across * COLUMNS, self.down * ROWS
+        self.stride = self.across * COLUMNS
 
     def padded(self, plane: Float) -> Float:
         """A plane [height * width] as one [height * stride], 0 beyond the picture."""
@@ -169,17 +179,14 @@ class _Strips:
         spare = beside * COLUMNS - halo
         return values[spare : len(values) - spare]
 
-    def read_moments(self, moments: Float, channel: UInt32, first: UInt32, column: UInt32) -> list[list[Float]]:
+    def read_moments(self, moments: list[Float], channel: UInt32, first: UInt32, column: UInt32) -> list[list[Float]]:
         """The four of a column's ROWS pixels from `first`, of 2 RADIUS to either side; 0 beyond the column's ends."""
         places = _neighbours(first, range(-2 * RADIUS, ROWS + 2 * RADIUS), self.height)
         start = channel * (self.height * self.stride) + column
-        return _transposed([_read(moments, 4, start + place * self.stride, inside) for place, inside in places])
-
-    def read_partials(self, partials: Float, channel: int, row: UInt32, strip: UInt32) -> list[list[Float]]:
-        """The three of a strip's pixels and of RADIUS to either side, 0 beyond the row's ends."""
-        places = _neighbours(strip * COLUMNS, range(-RADIUS, COLUMNS + RADIUS), self.width)
-        start = channel * (self.width * self.depth) + row
-        return _transposed([_read(partials, 4, start + place * self.depth, inside) for place, inside in places])[:3]
+        pixels = [(start + place * self.stride, inside) for place, inside in places]
+        if PACKED:
+            return _transposed([_read(moments[0], 4, *pixel) for pixel in pixels])
+        return [[dr.gather(ad.Float, plane, *pixel) for pixel in pixels] for plane in moments]
 
 
 def _neighbours(first: UInt32, offsets: range, extent: int) -> list[tuple[UInt32, Bool]]:
@@ -191,11 +198,6 @@ def _neighbours(first: UInt32, offsets: range, extent: int) -> list[tuple[UInt32
 def _read(array: Float, size: int, index: UInt32, active: Bool) -> list[Float]:
     """Packet `index` of `size` numbers, zeros where not `active`."""
     return list(dr.gather(ad.ArrayXf, array, index, active, shape=(size, dr.width(index))))
-
-
-def _joined(packets: list[list[Float]]) -> ArrayXf:
-    """Packets, one after another, as one."""
-    return ad.ArrayXf([value for packet in packets for value in packet])
 
 
 def _transposed(lists: Sequence[Sequence[Float]]) -> list[list[Float]]:
