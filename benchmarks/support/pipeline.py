@@ -12,7 +12,7 @@ from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
-from spacesim.splat.train.loss.terms import photometric_loss
+from spacesim.splat.train.loss.photometric import photometric_loss
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.optimizer.update import Update, ViewGradients
 from spacesim.splat.train.stages import project_views

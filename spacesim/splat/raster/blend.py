@@ -27,7 +27,7 @@ from spacesim.splat.raster.records import (
     load,
     store,
 )
-from spacesim.splat.raster.tiles import TileLists, round_capacity, thread_pixels, tiled_index
+from spacesim.splat.raster.tiles import TileLists, round_capacity, thread_offsets, thread_pixels
 
 BUCKET = 8  #: pairs of a bucket, a power of two; 4 keep twice as much for 1 % of a step, 16 took longer on an H100
 BUCKET_TURN = 2  #: pairs a turn of the blending loop where buckets are kept: fewer turns have to ask for a new bucket
@@ -106,14 +106,18 @@ def blend_lists(
     transmittance = [dr.abs(value) for value in transmittance]
 
     threads = tiles * shape.threads
-    tiled = [store([sums[p][c] for p in range(pixels)], thread.place, threads) for c in range(channels)]
+    planes = [dr.empty(ad.Float, width * height) for _ in range(1 + channels)]
+    for p, (i, j) in enumerate(thread_offsets(shape)):
+        column, row = thread.column + i, thread.row + j
+        inside = (column < width) & (row < height)
+        for plane, value in zip(planes, [transmittance[p], *sums[p]], strict=True):
+            dr.scatter(plane, value, row * width + column, inside, dr.ReduceMode.NoConflicts)
     tiled_transmittance, tiled_last = store(transmittance, thread.place, threads), store(last, thread.place, threads)
     checkpoints, bucket_tile = (snapshots.states, snapshots.tile) if snapshots else ([], None)
-    dr.eval(tiled, tiled_transmittance, tiled_last, checkpoints, bucket_tile)
-    pixel = tiled_index(lists, width, height)
+    dr.eval(planes, tiled_transmittance, tiled_last, checkpoints, bucket_tile)
     return BlendResult(
-        features=[dr.gather(ad.Float, plane, pixel) for plane in tiled],
-        transmittance=dr.gather(ad.Float, tiled_transmittance, pixel),
+        features=planes[1:],
+        transmittance=planes[0],
         tile_transmittance=tiled_transmittance,
         last=tiled_last,
         tile_last=dr.block_reduce(dr.ReduceOp.Max, tiled_last, shape.threads * pixels),

@@ -58,9 +58,15 @@ def encode_srgb(linear: ArrayT) -> ArrayT:
 
 
 def encode_srgb_unclipped(linear: ArrayT) -> ArrayT:
-    """sRGB values of linear ones, 0 or more, beyond 1 by the same curve. Arrays of any shape."""
-    curve = 1.055 * _power(dr.maximum(linear, _LINEAR_END), 1 / 2.4) - 0.055
-    return dr.select(linear <= _LINEAR_END, 12.92 * linear, curve)
+    """sRGB values of linear ones, 0 or more, beyond 1 by the same curve. Arrays of any shape. The slope is computed of
+    the values, without another power."""
+    light = dr.detach(linear)
+    bright = dr.maximum(light, _LINEAR_END)
+    values = dr.select(light <= _LINEAR_END, 12.92 * light, 1.055 * _power(bright, 1 / 2.4) - 0.055)
+    if not dr.grad_enabled(linear):
+        return values
+    slope = dr.select(light <= _LINEAR_END, 12.92, (values + 0.055) / (2.4 * bright))
+    return cast(ArrayT, dr.replace_grad(values, slope * linear))
 
 
 def encode_srgb_slope(linear: ArrayT) -> ArrayT:

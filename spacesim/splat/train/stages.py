@@ -17,7 +17,8 @@ from spacesim.splat.raster.supersample import pixel_means
 from spacesim.splat.raster.surface import normals
 from spacesim.splat.raster.tone import decode_srgb, inverse_tone_map, mu_law, tone_map
 from spacesim.splat.train.downscale import covered_color, truth_of_squares, valid_squares
-from spacesim.splat.train.loss.terms import TruthPlanes, depth_loss, normal_loss, photometric_loss, visibility_loss
+from spacesim.splat.train.loss.photometric import photometric_loss
+from spacesim.splat.train.loss.terms import TruthPlanes, depth_loss, normal_loss, visibility_loss
 from spacesim.splat.train.warm_start import foreground_loss
 
 
@@ -112,6 +113,8 @@ def picture_loss(
         covered, below = config.radiance * ad.Array3f(truths["radiance"]), decode_srgb(below) / PEAK
     elif config.tone:
         below = inverse_tone_map(below, config.tone)
+    if config.tone:
+        dr.eval(below)  # three numbers, which each pixel would compute
     truth = covered + (1 - alpha) * below
     planes = {name: [ad.Float(plane) for plane in group] for name, group in planes.items()}
     transmittance = ad.Float(transmittance)

@@ -1,4 +1,4 @@
-"""What training minimises: L1 and structural dissimilarity (thesis 2.8), on planes of pixels."""
+"""What training minimises beside the `photometric_loss`, on planes of pixels and on Gaussians."""
 
 from typing import Any
 
@@ -6,22 +6,9 @@ import drjit as dr
 
 from spacesim.backend.arrays import Array3f, Bool, Float
 from spacesim.splat.raster.gaussians import Gaussians, opacities
-from spacesim.splat.train.loss.ssim import ssim
 
 ROUND = 1e-4  #: of a Gaussian's mean scale
 TruthPlanes = dict[str, list[Any]]  #: on the device: Floats [H * W] by name; of "foreground" a Bool and its weight
-
-
-def photometric_loss(prediction: Array3f, target: Array3f, width: int, height: int, ssim_weight: float = 0.2) -> Float:
-    """(1 - w) mean |p - t| + w (1 - SSIM(p, t)), thesis 2.8 with D-SSIM = 1 - SSIM as gsplat takes it.
-
-    prediction, target: Array3f [3, height * width];  returns a Float of width 1.
-    """
-    pixels = 3 * width * height
-    l1 = dr.sum(dr.sum(dr.abs(prediction - target))) / pixels
-    if ssim_weight == 0:
-        return l1
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(prediction, target, width, height))
 
 
 def visibility_loss(prediction: Float, truth: Float, valid: Bool) -> Float:

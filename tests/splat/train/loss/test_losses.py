@@ -6,10 +6,9 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from skimage.metrics import structural_similarity
 
-from spacesim.backend import ad
+from spacesim.backend import ad, recorded
 from spacesim.backend.upload import upload
-from spacesim.splat.train.loss.ssim import gaussian_blur, ssim
-from spacesim.splat.train.loss.terms import photometric_loss
+from spacesim.splat.train.loss.photometric import photometric_loss
 
 WIDTH, HEIGHT = 31, 23
 
@@ -20,6 +19,25 @@ def picture(seed: int) -> np.ndarray:
     for axis in (1, 2):
         noise = gaussian_filter1d(noise, 1.0, axis=axis, mode="wrap")
     return noise.astype(np.float32)
+
+
+def twin(x: np.ndarray, y: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
+    """The loss of pictures [3, H, W] and its gradient by x, from the formulas, in float64."""
+
+    def blur(values):
+        for axis in (1, 2):
+            values = gaussian_filter1d(values, 1.5, axis=axis, mode="constant", radius=5)
+        return values
+
+    x, y = x.astype(np.float64), y.astype(np.float64)
+    mx, my, xx, yy, xy = blur(x), blur(y), blur(x * x), blur(y * y), blur(x * y)
+    a1, a2 = 2 * mx * my + 1e-4, 2 * (xy - mx * my) + 9e-4
+    b1, b2 = mx * mx + my * my + 1e-4, xx - mx * mx + yy - my * my + 9e-4
+    value = a1 * a2 / (b1 * b2)
+    by_mean = 2 * my * (a2 - a1) / (b1 * b2) + 2 * mx * value * (1 / b2 - 1 / b1)
+    by_ssim = blur(by_mean) - 2 * x * blur(value / b2) + y * blur(2 * a1 / (b1 * b2))
+    loss = (1 - weight) * np.abs(x - y).mean() + weight * (1 - value.mean())
+    return loss, ((1 - weight) * np.where(x >= y, 1, -1) - weight * by_ssim) / x.size
 
 
 def planes(values: np.ndarray):
@@ -42,19 +60,14 @@ def reference_ssim(x: np.ndarray, y: np.ndarray) -> float:
     return float(maps[:, 8:-8, 8:-8].mean())
 
 
-def test_blur_is_a_gaussian_of_eleven_pixels_with_a_black_border():
-    values = picture(0)[0]
-    blurred = np.array(gaussian_blur(upload(values.ravel()), WIDTH, HEIGHT)).reshape(HEIGHT, WIDTH)
-    expected = values.astype(np.float64)
-    for axis in (0, 1):
-        expected = gaussian_filter1d(expected, 1.5, axis=axis, mode="constant", radius=5)
-    np.testing.assert_allclose(blurred, expected, atol=1e-6)
+def ssim(prediction, target):
+    return 1 - photometric_loss(prediction, target, WIDTH, HEIGHT, 1.0)
 
 
 def test_ssim_matches_scikit_image():
     x, y = picture(1), picture(2)
-    assert float(ssim(planes(x), planes(y), WIDTH, HEIGHT)[0]) == pytest.approx(reference_ssim(x, y), abs=2e-6)
-    assert float(ssim(planes(x), planes(x), WIDTH, HEIGHT)[0]) == pytest.approx(1, abs=1e-5)
+    assert float(ssim(planes(x), planes(y))[0]) == pytest.approx(reference_ssim(x, y), abs=2e-6)
+    assert float(ssim(planes(x), planes(x))[0]) == pytest.approx(1, abs=1e-5)
 
 
 def test_loss_is_the_weighted_sum_of_equation_2_8():
@@ -68,7 +81,7 @@ def test_gradient_of_ssim_matches_central_differences():
     x, y = picture(3), picture(4)
     prediction = planes(x)
     dr.enable_grad(prediction)
-    dr.backward(ssim(prediction, planes(y), WIDTH, HEIGHT))
+    dr.backward(ssim(prediction, planes(y)))
     gradient = np.array(dr.grad(prediction)).reshape(3, HEIGHT, WIDTH)
     rng, step = np.random.default_rng(0), 1e-3
     for _ in range(12):
@@ -80,3 +93,38 @@ def test_gradient_of_ssim_matches_central_differences():
             ends.append(reference_ssim(moved, y))
         slope = (ends[0] - ends[1]) / (2 * step)
         assert gradient[index] == pytest.approx(slope, rel=5e-3, abs=1e-3 * float(np.abs(gradient).max()))
+
+
+@pytest.mark.parametrize("weight", [0.2, 1.0])
+@pytest.mark.parametrize("size", [(1, 1), (3, 40), (33, 8), (50, 27)])
+def test_loss_and_gradient_equal_their_twin(size, weight):
+    """Of pictures smaller than the window, and of those that end within a thread's pixels."""
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(size=(2, 3, *size)).astype(np.float32)
+    y[:, size[0] // 2 + 1 :] = x[:, size[0] // 2 + 1 :]
+    prediction, (height, width) = planes(x), size
+    dr.enable_grad(prediction)
+    loss = photometric_loss(prediction, planes(y), width, height, weight)
+    dr.backward(loss)
+    expected, gradient = twin(x, y, weight)
+    assert float(dr.detach(loss)[0]) == pytest.approx(expected, rel=1e-5, abs=1e-7)
+    found = np.array(dr.grad(prediction)).reshape(3, *size)
+    np.testing.assert_allclose(found, gradient, atol=2e-5 * np.abs(gradient).max())
+
+
+def test_a_recorded_loss_repeats_to_the_bit():
+    @recorded
+    def loss_and_gradient(x, y):
+        prediction = ad.Array3f(x)
+        dr.enable_grad(prediction)
+        loss = photometric_loss(prediction, ad.Array3f(y), WIDTH, HEIGHT)
+        dr.backward(loss)
+        return [dr.detach(loss), *dr.grad(prediction)]
+
+    pairs = [[list(planes(picture(seed))) for seed in seeds] for seeds in ((6, 7), (8, 9), (6, 7))]
+    first, other, again = ([np.array(one) for one in loss_and_gradient(*pair)] for pair in pairs)
+    traced = [np.array(one) for one in loss_and_gradient.traced(*pairs[1])]
+    for one, two, three, four in zip(first, again, other, traced, strict=True):
+        np.testing.assert_array_equal(one, two)
+        np.testing.assert_array_equal(three, four)
+        assert not np.array_equal(one, three)
