@@ -78,7 +78,7 @@ def made(fields, state):
 
 def test_what_a_scene_of_fields_has(fields, state):
     assert (fields.progressive, fields.content, fields.gaussian_count) == (True, "2 radiance fields", 0)
-    assert fields.modes == tuple(mode for mode in MODES if mode != "ellipsoids")
+    assert fields.modes == tuple(mode for mode in MODES if mode not in ("albedo", "ellipsoids"))
     centre, radius = fields.bounds(state)
     assert fields.models[0].radius == pytest.approx(np.sqrt(0.75))
     assert radius > 1.5
@@ -95,7 +95,7 @@ def test_modes(fields, state, mode):
         alone = replace(state, poses=state.poses[:1])
         assert frame.picture.any()
         frame = draw_frame(single, alone, view_from(-5, 0), DisplaySettings(mode, side=256), 0.25)
-    if mode in ("visibility", "ellipsoids"):
+    if mode in ("visibility", "albedo", "ellipsoids"):
         assert frame.note.startswith(f"no {mode} to be seen: ")
         assert not frame.picture.any()
     elif mode != "object id":  # fog covers less than half
