@@ -27,6 +27,9 @@ def print_headline(metrics: JsonDict) -> None:
         pooled = metrics["shadow_mask"]["error_rate"]
         pooled_words = "" if pooled is None else f" ({pooled['pooled']:.4f} over the pixels of all frames)"
         interrupts.print_output(f"shadow masks: error rate {share}{pooled_words}, balanced {balanced}")
+    if (metrics.get("material") or {}).get("albedo_error"):
+        words = f"albedo error {show('material', 'albedo_error', 3)}, normals {show('material', 'normals_deg', 1)}"
+        interrupts.print_output(f"materials: {words} degrees")
     if metrics.get("known_suns") and metrics.get("unseen_suns"):
         known_psnr, unseen_psnr = (_mean(metrics[part], "image", "psnr", 2) for part in ("known_suns", "unseen_suns"))
         interrupts.print_output(f"PSNR: {known_psnr} dB under known Suns, {unseen_psnr} dB under Suns never seen")
