@@ -177,7 +177,7 @@ def _export_mesh(options: argparse.Namespace) -> None:
             colors = color_vertices(surface, cameras, depth, partial(run.predict, sun=sun), config.views, report)
         words = ", coloured"
     elif holds_colors and not isinstance(run, NerfRun) and run.has_material:
-        if not run.sunlit_white.is_known:
+        if run.albedo_is_relative:
             print(RELATIVE, file=sys.stderr)
         with show_progress("export", "pictures") as report:
             values = color_vertices(

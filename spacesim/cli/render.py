@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     camera, sun_of_frame = view_of(options, run)
     if options.kind in MATERIAL_KINDS:
         write_material(run.draw_material(camera), options.kind, options.out)
-        if not isinstance(run, NerfRun) and not run.sunlit_white.is_known:
+        if not isinstance(run, NerfRun) and run.albedo_is_relative:
             print(RELATIVE, file=sys.stderr)
         interrupts.print_output(options.out)
         return

@@ -15,7 +15,7 @@ from spacesim.data.images.tone import STANDARD_EXPOSURE, Curve, Tone, tone_and_e
 from spacesim.data.records import Camera, as_numbers
 from spacesim.learning.prediction import MaterialView, check_picture
 from spacesim.learning.reflectance import seen_side_normals, unit_normals
-from spacesim.splat.light.material import Material
+from spacesim.splat.light.material import FittedMaterial
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.output import RenderOutput, over_alpha, planes_image
@@ -52,7 +52,7 @@ class SunlitWhite:
 
 def draw_material(
     gaussians: Gaussians,
-    material: Material,
+    material: FittedMaterial,
     normals: np.ndarray,
     camera: Camera,
     antialiased: Bool | bool,

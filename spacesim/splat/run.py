@@ -27,7 +27,7 @@ from spacesim.learning.prediction import MaterialView, Prediction, check_picture
 from spacesim.learning.record import TrainingRecord
 from spacesim.learning.rendering import Rendering, checked_sun
 from spacesim.splat.light.config import MAX_EXPOSURE
-from spacesim.splat.light.material import Material, has_material, read_material
+from spacesim.splat.light.material import FittedMaterial, has_material, read_material
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.material import SunlitWhite, draw_material, no_material
 from spacesim.splat.raster.gaussians import Gaussians
@@ -266,8 +266,14 @@ class Run:
             rgb = adjust_exposure(rgb, curve.tone, stops_more, curve.white)
         return replace(_prediction(output, rgb, visibility, normals), linear=light)
 
+    @property
+    def albedo_is_relative(self) -> bool:
+        """Whether the data that says how bright the Sun was, and the exposure, is not there: 1 au and 0 EV are taken
+        for it."""
+        return not self._white.is_known
+
     @cached_property
-    def sunlit_white(self) -> SunlitWhite:
+    def _white(self) -> SunlitWhite:
         """What its reflectances are shares of."""
         return SunlitWhite.of(Path(self.config.get("data", {}).get("path", self.path)), self.curve)
 
@@ -277,13 +283,13 @@ class Run:
         return self.light is not None and has_material(self.light.config.field)
 
     @cached_property
-    def material(self) -> Material:
+    def material(self) -> FittedMaterial:
         """Of each Gaussian, what the field answers about its normal, fitted: no training has seen it. Raises InputError
         where there is no light, or a field that takes directions."""
         if self.light is None or not self.has_material:
             how = "which has no light" if self.light is None else "whose light takes directions"
             raise no_material(self.path, f"one of {self.config.get('method')}, {how}")
-        white = self.sunlit_white
+        white = self._white
         return read_material(self.gaussians, self.light, white.display, white.tone, self.embedding)
 
     @property

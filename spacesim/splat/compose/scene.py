@@ -23,7 +23,7 @@ from spacesim.learning.prediction import ComposedPrediction, MaterialView, check
 from spacesim.splat.compose.light import EnsembleLight, LightCache, SunOccluder
 from spacesim.splat.compose.members import Ensemble, Member, display_colors
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.light.material import Material
+from spacesim.splat.light.material import FittedMaterial
 from spacesim.splat.material import draw_material, no_material
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.output import RenderOutput, over_alpha, planes_image
@@ -185,7 +185,7 @@ class GaussianComposition:
         placed = self.placed
         if not placed:
             raise no_material(self.path or self.models[0].run.path, "no Gaussians")
-        material = Material.joined([model.run.material for model in placed])
+        material = FittedMaterial.joined([model.run.material for model in placed])
         normals = np.concatenate([model.run.learned_normals @ model.pose.rotation.T for model in placed])
         return draw_material(self.in_world(), material, normals, camera, self.antialiased, self.supersample)
 

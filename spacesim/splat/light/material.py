@@ -29,7 +29,7 @@ CHUNK = 1 << 14  #: Gaussians that are fitted at once
 
 
 @dataclass(frozen=True, eq=False)
-class Material:
+class FittedMaterial:
     """Of N Gaussians, float32; linear camera RGB."""
 
     diffuse: np.ndarray  #: [N, 3] reflectance of the Lambertian lobe
@@ -37,10 +37,10 @@ class Material:
     roughness: np.ndarray  #: [N] alpha of GGX, 1 where no facets are seen
 
     @staticmethod
-    def joined(materials: "Sequence[Material]") -> "Material":
+    def joined(materials: "Sequence[FittedMaterial]") -> "FittedMaterial":
         """Of one set of Gaussians after another."""
         rows = ((each.diffuse, each.specular, each.roughness) for each in materials)
-        return Material(*(np.concatenate(parts) for parts in zip(*rows, strict=True)))
+        return FittedMaterial(*(np.concatenate(parts) for parts in zip(*rows, strict=True)))
 
     @property
     def albedo(self) -> np.ndarray:
@@ -92,7 +92,7 @@ def has_material(field: FieldConfig) -> bool:
 
 def read_material(
     gaussians: Gaussians, light: LightModel, white: Array, tone: Tone, embedding: np.ndarray | None = None
-) -> Material:
+) -> FittedMaterial:
     """What the field of a model says of each Gaussian's surface; `has_material` of it.
 
     white: [3] linear display value of a white Lambertian surface that faces the Sun;  tone: the curve of colours that
@@ -117,10 +117,10 @@ def read_material(
         asked = colors[..., part].astype(np.float64)
         linear = asked * curve.white if curve else linear_from_display(asked, tone)
         fitted.append(fit_material(angles, linear * per_white, asked < SATURATED))
-    return Material.joined(fitted)
+    return FittedMaterial.joined(fitted)
 
 
-def fit_material(angles: SunAndView, reflected: Array, known: np.ndarray) -> Material:
+def fit_material(angles: SunAndView, reflected: Array, known: np.ndarray) -> FittedMaterial:
     """By least squares of what is `known`, [K, 3, N] bool, of light `reflected` [K, 3, N], of which a white Lambertian
     surface that faces the Sun reflects 1: for each roughness the best reflectances, none below 0, in closed form."""
     count = reflected.shape[2]
@@ -137,7 +137,7 @@ def fit_material(angles: SunAndView, reflected: Array, known: np.ndarray) -> Mat
         least = np.where(better, error, least)
         diffuse, specular = (np.where(better, new, old) for new, old in zip(lobes, (diffuse, specular), strict=True))
         roughness = np.where(better, 1.0 if tried is None else tried, roughness)
-    return Material(*(np.float32(values.T) for values in (diffuse, specular, roughness)))
+    return FittedMaterial(*(np.float32(values.T) for values in (diffuse, specular, roughness)))
 
 
 def _fit_lobes(light: Array, weights: Array, lambert: Array, facets: Array) -> tuple[Array, Array, Array]:

@@ -19,7 +19,7 @@ from spacesim.splat.light.field import FieldConfig, SurfaceConfig
 from spacesim.splat.light.material import (
     ROUGHNESSES,
     SATURATED,
-    Material,
+    FittedMaterial,
     SunAndView,
     _fit_lobes,
     fit_material,
@@ -165,16 +165,17 @@ def test_the_field_is_asked_about_its_normals(monkeypatch, linear):
 def test_materials_do_not_depend_on_where_normals_point(run):
     turned = run.gaussians.to_numpy()
     turned["features"][:, 4:7] = np.random.default_rng(8).normal(size=(30, 3))
-    other = read_material(Gaussians.from_numpy(turned), run.light, run.sunlit_white.display, "srgb")
+    other = read_material(Gaussians.from_numpy(turned), run.light, np.ones(3), "srgb")
     for name in ("diffuse", "specular", "roughness"):
         assert np.array_equal(getattr(run.material, name), getattr(other, name))
     assert np.ptp(other.albedo) > 0
+    assert run.albedo_is_relative
 
 
 def test_a_picture_of_one_material_shows_it_wherever_there_is_something(run):
     rows = {"diffuse": (0.1, 0.2, 0.3), "specular": (0.4, 0.3, 0.2)}
     constant = {name: np.tile(np.float32(row), (30, 1)) for name, row in rows.items()}
-    run.__dict__["material"] = Material(**constant, roughness=np.full(30, 0.25, np.float32))
+    run.__dict__["material"] = FittedMaterial(**constant, roughness=np.full(30, 0.25, np.float32))
     view = run.draw_material(CAMERA)
     seen = view.alpha > 0
     assert seen.any()
