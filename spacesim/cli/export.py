@@ -44,7 +44,10 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
         "--keypoints", metavar="N|FILE", help="for a dataset: how many are found (11), or which they are"
     )
     parser.add_argument(
-        "--sun", type=angles, metavar="AZ,EL", help="for a relightable run: whose colours Gaussians or --mesh have"
+        "--sun",
+        type=angles,
+        metavar="AZ,EL",
+        help="for a relightable run: whose colours Gaussians or --mesh have (--mesh: albedo)",
     )
     parser.add_argument(
         "--up", metavar="z|y|-y", help="the file's axis that the dataset's +z becomes (y in glTF and SPZ)"
