@@ -13,6 +13,7 @@ from test_session import Screen, Source, view_from
 from spacesim import backend
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
+from spacesim.data.errors import InputError
 from spacesim.data.records import Sun
 from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.config import GridConfig, NerfConfig, ProposalConfig
@@ -80,6 +81,8 @@ def test_what_a_scene_of_fields_has(fields, state):
     assert (fields.progressive, fields.content, fields.gaussian_count) == (True, "2 radiance fields", 0)
     assert fields.modes == tuple(mode for mode in MODES if mode not in ("albedo", "ellipsoids"))
     centre, radius = fields.bounds(state)
+    with pytest.raises(InputError, match="expected Gaussians alone, to read materials, found a radiance field"):
+        fields.composition.draw_material(view_from(-5, 0).camera(16, 16))
     assert fields.models[0].radius == pytest.approx(np.sqrt(0.75))
     assert radius > 1.5
     assert abs(centre[0]) < 1e-9

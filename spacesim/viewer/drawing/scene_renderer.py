@@ -77,7 +77,7 @@ class SceneRenderer:
         scene = self.composition.posed(state.poses)
         if self.progressive:
             seen = scene.predict(camera, state.sun, normals=NEEDED[mode] == "normal", on_chunk=on_chunk)
-            return Planes(seen.alpha, seen.rgb, seen.depth, seen.visibility, seen.normal, seen.id)
+            return Planes(seen.alpha, seen.rgb, seen.depth, seen.visibility, seen.normal, object_id=seen.id)
         if mode == "ellipsoids":
             gaussians, colors = scene.lit_gaussians(camera, state.sun)
             blended = draw_ellipsoids(gaussians, colors, Pinhole.of(camera))

@@ -1,6 +1,7 @@
 """Materials out of answers: known ones come back; the closed form against another solver; what the field is asked."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from spacesim.data.geometry import look_at
 from spacesim.data.images.tone import Curve
 from spacesim.data.records import Camera
 from spacesim.splat.compose import GaussianComposition, PlacedRun, Pose
+from spacesim.splat.compose.aligned import AlignedRun
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.field import FieldConfig, SurfaceConfig
@@ -210,6 +212,19 @@ def test_a_composed_scene_shows_what_each_of_its_models_is_made_of(run, tmp_path
     vanilla = Run(tmp_path / "plain", {"method": "vanilla"}, {}, Gaussians.from_numpy(random_splats(20)), 1000)
     with pytest.raises(InputError, match=r"plain: expected a run .*, found one of vanilla, which has no light"):
         GaussianComposition([PlacedRun(run), PlacedRun(vanilla, Pose(translation=[3, 0, 0]))]).draw_material(CAMERA)
+
+
+def test_a_moved_run_shows_the_same_materials_and_turns_their_normals(run):
+    quarter = Pose(
+        rotation=np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), translation=np.array([1.0, 2, 3]), scale=2.0
+    )
+    aligned = AlignedRun(run, quarter)
+    pose = np.eye(4)
+    pose[:3, :3] = quarter.rotation @ CAMERA.world_from_camera[:3, :3]
+    pose[:3, 3] = quarter.points(CAMERA.position[None])[0]
+    seen, alone = aligned.draw_material(replace(CAMERA, world_from_camera=pose)), run.draw_material(CAMERA)
+    np.testing.assert_allclose(seen.albedo, alone.albedo, atol=1e-3)
+    np.testing.assert_allclose(seen.normal, alone.normal @ quarter.rotation.T, atol=1e-3)
 
 
 def test_runs_without_materials_say_why(tmp_path):
