@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from unittest.mock import ANY, patch
@@ -32,6 +33,7 @@ from spacesim.splat.compose.aligned import moved_frame
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.train.config import PRESETS, preset
 from spacesim.splat.train.pictures import suns
+from spacesim.splat.train.train import train
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 RUNS: dict[str, list[list[str]]] = {}  #: of each script, the arguments that tests run it with
@@ -622,6 +624,21 @@ def test_the_page_tells_its_size_its_speed_and_how_near_it_is(command, tiny_run,
     assert len(report["suns"]) == 2
     assert report["means"]["page against render, dB"] > 30
     assert report["worst_loss"] < 1.5
+
+
+@smallest("materials.py RUN --backend llvm --json")
+def test_materials_are_compared_part_by_part(command, tiny_data, place):
+    train(read_dataset(tiny_data), place / "RUN", replace(preset("demo", "relight"), iterations=20, init_count=200))
+    report = json.loads(call(command, ended))
+    rows = {row["part"]: row for row in report["parts"]}
+    bus, radiator = rows["bus"], rows["radiator"]
+    assert (bus["material"], bus["true roughness"]) == ("gold-mli", 0.12)
+    assert bus["true gloss"] == pytest.approx(0.48, abs=0.02)  # the luminance of its albedo
+    assert (radiator["true gloss"], radiator["true roughness"]) == (0.04, 0.4)
+    assert min(row["pixels"] for row in report["parts"]) >= 20
+    assert all(0 <= row["gloss"] <= row["albedo"] + 2e-3 for row in report["parts"])
+    assert all(value is None or -1 <= value <= 1 for value in report["rank"].values())
+    assert report["rank"]["albedo"] is not None
 
 
 @smallest(

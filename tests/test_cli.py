@@ -12,13 +12,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from tiny import GENERATE, PROGRAM, TRAIN, contents
 
 from spacesim.cli.parser import view_of
+from spacesim.cli.printing import RELATIVE
 from spacesim.cli.program import COMMANDS as ALL_COMMANDS
 from spacesim.cli.program import in_flags, parser
 from spacesim.data.errors import InputError
-from spacesim.data.images import read_exr, read_png
+from spacesim.data.images import read_exr, read_png, srgb_from_linear
 from spacesim.data.importers.kinds import KINDS
 from spacesim.data.mesh import read_mesh
 from spacesim.data.store import find_unreadable_files, read_dataset
@@ -419,6 +421,41 @@ def test_a_frame_is_seen_under_the_sun_that_was_estimated(tiny_data, tmp_path):
         view_of(options, run)
 
 
+def test_materials_of_a_run(spacesim, tiny_data, tmp_path):
+    """As pictures, on the vertices of a mesh, and without the data that says how bright the Sun was."""
+    shutil.copytree(tiny_data, tmp_path / "data")
+    short = ("--iterations", 40, "--set", "init_count=300", "--preset", "demo", "--method", "relight")
+    assert spacesim("train", tmp_path / "data", "--out", tmp_path / "run", *short).code == 0
+    view = load_run(tmp_path / "run").draw_material(read_dataset(tmp_path / "data").frames[3].camera)
+    for kind, shape in (("albedo", (40, 40, 3)), ("roughness", (40, 40))):
+        for suffix in ("png", "exr"):
+            out = tmp_path / f"{kind}.{suffix}"
+            done = spacesim("render", tmp_path / "run", "--frame", 3, "--kind", kind, "--out", out)
+            assert (done.code, done.output, done.errors) == (0, f"{out}\n", [])
+        layer = read_exr(tmp_path / f"{kind}.exr")[kind]
+        assert layer.shape == shape
+        assert np.array_equal(layer, getattr(view, kind))
+    picture = read_png(tmp_path / "albedo.png")
+    assert np.array_equal(picture[..., :3], np.rint(255 * srgb_from_linear(view.albedo)))
+    assert np.array_equal(picture[..., 3], np.rint(255 * np.clip(view.alpha, 0, 1)))
+
+    few = "--views", 3, "--voxel", 0.1
+    done = spacesim("export", tmp_path / "run", "--mesh", tmp_path / "a.glb", *few)
+    assert (done.code, done.output.endswith(" m, with albedo\n")) == (0, True), done
+    (mesh,) = trimesh.load(tmp_path / "a.glb", process=False).geometry.values()
+    assert mesh.visual.vertex_attributes["color"].shape == (len(mesh.vertices), 4)
+    shutil.move(tmp_path / "data", tmp_path / "elsewhere")
+    done = spacesim("export", tmp_path / "run", "--mesh", tmp_path / "b.glb", *few, "--data", tmp_path / "elsewhere")
+    assert done.errors == [RELATIVE]
+    done = spacesim("export", tmp_path / "run", "--mesh", tmp_path / "c.stl", *few, "--data", tmp_path / "elsewhere")
+    assert (done.code, done.output.endswith(" m\n"), done.errors) == (0, True, [])
+
+
+def test_a_radiance_field_has_no_materials(spacesim, tiny_field, tmp_path):
+    done = spacesim("render", tiny_field, "--frame", 3, "--kind", "roughness", "--out", tmp_path / "a.png")
+    assert done.is_refusal(tiny_field, "to read materials, found a radiance field")
+
+
 def test_render_where_the_data_has_moved(spacesim, tiny_data, tmp_path):
     shutil.copytree(tiny_data, tmp_path / "data")
     short = ("--iterations", 5, "--set", "init_count=50", "--preset", "demo")
@@ -665,6 +702,7 @@ def test_a_setting_that_cannot_be_is_named(spacesim, tiny_data, tmp_path, words,
         ("render RUN --out OUT.png --camera DATA/scene.json", ["scene.json", "w and h"]),
         ("render RUN --out OUT.png --kind shade", ["--kind", "shade"]),
         ("render RUN --out OUT.png --kind shadow", ["--kind: expected another than shadow"]),
+        ("render RUN --out OUT.png --kind albedo", ["RUN", "to read materials, found one of vanilla"]),
         ("sweep RUN --out OUT", ["RUN", "vanilla"]),
         ("render RUN --out OUT.png --sun 5", ["--sun", "5"]),
         ("render RUN --out OUT.jpg", ["OUT.jpg", ".png"]),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from spacesim import backend, interrupts
 from spacesim.cli.parser import Parser, angles
-from spacesim.cli.printing import KNOWS_ONE_LIGHT, WANTS_FILTER
+from spacesim.cli.printing import KNOWS_ONE_LIGHT, RELATIVE, WANTS_FILTER
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.integrity.manifest import check_unlisted
 
@@ -44,7 +44,10 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
         "--keypoints", metavar="N|FILE", help="for a dataset: how many are found (11), or which they are"
     )
     parser.add_argument(
-        "--sun", type=angles, metavar="AZ,EL", help="for a relightable run: whose colours Gaussians or --mesh have"
+        "--sun",
+        type=angles,
+        metavar="AZ,EL",
+        help="for a relightable run: whose colours Gaussians or --mesh have (--mesh: albedo)",
     )
     parser.add_argument(
         "--up", metavar="z|y|-y", help="the file's axis that the dataset's +z becomes (y in glTF and SPZ)"
@@ -139,7 +142,7 @@ def _export_mesh(options: argparse.Namespace) -> None:
     from spacesim.methods import load_run
     from spacesim.nerf.run import NerfRun
     from spacesim.progress import show_progress
-    from spacesim.splat.export.colors import color_vertices
+    from spacesim.splat.export.colors import color_of_material, color_vertices
     from spacesim.splat.export.frame import FileFrame
     from spacesim.splat.export.mesh import MeshConfig, cameras_around, depth_of, mesh_of_depths
 
@@ -168,14 +171,29 @@ def _export_mesh(options: argparse.Namespace) -> None:
     if len(surface.faces) == 0:
         raise WorkError(f"{options.path}: no view of the run shows an opaque surface, so there is no mesh to write")
     sun = Sun.from_angles(*options.sun) if options.sun else None
-    colors = None
+    colors, roughness = None, None
     if sun is not None and not run.relightable:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
+    words = "; colours need --sun" if holds_colors else ""
     if holds_colors and (sun is not None or not run.relightable):
         with show_progress("export", "pictures") as report:
             colors = color_vertices(surface, cameras, depth, partial(run.predict, sun=sun), config.views, report)
-    write_mesh(options.mesh, frame.sized(surface.vertices), surface.faces, colors, options.up)
-    words = ", coloured" if colors is not None else "; colours need --sun" if holds_colors else ""
+        words = ", coloured"
+    elif holds_colors and not isinstance(run, NerfRun) and run.has_material:
+        if run.albedo_is_relative:
+            print(RELATIVE, file=sys.stderr)
+        with show_progress("export", "pictures") as report:
+            values = color_vertices(
+                surface,
+                cameras,
+                depth,
+                lambda camera: color_of_material(run.draw_material(camera)),
+                config.views,
+                report,
+                channels=4,
+            )
+        colors, roughness, words = values[:, :3], values[:, 3], ", with albedo"
+    write_mesh(options.mesh, frame.sized(surface.vertices), surface.faces, colors, options.up, roughness)
     interrupts.print_output(
         f"{options.mesh}: {len(surface.faces)} faces from {surface.views} views, voxels of {surface.voxel:.4g} m{words}"
     )

@@ -8,6 +8,8 @@ from spacesim.data.files import JsonDict
 KNOWS_ONE_LIGHT = "the run knows the light that it was trained under only; --sun changes nothing"
 WANTS_FILTER = "the run is antialiased: viewers without Mip-Splatting's 2D filter draw thin splats wider"
 
+RELATIVE = "the data that says how bright the Sun was is not there: albedo is relative, to a Sun at 1 au and 0 EV"
+
 
 def print_headline(metrics: JsonDict) -> None:
     """PSNR, SSIM and shadow errors in a line each."""
@@ -25,6 +27,9 @@ def print_headline(metrics: JsonDict) -> None:
         pooled = metrics["shadow_mask"]["error_rate"]
         pooled_words = "" if pooled is None else f" ({pooled['pooled']:.4f} over the pixels of all frames)"
         interrupts.print_output(f"shadow masks: error rate {share}{pooled_words}, balanced {balanced}")
+    if (metrics.get("material") or {}).get("albedo_error"):
+        words = f"albedo error {show('material', 'albedo_error', 3)}, normals {show('material', 'normals_deg', 1)}"
+        interrupts.print_output(f"materials: {words} degrees")
     if metrics.get("known_suns") and metrics.get("unseen_suns"):
         known_psnr, unseen_psnr = (_mean(metrics[part], "image", "psnr", 2) for part in ("known_suns", "unseen_suns"))
         interrupts.print_output(f"PSNR: {known_psnr} dB under known Suns, {unseen_psnr} dB under Suns never seen")

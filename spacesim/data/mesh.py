@@ -194,12 +194,18 @@ def mesh_suffix(path: Path) -> str:
 
 
 def write_mesh(
-    path: Path, vertices: Array, faces: np.ndarray, colors: np.ndarray | None = None, up: str | None = None
+    path: Path,
+    vertices: Array,
+    faces: np.ndarray,
+    colors: np.ndarray | None = None,
+    up: str | None = None,
+    roughness: np.ndarray | None = None,
 ) -> None:
     """Write vertices [V, 3] metres and faces [F, 3] as PLY, OBJ, STL or glTF (.glb), by the file's name.
 
     colors: [V, 3] sRGB values of the vertices, which STL cannot hold; light is in them, so glTF says that they are to
     be shown unlit;  up: which axis of the file +z becomes, one of UPRIGHT; by default "y" in glTF, else "z"
+    roughness: [V] alphas of GGX of a surface whose colours are albedo, to be lit: glTF has them
     Raises InputError for another name, for colours in STL and where it cannot be written.
     """
     import trimesh
@@ -209,7 +215,7 @@ def write_mesh(
         raise InputError(f"{path}: expected a .glb, .obj or .ply, which hold colours, found STL")
     vertices = vertices @ np.array(UPRIGHT[up or ("y" if suffix == ".glb" else "z")]).T
     if suffix == ".glb":
-        _write_glb_mesh(path, vertices, faces, colors)
+        _write_glb_mesh(path, vertices, faces, colors, roughness)
         return
     bytes_of = None if colors is None else np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)
     mesh = trimesh.Trimesh(vertices, faces, vertex_colors=bytes_of, process=False)
@@ -217,14 +223,23 @@ def write_mesh(
     write_bytes(path, content.encode() if isinstance(content, str) else content)
 
 
-def _write_glb_mesh(path: Path, vertices: Array, faces: np.ndarray, colors: np.ndarray | None) -> None:
+def _write_glb_mesh(
+    path: Path, vertices: Array, faces: np.ndarray, colors: np.ndarray | None, roughness: np.ndarray | None
+) -> None:
+    """glTF has no roughness a vertex: `_ROUGHNESS` is an attribute of ours, of which its material has the median. Both
+    are square roots of alpha, as glTF (3.9.2, appendix B.3) means them."""
     attributes = {"POSITION": vertices.astype(np.float32)}
-    material: dict[str, JsonValue] = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0}}
+    surface: dict[str, JsonValue] = {"metallicFactor": 0}
+    material: dict[str, JsonValue] = {"doubleSided": True, "pbrMetallicRoughness": surface}
     document: dict[str, JsonValue] = {"materials": [material]}
     if colors is not None:
         opaque = np.ones((len(colors), 1))
         linear = linear_from_srgb(np.clip(colors, 0, 1))
         attributes["COLOR_0"] = np.concatenate([linear, opaque], axis=1).astype(np.float32)
+    if roughness is not None:
+        attributes["_ROUGHNESS"] = np.sqrt(roughness).astype(np.float32)
+        surface["roughnessFactor"] = round(float(np.median(attributes["_ROUGHNESS"])), 4)
+    elif colors is not None:
         material["extensions"] = {"KHR_materials_unlit": {}}
         document["extensionsUsed"] = ["KHR_materials_unlit"]
     write_glb(path, attributes, TRIANGLES, faces.ravel().astype(np.uint32), {"material": 0}, document)

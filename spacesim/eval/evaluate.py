@@ -37,7 +37,8 @@ from spacesim.eval.frame_metrics import (
     write_pictures,
 )
 from spacesim.eval.labels import GROUPS, SHADOW
-from spacesim.eval.metrics import grazing, lpips, shadow
+from spacesim.eval.material import compare_materials
+from spacesim.eval.metrics import grazing, lpips, material, shadow
 from spacesim.eval.metrics.geometry import GeometryConfig, ShapeResult, compare_geometry
 from spacesim.eval.notes import (
     MODELS_OF_A_SCENE,
@@ -134,6 +135,10 @@ def evaluate(
             progress(len(results), len(frames), frame.file_path)
         folder = out / "frames" / name
         results.append(_evaluate_frame(run, dataset, frame, has_known_sun, network, folder, objects, unknowns))
+    folders = [out / "frames" / result.record["name"] for result in results]
+    materials = compare_materials(run, dataset, frames, folders)
+    for result, values in zip(results, materials.records, strict=True):
+        result.record["material"] = values
     no_map = _write_camera_density(dataset, trained, out)
     sweep, no_sweep = write_sweep(run, dataset, frames, trained, out)
     if progress:
@@ -160,6 +165,8 @@ def evaluate(
         "fitted": [{"name": unknown.name, "how": unknown.how} for unknown in unknowns] or None,
         "alignment": alignment.to_json() if alignment else None,
         **_summaries(results),
+        "material": summary(materials.records),
+        "albedo_scale": materials.scale,
         "geometry": shape.values,
         "objects": _by_object(results, objects, shapes),
         "known_suns": _sun_group([result for result in results if result.has_known_sun is True]),
@@ -170,6 +177,7 @@ def evaluate(
             *other_data,
             *explain_fit(unknowns, records, region == "frame"),
             *([shape.note] if shape.note else []),
+            *materials.notes,
             *([no_map] if no_map else []),
             *explain_ignored(ignored),
             *explain_sensor(dataset.scene),
@@ -323,7 +331,7 @@ def summary(records: Iterable[Mapping[str, float | None] | None]) -> JsonDict | 
         if pairs:
             values, pixels = np.array(pairs, float).T
             result[metric] = {"mean": float(values.mean()), "std": float(values.std()), "count": len(values)}
-            if metric in shadow.OVER_PIXELS and "pixels" in present[0]:
+            if metric in (*shadow.OVER_PIXELS, *material.OVER_PIXELS) and "pixels" in present[0]:
                 result[metric]["pooled"] = float(np.average(values, weights=pixels))
     return result
 

@@ -100,6 +100,18 @@ SHADOW_MASK = (
     ),
 )  # fmt: skip
 
+MATERIAL = (
+    Metric(
+        "albedo_error", "Albedo error", "", LOWER, 4,
+        f"Mean error of the linear albedo, times one scale for the run, by the mean true albedo{POOLED}.",
+    ),
+    Metric(
+        "normals_deg", "Normals", "°", LOWER, 1,
+        "Mean angle between the Gaussians' shortest axes, as blended, and the true normals; 90° where nothing is.",
+    ),
+    Metric("learned_normals_deg", "Learned normals", "°", LOWER, 1, "The same of the normals that light is taught by."),
+)  # fmt: skip
+
 RECALL = Metric("recall", "Recall", "", HIGHER, 4, "Share of the pixels of that kind of shadow that is predicted dark.")
 
 SHADOW_KIND = (RECALL, *SHADOW_MASK)

@@ -134,6 +134,7 @@ class FrameRecord:
     shadow_full: Values | None  #: those of shadow by luminance over the whole frame
     shadow_mask: Values | None  #: those of predicted visibility
     known_sun: bool | None = None  #: whether training has seen its Sun; None where that is not known
+    material: Values | None = None  #: errors of albedo and normals; None without truth
     depth_range: tuple[float, float] | None = None  #: metres: the ends of its pictures of depth, None: it has none
     ssim: float | None = None  #: at most 1
     lpips: float | None = None  #: None without the network's weights
@@ -271,6 +272,8 @@ class Metrics(Groups):
     known_suns: SunGroups | None = None  #: over frames whose Sun training has seen
     unseen_suns: SunGroups | None = None  #: over the others
     by_grazing_angle: tuple[GrazingBin, ...] | None = None  #: errors by the Sun's height over the surface
+    material: Group | None = None  #: errors of albedo and normals, over the object's pixels; None without truth
+    albedo_scale: float | None = None  #: by which the run's albedo is multiplied; None where it has none
     relight: RelightSweep | None = None  #: None where there are no two Suns, or they change nothing
     image_region: str = "silhouette"  #: what `image` is over: "silhouette", or "frame" where none is known
     fitted: tuple[FittedNumbers, ...] | None = None  #: None where nothing was

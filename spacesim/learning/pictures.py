@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.images import write_exr, write_png
+from spacesim.data.images import srgb_from_linear, write_exr, write_png
 from spacesim.data.images.tone import as_bytes
-from spacesim.learning.prediction import Prediction
+from spacesim.learning.prediction import MaterialView, Prediction
 
 LIT, SHADOWED = (222, 222, 216), (58, 64, 82)  #: sRGB colours of visibility 1 and 0
 
@@ -27,7 +27,7 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
         layers = {kind: plane} if shown is None else {"linear": shown}
         write_exr(path, {name: layer.astype(np.float32) for name, layer in layers.items()})
     elif path.suffix != ".png":
-        raise InputError(f"{path}: expected a file name that ends in .png or .exr")
+        raise _neither_png_nor_exr(path)
     elif kind == "rgb":
         alpha = np.clip(prediction.alpha, 0, 1)[..., None]
         straight = np.where(alpha > 0, plane / np.maximum(alpha, 1e-6), 0)
@@ -41,6 +41,25 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
         write_png(path, as_bytes(np.where(surface, 0.5 + 0.5 * plane, 0)))
     else:
         write_png(path, as_bytes(plane))
+
+
+def write_material(view: MaterialView, kind: str, path: Path) -> None:
+    """kind: "albedo" (PNG: as sRGB values, straight alpha; EXR: linear) or "roughness". Raises InputError for another
+    suffix than .png or .exr."""
+    plane = np.asarray(getattr(view, kind))
+    if path.suffix == ".exr":
+        write_exr(path, {kind: plane.astype(np.float32)})
+    elif path.suffix != ".png":
+        raise _neither_png_nor_exr(path)
+    elif kind == "albedo":
+        alpha = np.clip(view.alpha, 0, 1)[..., None]
+        write_png(path, as_bytes(np.concatenate([srgb_from_linear(plane), alpha], axis=-1)))
+    else:
+        write_png(path, as_bytes(plane))
+
+
+def _neither_png_nor_exr(path: Path) -> InputError:
+    return InputError(f"{path}: expected a file name that ends in .png or .exr")
 
 
 def shadow_colors(prediction: Prediction) -> np.ndarray:

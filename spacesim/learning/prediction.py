@@ -14,6 +14,7 @@ more until it is written."""
 
 
 KINDS = ("rgb", "alpha", "depth", "normal", "shadow")  #: of pictures of a prediction
+MATERIAL_KINDS = ("albedo", "roughness")  #: of pictures of a `MaterialView`, which no Sun changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,19 @@ class ComposedPrediction(Prediction):
     #: [H, W] int32, number of the object with the largest share of the pixel, counted from 1 in the order of the
     #: models; 0 where less than half of the pixel is covered
     id: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialView:
+    """What a camera sees of the materials that were read out of a model, float32, straight: not weighted by alpha."""
+
+    albedo: np.ndarray  #: [H, W, 3] linear reflectance, diffuse and specular; 0 where alpha is 0, as all here
+    roughness: np.ndarray  #: [H, W] alpha of GGX, 1 where no gloss is seen
+    normal: np.ndarray  #: [H, W, 3] unit vectors in world axes, of the learned normals
+    alpha: np.ndarray  #: [H, W]
+
+    def __repr__(self) -> str:
+        return planes_repr(self, self.alpha.shape[1], self.alpha.shape[0])
 
 
 def check_picture(camera: Camera) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.data.files import as_path
 from spacesim.data.records import Camera, Sun, check_camera
-from spacesim.learning.pictures import write_picture
-from spacesim.learning.prediction import KINDS, Prediction
+from spacesim.learning.pictures import write_material, write_picture
+from spacesim.learning.prediction import KINDS, MATERIAL_KINDS, MaterialView, Prediction
 
 
 class CanPredict(Protocol):
@@ -22,6 +22,9 @@ class CanPredict(Protocol):
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> Prediction:
         """Render one view; see `spacesim.splat.run.Predictor`."""
+
+    def draw_material(self, camera: Camera) -> MaterialView:
+        """Materials in one view; see `spacesim.splat.run.Predictor`."""
 
 
 def checked_sun(sun: Sun | Sequence[float] | None, needed: bool, whose: str) -> Sun | None:
@@ -77,15 +80,32 @@ class Rendering:
         assert drawn.normal is not None
         return drawn.normal
 
+    @property
+    def albedo(self) -> np.ndarray:
+        """[H, W, 3] float32: linear reflectance, diffuse and specular, of a run that `Run.draw_material` takes."""
+        return self._material.albedo
+
+    @property
+    def roughness(self) -> np.ndarray:
+        """[H, W] float32: alpha of GGX, 1 where no gloss is seen, of a run that `Run.draw_material` takes."""
+        return self._material.roughness
+
+    @cached_property
+    def _material(self) -> MaterialView:
+        return self.run.draw_material(self.camera)
+
     def save(self, path: str | Path, kind: str = "rgb") -> Path:
         """Write a PNG to look at or an EXR to compute with; returns its path.
 
-        kind: "rgb", "alpha", "depth", "normal" or "shadow". Raises InputError for another, for another suffix, and for
-        shadows of a method without.
+        kind: "rgb", "alpha", "depth", "normal", "shadow", "albedo" or "roughness". Raises InputError for another, for
+        another suffix, and for what a method is without.
         """
         path = as_path(path, "path")
-        if kind not in KINDS:
-            raise InputError(f"kind: expected one of {', '.join(KINDS)}, found {kind!r}")
+        if kind not in (*KINDS, *MATERIAL_KINDS):
+            raise InputError(f"kind: expected one of {', '.join((*KINDS, *MATERIAL_KINDS))}, found {kind!r}")
+        if kind in MATERIAL_KINDS:
+            write_material(self._material, kind, path)
+            return path
         drawn = replace(self._drawn, normal=self.normal) if kind == "normal" else self._drawn
         write_picture(drawn, kind, path)
         return path

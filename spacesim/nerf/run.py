@@ -22,7 +22,7 @@ from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import read_record
 from spacesim.learning.folder import finished_model, read_described
-from spacesim.learning.prediction import Prediction, check_picture
+from spacesim.learning.prediction import MaterialView, Prediction, check_picture
 from spacesim.learning.record import TrainingRecord
 from spacesim.learning.rendering import Rendering, checked_sun
 from spacesim.learning.tensors import read_tensors
@@ -108,6 +108,10 @@ class NerfRun:
         self._check(sun, exposure)
         drawn = self._draw(camera, sun, normals)
         return Prediction(drawn["rgb"], drawn["alpha"], drawn["depth"], drawn.get("visibility"), drawn.get("normal"))
+
+    def draw_material(self, camera: Camera) -> MaterialView:
+        """Raises InputError: a field of colours has none."""
+        raise InputError(f"{self.path}: expected a run of Gaussians, to read materials, found a radiance field")
 
     def surface_depth(self, camera: Camera) -> np.ndarray:
         """[H, W] float32: depth in metres along the optical axis at which half of the light is gone, 0 where it is

@@ -12,7 +12,7 @@ import numpy as np
 from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.records import Camera, Sun
-from spacesim.learning.prediction import ComposedPrediction, check_picture
+from spacesim.learning.prediction import ComposedPrediction, MaterialView, check_picture
 
 COVERED = 0.5  #: alpha from which on a pixel shows a model
 
@@ -90,6 +90,10 @@ class FieldScene(ABC):
             visibility = np.divide(visibility, alpha, out=np.zeros_like(alpha), where=alpha > 0)
         number = np.where(alpha >= COVERED, drawn.shares.argmax(axis=-1) + 1, 0).astype(np.int32)
         return ComposedPrediction(drawn.rgb, alpha, drawn.depth, visibility, drawn.normal, number)
+
+    def draw_material(self, camera: Camera) -> MaterialView:
+        """Raises InputError: a field of colours has none."""
+        raise InputError(f"{self.path or 'scene'}: expected Gaussians alone, to read materials, found a radiance field")
 
     def surface_depth(self, camera: Camera) -> np.ndarray:
         """[H, W] float32: depth in metres along the optical axis at which half of the light is gone, 0 where it is

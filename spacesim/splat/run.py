@@ -9,7 +9,7 @@ RUN/cameras.json       poses and gains of the training pictures, where they were
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Protocol
 
@@ -23,11 +23,13 @@ from spacesim.data.images.tone import Curve
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import checked, read_record
 from spacesim.learning.folder import finished_model, read_described
-from spacesim.learning.prediction import Prediction, check_picture
+from spacesim.learning.prediction import MaterialView, Prediction, check_picture
 from spacesim.learning.record import TrainingRecord
 from spacesim.learning.rendering import Rendering, checked_sun
 from spacesim.splat.light.config import MAX_EXPOSURE
+from spacesim.splat.light.material import FittedMaterial, has_material, read_material
 from spacesim.splat.light.model import LightModel
+from spacesim.splat.material import SunlitWhite, draw_material, no_material
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.output import RenderOutput, over_alpha, planes_image
 from spacesim.splat.raster.project import Projection
@@ -121,6 +123,9 @@ class Predictor(Protocol):
         """Render one view. normals: predict these, too;  exposure: EV, of colours that are linear; by default that of
         the training pictures. Raises InputError where the Sun matters and none is given, and for an exposure of colours
         that are sRGB values."""
+
+    def draw_material(self, camera: Camera) -> MaterialView:
+        """What one view shows of the materials that can be read out of a model. Raises InputError where none can."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,6 +265,44 @@ class Run:
             light = display_light(rgb, curve, stops_more)
             rgb = adjust_exposure(rgb, curve.tone, stops_more, curve.white)
         return replace(_prediction(output, rgb, visibility, normals), linear=light)
+
+    @property
+    def albedo_is_relative(self) -> bool:
+        """Whether the data that says how bright the Sun was, and the exposure, is not there: 1 au and 0 EV are taken
+        for it."""
+        return not self._white.is_known
+
+    @cached_property
+    def _white(self) -> SunlitWhite:
+        """What its reflectances are shares of."""
+        return SunlitWhite.of(Path(self.config.get("data", {}).get("path", self.path)), self.curve)
+
+    @property
+    def has_material(self) -> bool:
+        """Whether there is a `material` to read."""
+        return self.light is not None and has_material(self.light.config.field)
+
+    @cached_property
+    def material(self) -> FittedMaterial:
+        """Of each Gaussian, what the field answers about its normal, fitted: no training has seen it. Raises InputError
+        where there is no light, or a field that takes directions."""
+        if self.light is None or not self.has_material:
+            how = "which has no light" if self.light is None else "whose light takes directions"
+            raise no_material(self.path, f"one of {self.config.get('method')}, {how}")
+        white = self._white
+        return read_material(self.gaussians, self.light, white.display, white.tone, self.embedding)
+
+    @property
+    def learned_normals(self) -> np.ndarray:
+        """[N, 3] of any length, of a run that has a `material`."""
+        assert self.light is not None
+        first = self.light.config.field.features
+        return self.gaussians.to_numpy()["features"][:, first : first + 3]
+
+    def draw_material(self, camera: Camera) -> MaterialView:
+        """What one view shows of `material`."""
+        material = self.material
+        return draw_material(self.gaussians, material, self.learned_normals, camera, self.antialiased, self.supersample)
 
 
 def check_gaussians(run: Predictor | str | Path) -> Run:

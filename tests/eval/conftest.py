@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spacesim.data.errors import InputError
 from spacesim.data.images import load_image, write_exr, write_png
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth
 from spacesim.data.store import SHADOW_LIT, SHADOW_SELF_CAST
@@ -86,7 +87,10 @@ class FakeRun:
         }
     )
 
-    relightable, gaussian_run = False, None
+    relightable, gaussian_run, gaussians = False, None, None
+
+    def draw_material(self, camera):
+        raise InputError(f"{self.path}: expected a run with materials, found none")
 
     def predict(self, camera, sun, exposure=None):
         frame = next(frame for frame in self.dataset.test if frame.camera is camera)

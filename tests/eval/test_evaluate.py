@@ -27,6 +27,7 @@ from spacesim.eval.report.write import write_report
 from spacesim.scenes import read_scene
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.sensor import SensorConfig
+from spacesim.splat.raster.gaussians import Gaussians
 
 SIZE = 40
 
@@ -260,7 +261,7 @@ def test_nan_names_the_frame(make_run, dataset, tmp_path):
 
 def test_a_mesh_that_is_missing_costs_the_shape_alone(make_run, dataset, tmp_path):
     run = make_run()
-    run.gaussians = object()
+    run.gaussians, run.antialiased = Gaussians.random(3, 1.0, 0.1), False
     metrics = evaluate(run, replace(dataset, mesh_path="gone.ply"), tmp_path / "eval")
     assert metrics["geometry"] is None
     assert metrics["image"]["ssim"]

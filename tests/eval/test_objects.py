@@ -49,6 +49,9 @@ class FakeScene:
     def predict(self, camera, sun, normals=False, exposure=None):
         return self.run.predict(camera, sun)
 
+    def draw_material(self, camera):
+        return self.run.draw_material(camera)
+
 
 class Scene(ComposedRun):
     """With names and a configuration as the test wants."""

@@ -44,6 +44,7 @@ def scene(run, tmp_path) -> ComposedRun:
 @pytest.mark.parametrize("kind", [Run, AlignedRun, ComposedRun, GaussianComposition])
 def test_predict_is_asked_in_the_same_words(kind):
     assert words_of(kind.predict) == words_of(Predictor.predict)
+    assert words_of(kind.draw_material) == words_of(Predictor.draw_material)
 
 
 @pytest.mark.parametrize(

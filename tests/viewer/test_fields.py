@@ -13,6 +13,7 @@ from test_session import Screen, Source, view_from
 from spacesim import backend
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
+from spacesim.data.errors import InputError
 from spacesim.data.records import Sun
 from spacesim.nerf.compose import FieldComposition
 from spacesim.nerf.config import GridConfig, NerfConfig, ProposalConfig
@@ -78,8 +79,10 @@ def made(fields, state):
 
 def test_what_a_scene_of_fields_has(fields, state):
     assert (fields.progressive, fields.content, fields.gaussian_count) == (True, "2 radiance fields", 0)
-    assert fields.modes == tuple(mode for mode in MODES if mode != "ellipsoids")
+    assert fields.modes == tuple(mode for mode in MODES if mode not in ("albedo", "ellipsoids"))
     centre, radius = fields.bounds(state)
+    with pytest.raises(InputError, match="expected Gaussians alone, to read materials, found a radiance field"):
+        fields.composition.draw_material(view_from(-5, 0).camera(16, 16))
     assert fields.models[0].radius == pytest.approx(np.sqrt(0.75))
     assert radius > 1.5
     assert abs(centre[0]) < 1e-9
@@ -95,7 +98,7 @@ def test_modes(fields, state, mode):
         alone = replace(state, poses=state.poses[:1])
         assert frame.picture.any()
         frame = draw_frame(single, alone, view_from(-5, 0), DisplaySettings(mode, side=256), 0.25)
-    if mode in ("visibility", "ellipsoids"):
+    if mode in ("visibility", "albedo", "ellipsoids"):
         assert frame.note.startswith(f"no {mode} to be seen: ")
         assert not frame.picture.any()
     elif mode != "object id":  # fog covers less than half

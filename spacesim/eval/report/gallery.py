@@ -28,6 +28,7 @@ _PANELS: Panels = {
     "shadow_prediction": "Dark pixels, prediction",
 }
 _DEPTHS: Panels = {"depth_truth": "Truth", "depth": "Prediction"}
+_ALBEDOS: Panels = {"albedo_truth": "Truth", "albedo": "Prediction"}
 MISTAKES = {
     "lit": LIT,
     "shadowed": SHADOWED,
@@ -61,13 +62,39 @@ def depths(runs: Sequence[Evaluation]) -> str:
     def score(frame: JsonMapping) -> float | None:
         return _psnr(frame) if frame.get("depth_range") else None
 
-    for group in _comparable(runs):
-        frames = ([run.frames.get(name) for run in group] for name in group[0].frames)
-        if not any(all(frame and score(frame) is not None for frame in same) for same in frames):
-            return ""
+    if not _have_scores(runs, score):
+        return ""
     truth = all(_has_pictures(run, "depth_truth") for run in runs)
     panels = _DEPTHS if truth else {"depth": _DEPTHS["depth"]}
     return strips(runs, panels, "depth", score, lambda frame: "")
+
+
+def albedos(runs: Sequence[Evaluation]) -> str:
+    """HTML of the albedo of frames, of the runs from which it can be read; "" where there are none."""
+    reading = [run for run in runs if any(_albedo_error(frame) is not None for frame in run.frames.values())]
+
+    def score(frame: JsonMapping) -> float | None:
+        return None if _albedo_error(frame) is None else _psnr(frame)
+
+    def words(frame: JsonMapping) -> str:
+        error = _albedo_error(frame)
+        return "" if error is None else f"error {error:.3f}"
+
+    return strips(reading, _ALBEDOS, "albedo", score, words) if reading and _have_scores(reading, score) else ""
+
+
+def _have_scores(runs: Sequence[Evaluation], score: Callable[[JsonMapping], float | None]) -> bool:
+    """Whether there is a frame to choose wherever `strips` chooses."""
+    for group in _comparable(runs):
+        frames = ([run.frames.get(name) for run in group] for name in group[0].frames)
+        if not any(all(frame and score(frame) is not None for frame in same) for same in frames):
+            return False
+    return True
+
+
+def _albedo_error(frame: JsonMapping) -> float | None:
+    value: float | None = (frame.get("material") or {}).get("albedo_error")
+    return value
 
 
 def _psnr(frame: JsonMapping) -> float | None:

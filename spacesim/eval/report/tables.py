@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from spacesim.data.files import JsonDict
-from spacesim.eval.labels import GROUPS, IMAGE, RECALL, SHADOW, SHADOW_KIND, SHADOW_MASK, Metric, metric_of
+from spacesim.eval.labels import GROUPS, IMAGE, MATERIAL, RECALL, SHADOW, SHADOW_KIND, SHADOW_MASK, Metric, metric_of
 from spacesim.eval.metrics.shadow import KINDS
 from spacesim.eval.report.html import escape, table
 from spacesim.eval.report.read import Evaluation
@@ -18,6 +18,7 @@ _TABLES: tuple[tuple[str, tuple[Metric, ...], tuple[str, ...], tuple[Metric, ...
     ("Shadow by luminance", SHADOW, ("shadow", "shadow_full"), SHADOW),
     ("Shadow by predicted visibility", SHADOW_MASK, ("shadow_mask",), SHADOW_MASK),
     ("Each kind of shadow by predicted visibility", SHADOW_KIND, tuple(KINDS), (RECALL,)),
+    ("Materials", MATERIAL, ("material",), MATERIAL),
 )
 """Caption, columns, groups, and the columns that are explained."""
 
@@ -34,6 +35,7 @@ def results(runs: Sequence[Evaluation]) -> str:
     parts = []
     whole = all(run.whole_pictures for run in runs)
     titles = {group: _sentence_case(where) for group, (where, _) in GROUPS.items()}
+    titles["material"] = "Over the object's pixels"
     if whole:
         titles |= {group: "Over whole pictures; no silhouette is known" for group in ("image", "shadow")}
     for caption, metrics, groups, described in _TABLES:

@@ -11,7 +11,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, JsonMapping, read_bytes, write_bytes
 from spacesim.eval.labels import IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric, metric_of
 from spacesim.eval.report.charts import column_histograms, histogram, line_chart, shared_edges
-from spacesim.eval.report.gallery import depths, gallery
+from spacesim.eval.report.gallery import albedos, depths, gallery
 from spacesim.eval.report.headings import aligned_words, common_header, data_header, fitted_words, header, page_links
 from spacesim.eval.report.html import escape, page, picture, section, table
 from spacesim.eval.report.lighting import by_grazing_angle, relighting, shadow_masks
@@ -64,6 +64,11 @@ def _sections(runs: Sequence[Evaluation]) -> list[str]:
         _headlines(runs),
         section("Frames", gallery(runs), f"Best, median and worst by PSNR{over}."),
         _section("Depth", depths(runs), "The same frames: metres along the optical axis."),
+        _section(
+            "Albedo",
+            albedos(runs),
+            "The same frames: reflectance as sRGB values, of a run what its field answers, times one scale.",
+        ),
         _section(
             "One view, many Suns",
             relighting(runs),

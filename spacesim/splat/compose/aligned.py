@@ -11,7 +11,7 @@ from spacesim.data.records import Camera, Frame, Sun
 from spacesim.splat.compose.members import Ensemble, Member
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.run import Prediction, Run
+from spacesim.splat.run import MaterialView, Prediction, Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +95,11 @@ class AlignedRun:
         drawn = self.run.predict(near, towards, normals, exposure)
         normal = None if drawn.normal is None else drawn.normal @ self.pose.rotation.T.astype(np.float32)
         return replace(drawn, depth=drawn.depth * np.float32(self.pose.scale), normal=normal)
+
+    def draw_material(self, camera: Camera) -> MaterialView:
+        """As `Run.draw_material`, of a camera in the world."""
+        drawn = self.run.draw_material(self.pose.camera_in_model(camera))
+        return replace(drawn, normal=drawn.normal @ self.pose.rotation.T.astype(np.float32))
 
 
 def moved_frame(frame: Frame, pose: Pose) -> Frame:

@@ -12,6 +12,7 @@ from spacesim.backend.arrays import Bool
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict
 from spacesim.data.records import Camera, Sun
+from spacesim.learning.prediction import MaterialView
 from spacesim.splat.compose.scene import ComposedPrediction, GaussianComposition
 from spacesim.splat.raster.gaussians import Gaussians
 
@@ -156,3 +157,8 @@ class ComposedRun:
         """See `GaussianComposition.predict`."""
         prediction: ComposedPrediction = self.composition.predict(camera, sun, normals, exposure)
         return prediction
+
+    def draw_material(self, camera: Camera) -> MaterialView:
+        """See `GaussianComposition.draw_material`."""
+        view: MaterialView = self.composition.draw_material(camera)
+        return view

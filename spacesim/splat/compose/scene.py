@@ -19,10 +19,12 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.images.tone import Curve
 from spacesim.data.records import Camera, Sun
-from spacesim.learning.prediction import ComposedPrediction, check_picture
+from spacesim.learning.prediction import ComposedPrediction, MaterialView, check_picture
 from spacesim.splat.compose.light import EnsembleLight, LightCache, SunOccluder
 from spacesim.splat.compose.members import Ensemble, Member, display_colors
 from spacesim.splat.compose.pose import Pose
+from spacesim.splat.light.material import FittedMaterial
+from spacesim.splat.material import draw_material, no_material
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.output import RenderOutput, over_alpha, planes_image
 from spacesim.splat.raster.render import render
@@ -177,6 +179,15 @@ class GaussianComposition:
         rgb = drawn.image("rgb", stops)
         alpha, depth = drawn.image("alpha"), drawn.image("depth")
         return ComposedPrediction(rgb, alpha, depth, visibility, normal, drawn.image("id"), linear=drawn.light(stops))
+
+    def draw_material(self, camera: Camera) -> MaterialView:
+        """What one view shows of the models' materials. Raises InputError where one has none."""
+        placed = self.placed
+        if not placed:
+            raise no_material(self.path or self.models[0].run.path, "no Gaussians")
+        material = FittedMaterial.joined([model.run.material for model in placed])
+        normals = np.concatenate([model.run.learned_normals @ model.pose.rotation.T for model in placed])
+        return draw_material(self.in_world(), material, normals, camera, self.antialiased, self.supersample)
 
     @property
     def antialiased(self) -> Bool | bool:

@@ -7,8 +7,9 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from spacesim.data.geometry import Array
+from spacesim.data.images.color import srgb_from_linear
 from spacesim.data.records import Camera
-from spacesim.learning.prediction import Prediction
+from spacesim.learning.prediction import MaterialView, Prediction
 from spacesim.splat.export.mesh import RunMesh, select_views
 
 NEAR = 2.0  #: voxels: what lies deeper than the surface that a pixel shows is hidden in it
@@ -23,15 +24,17 @@ def color_vertices(
     predict: Callable[[Camera], Prediction],
     most: int,
     progress: Callable[[int, int], None] | None = None,
+    channels: int = 3,
 ) -> Array:
-    """[V, 3] sRGB values: the mean of what the pictures show at each vertex that they see, weighted by how squarely
-    they see it; vertices that none sees take the colour of the nearest one that has one, black where there is none.
+    """[V, C] values of the pictures' `channels`, sRGB values: the mean of what they show at each vertex that they see,
+    weighted by how squarely they see it; vertices that none sees take the colour of the nearest one that has one, black
+    where there is none.
 
     depth: [H, W] metres along a camera's axis, 0 where it sees no surface;  predict: the run's picture from a
     camera;  most: views used;  progress: called with the views done and all of them
     """
     normals = _normals(mesh)
-    total, weights = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
+    total, weights = np.zeros((len(mesh.vertices), channels)), np.zeros(len(mesh.vertices))
     views = select_views(cameras, most)
     for done, camera in enumerate(views):
         if progress:
@@ -62,6 +65,13 @@ def color_vertices(
     if known.any() and not known.all():
         colors[~known] = colors[known][cKDTree(mesh.vertices[known]).query(mesh.vertices[~known])[1]]
     return np.clip(colors, 0, 1)
+
+
+def color_of_material(view: MaterialView) -> Prediction:
+    """Materials as a picture of four channels for `color_vertices`, weighted by alpha: albedo as sRGB values,
+    roughness."""
+    straight = np.concatenate([srgb_from_linear(view.albedo), view.roughness[..., None]], axis=-1)
+    return Prediction(straight * view.alpha[..., None], view.alpha, np.zeros_like(view.alpha), None)
 
 
 def _normals(mesh: RunMesh) -> Array:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from spacesim.data.images.color import srgb_from_linear
 from spacesim.data.images.sheet import font
 from spacesim.eval.pictures import depth_colors, error_colors
 from spacesim.learning.pictures import LIT, SHADOWED
@@ -32,6 +33,7 @@ class Planes:
     depth: np.ndarray | None = None  #: [H, W] metres, 0 where there is none
     visibility: np.ndarray | None = None  #: [H, W] of the Sun
     normal: np.ndarray | None = None  #: [H, W, 3] world axes, 0 where there is none
+    albedo: np.ndarray | None = None  #: [H, W, 3] linear reflectance, 0 where there is no surface
     object_id: np.ndarray | None = None  #: [H, W] uint8, from 1, 0 none
 
 
@@ -41,6 +43,7 @@ NEEDED = {
     "accumulation": "alpha",
     "visibility": "visibility",
     "normals": "normal",
+    "albedo": "albedo",
     "object id": "object_id",
     "ellipsoids": "rgb",
 }
@@ -67,6 +70,8 @@ def paint(planes: Planes, mode: str, depths: tuple[float, float] | None = None) 
         if mode == "object id":
             return _colors_by_id(values)
         alpha = _clip_to_unit(planes.alpha)
+        if mode == "albedo":
+            return _bytes(_clip_to_unit(srgb_from_linear(_clip_to_unit(values)) * alpha[..., None]))
         if mode == "accumulation":
             return np.repeat(_bytes(alpha)[..., None], 3, axis=-1)
         if mode == "depth":

@@ -20,6 +20,7 @@ from spacesim.viewer.drawing.ellipsoids import draw_ellipsoids
 from spacesim.viewer.drawing.paint import NEEDED, Planes
 from spacesim.viewer.state import MODES, SceneState
 
+OF_GAUSSIANS = "albedo", "ellipsoids"  #: modes of scenes of Gaussians alone
 MIN_RADIUS = 1e-6  #: metres of a model, where all its Gaussians are in one place
 
 
@@ -51,7 +52,7 @@ class SceneRenderer:
         self.gaussian_count = sum(count or 0 for count in counts)
         self.content = _describe(counts)
         self.progressive = not isinstance(composition, GaussianComposition)
-        self.modes = tuple(mode for mode in MODES if mode != "ellipsoids" or not self.progressive)
+        self.modes = tuple(mode for mode in MODES if mode not in OF_GAUSSIANS or not self.progressive)
         self.relightable = composition.relightable
         self.backend = composition.backend
         names = _unique_names([placed.name or placed.run.path.resolve().name for placed in composition.models])
@@ -76,13 +77,16 @@ class SceneRenderer:
         scene = self.composition.posed(state.poses)
         if self.progressive:
             seen = scene.predict(camera, state.sun, normals=NEEDED[mode] == "normal", on_chunk=on_chunk)
-            return Planes(seen.alpha, seen.rgb, seen.depth, seen.visibility, seen.normal, seen.id)
+            return Planes(seen.alpha, seen.rgb, seen.depth, seen.visibility, seen.normal, object_id=seen.id)
         if mode == "ellipsoids":
             gaussians, colors = scene.lit_gaussians(camera, state.sun)
             blended = draw_ellipsoids(gaussians, colors, Pinhole.of(camera))
             size = camera.width, camera.height
             rgb, transmittance = planes_image(blended.planes, *size), planes_image([blended.transmittance], *size)
             return Planes(1 - transmittance[..., 0], rgb=rgb)
+        if mode == "albedo":
+            materials = scene.draw_material(camera)
+            return Planes(materials.alpha, albedo=materials.albedo)
         outputs = {"rgb": "rgb", "depth": "depth", "visibility": "visibility", "normal": "normal", "object_id": "id"}
         name = NEEDED[mode]
         drawn = scene.draw(camera, state.sun, [outputs[name]] if name in outputs else [], supersample=1)

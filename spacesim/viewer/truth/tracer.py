@@ -106,6 +106,7 @@ def _label_planes(labels: dict[str, np.ndarray], models: Sequence[int]) -> Plane
         depth=labels["depth"],
         visibility=labels["sun_visibility"],
         normal=labels["normal"],
+        albedo=labels["albedo"],
         object_id=model_ids(labels["object_id"], models),
     )
 

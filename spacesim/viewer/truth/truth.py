@@ -86,6 +86,7 @@ def _labels(dataset: Dataset, frame: Frame, models: Sequence[int]) -> Planes:
         depth=truth.depth,
         visibility=truth.sun_visibility,
         normal=truth.normal,
+        albedo=truth.albedo,
         object_id=model_ids(truth.object_id, models),
     )
 

@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 import trimesh
-from splats import light_of
+from splat_readers import glb_array, glb_chunks
+from splats import light_of, srgb_of
 from test_tsdf import cameras, rays
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.mesh import write_mesh
 from spacesim.data.records import Camera
-from spacesim.learning.prediction import Prediction
-from spacesim.splat.export.colors import color_vertices
+from spacesim.learning.prediction import MaterialView, Prediction
+from spacesim.splat.export.colors import color_of_material, color_vertices
 from spacesim.splat.export.mesh import RunMesh
 
 AWAY = np.array([-3.0, 0, 0])  #: centre of the second sphere
@@ -101,6 +102,35 @@ def test_colors_in_files(tmp_path, suffix):
     else:
         np.testing.assert_allclose(found.visual.vertex_colors[:, :3] / 255, colors, atol=0.51 / 255)
     assert (found.faces == mesh.faces).all()
+
+
+def test_materials_in_gltf_are_lit(tmp_path):
+    """Base colours, roughness a vertex and one for all: square roots of alpha."""
+    mesh = trimesh.creation.icosphere(2)
+    colors, roughness = paint(np.array(mesh.vertices)), np.linspace(0.04, 0.49, len(mesh.vertices))
+    write_mesh(tmp_path / "a.glb", np.array(mesh.vertices), np.array(mesh.faces), colors, roughness=roughness)
+    document, body = glb_chunks(tmp_path / "a.glb")
+    (primitive,) = document["meshes"][0]["primitives"]
+    attributes = {name: glb_array(document, body, index) for name, index in primitive["attributes"].items()}
+    (material,) = document["materials"]
+    assert primitive["material"] == 0
+    assert "extensionsUsed" not in document
+    assert "extensions" not in material
+    surface = material["pbrMetallicRoughness"]
+    assert surface == {"metallicFactor": 0, "roughnessFactor": pytest.approx(np.sqrt(np.median(roughness)), abs=2e-3)}
+    np.testing.assert_allclose(attributes["COLOR_0"][:, :3], light_of(colors), atol=1e-6)
+    np.testing.assert_allclose(attributes["_ROUGHNESS"].ravel(), np.sqrt(roughness), atol=1e-6)
+
+
+def test_a_picture_of_materials_has_four_channels():
+    view = MaterialView(np.full((2, 3, 3), 0.5), np.full((2, 3), 0.3), np.zeros((2, 3, 3)), np.full((2, 3), 0.5))
+    shown = color_of_material(view)
+    np.testing.assert_allclose(shown.rgb / 0.5, np.tile([*srgb_of(np.full(3, 0.5)), 0.3], (2, 3, 1)), atol=1e-6)
+    centres, mesh = [np.zeros(3)], spheres(np.zeros(3))
+    camera = Camera.from_fov(look_at(np.array([4.0, 0, 0]), np.zeros(3)), 96, 96, 40.0)
+    one = lambda c: Prediction(np.tile([0.1, 0.2, 0.3, 0.4], (96, 96, 1)), np.ones((96, 96)), np.ones(1), None)  # noqa: E731
+    values = color_vertices(mesh, [camera], lambda c: seen(c, centres)[0], one, 9, channels=4)
+    np.testing.assert_allclose(values, np.tile([0.1, 0.2, 0.3, 0.4], (len(mesh.vertices), 1)), atol=1e-6)
 
 
 def test_stl_holds_no_colors(tmp_path):

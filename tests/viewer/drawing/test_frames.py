@@ -7,6 +7,7 @@ import pytest
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
+from spacesim.data.images import srgb_from_linear
 from spacesim.data.records import Camera
 from spacesim.eval.pictures import error_colors
 from spacesim.learning.pictures import LIT, SHADOWED
@@ -279,7 +280,8 @@ def test_the_scale_of_depths_names_its_ends():
 def test_planes_that_are_not_finite_are_painted():
     bad = np.full((8, 8), np.nan, np.float32)
     for mode in MODES:
-        planes = Planes(bad, rgb=np.stack([bad] * 3, -1), depth=bad, visibility=bad, normal=np.stack([bad] * 3, -1))
+        rows = np.stack([bad] * 3, -1)
+        planes = Planes(bad, rgb=rows, depth=bad, visibility=bad, normal=rows, albedo=rows)
         picture = paint(planes, mode)
         assert picture is None or picture.shape == (8, 8, 3)
 
@@ -313,6 +315,7 @@ def test_pictures_are_what_their_formulas_say(mode):
         depth=depth,
         visibility=rng.uniform(-0.2, 1.3, shape).astype(np.float32),
         normal=normal,
+        albedo=rng.uniform(-0.2, 1.3, (*shape, 3)).astype(np.float32),
         object_id=rng.integers(0, 20, shape).astype(np.int32),
     )
     near, far = 3.0, 7.0
@@ -332,6 +335,8 @@ def test_pictures_are_what_their_formulas_say(mode):
             expected = cover * (seen * np.array(LIT, float) + (1 - seen) * np.array(SHADOWED, float))
         elif mode == "normals":
             expected = np.clip(255 * cover * (0.5 + 0.5 * value.astype(float)) * value.any(), 0, 255)
+        elif mode == "albedo":
+            expected = 255 * cover * srgb_from_linear(value.astype(float))
         else:
             expected = np.array(PALETTE[(value - 1) % 7] if value else (0, 0, 0))
         levels = 6 if mode == "depth" else 1  # both colour maps have steps

@@ -1,0 +1,108 @@
+"""What materials read out of a run say of the true ones, part by part of a dataset of `spacesim generate`.
+
+    python benchmarks/materials.py RUN [--data DATA]
+
+Over the pixels of test frames that show a part, where at least 20 do: the median of the roughness, the mean luminance
+of the albedo and of its specular share, beside the scene's. True gloss is a metal's albedo, 0.04 of a coat, 0 of a dull
+surface; true roughness is alpha of GGX, of parts that have a gloss. Rank correlations (Spearman's) are over parts.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import spearmanr
+from support import common
+
+from spacesim import backend
+from spacesim.data.errors import InputError
+from spacesim.data.images import luminance
+from spacesim.data.records import Dataset
+from spacesim.data.store import load_truth, read_dataset
+from spacesim.splat.material import draw_material
+from spacesim.splat.run import Run, load_run
+
+LEAST_PIXELS = 20
+COAT = 0.04  #: reflectance of a clear coat, n = 1.5, at normal incidence
+
+
+def main() -> None:
+    parser = common.arguments(__doc__)
+    parser.add_argument("run", type=Path, metavar="RUN")
+    parser.add_argument("--data", type=Path, metavar="DATA", help="with truth (the run's own)")
+    options = parser.parse_args()
+    backend.select(options.backend)
+    run = load_run(options.run)
+    dataset = read_dataset(options.data or Path(run.config["data"]["path"]))
+    rows = parts(run, dataset)
+    dull = [row for row in rows if row["true gloss"] <= COAT]
+    glossy = [row for row in rows if row["true roughness"] is not None]
+    correlations = {
+        "albedo": rank(rows, "albedo"),
+        "roughness, glossy parts": rank(glossy, "roughness"),
+        "gloss": rank(rows, "gloss"),
+        "gloss, no metals": rank(dull, "gloss"),
+    }
+    common.emit({"parts": rows, "rank": correlations}, {"Parts": rows, "Rank correlation": [correlations]}, options)
+
+
+def parts(run: Run, dataset: Dataset) -> list[common.Row]:
+    """Of each part that enough pixels of the test frames show."""
+    materials: Any = dataset.scene.get("materials")
+    if not isinstance(materials, Mapping):
+        raise InputError(f"{dataset.root}: expected a dataset of `spacesim generate`, found no materials in scene.json")
+    seen = [pixels(run, dataset, index) for index in range(len(dataset.test))]
+    number, albedo, gloss, roughness, true = (np.concatenate(values) for values in zip(*seen, strict=True))
+    rows: list[common.Row] = []
+    for part in dataset.scene["parts"]:
+        mine = number == part["id"]
+        if mine.sum() < LEAST_PIXELS:
+            continue
+        material = materials[part["material"]]
+        alpha, is_metal = alpha_of(material["bsdf"]), holds(material["bsdf"], "type", "roughconductor")
+        reflectance = float(luminance(np.array(material["albedo"], float)))
+        row = {"part": part["name"], "material": part["material"], "pixels": int(mine.sum())}
+        row |= {"albedo": albedo[mine].mean(), "true albedo": true[mine].mean()}
+        row |= {"gloss": gloss[mine].mean(), "true gloss": reflectance if is_metal else COAT * (alpha is not None)}
+        rows.append(row | {"roughness": np.median(roughness[mine]), "true roughness": alpha})
+    return [{key: round(float(v), 3) if isinstance(v, float) else v for key, v in row.items()} for row in rows]
+
+
+def pixels(run: Run, dataset: Dataset, index: int) -> list[np.ndarray]:
+    """Of a test frame's pixels that show a part: its number, albedo, gloss, roughness, true albedo, [P] each."""
+    frame = dataset.test[index]
+    truth, view = load_truth(dataset, frame), run.draw_material(frame.camera)
+    shiny = replace(run.material, diffuse=np.zeros_like(run.material.diffuse))
+    drawn = draw_material(run.gaussians, shiny, run.learned_normals, frame.camera, run.antialiased, run.supersample)
+    mask = truth.part_id > 0
+    planes = luminance(view.albedo), luminance(drawn.albedo), view.roughness, luminance(truth.albedo)
+    return [truth.part_id[mask], *(plane[mask].astype(np.float64) for plane in planes)]
+
+
+def alpha_of(bsdf: Mapping[str, Any]) -> float | None:
+    """Alpha of GGX of one of Mitsuba's descriptions; None of a dull surface."""
+    if "alpha" in bsdf:
+        return float(bsdf["alpha"])
+    if bsdf.get("type") == "principled":
+        return float(bsdf["roughness"]) ** 2
+    inner = (alpha_of(value) for value in bsdf.values() if isinstance(value, Mapping))
+    return next((alpha for alpha in inner if alpha is not None), None)
+
+
+def holds(bsdf: Mapping[str, Any], key: str, value: str) -> bool:
+    """Whether one of Mitsuba's descriptions, or one within it, says so."""
+    return bsdf.get(key) == value or any(holds(v, key, value) for v in bsdf.values() if isinstance(v, Mapping))
+
+
+def rank(rows: list[common.Row], key: str) -> float | None:
+    """Spearman's correlation of a number with the true one; None where either is the same everywhere."""
+    pairs = np.array([(row[key], row[f"true {key}"]) for row in rows], float).reshape(-1, 2)
+    if len(pairs) < 3 or (np.ptp(pairs, axis=0) == 0).any():
+        return None
+    return round(float(spearmanr(*pairs.T).statistic), 2)
+
+
+if __name__ == "__main__":
+    main()
