@@ -21,7 +21,7 @@ class Earth:
     """Where the Earth is, how large in the sky and how bright."""
 
     direction: Array  #: [3] unit vector, world frame, from the scene towards the Earth's centre
-    angular_radius_deg: float  #: from the Earth's centre to its limb
+    angular_radius_deg: float = 68.0  #: from the Earth's centre to its limb; 68 at an altitude of 500 km
     albedo: float = EARTH_ALBEDO  #: of the sphere, the same in all channels
 
     def __post_init__(self) -> None:
