@@ -322,14 +322,18 @@ def _read_distortion(values: Json) -> tuple[float, ...]:
 
 
 def _read_sun(values: Json) -> Sun | None:
+    sun = _read_direction(values)
+    return sun and replace(sun, earth=_read_earth(values))
+
+
+def _read_direction(values: Json) -> Sun | None:
     if "sun_direction" in values:
         try:
-            return Sun(np.asarray(values["sun_direction"], np.float64), _read_earth(values))
+            return Sun(np.asarray(values["sun_direction"], np.float64))
         except (TypeError, ValueError, OverflowError):
             raise InputError(f"expected {SUN_WORDS}, as sun_direction, found other values") from None
     if "sun_azimuth_deg" in values and "sun_elevation_deg" in values:
-        sun = Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
-        return replace(sun, earth=_read_earth(values))
+        return Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
     return None
 
 
