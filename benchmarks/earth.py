@@ -23,6 +23,7 @@ from spacesim.data.images import linear_from_srgb
 from spacesim.data.images.tone import STANDARD_EXPOSURE, display_values
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import load_truth
+from spacesim.eval.metrics.image import psnr
 from spacesim.learning.prediction import added_light
 from spacesim.progress import show_progress
 from spacesim.reproduce.perform import trained
@@ -83,7 +84,7 @@ def layers_of(run: Run, data: Dataset, frame: Frame) -> tuple[float, ...]:
     surface = truth.object_id > 0
     pictures = [display_values(np.clip(STANDARD_EXPOSURE * layer, 0, 1), "srgb") for layer in traced]
     pairs = zip(shown, pictures, strict=True)
-    scores = [-10 * math.log10(np.mean((np.clip(one, 0, 1) - other)[surface] ** 2)) for one, other in pairs]
+    scores = [psnr(np.clip(one, 0, 1), other, surface) or math.nan for one, other in pairs]
     means = [float(linear_from_srgb(layer)[surface].mean()) for layer in (pictures[2], shown[2])]
     return (*scores, *means)
 
