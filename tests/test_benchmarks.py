@@ -729,6 +729,18 @@ def test_data_like_speedplus_have_suns_only_in_the_labels(command, place):
 
 
 @smallest(
+    "earth.py --out OUT --suns 3 --views 2 --resolution 24 --spp 2 --method relight --iterations 2"
+    " --backend llvm --json"
+)
+def test_the_earths_light_is_told_from_the_suns(command, place):
+    without, known = json.loads(call(command))["rows"]
+    assert (without["the Earth"], without["predicted"]) == ("without", 0)
+    assert without["of earthlight"] > 20
+    assert known["predicted"] > 0
+    assert known["earthlight, true"] == without["earthlight, true"] > 1e-5
+
+
+@smallest(
     "unknown_suns.py --out OUT --frames 8 --height 30 --spp 2 --preset demo --iterations 2 --rows known,unknown,vanilla"
     " --backend llvm --json"
 )

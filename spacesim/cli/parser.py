@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from spacesim import interrupts
 from spacesim.data.errors import InputError
@@ -95,6 +95,11 @@ def angles(text: str) -> tuple[float, float]:
     if not (math.isfinite(azimuth) and -90 <= elevation <= 90):
         raise argparse.ArgumentTypeError(f"expected a finite azimuth and an elevation up to 90, found {text!r}")
     return azimuth, elevation
+
+
+def angles_or_none(text: str) -> tuple[float, float] | Literal["none"]:
+    """As `angles`, or the word "none"."""
+    return "none" if text == "none" else angles(text)
 
 
 def resolution(text: str) -> int | tuple[int, int]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError, check_type
 from spacesim.data.files import JsonMapping
 from spacesim.data.geometry import (
@@ -143,9 +144,10 @@ def check_camera(camera: object) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Sun:
-    """The Sun as a direction."""
+    """The Sun as a direction, and the Earth that it lights."""
 
     direction: Array  #: [3] unit vector, world frame, from the scene towards the Sun
+    earth: Earth | None = None  #: gives light, too; None: there is none
 
     def __post_init__(self) -> None:
         direction = as_numbers(self.direction)

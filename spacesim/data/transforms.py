@@ -14,17 +14,19 @@ has been whole, and what is missing is damage.
 import logging
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from spacesim.data.earth import EARTH_ALBEDO, Earth
 from spacesim.data.errors import InputError
 from spacesim.data.files import MAX_LIST_BYTES, JsonValue, as_path, read_json
 from spacesim.data.geometry import OPENCV_FROM_OPENGL
 from spacesim.data.images import image_size
 from spacesim.data.integrity.manifest import NAME as DIGESTS
-from spacesim.data.records import SUN_WORDS, Camera, Dataset, Frame, Sun
+from spacesim.data.records import SUN_WORDS, Camera, Dataset, Frame, Sun, as_numbers
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 TRUTH_PATHS = ("gt_path", "shadow_path", "silhouette_path", "id_path", "depth_file_path", "mask_path")
@@ -320,6 +322,11 @@ def _read_distortion(values: Json) -> tuple[float, ...]:
 
 
 def _read_sun(values: Json) -> Sun | None:
+    sun = _read_direction(values)
+    return sun and replace(sun, earth=_read_earth(values))
+
+
+def _read_direction(values: Json) -> Sun | None:
     if "sun_direction" in values:
         try:
             return Sun(np.asarray(values["sun_direction"], np.float64))
@@ -328,6 +335,23 @@ def _read_sun(values: Json) -> Sun | None:
     if "sun_azimuth_deg" in values and "sun_elevation_deg" in values:
         return Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
     return None
+
+
+def _read_earth(values: Json) -> Earth | None:
+    if "earth_direction" not in values:
+        return None
+    radius = _number(values, "earth_angular_radius_deg")
+    return Earth(as_numbers(values["earth_direction"]), radius, _number(values, "earth_albedo", EARTH_ALBEDO))
+
+
+def earth_keys(earth: Earth) -> dict[str, JsonValue]:
+    """What a frame of transforms.json says of the Earth that lights it."""
+    direction = earth.direction.tolist()
+    return {
+        "earth_direction": direction,
+        "earth_angular_radius_deg": earth.angular_radius_deg,
+        "earth_albedo": earth.albedo,
+    }
 
 
 def _split(

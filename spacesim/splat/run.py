@@ -17,6 +17,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.backend.arrays import Bool
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, as_path
 from spacesim.data.images.tone import Curve
@@ -254,6 +255,7 @@ class Run:
             outputs=names,
             antialiased=self.antialiased,
             embedding=self.embedding,
+            earth=None if sun is None else sun.earth,
         )
         output = render_supersampled(lit, camera, self.supersample, colors=3, linear=self.curve is not None)
         features = output.features or []
@@ -345,11 +347,12 @@ def draw_lit(
     outputs: Sequence[str] = (),
     antialiased: bool = False,
     embedding: np.ndarray | None = None,
+    earth: Earth | None = None,
 ) -> RenderOutput:
     """A relit and shadowed frame on the device. features: colour (3 planes), then, of a model with shadows, visibility,
     all premultiplied. sun: [3], unit, towards the Sun, None: the model takes none;  outputs, antialiased: see
-    `render`;  embedding: of the picture, see `LightModel.shade_picture`"""
-    colors, visibility = light.shade_picture(gaussians, camera, sun, embedding=embedding)
+    `render`;  embedding: of the picture, see `LightModel.shade_picture`;  earth: that the Sun lights"""
+    colors, visibility = light.shade_picture(gaussians, camera, sun, embedding=embedding, earth=earth)
     visibilities = [] if visibility is None else [visibility]
     return render(gaussians, camera, outputs=outputs, features=[*colors, *visibilities], antialiased=antialiased)
 

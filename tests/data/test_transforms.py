@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
+from spacesim.data.earth import EARTH_ALBEDO
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.store import find_unreadable_files
@@ -95,6 +96,16 @@ def test_suns(tmp_path):
     angles = {"sun_azimuth_deg": 90, "sun_elevation_deg": 0}
     frame = read_dataset(write_folder(tmp_path, ["a.png"], frame=angles)).train[0]
     np.testing.assert_allclose(frame.sun.direction, [0, 1, 0], atol=1e-15)
+
+
+def test_earths(tmp_path):
+    lit = {"sun_direction": [0, 0, 1], "earth_direction": [0, -2, 0], "earth_angular_radius_deg": 60}
+    earth = read_dataset(write_folder(tmp_path, ["a.png"], frame=lit)).train[0].sun.earth
+    np.testing.assert_array_equal(earth.direction, [0, -1, 0])
+    assert (earth.angular_radius_deg, earth.albedo) == (60, EARTH_ALBEDO)
+    angles = {"sun_azimuth_deg": 90, "sun_elevation_deg": 0, "earth_direction": [1, 0, 0]}
+    own = {**angles, "earth_angular_radius_deg": 20, "earth_albedo": 0.1}
+    assert read_dataset(write_folder(tmp_path, ["a.png"], frame=own)).train[0].sun.earth.albedo == 0.1
 
 
 def test_a_null_counts_as_absent(tmp_path):
@@ -201,6 +212,11 @@ NAN_POSE = [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (lambda m: m["frames"][0].update(sun_direction=[0, 0, 0]), "sun_direction"),
         (lambda m: m["frames"][0].update(sun_direction="up"), "sun_direction"),
         (lambda m: m["frames"][0].update(sun_direction=[10**400, 0, 0]), "sun_direction"),
+        (lambda m: m["frames"][0].update(sun_direction=[0, 0, 1], earth_direction=[0, 0, 1]), "earth_angular_radius"),
+        (
+            lambda m: m["frames"][0].update(sun_direction=[0, 0, 1], earth_direction="up", earth_angular_radius_deg=9),
+            "earth_direction: expected 3 finite numbers",
+        ),
         (lambda m: m.update(w=10**400), "expected a finite number as w"),
         (lambda m: m["frames"][0]["transform_matrix"][0].__setitem__(0, 10**400), "transform_matrix"),
         (lambda m: (m.pop("fl_x"), m.pop("fl_y"), m.update(camera_angle_x=0)), "camera_angle_x, found 0"),

@@ -9,6 +9,9 @@ import trimesh
 import truth
 import whole
 
+from spacesim.data.records import Sun
+from spacesim.scenes.lights.earth import EarthConfig
+
 
 @pytest.mark.parametrize("elevation_deg", [90.0, 30.0, 5.0])
 def test_plate_has_the_radiance_of_lamberts_law(elevation_deg):
@@ -44,6 +47,15 @@ def test_light_in_a_hollow_sphere_is_conserved():
 @pytest.mark.parametrize(("phase_deg", "altitude_km"), [(0.0, 500.0), (90.0, 500.0), (0.0, 36_000.0)])
 def test_earth_gives_the_irradiance_of_a_lambertian_sphere(phase_deg, altitude_km):
     assert abs(truth.earth_error(phase_deg, altitude_km)) < 0.004
+
+
+def test_the_earths_beams_are_what_the_path_tracer_shows():
+    """A plate before whose horizon a part of the Earth has set."""
+    earth, sun = EarthConfig(30.0, 20.0), Sun.from_angles(190.0, 10.0)
+    traced = truth.seen_from_above(truth.scene_of(truth.plate(), earth=earth), sun, spp=4096)
+    beams = earth.light.beams(sun.direction)
+    expected = 0.5 / math.pi * truth.SOLAR_IRRADIANCE * np.maximum(beams[:, 2], 0) @ beams[:, 3]
+    assert traced.radiance_earth.mean() == pytest.approx(expected, rel=0.02)
 
 
 def test_sun_only_plus_earth_only_equals_both_within_noise():

@@ -19,7 +19,7 @@ from spacesim.data.integrity.manifest import digest_of
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import DEPTH_UNIT, DatasetWriter, FrameWriter, choose_depth_unit
-from spacesim.data.transforms import MILLIMETRE
+from spacesim.data.transforms import MILLIMETRE, earth_keys
 from spacesim.scenes.build import build
 from spacesim.scenes.cameras.rig import PlannedView, TargetSphere, plan
 from spacesim.scenes.cameras.sphere_rigs import RandomRig
@@ -30,7 +30,7 @@ from spacesim.scenes.generation.lighting import is_sunlit, sunlit_fractions, war
 from spacesim.scenes.generation.moves import cameras_inside, poses_in
 from spacesim.scenes.generation.overview import write_overview
 from spacesim.scenes.generation.points import sample_surface_points
-from spacesim.scenes.lights.earth import EARTH_RADIUS_KM
+from spacesim.scenes.lights.earth import EARTH_RADIUS_KM, EarthConfig
 from spacesim.scenes.lights.eclipse import visible_fraction
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
@@ -235,7 +235,7 @@ class _DatasetPlan:
         quality = config.quality
         self.renderer = Renderer(self.scene, quality.spp, quality.max_depth, config.camera.distortion)
         self._set_frames(quality)
-        self.keys = {name: self._keys_of(view) for name, view in (*self.train, *self.test)}
+        self.keys = {name: self._keys_of(name, view) for name, view in (*self.train, *self.test)}
         self._refuse_cameras_inside(config)
         self.left_out: dict[str, list[int]] = {}  # numbers that views would have had, by train and test
         if config.min_sunlit:
@@ -286,21 +286,24 @@ class _DatasetPlan:
             raise InputError(f"{field}: expected cameras outside of {config.name}, found that of {name} within a part")
 
     def _frame(self, index: int, spp: int, name: str, view: PlannedView) -> FrameSpec:
-        sunlight, earth = 1.0, self.scene.earth
+        sunlight, earth = 1.0, self._earth_in(name, view)
+        if view.earth is not None and earth is None:  # else it hides the Sun as it is traced
+            sunlight = visible_fraction(view.sun.direction, view.earth, self.scene.sun.angular_radius)
+        return FrameSpec(
+            index, name, view.camera, view.sun, spp, view.exposure, earth, sunlight, view.sky_from_world, view.objects
+        )
+
+    def _earth_in(self, name: str, view: PlannedView) -> EarthConfig | None:
+        """The scene's Earth, if it has one, where that view has it. Raises InputError for a place within it."""
+        earth = self.scene.earth
         if view.earth is not None and not np.linalg.norm(view.earth) > 1e3 * EARTH_RADIUS_KM:
             distance = f"{np.linalg.norm(view.earth) / 1e3:.6g} km in {name}"
             raise InputError(
                 f"earth: expected the Earth's centre beyond its radius of {EARTH_RADIUS_KM} km, found {distance}"
             )
-        if view.earth is not None and earth is None:
-            sunlight = visible_fraction(view.sun.direction, view.earth, self.scene.sun.angular_radius)
-        elif view.earth is not None and earth is not None:  # which hides the Sun as it is traced
-            earth = replace(earth, **_place_of(view.earth))
-        return FrameSpec(
-            index, name, view.camera, view.sun, spp, view.exposure, earth, sunlight, view.sky_from_world, view.objects
-        )
+        return earth if view.earth is None or earth is None else replace(earth, **_place_of(view.earth))
 
-    def _keys_of(self, view: PlannedView) -> dict[str, JsonValue]:
+    def _keys_of(self, name: str, view: PlannedView) -> dict[str, JsonValue]:
         """What transforms.json says of a frame beside its camera and its Sun's direction."""
         earth = view.earth
         if earth is None and self.scene.earth is not None:
@@ -313,6 +316,8 @@ class _DatasetPlan:
             poses = poses_in(self.scene, view.objects)
             moves = [{"id": number, "world_from_object": poses[number - 1].tolist()} for number in view.objects]
             keys["objects"] = moves
+        if (lit_by := self._earth_in(name, view)) is not None:
+            keys |= earth_keys(lit_by.light)
         return {key: value for key, value in {**keys, "sun_visibility": visible}.items() if value is not None}
 
 

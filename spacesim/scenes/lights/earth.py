@@ -3,16 +3,13 @@
 import math
 from dataclasses import dataclass
 
+from spacesim.data.earth import EARTH_ALBEDO, Earth
 from spacesim.data.errors import expect
 from spacesim.data.geometry import Array, direction_from_angles
 
 EARTH_RADIUS_KM = 6378.137
 """Equatorial radius of the Earth (WGS 84): altitudes of orbits are counted from it, so it is the sphere's here as well.
 The mean radius is 6371.0 km: the sphere gives up to 0.2 % more light for it, far less than albedos are known to."""
-
-EARTH_ALBEDO = 0.294
-"""Bond albedo of the Earth (D. R. Williams, "Earth Fact Sheet", NASA Goddard Space Flight Center); to the two digits
-that G. L. Stephens et al. give ("The albedo of Earth", Reviews of Geophysics 53, 2015), 0.29."""
 
 
 @dataclass(frozen=True)
@@ -44,3 +41,8 @@ class EarthConfig:
     def angular_radius(self) -> float:
         """Radians from the Earth's centre to its limb."""
         return math.asin(1 / self.distance)
+
+    @property
+    def light(self) -> Earth:
+        """As datasets name it."""
+        return Earth(self.direction, math.degrees(self.angular_radius), self.albedo)

@@ -1,5 +1,6 @@
 """A run in the world of another dataset: one that was trained in axes and a scale of its own."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from spacesim.data.files import JsonDict
+from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Frame, Sun
 from spacesim.splat.compose.members import Ensemble, Member
 from spacesim.splat.compose.pose import Pose
@@ -91,7 +93,7 @@ class AlignedRun:
     ) -> Prediction:
         """As `Run.predict`, of a camera and a Sun in the world."""
         near = self.pose.camera_in_model(camera)
-        towards = None if sun is None else Sun(self.pose.direction_in_model(sun.direction))
+        towards = None if sun is None else _turned(sun, self.pose.direction_in_model)
         drawn = self.run.predict(near, towards, normals, exposure)
         normal = None if drawn.normal is None else drawn.normal @ self.pose.rotation.T.astype(np.float32)
         return replace(drawn, depth=drawn.depth * np.float32(self.pose.scale), normal=normal)
@@ -107,5 +109,11 @@ def moved_frame(frame: Frame, pose: Pose) -> Frame:
     place = np.eye(4)
     place[:3, :3] = pose.rotation @ frame.camera.world_from_camera[:3, :3]
     place[:3, 3] = pose.points(frame.camera.position)
-    sun = None if frame.sun is None else Sun(pose.rotation @ frame.sun.direction)
+    sun = None if frame.sun is None else _turned(frame.sun, lambda direction: pose.rotation @ direction)
     return replace(frame, camera=replace(frame.camera, world_from_camera=place), sun=sun)
+
+
+def _turned(sun: Sun, turn: Callable[[Array], Array]) -> Sun:
+    """The Sun, and the Earth where it lights one. turn: directions [3] to others"""
+    earth = None if sun.earth is None else replace(sun.earth, direction=turn(sun.earth.direction))
+    return Sun(turn(sun.direction), earth)

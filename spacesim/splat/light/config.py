@@ -21,6 +21,9 @@ class LightConfig:
     shadow: ShadowConfig | None = None  #: how shadows are cast; none leaves them to the field (the method `relight`)
     #: so many of the Gaussians scatter sunlight onto all others, once and as if nothing stood in between; 0 for none
     bounce: int = 0
+    #: add what the Earth gives; none: where every training picture names its Earth and the field has normals, as
+    #: `train` finds out
+    earth: bool | None = None
     #: colours are linear, shares of what is white, and blended as such, and pictures go through the tone curve
     #: afterwards; else they are sRGB values, as in the thesis (section 7.2 asks for the former)
     linear: bool = False
@@ -38,6 +41,11 @@ class LightConfig:
         if self.bounce and not self.field.surface:
             kind = "a field that takes directions"
             raise InputError(f"bounce: expected 0 or light.field.inputs=surface, whose normals it needs, found {kind}")
+        if self.earth and not self.field.surface:
+            kind = "a field that takes directions"
+            raise InputError(
+                f"earth: expected false or light.field.inputs=surface, whose normals it needs, found {kind}"
+            )
         if self.shadow and not self.field.knows_sun:
             raise InputError("field: expected inputs with the Sun, which casts shadows, found view")
         for name in ("tone", "exposure"):
@@ -67,9 +75,9 @@ class LightConfig:
     @property
     def features(self) -> int:
         """F: numbers that each Gaussian has for the field, then for the refinement of shadows, then of its albedo."""
-        return self.albedos + 3 * (self.bounce > 0)
+        return self.albedos + 3 * (self.bounce > 0 or bool(self.earth))
 
     @property
     def albedos(self) -> int:
-        """Which of these numbers are the logits of the albedo (RGB) that one bounce needs: this and the next two."""
+        """Which of these numbers are the logits of the albedo (RGB) for bounce and Earth: this and the next two."""
         return self.field.stored + (self.refine.features if self.refine else 0)

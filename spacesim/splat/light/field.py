@@ -11,6 +11,7 @@ from spacesim.data.errors import check_ranges
 from spacesim.data.structure import check_fields
 from spacesim.learning.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape
 from spacesim.learning.reflectance import COSINES, points_away, seen_side_normals, surface_cosines
+from spacesim.splat.light.earthlight import earth_irradiance
 from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.cameras import Projection
@@ -115,6 +116,7 @@ class FieldInputs:
     rotations_and_scales: tuple[Array4f, Array3f]  #: (quaternions, log scales) of the Gaussians
     camera: Projection  #: from where the Gaussians are seen
     sun: Array3f  #: Array3f of width 1, unit, towards the Sun
+    beams: list[Float]  #: the Earth's, Float [4 * BEAMS] in a list, or nothing
 
 
 def field_items(config: FieldConfig, features: Float, views: list[Float], batch: PaddedBatch) -> TensorXf:
@@ -138,10 +140,22 @@ def sun_facing(config: FieldConfig, inputs: FieldInputs, views: list[Float], bat
     return [_faces(views[config.view.size], inputs, batch)] if config.surface else []
 
 
+def earthlight(config: FieldConfig, inputs: FieldInputs, batch: PaddedBatch) -> list[Float]:
+    """[M] of `earth_irradiance` in a list; nothing where there is no Earth."""
+    direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
+    return [earth_irradiance(_normals(config, inputs, batch), direction, beams) for beams in inputs.beams]
+
+
 def normals_adjoint(
-    config: FieldConfig, inputs: FieldInputs, grad_items: TensorXf, grad_facing: list[Float], batch: PaddedBatch
+    config: FieldConfig,
+    inputs: FieldInputs,
+    grad_items: TensorXf,
+    grad_facing: list[Float],
+    grad_earth: list[Float],
+    batch: PaddedBatch,
 ) -> TensorXf:
-    """[B, 3, m]: gradient of the normals, from that of the network's items and, if any, of `sun_facing`."""
+    """[B, 3, m]: gradient of the normals, from that of the network's items and, if any, of `sun_facing` and of
+    `earthlight`."""
     normals = _normals(config, inputs, batch)
     dr.enable_grad(normals)
     direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
@@ -150,6 +164,8 @@ def normals_adjoint(
     along = sum((cosine * batch.row(grad_items, first + i) for i, cosine in enumerate(cosines)), ad.Float(0))
     for gradient in grad_facing:
         along += gradient * _faces(cosines[0], inputs, batch)
+    for gradient, beams in zip(grad_earth, inputs.beams, strict=False):
+        along += gradient * earth_irradiance(normals, direction, beams)
     dr.backward(along)
     return batch.matrix(list(dr.grad(normals)))
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Float, UInt32
 from spacesim.backend.upload import upload
+from spacesim.data.earth import Earth
 from spacesim.data.geometry import Array
 from spacesim.learning import mlp
 from spacesim.splat.light import cooperative
@@ -148,9 +149,11 @@ class LightModel:
         embeddings = [upload(np.zeros(numbers))] if config.field.embeddings else []
         return LightModel(config, [upload(weight) for weight in weights], frame, embeddings)
 
-    def encode_sun(self, sun: np.ndarray | None) -> SunEncoding:
-        """What kernels read of a Sun in the direction `sun` [3], unit, world axes; None: the field does not take it."""
-        terms: SunEncoding = self._encodings(*(float(value) for value in (ANY_SUN if sun is None else sun)))
+    def encode_sun(self, sun: np.ndarray | None, earth: Earth | None = None) -> SunEncoding:
+        """What kernels read of a Sun in the direction `sun` [3], unit, world axes; None: the field does not take it.
+        earth: that it lights, if there is one; a model that has not learned its light takes none"""
+        earth = earth if self.config.earth and sun is not None else None
+        terms: SunEncoding = self._encodings(earth, *(float(value) for value in (ANY_SUN if sun is None else sun)))
         return terms
 
     def shadows(
@@ -171,13 +174,15 @@ class LightModel:
         sun: np.ndarray | None,
         picture: int | None = None,
         make_lists: MakeLists = bin_splats,
+        earth: Earth | None = None,
     ) -> Shading:
         """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes; None:
         the field does not take it. picture: number of the training picture whose embedding the field reads; None: it
-        reads the mean one. make_lists: of the Sun's picture"""
+        reads the mean one. make_lists: of the Sun's picture;  earth: see `encode_sun`"""
         shadows = self.shadows(gaussians, sun, make_lists)
         embedding = self._mean_embedding() if picture is None else self._embedding(picture)
-        inputs = self._inputs(gaussians, camera, self._with_embedding(sun, embedding), shadows)
+        terms = self._with_embedding(self.encode_sun(sun, earth), embedding)
+        inputs = self._inputs(gaussians, camera, terms, shadows)
         batch = PaddedBatch.of(gaussians.count)
         colors, visibility, tape = kernels.shade(self.config, self.weights, inputs, batch)
         return Shading(colors, visibility[0] if visibility else None, shadows, inputs, batch, tape, picture)
@@ -211,17 +216,19 @@ class LightModel:
         sun: np.ndarray | None,
         sunlight: Sunlight | None = None,
         embedding: np.ndarray | None = None,
+        earth: Earth | None = None,
     ) -> tuple[list[Float], Float | None]:
         """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. sunlight: `sunlight` of this
-        Sun, of an earlier picture;  embedding: [E] of the picture, None: the mean one. What the field's first layer
-        makes of the features does not change with Sun or camera and stays for the next picture: as many numbers for
-        each Gaussian as the layer has units."""
+        Sun, of an earlier picture;  embedding: [E] of the picture, None: the mean one;  earth: see `encode_sun`. What
+        the field's first layer makes of the features does not change with Sun or camera and stays for the next
+        picture: as many numbers for each Gaussian as the layer has units."""
         light = self.sunlight(gaussians, sun) if sunlight is None else sunlight
         of_any_size = replace(camera, width=1, height=1)  # directions do not depend on it: one recording for all sizes
         batch = PaddedBatch.of(gaussians.count, still=True)
         cache = self._picture_cache(_features(gaussians), batch)
         of_picture = cache.embedding if embedding is None else [upload(np.asarray(embedding, np.float64))]
-        inputs = self._inputs(gaussians, of_any_size, self._with_embedding(sun, of_picture), None)
+        terms = self._with_embedding(self.encode_sun(sun, earth), of_picture)
+        inputs = self._inputs(gaussians, of_any_size, terms, None)
         of_field, _ = split_weights(self.config, self.weights)
         visibility = [] if light.visibility is None else [light.visibility]
         shown = kernels.shade_picture(
@@ -277,9 +284,9 @@ class LightModel:
             model.embeddings = [upload(embeddings)]
         return model
 
-    def _with_embedding(self, sun: np.ndarray | None, embedding: list[Float]) -> SunEncoding:
+    @staticmethod
+    def _with_embedding(terms: SunEncoding, embedding: list[Float]) -> SunEncoding:
         """`encode_sun` with an embedding in a list, or nothing."""
-        terms = self.encode_sun(sun)
         return replace(terms, field_encoding=dr.concat([terms.field_encoding, *embedding])) if embedding else terms
 
     def _embedding(self, picture: int) -> list[Float]:
@@ -335,9 +342,10 @@ class LightModel:
             self._cache = _PictureCache(_kept(read), first_layer, packed, self._mean_embedding())
         return self._cache
 
-    def _encode_sun(self, *sun: float) -> SunEncoding:
+    def _encode_sun(self, earth: Earth | None, *sun: float) -> SunEncoding:
         refine = self.config.refine or self.config.field
-        terms = SunEncoding(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun))
+        beams = [upload(earth.beams(np.array(sun)))] if earth else []
+        terms = SunEncoding(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun), beams)
         dr.eval(terms)
         return terms
 

@@ -17,6 +17,7 @@ from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.field import (
     FieldConfig,
     FieldInputs,
+    earthlight,
     field_items,
     field_views,
     is_back_side_seen,
@@ -42,6 +43,7 @@ class SunEncoding:
     light_axes: Float  #: [9], `light_rows`
     field_encoding: Float  #: input of the field's network: the Sun's encoding, then the picture's embedding
     refine_encoding: Float  #: input of the refinement's network
+    beams: list[Float]  #: the Earth's, Float [4 * BEAMS] of `Earth.beams` in a list, or nothing
 
 
 @dataclass
@@ -67,7 +69,7 @@ class ShadingTape:
     colors: list[Float]  #: 3 arrays [M] before they are dimmed
     occlusion: list[Float]  #: the refined one [M] in a list, or nothing
     faces: list[Float]  #: of `sun_facing`, or nothing
-    bounced: list[Float]  #: 3 arrays [M], light at the side that is seen, or nothing
+    scattered: list[Float]  #: 3 arrays [M], light of the bounce and the Earth at the side that is seen, or nothing
 
 
 @recorded
@@ -87,14 +89,13 @@ def shade(
     dr.eval(outputs, colors, occlusion, faces)
     bounced = []
     if config.bounce:
-        bounced_both_sides = irradiance(
-            _scatterers(config, inputs), config.bounce, [1 - value for value in occlusion], batch
-        )
-        bounced = _select_seen_side(config, field_inputs, bounced_both_sides, batch)
-        outputs = _add_bounce(config, inputs, outputs, bounced, batch)
-        dr.eval(outputs, bounced)
+        bounced = irradiance(_scatterers(config, inputs), config.bounce, [1 - value for value in occlusion], batch)
+    scattered = _scattered(config, field_inputs, bounced, batch)
+    if scattered:
+        outputs = _add_scattered(config, inputs, outputs, scattered, batch)
+        dr.eval(outputs, scattered)
     outputs = batch.unpad(outputs, inputs.means.x)
-    return outputs[:3], outputs[3:], ShadingTape(field_tape, refine_tape, colors, occlusion, faces, bounced)
+    return outputs[:3], outputs[3:], ShadingTape(field_tape, refine_tape, colors, occlusion, faces, scattered)
 
 
 @recorded
@@ -123,9 +124,9 @@ def shade_picture(
     shown = _dimmed(
         colors, [batch.pad_zeros(value) for value in visibility], sun_facing(field, field_inputs, views, batch)
     )
-    if bounced:
-        seen = _select_seen_side(config, field_inputs, [batch.pad_zeros(light) for light in bounced], batch)
-        shown = _add_bounce(config, inputs, shown, seen, batch)
+    scattered = _scattered(config, field_inputs, [batch.pad_zeros(light) for light in bounced], batch)
+    if scattered:
+        shown = _add_scattered(config, inputs, shown, scattered, batch)
     dr.eval(shown)
     return batch.unpad(shown, inputs.means.x)
 
@@ -193,9 +194,12 @@ def adjoint(
     visibility = 1 - tape.occlusion[0] if tape.occlusion else 1
     gradients = [batch.pad_zeros(gradient) for gradient in grad_color]
     grad_albedo: list[Float] = []
-    if tape.bounced:
+    grad_earth: list[Float] = []
+    if tape.scattered:
         dimmed = [color * visibility for color in tape.colors]
-        gradients, grad_albedo = _bounce_adjoint(config, inputs, gradients, dimmed, tape.bounced, batch)
+        gradients, grad_albedo, grad_earth = _scattered_adjoint(
+            config, inputs, gradients, dimmed, tape.scattered, batch
+        )
     pairs = list(zip(gradients, tape.colors, strict=True))
     grad_output = batch.matrix([g * visibility * c * (1 - c) for g, c in pairs])
     grad_weights, grad_items = mlp.backward(
@@ -211,7 +215,8 @@ def adjoint(
     if by_sun:
         grad_sun = [sun_adjoint(config.field, _field_inputs(inputs), grad_items, grad_facing, by_encoding[0], batch)]
     if config.field.surface:
-        parts.append((normals_adjoint(config.field, _field_inputs(inputs), grad_items, grad_facing, batch), 0, 3))
+        field_inputs = _field_inputs(inputs)
+        parts.append((normals_adjoint(config.field, field_inputs, grad_items, grad_facing, grad_earth, batch), 0, 3))
     grad_occlusion = -sum(
         (g * c for g, c in pairs), sum((_picture_visibility(g, tape.faces) for g in grad_shown), ad.Float(0))
     )
@@ -259,7 +264,12 @@ def _refine_items(
 def _field_inputs(inputs: ShadingInputs) -> FieldInputs:
     assert inputs.camera is not None
     return FieldInputs(
-        inputs.features, inputs.means, inputs.rotations_and_scales, inputs.camera, towards_sun(inputs.sun.light_axes)
+        inputs.features,
+        inputs.means,
+        inputs.rotations_and_scales,
+        inputs.camera,
+        towards_sun(inputs.sun.light_axes),
+        inputs.sun.beams,
     )
 
 
@@ -280,38 +290,44 @@ def _albedo(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch) -> l
     return [mlp.sigmoid(row) for row in batch.block(inputs.features, config.albedos, 3)]
 
 
-def _select_seen_side(
-    config: LightConfig, inputs: FieldInputs, bounced: list[Float], batch: PaddedBatch
-) -> list[Float]:
-    """Three Floats [M] of the six of `irradiance`."""
-    over = is_back_side_seen(config.field, inputs, batch)
-    return [dr.select(over, bounced[3 + c], bounced[c]) for c in range(3)]
+def _scattered(config: LightConfig, inputs: FieldInputs, bounced: list[Float], batch: PaddedBatch) -> list[Float]:
+    """Three Floats [M]: light of the bounce and the Earth that arrives at the side that is seen, or nothing where there
+    is neither. bounced: six Floats [M] of `irradiance`, or nothing"""
+    light: list[Float] = []
+    if bounced:
+        over = is_back_side_seen(config.field, inputs, batch)
+        light = [dr.select(over, bounced[3 + c], bounced[c]) for c in range(3)]
+    for earth in earthlight(config.field, inputs, batch):
+        light = [channel + earth for channel in light or [ad.Float(0)] * 3]
+    return light
 
 
-def _add_bounce(
-    config: LightConfig, inputs: ShadingInputs, shown: list[Float], bounced: list[Float], batch: PaddedBatch
+def _add_scattered(
+    config: LightConfig, inputs: ShadingInputs, shown: list[Float], scattered: list[Float], batch: PaddedBatch
 ) -> list[Float]:
-    """Dimmed colours [M] with the light that bounces, what else is in `shown` as it was."""
-    rows = zip(shown[:3], _albedo(config, inputs, batch), bounced, strict=True)
+    """Dimmed colours [M] with the light of `_scattered`, what else is in `shown` as it was."""
+    rows = zip(shown[:3], _albedo(config, inputs, batch), scattered, strict=True)
     return [add_irradiance(color, rho * light, config.linear) for color, rho, light in rows] + shown[3:]
 
 
-def _bounce_adjoint(
+def _scattered_adjoint(
     config: LightConfig,
     inputs: ShadingInputs,
     gradients: list[Float],
     dimmed: list[Float],
-    bounced: list[Float],
+    scattered: list[Float],
     batch: PaddedBatch,
-) -> tuple[list[Float], list[Float]]:
-    """Gradients [M] of the dimmed colours and of the albedos' logits. What bounces counts as given, as it is small."""
-    grad_dimmed, grad_albedo = [], []
-    rows = zip(gradients, dimmed, _albedo(config, inputs, batch), bounced, strict=True)
+) -> tuple[list[Float], list[Float], list[Float]]:
+    """Gradients [M] of the dimmed colours, of the albedos' logits and, in a list, of the Earth's light, where there is
+    any. What bounces counts as given, as it is small."""
+    grad_dimmed, grad_albedo, grad_light = [], [], ad.Float(0)
+    rows = zip(gradients, dimmed, _albedo(config, inputs, batch), scattered, strict=True)
     for gradient, color, rho, light in rows:
         of_color, of_light = add_irradiance_slopes(color, rho * light, config.linear)
         grad_dimmed.append(gradient * of_color)
         grad_albedo.append(gradient * of_light * light * rho * (1 - rho))
-    return grad_dimmed, grad_albedo
+        grad_light += gradient * of_light * rho
+    return grad_dimmed, grad_albedo, [grad_light for _ in inputs.sun.beams]
 
 
 def split_weights(config: LightConfig, weights: list[Float]) -> tuple[list[Float], list[Float]]:

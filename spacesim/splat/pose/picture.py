@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from spacesim.backend.arrays import Float
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.images import load_image
@@ -30,12 +31,13 @@ class SunlitRun:
     run: Run  #: the trained model
     sun: Array | None  #: [3], towards it
     sunlight: Sunlight | None  #: None of a run without light
+    earth: Earth | None  #: that the Sun lights
 
     @staticmethod
     def of(run: Run, sun: Sun | None) -> "SunlitRun":
         direction = None if sun is None else sun.direction
         sunlight = run.light.sunlight(run.gaussians, direction) if run.light else None
-        return SunlitRun(run, direction, sunlight)
+        return SunlitRun(run, direction, sunlight, None if sun is None else sun.earth)
 
     def shade(self, camera: Camera) -> list[Float] | None:
         """Colours [N] three times as seen by a camera; None of harmonics, which are summed while drawing."""
@@ -43,7 +45,7 @@ class SunlitRun:
             return None
         light: LightModel = self.run.light
         model: Gaussians = self.run.gaussians
-        colors, _ = light.shade_picture(model, Pinhole.of(camera), self.sun, sunlight=self.sunlight)
+        colors, _ = light.shade_picture(model, Pinhole.of(camera), self.sun, sunlight=self.sunlight, earth=self.earth)
         return colors
 
     def draw(self, camera: Camera, colors: list[Float] | None) -> np.ndarray:

@@ -40,7 +40,7 @@ def train(
     Ctrl-C on the command line leaves a checkpoint of the step that it arrives in. Raises InputError where `out` holds a
     run and `resume` is not asked for, or one of another configuration, or where another training is at work in it.
     """
-    out, config = Path(out), _with_tone_and_exposure(config, check_still(dataset))
+    out, config = Path(out), _with_light_of(config, check_still(dataset))
     described = {**config.to_json(), "data": describe_data(dataset)}
     if is_finished(out, described, resume, read_config):
         return load_run(out)
@@ -109,11 +109,20 @@ def _trainer_of_poses(
     return Trainer(dataset, config, suns, values)
 
 
-def _with_tone_and_exposure(config: TrainConfig, dataset: Dataset) -> TrainConfig:
-    """Linear colours have the tone curve and the exposure of the dataset's pictures, where they were given none."""
+def _with_light_of(config: TrainConfig, dataset: Dataset) -> TrainConfig:
+    """What the configuration leaves to the dataset: whether the Earth is a part of the light; the tone curve and the
+    exposure of linear colours. Raises InputError where the Earth is asked for and a frame names none."""
     light = config.light
-    if light is None or not light.linear:
+    if light is None:
         return config
-    tone, exposure = tone_and_exposure(dataset.scene) or ("srgb", 0.0)
-    light = replace(light, tone=light.tone or tone, exposure=exposure if light.exposure is None else light.exposure)
+    dark = next((f.file_path for f in dataset.train if f.sun is None or f.sun.earth is None), None)
+    if light.earth and dark is not None:
+        expected = "expected earth_direction in every training frame (light.earth = true)"
+        raise InputError(f"{dataset.root}: {expected}, found none in {dark}")
+    if light.field.surface and dark is None and light.earth is None:
+        light = replace(light, earth=True)
+    if light.linear:
+        tone, exposure = tone_and_exposure(dataset.scene) or ("srgb", 0.0)
+        exposure = exposure if light.exposure is None else light.exposure
+        light = replace(light, tone=light.tone or tone, exposure=exposure)
     return replace(config, light=light)

@@ -124,7 +124,7 @@ class ViewPass:
             rows, camera, degree, config.antialiased, config.shape_terms, self.scale, watched
         )
         of_sun = partial(self.lists.make, "sun", view.index)
-        shading = light.shade(gaussians, camera, view.sun, view.index, of_sun) if light else None
+        shading = light.shade(gaussians, camera, view.sun, view.index, of_sun, view.earth) if light else None
         if shading:
             values["color"] = shading.colors
             if config.visibility_weight > 0 and shading.visibility is not None:

@@ -10,6 +10,7 @@ import numpy as np
 from spacesim.backend import ad, free_memory, main_memory
 from spacesim.backend.arrays import Bool, UInt32
 from spacesim.backend.upload import upload
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Truth
@@ -38,6 +39,7 @@ class TrainingView:
     #: surface; "depth", along the optical axis, metres, 0 where there is none; "normal", 3 planes, world axes;
     #: "radiance", 3 planes, W m^-2 sr^-1, weighted by alpha
     truth: dict[str, list[np.ndarray]]
+    earth: Earth | None = None  #: that the Sun lights, where the frame names one
 
 
 class TrainingViews:
@@ -110,7 +112,8 @@ class TrainingViews:
             log.warning("%s: no pixel of it counts, by its mask or by its lens distortion", frame.file_path)
         sun = None if frame.sun is None else frame.sun.direction
         opaque, planes = bool((alpha == 1).all()), self._planes(frame, traced)
-        return TrainingView(index, frame.camera, sun, bytes_.view("<u4").ravel(), valid, opaque, planes)
+        earth = None if frame.sun is None else frame.sun.earth
+        return TrainingView(index, frame.camera, sun, bytes_.view("<u4").ravel(), valid, opaque, planes, earth)
 
     def _traced(self, frame: Frame) -> Truth | None:
         """A frame's truth, if any of it is asked for. Raises InputError for radiance that is not finite."""

@@ -13,6 +13,7 @@ from splats import light_of, random_splats, srgb_of
 
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
@@ -45,6 +46,7 @@ from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 
 SUN = np.array([0.48, -0.36, 0.8])
+EARTH = Earth(np.array([-0.6, -0.5, -0.6]), 60.0, albedo=0.9)
 ENCODINGS = {"sun": Encoding("harmonics", 2), "view": Encoding("positional", 1)}
 FIELD = FieldConfig(features=5, width=12, layers=3, inputs=DirectionsConfig(**ENCODINGS))
 ON_SURFACE = replace(FIELD, inputs=SurfaceConfig(**ENCODINGS))
@@ -61,6 +63,8 @@ CONFIGS = {
     ),
     "bounce": LightConfig(ON_SURFACE, ShadowConfig(SplattingConfig(), 32, refine=REFINE), bounce=7),
     "bounce, linear": LightConfig(ON_SURFACE, bounce=5, linear=True),
+    "earth": LightConfig(ON_SURFACE, ShadowConfig(SplattingConfig(), 32, refine=REFINE), bounce=7, earth=True),
+    "earth, linear": LightConfig(ON_SURFACE, earth=True, linear=True),
     "no sun": LightConfig(replace(FIELD, inputs=ViewAloneConfig(ENCODINGS["view"]))),
     "embeddings": LightConfig(replace(FIELD, embeddings=4)),
     "no sun, embeddings": LightConfig(replace(FIELD, inputs=ViewAloneConfig(ENCODINGS["view"]), embeddings=1)),
@@ -214,7 +218,7 @@ def twin(
     color = sigmoid(network(field.shape, weights[:split], items, shared))
     if not raw:
         visible = np.ones(len(color))
-        color, given = with_bounce(light, arrays, color, visible, given)
+        color, given = with_scattered(light, arrays, color, visible, given)
         return color, visible, given
     occlusion, alignment, thickness, bias = raw
     if config.refine:
@@ -233,17 +237,27 @@ def twin(
         output = network(refine.shape, weights[split:], items, encoded(refine.sun, SUN[None])[0])[:, 0]
         sure = np.clip(occlusion, 0.02, 0.98)
         occlusion = sigmoid(output + (np.log(sure / (1 - sure)) if refine.residual else 0))
-    color, given = with_bounce(light, arrays, color * (1 - occlusion)[:, None], 1 - occlusion, given)
+    color, given = with_scattered(light, arrays, color * (1 - occlusion)[:, None], 1 - occlusion, given)
     return color, (1 - occlusion) * faces, given
 
 
-def with_bounce(light: LightModel, arrays: dict, color: np.ndarray, visible: np.ndarray, given) -> tuple:
-    """(colours, light that bounces): as they are for a model without."""
-    if not light.config.bounce:
+def earthlit(light: LightModel, arrays: dict) -> np.ndarray:
+    """[N, 1] irradiance of the side that is seen, one beam after another."""
+    first, towards = light.config.field.features, np.array([0, -6, 1.0]) - arrays["means"]
+    normals = arrays["features"][:, first : first + 3].astype(np.float64)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals *= np.sign((normals * towards).sum(axis=1, keepdims=True))
+    return sum(power * np.maximum(normals @ beam, 0) for *beam, power in EARTH.beams(SUN))[:, None]
+
+
+def with_scattered(light: LightModel, arrays: dict, color: np.ndarray, visible: np.ndarray, given) -> tuple:
+    """(colours, light that bounces): as they are for a model without bounce and Earth."""
+    config = light.config
+    if not (config.bounce or config.earth):
         return color, None
     given = bounced(light, arrays, visible) if given is None else given
-    albedo = sigmoid(arrays["features"].astype(np.float64)[:, light.config.albedos :])
-    return brightened(light, color, albedo * given), given
+    albedo = sigmoid(arrays["features"].astype(np.float64)[:, config.albedos :])
+    return brightened(light, color, albedo * (given + (earthlit(light, arrays) if config.earth else 0))), given
 
 
 @pytest.mark.parametrize("name", CONFIGS)
@@ -255,9 +269,10 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name):
     shadows = light.shadows(splats, SUN)
     raw = [numbers(row) for row in (shadows.occlusion, *shadows.info)] if shadows else []
     own = embedding_of(light, 3)
-    shading = light.shade(splats, eye(), SUN, picture=3)
+    shading = light.shade(splats, eye(), SUN, picture=3, earth=EARTH)
     color, visibility, given_light = twin(light, arrays, weights, raw, embedding=own)
-    assert given_light is None or np.abs(given_light).max() > 0.01
+    assert not light.config.bounce or np.abs(given_light).max() > 0.01
+    assert not light.config.earth or earthlit(light, arrays).max() > 0.1
     np.testing.assert_allclose(np.stack([numbers(c) for c in shading.colors], axis=1), color, atol=3e-5)
     assert (shading.visibility is None) == (light.config.shadow is None)
     if shading.visibility is not None:
@@ -346,7 +361,8 @@ def test_pictures_have_the_colors_that_are_trained(monkeypatch, name, by_vectors
     other_eye = Pinhole.of(Camera(look_at([5, 2, 1], [0, 0, 0]), 32, 32, 40, 40, 16, 16))
 
     def same(camera, sun: np.ndarray) -> None:
-        (colors, visibility), trained = light.shade_picture(splats, camera, sun), light.shade(splats, camera, sun)
+        colors, visibility = light.shade_picture(splats, camera, sun, earth=EARTH)
+        trained = light.shade(splats, camera, sun, earth=EARTH)
         for one, other in zip(colors, trained.colors, strict=True):
             np.testing.assert_allclose(numbers(one), numbers(other), atol=tolerance)
         assert (visibility is None) == (trained.visibility is None)

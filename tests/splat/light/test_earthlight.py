@@ -1,0 +1,148 @@
+"""The Earth as a source of the model: what training takes from a dataset, and the layers that it draws. The adjoint is
+in test_light.py."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spacesim.data.earth import Earth
+from spacesim.data.errors import InputError
+from spacesim.data.images import linear_from_srgb
+from spacesim.data.records import Dataset
+from spacesim.data.store import load_truth
+from spacesim.learning.prediction import added_light
+from spacesim.scenes import generate, read_scene
+from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.splat.compose.aligned import AlignedRun, moved_frame
+from spacesim.splat.compose.pose import Pose
+from spacesim.splat.compose.scene import GaussianComposition, PlacedRun
+from spacesim.splat.light.config import LightConfig
+from spacesim.splat.light.field import FieldConfig
+from spacesim.splat.pose.picture import SunlitRun
+from spacesim.splat.run import Run, load_run
+from spacesim.splat.train.config import preset, with_settings
+from spacesim.splat.train.train import train
+
+CONFIG = with_settings(replace(preset("demo", "relight"), iterations=400, init_count=1500), {"checkpoint_every": 300})
+
+
+@pytest.fixture(scope="module")
+def earthlit(tmp_path_factory) -> Dataset:
+    """Pictures under two Suns and a bright Earth."""
+    size = {"resolution": (32, 32), "spp": 16, "points": 400}
+    scene = read_scene("boxsat", sun=((20, 40), (200, 60)), views=8, test_views=2, **size)
+    scene = replace(scene, earth=EarthConfig(altitude_km=600.0, albedo=0.9))
+    return generate(scene, tmp_path_factory.mktemp("earth") / "data")
+
+
+@pytest.fixture(scope="module")
+def run(earthlit, tmp_path_factory) -> Run:
+    return train(earthlit, tmp_path_factory.mktemp("run") / "run", CONFIG)
+
+
+def pictures(run, frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of both sources, of the Sun alone, and linear light of the Earth alone."""
+    both, alone = (run.predict(frame.camera, sun) for sun in (frame.sun, replace(frame.sun, earth=None)))
+    return both.rgb, alone.rgb, linear_from_srgb(added_light(both, alone, "srgb").rgb)
+
+
+def test_frames_name_the_earth_that_lights_them(earthlit):
+    for frame in earthlit.frames:
+        np.testing.assert_allclose(frame.sun.earth.direction, [0, 0, -1], atol=1e-12)
+        assert frame.sun.earth.angular_radius_deg == pytest.approx(np.degrees(np.arcsin(6378.137 / 6978.137)))
+        assert frame.sun.earth.albedo == 0.9
+
+
+def test_training_takes_the_earth_where_frames_name_one(earthlit, run, tmp_path):
+    assert run.light.config.earth is True
+    assert CONFIG.light.earth is None
+    without = train(earthlit, tmp_path / "without", with_settings(CONFIG, {"light.earth": False}))
+    assert without.gaussians.feature_count == run.gaussians.feature_count - 3
+    both, alone, _ = pictures(without, earthlit.test[0])
+    np.testing.assert_array_equal(both, alone)
+    by_directions = with_settings(replace(CONFIG, iterations=1), {"light.field.inputs": "directions"})
+    assert train(earthlit, tmp_path / "directions", by_directions).light.config.earth is None
+
+
+def test_it_repeats_to_the_bit_and_resumes(earthlit, run, tmp_path):
+    train(earthlit, tmp_path / "again", CONFIG)
+    (tmp_path / "again/model.safetensors").unlink()  # as if stopped at the last checkpoint
+    (tmp_path / "again/checkpoints/step_00000400.safetensors").unlink(missing_ok=True)
+    resumed = train(earthlit, tmp_path / "again", CONFIG, resume=True)
+    assert (resumed.path / "model.safetensors").read_bytes() == (run.path / "model.safetensors").read_bytes()
+
+
+def test_the_layers_are_those_of_the_truth(earthlit, run):
+    """Near enough that each is told from the other: the Earth gives two fifths of the light here."""
+    layers: list[tuple[np.ndarray, ...]] = []
+    for frame in earthlit.test:
+        truth = load_truth(earthlit, frame)
+        both, alone, earth = pictures(run, frame)
+        traced = [np.pi / 1361 * layer for layer in (truth.radiance - truth.radiance_earth, truth.radiance_earth)]
+        shown = (linear_from_srgb(both), linear_from_srgb(alone), earth, *traced)
+        layers.append(tuple(layer[truth.object_id > 0] for layer in shown))
+    both, sun, earth, true_sun, true_earth = (np.concatenate(layer).mean(axis=1) for layer in zip(*layers, strict=True))
+    assert true_earth.mean() > 0.3 * (true_earth + true_sun).mean()
+    assert earth.mean() == pytest.approx(true_earth.mean(), rel=0.25)
+    assert sun.mean() == pytest.approx(true_sun.mean(), rel=0.25)
+    assert np.corrcoef(earth, true_earth)[0, 1] > 0.4
+    assert np.mean((sun - true_sun) ** 2) < 0.9 * np.mean((both - true_sun) ** 2)
+
+
+def test_where_no_earth_is_given_there_is_none(run, earthlit):
+    """Nor in compositions; an aligned run sees it where it stands in the world."""
+    frame = earthlit.test[0]
+    both, alone, earth = pictures(run, frame)
+    assert (both >= alone - 1e-5).all()
+    assert earth.max() > 0.02
+    composed = GaussianComposition([PlacedRun(run)]).predict(frame.camera, frame.sun)
+    np.testing.assert_allclose(composed.rgb, alone, atol=1e-5)
+    half = np.sqrt(0.5)
+    pose = Pose(np.array([[half, 0, half], [0, 1, 0], [-half, 0, half]]), [0.4, -0.2, 0.1], 1.0)
+    there = moved_frame(frame, pose)
+    assert np.abs(there.sun.earth.direction - frame.sun.earth.direction).max() > 0.5
+    np.testing.assert_allclose(
+        AlignedRun(run, pose).predict(there.camera, there.sun).rgb, both, atol=5e-3
+    )  # by other beams
+    drawn = SunlitRun.of(run, frame.sun)
+    np.testing.assert_allclose(drawn.draw(frame.camera, drawn.shade(frame.camera))[..., :3], both, atol=1e-5)
+
+
+def test_the_earths_night_side_adds_nothing(run, earthlit):
+    frame = earthlit.test[0]
+    behind = replace(frame.sun, earth=Earth(frame.sun.direction, 20.0))
+    np.testing.assert_allclose(run.predict(frame.camera, behind).rgb, pictures(run, frame)[1], atol=1e-6)
+
+
+def test_render_draws_the_layers(spacesim, run, earthlit, tmp_path):
+    from spacesim.data.images import read_exr
+
+    def rendered(*options) -> np.ndarray:
+        done = spacesim("render", run.path, "--frame", 16, "--out", tmp_path / "a.exr", *options)
+        assert done.code == 0, done.errors
+        return linear_from_srgb(read_exr(tmp_path / "a.exr")["rgb"])
+
+    both, sun, earth = rendered(), rendered("--earth", "none"), rendered("--sun", "none")
+    np.testing.assert_allclose(both, sun + earth, atol=1e-5)
+    np.testing.assert_array_equal(rendered("--earth", "0,-90"), both)
+    other = rendered("--earth", "90,-60", "--sun", "none")
+    assert np.abs(other - earth).max() > 0.01
+    frame = earthlit.test[0]
+    np.testing.assert_allclose(linear_from_srgb(load_run(run.path).predict(frame.camera, frame.sun).rgb), both)
+    refused = spacesim(
+        "render", run.path, "--frame", 16, "--earth", "none", "--sun", "none", "--out", tmp_path / "b.png"
+    )
+    assert refused.is_refusal("--sun", "no frame says")
+
+
+def test_what_cannot_be_is_named(spacesim, small_lit_dataset, tmp_path):
+    with pytest.raises(InputError, match=r"earth: expected false or light\.field\.inputs=surface"):
+        LightConfig(FieldConfig(), earth=True)
+    needed = with_settings(CONFIG, {"light.earth": True})
+    with pytest.raises(InputError, match=r"expected earth_direction in every training frame .*, found none in images/"):
+        train(small_lit_dataset, tmp_path / "run", needed)
+    blind = train(small_lit_dataset, tmp_path / "blind", replace(CONFIG, iterations=1))
+    for option in (("--earth", "0,0"), ("--sun", "none")):
+        done = spacesim("render", blind.path, *option, "--out", tmp_path / "a.png")
+        assert done.is_refusal(option[0], "light.earth", blind.path)
