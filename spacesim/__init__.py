@@ -21,6 +21,7 @@ from spacesim.version import __version__ as __version__
 _NAMES = {
     "api": "compose evaluate generate import_dataset render train write_report",
     "backend.selection": "BackendError",
+    "data.earth": "Earth",
     "data.errors": "InputError WorkError",
     "data.images": "load_image",
     "data.records": "Camera Dataset Frame Image Sun Truth",

@@ -16,6 +16,7 @@ import numpy as np
 from spacesim.backend import BackendError
 from spacesim.backend.arrays import ArrayXf, Bool, Float
 from spacesim.backend.upload import upload
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonDict, JsonMapping, as_path
 from spacesim.data.images import load_image
@@ -57,6 +58,7 @@ __all__ = [
     "CameraClient",
     "Composed",
     "Dataset",
+    "Earth",
     "FoundPose",
     "Frame",
     "Gaussians",

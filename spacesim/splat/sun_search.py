@@ -36,7 +36,7 @@ SHAPE_SIDE = 64  #: the same for `ShapeSearch`, which blends all Suns of the lat
 ERROR = 0.05  #: sRGB values, or roots of linear ones: an error so large counts half (Cauchy's loss)
 DRAWN = 16  #: Suns whose pictures are drawn at once: Gaussians are projected and sorted once for all of them
 GRANULE = 32  #: pixels, of which the sides of compared pictures are multiples
-BLOCKS = 512  #: parts of a small square picture whose errors count as one each
+BLOCKS = 512  #: parts of a small picture of SIDE x SIDE pixels whose errors count as one each
 COVERED = 0.5  #: least alpha of a pixel that counts
 AMBIENT = 0.02  #: light that comes from everywhere, as a share of the Sun's
 #: of a surface's n . s times visibility over the Suns of pictures, one of these: a quarter under Suns all round without
@@ -166,7 +166,7 @@ class SunFinder:
             curve = (self.curve.tone, self.curve.white) if self.curve else None
             errors = _errors(drawn.features or [], seen.rgb, seen.counts, curve)
             losses.append(dr.block_sum(dr.ravel(ad.ArrayXf(errors), order="C"), drawn.width * drawn.height))
-        return np.concatenate([np.array(some, np.float64) for some in losses]) * seen.share
+        return np.concatenate([np.array(some, np.float64) for some in losses]) * BLOCKS / SIDE**2
 
     def _colors(self, camera: Pinhole, direction: Array, number: int | None) -> list[Float]:
         light = None if number is None else self._sunlight.get(number)
@@ -187,7 +187,6 @@ class _SeenPicture:
         self.camera = Pinhole.of(replace(picture.camera, width=counts.shape[1], height=counts.shape[0]))
         self.rgb = [upload(np.ascontiguousarray(rgb[..., c].ravel())) for c in range(3)]
         self.counts = upload(counts.ravel().astype(np.float32))  #: 1 or 0
-        self.share = share_of_blocks(picture.counts.shape)
 
 
 @recorded
@@ -202,12 +201,6 @@ def _errors(planes: list[Float], rgb: list[Float], counts: Float, curve: tuple[s
         terms = [dr.log(1 + dr.square((d - t) / ERROR)) for d, t in zip(drawn, rgb, strict=True)]
         errors.append(counts / 3 * (terms[0] + terms[1] + terms[2]))
     return errors
-
-
-def share_of_blocks(shape: tuple[int, ...]) -> float:
-    """By which losses are multiplied that are sums over pixels of a small picture [H, W], as if those were as many as
-    the blocks that they cover."""
-    return min(BLOCKS / max(shape) ** 2, 1.0)
 
 
 def ring(direction: Array, degrees: float) -> list[Array]:
@@ -273,7 +266,7 @@ class _LitSurface:
     def losses(self, brighter: float = 1.0) -> Array:
         """[SPHERE], of a surface that reflects so many times as much."""
         errors = np.sqrt(brighter * self.reflected[:, None] * self.light) - np.sqrt(self.seen)[:, None]
-        losses: Array = np.log1p((errors / ERROR) ** 2).sum(axis=0) * share_of_blocks(self.counts.shape)
+        losses: Array = np.log1p((errors / ERROR) ** 2).sum(axis=0) * BLOCKS / SHAPE_SIDE**2
         return losses
 
 
