@@ -10,7 +10,7 @@ import trimesh
 
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
-from spacesim.data.mesh import SignedDistance, read_mesh, write_mesh
+from spacesim.data.mesh import SignedDistance, load_mesh, read_mesh, write_mesh
 from spacesim.data.store import read_dataset
 from spacesim.eval.metrics.exterior import ExteriorView
 from spacesim.eval.metrics.geometry import COMPARED, GeometryConfig, compare_geometry, compare_shape
@@ -205,8 +205,8 @@ def test_eval_and_report_show_the_shape(tiny_eval, tmp_path):
     assert not any(note.startswith("Geometry") for note in metrics["notes"])
     for name in ("truth", "reconstruction"):
         assert (read_png(tiny_eval / "geometry" / f"{name}_2.png") != BACKGROUND).any()
-    _, faces = read_mesh(tiny_eval / "geometry" / "reconstruction.ply")
-    assert len(faces) == geometry["mesh"]["faces"]
+    written = load_mesh(tiny_eval / "geometry" / "reconstruction.ply")
+    assert len(written.faces) == geometry["mesh"]["faces"]
     page = (tiny_eval / "report.html").read_text()
     for words in (
         "<h2>Shape</h2>",
