@@ -13,8 +13,8 @@ EARTH_ALBEDO = 0.294
 that G. L. Stephens et al. give ("The albedo of Earth", Reviews of Geophysics 53, 2015), 0.29."""
 
 BEAMS = 64
-"""Directions that stand for the Earth. What a surface gets is within 1.5 % of the most that one gets from the whole disc,
-up to phase angles of 60 degrees; of the dim crescent at 90 within 7 %."""
+"""Directions that stand for the Earth. What a surface gets is within 1.5 % of the most that one gets from all of the
+disc, up to phase angles of 60 degrees; of the dim crescent at 90 within 7 %."""
 
 
 @dataclass(frozen=True, eq=False)
