@@ -105,4 +105,4 @@ def rank(rows: list[common.Row], key: str) -> float | None:
 
 
 if __name__ == "__main__":
-    main()
+    common.run_main(main)

@@ -154,6 +154,7 @@ def _export_mesh(options: argparse.Namespace) -> None:
     config = MeshConfig(**{name: value for name, value in settings.items() if value is not None})
     backend.select(options.backend)
     run = load_run(options.path)
+    lit = run.gaussian_run
     data = options.data or Path(run.config["data"]["path"])
     if options.data or data.exists():
         cameras = [frame.camera for frame in read_dataset(data).train]
@@ -179,8 +180,8 @@ def _export_mesh(options: argparse.Namespace) -> None:
         with show_progress("export", "pictures") as report:
             colors = color_vertices(surface, cameras, depth, partial(run.predict, sun=sun), config.views, report)
         words = ", coloured"
-    elif holds_colors and not isinstance(run, NerfRun) and run.has_material:
-        if run.albedo_is_relative:
+    elif holds_colors and lit and lit.has_material:
+        if lit.albedo_is_relative:
             print(RELATIVE, file=sys.stderr)
         with show_progress("export", "pictures") as report:
             values = color_vertices(

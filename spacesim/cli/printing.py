@@ -7,7 +7,6 @@ from spacesim.data.files import JsonDict
 
 KNOWS_ONE_LIGHT = "the run knows the light that it was trained under only; --sun changes nothing"
 WANTS_FILTER = "the run is antialiased: viewers without Mip-Splatting's 2D filter draw thin splats wider"
-
 RELATIVE = "the data that says how bright the Sun was is not there: albedo is relative, to a Sun at 1 au and 0 EV"
 
 

@@ -38,23 +38,22 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.learning.pictures import write_material, write_picture
     from spacesim.learning.prediction import added_light
     from spacesim.methods import load_run
-    from spacesim.nerf.run import NerfRun
 
     check_unlisted(options.out)
     run = load_run(options.path)
+    lit = run.gaussian_run
     if options.sun and not run.relightable:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
     camera, of_frame = view_of(options, run)
     if options.kind in MATERIAL_KINDS:
         write_material(run.draw_material(camera), options.kind, options.out)
-        if not isinstance(run, NerfRun) and run.albedo_is_relative:
+        if lit and lit.albedo_is_relative:
             print(RELATIVE, file=sys.stderr)
         interrupts.print_output(options.out)
         return
     sun = _sun(options, of_frame)
     if sun is None and run.relightable:
         raise InputError("sun: expected AZ,EL for a run that can be relit and a camera without a Sun, found none")
-    lit = run.gaussian_run
     knows_earth = bool(lit and lit.light and lit.light.config.earth)
     for name, wanted in (("sun", options.sun == "none"), ("earth", options.earth not in (None, "none"))):
         if wanted and not knows_earth:

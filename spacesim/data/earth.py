@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spacesim.data.errors import expect
-from spacesim.data.geometry import Array, normalize
+from spacesim.data.geometry import Array, normalize, perpendicular
 
 EARTH_ALBEDO = 0.294
 """Bond albedo of the Earth (D. R. Williams, "Earth Fact Sheet", NASA Goddard Space Flight Center); to the two digits
@@ -41,14 +41,12 @@ class Earth:
         Parts of equal solid angle lie on a spherical Fibonacci lattice; the radiance of each is albedo / pi times the
         cosine of the Sun at the ground that is seen there. Lengths are in Earth radii.
         """
-        limb, distance = (
-            math.cos(math.radians(self.angular_radius_deg)),
-            1 / math.sin(math.radians(self.angular_radius_deg)),
-        )
+        radius = math.radians(self.angular_radius_deg)
+        limb, distance = math.cos(radius), 1 / math.sin(radius)
         k = np.arange(BEAMS) + 0.5
         height = 1 - (1 - limb) * k / BEAMS
         turn = np.pi * (1 + 5**0.5) * k
-        side = normalize(np.cross(self.direction, np.eye(3)[np.abs(self.direction).argmin()]))
+        side = -perpendicular(self.direction)
         across = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(self.direction, side)
         towards = height[:, None] * self.direction + np.sqrt(1 - height**2)[:, None] * across
         along = distance * height

@@ -29,6 +29,11 @@ def normalize(vectors: ArrayLike) -> Array:
     return vectors / lengths
 
 
+def perpendicular(direction: Array) -> Array:
+    """[3] a unit vector that stands upright on a `direction` [3] of any length above 0."""
+    return normalize(np.cross(np.eye(3)[np.abs(direction).argmin()], direction))
+
+
 def direction_from_angles(azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> Array:
     """Unit vector(s) [..., 3] at an azimuth from +x towards +y and an elevation from the xy plane (thesis 4.1)."""
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)

@@ -63,11 +63,11 @@ def compare_materials(
     total = AlbedoSums.total(sums)
     scale = total.scale
     if scale is not None:
+        mean = total.true / total.values
         for frame, record_of_frame, folder in zip(frames, records, folders, strict=True):
             if record_of_frame is not None:
                 truth, mask = _truth(dataset, frame)
                 view = run.draw_material(frame.camera)
-                mean = total.true / total.values
                 record_of_frame["albedo_error"] = material.albedo_error(view.albedo, truth.albedo, mask, scale, mean)
                 _write_pictures(folder, view, truth, scale)
     return MaterialScores(records, scale, [f"albedo_error is null: {why}."] if why else [])

@@ -294,7 +294,7 @@ class Run:
         white = self._white
         return read_material(self.gaussians, self.light, white.display, white.tone, self.embedding)
 
-    @property
+    @cached_property
     def learned_normals(self) -> np.ndarray:
         """[N, 3] of any length, of a run that has a `material`."""
         assert self.light is not None

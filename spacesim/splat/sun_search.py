@@ -158,12 +158,11 @@ class SunFinder:
 
     def _losses(self, seen: "_SeenPicture", directions: Sequence[Array], numbers: Sequence[int | None]) -> Array:
         """[K] of the model under K Suns. numbers: theirs in the lattice, whose light is kept for other pictures"""
-        losses = []
+        losses, curve = [], (self.curve.tone, self.curve.white) if self.curve else None
         for start in range(0, len(directions), DRAWN):
             suns = zip(directions[start : start + DRAWN], numbers[start : start + DRAWN], strict=True)
             colors = [color for sun in suns for color in self._colors(seen.camera, *sun)]
             drawn = render(self.gaussians, seen.camera, outputs=(), features=colors, antialiased=self.antialiased)
-            curve = (self.curve.tone, self.curve.white) if self.curve else None
             errors = _errors(drawn.features or [], seen.rgb, seen.counts, curve)
             losses.append(dr.block_sum(dr.ravel(ad.ArrayXf(errors), order="C"), drawn.width * drawn.height))
         return np.concatenate([np.array(some, np.float64) for some in losses]) * BLOCKS / SIDE**2

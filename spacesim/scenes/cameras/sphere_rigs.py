@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from spacesim.data.errors import InputError, expect
-from spacesim.data.geometry import Array, fibonacci_sphere, look_at, normalize, rotation_from_quaternion
+from spacesim.data.geometry import Array, fibonacci_sphere, look_at, normalize, perpendicular, rotation_from_quaternion
 from spacesim.data.records import Sun
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.rig import (
@@ -202,5 +202,5 @@ class RandomRig(RigConfig):
 
 def _frame_about(axis: Array) -> Array:
     """[3, 3] a rotation whose third column is the unit `axis` [3]."""
-    side = normalize(np.cross(np.eye(3)[np.abs(axis).argmin()], axis))
+    side = perpendicular(axis)
     return np.stack([side, np.cross(axis, side), axis], axis=1)

@@ -164,7 +164,7 @@ def normals_adjoint(
     along = sum((cosine * batch.row(grad_items, first + i) for i, cosine in enumerate(cosines)), ad.Float(0))
     for gradient in grad_facing:
         along += gradient * _faces(cosines[0], inputs, batch)
-    for gradient, beams in zip(grad_earth, inputs.beams, strict=False):
+    for gradient, beams in zip(grad_earth, inputs.beams, strict=True):
         along += gradient * earth_irradiance(normals, direction, beams)
     dr.backward(along)
     return batch.matrix(list(dr.grad(normals)))
