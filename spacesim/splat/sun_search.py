@@ -10,7 +10,7 @@ as brightness determines the angle: too large an albedo would put all Suns too l
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
@@ -35,7 +35,7 @@ SIDE = 128  #: pixels of the longer side of a small picture, which shows the obj
 SHAPE_SIDE = 64  #: the same for `ShapeSearch`, which blends all Suns of the lattice at once
 ERROR = 0.05  #: sRGB values, or roots of linear ones: an error so large counts half (Cauchy's loss)
 DRAWN = 16  #: Suns whose pictures are drawn at once: Gaussians are projected and sorted once for all of them
-GRANULE = 32  #: pixels, of which the sides of compared pictures are multiples
+GRANULES = 4  #: steps to the longer side, of which the sides of small pictures are multiples
 BLOCKS = 512  #: parts of a small picture of SIDE x SIDE pixels whose errors count as one each
 COVERED = 0.5  #: least alpha of a pixel that counts
 AMBIENT = 0.02  #: light that comes from everywhere, as a share of the Sun's
@@ -60,7 +60,8 @@ class SunEstimate:
 
 @dataclass(frozen=True, eq=False)
 class SmallPicture:
-    """A picture of few pixels, and which of them count."""
+    """A picture of few pixels, and which of them count. It has one of few sizes, as what is drawn is recorded anew for
+    each: none of the pixels beyond its right and lower edge count."""
 
     camera: Camera  #: of as many pixels
     rgb: Array  #: [H, W, 3] sRGB values over black
@@ -73,19 +74,16 @@ class SmallPicture:
         rows, columns = cropped(image)
         factor = max(1, -(-max(rows.stop - rows.start, columns.stop - columns.start) // side))
         numbers = camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start
-        small = Camera(
-            camera.world_from_camera,
-            max((columns.stop - columns.start) // factor, 1),
-            max((rows.stop - rows.start) // factor, 1),
-            *(number / factor for number in numbers),
-        )
         image = Image(image.rgb[rows, columns], image.alpha[rows, columns], image.valid[rows, columns])
         valid = image.valid.astype(np.float32)
         share = block_means(valid, factor)
         weights = (image.alpha * valid)[..., None]
         rgb = block_means(image.rgb * weights, factor) / np.maximum(share, 1e-6)[..., None]
-        covered = block_means(weights[..., 0], factor) / np.maximum(share, 1e-6)
-        return SmallPicture(small, rgb, (covered >= COVERED) & (share >= least))
+        counts = (block_means(weights[..., 0], factor) / np.maximum(share, 1e-6) >= COVERED) & (share >= least)
+        height, width = (-(-pixels // (side // GRANULES)) * (side // GRANULES) for pixels in counts.shape)
+        padding = (0, height - counts.shape[0]), (0, width - counts.shape[1])
+        small = Camera(camera.world_from_camera, width, height, *(number / factor for number in numbers))
+        return SmallPicture(small, np.pad(rgb, (*padding, (0, 0))), np.pad(counts, padding))
 
 
 def cropped(image: Image) -> tuple[slice, slice]:
@@ -177,15 +175,12 @@ class SunFinder:
 
 
 class _SeenPicture:
-    """A small picture where it is compared with others, of one of few sizes, as each is recorded anew."""
+    """A small picture where it is compared with others."""
 
     def __init__(self, picture: SmallPicture) -> None:
-        height, width = picture.counts.shape
-        padding = (0, -height % GRANULE), (0, -width % GRANULE)
-        rgb, counts = np.pad(picture.rgb, (*padding, (0, 0))), np.pad(picture.counts, padding)
-        self.camera = Pinhole.of(replace(picture.camera, width=counts.shape[1], height=counts.shape[0]))
-        self.rgb = [upload(np.ascontiguousarray(rgb[..., c].ravel())) for c in range(3)]
-        self.counts = upload(counts.ravel().astype(np.float32))  #: 1 or 0
+        self.camera = Pinhole.of(picture.camera)
+        self.rgb = [upload(np.ascontiguousarray(picture.rgb[..., c].ravel())) for c in range(3)]
+        self.counts = upload(picture.counts.ravel().astype(np.float32))  #: 1 or 0
 
 
 @recorded

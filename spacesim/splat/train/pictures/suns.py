@@ -12,7 +12,9 @@ Pictures with a time have Suns that turn little from one to the next.
 
 import logging
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +83,10 @@ class SunEstimation:
         self.numbers.values = first.directions.copy()
         self._steps = [round(share * iterations) for share in (*SEARCHES, 1.0)]
 
+    @cached_property
+    def _small_pictures(self) -> list[SmallPicture]:
+        return small_pictures(self.dataset, SIDE)
+
     def direction(self, picture: int) -> Array:
         """[3] unit, of a training picture."""
         values = self.numbers.of(picture)
@@ -104,7 +110,7 @@ class SunEstimation:
         for place, picture in enumerate(self.order if self.order is not None else range(len(directions))):
             before = directions[self.order[place - 1]] if self.order is not None and place else None
             estimate = finder.estimate(
-                _small_picture(self.dataset, self.dataset.train[picture]),
+                self._small_pictures[picture],
                 finder.near(directions[picture], self.choices[picture], LOOKED_AT),
                 lambda direction, before=before: _turn_cost(direction, before),  # type: ignore[misc]
             )
@@ -171,7 +177,7 @@ def first_suns(dataset: Dataset, gaussians: Gaussians, distance: float) -> First
     However it was trained, it is drawn with the anti-aliasing filter: pictures are far smaller here.
     """
     search = ShapeSearch(gaussians, True, distance)
-    losses = search.losses([_small_picture(dataset, frame, SHAPE_SIDE) for frame in dataset.train])
+    losses = search.losses(small_pictures(dataset, SHAPE_SIDE))
     best, order = losses.argmin(axis=1), time_order(dataset.train)
     if order is not None:
         best[order] = smoothest(losses[order], search.sphere, TURN)
@@ -199,5 +205,11 @@ def _turn_cost(direction: Array, before: Array | None) -> float:
     return float(0.5 * (turn / TURN) ** 2)
 
 
-def _small_picture(dataset: Dataset, frame: Frame, side: int = SIDE) -> SmallPicture:
-    return SmallPicture.of(frame.camera, load_image(dataset, frame), side=side)
+def small_pictures(dataset: Dataset, side: int) -> list[SmallPicture]:
+    """Of the training pictures, in order, of at most so many pixels a side."""
+
+    def of(frame: Frame) -> SmallPicture:
+        return SmallPicture.of(frame.camera, load_image(dataset, frame), side=side)
+
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(of, dataset.train))
