@@ -18,7 +18,7 @@ from spacesim.splat.train.pictures.exposure import Exposures
 from spacesim.splat.train.pictures.poses import PoseRefinement
 from spacesim.splat.train.pictures.suns import FirstSuns, SunEstimation
 from spacesim.splat.train.view_pass import RenderedView, ViewLoss
-from spacesim.splat.train.views import TrainingView
+from spacesim.splat.train.views import TrainingView, TrainingViews
 
 
 class LearnedPictures:
@@ -56,6 +56,12 @@ class LearnedPictures:
         if self.suns:
             view = replace(view, sun=self.suns.direction(view.index))
         return replace(view, camera=self.poses.camera(view.index)) if self.poses else view
+
+    def taught(self, views: TrainingViews, number: int, step: int) -> TrainingView:
+        """The view that is drawn as `number` of the training in a step, in place of one that is held out the next."""
+        view = views.at_step(number)
+        held_out = self.suns is not None and self.suns.waits(view.index, step)
+        return views[(view.index + 1) % len(views)] if held_out else view
 
     def gains(self, view: TrainingView) -> Float | None:
         """Float [3] that the colours of a view are multiplied by."""

@@ -41,6 +41,9 @@ from spacesim.splat.train.pictures.numbers import PictureNumbers, falling
 SEARCHES = 0.2, 0.4, 0.6, 0.8  #: of the training, after which pictures are compared with other Suns, as at its end
 CHOICES = 12  #: Suns that a picture's shading allowed, of those that are looked at
 LOOKED_AT = 32  #: Suns of the lattice, these and the nearest to a picture's own: two rings, of about 30 degrees
+#: about so many pictures, no more than one in the second number, are held out of the training at first. At the search
+#: after JOINED of it their Suns are looked for by halves; then they are trained on as the others
+HELD_OUT, HELD_OUT_OF, JOINED = 16, 5, 0.6
 SHAPE_SHARE, SHAPE_STEPS = 0.3, 1_500  #: of the training's steps, and at least: of the one without light before it
 TURN = 3.0  #: degrees: a turn of the Sun from one picture to the next, in time order, that costs half
 
@@ -80,6 +83,13 @@ class SunEstimation:
         self.numbers = PictureNumbers(len(dataset.train), 3, self._on_sphere)
         self.numbers.values = first.directions.copy()
         self._steps = [round(share * iterations) for share in (*SEARCHES, 1.0)]
+        self.held_out = range(0, len(dataset.train), max(HELD_OUT_OF, len(dataset.train) // HELD_OUT))
+        self._joined = min(step for step in self._steps if step >= round(JOINED * iterations))
+        self.apart = np.full(len(self.held_out), np.nan)  #: degrees, between Suns by halves, see `SunFinder.apart`
+
+    def waits(self, picture: int, step: int) -> bool:
+        """Whether a picture is still held out in a step, the first of which is 0."""
+        return step < self._joined and picture in self.held_out
 
     def direction(self, picture: int) -> Array:
         """[3] unit, of a training picture."""
@@ -100,6 +110,9 @@ class SunEstimation:
         if steps not in self._steps:
             return
         finder = SunFinder(gaussians, light, antialiased, light.config.curve)
+        if steps == self._joined:
+            pictures = (_small_picture(self.dataset, self.dataset.train[picture]) for picture in self.held_out)
+            self.apart = np.array([finder.apart(picture) for picture in pictures])
         directions = self.directions()
         for place, picture in enumerate(self.order if self.order is not None else range(len(directions))):
             before = directions[self.order[place - 1]] if self.order is not None and place else None
