@@ -148,7 +148,7 @@ class LearnedPictures:
             gains = self.exposures.all_gains().mean(axis=1)
             summary["gains"] = {"least": float(gains.min()), "most": float(gains.max())}
         if self.suns:
-            summary["suns"] = {"sigma_deg": float(np.median(self.suns.sigmas))}
+            summary["suns"] = {"sigma_deg": float(np.median(self.suns.told()))}
         return summary
 
     def sentences(self) -> list[str]:
@@ -160,10 +160,8 @@ class LearnedPictures:
         if "gains" in summary:
             least, most = summary["gains"].values()
             sentences.append(f"pictures' gains are from {least:.2f} to {most:.2f}")
-        if "suns" in summary:
-            sentences.append(
-                f"Suns are estimated to {summary['suns']['sigma_deg']:.1f} degrees (median of their own sigma)"
-            )
+        if self.suns:
+            sentences.append(self.suns.sentence())
         return sentences
 
     def _learned(self) -> dict[str, PoseRefinement | Exposures | SunEstimation]:

@@ -6,6 +6,8 @@
    shadows count as given within a step.
 3. Now and then (`SEARCHES`) every picture is compared with the model under other Suns, shadows included: those near its
    own, and those that its shading allowed (`sun_search.SunFinder`).
+4. A model that has taken wrong Suns for right explains its own pictures with them. So some pictures are held out for a
+   while: where two halves of one name Suns far apart, the model does not know light (`SunEstimation.told`).
 
 Pictures with a time have Suns that turn little from one to the next.
 """
@@ -44,6 +46,9 @@ LOOKED_AT = 32  #: Suns of the lattice, these and the nearest to a picture's own
 #: about so many pictures, no more than one in the second number, are held out of the training at first. At the search
 #: after JOINED of it their Suns are looked for by halves; then they are trained on as the others
 HELD_OUT, HELD_OUT_OF, JOINED = 16, 5, 0.6
+PER_APART = 1.0  #: error of a Sun, a share of the angle between those by halves of pictures held out
+CHANCE = 90.0  #: degrees: median error of Suns that are guessed
+HARDLY = 45.0  #: degrees, from which on Suns are hardly known
 SHAPE_SHARE, SHAPE_STEPS = 0.3, 1_500  #: of the training's steps, and at least: of the one without light before it
 TURN = 3.0  #: degrees: a turn of the Sun from one picture to the next, in time order, that costs half
 
@@ -132,21 +137,44 @@ class SunEstimation:
         sun = Sun(self.direction(picture))
         azimuth, elevation = sun.angles
         named = {"sun_direction": sun.direction.tolist(), "sun_azimuth_deg": azimuth, "sun_elevation_deg": elevation}
-        return {**named, "sun_sigma_deg": float(self.sigmas[picture])}
+        return {**named, "sun_sigma_deg": float(self.told()[picture])}
+
+    def told(self) -> Array:
+        """[V] degrees: how far Suns may be off. Their own sigmas times one number for all, at least 1, which makes the
+        median `PER_APART` times that of `apart`; at most `CHANCE`, which it is where no half shows enough."""
+        known = self.apart[np.isfinite(self.apart)]
+        median = min(PER_APART * float(np.median(known)), CHANCE) if len(known) else CHANCE
+        return np.minimum(self.sigmas * max(median / max(float(np.median(self.sigmas)), 1e-3), 1.0), CHANCE)
+
+    def sentence(self) -> str:
+        """What the log says at the end."""
+        seen, median = self.apart[np.isfinite(self.apart)], float(np.median(self.told()))
+        if not len(seen):
+            return "Suns are hardly known: no picture held out shows enough of the object to tell; take larger pictures"
+        by = f"two halves of {len(seen)} pictures held out name Suns {np.median(seen):.0f} degrees apart (median)"
+        if median < HARDLY:
+            return f"Suns are estimated to {median:.1f} degrees (median): {by}"
+        return f"Suns are hardly known: {by}, where chance is 90; take more pictures, the object cut out"
 
     def tensors(self) -> dict[str, np.ndarray]:
         """For a checkpoint, beside `numbers`."""
-        own = {"choices": self.choices.astype(np.float64), "sigmas": self.sigmas}
+        own = {"choices": self.choices.astype(np.float64), "sigmas": self.sigmas, "apart": self.apart}
         return {f"pictures.suns.{name}": values.copy() for name, values in own.items()}
 
     def restore(self, tensors: Mapping[str, np.ndarray]) -> None:
         """The inverse of `tensors`. Raises KeyError, or ValueError for another number of pictures."""
-        choices, sigmas = (tensors[f"pictures.suns.{name}"] for name in ("choices", "sigmas"))
-        if choices.ndim != 2 or len(choices) != len(self.sigmas) or sigmas.shape != self.sigmas.shape:
+        choices, sigmas, apart = (tensors[f"pictures.suns.{name}"] for name in ("choices", "sigmas", "apart"))
+        if (
+            choices.ndim != 2
+            or len(choices) != len(self.sigmas)
+            or sigmas.shape != self.sigmas.shape
+            or apart.shape != self.apart.shape
+        ):
             raise ValueError(f"pictures.suns: expected {len(self.sigmas)} pictures, found another number")
         if choices.min(initial=0) < 0 or choices.max(initial=0) >= SPHERE:
             raise ValueError("pictures.suns.choices: expected numbers of the lattice, found others")
         self.choices, self.sigmas = choices.astype(int), np.array(sigmas, np.float64)
+        self.apart = np.array(apart, np.float64)
 
     def _on_sphere(self, picture: int, gradient: Array) -> Array:
         """[3] gradient by the numbers, whose length does not count."""
