@@ -49,7 +49,8 @@ class LearnedPictures:
         self.suns, self._antialiased = None, config.antialiased
         if config.sun == "unknown":
             assert first_suns is not None, "Suns that are unknown start somewhere"
-            self.suns = SunEstimation(dataset, first_suns, rates.suns, steps)
+            learns_poses = config.refine_poses and poses is None  # of all pictures
+            self.suns = SunEstimation(dataset, first_suns, rates.suns, steps, holds_out=not learns_poses)
 
     def shown(self, view: TrainingView) -> TrainingView:
         """A view from where its camera is thought to stand, under the Sun that is thought to shine."""
@@ -160,7 +161,7 @@ class LearnedPictures:
         if "gains" in summary:
             least, most = summary["gains"].values()
             sentences.append(f"pictures' gains are from {least:.2f} to {most:.2f}")
-        if self.suns:
+        if self.suns and self.suns.held_out:
             sentences.append(self.suns.sentence())
         return sentences
 

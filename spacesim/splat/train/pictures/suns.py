@@ -79,8 +79,10 @@ class FirstSuns:
 class SunEstimation:
     """The Suns of a training's pictures."""
 
-    def __init__(self, dataset: Dataset, first: FirstSuns, rate: float, iterations: int) -> None:
-        """rate: step size at the start, radians"""
+    def __init__(
+        self, dataset: Dataset, first: FirstSuns, rate: float, iterations: int, holds_out: bool = True
+    ) -> None:
+        """rate: step size at the start, radians;  holds_out: some pictures, without which nothing is told of Suns"""
         self.dataset, self.rate, self.iterations = dataset, rate, iterations
         self.order = time_order(dataset.train)
         self.choices = first.choices
@@ -88,7 +90,8 @@ class SunEstimation:
         self.numbers = PictureNumbers(len(dataset.train), 3, self._on_sphere)
         self.numbers.values = first.directions.copy()
         self._steps = [round(share * iterations) for share in (*SEARCHES, 1.0)]
-        self.held_out = range(0, len(dataset.train), max(HELD_OUT_OF, len(dataset.train) // HELD_OUT))
+        count = len(dataset.train) if holds_out else 0
+        self.held_out = range(0, count, max(HELD_OUT_OF, count // HELD_OUT))
         self._joined = min(step for step in self._steps if step >= round(JOINED * iterations))
         self.apart = np.full(len(self.held_out), np.nan)  #: degrees, between Suns by halves, see `SunFinder.apart`
 
