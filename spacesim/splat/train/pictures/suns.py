@@ -46,7 +46,7 @@ LOOKED_AT = 32  #: Suns of the lattice, these and the nearest to a picture's own
 #: about so many pictures, no more than one in the second number, are held out of the training at first. At the search
 #: after JOINED of it their Suns are looked for by halves; then they are trained on as the others
 HELD_OUT, HELD_OUT_OF, JOINED = 16, 5, 0.6
-PER_APART = 1.0  #: error of a Sun, a share of the angle between those by halves of pictures held out
+PER_APART = 1.0  #: median error of Suns, a share of the mean angle between those by halves of pictures held out
 CHANCE = 90.0  #: degrees: median error of Suns that are guessed
 HARDLY = 45.0  #: degrees, from which on Suns are hardly known
 SHAPE_SHARE, SHAPE_STEPS = 0.3, 1_500  #: of the training's steps, and at least: of the one without light before it
@@ -144,9 +144,9 @@ class SunEstimation:
 
     def told(self) -> Array:
         """[V] degrees: how far Suns may be off. Their own sigmas times one number for all, at least 1, which makes the
-        median `PER_APART` times that of `apart`; at most `CHANCE`, which it is where no half shows enough."""
+        median `PER_APART` times the mean of `apart`; at most `CHANCE`, which it is where no half shows enough."""
         known = self.apart[np.isfinite(self.apart)]
-        median = min(PER_APART * float(np.median(known)), CHANCE) if len(known) else CHANCE
+        median = min(PER_APART * float(known.mean()), CHANCE) if len(known) else CHANCE
         return np.minimum(self.sigmas * max(median / max(float(np.median(self.sigmas)), 1e-3), 1.0), CHANCE)
 
     def sentence(self) -> str:
@@ -154,7 +154,7 @@ class SunEstimation:
         seen, median = self.apart[np.isfinite(self.apart)], float(np.median(self.told()))
         if not len(seen):
             return "Suns are hardly known: no picture held out shows enough of the object to tell; take larger pictures"
-        by = f"two halves of {len(seen)} pictures held out name Suns {np.median(seen):.0f} degrees apart (median)"
+        by = f"two halves of {len(seen)} pictures held out name Suns {seen.mean():.0f} degrees apart (mean)"
         if median < HARDLY:
             return f"Suns are estimated to {median:.1f} degrees (median): {by}"
         return f"Suns are hardly known: {by}, where chance is 90; take more pictures, the object cut out"
