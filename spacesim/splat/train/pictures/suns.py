@@ -48,7 +48,7 @@ LOOKED_AT = 32  #: Suns of the lattice, these and the nearest to a picture's own
 HELD_OUT, HELD_OUT_OF, JOINED = 16, 5, 0.6
 PER_APART = 1.0  #: median error of Suns, a share of the mean angle between those by halves of pictures held out
 CHANCE = 90.0  #: degrees: median error of Suns that are guessed
-HARDLY = 45.0  #: degrees, from which on Suns are hardly known
+HARDLY = 40.0  #: degrees, from which on Suns are hardly known
 SHAPE_SHARE, SHAPE_STEPS = 0.3, 1_500  #: of the training's steps, and at least: of the one without light before it
 TURN = 3.0  #: degrees: a turn of the Sun from one picture to the next, in time order, that costs half
 
