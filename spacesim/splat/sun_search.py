@@ -154,12 +154,12 @@ class SunFinder:
     def apart(self, picture: SmallPicture) -> float:
         """Degrees between the Suns of a picture's two halves, left and right of the median column of what counts, each
         looked for all over the sphere; 90 on average where they have nothing to do with each other. NaN where a half
-        shows less than `LEAST` pixels.
+        shows less than `LEAST` pixels, or the object is not cut out, so that halves agree on what is behind it.
         """
         middle = np.median(np.nonzero(picture.counts)[1]) if picture.counts.any() else 0
         is_left = np.arange(picture.counts.shape[1]) < middle
         halves = [picture.counts & side for side in (is_left, ~is_left)]
-        if min(half.sum() for half in halves) < LEAST:
+        if min(half.sum() for half in halves) < LEAST or picture.counts.all():
             return float("nan")
         left, right = (self.estimate(replace(picture, counts=half)).direction for half in halves)
         return float(degrees_between(left @ right))

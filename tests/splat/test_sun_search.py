@@ -178,7 +178,8 @@ def test_halves_that_two_suns_lit_are_apart():
     rgb = np.concatenate([planes[0][:, :24], planes[1][:, 24:]], axis=1) / np.maximum(alpha, 1e-6)[..., None]
     picture = SmallPicture.of(camera, Image(np.clip(rgb, 0, 1), alpha, np.ones(alpha.shape, bool)))
     assert finder.apart(picture) == pytest.approx(angle(*suns), abs=10)
-    assert np.isnan(finder.apart(replace(picture, counts=np.zeros_like(picture.counts))))
+    for counts in (np.zeros_like(picture.counts), np.ones_like(picture.counts)):  # nothing seen, nothing cut out
+        assert np.isnan(finder.apart(replace(picture, counts=counts)))
 
 
 @pytest.mark.parametrize("field", [FIELD, DIRECTIONS_FIELD], ids=["surface", "directions"])

@@ -153,7 +153,9 @@ class SunEstimation:
         """What the log says at the end."""
         seen, median = self.apart[np.isfinite(self.apart)], float(np.median(self.told()))
         if not len(seen):
-            return "Suns are hardly known: no picture held out shows enough of the object to tell; take larger pictures"
+            return (
+                "Suns are hardly known: no picture held out shows enough of an object that is cut out to tell how well"
+            )
         by = f"two halves of {len(seen)} pictures held out name Suns {seen.mean():.0f} degrees apart (mean)"
         if median < HARDLY:
             return f"Suns are estimated to {median:.1f} degrees (median): {by}"

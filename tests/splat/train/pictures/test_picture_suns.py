@@ -124,7 +124,7 @@ def test_what_is_told_of_suns_is_what_pictures_held_out_say(sunless):
     estimation = SunEstimation(sunless, FirstSuns(fibonacci_sphere(8), np.zeros((8, CHOICES), int)), 0.01, 100)
     estimation.sigmas = np.array([1.0, 2, 2, 2, 2, 2, 4, 60])
     assert (estimation.told() == CHANCE).sum() == 7  # nothing is known of it
-    assert "no picture held out shows enough" in estimation.sentence()
+    assert "no picture held out shows enough of an object" in estimation.sentence()
     estimation.apart = np.array([20.0, np.nan])
     np.testing.assert_allclose(estimation.told(), np.minimum(estimation.sigmas * PER_APART * 10, CHANCE))
     assert f"estimated to {20 * PER_APART:.1f} degrees (median): two halves of 1 pictures" in estimation.sentence()
