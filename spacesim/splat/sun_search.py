@@ -37,6 +37,7 @@ ERROR = 0.05  #: sRGB values, or roots of linear ones: an error so large counts 
 DRAWN = 16  #: Suns whose pictures are drawn at once: Gaussians are projected and sorted once for all of them
 GRANULES = 4  #: steps to the longer side, of which the sides of small pictures are multiples
 BLOCKS = 512  #: parts of a small picture of SIDE x SIDE pixels whose errors count as one each
+LEAST = 30  #: pixels of a half of a picture that tells of a Sun
 COVERED = 0.5  #: least alpha of a pixel that counts
 AMBIENT = 0.02  #: light that comes from everywhere, as a share of the Sun's
 #: of a surface's n . s times visibility over the Suns of pictures, one of these: a quarter under Suns all round without
@@ -147,6 +148,19 @@ class SunFinder:
             losses += losses_of([lowest], [None])
         best = int(np.argmin(losses))
         return SunEstimate(directions[best], spread(np.array(directions), np.array(losses)), float(losses[best]))
+
+    def apart(self, picture: SmallPicture) -> float:
+        """Degrees between the Suns of a picture's two halves, left and right of the median column of what counts, each
+        looked for all over the sphere; 90 on average where they have nothing to do with each other. NaN where a half
+        shows less than `LEAST` pixels, or the object is not cut out, so that halves agree on what is behind it.
+        """
+        middle = np.median(np.nonzero(picture.counts)[1]) if picture.counts.any() else 0
+        is_left = np.arange(picture.counts.shape[1]) < middle
+        halves = [picture.counts & side for side in (is_left, ~is_left)]
+        if min(half.sum() for half in halves) < LEAST or picture.counts.all():
+            return float("nan")
+        left, right = (self.estimate(replace(picture, counts=half)).direction for half in halves)
+        return float(degrees_between(left @ right))
 
     def near(self, direction: Array, besides: Sequence[int], count: int) -> list[int]:
         """Numbers of so many of the lattice's Suns: `besides`, and of the others those nearest to a direction."""

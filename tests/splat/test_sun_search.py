@@ -162,8 +162,25 @@ def test_a_model_tells_the_sun_that_it_was_drawn_with():
         assert numbers[:2] == [0, 7]
         assert len(set(numbers)) == 32
         assert max(angle(finder.sphere[k], sun) for k in numbers[2:]) < 40
+        assert finder.apart(SmallPicture.of(camera, image)) < 5
         again = SunFinder(splats, light, False, None).estimate(SmallPicture.of(camera, image))
         np.testing.assert_array_equal(again.direction, estimate.direction)
+
+
+def test_halves_that_two_suns_lit_are_apart():
+    light, splats, camera = model(FIELD), ball(600, FIELD.stored), eye()
+    finder, planes = SunFinder(splats, light, False, None), []
+    suns = normalize(np.array([-0.5, -0.8, 0.1])), normalize(np.array([0.3, -0.5, 0.8]))
+    for sun in suns:
+        colors, _ = light.shade_picture(splats, Pinhole.of(camera), sun)
+        drawn = render(splats, Pinhole.of(camera), outputs=("alpha",), features=colors)
+        planes.append(drawn.image("features"))
+    alpha = drawn.image("alpha")
+    rgb = np.concatenate([planes[0][:, :24], planes[1][:, 24:]], axis=1) / np.maximum(alpha, 1e-6)[..., None]
+    picture = SmallPicture.of(camera, Image(np.clip(rgb, 0, 1), alpha, np.ones(alpha.shape, bool)))
+    assert finder.apart(picture) == pytest.approx(angle(*suns), abs=10)
+    for counts in (np.zeros_like(picture.counts), np.ones_like(picture.counts)):  # nothing seen, nothing cut out
+        assert np.isnan(finder.apart(replace(picture, counts=counts)))
 
 
 @pytest.mark.parametrize("field", [FIELD, DIRECTIONS_FIELD], ids=["surface", "directions"])

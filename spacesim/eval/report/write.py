@@ -295,7 +295,7 @@ def _data_facts(run: Evaluation) -> JsonDict:
 
 def _model_facts(run: Evaluation) -> JsonDict:
     model, training = run.metrics["model"], run.metrics["training"]
-    seconds = training.get("seconds")
+    seconds, sigma = training.get("seconds"), (training.get("suns") or {}).get("sigma_deg")
     return {
         "run": run.metrics["run"],
         "Gaussians": None if model["gaussians"] is None else f"{model['gaussians']:,}",
@@ -303,6 +303,7 @@ def _model_facts(run: Evaluation) -> JsonDict:
         "rendering a frame": f"{model['render_ms']:.1f} ms",
         "rendered on": model["backend"],
         "training": None if seconds is None else f"{seconds:.1f} s",
+        "estimated Suns off": None if sigma is None else f"{sigma:.0f}° (median, by pictures held out)",
         "trained on": " ".join(str(training[key]) for key in ("backend", "device") if training.get(key)),
     }
 

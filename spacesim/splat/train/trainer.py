@@ -145,7 +145,8 @@ class Trainer(TrainingLoop):
 
     def _forward_backward(self, rows: list[Float], degree: int, number: int) -> ViewResult:
         """Forward, loss, backward for one view, `number` of the training."""
-        view, view_pass = self.pictures.shown(self.views.at_step(number)), self._view_pass
+        view_pass = self._view_pass
+        view = self.pictures.shown(self.pictures.taught(self.views, number, self.iteration))
         watched = self.strategy.observes_step(self.iteration + 1) and not self._warming(self.iteration)
         attraction = self._attraction(view)
         target = self._target_image(number, view, attraction)

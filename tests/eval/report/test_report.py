@@ -76,6 +76,14 @@ def page_of(*folders):
     return Page(out.read_text())
 
 
+def test_how_far_estimated_suns_may_be_off_is_told(folder):
+    def estimate(metrics):
+        metrics["training"]["suns"] = {"sigma_deg": 37.4}
+
+    assert "estimated Suns off" not in "".join(page_of(folder).text)
+    assert "37° (median, by pictures held out)" in "".join(page_of(another(folder, "estimated", estimate)).text)
+
+
 def test_numbers_are_there(folder):
     metrics = json.loads((folder / "metrics.json").read_text())
     text = "".join(page_of(folder).text)

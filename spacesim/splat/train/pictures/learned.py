@@ -18,7 +18,7 @@ from spacesim.splat.train.pictures.exposure import Exposures
 from spacesim.splat.train.pictures.poses import PoseRefinement
 from spacesim.splat.train.pictures.suns import FirstSuns, SunEstimation
 from spacesim.splat.train.view_pass import RenderedView, ViewLoss
-from spacesim.splat.train.views import TrainingView
+from spacesim.splat.train.views import TrainingView, TrainingViews
 
 
 class LearnedPictures:
@@ -49,13 +49,20 @@ class LearnedPictures:
         self.suns, self._antialiased = None, config.antialiased
         if config.sun == "unknown":
             assert first_suns is not None, "Suns that are unknown start somewhere"
-            self.suns = SunEstimation(dataset, first_suns, rates.suns, steps)
+            learns_poses = config.refine_poses and poses is None  # of all pictures
+            self.suns = SunEstimation(dataset, first_suns, rates.suns, steps, holds_out=not learns_poses)
 
     def shown(self, view: TrainingView) -> TrainingView:
         """A view from where its camera is thought to stand, under the Sun that is thought to shine."""
         if self.suns:
             view = replace(view, sun=self.suns.direction(view.index))
         return replace(view, camera=self.poses.camera(view.index)) if self.poses else view
+
+    def taught(self, views: TrainingViews, number: int, step: int) -> TrainingView:
+        """The view that is drawn as `number` of the training in a step, in place of one that is held out the next."""
+        view = views.at_step(number)
+        held_out = self.suns is not None and self.suns.waits(view.index, step)
+        return views[(view.index + 1) % len(views)] if held_out else view
 
     def gains(self, view: TrainingView) -> Float | None:
         """Float [3] that the colours of a view are multiplied by."""
@@ -142,7 +149,7 @@ class LearnedPictures:
             gains = self.exposures.all_gains().mean(axis=1)
             summary["gains"] = {"least": float(gains.min()), "most": float(gains.max())}
         if self.suns:
-            summary["suns"] = {"sigma_deg": float(np.median(self.suns.sigmas))}
+            summary["suns"] = {"sigma_deg": float(np.median(self.suns.told()))}
         return summary
 
     def sentences(self) -> list[str]:
@@ -154,10 +161,8 @@ class LearnedPictures:
         if "gains" in summary:
             least, most = summary["gains"].values()
             sentences.append(f"pictures' gains are from {least:.2f} to {most:.2f}")
-        if "suns" in summary:
-            sentences.append(
-                f"Suns are estimated to {summary['suns']['sigma_deg']:.1f} degrees (median of their own sigma)"
-            )
+        if self.suns and self.suns.held_out:
+            sentences.append(self.suns.sentence())
         return sentences
 
     def _learned(self) -> dict[str, PoseRefinement | Exposures | SunEstimation]:

@@ -6,6 +6,8 @@
    shadows count as given within a step.
 3. Now and then (`SEARCHES`) every picture is compared with the model under other Suns, shadows included: those near its
    own, and those that its shading allowed (`sun_search.SunFinder`).
+4. A model that has taken wrong Suns for right explains its own pictures with them. So some pictures are held out for a
+   while: where two halves of one name Suns far apart, the model does not know light (`SunEstimation.told`).
 
 Pictures with a time have Suns that turn little from one to the next.
 """
@@ -43,6 +45,12 @@ from spacesim.splat.train.pictures.numbers import PictureNumbers, falling
 SEARCHES = 0.2, 0.4, 0.6, 0.8  #: of the training, after which pictures are compared with other Suns, as at its end
 CHOICES = 12  #: Suns that a picture's shading allowed, of those that are looked at
 LOOKED_AT = 32  #: Suns of the lattice, these and the nearest to a picture's own: two rings, of about 30 degrees
+#: about so many pictures, no more than one in the second number, are held out of the training at first. At the search
+#: after JOINED of it their Suns are looked for by halves; then they are trained on as the others
+HELD_OUT, HELD_OUT_OF, JOINED = 16, 5, 0.6
+PER_APART = 1.0  #: median error of Suns, a share of the mean angle between those by halves of pictures held out
+CHANCE = 90.0  #: degrees: median error of Suns that are guessed
+HARDLY = 40.0  #: degrees, from which on Suns are hardly known
 SHAPE_SHARE, SHAPE_STEPS = 0.3, 1_500  #: of the training's steps, and at least: of the one without light before it
 TURN = 3.0  #: degrees: a turn of the Sun from one picture to the next, in time order, that costs half
 
@@ -73,8 +81,10 @@ class FirstSuns:
 class SunEstimation:
     """The Suns of a training's pictures."""
 
-    def __init__(self, dataset: Dataset, first: FirstSuns, rate: float, iterations: int) -> None:
-        """rate: step size at the start, radians"""
+    def __init__(
+        self, dataset: Dataset, first: FirstSuns, rate: float, iterations: int, holds_out: bool = True
+    ) -> None:
+        """rate: step size at the start, radians;  holds_out: some pictures, without which nothing is told of Suns"""
         self.dataset, self.rate, self.iterations = dataset, rate, iterations
         self.order = time_order(dataset.train)
         self.choices = first.choices
@@ -82,6 +92,14 @@ class SunEstimation:
         self.numbers = PictureNumbers(len(dataset.train), 3, self._on_sphere)
         self.numbers.values = first.directions.copy()
         self._steps = [round(share * iterations) for share in (*SEARCHES, 1.0)]
+        count = len(dataset.train) if holds_out else 0
+        self.held_out = range(0, count, max(HELD_OUT_OF, count // HELD_OUT))
+        self._joined = min(step for step in self._steps if step >= round(JOINED * iterations))
+        self.apart = np.full(len(self.held_out), np.nan)  #: degrees, between Suns by halves, see `SunFinder.apart`
+
+    def waits(self, picture: int, step: int) -> bool:
+        """Whether a picture is still held out in a step, the first of which is 0."""
+        return step < self._joined and picture in self.held_out
 
     @cached_property
     def _small_pictures(self) -> list[SmallPicture]:
@@ -106,6 +124,9 @@ class SunEstimation:
         if steps not in self._steps:
             return
         finder = SunFinder(gaussians, light, antialiased, light.config.curve)
+        if steps == self._joined:
+            pictures = (_small_picture(self.dataset, self.dataset.train[picture]) for picture in self.held_out)
+            self.apart = np.array([finder.apart(picture) for picture in pictures])
         directions = self.directions()
         for place, picture in enumerate(self.order if self.order is not None else range(len(directions))):
             before = directions[self.order[place - 1]] if self.order is not None and place else None
@@ -125,21 +146,46 @@ class SunEstimation:
         sun = Sun(self.direction(picture))
         azimuth, elevation = sun.angles
         named = {"sun_direction": sun.direction.tolist(), "sun_azimuth_deg": azimuth, "sun_elevation_deg": elevation}
-        return {**named, "sun_sigma_deg": float(self.sigmas[picture])}
+        return {**named, "sun_sigma_deg": float(self.told()[picture])}
+
+    def told(self) -> Array:
+        """[V] degrees: how far Suns may be off. Their own sigmas times one number for all, at least 1, which makes the
+        median `PER_APART` times the mean of `apart`; at most `CHANCE`, which it is where no half shows enough."""
+        known = self.apart[np.isfinite(self.apart)]
+        median = min(PER_APART * float(known.mean()), CHANCE) if len(known) else CHANCE
+        return np.minimum(self.sigmas * max(median / max(float(np.median(self.sigmas)), 1e-3), 1.0), CHANCE)
+
+    def sentence(self) -> str:
+        """What the log says at the end."""
+        seen, median = self.apart[np.isfinite(self.apart)], float(np.median(self.told()))
+        if not len(seen):
+            return (
+                "Suns are hardly known: no picture held out shows enough of an object that is cut out to tell how well"
+            )
+        by = f"two halves of {len(seen)} pictures held out name Suns {seen.mean():.0f} degrees apart (mean)"
+        if median < HARDLY:
+            return f"Suns are estimated to {median:.1f} degrees (median): {by}"
+        return f"Suns are hardly known: {by}, where chance is 90; take more pictures, the object cut out"
 
     def tensors(self) -> dict[str, np.ndarray]:
         """For a checkpoint, beside `numbers`."""
-        own = {"choices": self.choices.astype(np.float64), "sigmas": self.sigmas}
+        own = {"choices": self.choices.astype(np.float64), "sigmas": self.sigmas, "apart": self.apart}
         return {f"pictures.suns.{name}": values.copy() for name, values in own.items()}
 
     def restore(self, tensors: Mapping[str, np.ndarray]) -> None:
         """The inverse of `tensors`. Raises KeyError, or ValueError for another number of pictures."""
-        choices, sigmas = (tensors[f"pictures.suns.{name}"] for name in ("choices", "sigmas"))
-        if choices.ndim != 2 or len(choices) != len(self.sigmas) or sigmas.shape != self.sigmas.shape:
+        choices, sigmas, apart = (tensors[f"pictures.suns.{name}"] for name in ("choices", "sigmas", "apart"))
+        if (
+            choices.ndim != 2
+            or len(choices) != len(self.sigmas)
+            or sigmas.shape != self.sigmas.shape
+            or apart.shape != self.apart.shape
+        ):
             raise ValueError(f"pictures.suns: expected {len(self.sigmas)} pictures, found another number")
         if choices.min(initial=0) < 0 or choices.max(initial=0) >= SPHERE:
             raise ValueError("pictures.suns.choices: expected numbers of the lattice, found others")
         self.choices, self.sigmas = choices.astype(int), np.array(sigmas, np.float64)
+        self.apart = np.array(apart, np.float64)
 
     def _on_sphere(self, picture: int, gradient: Array) -> Array:
         """[3] gradient by the numbers, whose length does not count."""

@@ -92,7 +92,10 @@ def prune(gaussians: Gaussians, optimizer: Adam, remove: np.ndarray) -> np.ndarr
     """Take the marked Gaussians out ([N] bool). Returns the index of each that stays; WorkError where none does."""
     index = np.flatnonzero(~remove)
     if len(index) == 0:
-        raise WorkError("training: refinement would prune every Gaussian; lower prune_opacity or the learning rates")
+        raise WorkError(
+            "training: expected Gaussians that pictures need, found none: refinement would prune every Gaussian, too "
+            "faint or too wide; take more or larger pictures, of objects cut out, or lower refinement.prune_opacity"
+        )
     if remove.any():
         rearrange(gaussians, optimizer, index, np.zeros(len(index), bool))
     return index

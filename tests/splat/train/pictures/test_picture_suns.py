@@ -16,9 +16,11 @@ from spacesim.splat.sun_search import SPHERE
 from spacesim.splat.train.checkpoint import read_tensors
 from spacesim.splat.train.config import preset, with_settings
 from spacesim.splat.train.pictures import suns
-from spacesim.splat.train.pictures.suns import CHOICES, FirstSuns, SunEstimation, time_order
+from spacesim.splat.train.pictures.learned import LearnedPictures
+from spacesim.splat.train.pictures.suns import CHANCE, CHOICES, PER_APART, FirstSuns, SunEstimation, time_order
 from spacesim.splat.train.start import MANY_PICTURES, sun_warning
 from spacesim.splat.train.train import train
+from spacesim.splat.train.views import TrainingViews
 
 CONFIG = replace(preset("demo", "shadow-map"), sun="unknown", init_count=150, iterations=20, checkpoint_every=6)
 
@@ -104,6 +106,35 @@ def test_a_sun_stays_on_the_sphere_and_follows_its_gradient(sunless):
     np.testing.assert_array_equal(estimation.direction(1), start[1])
 
 
+def test_some_pictures_are_held_out_at_first(sunless):
+    """Until the search that looks for their Suns by halves; the next picture is drawn in place of each."""
+    estimation = SunEstimation(sunless, FirstSuns(fibonacci_sphere(8), np.zeros((8, CHOICES), int)), 0.01, 100)
+    assert [picture for picture in range(8) if estimation.waits(picture, 59)] == [0, 5]
+    assert not any(estimation.waits(picture, 60) for picture in range(8))
+    pictures = LearnedPictures(
+        sunless, replace(CONFIG, iterations=100), FirstSuns(fibonacci_sphere(8), np.zeros((8, CHOICES), int))
+    )
+    views = TrainingViews(sunless, 0)
+    drawn = {step: [pictures.taught(views, number, step).index for number in range(8)] for step in (0, 60)}
+    assert sorted(drawn[0]) == [1, 1, 2, 3, 4, 6, 6, 7]
+    assert sorted(drawn[60]) == list(range(8))
+
+
+def test_what_is_told_of_suns_is_what_pictures_held_out_say(sunless):
+    estimation = SunEstimation(sunless, FirstSuns(fibonacci_sphere(8), np.zeros((8, CHOICES), int)), 0.01, 100)
+    estimation.sigmas = np.array([1.0, 2, 2, 2, 2, 2, 4, 60])
+    assert (estimation.told() == CHANCE).sum() == 7  # nothing is known of it
+    assert "no picture held out shows enough of an object" in estimation.sentence()
+    estimation.apart = np.array([20.0, np.nan])
+    np.testing.assert_allclose(estimation.told(), np.minimum(estimation.sigmas * PER_APART * 10, CHANCE))
+    assert f"estimated to {20 * PER_APART:.1f} degrees (median): two halves of 1 pictures" in estimation.sentence()
+    estimation.apart = np.array([0.5, 0.5])  # never less than their own
+    np.testing.assert_array_equal(estimation.told(), estimation.sigmas)
+    estimation.apart = np.array([100.0, 170.0])
+    assert np.median(estimation.told()) == CHANCE
+    assert "Suns are hardly known" in estimation.sentence()
+
+
 def test_frames_that_tell_their_time_are_in_order(sunless):
     frames = [replace(frame, time=float(time)) for frame, time in zip(sunless.train, range(9, 0, -1), strict=False)]
     np.testing.assert_array_equal(time_order(frames), np.arange(len(frames))[::-1])
@@ -145,24 +176,31 @@ def test_poses_are_learned_under_suns_that_are_estimated(sunless, tmp_path, quic
 
 
 def test_data_that_cannot_determine_suns_are_warned_of(tmp_path):
+    """By their pixels: alpha of ones, or a mask that hides nothing, cuts nothing out."""
+    half, whole = np.full((4, 4), 255, np.uint8), np.full((4, 4), 255, np.uint8)
+    half[:2] = 0
+    for name, alpha in (("alpha", half), ("ones", whole)):
+        write_png(tmp_path / f"{name}.png", np.dstack([np.zeros((4, 4, 3), np.uint8), alpha]))
+        write_png(tmp_path / f"{name}_mask.png", alpha)
     write_png(tmp_path / "opaque.png", np.zeros((4, 4, 3), np.uint8))
-    write_png(tmp_path / "alpha.png", np.zeros((4, 4, 4), np.uint8))
     camera = Camera.from_fov(np.eye(4), 4, 4, 40)
+    opaque = Frame("opaque.png", camera)
 
-    def remark(count, **frame):
-        return sun_warning(
-            Dataset(tmp_path, (Frame(**{"file_path": "opaque.png", "camera": camera} | frame),) * count, ())
-        )
+    def remark(*frames):
+        return sun_warning(Dataset(tmp_path, frames, ()))
 
     few, bare = "12 training pictures", "no silhouette, mask or alpha"
-    assert few in remark(12)
-    assert bare in remark(12)
-    assert bare in remark(MANY_PICTURES)
-    assert few not in remark(MANY_PICTURES)
-    for cut_out in ({"file_path": "alpha.png"}, {"silhouette_path": "s.png"}, {"mask_path": "m.png"}):
-        assert few in remark(12, **cut_out)
-        assert bare not in remark(12, **cut_out)
-        assert remark(MANY_PICTURES, **cut_out) == ""
+    for frame in (opaque, replace(opaque, file_path="ones.png"), replace(opaque, mask_path="ones_mask.png")):
+        assert few in remark(*[frame] * 12)
+        assert bare in remark(*[frame] * 12)
+        assert bare in remark(*[frame] * MANY_PICTURES)
+        assert few not in remark(*[frame] * MANY_PICTURES)
+    masks = ({"silhouette_path": "alpha_mask.png"}, {"mask_path": "alpha_mask.png"})
+    for cut_out in (replace(opaque, file_path="alpha.png"), *(replace(opaque, **mask) for mask in masks)):
+        assert few in remark(*[cut_out] * 12)
+        assert bare not in remark(*[cut_out] * 12)
+        assert remark(*[cut_out] * MANY_PICTURES) == ""
+        assert bare in remark(*[cut_out] * 20, *[opaque] * 60)  # of most
 
 
 def test_training_warns_of_suns_that_may_be_far_off(sunless, quick, tmp_path, caplog):
