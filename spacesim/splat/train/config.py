@@ -98,6 +98,7 @@ class TrainConfig:
     num_downscales: int = 0  #: training begins with pictures smaller by 2 to this power on a side; splatfacto's is 2
     resolution_schedule: int = 3_000  #: steps after which they are twice as large on a side, up to their own size
     antialiased: bool = False  #: with Mip-Splatting's 2D filter, in training and in the run's pictures
+    surfels: bool = False  #: Gaussians are discs; the first axis is their normal
     supersample: int = 1  #: places on a side of each pixel, whose mean light it is, in training and the run's pictures
     light: LightConfig | None = None  #: how the Sun makes colours; none for `vanilla`, whose colours are fixed
     visibility_weight: float = 0.0  #: weight in the loss: mean error of blended visibility against the path-traced one
