@@ -147,6 +147,8 @@ class TrainConfig:
             raise InputError(f"sun: expected a method that takes the Sun, as shadow-map, found {self.method}")
         if self.visibility_weight > 0 and not (self.light and self.light.shadow):
             raise InputError(f"visibility_weight: expected a method with shadows, found {self.method}")
+        if self.surfels and self.flatten_weight > 0:
+            raise InputError(f"flatten_weight: expected 0 beside surfels, which are flat, found {self.flatten_weight}")
         if self.prior == "mesh" and not self.shape_terms:
             expected = "depth_weight or normal_weight above 0, which say how much of it counts"
             raise InputError(f"prior: expected {expected}, found neither")

@@ -43,7 +43,7 @@ class Update:
 
     antialiased: whether splats are drawn with the anti-aliasing filter
     scale: metres, the unit of depth
-    surfels: whether Gaussians stay discs: `flattened` after each step
+    surfels: whether each step ends with discs, see `flattened`
     """
 
     def __init__(self, antialiased: bool, scale: float, surfels: bool = False) -> None:
