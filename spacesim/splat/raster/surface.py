@@ -1,5 +1,6 @@
 """Geometry from Gaussians: normals as features to blend, the median depth of a pixel, the surface there."""
 
+import math
 from functools import reduce
 from typing import cast
 
@@ -14,6 +15,7 @@ from spacesim.splat.raster.records import ALPHA_MAX, POWER_MIN, exp2, exponents,
 from spacesim.splat.raster.tiles import TileLists, round_capacity, thread_pixels, tiled_index
 
 NONE = 2**32 - 1  #: in place of a splat's number
+THICKNESS = 0.05  #: of a disc, in its shorter standard deviation
 REACH = 2.0  #: standard deviations to which a Gaussian's surface reaches (docs/research/geometry.md)
 
 
@@ -36,6 +38,12 @@ def shortest_axis(quaternions: Array4f, log_scales: Array3f) -> Array3f:
     columns, scales = principal_axes(quaternions), dr.detach(log_scales)
     first = (scales[0] <= scales[1]) & (scales[0] <= scales[2])
     return dr.select(first, columns[0], dr.select(scales[1] <= scales[2], columns[1], columns[2]))
+
+
+def flattened(log_scales: list[Float]) -> list[Float]:
+    """Three Floats [N], ln of metres: of a disc with the second and third of these, whose normal is the first axis."""
+    _, second, third = log_scales
+    return [dr.minimum(second, third) + math.log(THICKNESS), second, third]
 
 
 def unit(vector: Array3f) -> Array3f:

@@ -98,6 +98,7 @@ class TrainConfig:
     num_downscales: int = 0  #: training begins with pictures smaller by 2 to this power on a side; splatfacto's is 2
     resolution_schedule: int = 3_000  #: steps after which they are twice as large on a side, up to their own size
     antialiased: bool = False  #: with Mip-Splatting's 2D filter, in training and in the run's pictures
+    surfels: bool = False  #: Gaussians are discs; the first axis is their normal
     supersample: int = 1  #: places on a side of each pixel, whose mean light it is, in training and the run's pictures
     light: LightConfig | None = None  #: how the Sun makes colours; none for `vanilla`, whose colours are fixed
     visibility_weight: float = 0.0  #: weight in the loss: mean error of blended visibility against the path-traced one
@@ -146,6 +147,8 @@ class TrainConfig:
             raise InputError(f"sun: expected a method that takes the Sun, as shadow-map, found {self.method}")
         if self.visibility_weight > 0 and not (self.light and self.light.shadow):
             raise InputError(f"visibility_weight: expected a method with shadows, found {self.method}")
+        if self.surfels and self.flatten_weight > 0:
+            raise InputError(f"flatten_weight: expected 0 beside surfels, which are flat, found {self.flatten_weight}")
         if self.prior == "mesh" and not self.shape_terms:
             expected = "depth_weight or normal_weight above 0, which say how much of it counts"
             raise InputError(f"prior: expected {expected}, found neither")

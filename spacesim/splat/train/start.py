@@ -12,6 +12,7 @@ from spacesim.data.store import read_points
 from spacesim.learning.cameras import focus_point, nearest_camera
 from spacesim.splat.raster.cameras import NEAR
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
+from spacesim.splat.raster.surface import flattened
 
 OPACITY = 0.1  #: of every Gaussian at the start (Kerbl et al. 2023)
 NEIGHBOURS = 12  #: points that a normal is estimated from
@@ -70,6 +71,15 @@ def surface_normals(means: np.ndarray) -> np.ndarray:
     near = means[cKDTree(means).query(means, k=count)[1].reshape(len(means), count)]
     centred = near - near.mean(axis=1, keepdims=True)
     return np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][:, :, 0]
+
+
+def lay_flat(gaussians: Gaussians) -> None:
+    """Make Gaussians discs (`flattened`) along the surface on which their centres lie (`surface_normals`)."""
+    normals = surface_normals(gaussians.to_numpy()["means"].astype(np.float64)).T
+    x, y, z = np.where(normals[0] < 0, -normals, normals)
+    turns = np.stack([1 + x, np.zeros_like(x), -z, y])  # the shortest turns from (1, 0, 0)
+    gaussians.quaternions = ad.Array4f(*map(upload, turns / np.linalg.norm(turns, axis=0)))
+    gaussians.log_scales = ad.Array3f(flattened(list(gaussians.log_scales)))
 
 
 def spacing(means: np.ndarray) -> np.ndarray:

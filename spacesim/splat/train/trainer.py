@@ -37,7 +37,7 @@ from spacesim.splat.train.pictures.learned import LearnedPictures
 from spacesim.splat.train.pictures.suns import FirstSuns
 from spacesim.splat.train.prior import MeshPrior
 from spacesim.splat.train.stages import TargetImage, update_light
-from spacesim.splat.train.start import initial_gaussians, scene_scale, surface_normals
+from spacesim.splat.train.start import initial_gaussians, lay_flat, scene_scale, surface_normals
 from spacesim.splat.train.strategies.factory import make_strategy
 from spacesim.splat.train.view_pass import RenderedView, ViewLoss, ViewPass, ViewResult
 from spacesim.splat.train.views import TrainingView, TrainingViews
@@ -74,6 +74,8 @@ class Trainer(TrainingLoop):
             box=config.init_box,
             like_splatfacto=config.splatfacto_start,
         )
+        if config.surfels:
+            lay_flat(self.gaussians)
         self.optimizer = Adam(self.gaussians.rows())
         self.light = self._initial_light(dataset)
         self.light_optimizer = NetworkAdam(_learned(self.light))
@@ -87,7 +89,7 @@ class Trainer(TrainingLoop):
             self._start_radius = float(np.linalg.norm(means - centre, axis=1)[is_near(means)].max())
         self.history, self.seconds = [], {"refinement": 0.0}
         self._view_pass = ViewPass(config, self.scene_scale)
-        self._update = Update(config.antialiased, self.scene_scale)
+        self._update = Update(config.antialiased, self.scene_scale, config.surfels)
         self._update_light = recorded(update_light)
 
     @property

@@ -17,14 +17,21 @@ from spacesim.data.images import load_image
 from spacesim.data.lock import lock_folder
 from spacesim.learning.cameras import focus_point
 from spacesim.splat.export.ply import read_ply, write_ply
-from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 from spacesim.splat.run import load_run
 from spacesim.splat.train import views
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig, preset, with_options
-from spacesim.splat.train.start import distance_warning, initial_gaussians, scale_warning, scene_scale
+from spacesim.splat.train.start import (
+    distance_warning,
+    gaussians_at,
+    initial_gaussians,
+    lay_flat,
+    scale_warning,
+    scene_scale,
+)
 from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
@@ -243,6 +250,29 @@ def test_a_start_like_splatfactos(small_dataset):
     assert (ours["quaternions"] == [1, 0, 0, 0]).all()
     assert not (points["quaternions"] == [1, 0, 0, 0]).all()
     assert preset("thesis").splatfacto_start
+
+
+def test_surfels_start_on_the_surface():
+    means = np.random.default_rng(0).normal(size=(2000, 3))
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    gaussians = gaussians_at(means, np.full((2000, 3), 0.5), 0)
+    lay_flat(gaussians)
+    normals = np.array(principal_axes(gaussians.quaternions)[0]).T
+    assert np.quantile(np.abs(np.einsum("nc,nc->n", normals, means)), 0.01) > 0.98
+
+
+def test_surfels_stay_discs(small_dataset):
+    """Also those that have been split."""
+    trainer = Trainer(small_dataset, replace(CONFIG, surfels=True, iterations=60))
+    start = trainer.gaussians.to_numpy()["log_scales"]
+    trainer.run(lambda progress: None, lambda: None)
+    after = trainer.gaussians.to_numpy()["log_scales"]
+    assert len(after) > len(start)
+    assert np.ptp(after[:, 1] - after[:, 2]) > 0.01
+    for scales in (start, after):
+        np.testing.assert_allclose(np.exp(scales[:, 0]), 0.05 * np.exp(scales[:, 1:].min(axis=1)), rtol=1e-5)
+    with pytest.raises(InputError, match="flatten_weight: expected 0 beside surfels"):
+        replace(CONFIG, surfels=True, flatten_weight=1.0)
 
 
 @pytest.mark.parametrize("init", ["points", "random"])

@@ -17,6 +17,7 @@ from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import ROWS, SH_C0, Gaussians
 from spacesim.splat.raster.project import Splats, project
 from spacesim.splat.raster.render import harmonics, is_unclamped
+from spacesim.splat.raster.surface import flattened
 from spacesim.splat.train.loss.terms import penalty
 from spacesim.splat.train.optimizer.adam import OWN, Adam
 from spacesim.splat.train.optimizer.packing import PackedArray, load, store
@@ -42,10 +43,11 @@ class Update:
 
     antialiased: whether splats are drawn with the anti-aliasing filter
     scale: metres, the unit of depth
+    surfels: whether each step ends with discs, see `flattened`
     """
 
-    def __init__(self, antialiased: bool, scale: float) -> None:
-        self.antialiased, self.scale = antialiased, scale
+    def __init__(self, antialiased: bool, scale: float, surfels: bool = False) -> None:
+        self.antialiased, self.scale, self.surfels = antialiased, scale, surfels
         self._own, self._features = recorded(_move_own), recorded(_move_features)
         self._harmonics = recorded(_move_harmonics)
 
@@ -72,7 +74,16 @@ class Update:
         of_own = [_without_features(view) for view in views]
         views.clear()
         grad_sums, *moved = self._own(
-            rows, optimizer.slices[0].stop, packed, of_own, degree, factors, penalties, self.antialiased, self.scale
+            rows,
+            optimizer.slices[0].stop,
+            packed,
+            of_own,
+            degree,
+            factors,
+            penalties,
+            self.antialiased,
+            self.scale,
+            self.surfels,
         )
         del packed, of_own
         _replace(gaussians, optimizer, rows, 0, *moved)
@@ -115,6 +126,7 @@ def _move_own(
     penalties: Mapping[str, Float],
     antialiased: bool,
     scale: float,
+    surfels: bool,
 ) -> tuple[list[list[Float]], list[Float], list[Float]]:
     """A step of the first `count` rows. rows: all of them.
 
@@ -146,6 +158,8 @@ def _move_own(
     grad_rows = [dr.grad(row) for row in shape_rows]
     grad_rows += [mean([SH_C0 * grad_sum[c] for grad_sum in grad_sums]) for c in range(count - OWN)]
     moved, moments = _step([*dr.detach(shape_rows), *rows[OWN:count]], grad_rows, packed, factors, 0)
+    if surfels:
+        moved[ROWS["log_scales"]] = flattened(moved[ROWS["log_scales"]])
     dr.eval(grad_sums, moved, moments)
     return grad_sums, moved, moments
 
