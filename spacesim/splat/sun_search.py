@@ -10,7 +10,7 @@ as brightness determines the angle: too large an albedo would put all Suns too l
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
@@ -154,10 +154,12 @@ class SunFinder:
         looked for all over the sphere; 90 on average where they have nothing to do with each other. NaN where a half
         shows less than `LEAST` pixels, or the object is not cut out, so that halves agree on what is behind it.
         """
-        middle = np.median(np.nonzero(picture.counts)[1]) if picture.counts.any() else 0
-        is_left = np.arange(picture.counts.shape[1]) < middle
-        halves = [picture.counts & side for side in (is_left, ~is_left)]
-        if min(half.sum() for half in halves) < LEAST or picture.counts.all():
+        counts = picture.counts
+        middle = np.median(np.nonzero(counts)[1]) if counts.any() else 0
+        is_left = np.arange(counts.shape[1]) < middle
+        halves = [counts & side for side in (is_left, ~is_left)]
+        is_cut_out = not counts[np.ix_(counts.any(axis=1), counts.any(axis=0))].all()
+        if min(half.sum() for half in halves) < LEAST or not is_cut_out:
             return float("nan")
         left, right = (self.estimate(replace(picture, counts=half)).direction for half in halves)
         return float(degrees_between(left @ right))

@@ -125,8 +125,7 @@ class SunEstimation:
             return
         finder = SunFinder(gaussians, light, antialiased, light.config.curve)
         if steps == self._joined:
-            pictures = (_small_picture(self.dataset, self.dataset.train[picture]) for picture in self.held_out)
-            self.apart = np.array([finder.apart(picture) for picture in pictures])
+            self.apart = np.array([finder.apart(self._small_pictures[picture]) for picture in self.held_out])
         directions = self.directions()
         for place, picture in enumerate(self.order if self.order is not None else range(len(directions))):
             before = directions[self.order[place - 1]] if self.order is not None and place else None
