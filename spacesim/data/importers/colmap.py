@@ -22,6 +22,7 @@ from spacesim.data.importers.writing import Progress, frame_names, write_dataset
 from spacesim.data.records import Dataset
 from spacesim.data.transforms import is_file
 
+_FOLDERS = "images", "images_2", "images_4", "images_8"  # of a project; the others hold fractions of the size
 _WILD = 100.0  # times as far out as 95 % of points and cameras: points beyond are taken for wrong matches
 
 _log = logging.getLogger(__name__)
@@ -38,7 +39,7 @@ def import_colmap(
 ) -> Dataset:
     """Import a COLMAP project: the folder of a sparse model, binary or text, or one with it in sparse/ or sparse/0/.
 
-    images: the folder of the pictures, by default SRC/images or what lies beside the model. They may have any size of
+    images: the folder of the pictures, by default SRC/images (or images_2, 4, 8) or what lies beside the model. They may have any size of
         the cameras' shape: intrinsics are scaled to each
     masks, masked: see `masks.MASKED`
 
@@ -75,7 +76,8 @@ def _find_model(src: Path) -> Path:
         raise InputError(
             f"{src}: expected a folder with a COLMAP model, found {'a file' if src.exists() else 'nothing'}"
         )
-    for folder in (src, src / "sparse", src / "colmap" / "sparse"):
+    places = src, src / "sparse", src / "sparse/0", src / "colmap" / "sparse"
+    for folder in places:
         if not folder.is_dir():
             continue
         if holds_model(folder):
@@ -92,7 +94,8 @@ def _find_model(src: Path) -> Path:
                 )  # fmt: skip
             return largest
     names = "cameras and images (.bin or .txt), in it, in sparse or in sparse/0"
-    raise InputError(f"{src}: expected a COLMAP model, {names}, found none")
+    packed = next((path.name for folder in places for path in sorted(folder.glob("cameras.*.*"))), "none")
+    raise InputError(f"{src}: expected a COLMAP model, {names}, found {packed}")
 
 
 def _largest_part(folder: Path, model: ColmapModel) -> list[ColmapImage]:
@@ -113,7 +116,7 @@ def _find_pictures(
     """Files of images by their names, those that there are."""
     if given is not None and not given.is_dir():
         raise InputError(f"images: expected a folder, found {'a file' if given.exists() else 'none'} at {given}")
-    places = [given] if given is not None else [p for project in projects for p in (project / "images", project)]
+    places = [given] if given is not None else [p for project in projects for p in (*(project / name for name in _FOLDERS), project)]
     for place in places:
         paths = {image.name: place / image.name for image in images if is_file(place / image.name)}
         if paths:

@@ -30,6 +30,7 @@ from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.masks import MASK_OPTIONS, MASKED, MaskFolder, read_mask
 from spacesim.data.importers.writing import ImportedFrame, Progress, frame_names, write_dataset
 from spacesim.data.records import Camera, Dataset
+from spacesim.data.transforms import FARTHEST
 
 DOMAINS = ("synthetic", "lightbox", "sunlamp")
 SPEED_CAMERA = {"Nu": 1920, "Nv": 1200, "ppx": 5.86e-6, "ppy": 5.86e-6, "fx": 0.0176, "fy": 0.0176}
@@ -38,7 +39,7 @@ SPEED_CAMERA = {"Nu": 1920, "Nv": 1200, "ppx": 5.86e-6, "ppy": 5.86e-6, "fx": 0.
 _TURNS, _PLACES = ("q_vbs2tango_true", "q_vbs2tango"), ("r_Vo2To_vbs_true", "r_Vo2To_vbs")
 _UNIT = 1e-3  #: how far from 1 the length of a quaternion may be
 _SKEWED = 0.1  #: pixels from the top of a picture to its bottom: our cameras have none
-_FARTHEST = 1e9  #: metres
+_BENT = 100.0  #: coefficients of distortion: those of lenses are about 1
 _BOX = PillowImage.Resampling.BOX
 
 _log = logging.getLogger(__name__)
@@ -167,6 +168,8 @@ def _read_camera(src: Path, labels: Path) -> _Intrinsics:
         distortion = tuple([*lens, *[0.0] * (5 - len(lens))]) if any(lens) else ()
         if len(distortion) > 5 or not np.isfinite([fx, fy, cx, cy, *distortion]).all():
             raise ValueError
+        if max(map(abs, distortion), default=0) > _BENT:
+            raise InputError(f"expected distCoeffs up to {_BENT:g}, found {lens}")
         Camera(np.eye(4), width, height, fx, fy, cx, cy)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -195,8 +198,10 @@ def _read_label(path: Path, entry: JsonDict) -> _Label:
         length = float(np.linalg.norm(quaternion))
         if abs(length - 1) > _UNIT:
             raise InputError(f"expected a quaternion of length 1, found one of length {length:.4g}")
-        if max(map(abs, position)) > _FARTHEST:
-            raise InputError(f"expected a position within {_FARTHEST:g} m, found {position}")
+        if max(map(abs, position)) > FARTHEST:
+            raise InputError(f"expected a position within {FARTHEST:g} m, found {position}")
+        if position[2] <= 0:
+            raise InputError(f"expected a position before the camera, z above 0, found {position}")
     except InputError as error:
         raise InputError(f"{path}: {name}: {error}") from None
     return _Label(str(name), quaternion, position)

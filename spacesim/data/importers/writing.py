@@ -28,7 +28,7 @@ from spacesim.data.integrity.manifest import write_manifest
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import intrinsics_of, write_points
-from spacesim.data.transforms import DEPTH_UNITS, MILLIMETRE, dataset_of, read_dataset
+from spacesim.data.transforms import DEPTH_UNITS, MILLIMETRE, check_place, dataset_of, read_dataset
 
 SOURCE = "import.json"  #: of a dataset: where it comes from and what was asked for; written first
 _PARTS = {"silhouette": "silhouette_path", "mask": "mask_path", "depth": "depth_file_path"}
@@ -79,7 +79,7 @@ def write_dataset(
     if not train:
         raise InputError(f"{source.get('source', out)}: expected frames to train on, found none")
     entries = [_entry(frame) for frame in frames]
-    _check_names(str(source.get("source", out)), entries)
+    _check(str(source.get("source", out)), frames, entries)
     with lock_folder(out):
         _claim(out, source)
         paths = [SOURCE]
@@ -112,8 +112,14 @@ def write_dataset(
     return read_dataset(out)
 
 
-def _check_names(source: str, entries: Sequence[JsonMapping]) -> None:
-    """Raises InputError where two frames would be written to one file, before anything is."""
+def _check(source: str, frames: Sequence[ImportedFrame], entries: Sequence[JsonMapping]) -> None:
+    """Raises InputError, before anything is written, for a camera that is too far away and where two frames would be
+    written to one file."""
+    for frame in frames:
+        try:
+            check_place(frame.camera)
+        except InputError as error:
+            raise InputError(f"{source}: {frame.name}: {error}") from None
     for key in ("file_path", *_PARTS.values()):
         for path, count in Counter(entry[key] for entry in entries if key in entry).items():
             if count > 1:
