@@ -39,6 +39,25 @@ Progress = Callable[[int, int, str], None]
 """Called with how many pictures are written, of how many, and the name of the last."""
 
 
+class StageProgress:
+    """Tells a `Progress` of stages as parts of one whole."""
+
+    def __init__(self, progress: Progress | None, stages: Sequence[str]) -> None:
+        self.progress, self.stages = progress, stages
+
+    def __call__(self, stage: str, done: int, total: int, detail: str = "") -> None:
+        if self.progress is not None:
+            part = 100 * (self.stages.index(stage) + done / max(total, 1))
+            self.progress(round(part), 100 * len(self.stages), f"{stage} {detail}".rstrip())
+
+    def write(self, done: int, total: int, name: str) -> None:
+        """What `write_dataset` tells, of the last stage."""
+        if len(self.stages) > 1:
+            self("write", done, total, name)
+        elif self.progress is not None:
+            self.progress(done, total, name)
+
+
 @dataclass(frozen=True, eq=False)
 class ImportedFrame:
     """A view from elsewhere."""
