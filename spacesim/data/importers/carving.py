@@ -31,12 +31,7 @@ _SIDES = 48, 64, 96, 96  # voxels of the grid's side, round by round
 _CROP = 240  # pixels of the longer side at which pictures are looked at
 _LEAST = 4  # of its shorter side
 _MARGIN = 1.4  # times the object's radius: half the side of what is looked at
-_SHARES = (
-    0.6,
-    0.75,
-    0.92,
-    0.95,
-)  # of the votes that the best voxels get: others of the object get as many, round by round
+_SHARES = 0.6, 0.75, 0.92, 0.95  # of the best voxels' votes, which others of the object get, too, round by round
 _ASKED = 0.4  # of these: what has less in one round is not asked about in the next
 _PIECE = 0.02  # of the largest piece of the shape: smaller ones are no part of it
 _RARE = 5.0  # log-densities that a pixel of the object is rarer than the median of what surrounds it
@@ -259,7 +254,8 @@ class _Grid:
         if before is not None:
             index = np.floor((points - before.origin) / before.side).astype(np.intp)
             known = ((index >= 0) & (index < len(before.share))).all(axis=1)
-            enough = np.asarray(ndimage.binary_dilation(before.share > _ASKED * before.best))
+            few = before.share <= _ASKED * before.best
+            enough: np.ndarray = np.asarray(ndimage.distance_transform_edt(few)) <= 1
             asked[asked] = known & enough[tuple(np.where(known[:, None], index, 0).T)]
             points = points[asked.ravel()]
         return _Grid(origin, side, np.zeros(asked.shape), asked, points)

@@ -34,7 +34,7 @@ def import_colmap(
     out: Path,
     *,
     images: Path | None = None,
-    masks: Path | None = None,
+    masks: str | Path | None = None,
     masked: str = "empty",
     progress: Progress | None = None,
 ) -> Dataset:

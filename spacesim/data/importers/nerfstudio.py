@@ -57,7 +57,7 @@ def import_nerfstudio(
     src: Path,
     out: Path,
     *,
-    masks: Path | None = None,
+    masks: str | Path | None = None,
     masked: str | None = None,
     depth_unit: float | None = None,
     progress: Progress | None = None,
@@ -151,9 +151,10 @@ def _write(dataset: Dataset, extras: _Extras, out: Path, source: JsonMapping, pr
     views = {frame: _view(dataset, frame, names[frame], extras, depths) for frame in dataset.frames}
     tell = StageProgress(progress, ("cut out", "write") if masks == AUTO else ("write",))
     if masks is not None:
-        posed = {frame.file_path: PosedPicture(v.path, v.world_from_camera, v.lens) for frame, v in views.items()}
+        keys = {frame: f"{names[frame]}{PurePosixPath(frame.file_path).suffix}" for frame in views}
+        posed = {keys[frame]: PosedPicture(v.path, v.world_from_camera, v.lens) for frame, v in views.items()}
         makers = mask_makers(masks, posed, tell)
-        views = {frame: replace(view, mask=makers.get(frame.file_path)) for frame, view in views.items()}
+        views = {frame: replace(view, mask=makers.get(keys[frame])) for frame, view in views.items()}
 
     def make(frames: Iterable[Frame]) -> list[ImportedFrame]:
         return [maker.frame(views[frame]) for frame in frames]

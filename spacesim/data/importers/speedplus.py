@@ -94,7 +94,7 @@ def import_speedplus(
     count: int | None = None,
     scale: float = 1.0,
     seed: int = 0,
-    masks: Path | None = None,
+    masks: str | Path | None = None,
     masked: str = "empty",
     progress: Progress | None = None,
 ) -> Dataset:
@@ -130,6 +130,8 @@ def import_speedplus(
     if there < near:
         _log.warning("%s: %d of %d pictures are missing, their frames are skipped", pictures, near - there, near)
     if count is not None:
+        if count > there:
+            _log.warning("%s: expected %d pictures, found %d: all are taken", pictures, count, there)
         splits = _subsets(splits, count, seed)
     size = max(1, round(scale * intrinsics.width)), max(1, round(scale * intrinsics.height))
     files = [one.filename for labels in splits for one in labels]
@@ -325,7 +327,7 @@ SPEEDPLUS = Importer(
         Option("max_distance", float, "M", "leave out what is farther than so many metres (all)"),
         Option("count", int, "N", "so many frames, evenly spread (all)"),
         Option("scale", float, "X", "size of the pictures, a fraction (1)"),
-        Option("seed", int, "N", "draws the frames of --count (0)"),
+        Option("seed", int, "N", "random seed of --count (0)"),
         *mask_options("those in the folder masks, else auto of 20 pictures or more"),
     ),
 )
