@@ -74,7 +74,8 @@ def mask_overlaps(data: SpeedplusData, folder: Path) -> np.ndarray:
             import_speedplus(folder.parent / "speedplus", folder, masks="auto", progress=report)
     shares = []
     for known, frame in zip(data.made.frames, read_dataset(folder).frames, strict=True):
-        assert known.silhouette_path is not None and frame.silhouette_path is not None
+        assert known.silhouette_path is not None
+        assert frame.silhouette_path is not None
         true = read_png(data.made.root / known.silhouette_path) > 0
         found = read_png(folder / frame.silhouette_path) > 0
         shares.append((true & found).sum() / max((true | found).sum(), 1))

@@ -253,7 +253,7 @@ class _Grid:
         points = origin + side * (np.argwhere(asked) + 0.5)
         if before is not None:
             index = np.floor((points - before.origin) / before.side).astype(np.intp)
-            known = ((index >= 0) & (index < len(before.share))).all(axis=1)
+            known: np.ndarray = np.asarray(((index >= 0) & (index < len(before.share))).all(axis=1))
             few = before.share <= _ASKED * before.best
             enough: np.ndarray = np.asarray(ndimage.distance_transform_edt(few)) <= 1
             asked[asked] = known & enough[tuple(np.where(known[:, None], index, 0).T)]

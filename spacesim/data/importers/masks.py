@@ -27,7 +27,7 @@ def mask_options(default: str, masked: str = "default: empty") -> tuple[Option, 
             "masks",
             Path,
             "DIR|auto|none",
-            "masks named like the pictures (of a video: like the frames of an earlier import), white = object; auto: "
+            "masks named like the pictures (of a video: like data/images of an earlier import), white = object; auto: "
             f"the object is cut out by what space looks like; none: the background stays (default: {default})",
         ),
         Option(

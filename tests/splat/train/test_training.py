@@ -285,9 +285,9 @@ def test_poses_in_kilometres_are_warned_of(small_dataset):
 
 
 def test_points_too_near_to_be_drawn_are_warned_of(small_dataset, tmp_path):
-    """The cameras are 3 from the middle of an object that is about 2 wide."""
+    """The cameras are 3 from the middle of the object."""
     points = read_points(small_dataset.root / small_dataset.ply_file_path)[0]
-    for factor, warned in ((1.0, False), (2e-2, False), (6e-3, True), (1e-3, True)):
+    for factor, warned in ((1.0, False), (2e-2, False), (3.5e-3, True), (1e-3, True)):
         write_points(tmp_path / "points.ply", factor * points, np.zeros((len(points), 3), np.uint8))
         scaled = replace(placed(small_dataset, factor), root=tmp_path, ply_file_path="points.ply")
         assert bool(scale_warning(scaled)) == warned
