@@ -1,8 +1,9 @@
 """Data like SPEED+: made, blurred and made noisy, exported in its form, and imported again without the Suns.
 
-    python benchmarks/speedplus_data.py --out DIR [--frames 600] [--height 300] [--seed 0] [--json]
+    python benchmarks/speedplus_data.py --out DIR [--frames 600] [--height 300] [--seed 0] [--masks] [--json]
 
-`make` is what other benchmarks call. The scene is `speedplus`; an eighth as many frames are held out.
+--masks cuts the object out (`import speedplus --masks auto`) and compares with the true silhouettes: intersection over
+union. `make` is what other benchmarks call. The scene is `speedplus`; an eighth as many frames are held out.
 """
 
 import argparse
@@ -56,7 +57,7 @@ def make(folder: Path, frames: int = 600, height: int = 300, seed: int = 0, spp:
         for number, path in enumerate(sorted((folder / "speedplus/synthetic/images").glob("*.png"))):
             write_png(path, degraded(read_png(path), (seed, number)), durable=False)
         shutil.rmtree(folder / "speedplus/synthetic/masks")  # SPEED+ has none
-        import_speedplus(folder / "speedplus", folder / "data")
+        import_speedplus(folder / "speedplus", folder / "data", masks="none")
     data = read_dataset(folder / "data")
     if not (folder / "labelled/transforms.json").exists():
         train, test = (
@@ -64,6 +65,21 @@ def make(folder: Path, frames: int = 600, height: int = 300, seed: int = 0, spp:
         )
         write_dataset(folder / "labelled", train, test, {"kind": "labelled", "source": str(folder / "data")})
     return SpeedplusData(made, data, read_dataset(folder / "labelled"))
+
+
+def mask_overlaps(data: SpeedplusData, folder: Path) -> np.ndarray:
+    """Intersection over union of silhouettes that `import speedplus --masks auto` finds with the true ones, [N]."""
+    if not (folder / "transforms.json").exists():
+        with show_progress("cut out", "pictures") as report:
+            import_speedplus(folder.parent / "speedplus", folder, masks="auto", progress=report)
+    shares = []
+    for known, frame in zip(data.made.frames, read_dataset(folder).frames, strict=True):
+        assert known.silhouette_path is not None
+        assert frame.silhouette_path is not None
+        true = read_png(data.made.root / known.silhouette_path) > 0
+        found = read_png(folder / frame.silhouette_path) > 0
+        shares.append((true & found).sum() / max((true | found).sum(), 1))
+    return np.array(shares)
 
 
 def degraded(picture: np.ndarray, seed: tuple[int, ...]) -> np.ndarray:
@@ -100,6 +116,7 @@ def main() -> None:
     parser.add_argument("--spp", type=common.positive, default=64, metavar="N", help="samples a pixel (64)")
     parser.add_argument("--seed", type=common.natural, default=0, metavar="N")
     parser.add_argument("--backend", choices=backend.NAMES, default="auto")
+    parser.add_argument("--masks", action="store_true", help="compare masks that are found with the true ones")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     name = backend.select(options.backend)
@@ -115,6 +132,9 @@ def main() -> None:
         "seconds_a_frame": seconds / count,
         "mean": float(np.mean([picture.mean() for picture in pictures])),
     }
+    if options.masks:
+        shares = mask_overlaps(result, options.out / "cut-out")
+        report |= {"masks_iou_mean": float(shares.mean()), "masks_iou_least": float(shares.min())}
     print(json.dumps(report) if options.json else "\n".join(f"{key}: {value}" for key, value in report.items()))
 
 

@@ -755,6 +755,7 @@ def test_a_wrong_number_is_named_in_every_command(spacesim, command):
         ("train DATA --out OUT --sed=5", "train: unknown option --sed; did you mean --seed? see spacesim train --help"),
         ("train DATA --ouut OUT", "train: unknown option --ouut; did you mean --out? see spacesim train --help"),
         ("export RUN --plyy OUT", "export: unknown option --plyy; did you mean --ply? see spacesim export --help"),
+        ("import speedplus A --out B --frames 9", "speedplus: unknown option --frames; did you mean --count? see"),
         ("train DATA --out OUT -q", "train: unknown option -q; see spacesim train --help"),
         (
             "import video A --out B --hight 9",

@@ -81,9 +81,15 @@ class Parser(argparse.ArgumentParser):
                 break
             name = word.partition("=")[0]
             if re.match(r"--?[a-zA-Z]", name) and not any(option.startswith(name) for option in known.values()):
-                close = get_close_matches(name.lstrip("-"), known, n=1)
+                bare = name.lstrip("-")
+                close = get_close_matches(bare, known, n=1) or self._options_of(bare)
                 return f"unknown option {name}" + (f"; did you mean {known[close[0]]}?" if close else "")
         return None
+
+    def _options_of(self, word: str) -> list[str]:
+        """The one option, without dashes, whose help speaks of this word; none where several do."""
+        actions = [a for a in self._actions if re.search(rf"\b{re.escape(word)}\b", f"{a.help}")]
+        return [actions[0].option_strings[-1].lstrip("-")] if len(actions) == 1 and actions[0].option_strings else []
 
 
 def angles(text: str) -> tuple[float, float]:

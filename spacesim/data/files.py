@@ -193,7 +193,7 @@ def read_json(path: Path, most: int = MAX_JSON_BYTES) -> Any:
     content = read_bytes(path, "a JSON file", most)
     check_memory(PARSED * len(content), f"{path}: reading it")
     try:
-        return json.loads(content.decode("utf-8"))
+        return json.loads(content.decode("utf-8-sig"))
     except InputError:
         raise
     except (ValueError, RecursionError) as error:  # malformed, no UTF-8, endless numbers or brackets

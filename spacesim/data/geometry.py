@@ -55,6 +55,16 @@ def degrees_between(cosines: ArrayLike) -> Array:
     return angles
 
 
+def focus_of(world_from_camera: Array) -> Array:
+    """[3] the point nearest to the optical axes of cameras [N, 4, 4], in the least-squares sense."""
+    A, b = 1e-9 * np.eye(3), np.zeros(3)
+    for pose in world_from_camera:
+        across = np.eye(3) - np.outer(pose[:3, 2], pose[:3, 2])
+        A += across
+        b += across @ pose[:3, 3]
+    return np.asarray(np.linalg.solve(A, b), np.float64)
+
+
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
     """world_from_camera [4, 4] (OpenCV axes) of a camera at `origin` [3] that looks at `target` [3], metres.
 

@@ -33,6 +33,7 @@ TRUTH_PATHS = ("gt_path", "shadow_path", "silhouette_path", "id_path", "depth_fi
 DEPTH_UNITS = "depth_unit_scale_factor", "integer_depth_scale"  #: keys: Nerfstudio's name, instant-ngp's
 MILLIMETRE = 1e-3  #: metres: Nerfstudio's default
 MAX_DEPTH_UNIT = 1e30  #: metres a step
+FARTHEST = 1e9  #: metres from the origin at which a camera may be: nothing is drawn beyond
 _HOLD_OUT = 8
 _SPLITS = ("train", "val", "test")
 
@@ -283,9 +284,16 @@ def _read_camera(values: Json, image: Path) -> Camera:
     cx, cy = _number(values, "cx", 0.5 * width), _number(values, "cy", 0.5 * height)
     pose = _read_pose(values)
     camera = Camera(pose @ OPENCV_FROM_OPENGL, width, height, fx, fy, cx, cy)
+    check_place(camera)
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise InputError(f"expected 0 0 0 1 as the last row of transform_matrix, found {pose[3].tolist()}")
     return camera
+
+
+def check_place(camera: Camera) -> None:
+    """Raise InputError for a camera farther than `FARTHEST` from the origin."""
+    if np.abs(camera.position).max() > FARTHEST:
+        raise InputError(f"expected a camera within {FARTHEST:g} m of the origin, found it at {camera.position}")
 
 
 def _focal_length(values: Json, key: str, angle_key: str, size: int) -> float | None:
@@ -382,7 +390,7 @@ def _listed(source: Path, names: object, paths: list[str], missing: tuple[str, .
     missing."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{source}: expected lists of file paths as train_filenames and the like")
-    listed = {f"{PurePosixPath(name)}" for name in names}
+    listed = {_relative(source, name) for name in names}
     listed = {name if name in paths else f"{name}.png" for name in listed.difference(missing)}
     unknown = sorted(listed.difference(paths))
     if unknown:
@@ -426,4 +434,11 @@ def _path(source: Path, values: Json, key: str) -> str | None:
         return None
     if not isinstance(value, str) or not value or "\0" in value:
         raise InputError(f"{source}: expected a file path as {key}, found {value!r}")
-    return str(PurePosixPath(value))
+    return _relative(source, value)
+
+
+def _relative(source: Path, name: str) -> str:
+    """`name` of a file, from the folder of `source`, in which Windows may have put backslashes."""
+    if "\\" in name and not is_file(source.parent / name):
+        name = name.replace("\\", "/")
+    return str(PurePosixPath(name))

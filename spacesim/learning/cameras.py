@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from spacesim.data.geometry import focus_of
 from spacesim.data.records import Dataset
 
 
@@ -17,10 +18,4 @@ def nearest_camera(dataset: Dataset, center: np.ndarray) -> float:
 
 def focus_point(dataset: Dataset) -> np.ndarray:
     """[3] the point nearest to all optical axes, in the least-squares sense."""
-    A, b = 1e-9 * np.eye(3), np.zeros(3)
-    for frame in dataset.train:
-        axis = frame.camera.world_from_camera[:3, 2]
-        across = np.eye(3) - np.outer(axis, axis)
-        A += across
-        b += across @ frame.camera.position
-    return np.linalg.solve(A, b)
+    return focus_of(np.array([frame.camera.world_from_camera for frame in dataset.train]))

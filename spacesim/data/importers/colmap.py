@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from spacesim.data.errors import InputError
+from spacesim.data.importers.carving import PosedPicture, mask_makers
 from spacesim.data.importers.colmap_model import (
     ColmapImage,
     ColmapModel,
@@ -16,12 +17,13 @@ from spacesim.data.importers.colmap_model import (
     read_model,
 )
 from spacesim.data.importers.importer import Importer, Option
-from spacesim.data.importers.masks import MASK_OPTIONS, MaskFolder
+from spacesim.data.importers.masks import AUTO, mask_options
 from spacesim.data.importers.pictures import FrameImporter, SourceView, fitted
-from spacesim.data.importers.writing import Progress, frame_names, write_dataset
+from spacesim.data.importers.writing import Progress, StageProgress, frame_names, write_dataset
 from spacesim.data.records import Dataset
 from spacesim.data.transforms import is_file
 
+_FOLDERS = "images", "images_2", "images_4", "images_8"  # of a project; the others hold fractions of the size
 _WILD = 100.0  # times as far out as 95 % of points and cameras: points beyond are taken for wrong matches
 
 _log = logging.getLogger(__name__)
@@ -32,15 +34,16 @@ def import_colmap(
     out: Path,
     *,
     images: Path | None = None,
-    masks: Path | None = None,
+    masks: str | Path | None = None,
     masked: str = "empty",
     progress: Progress | None = None,
 ) -> Dataset:
     """Import a COLMAP project: the folder of a sparse model, binary or text, or one with it in sparse/ or sparse/0/.
 
-    images: the folder of the pictures, by default SRC/images or what lies beside the model. They may have any size of
-        the cameras' shape: intrinsics are scaled to each
-    masks, masked: see `masks.MASKED`
+    images: the folder of the pictures, by default SRC/images (or images_2, 4, 8) or what lies beside the model. They
+        may have any size of the cameras' shape: intrinsics are scaled to each
+    masks: a folder of masks, "auto": cut out by `carving`, "none" or None: the background stays
+    masked: see `masks.MASKED`
 
     Poses are taken as they are, in the model's axes and units. Of several models the largest is taken; images without
     a file are left out; both are logged. Raises InputError where there is no model, as `read_model` does, where no
@@ -52,13 +55,14 @@ def import_colmap(
     projects = dict.fromkeys([src, folder.parent, folder.parent.parent])
     paths = _find_pictures(folder, list(projects), connected, images)
     used = [image for image in connected if image.name in paths]
-    mask_paths = {} if masks is None else MaskFolder(masks).find_all([image.name for image in used])
-    maker = FrameImporter(masked)
+    lenses = {image.name: fitted(model.cameras[image.camera], paths[image.name]) for image in used}
+    pictures = {i.name: PosedPicture(paths[i.name], i.world_from_camera, lenses[i.name]) for i in used}
+    tell = StageProgress(progress, ("cut out", "write") if str(masks) == AUTO else ("write",))
+    makers, maker = mask_makers(masks, pictures, tell), FrameImporter(masked)
     frames = []
-    for name, image in zip(frame_names([image.name for image in used]), used, strict=True):
-        path = paths[image.name]
-        lens = fitted(model.cameras[image.camera], path)
-        frames.append(maker.frame(SourceView(name, path, image.world_from_camera, lens, mask_paths.get(image.name))))
+    for name, (key, picture) in zip(frame_names(list(pictures)), pictures.items(), strict=True):
+        view = SourceView(name, picture.path, picture.world_from_camera, picture.lens, makers.get(key))
+        frames.append(maker.frame(view))
     source = {
         "kind": "colmap",
         "source": str(src),
@@ -66,7 +70,7 @@ def import_colmap(
         "masks": None if masks is None else str(masks),
         "masked": masked,
     }
-    return write_dataset(out, frames, None, source, _start_points(folder, model, connected), progress=progress)
+    return write_dataset(out, frames, None, source, _start_points(folder, model, connected), progress=tell.write)
 
 
 def _find_model(src: Path) -> Path:
@@ -75,7 +79,8 @@ def _find_model(src: Path) -> Path:
         raise InputError(
             f"{src}: expected a folder with a COLMAP model, found {'a file' if src.exists() else 'nothing'}"
         )
-    for folder in (src, src / "sparse", src / "colmap" / "sparse"):
+    places = src, src / "sparse", src / "sparse/0", src / "colmap" / "sparse"
+    for folder in places:
         if not folder.is_dir():
             continue
         if holds_model(folder):
@@ -92,7 +97,8 @@ def _find_model(src: Path) -> Path:
                 )  # fmt: skip
             return largest
     names = "cameras and images (.bin or .txt), in it, in sparse or in sparse/0"
-    raise InputError(f"{src}: expected a COLMAP model, {names}, found none")
+    packed = next((path.name for folder in places for path in sorted(folder.glob("cameras.*.*"))), "none")
+    raise InputError(f"{src}: expected a COLMAP model, {names}, found {packed}")
 
 
 def _largest_part(folder: Path, model: ColmapModel) -> list[ColmapImage]:
@@ -113,7 +119,11 @@ def _find_pictures(
     """Files of images by their names, those that there are."""
     if given is not None and not given.is_dir():
         raise InputError(f"images: expected a folder, found {'a file' if given.exists() else 'none'} at {given}")
-    places = [given] if given is not None else [p for project in projects for p in (project / "images", project)]
+    places = (
+        [given]
+        if given is not None
+        else [p for project in projects for p in (*(project / name for name in _FOLDERS), project)]
+    )
     for place in places:
         paths = {image.name: place / image.name for image in images if is_file(place / image.name)}
         if paths:
@@ -158,5 +168,5 @@ COLMAP = Importer(
     import_colmap,
     "a COLMAP project: a sparse model, binary or text, and its pictures",
     "folder with sparse/0 and images, or that of the model",
-    (Option("images", Path, "DIR", "folder of the pictures, of any scale (SRC/images)"), *MASK_OPTIONS),
+    (Option("images", Path, "DIR", "folder of the pictures, of any scale (SRC/images)"), *mask_options("none")),
 )

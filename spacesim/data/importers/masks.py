@@ -14,20 +14,46 @@ from spacesim.data.importers.importer import Option
 MASKED = "empty", "unknown"
 """Of the pixels that are black in a mask: nothing of the object is there, which training learns (silhouette_path); or
 nothing is known of them, and training ignores them (mask_path)."""
-MASK_OPTIONS = (
-    Option("masks", Path, "DIR", "masks of the same relative names as the pictures, any suffix: white = object"),
-    Option(
-        "masked",
-        str,
-        "WHAT",
-        "pixels black in a mask: empty = nothing is there, and training learns it (default); "
-        "unknown = training ignores them",
-        MASKED,
-    ),
-)
-"""Of importers that take masks."""
+AUTO, NO_MASKS = "auto", "none"  #: in place of a folder of masks
+NO_OBJECT = "masks: expected an object in the pictures, found none; give masks, or masks none"
 
 _log = logging.getLogger(__name__)
+
+
+def mask_options(default: str, masked: str = "default: empty") -> tuple[Option, Option]:
+    """Of importers that take masks. default: what they do without; masked: which kind of pixels they take then."""
+    return (
+        Option(
+            "masks",
+            Path,
+            "DIR|auto|none",
+            "masks named like the pictures (of a video: like data/images of an earlier import), white = object; auto: "
+            f"the object is cut out by what space looks like; none: the background stays (default: {default})",
+        ),
+        Option(
+            "masked",
+            str,
+            "WHAT",
+            "pixels black in a mask: empty = nothing is there, and training learns it; unknown = training ignores "
+            f"them ({masked})",
+            MASKED,
+        ),
+    )
+
+
+def over_black(pixels: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint8 of what `read_png` gives."""
+    pixels = as_color(pixels)
+    if pixels.shape[2] == 3:
+        return pixels
+    return ((pixels[..., :3].astype(np.uint16) * pixels[..., 3:] + 127) // 255).astype(np.uint8)
+
+
+def as_color(pixels: np.ndarray) -> np.ndarray:
+    """[H, W, 3] or [H, W, 4] uint8 of what `read_png` gives."""
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    return np.repeat(pixels[..., None], 3, axis=-1) if pixels.ndim == 2 else pixels
 
 
 class MaskFolder:

@@ -11,20 +11,21 @@ import logging
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, expect
 from spacesim.data.files import JsonMapping, read_bytes
 from spacesim.data.images import read_png
+from spacesim.data.importers.carving import PosedPicture, mask_makers
 from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.lenses import LENS_MODELS, Lens, LensModel
-from spacesim.data.importers.masks import MASKED
+from spacesim.data.importers.masks import AUTO, MASKED, mask_options, read_mask
 from spacesim.data.importers.pictures import FrameImporter, SourceView, fitted
-from spacesim.data.importers.writing import ImportedFrame, Progress, frame_names, write_dataset
+from spacesim.data.importers.writing import ImportedFrame, Progress, StageProgress, frame_names, write_dataset
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import choose_depth_unit, read_points
 from spacesim.data.transforms import (
@@ -56,13 +57,15 @@ def import_nerfstudio(
     src: Path,
     out: Path,
     *,
-    masked: str = "unknown",
+    masks: str | Path | None = None,
+    masked: str | None = None,
     depth_unit: float | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
     """Import a folder with a transforms.json, or the file itself: cameras, pictures, Suns, masks, depth and points.
 
-    masked: what black in the pictures of mask_path means, see `masks.MASKED`
+    masks: a folder of masks in place of mask_path, "auto": cut out by `carving`, "none": the background stays
+    masked: what black in masks means, see `masks.MASKED`; None is "unknown" of mask_path, else "empty"
     depth_unit: metres a step of the depth files; None is what transforms.json says, else a millimetre
 
     Truth beyond these stays behind. Raises InputError as `read_dataset` does, and where a file is broken.
@@ -70,7 +73,9 @@ def import_nerfstudio(
     path = src / "transforms.json" if src.is_dir() else src
     extras = _Extras()
     dataset = dataset_of(path, _take_extras(path, read_object(path), extras, depth_unit))
-    source = {"kind": "nerfstudio", "source": str(src), "masked": masked, "depth_unit": depth_unit}
+    given = None if masks is None else str(masks)
+    masked = masked or ("unknown" if masks is None else "empty")
+    source = {"kind": "nerfstudio", "source": str(src), "masks": given, "masked": masked, "depth_unit": depth_unit}
     return _write(dataset, extras, out, source, progress)
 
 
@@ -87,7 +92,7 @@ def import_blender(src: Path, out: Path, *, progress: Progress | None = None) ->
     train = _take_extras(root / "transforms_train.json", train, extras, None)
     if test is not None:
         test = test[0], _take_extras(root / test[0], test[1], extras, None)
-    source = {"kind": "blender", "source": str(src), "masked": "unknown"}
+    source = {"kind": "blender", "source": str(src), "masks": None, "masked": "unknown"}
     return _write(dataset_of_pair(root, train, test), extras, out, source, progress)
 
 
@@ -137,17 +142,26 @@ def _unit(path: Path, name: str, values: JsonMapping) -> float:
 
 
 def _write(dataset: Dataset, extras: _Extras, out: Path, source: JsonMapping, progress: Progress | None) -> Dataset:
-    assert source["masked"] in MASKED
-    maker, depths = FrameImporter(source["masked"]), _DepthReader(_common_unit(dataset.root, extras))
+    masks, masked = source["masks"], source["masked"]
+    expect(masked in MASKED, "masked", f"one of {', '.join(MASKED)}", masked)
+    maker, depths = FrameImporter(masked), _DepthReader(_common_unit(dataset.root, extras))
     paths = _below_one_folder(dataset.root, [frame.file_path for frame in dataset.frames])
     names = dict(zip(dataset.frames, frame_names(paths), strict=True))
 
+    views = {frame: _view(dataset, frame, names[frame], extras, depths) for frame in dataset.frames}
+    tell = StageProgress(progress, ("cut out", "write") if masks == AUTO else ("write",))
+    if masks is not None:
+        keys = {frame: f"{names[frame]}{PurePosixPath(frame.file_path).suffix}" for frame in views}
+        posed = {keys[frame]: PosedPicture(v.path, v.world_from_camera, v.lens) for frame, v in views.items()}
+        makers = mask_makers(masks, posed, tell)
+        views = {frame: replace(view, mask=makers.get(keys[frame])) for frame, view in views.items()}
+
     def make(frames: Iterable[Frame]) -> list[ImportedFrame]:
-        return [maker.frame(_view(dataset, frame, names[frame], extras, depths)) for frame in frames]
+        return [maker.frame(views[frame]) for frame in frames]
 
     points = None if dataset.ply_file_path is None else read_points(dataset.root / dataset.ply_file_path)
     return write_dataset(
-        out, make(dataset.train), make(dataset.test), source, points, progress=progress, depth_unit=depths.unit
+        out, make(dataset.train), make(dataset.test), source, points, progress=tell.write, depth_unit=depths.unit
     )
 
 
@@ -172,7 +186,10 @@ def _view(dataset: Dataset, frame: Frame, name: str, extras: _Extras, depths: "_
         raise InputError(
             f"{dataset.root / frame.file_path}: {error}" if str(path) not in str(error) else str(error)
         ) from None
-    mask, silhouette = (None if p is None else dataset.root / p for p in (frame.mask_path, frame.silhouette_path))
+    silhouette = None if frame.silhouette_path is None else dataset.root / frame.silhouette_path
+    mask = None
+    if frame.mask_path is not None:
+        mask = partial(read_mask, dataset.root / frame.mask_path, lens.width, lens.height)
     depth: Callable[[], np.ndarray] | None = None
     if frame.file_path in extras.depth:
         file, unit = extras.depth[frame.file_path]
@@ -258,14 +275,7 @@ NERFSTUDIO = Importer(
     "a folder with a transforms.json, of Nerfstudio or instant-ngp",
     "folder, or the transforms.json",
     (
-        Option(
-            "masked",
-            str,
-            "WHAT",
-            "pixels black in mask_path: unknown = training ignores them (default); "
-            "empty = nothing is there, and training learns it",
-            MASKED,
-        ),
+        *mask_options("those of mask_path", "default: empty; of mask_path: unknown"),
         Option("depth_unit", float, "M", "metres a step of depth files (what transforms.json says, else 0.001)"),
     ),
 )

@@ -14,7 +14,7 @@ from spacesim.data.files import JsonValue
 from spacesim.data.geometry import Array
 from spacesim.data.images import Resampling, Undistortion, has_alpha, image_size, read_png, resample
 from spacesim.data.importers.lenses import Lens
-from spacesim.data.importers.masks import read_mask, read_silhouette
+from spacesim.data.importers.masks import read_silhouette
 from spacesim.data.importers.writing import ImportedFrame
 from spacesim.data.records import Camera, Image, Sun
 
@@ -33,7 +33,7 @@ class SourceView:
     path: Path  #: of the picture, which has the lens's size
     world_from_camera: Array  #: [4, 4]
     lens: Lens  #: intrinsics, size and distortion of the picture
-    mask: Path | None = None  #: white = object, or = known, as the frames' maker says
+    mask: Callable[[], np.ndarray] | None = None  #: makes [H, W] bool: the object, or known, as the frames' maker says
     sun: Sun | None = None  #: None where the source does not name it
     silhouette: Path | None = None  #: other than 0 = object
     depth: Callable[[], np.ndarray] | None = None  #: makes uint16 [H, W], steps along the optical axis
@@ -110,7 +110,7 @@ class FrameImporter:
             return np.rint(255 * shown[..., 0] if shown.shape[2] == 1 else 255 * shown).astype(np.uint8)
         alpha = values[..., 3]
         if view.mask is not None and self.masked == "empty":
-            alpha = alpha * read_mask(view.mask, view.lens.width, view.lens.height)
+            alpha = alpha * view.mask()
         image = Image(values[..., :3], alpha, np.ones(alpha.shape, bool))
         if source is not None:
             image = resample(image, source)
@@ -119,7 +119,7 @@ class FrameImporter:
     def _silhouette(self, view: SourceView) -> np.ndarray:
         """255 object, 0 none."""
         if view.mask is not None and self.masked == "empty":
-            known = read_mask(view.mask, view.lens.width, view.lens.height)
+            known = view.mask()
         else:
             assert view.silhouette is not None
             known = read_silhouette(view.silhouette, view.lens.width, view.lens.height)
@@ -129,7 +129,7 @@ class FrameImporter:
         """255 counts, 0 unknown."""
         known = np.ones((view.lens.height, view.lens.width), bool)
         if view.mask is not None and self.masked == "unknown":
-            known = read_mask(view.mask, view.lens.width, view.lens.height)
+            known = view.mask()
         if view.lens.distortion is None:
             source = self._resampling(view.lens)
             known = source.inside & (source.linear(known.astype(np.float32)) > 0.999)  # no unknown pixel takes part

@@ -14,7 +14,7 @@ world is the frame of the body. Labels stay with their frames in transforms.json
 import logging
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -25,11 +25,14 @@ from PIL import Image as PillowImage
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import MAX_LIST_BYTES, JsonDict, read_json
 from spacesim.data.geometry import Array, camera_that_sees
-from spacesim.data.images import image_size, read_png
+from spacesim.data.images import has_alpha, image_size, read_png
+from spacesim.data.importers.carving import FEW, PosedPicture, mask_makers
 from spacesim.data.importers.importer import Importer, Option
-from spacesim.data.importers.masks import MASK_OPTIONS, MASKED, MaskFolder, read_mask
-from spacesim.data.importers.writing import ImportedFrame, Progress, frame_names, write_dataset
+from spacesim.data.importers.lenses import LENS_MODELS, Lens
+from spacesim.data.importers.masks import AUTO, MASKED, NO_MASKS, mask_options
+from spacesim.data.importers.writing import ImportedFrame, Progress, StageProgress, frame_names, write_dataset
 from spacesim.data.records import Camera, Dataset
+from spacesim.data.transforms import FARTHEST
 
 DOMAINS = ("synthetic", "lightbox", "sunlamp")
 SPEED_CAMERA = {"Nu": 1920, "Nv": 1200, "ppx": 5.86e-6, "ppy": 5.86e-6, "fx": 0.0176, "fy": 0.0176}
@@ -38,7 +41,7 @@ SPEED_CAMERA = {"Nu": 1920, "Nv": 1200, "ppx": 5.86e-6, "ppy": 5.86e-6, "fx": 0.
 _TURNS, _PLACES = ("q_vbs2tango_true", "q_vbs2tango"), ("r_Vo2To_vbs_true", "r_Vo2To_vbs")
 _UNIT = 1e-3  #: how far from 1 the length of a quaternion may be
 _SKEWED = 0.1  #: pixels from the top of a picture to its bottom: our cameras have none
-_FARTHEST = 1e9  #: metres
+_BENT = 100.0  #: coefficients of distortion: those of lenses are about 1
 _BOX = PillowImage.Resampling.BOX
 
 _log = logging.getLogger(__name__)
@@ -70,6 +73,12 @@ class _Intrinsics:
     cy: float  #: pixels
     distortion: tuple[float, ...]  #: Brown-Conrady k1, k2, p1, p2, k3, () none
 
+    @property
+    def lens(self) -> Lens:
+        """Of pictures of the full size."""
+        parameters = self.fx, self.fy, self.cx, self.cy, *(self.distortion or (0.0,) * 5), 0.0, 0.0, 0.0
+        return Lens(LENS_MODELS[6], self.width, self.height, parameters)
+
     def camera(self, pose: Array, size: tuple[int, int]) -> Camera:
         """At a pose, with pictures resized to (width, height)."""
         u, v = size[0] / self.width, size[1] / self.height
@@ -85,7 +94,7 @@ def import_speedplus(
     count: int | None = None,
     scale: float = 1.0,
     seed: int = 0,
-    masks: Path | None = None,
+    masks: str | Path | None = None,
     masked: str = "empty",
     progress: Progress | None = None,
 ) -> Dataset:
@@ -94,7 +103,9 @@ def import_speedplus(
     domain: "synthetic", whose validation pictures become the test split, "lightbox" or "sunlamp", of which every 8th
     is held out; max_distance: metres to the body, farther ones are left out; count: frames in all, one drawn by `seed`
     from each of as many equal pieces of the lists; scale: of the pictures' size, by the means over areas.
-    masks: a folder of them, without it the domain's own folder `masks`, if there is one; masked: one of `MASKED`.
+    masks: a folder of them, "auto": cut out by `carving`, "none": the background stays; None: the domain's own folder
+    `masks`, where there is none "auto", but of fewer than 20 pictures and of those with alpha "none". masked: one of
+    `MASKED`.
     Frames without a picture are skipped, with one warning. Raises InputError for labels or a camera that are missing or
     broken, pictures of another size than the camera's, and where no frame is left.
     """
@@ -119,20 +130,43 @@ def import_speedplus(
     if there < near:
         _log.warning("%s: %d of %d pictures are missing, their frames are skipped", pictures, near - there, near)
     if count is not None:
+        if count > there:
+            _log.warning("%s: expected %d pictures, found %d: all are taken", pictures, count, there)
         splits = _subsets(splits, count, seed)
     size = max(1, round(scale * intrinsics.width)), max(1, round(scale * intrinsics.height))
-    folder = masks or pictures.parent / "masks"
     files = [one.filename for labels in splits for one in labels]
     if twice := next((name for name, count in Counter(files).items() if count > 1), ""):
         raise InputError(f"{lists[0]}: expected each image once, found {twice} twice, in it or in {lists[-1].name}")
-    mask_paths = MaskFolder(folder).find_all(files) if masks or folder.is_dir() else {}
+    for name in files:
+        _check_size(pictures / name, intrinsics)
+    chosen = masks or _default_masks(pictures, files)
+    poses = {one.filename: one.world_from_camera for labels in splits for one in labels}
+    posed = {name: PosedPicture(pictures / name, pose, intrinsics.lens) for name, pose in poses.items()}
+    tell = StageProgress(progress, ("cut out", "write") if str(chosen) == AUTO else ("write",))
+    makers = mask_makers(chosen, posed, tell, np.zeros(3))
     names = dict(zip(files, frame_names(files), strict=True))
-    maker = _FrameMaker(pictures, names, intrinsics, size, mask_paths, masked)
+    maker = _FrameMaker(pictures, names, intrinsics, size, makers, masked)
     train, test = (list(map(maker.frame, labels)) for labels in [*splits, []][:2])
     options = {"domain": domain, "max_distance": max_distance, "count": count, "scale": scale, "seed": seed}
     options |= {"masks": None if masks is None else str(masks), "masked": masked}
     source = {"kind": "speedplus", "source": str(src), **options}
-    return write_dataset(out, train, test or None, source, progress=progress)
+    return write_dataset(out, train, test or None, source, progress=tell.write)
+
+
+def _check_size(path: Path, intrinsics: _Intrinsics) -> None:
+    """Raise InputError for a picture of another size than the camera's."""
+    (width, height), full = image_size(path), (intrinsics.width, intrinsics.height)
+    if (width, height) != full:
+        raise InputError(f"{path}: expected {full[0]}x{full[1]} pixels as camera.json says, found {width}x{height}")
+
+
+def _default_masks(pictures: Path, files: Sequence[str]) -> Path | str:
+    """The data set's own, none of pictures that have alpha or are few, else "auto"."""
+    if (pictures.parent / "masks").is_dir():
+        return pictures.parent / "masks"
+    if len(files) < FEW:
+        _log.warning("%s: %d pictures are few to cut the object out by; what is behind stays", pictures, len(files))
+    return NO_MASKS if len(files) < FEW or has_alpha(pictures / files[0]) else AUTO
 
 
 def _lists(src: Path, domain: str) -> tuple[Path, list[Path]]:
@@ -167,6 +201,8 @@ def _read_camera(src: Path, labels: Path) -> _Intrinsics:
         distortion = tuple([*lens, *[0.0] * (5 - len(lens))]) if any(lens) else ()
         if len(distortion) > 5 or not np.isfinite([fx, fy, cx, cy, *distortion]).all():
             raise ValueError
+        if max(map(abs, distortion), default=0) > _BENT:
+            raise InputError(f"expected distCoeffs up to {_BENT:g}, found {lens}")
         Camera(np.eye(4), width, height, fx, fy, cx, cy)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -195,8 +231,10 @@ def _read_label(path: Path, entry: JsonDict) -> _Label:
         length = float(np.linalg.norm(quaternion))
         if abs(length - 1) > _UNIT:
             raise InputError(f"expected a quaternion of length 1, found one of length {length:.4g}")
-        if max(map(abs, position)) > _FARTHEST:
-            raise InputError(f"expected a position within {_FARTHEST:g} m, found {position}")
+        if max(map(abs, position)) > FARTHEST:
+            raise InputError(f"expected a position within {FARTHEST:g} m, found {position}")
+        if position[2] <= 0:
+            raise InputError(f"expected a position before the camera, z above 0, found {position}")
     except InputError as error:
         raise InputError(f"{path}: {name}: {error}") from None
     return _Label(str(name), quaternion, position)
@@ -239,18 +277,14 @@ class _FrameMaker:
     names: Mapping[str, str]  #: of frames, by file names
     intrinsics: _Intrinsics
     size: tuple[int, int]  #: (width, height) that pictures get
-    masks: Mapping[str, Path]  #: of file names
+    masks: Mapping[str, Callable[[], np.ndarray]]  #: what makes them, of file names
     masked: str
 
     def frame(self, label: _Label) -> ImportedFrame:
-        """Pictures are read when it is written. Raises InputError for a picture of another size than the camera's."""
+        """Pictures are read when it is written."""
         path, full = self.pictures / label.filename, (self.intrinsics.width, self.intrinsics.height)
-        size = image_size(path)
-        if size != full:
-            expected = f"{full[0]}x{full[1]} pixels as camera.json says"
-            raise InputError(f"{path}: expected {expected}, found {size[0]}x{size[1]}")
         mask = self.masks.get(label.filename)
-        made = None if mask is None else partial(_resized_mask, mask, full, self.size)
+        made = None if mask is None else partial(_resized_mask, mask, self.size)
         return ImportedFrame(
             name=self.names[label.filename],
             picture=path if self.size == full else partial(_resized, path, self.size),
@@ -278,9 +312,9 @@ def _resized(path: Path, size: tuple[int, int]) -> np.ndarray:
     return np.rint(means).astype(pixels.dtype).reshape(size[::-1] + pixels.shape[2:])
 
 
-def _resized_mask(path: Path, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
+def _resized_mask(make: Callable[[], np.ndarray], size: tuple[int, int]) -> np.ndarray:
     """[h, w] uint8, 255 where most of a pixel is white."""
-    white = np.where(read_mask(path, *full), 255, 0).astype(np.uint8)
+    white = np.where(make(), 255, 0).astype(np.uint8)
     return np.where(np.asarray(PillowImage.fromarray(white).resize(size, _BOX)) > 127, 255, 0).astype(np.uint8)
 
 
@@ -293,7 +327,7 @@ SPEEDPLUS = Importer(
         Option("max_distance", float, "M", "leave out what is farther than so many metres (all)"),
         Option("count", int, "N", "so many frames, evenly spread (all)"),
         Option("scale", float, "X", "size of the pictures, a fraction (1)"),
-        Option("seed", int, "N", "draws the frames of --count (0)"),
-        *MASK_OPTIONS,
+        Option("seed", int, "N", "random seed of --count (0)"),
+        *mask_options("those in the folder masks, else auto of 20 pictures or more"),
     ),
 )

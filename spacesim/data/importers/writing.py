@@ -28,7 +28,7 @@ from spacesim.data.integrity.manifest import write_manifest
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import intrinsics_of, write_points
-from spacesim.data.transforms import DEPTH_UNITS, MILLIMETRE, dataset_of, read_dataset
+from spacesim.data.transforms import DEPTH_UNITS, MILLIMETRE, check_place, dataset_of, read_dataset
 
 SOURCE = "import.json"  #: of a dataset: where it comes from and what was asked for; written first
 _PARTS = {"silhouette": "silhouette_path", "mask": "mask_path", "depth": "depth_file_path"}
@@ -37,6 +37,25 @@ Picture = Path | Callable[[], np.ndarray]
 uint16 [H, W]."""
 Progress = Callable[[int, int, str], None]
 """Called with how many pictures are written, of how many, and the name of the last."""
+
+
+class StageProgress:
+    """Tells a `Progress` of stages as parts of one whole."""
+
+    def __init__(self, progress: Progress | None, stages: Sequence[str]) -> None:
+        self.progress, self.stages = progress, stages
+
+    def __call__(self, stage: str, done: int, total: int, detail: str = "") -> None:
+        if self.progress is not None:
+            part = 100 * (self.stages.index(stage) + done / max(total, 1))
+            self.progress(round(part), 100 * len(self.stages), f"{stage} {detail}".rstrip())
+
+    def write(self, done: int, total: int, name: str) -> None:
+        """What `write_dataset` tells, of the last stage."""
+        if len(self.stages) > 1:
+            self("write", done, total, name)
+        elif self.progress is not None:
+            self.progress(done, total, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +98,7 @@ def write_dataset(
     if not train:
         raise InputError(f"{source.get('source', out)}: expected frames to train on, found none")
     entries = [_entry(frame) for frame in frames]
-    _check_names(str(source.get("source", out)), entries)
+    _check(str(source.get("source", out)), frames, entries)
     with lock_folder(out):
         _claim(out, source)
         paths = [SOURCE]
@@ -112,8 +131,14 @@ def write_dataset(
     return read_dataset(out)
 
 
-def _check_names(source: str, entries: Sequence[JsonMapping]) -> None:
-    """Raises InputError where two frames would be written to one file, before anything is."""
+def _check(source: str, frames: Sequence[ImportedFrame], entries: Sequence[JsonMapping]) -> None:
+    """Raises InputError, before anything is written, for a camera that is too far away and where two frames would be
+    written to one file."""
+    for frame in frames:
+        try:
+            check_place(frame.camera)
+        except InputError as error:
+            raise InputError(f"{source}: {frame.name}: {error}") from None
     for key in ("file_path", *_PARTS.values()):
         for path, count in Counter(entry[key] for entry in entries if key in entry).items():
             if count > 1:

@@ -21,6 +21,8 @@ MANY_PICTURES = 50  #: that unknown Suns are estimated from
 LOOKED_AT = 32  #: training pictures, at most, that are looked at for whether the object is cut out
 CUT_AWAY = 0.02  #: least share of a picture's pixels that are empty or ignored, where the object is cut out
 FEATURES = 0.3  #: standard deviation of the features at the start
+SOME_POINTS = 5_000  #: of a dataset, that say how near its cameras are
+CUT_OFF = 1e-3  #: share of the points before cameras that may be too near to be drawn
 SPLATFACTO_CUBE = 10  #: scene scales, side of the cube that its random start fills (`random_scale`)
 
 
@@ -118,15 +120,38 @@ def scene_scale(dataset: Dataset) -> float:
 
 
 def scale_warning(dataset: Dataset) -> str:
-    """A sentence where the cameras stand so near to each other and to what they look at that little of it can be drawn,
-    as with poses in kilometres; "" where they do not."""
-    distance = nearest_camera(dataset, focus_point(dataset))
-    if max(distance, scene_scale(dataset)) >= 2 * NEAR:
+    """A sentence where cameras stand so near to what they look at that some of it cannot be drawn, as with poses in
+    kilometres; "" where they do not. Training is the same at any larger scale."""
+    centre = focus_point(dataset)
+    if not _is_cut_off(dataset, centre):
         return ""
     return (
-        f"{dataset.root}: expected poses in metres, found training cameras {distance:.2g} m from what they look at: "
-        f"what is nearer to a camera than {NEAR} m is not drawn"
+        f"{dataset.root}: expected poses in metres, found training cameras {nearest_camera(dataset, centre):.2g} m "
+        f"from what they look at: what is nearer to a camera than {NEAR} m is not drawn; scale poses and points up"
     )
+
+
+def _is_cut_off(dataset: Dataset, centre: np.ndarray) -> bool:
+    """Whether points or the mesh lie before training cameras and nearer than `NEAR`; without either, whether a tenth
+    of the cameras are within twice that of `centre`: the random start then reaches there."""
+    points = _known_points(dataset)
+    if points is None or not len(points):
+        distances = [np.linalg.norm(frame.camera.position - centre) for frame in dataset.train]
+        return bool(np.quantile(distances, 0.1) < 2 * NEAR)
+    some = points[:: max(1, len(points) // SOME_POINTS)]
+    poses = np.array([frame.camera.camera_from_world for frame in dataset.train])
+    depth = some @ poses[:, 2, :3].T + poses[:, 2, 3]
+    return bool(((depth > 0) & (depth < NEAR)).sum() > CUT_OFF * (depth > 0).sum())
+
+
+def _known_points(dataset: Dataset) -> np.ndarray | None:
+    """[N, 3] metres: the dataset's points, else corners of its mesh's triangles, else None."""
+    if dataset.ply_file_path is not None:
+        return read_points(dataset.root / dataset.ply_file_path)[0].astype(np.float64)
+    if dataset.mesh_path is not None and (dataset.root / dataset.mesh_path).exists():
+        vertices, faces = read_mesh(dataset.root / dataset.mesh_path)
+        return np.asarray(vertices[faces.ravel()], np.float64)
+    return None
 
 
 def distance_warning(dataset: Dataset) -> str:

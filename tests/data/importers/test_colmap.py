@@ -1,6 +1,7 @@
 """COLMAP projects: models that the tests write themselves and those of pycolmap, their pictures and masks."""
 
 import logging
+import shutil
 
 import numpy as np
 import pytest
@@ -141,6 +142,15 @@ def test_pictures_of_any_scale(tmp_path, size):
     assert (camera.width, camera.height) == size
     np.testing.assert_allclose([camera.fx, camera.fy, camera.cx, camera.cy], [20 * x, 21 * y, 8.5 * x, 6.5 * y])
     assert frame.distortion == (0.1, 0, 0, 0, 0)
+
+
+def test_pictures_of_a_fraction_stand_for_the_others(tmp_path):
+    root = project(tmp_path / "src")
+    whole = imported(root, tmp_path / "whole").frames[0].camera
+    shutil.rmtree(root / "images")
+    write_pictures(root / "images_2", [f"view {k}.png" for k in range(5)], (8, 6))
+    camera = imported(root, tmp_path / "out").frames[0].camera
+    assert (camera.width, camera.fx, camera.cx) == (8, 0.5 * whole.fx, 0.5 * whole.cx)
 
 
 def test_images_without_a_file_are_left_out(tmp_path, caplog):
@@ -289,7 +299,7 @@ def test_the_command(spacesim, tmp_path):
     assert done.output.strip() == f"{tmp_path / 'out'}: 4 frames to train on, 1 to test with, with points to start from"
     helped = spacesim("import", "colmap", "--help").output
     assert all(option in helped for option in ("--images", "--masks", "--masked", "training ignores them"))
-    assert "--masks" not in spacesim("import", "nerfstudio", "--help").output
+    assert all("DIR|auto|none" in spacesim("import", kind, "--help").output for kind in ("nerfstudio", "speedplus"))
     refused = spacesim("import", "colmap", root, "--out", tmp_path / "new", "--masks", tmp_path / "nowhere")
     assert refused.code == 2
     assert "spacesim: --masks: expected a folder" in refused.errors[0]

@@ -170,6 +170,11 @@ BROKEN = {
         without("sparse/0/cameras.bin"),
         "expected a COLMAP model, cameras and images (.bin or .txt), in it",
     ),
+    "packed": (
+        "text",
+        lambda root: (root / "sparse/0/cameras.txt").rename(root / "sparse/0/cameras.txt.gz"),
+        "in sparse or in sparse/0, found cameras.txt.gz",
+    ),
     "no pictures": ("binary", without(*(f"images/view {k}.png" for k in range(5))), "expected the pictures of"),
     "another shape": ("binary", lambda root: write_pictures(root / "images", ["view 0.png"], (12, 16)), "found 12x16"),
     "no picture": (

@@ -80,6 +80,33 @@ def test_a_folder_that_lacks_pictures_is_imported_and_read(tmp_path, caplog):
     ]
 
 
+def test_a_folder_from_windows_is_read(tmp_path):
+    root = folder(tmp_path / "src", named(9, mask_path="masks/m.png"))
+    write_picture(root / "masks/m.png")
+    plain, path = ss.read_dataset(root), root / "transforms.json"
+    meta = json.loads(path.read_text())
+    meta["train_filenames"] = [frame["file_path"].replace("/", "\\") for frame in meta["frames"][:8]]
+    meta["test_filenames"] = ["images\\8.png"]
+    for frame in meta["frames"]:
+        frame |= {key: frame[key].replace("/", "\\") for key in ("file_path", "mask_path")}
+    path.write_text(json.dumps(meta), encoding="utf-8-sig")
+    read = ss.read_dataset(root)
+    assert [frame.file_path for frame in read.frames] == [f"images/{k}.png" for k in range(9)]
+    assert {frame.mask_path for frame in read.frames} == {frame.mask_path for frame in plain.frames}
+    assert len(imported(root, tmp_path / "out").test) == 1
+
+
+def test_masks_from_elsewhere_take_the_place_of_those_named(tmp_path):
+    root = folder(tmp_path / "src", named(2, mask_path="masks/m.png"))
+    write_picture(root / "masks/m.png", color=(0, 0, 0))
+    write_picture(root / "others/0.png", color=(255, 255, 255))
+    write_picture(root / "others/1.png", color=(0, 0, 0))
+    first, second = imported(root, tmp_path / "given", masks=root / "others").frames[:2]
+    alphas = [ss.load_image(ss.read_dataset(tmp_path / "given"), frame).alpha.mean() for frame in (first, second)]
+    assert sorted(alphas) == [0, 1]
+    assert all(frame.mask_path is None for frame in imported(root, tmp_path / "none", masks="none").frames)
+
+
 def test_fisheye_cameras_are_undistorted(tmp_path):
     width, height, f, k1 = 128, 96, 90.0, 0.08
     x, y = np.meshgrid((np.arange(width) + 0.5 - 64) / f, (np.arange(height) + 0.5 - 48) / f)
@@ -343,6 +370,10 @@ BROKEN = {
     "no mask": (lambda root: (root / "mask.png").unlink(), "mask.png: expected a file, found none"),
     "mask of a shape": (lambda root: write_picture(root / "mask.png", (12, 16)), "mask.png: expected 16x12 pixels, or"),
     "no points": (change(ply_file_path="a.ply"), "a.ply: expected a mesh, found none"),
+    "far pose": (
+        lambda root: edit(root, lambda m: m["frames"][0]["transform_matrix"][1].__setitem__(3, 1e30)),
+        "0.png: expected a camera within 1e+09 m of the origin, found it at",
+    ),
     "bent pose": (
         lambda root: edit(root, lambda m: m["frames"][0].update(transform_matrix=[[1] * 4] * 4)),
         "expected a rot",

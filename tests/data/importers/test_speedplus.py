@@ -152,8 +152,8 @@ def test_published_layout(published, tmp_path):
     assert (len(held_out.train), len(held_out.test)) == (7, 1)  # every eighth
 
 
-def test_a_distance_limit_and_a_subset(published, tmp_path):
-    near = import_speedplus(published, tmp_path / "near", max_distance=10.0)
+def test_a_distance_limit_and_a_subset(published, tmp_path, caplog):
+    near = import_speedplus(published, tmp_path / "near", max_distance=10.0, masks="none")
     assert all(np.linalg.norm(frame.camera.position) <= 10 for frame in near.frames)
     assert (len(near.train), len(near.test)) == (16, 4)  # 2 to 9.5 m and 2 to 8 m
     few = import_speedplus(published, tmp_path / "few", max_distance=10.0, count=10)
@@ -165,8 +165,9 @@ def test_a_distance_limit_and_a_subset(published, tmp_path):
     assert [number // 2 for number in numbers] == list(range(8))  # one of each pair
     two = import_speedplus(published, tmp_path / "two", count=2)
     assert (len(two.train), len(two.test)) == (1, 1)
-    all_ = import_speedplus(published, tmp_path / "all", count=1000)
+    all_ = import_speedplus(published, tmp_path / "all", count=1000, masks="none")
     assert len(all_.frames) == 40
+    assert "expected 1000 pictures, found 40: all are taken" in caplog.text
 
 
 def test_pictures_are_resized_by_means_over_areas(published, tmp_path):
@@ -208,7 +209,7 @@ def test_missing_pictures_are_skipped_with_one_warning(published, tmp_path, capl
     for number in (3, 4, 20):
         (published / f"synthetic/images/img{number:06d}.jpg").unlink()
     with caplog.at_level(logging.WARNING):
-        data = import_speedplus(published, tmp_path / "data")
+        data = import_speedplus(published, tmp_path / "data", masks="none")
     assert [r.getMessage() for r in caplog.records] == [
         f"{published / 'synthetic/images'}: 3 of 40 pictures are missing, their frames are skipped"
     ]
@@ -247,6 +248,7 @@ def edit(path: Path, change) -> None:
         ("synthetic/train.json", lambda v: v[2].pop("q_vbs2tango_true"), "q_vbs2tango, found None"),
         ("synthetic/train.json", lambda v: v[2].update(r_Vo2To_vbs_true=[0, 0, "far"]), "3 finite numbers"),
         ("synthetic/train.json", lambda v: v[2].update(r_Vo2To_vbs_true=[0, 0, 1e300]), "position within"),
+        ("synthetic/train.json", lambda v: v[2].update(r_Vo2To_vbs_true=[0, 0, -5]), "before the camera, z above 0"),
         ("synthetic/train.json", lambda v: v[2].update(filename="../../train.json"), "file name below"),
         ("synthetic/train.json", lambda v: v[2].update(filename=7), "file name below"),
         ("synthetic/train.json", lambda v: v[2].update(filename="img000000.jpg"), "each image once"),
@@ -255,6 +257,7 @@ def edit(path: Path, change) -> None:
         ("camera.json", lambda v: v.update(cameraMatrix=[[1, 2], [3, 4]]), "expected Nu, Nv, cameraMatrix"),
         ("camera.json", lambda v: v.update(cameraMatrix=[[0, 0, 0]] * 3), "focal lengths"),
         ("camera.json", lambda v: v.update(distCoeffs=[1] * 8), "at most five distCoeffs"),
+        ("camera.json", lambda v: v.update(distCoeffs=[1e9, 0]), "expected distCoeffs up to 100, found"),
         ("camera.json", lambda v: v["cameraMatrix"][0].__setitem__(1, 3.0), "without skew, found 3 in its first row"),
         ("camera.json", lambda v: v.update(Nu=1920), "expected 1920x30 pixels as camera.json says, found 48x30"),
     ],

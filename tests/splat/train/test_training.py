@@ -15,6 +15,7 @@ from spacesim.cli import main
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image
 from spacesim.data.lock import lock_folder
+from spacesim.data.store import read_points, write_points
 from spacesim.learning.cameras import focus_point
 from spacesim.splat.export.ply import read_ply, write_ply
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
@@ -308,9 +309,18 @@ def placed(dataset, factor=1.0, shift=0.0):
 
 
 def test_poses_in_kilometres_are_warned_of(small_dataset):
-    assert scale_warning(small_dataset) == scale_warning(placed(small_dataset, 1e-2)) == ""
-    assert scale_warning(placed(small_dataset, 1e4)) == ""
-    assert "expected poses in metres, found training cameras 0.003 m from" in scale_warning(placed(small_dataset, 1e-3))
+    bare = replace(small_dataset, ply_file_path=None, mesh_path=None)
+    assert scale_warning(bare) == scale_warning(placed(bare, 1e-2)) == scale_warning(placed(bare, 1e4)) == ""
+    assert "expected poses in metres, found training cameras 0.003 m from" in scale_warning(placed(bare, 1e-3))
+
+
+def test_points_too_near_to_be_drawn_are_warned_of(small_dataset, tmp_path):
+    """The cameras are 3 from the middle of the object."""
+    points = read_points(small_dataset.root / small_dataset.ply_file_path)[0]
+    for factor, warned in ((1.0, False), (2e-2, False), (3.5e-3, True), (1e-3, True)):
+        write_points(tmp_path / "points.ply", factor * points, np.zeros((len(points), 3), np.uint8))
+        scaled = replace(placed(small_dataset, factor), root=tmp_path, ply_file_path="points.ply")
+        assert bool(scale_warning(scaled)) == warned
 
 
 def test_poses_far_from_the_origin_are_warned_of(small_dataset):

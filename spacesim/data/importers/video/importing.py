@@ -18,19 +18,35 @@ from spacesim.data.errors import InputError, expect
 from spacesim.data.files import JsonValue, json_bytes
 from spacesim.data.images import read_png, write_png
 from spacesim.data.importers.importer import Importer, Option
-from spacesim.data.importers.masks import MASKED, MaskFolder, read_mask
+from spacesim.data.importers.masks import (
+    AUTO,
+    MASKED,
+    NO_MASKS,
+    NO_OBJECT,
+    MaskFolder,
+    as_color,
+    mask_options,
+    over_black,
+    read_mask,
+)
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import choose, read_frames, survey
 from spacesim.data.importers.video.model import SfmModel, placed, report_of, without_floating
 from spacesim.data.importers.video.segmentation import segment_sequence
 from spacesim.data.importers.video.sfm import check_focal, reconstruct
-from spacesim.data.importers.writing import ImportedFrame, Progress, check_free, frame_names, write_dataset
+from spacesim.data.importers.writing import (
+    ImportedFrame,
+    Progress,
+    StageProgress,
+    check_free,
+    frame_names,
+    write_dataset,
+)
 from spacesim.data.records import Camera, Dataset
 
 FRAMES = 120  #: taken of a video, at most
 LEAST = 3  #: pictures that poses can be found of
 REGISTERED = 0.9  #: share of pictures with a pose below which a warning is logged
-NO_MASKS = "none"
 _RIM = 2  # pixels along the outline in which no features are taken: they are of what is behind, too
 _STAGES = ("cut out", "features", "matches", "poses", "write")
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
@@ -42,7 +58,7 @@ _log = logging.getLogger(__name__)
 class ImportOptions:
     """What both importers are asked for. Raises InputError for a value out of range."""
 
-    masks: str | Path | None = None  #: a folder; "none": the background stays; None: cut out by `segment_sequence`
+    masks: str | Path | None = None  #: a folder; "none": the background stays; None, "auto": by `segment_sequence`
     masked: str = "empty"  #: what black in a mask means, see `masks.MASKED`
     fov: float | None = None  #: degrees of the pictures' width; None: estimated
     length: float | None = None  #: metres of the object along its longest axis
@@ -74,7 +90,7 @@ def import_video(
     source = _source("video", src, settings, frames=frames)
     check_free(out, source)
     with _workspace() as folder:
-        tell = _StageProgress(progress, ("look", *_STAGES))
+        tell = StageProgress(progress, ("look", *_STAGES))
         seen = survey((frame.picture for frame in read_frames(src)), lambda count: tell("look", 0, 1, f"frame {count}"))
         chosen = choose(seen, frames)
         if len(chosen) < LEAST:
@@ -110,11 +126,11 @@ def import_images(src: Path, out: Path, *, progress: Progress | None = None, **o
         raise InputError(f"{src}: expected at least {LEAST} pictures, found {len(paths)}")
     names = [f"{name}.png" for name in frame_names([path.relative_to(src).as_posix() for path in paths])]
     with _workspace() as folder:
-        tell = _StageProgress(progress, ("look", *_STAGES))
+        tell = StageProgress(progress, ("look", *_STAGES))
         size = None
         for k, (path, name) in enumerate(zip(paths, names, strict=True)):
             tell("look", k, len(paths), name)
-            pixels = _as_color(read_png(path))
+            pixels = as_color(read_png(path))
             size = size or pixels.shape[:2]
             if pixels.shape[:2] != size:
                 expected = f"{size[1]}x{size[0]} pixels as the first picture has"
@@ -131,7 +147,7 @@ def _import(
     ordered: bool,
     settings: ImportOptions,
     source: dict[str, JsonValue],
-    tell: "_StageProgress",
+    tell: StageProgress,
     facts: dict[str, JsonValue],
 ) -> Dataset:
     """Of pictures in folder/pictures, all of one size. keys: of each picture by its name, what transforms.json has of
@@ -168,11 +184,11 @@ def _import(
     )
 
 
-def _find_masks(folder: Path, names: Sequence[str], settings: ImportOptions, tell: "_StageProgress") -> bool:
+def _find_masks(folder: Path, names: Sequence[str], settings: ImportOptions, tell: StageProgress) -> bool:
     """Write folder/masks/NAME, 255 the object; False where the background stays."""
     if settings.masks is not None and str(settings.masks) == NO_MASKS:
         return False
-    if settings.masks is not None:
+    if settings.masks is not None and str(settings.masks) != AUTO:
         given = MaskFolder(Path(settings.masks)).find_all(names)
         masks = []
         for k, name in enumerate(names):
@@ -182,13 +198,13 @@ def _find_masks(folder: Path, names: Sequence[str], settings: ImportOptions, tel
             masks.append(read_mask(given[name], width, height) if name in given else whole)
     else:
         loads: list[Callable[[], np.ndarray]] = [
-            lambda name=name: _over_black(read_png(folder / "pictures" / name))  # type: ignore[misc]
+            lambda name=name: over_black(read_png(folder / "pictures" / name))  # type: ignore[misc]
             for name in names
         ]
         masks = segment_sequence(loads, lambda count: tell("cut out", count, len(names), ""))
     empty = [name for name, mask in zip(names, masks, strict=True) if not mask.any()]
     if len(empty) == len(names):
-        raise InputError("masks: expected an object in the pictures, found none; give masks, or masks none")
+        raise InputError(NO_OBJECT)
     if empty:
         _log.warning("masks: nothing is found in %d of %d pictures, %s first", len(empty), len(names), empty[0])
     for name, mask in zip(names, masks, strict=True):
@@ -199,7 +215,7 @@ def _find_masks(folder: Path, names: Sequence[str], settings: ImportOptions, tel
 def _hide_background(folder: Path, names: Sequence[str]) -> Path:
     """Write folder/features/NAME, the object over black, and return the folder of where features may be."""
     for name in names:
-        pixels = _over_black(read_png(folder / "pictures" / name))
+        pixels = over_black(read_png(folder / "pictures" / name))
         mask = read_png(folder / "masks" / name) > 0
         write_png(folder / "features" / name, np.where(mask[..., None], pixels, 0).astype(np.uint8), durable=False)
         inner = ndimage.binary_erosion(mask, iterations=_RIM)
@@ -216,7 +232,7 @@ def _frames(
         cut_out = has_masks and masked == "empty"
 
         def with_alpha(picture: Path = picture, mask: Path = mask) -> np.ndarray:
-            pixels = _as_color(read_png(picture))
+            pixels = as_color(read_png(picture))
             alpha = read_png(mask) if pixels.shape[2] == 3 else np.minimum(pixels[..., 3], read_png(mask))
             return np.dstack([pixels[..., :3], alpha])
 
@@ -235,18 +251,6 @@ def _source(kind: str, src: Path, settings: ImportOptions, **more: JsonValue) ->
     return {"kind": kind, "source": str(src), **more, **options}
 
 
-class _StageProgress:
-    """Tells a `Progress` of stages as parts of one whole."""
-
-    def __init__(self, progress: Progress | None, stages: Sequence[str]) -> None:
-        self.progress, self.stages = progress, stages
-
-    def __call__(self, stage: str, done: int, total: int, detail: str = "") -> None:
-        if self.progress is not None:
-            part = 100 * (self.stages.index(stage) + done / max(total, 1))
-            self.progress(round(part), 100 * len(self.stages), f"{stage} {detail}".rstrip())
-
-
 class _workspace:  # noqa: N801
     """A temporary folder, gone afterwards whatever happens."""
 
@@ -258,21 +262,6 @@ class _workspace:  # noqa: N801
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def _as_color(pixels: np.ndarray) -> np.ndarray:
-    """[H, W, 3] or [H, W, 4] uint8."""
-    if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
-    return np.repeat(pixels[..., None], 3, axis=-1) if pixels.ndim == 2 else pixels
-
-
-def _over_black(pixels: np.ndarray) -> np.ndarray:
-    """[H, W, 3] uint8."""
-    pixels = _as_color(pixels)
-    if pixels.shape[2] == 3:
-        return pixels
-    return ((pixels[..., :3].astype(np.uint16) * pixels[..., 3:] + 127) // 255).astype(np.uint8)
-
-
 def _scaled(pixels: np.ndarray, height: int | None) -> np.ndarray:
     if height is None or height >= pixels.shape[0]:
         return pixels
@@ -281,14 +270,7 @@ def _scaled(pixels: np.ndarray, height: int | None) -> np.ndarray:
 
 
 _OPTIONS = (
-    Option(
-        "masks",
-        Path,
-        "DIR",
-        "masks named like the pictures (of a video: like the frames of an earlier import), white = object; "
-        "none: the background stays (default: the object is cut out by what space looks like)",
-    ),
-    Option("masked", str, "WHAT", "pixels black in a mask: empty (default) or unknown, which training ignores", MASKED),
+    *mask_options("auto"),
     Option("fov", float, "DEG", "angle that a picture's width covers, where it is known (estimated)"),
     Option("length", float, "M", "metres of the object along its longest axis (unit: median distance of the cameras)"),
     Option("distance", float, "M", "metres from the cameras to the object, the median, instead of a length"),

@@ -111,7 +111,12 @@ def _working(picture: np.ndarray) -> np.ndarray:
     if scale < 1:
         size = max(1, round(scale * image.width)), max(1, round(scale * image.height))
         image = image.resize(size, Image.Resampling.BOX)
-    red, green, blue = np.moveaxis(np.asarray(image, np.float32) / 255, -1, 0)
+    return luma_and_chroma(np.asarray(image))
+
+
+def luma_and_chroma(pixels: np.ndarray) -> np.ndarray:
+    """[h, w, 3] float32 of uint8 [h, w, 3]: luma and two differences of colour, each about 0 to 1."""
+    red, green, blue = np.moveaxis(pixels.astype(np.float32) / 255, -1, 0)
     luma = 0.2126 * red + 0.7152 * green + 0.0722 * blue
     return np.stack([luma, blue - luma, red - luma], axis=-1)
 
@@ -206,7 +211,7 @@ def _follow(image: np.ndarray, other: np.ndarray, mask: np.ndarray) -> np.ndarra
         return _placed(mask, box, inside.shape)
     signed = np.where(mask, inside[box], -outside)
     prior = 2.0 * np.clip(signed / reach, -1, 1)  # log-odds
-    odds = prior + _color_odds(image, other[mask], image[surroundings])
+    odds = prior + color_odds(image, other[mask], image[surroundings])
     odds = np.where(sure, 2 * _ODDS, np.where(surroundings, -2 * _ODDS, odds))
     object_mask = _walk(image, odds)
     main = _largest(object_mask & ~surroundings)
@@ -236,14 +241,21 @@ def _before_earth(image: np.ndarray) -> np.ndarray:
         if not far.any():
             return mask
         prior = np.clip(2.0 - outside / max(3.0, 0.1 * _size_of(mask)), -4, 1)
-        odds = prior + _color_odds(image, image[mask], image[far])
+        odds = prior + color_odds(image, image[mask], image[far])
         object_mask = _walk(image, np.where(border | far, -2 * _ODDS, odds))
         main = _largest(object_mask)
         mask = _whole(main, object_mask) if main.any() else main
     return mask
 
 
-def _color_odds(image: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
+def rarity(image: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """[h, w] 0 to 30: how much rarer than their median colours [h, w, 3] are among others [N, 3], in log-densities."""
+    common = _Mixture(among)
+    middle = np.median(common.log_density(among[None, :: max(1, len(among) // _SAMPLES)]))
+    return np.clip(middle - common.log_density(image), 0, 30)
+
+
+def color_odds(image: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
     """[h, w] log-odds that pixels have the colours `inside` [N, 3] rather than those `outside` [M, 3]."""
     odds = _Mixture(inside).log_density(image) - _Mixture(outside).log_density(image)
     return np.clip(odds, -_ODDS, _ODDS)
