@@ -102,7 +102,7 @@ def test_broken_videos_end_in_a_sentence(tmp_path, caplog):
     with pytest.raises(InputError, match=r"none.mp4: expected a video file, found none"):
         next(read_frames(tmp_path / "none.mp4"))
     (tmp_path / "cut.mp4").write_bytes(path.read_bytes()[: path.stat().st_size // 2])  # its index is at the end
-    with pytest.raises(InputError, match=r"cut.mp4: expected a video"):
+    with pytest.raises(InputError, match=r"cut.mp4: expected .* found an MP4 file that is cut off before its index$"):
         list(read_frames(tmp_path / "cut.mp4"))
     with pytest.raises(InputError, match="nothing moves"):
         import_dataset("video", film(tmp_path / "still.mp4", [noise[0]] * 12), tmp_path / "out")

@@ -32,7 +32,6 @@ FOCAL = 0.2, 90.0  #: of a camera, in longer sides of its pictures
 _LEAST_ANGLE = 2.0  # degrees: of the median point, from which on its depth is known
 _STRICT = 480  # pixels of the longer side for which a match may be off by one; up to four: all of a small object looks
 # like a plane otherwise
-_RATIO = 0.7  # of a match's distance to the next best one's; 0.8 by default: parts of a spacecraft look alike
 _SOFT = 0.3  # pixels from which on a feature pulls less: highlights move
 _ENOUGH = 0.9  # share of pictures with a pose, from which on a lens without distortion will do
 _BETTER = 0.95  # share of the error that may be left, for distortion to be believed
@@ -182,7 +181,6 @@ def _match(colmap: ModuleType, database: Path, count: int, ordered: bool, strict
     options = colmap.FeatureMatchingOptions()
     options.use_gpu = False
     options.num_threads = 1
-    options.sift.max_ratio = _RATIO
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.max_error = strict
     verification.ransac.random_seed = SEED
